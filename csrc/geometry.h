@@ -1,0 +1,98 @@
+// Screen geometry: pixel coordinates, facing, barycentric weights. Every expression is evaluated in the order written, in T,
+// without contraction: the order of operations is part of the definition (it decides pixels that lie on an edge).
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <limits>
+
+#include "parallel.h"
+
+namespace nmr {
+
+// Centre of raster column (or row) i in [-1, 1].
+template <class T>
+NMR_INLINE T pixel_centre(int64_t i, int64_t raster_size) {
+  return static_cast<T>(2 * i + 1 - raster_size) / static_cast<T>(raster_size);
+}
+
+// Pixel coordinate of x in [-1, 1]: pixel centres are the integers.
+template <class T>
+NMR_INLINE T to_pixel(T x, T raster_size) {
+  return (x * raster_size + raster_size - 1) / 2;
+}
+
+// One face on the screen: corners in [-1, 1] and depths, in the vertex order in which it is drawn.
+template <class T>
+struct Triangle {
+  T x[3], y[3], z[3];
+};
+
+template <class T>
+NMR_INLINE Triangle<T> load_triangle(const T* vertices, const int64_t* face, bool reversed) {
+  Triangle<T> t;
+  for (int k = 0; k < 3; ++k) {
+    const T* v = vertices + 3 * face[reversed ? 2 - k : k];
+    t.x[k] = v[0];
+    t.y[k] = v[1];
+    t.z[k] = v[2];
+  }
+  return t;
+}
+
+// Faces with a non-finite x or y, a NaN depth, or no area are not drawn. The area is computed in double, which is all but exact
+// for float coordinates: the inclusive edge tests of a face that is collinear would otherwise pass along its whole line.
+template <class T>
+NMR_INLINE bool is_drawable(const Triangle<T>& t) {
+  bool finite = true;
+  for (int k = 0; k < 3; ++k) finite &= std::isfinite(t.x[k]) & std::isfinite(t.y[k]) & !std::isnan(t.z[k]);
+  const double x0 = t.x[0], y0 = t.y[0];
+  return finite & ((t.x[1] - x0) * (t.y[2] - y0) != (t.y[1] - y0) * (t.x[2] - x0));
+}
+
+// Counter-clockwise (y up), or of exactly zero area. In floating point a sliver can pass in both vertex orders, or in neither.
+template <class T>
+NMR_INLINE bool faces_camera(const Triangle<T>& t) {
+  return !((t.y[2] - t.y[0]) * (t.x[1] - t.x[0]) < (t.y[1] - t.y[0]) * (t.x[2] - t.x[0]));
+}
+
+// Rows of the matrix M with barycentric weight w_k = M[k][0] X + M[k][1] Y + M[k][2] at pixel coordinates (X, Y): the inverse
+// of the matrix with columns (X_k, Y_k, 1).
+template <class T>
+struct BarycentricMatrix {
+  T m[3][3];
+};
+
+template <class T>
+NMR_INLINE BarycentricMatrix<T> barycentric_matrix(const Triangle<T>& t, T raster_size) {
+  T X[3], Y[3];
+  for (int k = 0; k < 3; ++k) {
+    X[k] = to_pixel(t.x[k], raster_size);
+    Y[k] = to_pixel(t.y[k], raster_size);
+  }
+  const T det = X[2] * (Y[0] - Y[1]) + X[0] * (Y[1] - Y[2]) + X[1] * (Y[2] - Y[0]);
+  return {{{(Y[1] - Y[2]) / det, (X[2] - X[1]) / det, (X[1] * Y[2] - X[2] * Y[1]) / det},
+           {(Y[2] - Y[0]) / det, (X[0] - X[2]) / det, (X[2] * Y[0] - X[0] * Y[2]) / det},
+           {(Y[0] - Y[1]) / det, (X[1] - X[0]) / det, (X[0] * Y[1] - X[1] * Y[0]) / det}}};
+}
+
+// Clamps a weight to [0, 1]; NaN becomes 0.
+template <class T>
+NMR_INLINE T clamp_weight(T w) {
+  w = w > 0 ? w : T(0);
+  return w < 1 ? w : T(1);
+}
+
+template <class T>
+NMR_INLINE T min3(T a, T b, T c) {
+  const T ab = a < b ? a : b;
+  return ab < c ? ab : c;
+}
+
+template <class T>
+NMR_INLINE T max3(T a, T b, T c) {
+  const T ab = a > b ? a : b;
+  return ab > c ? ab : c;
+}
+
+}  // namespace nmr

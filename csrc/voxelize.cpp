@@ -1,0 +1,133 @@
+// Occupancy grids in the definition of Kato et al. 2018 ("kato18"), the one behind the published voxel IoU figures:
+// surface cells, then everything that is not reached from the border of the grid through empty cells.
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "parallel.h"
+#include "stages.h"
+
+namespace nmr {
+namespace {
+
+using Vec3f = Eigen::Vector3f;
+
+struct VoxelScratch {
+  std::vector<uint8_t> cells;   // [s, s, s] 1 = surface, 2 = outside
+  std::vector<int32_t> frontier;
+};
+
+struct Grid {
+  uint8_t* cells;
+  int64_t size;
+
+  void mark(const int64_t (&c)[3]) {
+    for (int64_t x : c)
+      if (x < 0 || x >= size) return;
+    cells[(c[0] * size + c[1]) * size + c[2]] = 1;
+  }
+};
+
+// First and last integer in [0, size) within [lo, hi].
+void lattice_range(float lo, float hi, int64_t size, int64_t& first, int64_t& last) {
+  const float end = static_cast<float>(size);
+  first = static_cast<int64_t>(std::ceil(std::min(std::max(lo, 0.f), end)));
+  last = static_cast<int64_t>(std::floor(std::min(std::max(hi, -1.f), end - 1)));
+}
+
+// Rays along `axis` through the integer lattice of the other two axes (p, q): each hit marks the cell of its depth in the four
+// columns of cells that meet at (p, q).
+void mark_ray_hits(const Vec3f (&v)[3], int axis, Grid& grid) {
+  const int pa = (axis + 1) % 3, qa = (axis + 2) % 3;
+  const float p0 = v[0][pa], p1 = v[1][pa], p2 = v[2][pa], q0 = v[0][qa], q1 = v[1][qa], q2 = v[2][qa];
+  const float det = (p1 - p0) * (q2 - q0) - (p2 - p0) * (q1 - q0);
+  if (det == 0) return;
+  int64_t p_first, p_last, q_first, q_last;
+  lattice_range(std::min({p0, p1, p2}), std::max({p0, p1, p2}), grid.size, p_first, p_last);
+  lattice_range(std::min({q0, q1, q2}), std::max({q0, q1, q2}), grid.size, q_first, q_last);
+  for (int64_t p = p_first; p <= p_last; ++p) {
+    for (int64_t q = q_first; q <= q_last; ++q) {
+      const float dp = static_cast<float>(p) - p0, dq = static_cast<float>(q) - q0;
+      const float t1 = (dp * (q2 - q0) - (p2 - p0) * dq) / det;
+      const float t2 = ((p1 - p0) * dq - dp * (q1 - q0)) / det;
+      if (!(t1 >= 0 && t2 >= 0 && t1 + t2 <= 1)) continue;
+      const float depth = std::floor(v[0][axis] + t1 * (v[1][axis] - v[0][axis]) + t2 * (v[2][axis] - v[0][axis]));
+      if (!(depth >= 0 && depth < static_cast<float>(grid.size))) continue;
+      int64_t cell[3];
+      cell[axis] = static_cast<int64_t>(depth);
+      for (int64_t cp = p - 1; cp <= p; ++cp)
+        for (int64_t cq = q - 1; cq <= q; ++cq) {
+          cell[pa] = cp;
+          cell[qa] = cq;
+          grid.mark(cell);
+        }
+    }
+  }
+}
+
+// The cell of a vertex, coordinates truncated towards zero: (-1, 0) falls into cell 0.
+void mark_vertex(const Vec3f& v, Grid& grid) {
+  int64_t cell[3];
+  for (int k = 0; k < 3; ++k) {
+    if (!(v[k] > -1 && v[k] < static_cast<float>(grid.size))) return;
+    cell[k] = static_cast<int64_t>(v[k]);
+  }
+  grid.mark(cell);
+}
+
+// Floods the empty cells from the border (6-connected) and marks them 2.
+void flood_outside(Grid& grid, std::vector<int32_t>& frontier) {
+  const int64_t s = grid.size;
+  frontier.clear();
+  const auto visit = [&](int64_t x, int64_t y, int64_t z) {
+    const int64_t n = (x * s + y) * s + z;
+    if (grid.cells[n] != 0) return;
+    grid.cells[n] = 2;
+    frontier.push_back(static_cast<int32_t>(n));
+  };
+  for (int64_t a = 0; a < s; ++a)
+    for (int64_t b = 0; b < s; ++b)
+      for (int64_t side : {int64_t(0), s - 1}) {
+        visit(side, a, b);
+        visit(a, side, b);
+        visit(a, b, side);
+      }
+  while (!frontier.empty()) {
+    const int64_t n = frontier.back();
+    frontier.pop_back();
+    const int64_t x = n / (s * s), y = n / s % s, z = n % s;
+    if (x > 0) visit(x - 1, y, z);
+    if (x < s - 1) visit(x + 1, y, z);
+    if (y > 0) visit(x, y - 1, z);
+    if (y < s - 1) visit(x, y + 1, z);
+    if (z > 0) visit(x, y, z - 1);
+    if (z < s - 1) visit(x, y, z + 1);
+  }
+}
+
+}  // namespace
+
+void voxelize(const Voxelize& args) {
+  const int64_t s = args.size, num_cells = s * s * s;
+  parallel_for(args.mesh.batch, args.num_threads, [&](int64_t b) {
+    VoxelScratch& scratch = thread_scratch<VoxelScratch>();
+    Grid grid{reserve(scratch.cells, num_cells), s};
+    std::fill_n(grid.cells, num_cells, uint8_t(0));
+    const float* vertices = args.mesh.image_vertices(b);
+    const int64_t* faces = args.mesh.image_faces(b);
+    for (int64_t f = 0; f < args.mesh.num_faces; ++f) {
+      Vec3f corners[3];
+      for (int k = 0; k < 3; ++k)
+        corners[k] = Eigen::Map<const Vec3f>(vertices + 3 * faces[3 * f + k]) * static_cast<float>(s);
+      for (const Vec3f& corner : corners) mark_vertex(corner, grid);
+      for (int axis = 0; axis < 3; ++axis) mark_ray_hits(corners, axis, grid);
+    }
+    flood_outside(grid, scratch.frontier);
+    bool* voxels = args.voxels + b * num_cells;
+    for (int64_t n = 0; n < num_cells; ++n) voxels[n] = grid.cells[n] != 2;
+  });
+}
+
+}  // namespace nmr

@@ -1,0 +1,178 @@
+"""Files out of Debian packages, without installing them: apt-get download, .deb archives, or an installed system.
+
+A .deb is an `ar` archive whose member `data.tar.*` holds the files. Nothing is unpacked to disk: the few files wanted are read
+into memory one at a time, and an archive with an absolute path, a ".." or an oversized member is refused.
+"""
+
+from __future__ import annotations
+
+import io
+import shutil
+import subprocess
+import tarfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
+
+MAX_FILE_BYTES = 512 * 2**20  # one file of a package; the largest wanted today is a 61 MB catalogue
+MAX_MEMBER_BYTES = 64 * 2**20  # one file inside a catalogue; the largest wanted today is a 9 MB model
+
+
+class PackageMissing(ValueError):
+    """The package is not where it was looked for; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Package:
+    """One Debian package at hand: a .deb file, or the list of its files on an installed system."""
+
+    name: str
+    version: str
+    deb: Path | None = None  # the archive, or
+    root: Path | None = None  # the system's root, together with
+    listed: tuple[str, ...] = ()  # the paths below it
+
+
+def check_member_path(path: str, archive: str) -> str:
+    """The path of an archive member without a leading "./"; ValueError if it leaves the archive's folder."""
+    parts = PurePosixPath(path).parts
+    if path.startswith("/") or "\\" in path or ".." in parts:
+        raise ValueError(f"{archive} is refused: its member {path!r} points outside the archive; get the package again")
+    return "/".join(parts)
+
+
+def download_package(name: str, folder: Path) -> Package:
+    """Download one package with `apt-get download` (no root, no installation) into `folder`.
+
+    Raises PackageMissing when apt-get is not there, does not know the package, or fails.
+    """
+    if shutil.which("apt-get") is None:
+        raise PackageMissing(
+            f"apt-get is not on this machine, so {name} cannot be downloaded; "
+            "put its .deb file into a folder and name it with --packages-dir"
+        )
+    before = set(folder.iterdir())
+    command = ["apt-get", "download", "-q", name]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False)
+    if result.returncode != 0 or not set(folder.iterdir()) - before:
+        reason = next((line for line in result.stderr.splitlines() if line.startswith("E:")), "E: no reason given")
+        component = "the component non-free" if name.endswith("-nonfree") else "the component main"
+        raise PackageMissing(
+            f"apt-get could not download {name} ({reason[3:]}); run `apt-get update` as root first, "
+            f"and see that {component} is enabled in the apt sources"
+        )
+    return find_package(name, folder)
+
+
+def find_package(name: str, folder: Path) -> Package:
+    """The package whose file NAME_VERSION_ARCH.deb lies in `folder`; PackageMissing if none, ValueError if several."""
+    found = sorted(folder.glob(f"{name}_*.deb"))
+    if not found:
+        raise PackageMissing(f"{folder} holds no {name}_*.deb; run `apt-get download {name}` there")
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise ValueError(f"{folder} holds several versions of {name} ({names}); keep one")
+    return Package(name, unquote(found[0].stem.split("_")[1]), deb=found[0])
+
+
+def installed_package(name: str, root: Path) -> Package:
+    """The package as installed below `root` (its file list and version from dpkg's database); else PackageMissing."""
+    database = root / "var/lib/dpkg"
+    listing = database / "info" / f"{name}.list"
+    if not listing.is_file():
+        raise PackageMissing(f"{name} is not installed below {root}; install it, or leave --root out to download it")
+    version = ""
+    for paragraph in (database / "status").read_text(encoding="utf-8", errors="replace").split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in paragraph.splitlines() if ": " in line and line[0] != " ")
+        if fields.get("Package") == name:
+            version = fields.get("Version", "")
+    return Package(name, version, root=root, listed=tuple(listing.read_text(encoding="utf-8").splitlines()))
+
+
+def read_package(package: Package, suffixes: tuple[str, ...]) -> Iterator[tuple[str, bytes]]:
+    """Each regular file of the package whose path ends in one of `suffixes`, as (path without leading /, content).
+
+    The order is that of the archive (or of the sorted file list). Symbolic links and devices are passed over.
+    Raises ValueError for unsafe member paths, members over 512 MiB and archives that cannot be read.
+    """
+    if package.deb is None:
+        assert package.root is not None
+        for line in sorted(package.listed):
+            path = check_member_path(line.lstrip("/"), f"the file list of {package.name}")
+            file = package.root / path
+            if path.endswith(suffixes) and file.is_file() and not file.is_symlink():
+                _check_size(file.stat().st_size, path, package.name)
+                yield path, file.read_bytes()
+        return
+    archive = package.deb.name
+    try:
+        with _data_tar(package.deb) as tar:
+            for member in tar:
+                path = check_member_path(member.name, archive)
+                if member.isreg() and path.endswith(suffixes):
+                    _check_size(member.size, path, archive)
+                    stream = tar.extractfile(member)
+                    assert stream is not None
+                    yield path, stream.read()
+    except (tarfile.TarError, EOFError, OSError) as error:
+        raise ValueError(f"{archive} cannot be read as a Debian package ({error}); download it again") from error
+
+
+def open_catalogue(content: bytes, name: str) -> zipfile.ZipFile:
+    """A zip archive (.sh3f) held in memory, every member's path checked; ValueError if unsafe or not a zip file."""
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(content))
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"{name} is not a zip archive ({error}); download its package again") from error
+    for member in archive.namelist():
+        check_member_path(member, name)
+    return archive
+
+
+def read_member(archive: zipfile.ZipFile, path: str) -> bytes:
+    """The content of one member of a zip archive; ValueError if it is missing, damaged or over 64 MiB."""
+    try:
+        info = archive.getinfo(path)
+        _check_size(info.file_size, path, "the catalogue", MAX_MEMBER_BYTES)
+        return archive.read(info)
+    except (KeyError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} cannot be read from the catalogue ({error})") from error
+
+
+def _check_size(size: int, path: str, archive: str, limit: int = MAX_FILE_BYTES) -> None:
+    if size > limit:
+        raise ValueError(f"{path} of {archive} is refused: {size} bytes, at most {limit} are read")
+
+
+@contextmanager
+def _data_tar(deb: Path) -> Iterator[tarfile.TarFile]:
+    """The data.tar.* of a .deb as a stream; one that tarfile cannot decompress (zstd) goes through dpkg-deb."""
+    with deb.open("rb") as file:
+        if file.read(8) != b"!<arch>\n":
+            raise ValueError(f"{deb.name} is not a Debian package; download it again")
+        while len(header := file.read(60)) == 60:
+            member = header[:16].decode("ascii", "replace").strip().rstrip("/")
+            size = int(header[48:58])
+            if member.startswith("data.tar"):
+                kind = member.removeprefix("data.tar").removeprefix(".")
+                break
+            file.seek(size + size % 2, io.SEEK_CUR)
+        else:
+            raise ValueError(f"{deb.name} holds no data.tar; download it again")
+        if kind in ("", "gz", "bz2", "xz"):
+            with tarfile.open(fileobj=file, mode=f"r|{kind}") as tar:
+                yield tar
+            return
+    if shutil.which("dpkg-deb") is None:
+        raise ValueError(f"{deb.name} is compressed with {kind}, which needs dpkg-deb; install Debian's package dpkg")
+    with (
+        subprocess.Popen(["dpkg-deb", "--fsys-tarfile", str(deb)], stdout=subprocess.PIPE) as process,
+        tarfile.open(fileobj=process.stdout, mode="r|") as tar,
+    ):
+        try:
+            yield tar
+        finally:
+            process.kill()

@@ -1,0 +1,151 @@
+"""Meshes as they come: from a folder of files, from a mesh pack (npz) or from the procedural generator.
+
+Every source is a list of `MeshSource`, in an order that does not depend on the file system. Reading one may raise
+whatever the file's reader raises; `checked` raises ValueError with the reason where a mesh cannot be used.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf", ".dae", ".3mf", ".3dxml")
+SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
+
+
+@dataclass(frozen=True, eq=False)
+class RawMesh:
+    """Triangles as read: any scale and place, right-handed, either winding."""
+
+    vertices: np.ndarray  # float64 [V, 3]
+    faces: np.ndarray  # int64 [F, 3]
+    face_colors: np.ndarray | None = None  # float32 [F, 3], RGB in [0, 1], NaN or None where the file gives none
+
+
+@dataclass(frozen=True)
+class MeshSource:
+    """A mesh that can be read when its turn comes."""
+
+    name: str  # unique within its source: path relative to the folder, or the number in the pack
+    read: Callable[[], RawMesh]
+
+
+def folder_sources(folder: Path) -> tuple[list[MeshSource], Counter[str]]:
+    """The mesh files below a folder, sorted by relative path, and how many files of which other extension it ignored.
+
+    Raises ValueError where the folder holds no mesh file.
+    """
+    files = sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.relative_to(folder).as_posix())
+    meshes = [path for path in files if path.suffix.lower() in EXTENSIONS]
+    ignored = Counter(p.suffix.lower() or "(none)" for p in files if p.suffix.lower() not in EXTENSIONS + SIDECARS)
+    if not meshes:
+        raise ValueError(
+            f"no mesh file in {folder} or below it: wanted {', '.join(EXTENSIONS)}, "
+            f"found {dict(ignored) or 'nothing'}; convert the meshes to one of these, or give another folder"
+        )
+    return [MeshSource(p.relative_to(folder).as_posix(), lambda p=p: read_mesh(p)) for p in meshes], ignored
+
+
+def pack_sources(path: Path) -> list[MeshSource]:
+    """The meshes of a pack: an npz file with `n` and v0 float [V, 3], f0 int [F, 3], v1, f1, ... (never pickled).
+
+    Raises ValueError where the file is no such pack.
+    """
+    wanted = "an npz file with n, v0, f0, v1, f1, ... and no pickled objects"
+    try:
+        pack = np.load(path, allow_pickle=False)
+        count = int(pack["n"]) if "n" in pack else -1
+    except Exception as error:  # numpy and zipfile raise half a dozen types for a foreign or truncated file
+        raise ValueError(f"cannot read the mesh pack {path}: {error}; it must be {wanted}") from error
+    missing = [key for i in range(max(count, 0)) for key in (f"v{i}", f"f{i}") if key not in pack]
+    if count < 1 or missing:
+        raise ValueError(f"{path} is no mesh pack: it must be {wanted}; n is {count}, missing keys: {missing[:4]}")
+    width = len(str(count - 1))
+    return [MeshSource(f"{i:0{width}d}", lambda i=i: RawMesh(pack[f"v{i}"], pack[f"f{i}"])) for i in range(count)]
+
+
+def procedural_sources(category: str, count: int, seed: int) -> list[MeshSource]:
+    """`count` shapes of the procedural generator; shape i depends on the seed and i alone."""
+    from learn3d.data.shapes import CATEGORIES, make_shape
+
+    if category not in CATEGORIES:
+        raise ValueError(f"the procedural generator makes {', '.join(CATEGORIES)}; got category {category!r}")
+
+    def read(i: int) -> RawMesh:
+        shape = make_shape(category, np.random.default_rng([seed, 0, i]))
+        return RawMesh(shape.vertices, shape.faces)
+
+    return [MeshSource(f"{category}_{i:05d}", lambda i=i: read(i)) for i in range(count)]
+
+
+def read_mesh(path: Path) -> RawMesh:
+    """All triangles of a mesh file, scenes concatenated with their transforms, with their colours where it has any."""
+    import trimesh
+
+    scene = trimesh.load(str(path), force="scene", process=False)
+    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    if not parts:
+        raise ValueError("no faces")
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    return RawMesh(
+        vertices=np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]),
+        faces=np.concatenate([np.asarray(p.faces, dtype=np.int64) + o for p, o in zip(parts, offsets, strict=True)]),
+        face_colors=np.concatenate([_part_colors(part) for part in parts]),
+    )
+
+
+def _part_colors(part) -> np.ndarray:
+    """Face colours float32 [F, 3] of a trimesh.Trimesh; a texture is sampled at the vertices. NaN where it has none."""
+    none = np.full((len(part.faces), 3), np.nan, dtype=np.float32)
+    visual = part.visual
+    if visual is None or not visual.defined:
+        return none
+    try:
+        colors = np.asarray((visual.to_color() if visual.kind == "texture" else visual).face_colors)
+    except Exception:  # a texture that cannot be read must not cost the mesh
+        return none
+    return (colors[:, :3] / 255).astype(np.float32) if len(colors) == len(none) else none
+
+
+def checked(mesh: RawMesh, max_faces: int) -> RawMesh:
+    """The mesh with the vertices that no face uses dropped; ValueError with the reason where it cannot be rendered."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise ValueError(f"not a triangle mesh: vertices {list(vertices.shape)}, faces {list(faces.shape)}")
+    if not np.issubdtype(faces.dtype, np.integer) or not np.issubdtype(vertices.dtype, np.number):
+        raise ValueError(f"not a triangle mesh: vertices are {vertices.dtype}, faces are {faces.dtype}")
+    if len(faces) == 0:
+        raise ValueError("no faces")
+    if len(faces) > max_faces:
+        raise ValueError(f"too large: {len(faces)} faces, the limit is {max_faces} (max_faces)")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"faces refer to vertices {faces.min()} .. {faces.max()}, there are {len(vertices)}")
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices = vertices[used].astype(np.float64)
+    if not np.isfinite(vertices).all():
+        raise ValueError("vertices that are not finite (NaN or infinite)")
+    with np.errstate(over="ignore"):
+        extent = float(np.ptp(vertices, axis=0).max())
+    if not 1e-12 < extent < 1e30:
+        raise ValueError(f"no usable extent: its longest side is {extent:g}")
+    return replace(mesh, vertices=vertices, faces=faces.reshape(-1, 3).astype(np.int64))
+
+
+def fit_to_box(vertices: np.ndarray) -> np.ndarray:
+    """Vertices [V, 3] with their bounding box centred at the origin and its longest side 1."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    return (vertices - (low + high) / 2) / (high - low).max()
+
+
+def is_watertight(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """True where every edge has exactly two faces, after vertices at equal positions are taken as one."""
+    _, welded = np.unique(vertices, axis=0, return_inverse=True)
+    corners = welded.reshape(-1)[faces]
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]  # degenerate faces close nothing
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    _, counts = np.unique(edges[:, 0] * np.int64(len(vertices)) + edges[:, 1], return_counts=True)
+    return bool(len(counts)) and bool((counts == 2).all())

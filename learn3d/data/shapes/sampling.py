@@ -1,0 +1,21 @@
+"""Two words for random decisions, so that the recipes of the shapes read as sentences."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
+
+
+def pick(rng: np.random.Generator, options: dict[T, float] | tuple[T, ...]) -> T:
+    """One of the options: with equal chances, or with the weights that a dict gives them."""
+    keys = tuple(options)
+    weights = np.cumsum(list(options.values()) if isinstance(options, dict) else np.ones(len(keys)))
+    return keys[min(int(np.searchsorted(weights, rng.random() * weights[-1], side="right")), len(keys) - 1)]
+
+
+def maybe(rng: np.random.Generator, probability: float) -> bool:
+    """True with the given probability."""
+    return bool(rng.random() < probability)

@@ -1,0 +1,136 @@
+"""Pictures for people: the grid shown during training, turntables, strips, and the files they go into."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+import nmr
+from learn3d.data.kato import KatoDataset
+from learn3d.networks import IMAGE_SIZE, Networks, network_input
+from learn3d.shading import shade_mesh
+
+CLAY = (0.62, 0.68, 0.78)
+GRID_COLUMNS = ("input", "target", "rendering", "same view", "+60°", "+120°", "+180°", "+240°", "+300°")
+TILE = 96
+MARGIN = 4
+HEADER = 18
+
+
+def natural_colors(images: np.ndarray) -> np.ndarray:
+    """Stored images uint8 [..., 4, H, W] (colours inverted on black) -> uint8 [..., H, W, 3], objects on white."""
+    return 255 - np.moveaxis(images[..., :3, :, :], -3, -1)
+
+
+def to_uint8(values: Tensor) -> np.ndarray:
+    """Grey values in [0,1], any shape -> uint8 with a last axis of 3 equal channels."""
+    grey = (values.detach().cpu().float().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return np.repeat(grey[..., None], 3, axis=-1)
+
+
+def draw_mesh(
+    vertices: Tensor, faces: Tensor, azimuths_deg: Sequence[float], *, elevation_deg: float, image_size: int
+) -> np.ndarray:
+    """One mesh [V,3] in the object frame as plain clay on white, from several azimuths: uint8 [N,S,S,3]."""
+    azimuths = torch.as_tensor(azimuths_deg, dtype=torch.float32)
+    cameras = nmr.LookAt.from_angles(2.732, elevation_deg, azimuths, half_fov_deg=15.0)
+    rgb, _ = shade_mesh(vertices, faces, np.asarray(CLAY), cameras, image_size=image_size, supersample=4, ambient=0.35)
+    return rgb
+
+
+@torch.no_grad()
+def picture_grid(networks: Networks, dataset: KatoDataset, indices: Tensor) -> np.ndarray:
+    """What the networks make of some images: uint8 [H,W,3].
+
+    A row per image: the input, the target silhouette, the rendered silhouette and the shaded mesh at the input's view,
+    and the mesh from five new views around it.
+    """
+    batch = dataset.batch(indices)
+    vertices = networks.generator(networks.encoder(network_input(batch.images, networks.device))).cpu()
+    faces = networks.generator.faces.cpu()
+    silhouettes = nmr.render_silhouette(vertices, faces, batch.cameras, image_size=IMAGE_SIZE)
+    inputs = natural_colors(batch.images.numpy())
+    rows = []
+    for i in range(len(indices)):
+        azimuth = _azimuth_deg(batch.cameras.eye[i])
+        views = draw_mesh(vertices[i], faces, [azimuth + 60 * k for k in range(6)], elevation_deg=30, image_size=TILE)
+        flat = [inputs[i], to_uint8(batch.masks[i]), to_uint8(silhouettes[i])]
+        rows.append([*flat, *views])
+    return tile(rows, GRID_COLUMNS)
+
+
+def tile(
+    rows: Sequence[Sequence[np.ndarray]], titles: Sequence[str] | None = None, *, tile_size: int = TILE
+) -> np.ndarray:
+    """Arrange pictures uint8 [h,w,3] on a white sheet, each scaled to the same square, titles above the columns."""
+    columns = max(len(row) for row in rows)
+    header = HEADER if titles else 0
+    sheet = Image.new(
+        "RGB",
+        (columns * (tile_size + MARGIN) + MARGIN, header + len(rows) * (tile_size + MARGIN) + MARGIN),
+        (255, 255, 255),
+    )
+    draw = ImageDraw.Draw(sheet)
+    for column, title in enumerate(titles or ()):
+        draw.text(
+            (column * (tile_size + MARGIN) + MARGIN + tile_size // 2, header - 4), title, fill=(60, 60, 60), anchor="ms"
+        )
+    for r, row in enumerate(rows):
+        for c, picture in enumerate(row):
+            image = Image.fromarray(picture)
+            if image.size != (tile_size, tile_size):
+                image = image.resize((tile_size, tile_size), Image.Resampling.BICUBIC)
+            sheet.paste(image, (c * (tile_size + MARGIN) + MARGIN, header + r * (tile_size + MARGIN) + MARGIN))
+    return np.asarray(sheet)
+
+
+def turntable(
+    vertices: Tensor, faces: Tensor, *, frames: int = 36, image_size: int = 256, elevation_deg: float = 20.0
+) -> np.ndarray:
+    """One full turn around a mesh [V,3] in the object frame: uint8 [frames,S,S,3]."""
+    azimuths = [-360.0 * frame / frames for frame in range(frames)]
+    return draw_mesh(vertices, faces, azimuths, elevation_deg=elevation_deg, image_size=image_size)
+
+
+def save_png(path: Path, rgb: np.ndarray) -> None:
+    """Write a picture uint8 [H,W,3]."""
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).save(buffer, format="PNG", optimize=True)
+    write_bytes(path, buffer.getvalue())
+
+
+def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0) -> None:
+    """Write an endless animation from frames uint8 [N,H,W,3]."""
+    buffer = io.BytesIO()
+    palette = Image.Palette.ADAPTIVE
+    first, *others = [Image.fromarray(frame).convert("P", palette=palette, colors=64) for frame in frames]
+    first.save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=others,
+        duration=round(1000 / frames_per_second),
+        loop=0,
+        optimize=True,
+    )
+    write_bytes(path, buffer.getvalue())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file that appears under its name only when complete."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.partial")
+    temporary.write_bytes(content)
+    os.replace(temporary, path)
+
+
+def _azimuth_deg(eye: Tensor) -> float:
+    """Azimuth of a camera position (d cos e sin a, d sin e, -d cos e cos a)."""
+    return float(torch.rad2deg(torch.atan2(eye[0], -eye[2])))

@@ -1,0 +1,109 @@
+"""Losses on shape codes and pose logits, and the MMD between sets of codes. (Projection, smoothness: nmr.losses.)
+
+Everything is computed in float32, whatever precision the networks ran in.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def pose_classification_loss(logits: Tensor, view_ids: Tensor) -> Tensor:
+    """L_cls: mean over the batch of -log p(view | code) (the paper's eq. 3).
+
+    logits [B,K]; view_ids int64 [B] in 0..K-1. Differentiable in logits.
+    """
+    return F.cross_entropy(logits.float(), view_ids)
+
+
+def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -> Tensor:
+    """L_adv: distance of the discriminator's output from the uniform distribution over K views (eq. 4), batch mean.
+
+    "probability", as printed: sum_k (p_k - 1/K)^2. "log", as in the published code: sum_k (log(1/K) - log p_k)^2, which
+    is unbounded and much stronger where the discriminator is sure of itself. logits [B,K]; differentiable.
+    """
+    views = logits.shape[1]
+    if form == "log":
+        difference = F.log_softmax(logits.float(), dim=1) + math.log(views)
+    elif form == "probability":
+        difference = F.softmax(logits.float(), dim=1) - 1 / views
+    else:
+        raise ValueError(f"form must be 'log' or 'probability', got {form!r}")
+    return difference.square().sum(dim=1).mean()
+
+
+def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tensor:
+    """L_prior: batch mean of the length of the codes (eq. 5, "norm") or of its square (published code, "squared").
+
+    codes [B,C]; differentiable (the gradient of the norm at a zero code is zero).
+    """
+    codes = codes.float()
+    if form == "squared":
+        return codes.square().sum(dim=1).mean()
+    if form == "norm":
+        return torch.linalg.vector_norm(codes, dim=1).mean()
+    raise ValueError(f"form must be 'squared' or 'norm', got {form!r}")
+
+
+def mmd(
+    x: Tensor, y: Tensor, form: Literal["released", "paper"] = "released", *, bandwidth: float | None = None
+) -> Tensor:
+    """Maximum mean discrepancy between two sets of codes: 0 when they are alike, differentiable.
+
+    x, y float [N,C]. With b the `bandwidth`, by default the mean squared distance over all pairs of different rows of x
+    and y together (a constant for the gradient):
+    "released", the published code's quantity and the one in the paper's table: mean(XX + YY - XY - YX) with the sum of
+    the five kernels exp(-d^2 / (b * 2^i)), i = -2..2, and no root.
+    "paper", as printed: the square root of it with one kernel; the text gives no bandwidth, so i = 0 is taken.
+    """
+    if x.ndim != 2 or x.shape != y.shape or x.shape[0] == 0:
+        raise ValueError(f"x and y must be [N, C] of one shape with N >= 1, got {list(x.shape)} and {list(y.shape)}")
+    x, y = x.float(), y.float()
+    xx, yy, xy = (_squared_distances(a, b) for a, b in ((x, x), (y, y), (x, y)))
+    return mmd_from_distances(xx, yy, xy, form, bandwidth=bandwidth)
+
+
+def mmd_from_distances(
+    xx: Tensor,
+    yy: Tensor,
+    xy: Tensor,
+    form: Literal["released", "paper"] = "released",
+    *,
+    bandwidth: float | None = None,
+) -> Tensor:
+    """The MMD of `mmd` from squared distances [N,N] within x, within y and from x to y."""
+    rows = 2 * xx.shape[0]
+    if bandwidth is None:
+        width = ((xx.sum() + yy.sum() + 2 * xy.sum()) / (rows * rows - rows)).detach()
+    else:
+        width = torch.as_tensor(bandwidth, dtype=xx.dtype, device=xx.device)
+    width = width.clamp_min(1e-30)  # all codes equal: every kernel is 1, the MMD is 0
+    if form == "released":
+        means = [_five_kernels(d, width).mean() for d in (xx, yy, xy)]
+        return means[0] + means[1] - 2 * means[2]
+    if form == "paper":
+        means = [torch.exp(-d / width).mean() for d in (xx, yy, xy)]
+        return (means[0] + means[1] - 2 * means[2]).clamp_min(0).sqrt()
+    raise ValueError(f"form must be 'released' or 'paper', got {form!r}")
+
+
+def _five_kernels(distances: Tensor, bandwidth: Tensor) -> Tensor:
+    """sum_i exp(-d / (b 2^i)), i = -2..2: each kernel is the square of the next wider one."""
+    kernel = torch.exp(-distances / (4 * bandwidth))
+    total = kernel
+    for _ in range(4):
+        kernel = kernel.square()
+        total = total + kernel
+    return total
+
+
+def _squared_distances(x: Tensor, y: Tensor) -> Tensor:
+    """|x_i - y_j|^2 as [N,M], through a float64 product so that near codes keep their digits."""
+    x64, y64 = x.double(), y.double()
+    distances = x64.square().sum(1)[:, None] + y64.square().sum(1) - 2 * x64 @ y64.T
+    return distances.clamp_min(0).float()

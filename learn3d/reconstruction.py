@@ -1,0 +1,191 @@
+"""From an image with a mask to a mesh file and pictures of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import trimesh
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from learn3d import checkpoint, figures
+from learn3d.data.kato import KatoDataset, mesh_to_object
+from learn3d.networks import IMAGE_SIZE, Networks, network_input
+
+OBJECT_SHARE = 0.65  # side of the object's bounding square as a share of the picture's side, about that of the data set
+STRIP_SIZE = 160
+
+
+def read_image(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Read colours uint8 [H,W,3] and mask uint8 [H,W]: of an image with transparency, or of an image and a mask file.
+
+    A mask file is read as grey values (white = object) and must have the image's size.
+    Raises ValueError for an unreadable file, an image with no transparency and no mask, a wrong size, an empty mask.
+    """
+    image = _open(path)
+    if mask_path is not None:
+        grey = _open(mask_path).convert("L")
+        if grey.size != image.size:
+            raise ValueError(f"mask {mask_path} is {grey.size[0]}x{grey.size[1]}, image {path} is {_size(image)}")
+        mask = np.asarray(grey)
+    else:
+        mask = np.asarray(image.convert("RGBA"))[..., 3]
+        if mask.min() == 255:
+            raise ValueError(f"{path} has no transparency to tell the object from its background; give a mask image")
+    if mask.max() == 0:
+        raise ValueError(f"the mask of {path} is empty: no pixel belongs to the object")
+    return np.asarray(image.convert("RGBA"))[..., :3], mask
+
+
+def prepare_image(colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
+    """Bring an image of any size into the data set's form: uint8 [4,64,64], inverted colours on black, and the mask.
+
+    The object is laid over white and, with `crop`, centred in a square that leaves it the same room as in the data set;
+    without, the image must already be framed like that and is only made square and scaled.
+    """
+    if colors.ndim != 3 or colors.shape[2] != 3 or mask.shape != colors.shape[:2]:
+        raise ValueError(f"colors must be [H, W, 3] and mask [H, W], got {list(colors.shape)} and {list(mask.shape)}")
+    alpha = mask.astype(np.float32)[..., None] / 255
+    composite = colors * alpha + 255 * (1 - alpha)
+    stored = np.concatenate([255 - composite, 255 * alpha], axis=2)  # zero outside the object, so padding is plain
+    if crop:
+        rows, columns = (np.flatnonzero(mask.max(axis=axis) > 127) for axis in (1, 0))
+        if len(rows) == 0:
+            raise ValueError("the mask has no pixel above half strength; is it the right mask?")
+        extent = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
+        centre_y, centre_x = (rows[0] + rows[-1] + 1) / 2, (columns[0] + columns[-1] + 1) / 2
+        side = extent / OBJECT_SHARE
+    else:
+        centre_y, centre_x = mask.shape[0] / 2, mask.shape[1] / 2
+        side = float(max(mask.shape))
+    channels = [_resample(stored[..., c], centre_x - side / 2, centre_y - side / 2, side) for c in range(4)]
+    return np.rint(np.stack(channels)).clip(0, 255).astype(np.uint8)
+
+
+@torch.no_grad()
+def reconstruct(networks: Networks, images: np.ndarray) -> Tensor:
+    """Meshes float32 [B,642,3] in the object frame, from images uint8 [B,4,64,64] in the data set's form."""
+    codes = networks.encoder(network_input(torch.from_numpy(images), networks.device))
+    return networks.generator(codes).cpu()
+
+
+def export_mesh(path: Path, vertices: Tensor, faces: Tensor) -> None:
+    """Write a mesh [V,3], [F,3] of the object frame as OBJ, GLB or PLY (by the file's ending), y up, right-handed.
+
+    The object frame is left-handed; the reflection back turns the faces, whose normals point outwards in the file.
+    """
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in ("obj", "glb", "ply"):
+        raise ValueError(f"mesh files are written as .obj, .glb or .ply, not '{path.name}'")
+    points = vertices.detach().cpu().double().numpy() @ mesh_to_object()
+    mesh = trimesh.Trimesh(points, faces.cpu().numpy()[:, ::-1], process=False)
+    content = mesh.export(file_type=kind)
+    figures.write_bytes(path, content.encode() if isinstance(content, str) else content)
+
+
+def save_reconstruction(
+    folder: Path,
+    name: str,
+    image: np.ndarray,
+    vertices: Tensor,
+    faces: Tensor,
+    *,
+    mesh_format: Literal["obj", "glb", "ply"] = "obj",
+    frames: int = 36,
+    image_size: int = 256,
+) -> list[Path]:
+    """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input and six views); returns the three paths."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png")]
+    export_mesh(paths[0], vertices, faces)
+    turn = figures.turntable(vertices, faces, frames=frames, image_size=image_size)
+    figures.save_gif(paths[1], turn)
+    views = figures.draw_mesh(
+        vertices, faces, [-60.0 * k - 15 for k in range(6)], elevation_deg=20, image_size=STRIP_SIZE
+    )
+    strip = figures.tile([[figures.natural_colors(image), *views]], tile_size=STRIP_SIZE)
+    figures.save_png(paths[2], strip)
+    return paths
+
+
+def reconstruct_files(
+    run: Path,
+    folder: Path,
+    images: Sequence[Path],
+    masks: Sequence[Path] = (),
+    *,
+    crop: bool = True,
+    which: str = "last",
+    **options: Any,
+) -> list[Path]:
+    """Reconstruct image files with the networks of a run and save each result under the image's name in `folder`.
+
+    `masks` is empty (the images have transparency) or as long as `images`; `options` go to `save_reconstruction`.
+    Returns the files written.
+    """
+    if masks and len(masks) != len(images):
+        raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
+    pairs = zip(images, masks or [None] * len(images), strict=True)
+    prepared = [prepare_image(*read_image(image, mask), crop=crop) for image, mask in pairs]
+    networks, _, _ = checkpoint.load_networks(checkpoint.find(run, which))
+    names = [Path(image).stem for image in images]
+    if len(set(names)) < len(names):
+        names = [f"{number:03}_{name}" for number, name in enumerate(names)]
+    return _save_all(networks, folder, names, np.stack(prepared), options)
+
+
+def reconstruct_dataset(
+    run: Path,
+    folder: Path,
+    data: Path,
+    indices: Sequence[int],
+    *,
+    category: str | None = None,
+    split: str = "test",
+    which: str = "last",
+    **options: Any,
+) -> list[Path]:
+    """Reconstruct images of a data set (indices object * views + view) and save the results in `folder`."""
+    networks, config, _ = checkpoint.load_networks(checkpoint.find(run, which))
+    dataset = KatoDataset.load(data, category or config.category, split)
+    batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
+    numbers = zip(batch.object_ids.tolist(), batch.view_ids.tolist(), strict=True)
+    names = [f"{dataset.category}_{split}_object{number:04}_view{view:02}" for number, view in numbers]
+    return _save_all(networks, folder, names, batch.images.numpy(), options)
+
+
+def _save_all(networks: Networks, folder: Path, names: list[str], images: np.ndarray, options: dict) -> list[Path]:
+    meshes, faces = reconstruct(networks, images), networks.generator.faces
+    written = []
+    for name, image, vertices in zip(names, images, meshes, strict=True):
+        written += save_reconstruction(folder, name, image, vertices, faces, **options)
+    return written
+
+
+def _resample(channel: np.ndarray, left: float, top: float, side: float) -> np.ndarray:
+    """The square with that corner and side, scaled to 64x64 (box filter, bicubic when enlarging); zero outside."""
+    pad = int(np.ceil(max(0, -left, -top, left + side - channel.shape[1], top + side - channel.shape[0])))
+    padded = Image.fromarray(np.pad(channel, pad).astype(np.float32), mode="F")
+    box = (left + pad, top + pad, left + pad + side, top + pad + side)
+    method = Image.Resampling.BOX if side >= IMAGE_SIZE else Image.Resampling.BICUBIC
+    return np.asarray(padded.resize((IMAGE_SIZE, IMAGE_SIZE), method, box=box))
+
+
+def _open(path: Path) -> Image.Image:
+    try:
+        image = Image.open(path)
+        image.load()
+    except FileNotFoundError:
+        raise ValueError(f"there is no image {path}") from None
+    except (UnidentifiedImageError, OSError) as error:
+        raise ValueError(f"{path} cannot be read as an image: {error}") from None
+    return image
+
+
+def _size(image: Image.Image) -> str:
+    return f"{image.size[0]}x{image.size[1]}"

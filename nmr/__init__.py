@@ -1,0 +1,32 @@
+"""nmr: the Neural Mesh Renderer of Kato et al. 2018 as a compiled CPU operator for torch.
+
+Public names
+------------
+render_silhouette   meshes -> anti-aliased silhouettes, differentiable with NMR's gradient
+render_face_index   meshes -> which face is nearest at each pixel
+voxelize            meshes -> filled occupancy grids (kato18, the published voxel IoU)
+LookAt, Camera      cameras: world space -> renderer space
+icosphere, edge_table, losses   meshes to deform, and what to minimise
+
+Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]``; in renderer space x points right, y up, both in
+[-1, 1] across the image, and z is the depth in front of the camera. Images are ``[B, S, S]`` with row 0 at the top.
+"""
+
+import torch as _torch  # noqa: F401  torch first: the extension then shares torch's OpenMP runtime
+
+from . import losses
+from .cameras import Camera, LookAt
+from .mesh import edge_table, icosphere
+from .render import render_face_index, render_silhouette
+from .voxels import voxelize
+
+__all__ = [
+    "Camera",
+    "LookAt",
+    "edge_table",
+    "icosphere",
+    "losses",
+    "render_face_index",
+    "render_silhouette",
+    "voxelize",
+]
