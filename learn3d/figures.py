@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 import nmr
-from learn3d.data.kato import KatoDataset
+from learn3d.data.kato import DISTANCE, ELEVATION_DEG, HALF_FOV_DEG, KatoDataset
 from learn3d.networks import IMAGE_SIZE, Networks, network_input
 from learn3d.shading import shade_mesh
 
@@ -36,13 +37,30 @@ def to_uint8(values: Tensor) -> np.ndarray:
 
 
 def draw_mesh(
-    vertices: Tensor, faces: Tensor, azimuths_deg: Sequence[float], *, elevation_deg: float, image_size: int
+    vertices: Tensor,
+    faces: Tensor,
+    azimuths_deg: Sequence[float],
+    *,
+    elevation_deg: float,
+    image_size: int,
+    fit: bool = False,
 ) -> np.ndarray:
-    """One mesh [V,3] in the object frame as plain clay on white, from several azimuths: uint8 [N,S,S,3]."""
-    azimuths = torch.as_tensor(azimuths_deg, dtype=torch.float32)
-    cameras = nmr.LookAt.from_angles(2.732, elevation_deg, azimuths, half_fov_deg=15.0)
-    rgb, _ = shade_mesh(vertices, faces, np.asarray(CLAY), cameras, image_size=image_size, supersample=4, ambient=0.35)
-    return rgb
+    """One mesh [V,3] in the object frame as plain clay on white, from several azimuths: uint8 [N,S,S,3].
+
+    The camera is the data set's, or with `fit` one whose field of view just holds the mesh at every azimuth.
+    """
+    half_fov_deg = HALF_FOV_DEG
+    if fit:
+        radius = float(vertices.norm(dim=1).max())
+        half_fov_deg = max(1.0, math.degrees(math.asin(min(1.03 * radius / DISTANCE, 0.9))))
+    pictures = []
+    for azimuth in azimuths_deg:  # one at a time: the fine images that are averaged take memory
+        cameras = nmr.LookAt.from_angles(DISTANCE, elevation_deg, [azimuth], half_fov_deg=half_fov_deg)
+        rgb, _ = shade_mesh(
+            vertices, faces, np.asarray(CLAY), cameras, image_size=image_size, supersample=4, ambient=0.35
+        )
+        pictures.append(rgb)
+    return np.concatenate(pictures)
 
 
 @torch.no_grad()
@@ -60,7 +78,9 @@ def picture_grid(networks: Networks, dataset: KatoDataset, indices: Tensor) -> n
     rows = []
     for i in range(len(indices)):
         azimuth = _azimuth_deg(batch.cameras.eye[i])
-        views = draw_mesh(vertices[i], faces, [azimuth + 60 * k for k in range(6)], elevation_deg=30, image_size=TILE)
+        views = draw_mesh(
+            vertices[i], faces, [azimuth + 60 * k for k in range(6)], elevation_deg=ELEVATION_DEG, image_size=TILE
+        )
         flat = [inputs[i], to_uint8(batch.masks[i]), to_uint8(silhouettes[i])]
         rows.append([*flat, *views])
     return tile(rows, GRID_COLUMNS)
@@ -96,7 +116,7 @@ def turntable(
 ) -> np.ndarray:
     """One full turn around a mesh [V,3] in the object frame: uint8 [frames,S,S,3]."""
     azimuths = [-360.0 * frame / frames for frame in range(frames)]
-    return draw_mesh(vertices, faces, azimuths, elevation_deg=elevation_deg, image_size=image_size)
+    return draw_mesh(vertices, faces, azimuths, elevation_deg=elevation_deg, image_size=image_size, fit=True)
 
 
 def save_png(path: Path, rgb: np.ndarray) -> None:

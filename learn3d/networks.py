@@ -13,6 +13,7 @@ import nmr
 CODE_SIZE = 512
 IMAGE_SIZE = 64
 OBJECT_SCALE = 0.5
+CPUINFO = "/proc/cpuinfo"  # where Linux lists the instructions of the CPU
 
 
 class Encoder(nn.Module):
@@ -147,7 +148,7 @@ def resolve_precision(precision: Literal["auto", "bf16", "fp32"], device: str) -
     if device == "cuda":
         return "bf16" if torch.cuda.is_bf16_supported() else "fp32"
     try:
-        with open("/proc/cpuinfo") as file:
+        with open(CPUINFO) as file:
             flags = next((line.split(":", 1)[1].split() for line in file if line.startswith("flags")), [])
     except OSError:
         flags = []

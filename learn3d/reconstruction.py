@@ -16,7 +16,7 @@ from learn3d import checkpoint, figures
 from learn3d.data.kato import KatoDataset, mesh_to_object
 from learn3d.networks import IMAGE_SIZE, Networks, network_input
 
-OBJECT_SHARE = 0.65  # side of the object's bounding square as a share of the picture's side, about that of the data set
+OBJECT_SHARE = 0.65  # side of the object's bounding square as a share of the picture's side, when the run does not say
 STRIP_SIZE = 160
 
 
@@ -41,11 +41,13 @@ def read_image(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, n
     return np.asarray(image.convert("RGBA"))[..., :3], mask
 
 
-def prepare_image(colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
+def prepare_image(
+    colors: np.ndarray, mask: np.ndarray, *, crop: bool = True, object_share: float = OBJECT_SHARE
+) -> np.ndarray:
     """Bring an image of any size into the data set's form: uint8 [4,64,64], inverted colours on black, and the mask.
 
-    The object is laid over white and, with `crop`, centred in a square that leaves it the same room as in the data set;
-    without, the image must already be framed like that and is only made square and scaled.
+    The object is laid over white and, with `crop`, centred in a square so that its larger side takes `object_share` of
+    it, as in the data set; without, the image must be framed like that already and is only made square and scaled.
     """
     if colors.ndim != 3 or colors.shape[2] != 3 or mask.shape != colors.shape[:2]:
         raise ValueError(f"colors must be [H, W, 3] and mask [H, W], got {list(colors.shape)} and {list(mask.shape)}")
@@ -58,7 +60,7 @@ def prepare_image(colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) ->
             raise ValueError("the mask has no pixel above half strength; is it the right mask?")
         extent = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
         centre_y, centre_x = (rows[0] + rows[-1] + 1) / 2, (columns[0] + columns[-1] + 1) / 2
-        side = extent / OBJECT_SHARE
+        side = extent / object_share
     else:
         centre_y, centre_x = mask.shape[0] / 2, mask.shape[1] / 2
         side = float(max(mask.shape))
@@ -106,7 +108,7 @@ def save_reconstruction(
     turn = figures.turntable(vertices, faces, frames=frames, image_size=image_size)
     figures.save_gif(paths[1], turn)
     views = figures.draw_mesh(
-        vertices, faces, [-60.0 * k - 15 for k in range(6)], elevation_deg=20, image_size=STRIP_SIZE
+        vertices, faces, [-60.0 * k - 15 for k in range(6)], elevation_deg=20, image_size=STRIP_SIZE, fit=True
     )
     strip = figures.tile([[figures.natural_colors(image), *views]], tile_size=STRIP_SIZE)
     figures.save_png(paths[2], strip)
@@ -131,8 +133,9 @@ def reconstruct_files(
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
     pairs = zip(images, masks or [None] * len(images), strict=True)
-    prepared = [prepare_image(*read_image(image, mask), crop=crop) for image, mask in pairs]
-    networks, _, _ = checkpoint.load_networks(checkpoint.find(run, which))
+    networks, _, metadata = checkpoint.load_networks(checkpoint.find(run, which))
+    share = metadata.get("object_share") or OBJECT_SHARE
+    prepared = [prepare_image(*read_image(image, mask), crop=crop, object_share=share) for image, mask in pairs]
     names = [Path(image).stem for image in images]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]

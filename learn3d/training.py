@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,6 +37,7 @@ class Progress:
     step: int = 0  # steps taken
     best_iou: float = -1.0  # best validation voxel IoU so far; -1 before the first validation
     best_step: int = 0
+    object_share: float = 0.0  # side of the objects' bounding squares over that of the pictures, training mean
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         train_set.num_views, discriminator=uses_discriminator(settings), device=config.device, seed=config.seed
     )
     optimizers = create_optimizers(networks, config.learning_rate)
-    progress = Progress()
+    progress = Progress(object_share=object_share(train_set))
     folder = config.output
     if resume:
         restore(folder / "last.safetensors", config, networks, optimizers, progress)
@@ -134,6 +136,21 @@ def _epoch_order(num_samples: int, seed: int, epoch: int) -> Tensor:
     return torch.randperm(num_samples, generator=generator)
 
 
+def object_share(dataset: KatoDataset) -> float:
+    """Mean over the images of the larger side of the mask's bounding box, as a share of the picture's side.
+
+    Kept in checkpoints, so that photographs can be framed like the images that the networks know.
+    """
+    masks = dataset.images[:, :, 3].reshape(len(dataset), *dataset.images.shape[-2:]) > 127
+    sides = []
+    for axis in (1, 2):
+        seen = masks.any(axis=axis)
+        size = seen.shape[1]
+        first, last = seen.argmax(axis=1), size - 1 - seen[:, ::-1].argmax(axis=1)
+        sides.append(np.where(seen.any(axis=1), last - first + 1, 0) / size)
+    return float(np.maximum(*sides).mean())
+
+
 def _validate(
     config: TrainConfig,
     networks: Networks,
@@ -193,7 +210,7 @@ def restore(path: Path, config: TrainConfig, networks: Networks, optimizers: Opt
     for name, optimizer in optimizers.items():
         checkpoint.restore_optimizer(name, optimizer, tensors)
     for field in dataclasses.fields(Progress):
-        setattr(progress, field.name, metadata[field.name])
+        setattr(progress, field.name, metadata.get(field.name, field.default))
     torch.set_rng_state(tensors["random.cpu"])
     if config.device == "cuda" and "random.cuda" in tensors:
         torch.cuda.set_rng_state(tensors["random.cuda"])

@@ -6,6 +6,7 @@ python tools/train.py --output runs/airplane --resume
 
 from __future__ import annotations
 
+import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,10 +30,13 @@ class Command:
 
 def parse(arguments: list[str]) -> Command:
     """Read the command line; with --resume the options saved in the run folder are the defaults."""
+    finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    finder.add_argument("--resume", action="store_true")
+    finder.add_argument("--output", type=Path)
+    known, _ = finder.parse_known_args(arguments)
     default = {}
-    if "--resume" in arguments and "--output" in arguments[:-1]:
-        folder = Path(arguments[arguments.index("--output") + 1])
-        default = {"default": Command(load_config(folder / "config.json"), resume=True)}
+    if known.resume and known.output is not None:
+        default = {"default": Command(load_config(known.output / "config.json"))}
     return tyro.cli(Command, args=arguments, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,), **default)
 
 

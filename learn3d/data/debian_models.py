@@ -1,8 +1,8 @@
 """Real meshes from Debian packages: chairs, tables, cabinets, sofas, lamps (Sweet Home 3D) and airplanes (FlightGear).
 
-`fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply, welded, y up, facing +z, box centred at the origin, longest side 1, with
-OUTPUT/index.csv (what each mesh is and under which licence), OUTPUT/dropped.csv (what was left out and why) and the packages'
-copyright files. The same packages give the same bytes.
+`fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply, welded, y up, facing +z, box centred at the origin, longest side
+1, with OUTPUT/index.csv (what each mesh is and under which licence), OUTPUT/dropped.csv (what was left out and why)
+and OUTPUT/licences (the packages' copyright files). The same packages give the same bytes.
 """
 
 from __future__ import annotations
@@ -11,26 +11,22 @@ import csv
 import os
 import re
 import tempfile
-import zipfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path, PurePosixPath
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
 from learn3d.data import debian_packages as packages
+from learn3d.data.debian_aircraft import AIRCRAFT_PACKAGE, aircraft_models
+from learn3d.data.debian_furniture import FURNITURE_PACKAGES, furniture_models
 from learn3d.data.mesh_cleaning import clean_mesh, is_watertight, overlap, surface_grid
-from learn3d.data.mesh_text import Part, read_ac3d, read_obj, write_ply
+from learn3d.data.mesh_text import write_ply
 
-AIRCRAFT_PACKAGE = "flightgear-data-ai"
-FURNITURE_PACKAGES = ("sweethome3d-furniture", "sweethome3d-furniture-nonfree")  # the second is optional
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
-CATALOGUE = "PluginFurnitureCatalog.properties"
-AIRCRAFT_FOLDER = "usr/share/games/flightgear/AI/Aircraft/"
-AIRCRAFT_LICENCE = "GPL-2+"
-AIRCRAFT_AUTHOR = "the FlightGear team"
 GRID = 24  # cells per side when surfaces are compared
 
 
@@ -43,7 +39,8 @@ class FetchConfig:
     packages_dir: Path | None = None  # folder with the .deb files; without it they are downloaded with apt-get
     root: Path | None = None  # take the packages as installed below this folder ("/" for this machine)
     overwrite: bool = False  # replace an earlier output
-    duplicate_iou: float = 0.85  # two surfaces with a greater overlap are one model; 1 keeps everything
+    duplicate_iou: float = 0.85  # two surfaces whose overlap is greater are one model; 1 keeps all
+    stretched_iou: float = 0.85  # the same with both boxes stretched to cubes; 1 keeps stretched copies
     progress: bool = True  # draw progress bars
 
 
@@ -92,236 +89,24 @@ class Report:
         lines = [f"{category:9s}{kept[category]:5d} meshes, {closed[category]} watertight" for category in kept]
         reasons = Counter(re.sub(r" \(.*| of .*", "", drop.reason) for drop in self.dropped)
         lines += [f"{count} dropped: {reason}" for reason, count in reasons.most_common()]
-        return "\n".join([*lines, f"{self.ignored} models of other categories", *self.notes, f"written to {self.output}"])
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A model of a wanted category before cleaning; `mesh` is (vertices, faces), or the reason why there is none."""
-
-    category: str
-    title: str
-    author: str
-    licence: str
-    package: packages.Package
-    source: str
-    stem: str  # file name without suffix
-    mesh: tuple[np.ndarray, np.ndarray] | str
-
-
-# ---------------------------------------------------------------- furniture
-
-# The first rule whose words occur in the English name of the catalogue gives the category; None leaves the piece out.
-# Each pattern is searched in "name" as written in the catalogue, lower case.
-FURNITURE_RULES: tuple[tuple[str, str | None], ...] = (
-    (r"\b(switch|racket|bat|fan|freezer|wheelchair|ottoman|swinging|opened|skylight|tablet|flashlight)\b", None),
-    (r"\b(knife|towel|clothes|hat|cd|wine|speech) .*\b(stand|rack|unit)\b|washbasin|changing table|extension", None),
-    (r"candle|artwork", None),
-    (r"\b(lamp|lantern|chandelier|lamppost|(light|lights|spotlight|strip)$)", "lamp"),
-    (r"\b(sofa|couch|settee)\b", "sofa"),
-    (r"\b(chair|armchair|stool|class seat)\b", "chair"),
-    (r"\b(bedside table|night ?stand|tv stand)\b", "cabinet"),
-    (r"\b(table|desk|workbench)\b", "table"),
-    (r"\b(corner |cube )?shelf( (cherry|maple))?$", None),  # a board on the wall
-    (r"\b(cabinet|cupboard|wardrobe|bookcase|dresser|sideboard|locker|commode|chest|closet)\b", "cabinet"),
-    (r"\b(drawers?|shelves|bookshelves|shelving|shelf|rack)\b", "cabinet"),
-)
-FURNITURE_SECTIONS_LEFT_OUT = ("Characters", "Doors and windows", "Staircases", "Vehicles")
-
-
-def furniture_category(name: str, section: str = "") -> str | None:
-    """Category of a catalogue entry from its English name and the section it is listed in; None if it has none."""
-    if section in FURNITURE_SECTIONS_LEFT_OUT:
-        return None
-    for pattern, category in FURNITURE_RULES:
-        if re.search(pattern, name.lower()):
-            return category
-    return None
-
-
-def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
-    """The general properties and the entries (`key#N`, in the order of N) of a Sweet Home 3D furniture catalogue."""
-    general: dict[str, str] = {}
-    entries: dict[int, dict[str, str]] = {}
-    for line in text.splitlines():
-        match = re.match(r"\s*(\w+)(?:#(\d+))?\s*=\s*(.*)", line)
-        if match:
-            key, number, value = match.groups()
-            value = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value).strip()
-            (general if number is None else entries.setdefault(int(number), {}))[key] = value
-    return general, [entries[number] for number in sorted(entries)]
-
-
-def place_furniture(vertices: np.ndarray, entry: dict[str, str]) -> np.ndarray:
-    """Vertices [V, 3] turned by the entry's modelRotation (nine numbers by rows, p' = R p) and stretched to its box.
-
-    The box is width x height x depth along x, y, z, as Sweet Home 3D draws it: y up, the front towards +z.
-    Raises ValueError for a modelRotation that is not a rotation.
-    """
-    if "modelRotation" in entry:
-        numbers = np.array(entry["modelRotation"].split(), dtype=np.float64)
-        rotation = numbers.reshape(3, 3) if numbers.size == 9 else np.zeros((3, 3))
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-            raise ValueError(f"modelRotation is not a rotation: {entry['modelRotation']}")
-        vertices = vertices @ rotation.T
-    if len(vertices) and all(key in entry for key in ("width", "height", "depth")):
-        extents = np.ptp(vertices, axis=0)
-        size = np.array([float(entry[key]) for key in ("width", "height", "depth")])
-        if (extents > 0).all() and (size > 0).all():
-            vertices = vertices * (size / extents)
-    return vertices
-
-
-def _furniture(package: packages.Package, config: FetchConfig) -> Iterable[Candidate | None]:
-    """Candidates of every catalogue of a package; None for an entry of no category."""
-    for path, content in packages.read_package(package, (".sh3f",)):
-        catalogue = PurePosixPath(path).name
-        with packages.open_catalogue(content, catalogue) as archive:
-            general, entries = read_catalogue(packages.read_member(archive, CATALOGUE).decode("latin-1"))
-            progress = tqdm(entries, desc=catalogue, unit="model", disable=not config.progress, leave=False)
-            for entry in progress:
-                category = furniture_category(entry.get("name", ""), entry.get("category", ""))
-                if category not in config.categories:
-                    yield None
-                    continue
-                model = entry.get("model", "").removeprefix("/")
-                licence = " ".join(entry.get("license", general.get("license", "see the package")).split())
-                yield Candidate(
-                    category=category,
-                    title=entry["name"],
-                    author=entry.get("creator", ""),
-                    licence=licence,
-                    package=package,
-                    source=f"{catalogue}!/{model}",
-                    stem=f"{PurePosixPath(catalogue).stem}-{PurePosixPath(model).stem}",
-                    mesh=_furniture_mesh(archive, model, entry),
-                )
-
-
-def _furniture_mesh(archive: zipfile.ZipFile, model: str, entry: dict) -> tuple[np.ndarray, np.ndarray] | str:
-    if not model.lower().endswith(".obj"):
-        return f"unreadable (only OBJ models are read, this is {PurePosixPath(model).suffix or 'nothing'})"
-    try:
-        vertices, faces = read_obj(packages.read_member(archive, model).decode("latin-1"))
-        return place_furniture(vertices, entry), faces
-    except ValueError as error:
-        return f"unreadable ({error})"
-
-
-# ---------------------------------------------------------------- aircraft
-
-NOT_AIRPLANES = re.compile(r"balloon|ferry|ship|heli|vehicle|truck|bluebird", re.IGNORECASE)
-# Files that hold a part of an aircraft: their folder or their stem.
-PART_FOLDERS = re.compile(r"^(lights?|refuel\w*)$", re.IGNORECASE)
-PART_STEMS = re.compile(
-    r"light|flare|flash|beacon|strobe|^nav[lr]?$|navback|taxi$|wheel|tank|probe|refuel|exhaust|banner|pilot|engine|gear|ssme|oms",
-    re.IGNORECASE,
-)
-# Objects inside a file that stand for motion, light or smoke, not for a solid: left out by name.
-EFFECTS = re.compile(
-    r"prop(eller)?[^a-z]*(\w+[^a-z])?(dis[ck]|blur|fast)|fast_?prop|prplr-disk|blur|disque|helice.?disque|halo|flare|flame|"
-    r"burner|cond?ens|\bchute\b|^chute$|light-?cone|banner|shadow$|pilot(?!seat|-ext|-doub)|helmet",
-    re.IGNORECASE,
-)
-DISC_DIAMETER = 0.09  # of the longest side: a flat disc across the flight direction that wide is a propeller disc
-
-
-def is_airplane_file(path: str) -> bool:
-    """Whether an .ac path below AI/Aircraft names a whole airplane, not a part, a balloon or a ship."""
-    folders, stem = PurePosixPath(path).parts[:-1], PurePosixPath(path).stem
-    if any(NOT_AIRPLANES.search(name) for name in (*folders, stem)):
-        return False
-    return not any(PART_FOLDERS.match(name) for name in folders) and not PART_STEMS.search(stem)
-
-
-def turn_to_front(vertices: np.ndarray) -> np.ndarray:
-    """FlightGear's AC3D frame (nose -x, y up, left wing +z) to the frame of the furniture: front +z, y up, left +x."""
-    return np.stack([vertices[:, 2], vertices[:, 1], -vertices[:, 0]], axis=1)
-
-
-def without_discs(parts: list[Part]) -> list[Part]:
-    """The parts less the flat discs (or discs drawn on squares) across the flight direction x: turning propellers.
-
-    A part goes when its depth along x is under 3 % of its diameter, its outline is about round or square and wider than
-    DISC_DIAMETER of the whole.
-    """
-    everything = np.concatenate([part.vertices for part in parts])
-    whole = np.ptp(everything, axis=0).max()
-    kept = []
-    for part in parts:
-        x, y, z = np.ptp(part.vertices[np.unique(part.faces)], axis=0)
-        a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-        flat = x < 0.03 * max(y, z) and min(y, z) > 0.8 * max(y, z) and area > 0.55 * y * z
-        if not (flat and max(y, z) > DISC_DIAMETER * whole):
-            kept.append(part)
-    return kept
-
-
-def _aircraft(package: packages.Package, config: FetchConfig) -> Iterable[Candidate | None]:
-    """Candidates of the aircraft package in the order of their paths; None for a file that is no airplane."""
-    models: dict[str, tuple[np.ndarray, np.ndarray] | str] = {}
-    authors: dict[tuple[str, str], str] = {}
-    files = packages.read_package(package, (".ac", ".xml"))
-    for path, content in tqdm(files, desc=package.name, unit="file", disable=not config.progress, leave=False):
-        if not path.startswith(AIRCRAFT_FOLDER):
-            continue
-        below = path.removeprefix(AIRCRAFT_FOLDER)
-        folder = below.split("/", 1)[0]
-        text = content.decode("latin-1")
-        if path.endswith(".xml"):
-            author = re.search(r"<author>([^<]+)</author>", text)
-            for model in re.findall(r"<path>\s*([^<]+\.ac)\s*</path>", text) if author else ():
-                key = (folder, PurePosixPath(model).name)
-                authors[key] = min(authors.get(key, author[1].strip()), author[1].strip())
-        elif not is_airplane_file(below):
-            yield None
-        else:
-            models[path] = _aircraft_mesh(text)
-    for path in sorted(models):
-        folder, stem = path.removeprefix(AIRCRAFT_FOLDER).split("/", 1)[0], PurePosixPath(path).stem
-        yield Candidate(
-            category="airplane",
-            title=f"{folder} {stem}",
-            author=authors.get((folder, PurePosixPath(path).name), AIRCRAFT_AUTHOR),
-            licence=AIRCRAFT_LICENCE,
-            package=package,
-            source=path,
-            stem=stem if folder.lower() in stem.lower() else f"{folder}-{stem}",
-            mesh=models[path],
-        )
-
-
-def _aircraft_mesh(text: str) -> tuple[np.ndarray, np.ndarray] | str:
-    try:
-        parts = read_ac3d(text, skip=lambda name: EFFECTS.search(name) is not None)
-    except ValueError as error:
-        return f"unreadable ({error})"
-    parts = without_discs(parts) if parts else []
-    if not parts:
-        return "empty (no polygon is left)"
-    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    vertices = np.concatenate([part.vertices for part in parts])
-    faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)])
-    return turn_to_front(vertices), faces
-
-
-# ---------------------------------------------------------------- all together
+        lines.append(f"{self.ignored} models of other categories or parts")
+        return "\n".join([*lines, *self.notes, f"written to {self.output}"])
 
 
 def fetch_debian_models(config: FetchConfig) -> Report:
     """Write the meshes that `config` names into its output folder; the folder appears at once or not at all.
 
-    Raises ValueError (a sentence that says what to do) for unknown categories, an output that is there already, a package
-    that cannot be had, and archives that are damaged or unsafe. A single unreadable model is reported, not raised.
+    Raises ValueError (a sentence that says what to do) for unknown categories, an output that is there already, a
+    package that cannot be had, and archives that are damaged or unsafe. An unreadable model is reported, not raised.
     """
     unknown = [name for name in config.categories if name not in CATEGORIES]
     if unknown or not config.categories:
         raise ValueError(f"categories must be some of {', '.join(CATEGORIES)}; got {', '.join(unknown) or 'none'}")
     if config.packages_dir is not None and config.root is not None:
         raise ValueError("give either --packages-dir or --root, not both")
-    if not 0 < config.duplicate_iou <= 1:
-        raise ValueError(f"duplicate_iou must be in (0, 1], got {config.duplicate_iou}")
+    for field in ("duplicate_iou", "stretched_iou"):
+        if not 0 < getattr(config, field) <= 1:
+            raise ValueError(f"{field} must be in (0, 1], got {getattr(config, field)}")
     output = config.output.resolve()
     if output.exists():
         if not config.overwrite:
@@ -342,14 +127,17 @@ def fetch_debian_models(config: FetchConfig) -> Report:
 
 def _write_all(config: FetchConfig, folder: Path, downloads: Path) -> Report:
     """The body of `fetch_debian_models`: models, tables and copyright files into `folder`."""
-    sources = []
-    notes = []
+    licences = folder / "licences"
+    furniture = partial(furniture_models, categories=config.categories, licences=licences, progress=config.progress)
+    aircraft = partial(aircraft_models, licences=licences, progress=config.progress)
+    wanted: list[tuple[str, Callable[[packages.Package], Iterator[packages.Candidate | None]]]] = []
     if set(config.categories) - {"airplane"}:
-        sources += [(name, _furniture) for name in FURNITURE_PACKAGES]
+        wanted += [(name, furniture) for name in FURNITURE_PACKAGES]
     if "airplane" in config.categories:
-        sources.append((AIRCRAFT_PACKAGE, _aircraft))
+        wanted.append((AIRCRAFT_PACKAGE, aircraft))
     found = []
-    for name, reader in tqdm(sources, desc="packages", unit="package", disable=not config.progress):
+    notes = []
+    for name, reader in tqdm(wanted, desc="finding packages", unit="package", disable=not config.progress, leave=False):
         try:
             found.append((_locate(name, config, downloads), reader))
         except packages.PackageMissing as missing:
@@ -363,15 +151,12 @@ def _write_all(config: FetchConfig, folder: Path, downloads: Path) -> Report:
     names: set[str] = set()
     known: dict[str, list[tuple[str, np.ndarray, np.ndarray]]] = {category: [] for category in CATEGORIES}
     for package, reader in found:
-        for candidate in reader(package, config):
+        for candidate in reader(package):
             if candidate is None:
                 ignored += 1
                 continue
             outcome = _keep(candidate, known[candidate.category], config, folder, names)
             (models if isinstance(outcome, Model) else dropped).append(outcome)
-        for path, content in packages.read_package(package, (f"/doc/{package.name}/copyright",)):
-            (folder / "licences").mkdir(exist_ok=True)
-            (folder / "licences" / f"{PurePosixPath(path).parent.name}.copyright").write_bytes(content)
     models.sort(key=lambda model: (CATEGORIES.index(model.category), model.file))
     dropped.sort(key=lambda drop: (CATEGORIES.index(drop.category), drop.package, drop.source))
     _write_table(folder / "index.csv", Model, models)
@@ -387,7 +172,9 @@ def _locate(name: str, config: FetchConfig, downloads: Path) -> packages.Package
     return packages.download_package(name, downloads)
 
 
-def _keep(candidate: Candidate, known: list, config: FetchConfig, folder: Path, names: set[str]) -> Model | Dropped:
+def _keep(
+    candidate: packages.Candidate, known: list, config: FetchConfig, folder: Path, names: set[str]
+) -> Model | Dropped:
     """Clean one candidate, compare it with those kept before it in its category, and write it or say why not."""
 
     def drop(reason: str) -> Dropped:
@@ -401,9 +188,11 @@ def _keep(candidate: Candidate, known: list, config: FetchConfig, folder: Path, 
         return drop(f"unreadable ({error})")
     grids = surface_grid(vertices, faces, GRID), surface_grid(vertices, faces, GRID, per_axis=True)
     for name, *others in known:
-        iou = max(overlap(mine, other) for mine, other in zip(grids, others, strict=True))
+        iou, stretched = (overlap(mine, other) for mine, other in zip(grids, others, strict=True))
         if iou > config.duplicate_iou:
             return drop(f"near-duplicate of {name} (surface IoU {iou:.3f})")
+        if stretched > config.stretched_iou:
+            return drop(f"stretched near-duplicate of {name} (surface IoU {stretched:.3f} as cubes)")
     stem = re.sub(r"[^a-z0-9]+", "-", candidate.stem.lower()).strip("-") or "model"
     name, number = f"{candidate.category}/{stem}", 1
     while name in names:

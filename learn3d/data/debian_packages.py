@@ -1,7 +1,7 @@
 """Files out of Debian packages, without installing them: apt-get download, .deb archives, or an installed system.
 
-A .deb is an `ar` archive whose member `data.tar.*` holds the files. Nothing is unpacked to disk: the few files wanted are read
-into memory one at a time, and an archive with an absolute path, a ".." or an oversized member is refused.
+A .deb is an `ar` archive whose member `data.tar.*` holds the files. Nothing is unpacked to disk: the few files wanted
+are read into memory one at a time, and an archive with an absolute path, a ".." or an oversized member is refused.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
+
+import numpy as np
 
 MAX_FILE_BYTES = 512 * 2**20  # one file of a package; the largest wanted today is a 61 MB catalogue
 MAX_MEMBER_BYTES = 64 * 2**20  # one file inside a catalogue; the largest wanted today is a 9 MB model
@@ -34,6 +36,20 @@ class Package:
     deb: Path | None = None  # the archive, or
     root: Path | None = None  # the system's root, together with
     listed: tuple[str, ...] = ()  # the paths below it
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model of a wanted category as its package has it; `mesh` is (vertices, faces) or why there is none."""
+
+    category: str
+    title: str  # the maker's name for it
+    author: str
+    licence: str
+    package: Package
+    source: str  # path inside the package
+    stem: str  # file name to use, without suffix
+    mesh: tuple[np.ndarray, np.ndarray] | str  # float64 [V, 3], int64 [F, 3]; y up, front +z
 
 
 def check_member_path(path: str, archive: str) -> str:
@@ -119,6 +135,17 @@ def read_package(package: Package, suffixes: tuple[str, ...]) -> Iterator[tuple[
                     yield path, stream.read()
     except (tarfile.TarError, EOFError, OSError) as error:
         raise ValueError(f"{archive} cannot be read as a Debian package ({error}); download it again") from error
+
+
+def read_keeping_copyright(package: Package, suffixes: tuple[str, ...], folder: Path) -> Iterator[tuple[str, bytes]]:
+    """As `read_package`; the package's copyright file is copied to FOLDER/NAME.copyright on the way."""
+    notice = f"/doc/{package.name}/copyright"
+    for path, content in read_package(package, (*suffixes, notice)):
+        if path.endswith(notice):
+            folder.mkdir(exist_ok=True)
+            (folder / f"{package.name}.copyright").write_bytes(content)
+        else:
+            yield path, content
 
 
 def open_catalogue(content: bytes, name: str) -> zipfile.ZipFile:

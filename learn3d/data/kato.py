@@ -178,16 +178,17 @@ def _read_array(path: Path, dtype: type, shape: tuple[int, ...], what: str) -> n
     """The array 'arr_0' of an npz file, checked: `dtype` and [N, *shape]."""
     wanted = f"{np.dtype(dtype)} [N, {', '.join(map(str, shape))}] under the key 'arr_0'"
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            keys = archive.files if isinstance(archive, np.lib.npyio.NpzFile) else None
-            array = archive["arr_0"] if keys and "arr_0" in keys else None
+        archive = np.load(path, allow_pickle=False)
+        if isinstance(archive, np.ndarray):
+            raise ValueError("it is a single npy array")
+        with archive:
+            keys = archive.files
+            array = archive["arr_0"] if "arr_0" in keys else None
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, NotImplementedError, MemoryError) as error:
         raise ValueError(
             f"cannot read the {what} file {path}: {error}; it must be an npz file with {wanted} "
             "and no pickled objects. Perhaps the download or copy was cut short: fetch it again"
         ) from error
-    if keys is None:
-        raise ValueError(f"{path} is a single npy array, not an npz file; the {what} file must hold {wanted}")
     if array is None:
         raise ValueError(f"{path} holds the keys {keys}; the {what} file must hold {wanted}")
     if array.dtype != dtype or array.ndim != len(shape) + 1 or array.shape[1:] != shape:

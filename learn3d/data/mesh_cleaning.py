@@ -8,8 +8,9 @@ import numpy as np
 def clean_mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
     """The welded mesh with its box centred at the origin and its longest side 1: float64 [V, 3], int64 [F, 3].
 
-    Vertices closer than about `tolerance` of the longest side become one; faces without area, repeated faces (in whatever
-    winding) and unused vertices go. Raises ValueError when nothing solid is left or a coordinate is not finite.
+    Vertices closer than about `tolerance` of the longest side become one; faces without area, repeated faces (in
+    whatever winding) and unused vertices go.
+    Raises ValueError when nothing solid is left or a coordinate is not finite.
     """
     if len(faces) == 0:
         raise ValueError("it has no faces")

@@ -1,13 +1,13 @@
 """Readers of the two text formats of the Debian meshes (OBJ and AC3D), and a writer of binary PLY.
 
-Only the geometry is read: positions and polygons, the latter cut into triangles. Both readers are strict about indices and lenient
-about everything that they do not need.
+Only the geometry is read: positions and polygons, the latter cut into triangles. Both readers are strict about indices
+and lenient about everything that they do not need.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +48,7 @@ def read_obj(text: str) -> tuple[np.ndarray, np.ndarray]:
 def read_ac3d(text: str, skip: Callable[[str], bool] = lambda name: False) -> list[Part]:
     """Objects of an AC3D text with at least one polygon, placed by the `loc` and `rot` of their ancestors.
 
-    An object whose name `skip` accepts is left out together with its children. Lines (surface types 1 and 2) are left out.
+    An object whose name `skip` accepts is left out with its children; so are lines (surface types 1 and 2).
     Convention of FlightGear's models: nose towards -x, y up, left wing towards +z.
     Raises ValueError when the text is not AC3D or ends too early.
     """
@@ -67,14 +67,21 @@ def read_ac3d(text: str, skip: Callable[[str], bool] = lambda name: False) -> li
     return parts
 
 
-def _read_object(lines, stack: list[list], parts: list[Part], skip: Callable[[str], bool]) -> None:
+def _next(lines: Iterator[str]) -> str:
+    """The next line that is not blank (some exporters scatter blank ones); StopIteration at the end."""
+    while not (line := next(lines).strip()):
+        pass
+    return line
+
+
+def _read_object(lines: Iterator[str], stack: list[list], parts: list[Part], skip: Callable[[str], bool]) -> None:
     """Read one AC3D object up to its `kids` line; push it as the ancestor of its children."""
     stack[-1][0] -= 1
     _, rotation, translation, skipped = stack[-1]
     name, vertices, polygons = "", np.zeros((0, 3)), []
     own_rotation, own_translation = np.eye(3), np.zeros(3)
     while True:
-        key, _, value = next(lines).strip().partition(" ")
+        key, _, value = _next(lines).partition(" ")
         if key == "name":
             name = value.strip().strip('"')
         elif key == "data":
@@ -86,11 +93,11 @@ def _read_object(lines, stack: list[list], parts: list[Part], skip: Callable[[st
         elif key == "rot":
             own_rotation = np.array(value.split()[:9], dtype=np.float64).reshape(3, 3)
         elif key == "numvert":
-            vertices = np.array([next(lines).split()[:3] for _ in range(int(value))], dtype=np.float64).reshape(-1, 3)
+            vertices = np.array([_next(lines).split()[:3] for _ in range(int(value))], dtype=np.float64).reshape(-1, 3)
         elif key == "SURF":
             kind = int(value, 16) & 0xF
         elif key == "refs":
-            polygon = [int(next(lines).split()[0]) for _ in range(int(value))]
+            polygon = [int(_next(lines).split()[0]) for _ in range(int(value))]
             if kind == 0 and len(polygon) > 2:
                 polygons.append(polygon)
         elif key == "kids":
@@ -111,8 +118,8 @@ def _read_object(lines, stack: list[list], parts: list[Part], skip: Callable[[st
 def triangulate(polygons: Sequence[Polygon], vertices: np.ndarray) -> np.ndarray:
     """Triangles int64 [F, 3] of simple polygons, convex or not; ValueError when an index is outside of `vertices`.
 
-    A quadrilateral is cut along the diagonal that keeps both normals on one side; a larger polygon is cut by ears in the plane
-    of its Newell normal.
+    A quadrilateral is cut along the diagonal that keeps both normals on one side; a larger polygon is cut by ears in
+    the plane of its Newell normal.
     """
     by_size: dict[int, list[Polygon]] = {}
     for polygon in polygons:

@@ -134,7 +134,7 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
         bar = _progress_bar(sum(len(splits[s]) * copies[s] for s in splits), config.category, progress)
         for split in ("train", "val", "test"):
             numbers = splits[split]
-            images, voxels, names = _render_split(config, sources, numbers, split, copies[split], used, skipped, bar)
+            images, voxels = _render_split(config, sources, numbers, split, copies[split], used, skipped, bar)
             if not len(images):
                 continue
             objects[split] = len(images)
@@ -142,7 +142,6 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
             np.savez_compressed(Path(temporary) / f"{prefix}_{split}_voxels.npz", voxels)
             chosen = np.unique(np.linspace(0, len(images) - 1, 6).astype(int))
             sheet.append(contact_sheet(images[chosen], voxels[chosen]))
-            bar.write(f"{split}: {len(images)} objects of {len(set(names))} meshes")
         bar.close()
         if not used:
             raise ValueError(
@@ -189,14 +188,14 @@ def _render_split(
     used: list[dict],
     skipped: list[dict],
     bar,
-) -> tuple[np.ndarray, np.ndarray, list[str]]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Render the meshes `numbers` of one split, `copies` objects each; appends to `used` and `skipped`."""
     total = len(numbers) * copies
     images = np.empty((total, kato.NUM_VIEWS, 4, kato.IMAGE_SIZE, kato.IMAGE_SIZE), dtype=np.uint8)
     voxels = np.empty((total, *(kato.VOXEL_SIZE,) * 3), dtype=bool)
-    names: list[str] = []
+    done = 0
     for number in numbers.tolist():
-        source, done, rendered = sources[number], len(names), 0
+        source, rendered = sources[number], 0
         try:
             mesh = meshes.checked(source.read(), config.max_faces)
             vertices = mesh.vertices @ kato.mesh_to_object(config.up, _front(config)).T
@@ -217,10 +216,10 @@ def _render_split(
             skipped.append({"name": source.name, "split": split, "reason": kind + reason})
             bar.update(copies - rendered)
             continue
-        names += [source.name] * copies
+        done += copies
         size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
         used.append({"name": source.name, "split": split, **size, "watertight": watertight})
-    return images[: len(names)], voxels[: len(names)], names
+    return images[:done], voxels[:done]
 
 
 def _front(config: DatasetConfig) -> str:

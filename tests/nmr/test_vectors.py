@@ -3,20 +3,22 @@
 import numpy as np
 import pytest
 import torch
-
-import nmr
 from vectors import load_vector, vector_names
 
-SILHOUETTES = vector_names("sil_*") + vector_names("quirk_sil_*")
+import nmr
+from nmr import reference
+
+SILHOUETTES = vector_names("sil_*")
+QUIRKS = vector_names("quirk_sil_*")
+SMALL = [
+    name
+    for name in SILHOUETTES
+    if load_vector(name)["vertices"].shape[1] <= 24 and int(load_vector(name)["image_size"]) <= 33
+]
 
 
-@pytest.mark.parametrize("name", SILHOUETTES)
-def test_silhouette(name):
-    v = load_vector(name)
-    vertices = torch.from_numpy(v["vertices"]).requires_grad_()
-    alpha = nmr.render_silhouette(
-        vertices,
-        torch.from_numpy(v["faces"]),
+def settings_of(v):
+    return dict(
         image_size=int(v["image_size"]),
         anti_aliasing=bool(v["anti_aliasing"]),
         fill_back=bool(v["fill_back"]),
@@ -24,12 +26,74 @@ def test_silhouette(name):
         far=float(v["far"]),
         eps=float(v["eps"]),
     )
+
+
+def test_the_vectors_are_there():
+    assert len(SILHOUETTES) >= 23 and len(QUIRKS) == 2 and len(SMALL) >= 10
+
+
+@pytest.mark.parametrize("name", SILHOUETTES)
+def test_silhouette_and_gradient_bit_for_bit(name):
+    v = load_vector(name)
+    vertices = torch.from_numpy(v["vertices"]).requires_grad_()
+    alpha = nmr.render_silhouette(vertices, torch.from_numpy(v["faces"]), **settings_of(v))
     alpha.backward(torch.from_numpy(v["grad_alpha"]))
-    gradient = vertices.grad.numpy()
-    if name.startswith("quirk_"):
-        # Collinear up to rounding: the published kernels paint stray pixels, ours paints none.
-        assert alpha.count_nonzero() == 0
-        assert np.all(gradient == 0)
-        return
     assert np.array_equal(alpha.detach().numpy(), v["alpha"])
-    np.testing.assert_array_equal(gradient, v["grad_vertices"])
+    assert np.array_equal(vertices.grad.numpy(), v["grad_vertices"])
+
+
+@pytest.mark.parametrize("name", [n for n in SILHOUETTES if "face_index_map" in load_vector(n)])
+def test_index_map(name):
+    v = load_vector(name)
+    num_faces, raster_size = len(v["faces"]), v["face_index_map"].shape[1]
+    _, index = nmr.ops.silhouette(
+        torch.from_numpy(v["vertices"]),
+        torch.from_numpy(v["faces"]).long(),
+        raster_size,
+        False,
+        bool(v["fill_back"]),
+        float(v["near"]),
+        float(v["far"]),
+        float(v["eps"]),
+    )
+    assert np.array_equal(index.numpy(), v["face_index_map"])
+    public = nmr.render_face_index(
+        torch.from_numpy(v["vertices"]),
+        torch.from_numpy(v["faces"]),
+        image_size=raster_size,
+        fill_back=bool(v["fill_back"]),
+        near=float(v["near"]),
+        far=float(v["far"]),
+    )
+    expected = v["face_index_map"][:, ::-1]
+    assert np.array_equal(public.numpy(), np.where(expected >= num_faces, expected - num_faces, expected))
+
+
+@pytest.mark.parametrize("name", QUIRKS)
+def test_no_stray_pixels_of_collinear_faces(name):
+    """The published kernels paint pixels all along the line through the face; a clean renderer paints none."""
+    v = load_vector(name)
+    vertices = torch.from_numpy(v["vertices"]).requires_grad_()
+    alpha = nmr.render_silhouette(vertices, torch.from_numpy(v["faces"]), **settings_of(v))
+    alpha.backward(torch.from_numpy(v["grad_alpha"]))
+    assert v["alpha"].any() and not alpha.any() and not vertices.grad.any()
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_reference_agrees_with_vectors(name):
+    """The slow pure-torch definition, so that other tests may lean on it."""
+    v = load_vector(name)
+    settings = settings_of(v)
+    faces, aa = torch.from_numpy(v["faces"]).long(), settings["anti_aliasing"]
+    for b in range(len(v["vertices"])):
+        vertices = torch.from_numpy(v["vertices"][b])
+        raster_size = settings["image_size"] * (2 if aa else 1)
+        index = reference.face_index(
+            vertices, faces, raster_size, settings["fill_back"], settings["near"], settings["far"]
+        )
+        assert np.array_equal(reference.silhouette(index, aa).numpy(), v["alpha"][b])
+        grad = reference.silhouette_gradient(
+            vertices, faces, index, torch.from_numpy(v["grad_alpha"][b]), aa, settings["fill_back"], settings["eps"]
+        )
+        scale = np.abs(v["grad_vertices"][b]).max()
+        np.testing.assert_allclose(grad.numpy(), v["grad_vertices"][b], rtol=1e-4, atol=1e-5 * scale)

@@ -6,7 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from learn3d.data.shapes.parts import Solid, bar, both_sides, ellipse, ellipsoid, rectangle, revolve, tube, wing
+from learn3d.data.shapes.parts import (
+    Solid,
+    bar,
+    both_sides,
+    both_sides_of,
+    ellipse,
+    ellipsoid,
+    rectangle,
+    revolve,
+    tube,
+    wing,
+)
 from learn3d.data.shapes.sampling import maybe
 
 
@@ -152,7 +163,10 @@ def engine_pod(rng: np.random.Generator, plan: Planform, share: float, radius: f
     drop = rng.uniform(1.1, 1.5) * radius
     forward = z + rng.uniform(0.0, 0.3) * length
     pylon = wing(
-        [(y - drop + 0.6 * radius, x, forward + 0.25 * length, 0.9 * length, 0.08), (y, x, z - 0.05 * chord, 0.5 * chord, 0.1)],
+        [
+            (y - drop + 0.6 * radius, x, forward + 0.25 * length, 0.9 * length, 0.08),
+            (y, x, z - 0.05 * chord, 0.5 * chord, 0.1),
+        ],
         upright=True,
     )
     return [pylon, *[part.moved(x, y - drop, forward) for part in nacelle(radius, length)]]
@@ -207,3 +221,24 @@ def wheel(radius: float) -> Solid:
     """A wheel about the x axis."""
     t = 0.35 * radius
     return revolve([(0.7 * radius, -t), (radius, -0.6 * t), (radius, 0.6 * t), (0.7 * radius, t)], 12).rotated("z", 90)
+
+
+def tail_engines(rng: np.random.Generator, radius: float, size: float, z: float) -> list[Solid]:
+    """A pair of jet engines on short stubs at the rear fuselage."""
+    x, y = 0.8 * radius + 1.1 * size, rng.uniform(0.1, 0.6) * radius
+    stub = wing([(0.0, y, z + 0.02, 0.09, 0.12), (x, y, z + 0.01, 0.08, 0.12)])
+    return both_sides_of([*[p.moved(x, y, z) for p in nacelle(size, rng.uniform(4.0, 5.5) * size)], stub])
+
+
+def streamlined(radius: float, length: float) -> Solid:
+    """A drop-shaped body along z, its blunt end forward, centred."""
+    t = np.array([0.0, 0.05, 0.15, 0.35, 0.6, 0.85, 1.0])
+    r = np.array([0.1, 0.3, 0.6, 0.95, 1.0, 0.85, 0.55]) * radius
+    return revolve(np.stack([r, (t - 0.5) * length], 1), 12).rotated("x", 90)
+
+
+def jet_nozzle(radius: float, length: float) -> Solid:
+    """An open jet nozzle along z, centred."""
+    profile = [(0.8, -1), (1, 1), (0.9, 1.02), (0.02, 0.9), (0.02, 0.7), (0.8, 0.6), (0.7, -1)]
+    outer = [(r * radius, -y * 0.5 * length) for r, y in profile]
+    return revolve(outer, 12, hollow=True).rotated("x", -90)

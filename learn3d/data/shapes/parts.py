@@ -17,7 +17,7 @@ Point = Sequence[float] | np.ndarray
 
 # Bars thinner than THIN (of the longest side of the whole shape) get a ring at least every STEP: a voxeliser that casts
 # rays on a 32^3 grid can miss a bar between two grid lines, but it also marks the cell of every vertex.
-THIN, STEP = 0.08, 0.025
+THIN, STEP = 0.08, 0.031
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,11 @@ class Solid:
 def both_sides(solid: Solid) -> list[Solid]:
     """The solid and its mirror image in x = 0."""
     return [solid, solid.mirrored()]
+
+
+def both_sides_of(parts: list[Solid]) -> list[Solid]:
+    """The parts and their mirror images."""
+    return [solid for part in parts for solid in both_sides(part)]
 
 
 # --- outlines: closed curves [N, 2], counter-clockwise, star-shaped about their mean --------------------------------
@@ -199,7 +204,7 @@ def tube(
 
 def bar(start: Point, end: Point, width: float, height: float | None = None, side: Point = (0.0, 0.0, 1.0)) -> Solid:
     """A straight bar: round with diameter `width`, or rectangular, width (along `side`) by height."""
-    section = ellipse(width, width, 8) if height is None else rectangle(width, height, segments=1)
+    section = ellipse(width, width, 6) if height is None else rectangle(width, height, segments=1)
     return tube([start, end], 1.0, section, side=side)
 
 

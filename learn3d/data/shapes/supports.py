@@ -50,15 +50,32 @@ def leg_profile(rng: np.random.Generator) -> tuple[Profile, bool]:
         return [(0, 1), (0.1, 1), (0.13, waist), (0.68, waist), (0.72, 1), (1, 1)], False
     if kind == "turned":
         a, b = rng.uniform(0.2, 0.35), rng.uniform(0.55, 0.75)
-        return [(0, 0.5), (a - 0.08, 0.7), (a, 1.05), (a + 0.08, 0.65), (b, 1.2), (b + 0.08, 0.7), (0.92, 1.1), (1, 1)], True
+        return [
+            (0, 0.5),
+            (a - 0.08, 0.7),
+            (a, 1.05),
+            (a + 0.08, 0.65),
+            (b, 1.2),
+            (b + 0.08, 0.7),
+            (0.92, 1.1),
+            (1, 1),
+        ], True
     swell = rng.uniform(0.25, 0.5)
     return [(0, 0.55), (0.06, 0.75), (0.1, 0.5), (swell, 1.25), (0.75, 0.7), (0.82, 1.1), (0.88, 0.8), (1, 1)], True
 
 
 def four_legs(
-    rng: np.random.Generator, half_x: float, half_z: float, height: float, size: float | None = None
+    rng: np.random.Generator,
+    half_x: float,
+    half_z: float,
+    height: float,
+    size: float | None = None,
+    plain: bool = False,
 ) -> list[Solid]:
-    """Four legs, straight or splayed, perhaps with stretchers and an apron; sometimes bent-wire (hairpin) legs."""
+    """Four legs, straight or splayed, perhaps with stretchers and an apron; sometimes bent-wire (hairpin) legs.
+
+    `plain` ones are tapered and without an apron.
+    """
     size = rng.uniform(0.028, 0.055) if size is None else size
     splay = rng.uniform(0.02, 0.16) * height if maybe(rng, 0.55) else 0.0
     if maybe(rng, 0.1):
@@ -68,7 +85,7 @@ def four_legs(
             for dx, dz in ((-0.1, 0.0), (0.0, -0.1 * np.sign(z))):
                 solids += both_sides(bar(foot, (x + dx, height + 0.01, z + dz), 0.013))
         return solids + [between((-half_x - 0.01, height - 0.012, -half_z), (half_x + 0.01, height + 0.005, half_z))]
-    profile, turned = leg_profile(rng)
+    profile, turned = ([(0, 0.6), (1, 1)], True) if plain else leg_profile(rng)
     outline = ellipse(size, size, 10) if turned or maybe(rng, 0.3) else rectangle(size, size, segments=1)
     rear = splay * pick(rng, (0.3, 1.0, 1.6))
     corners = {(half_x, half_z): (half_x + splay, half_z + splay), (half_x, -half_z): (half_x + splay, -half_z - rear)}
@@ -94,7 +111,7 @@ def four_legs(
         solids += [bar(at(front, t2), at(front, t2) * flip, thick), bar(at(back, t2), at(back, t2) * flip, thick)]
     if stretchers == "X":
         solids += both_sides(bar(at(front, t), at(back, t) * flip, thick, thick, side=(0, 1, 0)))
-    if maybe(rng, 0.45) and splay < 0.1 * height:
+    if maybe(rng, 0.45) and splay < 0.1 * height and not plain:
         solids += apron(half_x, half_z, height, rng.uniform(0.04, 0.09), 0.5 * size)
     return solids
 
@@ -115,14 +132,18 @@ def feet(rng: np.random.Generator, half_x: float, half_z: float, height: float) 
     kind = pick(rng, ("block", "cone", "bun"))
     if kind == "bun":
         return [
-            s for z in (half_z, -half_z) for s in both_sides(ellipsoid((1.4 * size, height, 1.4 * size), (half_x, height / 2, z)))
+            s
+            for z in (half_z, -half_z)
+            for s in both_sides(ellipsoid((1.4 * size, height, 1.4 * size), (half_x, height / 2, z)))
         ]
     outline = rectangle(size, size, segments=1) if kind == "block" else ellipse(size, size, 10)
     lean = 0.03 if maybe(rng, 0.4) else 0.0
     return [
         s
         for z in (half_z, -half_z)
-        for s in both_sides(post((half_x + lean, 0, z + np.sign(z) * lean), (half_x, height, z), outline, [(0, 0.6), (1, 1)]))
+        for s in both_sides(
+            post((half_x + lean, 0, z + np.sign(z) * lean), (half_x, height, z), outline, [(0, 0.6), (1, 1)])
+        )
     ]
 
 
@@ -145,7 +166,9 @@ def star_pedestal(rng: np.random.Generator, half_x: float, half_z: float, height
         angle = turn + 2 * np.pi * k / count
         way = np.array([np.cos(angle), 0.0, np.sin(angle)])
         tip = way * reach + [0, low + 0.012, 0]
-        path = rounded_path([way * 0.3 * thick + [0, hub, 0], way * 0.4 * reach + [0, 0.7 * hub + 0.3 * low, 0], tip], 0.1, 3)
+        path = rounded_path(
+            [way * 0.3 * thick + [0, hub, 0], way * 0.4 * reach + [0, 0.7 * hub + 0.3 * low, 0], tip], 0.1, 3
+        )
         section = rectangle(width, 0.8 * width, segments=1)
         solids.append(tube(path, np.linspace(1.0, 0.6, len(path)), section, side=np.cross(way, (0, 1, 0))))
         if castors:
@@ -263,7 +286,9 @@ def rocker(rng: np.random.Generator, half_x: float, half_z: float, height: float
     for s in (-1, 1):
         foot = s * half_z * 1.08
         start = (half_x + 0.02, float(np.interp(foot, z[::-1], y[::-1])), foot)
-        solids += both_sides(post(start, (half_x, height + 0.01, s * half_z), ellipse(size, size, 8), [(0, 0.8), (1, 1)]))
+        solids += both_sides(
+            post(start, (half_x, height + 0.01, s * half_z), ellipse(size, size, 8), [(0, 0.8), (1, 1)])
+        )
         middle = 0.4 * height
         zz = foot + 0.4 * (s * half_z - foot)
         solids.append(bar((-half_x - 0.01, middle, zz), (half_x + 0.01, middle, zz), 0.6 * size))

@@ -1,0 +1,149 @@
+"""The renderer's definition in plain torch: slow and clear, for tests and for reading. One image, no shortcuts.
+
+Every face is tested against every pixel, every sweep visits every pixel of its line, and ``fill_back`` really appends the reversed
+faces, as the published kernels do. Works in the dtype of its input.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def with_back_faces(faces: Tensor, fill_back: bool) -> Tensor:
+    """``[F, 3]``, followed by all faces in reversed vertex order if ``fill_back``."""
+    return torch.cat([faces, faces.flip(1)]) if fill_back else faces
+
+
+def _cross(p: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """The two products whose order tells on which side of the line a -> b the points p lie."""
+    return (p[..., 1] - a[1]) * (b[0] - a[0]), (p[..., 0] - a[0]) * (b[1] - a[1])
+
+
+def face_index(
+    vertices: Tensor, faces: Tensor, raster_size: int, fill_back: bool = True, near: float = 0.1, far: float = 100.0
+) -> Tensor:
+    """Index map ``[R, R]`` of one mesh ``[V, 3]``, ``[F, 3]``: row 0 = bottom, -1 = background, F + f = back copy of f."""
+    R = raster_size
+    column = torch.arange(R)
+    centre = (2 * column + 1 - R).to(vertices) / R
+    points = torch.stack(torch.meshgrid(centre, centre, indexing="xy"), dim=-1)
+    x_pixel, y_pixel = torch.meshgrid(column.to(vertices), column.to(vertices), indexing="xy")
+    depth = torch.full((R, R), far, dtype=vertices.dtype)
+    index = torch.full((R, R), -1)
+    for f, corners in enumerate(vertices[with_back_faces(faces, fill_back)]):
+        (x, y, z), flat = corners.unbind(1), corners[:, :2].double()
+        if not corners[:, :2].isfinite().all() or z.isnan().any() or torch.linalg.det(flat[1:] - flat[0]) == 0:
+            continue
+        left, right = _cross(corners[2], corners[0], corners[1])
+        if left < right:
+            continue  # clockwise
+        inside = (points >= corners[:, :2].amin(0)).all(-1) & (points <= corners[:, :2].amax(0)).all(-1)
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            left, right = _cross(points, corners[a], corners[b])
+            inside &= ~(left < right)
+        X, Y = (x * R + R - 1) / 2, (y * R + R - 1) / 2
+        det = X[2] * (Y[0] - Y[1]) + X[0] * (Y[1] - Y[2]) + X[1] * (Y[2] - Y[0])
+        weights = []
+        for k in range(3):
+            a, b = (k + 1) % 3, (k + 2) % 3
+            w = (Y[a] - Y[b]) / det * x_pixel + (X[b] - X[a]) / det * y_pixel + (X[a] * Y[b] - X[b] * Y[a]) / det
+            weights.append(w.nan_to_num(0.0).clamp(0, 1))
+        total = weights[0] + weights[1] + weights[2]
+        w0, w1, w2 = (w / total for w in weights)
+        zp = 1 / (w0 / z[0] + w1 / z[1] + w2 / z[2])
+        nearest = inside & (zp > near) & (zp < depth)
+        depth[nearest] = zp[nearest]
+        index[nearest] = f
+    return index
+
+
+def silhouette(index: Tensor, anti_aliasing: bool, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Alpha ``[S, S]``, row 0 = top, of an index map ``[R, R]``."""
+    alpha = (index >= 0).to(dtype).flip(0)
+    return alpha.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2)) if anti_aliasing else alpha
+
+
+def silhouette_gradient(
+    vertices: Tensor,
+    faces: Tensor,
+    index: Tensor,
+    grad_alpha: Tensor,
+    anti_aliasing: bool,
+    fill_back: bool = True,
+    eps: float = 1e-4,
+) -> Tensor:
+    """NMR's gradient ``[V, 3]`` of one image, given its index map ``[R, R]`` and the gradient ``[S, S]`` of its alpha."""
+    R = index.shape[0]
+    grad = grad_alpha
+    if anti_aliasing:
+        grad = (grad_alpha / 4).repeat_interleave(2, 0).repeat_interleave(2, 1)
+    grad = grad.flip(0)
+    result = torch.zeros_like(vertices)
+    for f, face in enumerate(with_back_faces(faces, fill_back)):
+        if not (index == f).any():
+            continue
+        pixel = (vertices[face, :2] * R + R - 1) / 2
+        for p in range(3):
+            q, o = (p + 1) % 3, (p + 2) % 3
+            for axis in (0, 1):  # 0: lines of constant x, swept along y, which moves y; 1: the other way round
+                lines = index.T if axis == 0 else index
+                line_grad = grad.T if axis == 0 else grad
+                corners = pixel if axis == 0 else pixel.flip(1)
+                pull_p, pull_q = _sweep_edge(corners[p], corners[q], corners[o], axis, f, lines, line_grad, eps)
+                result[face[p], 1 - axis] += pull_p
+                result[face[q], 1 - axis] += pull_q
+    return result
+
+
+def _sweep_edge(
+    p: Tensor, q: Tensor, o: Tensor, axis: int, f: int, lines: Tensor, line_grad: Tensor, eps: float
+) -> tuple[float, float]:
+    """Gradients of the sweep coordinates of p and q; points are (scan, sweep), ``lines[n]`` is the line at scan n."""
+    R = lines.shape[0]
+    pull_p = pull_q = 0.0
+    direction = (-1 if p[0] < q[0] else 1) * (1 if axis == 0 else -1)
+    low, high = sorted((float(p[0]), float(q[0])))
+    first = math.ceil(max(low, 0))
+    last = math.trunc(min(high, R - 1))  # towards zero, as published: not floor
+    for n in range(first, last + 1):
+        if p[0] == q[0]:
+            continue
+        crossing = (q[1] - p[1]) / (q[0] - p[0]) * (n - p[0]) + p[1]
+        if not crossing.isfinite():
+            continue
+        inner = math.floor(crossing) if direction > 0 else math.ceil(crossing)
+        outer = inner + direction
+        if min(inner, outer) < 0 or max(inner, outer) > R - 1:
+            continue
+        m = torch.arange(R)
+        covered = (lines[n] >= 0).to(line_grad)
+        # Outside: what changes if a pixel takes the value of the inner one.
+        beyond = m >= outer if direction > 0 else m <= outer
+        outside = (covered - covered[inner]) * line_grad[n]
+        outside = torch.where(beyond & (lines[n, inner] == f), outside, torch.zeros_like(outside))
+        # Inside: what changes if an own pixel takes the value of the outer one.
+        limit = _height(p, o, n) if (n - p[0]) * (n - o[0]) < 0 else _height(q, o, n)
+        limit = 0 if math.isnan(limit) else max(min(limit, R), -1)
+        limit = math.ceil(limit) if direction > 0 else math.floor(limit)
+        between = (m >= min(inner, limit)) & (m <= max(inner, limit))
+        inside = (covered - covered[outer]) * line_grad[n]
+        inside = torch.where(between & (lines[n] == f), inside, torch.zeros_like(inside))
+        gain = outside.clamp_min(0) + inside.clamp_min(0)
+        for end, other in ((p, q), (q, p)):
+            if other[0] == n:
+                continue
+            travel = (q[0] - p[0]) / ((q[0] - n) if end is p else (n - p[0])) * (m - crossing) * 2 / R
+            travel = torch.where(travel > 0, travel + eps, travel - eps)
+            pull = float((gain / travel).sum())
+            if end is p:
+                pull_p -= pull
+            else:
+                pull_q -= pull
+    return pull_p, pull_q
+
+
+def _height(a: Tensor, b: Tensor, n: int) -> float:
+    return float((b[1] - a[1]) / (b[0] - a[0]) * (n - a[0]) + a[1])

@@ -1,0 +1,93 @@
+"""A tiny data set in Kato's layout, and one short run of the real networks on it, shared by the tests."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from learn3d.config import TrainConfig
+from learn3d.data.kato import KatoDataset
+from learn3d.training import train
+
+VECTORS = Path(__file__).parents[1] / "data" / "vectors"
+
+
+@pytest.fixture(scope="session")
+def vectors() -> Callable[[str], dict[str, np.ndarray]]:
+    """Reads a file of reference vectors by name."""
+
+    def read(name: str) -> dict[str, np.ndarray]:
+        with np.load(VECTORS / f"{name}.npz", allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+
+    return read
+
+
+def tiny_arrays(objects: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Images and voxels of boxes of random size, the same in every view; colours are noise inside the mask."""
+    rng = np.random.default_rng(seed)
+    images = np.zeros((objects, 24, 4, 64, 64), np.uint8)
+    voxels = np.zeros((objects, 32, 32, 32), bool)
+    for i, (h, w) in enumerate(rng.integers(8, 24, (objects, 2))):
+        images[i, :, :3, 32 - h : 32 + h, 32 - w : 32 + w] = rng.integers(0, 256, (24, 3, 2 * h, 2 * w), np.uint8)
+        images[i, :, 3, 32 - h : 32 + h, 32 - w : 32 + w] = 255
+        voxels[i, 16 - h // 2 : 16 + h // 2, 8:24, 16 - w // 2 : 16 + w // 2] = True
+    return images, voxels
+
+
+@pytest.fixture(scope="session")
+def tiny_set() -> KatoDataset:
+    return KatoDataset(*tiny_arrays(3, seed=0), category="airplane", split="test")
+
+
+@pytest.fixture(scope="session")
+def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with 3 objects to train on and 1 to validate on."""
+    folder = tmp_path_factory.mktemp("data")
+    for seed, (split, objects) in enumerate({"train": 3, "val": 1, "test": 1}.items()):
+        images, voxels = tiny_arrays(objects, seed)
+        np.savez_compressed(folder / f"02691156_{split}_images.npz", images)
+        np.savez_compressed(folder / f"02691156_{split}_voxels.npz", voxels)
+    return folder
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path) -> Iterator[Path]:
+    """A folder for a run, removed afterwards: checkpoints are large."""
+    yield tmp_path / "run"
+    shutil.rmtree(tmp_path / "run", ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def tiny_config(tiny_folder: Path) -> Callable[..., TrainConfig]:
+    """Makes a configuration for a few steps of batch 4 on the tiny data."""
+
+    def make(output: Path, **options: object) -> TrainConfig:
+        defaults = {"iterations": 4, "batch_size": 4, "precision": "fp32", "log_every": 1, "max_val_images": 4}
+        return TrainConfig(**({"data": tiny_folder, "category": "airplane", "output": output} | defaults | options))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable[..., TrainConfig]) -> Iterator[Path]:
+    """The folder of a run of four steps that nothing interrupted. Do not change it."""
+    folder = tmp_path_factory.mktemp("runs") / "finished"
+    summary = train(tiny_config(folder))
+    assert summary.finished
+    assert summary.step == 4
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.fixture(autouse=True)
+def keep_threads() -> Iterator[None]:
+    """Put back the number of threads that a test may have set."""
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)

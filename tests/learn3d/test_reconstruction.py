@@ -1,0 +1,126 @@
+"""Images into the data set's form, and meshes into files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+import nmr
+from learn3d.data.kato import mesh_to_object
+from learn3d.reconstruction import (
+    export_mesh,
+    prepare_image,
+    read_image,
+    reconstruct_dataset,
+    reconstruct_files,
+)
+
+
+def test_stored_form_is_inverted_on_black() -> None:
+    colors = np.full((64, 64, 3), (255, 0, 10), np.uint8)
+    mask = np.zeros((64, 64), np.uint8)
+    mask[10:20, 30:40] = 255
+    mask[20, 30:40] = 51  # a fifth
+    stored = prepare_image(colors, mask, crop=False)
+    assert stored.shape == (4, 64, 64)
+    assert stored.dtype == np.uint8
+    assert np.array_equal(stored[3], mask)
+    assert stored[:, 15, 35].tolist() == [0, 255, 245, 255]
+    assert stored[:, 20, 35].tolist() == [0, 51, 49, 51]
+    assert not stored[:, 0, 0].any()
+
+
+def test_data_set_image_survives_the_way_out_and_back(tiny_set) -> None:
+    stored = tiny_set.images[0, 3]
+    again = prepare_image(255 - stored[:3].transpose(1, 2, 0), stored[3], crop=False)
+    assert np.array_equal(again, stored)
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (40, 100), (199, 260)])
+def test_crop_centres_and_scales_the_object(corner: tuple[int, int]) -> None:
+    mask = np.zeros((300, 400), np.uint8)
+    y, x = corner
+    mask[y : y + 60, x : x + 120] = 255
+    stored = prepare_image(np.zeros((300, 400, 3), np.uint8), mask, object_share=0.75)
+    rows, columns = np.flatnonzero(stored[3].max(1) > 127), np.flatnonzero(stored[3].max(0) > 127)
+    assert (columns[0], columns[-1]) == (8, 55)
+    assert (rows[0], rows[-1]) == (20, 43)
+    assert np.array_equal(stored[0], stored[3])
+
+
+def test_small_images_are_enlarged() -> None:
+    mask = np.zeros((20, 20), np.uint8)
+    mask[5:15, 5:15] = 255
+    stored = prepare_image(np.zeros((20, 20, 3), np.uint8), mask, object_share=0.5)
+    assert 0.22 < (stored[3] > 127).mean() < 0.28
+
+
+def test_prepare_image_refuses_what_it_cannot_frame() -> None:
+    with pytest.raises(ValueError, match=r"colors must be \[H, W, 3\]"):
+        prepare_image(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5), np.uint8))
+    with pytest.raises(ValueError, match="no pixel above half strength"):
+        prepare_image(np.zeros((4, 4, 3), np.uint8), np.full((4, 4), 9, np.uint8))
+
+
+def test_read_image_with_transparency_or_mask(tmp_path) -> None:
+    rgba = np.zeros((6, 8, 4), np.uint8)
+    rgba[2:4, 3:5] = (200, 100, 50, 255)
+    Image.fromarray(rgba).save(tmp_path / "a.png")
+    Image.fromarray(rgba[..., :3]).save(tmp_path / "b.png")
+    Image.fromarray(rgba[..., 3]).save(tmp_path / "mask.png")
+    for colors, mask in (read_image(tmp_path / "a.png"), read_image(tmp_path / "b.png", tmp_path / "mask.png")):
+        assert np.array_equal(colors, rgba[..., :3])
+        assert np.array_equal(mask, rgba[..., 3])
+    Image.fromarray(np.zeros((3, 3), np.uint8)).save(tmp_path / "black.png")
+    Image.fromarray(np.zeros((6, 8), np.uint8)).save(tmp_path / "empty.png")
+    (tmp_path / "text.png").write_text("no image")
+    for arguments, message in (
+        (("b.png",), "has no transparency"),
+        (("b.png", "black.png"), "mask .* is 3x3, image .* is 8x6"),
+        (("b.png", "empty.png"), "mask of .* is empty"),
+        (("c.png",), "there is no image"),
+        (("text.png",), "cannot be read as an image"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_image(*(tmp_path / name for name in arguments))
+
+
+@pytest.mark.parametrize("kind", ["obj", "glb", "ply"])
+def test_mesh_files_are_right_handed_with_normals_outwards(tmp_path, kind: str) -> None:
+    sphere, faces = nmr.icosphere(2)
+    vertices = sphere * torch.tensor([0.5, 0.3, 0.2]) + torch.tensor([0.1, 0.2, 0.3])
+    export_mesh(tmp_path / f"a.{kind}", vertices, faces)
+    mesh = trimesh.load(tmp_path / f"a.{kind}", force="mesh")
+    assert (len(mesh.vertices), len(mesh.faces)) == (162, 320)
+    assert mesh.is_watertight
+    assert mesh.volume > 0.9 * 4 / 3 * np.pi * 0.5 * 0.3 * 0.2
+    # read with the data sets' rule the mesh is where the network put it
+    assert np.allclose((mesh_to_object() @ mesh.bounds.T).T.mean(0), [0.1, 0.2, 0.3], atol=1e-5)
+    assert np.allclose(mesh.extents, [0.4, 0.6, 1.0], atol=1e-5)
+
+
+def test_unknown_mesh_format(tmp_path) -> None:
+    with pytest.raises(ValueError, match=r"\.obj, \.glb or \.ply, not 'a.fbx'"):
+        export_mesh(tmp_path / "a.fbx", *nmr.icosphere(0))
+
+
+def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_path) -> None:
+    options = {"frames": 2, "image_size": 32}
+    paths = reconstruct_dataset(finished_run, tmp_path / "a", tiny_folder, [5], **options)
+    assert [p.name for p in paths] == [f"airplane_test_object0000_view05.{s}" for s in ("obj", "gif", "png")]
+    with np.load(tiny_folder / "02691156_test_images.npz") as archive:
+        stored = archive["arr_0"][0, 5]
+    rgba = np.concatenate([255 - stored[:3], stored[3:]]).transpose(1, 2, 0)
+    (tmp_path / "in").mkdir()
+    Image.fromarray(rgba).save(tmp_path / "photo.png")
+    Image.fromarray(rgba).save(tmp_path / "in" / "photo.png")
+    files = reconstruct_files(finished_run, tmp_path / "b", [tmp_path / "photo.png"], crop=False, **options)
+    assert files[0].read_text() == paths[0].read_text()
+    twins = [tmp_path / "photo.png", tmp_path / "in" / "photo.png"]
+    files = reconstruct_files(finished_run, tmp_path / "c", twins, mesh_format="ply", **options)
+    assert [p.name for p in files[::3]] == ["000_photo.ply", "001_photo.ply"]
+    with pytest.raises(ValueError, match="2 images but 1 masks"):
+        reconstruct_files(finished_run, tmp_path / "d", twins, [tmp_path / "photo.png"])

@@ -1,0 +1,123 @@
+"""The command lines of training, evaluation and reconstruction, from parsing to files."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from learn3d.config import load_config
+
+TOOLS = Path(__file__).parents[2] / "tools"
+
+
+def tool(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"tool_{name}", TOOLS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def call(module: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["tool", *map(str, arguments)])
+    return module.main()
+
+
+def test_options_reach_the_configuration(tmp_path) -> None:
+    arguments = (
+        f"--data d --category chair --output {tmp_path} --method vanilla --preset paper --batch-size 7 --overwrite"
+    )
+    command = tool("train").parse(arguments.split())
+    config = command.config
+    assert (config.category, config.method, config.preset, config.batch_size) == ("chair", "vanilla", "paper", 7)
+    assert (command.overwrite, command.resume) == (True, False)
+    assert config.iterations == 20_000
+
+
+@pytest.mark.parametrize("form", ["--output {}", "--output={}"])
+def test_resume_starts_from_the_saved_options(finished_run, form: str) -> None:
+    arguments = [*form.format(finished_run).split(), "--resume", "--iterations", "9"]
+    command = tool("train").parse(arguments)
+    assert command.resume
+    assert command.config.iterations == 9
+    saved = load_config(finished_run / "config.json")
+    assert (command.config.data, command.config.batch_size) == (saved.data, saved.batch_size)
+
+
+@pytest.mark.parametrize("name", ["train", "evaluate", "reconstruct"])
+def test_help_explains_every_option(name: str, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit) as stop:
+        tool(name).main()
+    assert stop.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"python tools/{name}.py" in text
+    assert {"train": "Images per step", "evaluate": "Run folders", "reconstruct": "turntable GIF"}[name] in text
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("train", ["--data", "{}", "--category", "airplane", "--output", "{}/run"], "02691156_train_images.npz"),
+        ("train", ["--output", "{}", "--resume"], "folder of a training run"),
+        ("train", ["--data", "x", "--category", "chair", "--output", "{}", "--resume", "--overwrite"], "folder of a"),
+        ("evaluate", ["{}"], "there is no checkpoint"),
+        ("reconstruct", ["--run", "{}", "--output", "{}/out"], "give either image files or --dataset"),
+    ],
+)
+def test_mistakes_are_one_clear_line(
+    name: str, arguments: list[str], message: str, tmp_path, monkeypatch, capsys
+) -> None:
+    assert call(tool(name), monkeypatch, *(a.format(tmp_path) for a in arguments)) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert message in error
+
+
+def test_resume_and_overwrite_exclude_each_other(finished_run, monkeypatch, capsys) -> None:
+    assert call(tool("train"), monkeypatch, "--output", finished_run, "--resume", "--overwrite") == 1
+    assert "give one of them" in capsys.readouterr().err
+
+
+def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, monkeypatch, capsys) -> None:
+    assert call(tool("evaluate"), monkeypatch, finished_run, "--split", "val", "--json", tmp_path / "t.json") == 0
+    report = json.loads((tmp_path / "t.json").read_text())
+    assert report["protocol"]["split"] == "val"
+    assert f"{report['results'][0]['voxel_iou']:.4f}" in capsys.readouterr().out
+
+
+def test_reconstruct_lists_its_files(finished_run, tiny_folder, tmp_path, monkeypatch, capsys) -> None:
+    options = ["--dataset", tiny_folder, "--indices", 0, 7, "--format", "glb", "--frames", 2, "--image-size", 32]
+    assert call(tool("reconstruct"), monkeypatch, "--run", finished_run, "--output", tmp_path, *options) == 0
+    listed = capsys.readouterr().out.split()
+    assert len(listed) == 6
+    assert all(Path(path).stat().st_size > 100 for path in listed)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT to another process")
+def test_interrupting_the_command_saves_and_ends_well(tiny_folder, run_folder) -> None:
+    command = [sys.executable, str(TOOLS / "train.py"), "--data", str(tiny_folder), "--category", "airplane"]
+    command += ["--output", str(run_folder), "--batch-size", "2", "--method", "vanilla", "--log-every", "1"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        metrics = run_folder / "metrics.jsonl"
+        while not (metrics.exists() and metrics.stat().st_size) and time.monotonic() < deadline:
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert "stopped by SIGINT" in err
+    assert "--resume" in err
+    assert out.startswith("stopped at step ")
+    assert (run_folder / "last.safetensors").exists()

@@ -1,0 +1,321 @@
+"""The training step's alternation, the presets, sampling, resumption, and how a run ends."""
+
+from __future__ import annotations
+
+import json
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+from learn3d import checkpoint, training
+from learn3d.config import (
+    PRESETS,
+    TrainConfig,
+    check_resume,
+    config_from_dict,
+    config_to_dict,
+    load_config,
+)
+from learn3d.data.kato import KatoDataset
+from learn3d.methods import pose_invariant
+from learn3d.methods.pose_invariant import create_optimizers, train_step, uses_discriminator
+from learn3d.networks import create_networks
+from learn3d.runlog import read_metrics
+from learn3d.training import batch_indices, object_share, train
+
+
+def snapshot(network: torch.nn.Module) -> list[torch.Tensor]:
+    return [p.detach().clone() for p in network.parameters()]
+
+
+def changed(network: torch.nn.Module, before: list[torch.Tensor]) -> bool:
+    return any(not torch.equal(p, q) for p, q in zip(network.parameters(), before, strict=True))
+
+
+def make_step(config: TrainConfig, data: KatoDataset):
+    """Networks, and a function that takes one step with them."""
+    settings = config.loss_settings()
+    networks = create_networks(24, discriminator=uses_discriminator(settings), device="cpu", seed=0)
+    optimizers = create_optimizers(networks, config.learning_rate)
+    batch = data.batch(torch.tensor([0, 25, 50, 7]))
+    return networks, lambda iteration: train_step(networks, optimizers, batch, iteration, settings, "fp32")
+
+
+def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
+    networks, step = make_step(tiny_config(tmp_path), tiny_set)
+    for iteration in (1, 2, 3, 4):
+        before = {name: snapshot(network) for name, network in networks.items()}
+        losses = step(iteration)
+        assert changed(networks.encoder, before["encoder"])
+        assert changed(networks.generator, before["generator"])
+        odd = iteration % 2 == 1
+        assert changed(networks.discriminator, before["discriminator"]) == odd
+        assert ("classification" in losses, "confusion" in losses) == (odd, not odd)
+        if not odd:
+            assert all(p.grad is None for p in networks.discriminator.parameters())
+
+
+def test_total_is_the_weighted_sum(tiny_config, tiny_set, tmp_path) -> None:
+    config = tiny_config(tmp_path, lambda_adversarial=0.5, lambda_prior=0.25, lambda_classification=2.0)
+    _, step = make_step(config, tiny_set)
+    odd, even = step(1), step(2)
+    shape = [x["projection"] + 0.001 * x["smoothness"] + 0.25 * x["prior"] for x in (odd, even)]
+    assert odd["total"] == pytest.approx(shape[0] + 2.0 * odd["classification"], rel=1e-5)
+    assert even["total"] == pytest.approx(shape[1] + 0.5 * even["confusion"], rel=1e-5)
+
+
+def gradients(config: TrainConfig, data: KatoDataset, iteration: int) -> dict[str, list[torch.Tensor]]:
+    networks, step = make_step(config, data)
+    step(iteration)
+    return {
+        name: [p.grad.clone() for p in network.parameters() if p.grad is not None] for name, network in networks.items()
+    }
+
+
+def test_classification_does_not_reach_encoder_and_generator(tiny_config, tiny_set, tmp_path) -> None:
+    with_cls = gradients(tiny_config(tmp_path), tiny_set, 1)
+    without = gradients(tiny_config(tmp_path, lambda_classification=0.0), tiny_set, 1)
+    for name in ("encoder", "generator"):
+        assert all(torch.equal(a, b) for a, b in zip(with_cls[name], without[name], strict=True))
+    assert with_cls["discriminator"]
+    assert not without["discriminator"]
+
+
+def test_confusion_reaches_the_encoder_only(tiny_config, tiny_set, tmp_path) -> None:
+    with_adv = gradients(tiny_config(tmp_path), tiny_set, 2)
+    without = gradients(tiny_config(tmp_path, lambda_adversarial=0.0), tiny_set, 2)
+    assert any(not torch.equal(a, b) for a, b in zip(with_adv["encoder"], without["encoder"], strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(with_adv["generator"], without["generator"], strict=True))
+    assert not with_adv["discriminator"]
+
+
+def test_vanilla_has_no_discriminator_and_no_code_losses(tiny_config, tiny_set, tmp_path) -> None:
+    networks, step = make_step(tiny_config(tmp_path, method="vanilla"), tiny_set)
+    assert networks.discriminator is None
+    for iteration in (1, 2):
+        assert set(step(iteration)) == {"projection", "smoothness", "total"}
+
+
+def test_projection_loss_falls(tiny_config, tiny_set, tmp_path) -> None:
+    _, step = make_step(tiny_config(tmp_path, method="vanilla", learning_rate=3e-4), tiny_set)
+    values = [step(iteration)["projection"] for iteration in range(1, 9)]
+    assert values[-1] < values[0] - 0.05
+
+
+def test_presets_differ_as_stated(tiny_config, tiny_set, tmp_path) -> None:
+    assert (PRESETS["released"].adversarial, PRESETS["released"].prior) == ("log", "squared")
+    assert (PRESETS["paper"].adversarial, PRESETS["paper"].prior) == ("probability", "norm")
+    _, released = make_step(tiny_config(tmp_path), tiny_set)
+    _, paper = make_step(tiny_config(tmp_path, preset="paper"), tiny_set)
+    a, b = released(2), paper(2)
+    assert a["projection"] == b["projection"]
+    assert a["smoothness"] == b["smoothness"]
+    assert a["confusion"] > 5 * b["confusion"]  # near uniform the log form is about K^2 times larger
+    assert a["prior"] != b["prior"]
+
+
+def test_method_sets_the_default_weights(tmp_path) -> None:
+    config = TrainConfig(tmp_path, "airplane", tmp_path)
+    settings = config.loss_settings()
+    assert (settings.smoothness, settings.classification, settings.adversarial, settings.prior) == (0.001, 1, 1, 1)
+    settings = TrainConfig(tmp_path, "airplane", tmp_path, method="vanilla").loss_settings()
+    assert (settings.smoothness, settings.classification, settings.adversarial, settings.prior) == (0.001, 0, 0, 0)
+    assert (config.iterations, config.batch_size, config.learning_rate) == (20_000, 128, 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "vae"}, "method must be one of proposed, vanilla"),
+        ({"preset": "kato"}, "preset must be one of released, paper"),
+        ({"method": "vanilla", "lambda_prior": 1.0}, "lambda_prior=1.0 conflicts with method 'vanilla'"),
+        ({"iterations": 0}, "iterations must be a whole number >= 1"),
+        ({"batch_size": 2.5}, "batch_size must be a whole number >= 1"),
+        ({"learning_rate": float("nan")}, "learning_rate must be a positive number"),
+        ({"lambda_smooth": -1.0}, "lambda_smooth must be a number >= 0"),
+        ({"seed": -1}, "seed must be a whole number >= 0"),
+        ({"category": ""}, "category must be a class name"),
+        ({"threads": 0}, "threads must be a whole number >= 1"),
+    ],
+)
+def test_wrong_options_are_named(tmp_path, options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        TrainConfig(**({"data": tmp_path, "category": "airplane", "output": tmp_path} | options))
+
+
+def test_config_survives_json_and_names_unknown_options(tmp_path) -> None:
+    config = TrainConfig(tmp_path, "chair", tmp_path / "run", lambda_prior=0.5, threads=2)
+    values = json.loads(json.dumps(config_to_dict(config)))
+    assert config_from_dict(values) == config
+    with pytest.raises(ValueError, match=r"unknown options \['latent'\]"):
+        config_from_dict(values | {"latent": 3})
+    with pytest.raises(ValueError, match=r"lacks the options \['output'\]"):
+        config_from_dict({"data": "a", "category": "b"})
+    with pytest.raises(ValueError, match="folder of a training run"):
+        load_config(tmp_path / "config.json")
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(ValueError, match="not valid JSON"):
+        load_config(tmp_path / "config.json")
+
+
+def test_resume_may_change_only_what_does_not_matter(tiny_config, tmp_path) -> None:
+    saved = tiny_config(tmp_path)
+    check_resume(tiny_config(tmp_path, iterations=9, threads=1, validate_every=3), saved)
+    with pytest.raises(ValueError, match="batch_size: 4 in the run, 8 asked for; seed: 0 in the run, 1 asked for"):
+        check_resume(tiny_config(tmp_path, batch_size=8, seed=1), saved)
+
+
+@pytest.mark.parametrize(("samples", "batch"), [(24, 5), (24, 24), (7, 20)])
+def test_batches_go_through_every_epoch_completely(samples: int, batch: int) -> None:
+    steps = 3 * samples
+    drawn = torch.cat([batch_indices(samples, batch, seed=0, step=step) for step in range(1, steps + 1)])
+    assert len(drawn) == steps * batch
+    epochs = drawn[: len(drawn) // samples * samples].reshape(-1, samples)
+    assert torch.equal(epochs.sort(dim=1).values, torch.arange(samples).expand_as(epochs))
+    assert not torch.equal(epochs[0], epochs[1])
+    assert torch.equal(batch_indices(samples, batch, seed=0, step=3), batch_indices(samples, batch, seed=0, step=3))
+    other = torch.cat([batch_indices(samples, batch, seed=1, step=step) for step in range(1, steps + 1)])
+    assert not torch.equal(drawn, other)
+
+
+def test_object_share() -> None:
+    images = np.zeros((1, 24, 4, 64, 64), np.uint8)
+    images[:, :12, 3, 10:26, 5:37] = 255  # 16 x 32: half of the picture
+    data = KatoDataset(images, np.zeros((1, 32, 32, 32), bool), "airplane", "train")
+    assert object_share(data) == pytest.approx(0.25)  # the other twelve are empty
+
+
+def test_a_finished_run_leaves_everything(finished_run) -> None:
+    names = {path.name for path in finished_run.iterdir()}
+    assert names == {
+        "config.json",
+        "last.safetensors",
+        "best.safetensors",
+        "metrics.jsonl",
+        "tensorboard",
+        "pictures",
+    }
+    metrics = read_metrics(finished_run)
+    assert [(m["step"], m["split"]) for m in metrics] == [(s, "train") for s in (1, 2, 3, 4)] + [(4, "val")]
+    assert "confusion" in metrics[1]
+    assert 0 <= metrics[-1]["voxel_iou"] <= 1
+    assert metrics[-1]["mmd"] > 0
+    assert (finished_run / "pictures" / "000004.png").stat().st_size > 1000
+    assert list((finished_run / "tensorboard").iterdir())
+
+
+def signal_after(number: int, step: int):
+    """The training step, with a signal to this process at the end of one of them."""
+
+    def step_and_signal(*arguments):
+        losses = train_step(*arguments)
+        if arguments[3] == step:
+            signal.raise_signal(number)
+        return losses
+
+    return step_and_signal
+
+
+def test_sigterm_saves_and_says_how_to_resume(tiny_config, run_folder, monkeypatch, capsys) -> None:
+    handler = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(training, "train_step", signal_after(signal.SIGTERM, 1))
+    summary = train(tiny_config(run_folder, method="vanilla"))
+    assert (summary.step, summary.finished) == (1, False)
+    assert signal.getsignal(signal.SIGTERM) is handler
+    assert "stopped by SIGTERM after step 1" in capsys.readouterr().err
+    assert (run_folder / "last.safetensors").exists()
+
+
+def test_a_second_interrupt_does_not_wait(tiny_config, run_folder, monkeypatch) -> None:
+    def twice(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(training, "train_step", twice)
+    with pytest.raises(KeyboardInterrupt):
+        train(tiny_config(run_folder, method="vanilla"))
+
+
+def test_interrupted_run_resumes_bit_for_bit(tiny_config, finished_run, run_folder, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(training, "train_step", signal_after(signal.SIGINT, 2))
+    summary = train(tiny_config(run_folder))
+    assert (summary.step, summary.finished) == (2, False)
+    assert f"--output {run_folder} --resume" in capsys.readouterr().err
+
+    torch.manual_seed(99)  # whatever the new process does before
+    monkeypatch.setattr(training, "train_step", train_step)
+    with open(run_folder / "metrics.jsonl", "a") as file:
+        file.write('{"step": 3, "split": "train"}\n{"step": 4, "spl')  # as a crash after the checkpoint would leave it
+    summary = train(tiny_config(run_folder), resume=True)
+    assert (summary.step, summary.finished) == (4, True)
+    assert read_metrics(run_folder) == read_metrics(finished_run)
+    for name in ("last", "best"):
+        ours, about = checkpoint.load(run_folder / f"{name}.safetensors")
+        theirs, about_theirs = checkpoint.load(finished_run / f"{name}.safetensors")
+        assert ours.keys() == theirs.keys()
+        assert all(torch.equal(ours[key], theirs[key]) for key in ours)
+        assert {k: v for k, v in about.items() if k != "config"} == {
+            k: v for k, v in about_theirs.items() if k != "config"
+        }
+
+
+def test_resume_refuses_conflicts_and_finished_runs(tiny_config, finished_run) -> None:
+    with pytest.raises(ValueError, match=r"cannot resume with different options .*learning_rate"):
+        train(tiny_config(finished_run, learning_rate=1e-3), resume=True)
+    with pytest.raises(ValueError, match="taken 4 steps of 4 already"):
+        train(tiny_config(finished_run), resume=True)
+
+
+def test_resume_without_a_checkpoint(tiny_config, run_folder) -> None:
+    with pytest.raises(ValueError, match="no checkpoint"):
+        train(tiny_config(run_folder), resume=True)
+
+
+def test_used_folder_is_refused_and_overwrite_keeps_foreign_files(tiny_config, run_folder, monkeypatch) -> None:
+    run_folder.mkdir()
+    (run_folder / "notes.txt").write_text("mine")
+    (run_folder / "metrics.jsonl").write_text('{"step": 0, "split": "train"}\n')
+    with pytest.raises(ValueError, match="is not empty; continue that run"):
+        train(tiny_config(run_folder))
+    monkeypatch.setattr(training, "_draw", lambda *arguments: None)
+    train(tiny_config(run_folder, iterations=1, method="vanilla"), overwrite=True)
+    assert (run_folder / "notes.txt").read_text() == "mine"
+    assert read_metrics(run_folder)[0]["step"] == 1
+
+
+def test_output_that_is_a_file(tiny_config, tmp_path) -> None:
+    (tmp_path / "run").write_text("")
+    with pytest.raises(ValueError, match="is a file; give a folder"):
+        train(tiny_config(tmp_path / "run"))
+
+
+def test_nan_loss_stops_before_the_step_and_names_the_last_checkpoint(tiny_config, run_folder, monkeypatch) -> None:
+    calls = []
+
+    def loss(prediction, target):
+        calls.append(0)
+        return prediction.mean() * (float("nan") if len(calls) == 3 else 1)
+
+    monkeypatch.setattr(pose_invariant.nmr.losses, "soft_iou_loss", loss)
+    config = tiny_config(run_folder, method="vanilla", checkpoint_every=2)
+    with pytest.raises(FloatingPointError, match=r"not finite at iteration 3 \(projection nan.*last good checkpoint"):
+        train(config)
+    tensors, metadata = checkpoint.load(run_folder / "last.safetensors")
+    assert metadata["step"] == 2
+    assert all(bool(t.isfinite().all()) for t in tensors.values() if t.is_floating_point())
+
+
+def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> None:
+    networks, _ = make_step(tiny_config(run_folder), KatoDataset(*np_empty(), "airplane", "train"))
+    with torch.no_grad():
+        networks.generator.layers[0].bias[3] = float("inf")
+    run_folder.mkdir()
+    with pytest.raises(FloatingPointError, match="generator has weights that are not finite; there is no checkpoint"):
+        training.save_last(run_folder, tiny_config(run_folder), networks, None, training.Progress())
+    assert not list(run_folder.iterdir())
+
+
+def np_empty() -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros((3, 24, 4, 64, 64), np.uint8), np.zeros((3, 32, 32, 32), bool)

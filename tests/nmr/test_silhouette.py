@@ -1,0 +1,268 @@
+"""render_silhouette: against the slow definition, its invariances, the operator's registration, bad input."""
+
+import subprocess
+import sys
+
+import hypothesis.extra.numpy as hnp
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import nmr
+from nmr import reference
+
+
+def random_soup(seed, batch=2, num_faces=12, dtype=torch.float32):
+    """Random triangles in renderer space, some of them partly off the screen."""
+    g = torch.Generator().manual_seed(seed)
+    centre = torch.rand(batch, num_faces, 1, 3, generator=g) * 2 - 1
+    corners = centre + 0.5 * torch.randn(batch, num_faces, 3, 3, generator=g)
+    corners[..., 2] = 1 + torch.rand(batch, num_faces, 3, generator=g)
+    vertices = corners.reshape(batch, -1, 3).to(dtype)
+    return vertices, torch.arange(num_faces * 3).view(-1, 3)
+
+
+def bumpy_spheres(batch=4, seed=0):
+    """Deformed icospheres and a camera that sees each from another side."""
+    g = torch.Generator().manual_seed(seed)
+    vertices, faces = nmr.icosphere(3)
+    vertices = 0.4 * vertices * (0.5 + torch.rand(batch, 1, 3, generator=g)) + 0.01 * torch.randn(batch, 642, 3, generator=g)
+    camera = nmr.LookAt.from_angles(2.732, 30.0, torch.arange(batch) * 37.0, half_fov_deg=15.0)
+    return vertices, faces, camera
+
+
+def render_with_gradient(vertices, faces, upstream_seed=0, **kwargs):
+    vertices = vertices.clone().requires_grad_()
+    alpha = nmr.render_silhouette(vertices, faces, **kwargs)
+    g = torch.Generator().manual_seed(upstream_seed)
+    alpha.backward(torch.randn(alpha.shape, generator=g, dtype=alpha.dtype))
+    return alpha.detach(), vertices.grad
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("anti_aliasing", [False, True])
+@pytest.mark.parametrize("fill_back", [False, True])
+def test_equals_the_slow_definition(seed, anti_aliasing, fill_back):
+    vertices, faces = random_soup(seed, dtype=torch.float64)
+    size = 11 if anti_aliasing else 19
+    upstream = torch.randn(2, size, size, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    leaf = vertices.clone().requires_grad_()
+    alpha = nmr.render_silhouette(leaf, faces, image_size=size, anti_aliasing=anti_aliasing, fill_back=fill_back)
+    alpha.backward(upstream)
+    for b in range(2):
+        index = reference.face_index(vertices[b], faces, size * (1 + anti_aliasing), fill_back)
+        assert torch.equal(alpha[b], reference.silhouette(index, anti_aliasing, torch.float64))
+        grad = reference.silhouette_gradient(vertices[b], faces, index, upstream[b], anti_aliasing, fill_back)
+        torch.testing.assert_close(leaf.grad[b], grad, rtol=1e-9, atol=1e-9 * float(grad.abs().max()))
+    assert leaf.grad[..., :2].any() and not leaf.grad[..., 2].any()
+
+
+def test_same_bits_for_any_number_of_threads():
+    vertices, faces, camera = bumpy_spheres(batch=7)
+    vertices = camera.transform(vertices)
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            results += [render_with_gradient(vertices, faces, image_size=64) for _ in range(2)]
+    finally:
+        torch.set_num_threads(before)
+    for alpha, grad in results[1:]:
+        assert torch.equal(alpha, results[0][0]) and torch.equal(grad, results[0][1])
+
+
+def test_same_bits_for_any_batch_size():
+    vertices, faces = random_soup(3, batch=5)
+    leaf = vertices.clone().requires_grad_()
+    nmr.render_silhouette(leaf, faces, image_size=24).square().sum().backward()
+    for b in range(5):
+        single = vertices[b].clone().requires_grad_()
+        nmr.render_silhouette(single, faces, image_size=24).square().sum().backward()
+        assert torch.equal(single.grad, leaf.grad[b])
+
+
+def test_faces_per_image_equal_shared_faces():
+    vertices, faces, camera = bumpy_spheres(batch=2)
+    vertices = camera.transform(vertices)
+    shared = render_with_gradient(vertices, faces, image_size=32)
+    own = render_with_gradient(vertices, faces.expand(2, -1, -1).to(torch.int32), image_size=32)
+    assert torch.equal(shared[0], own[0]) and torch.equal(shared[1], own[1])
+
+
+def test_face_order_does_not_change_the_image():
+    vertices, faces, camera = bumpy_spheres()
+    permuted = faces[torch.randperm(len(faces), generator=torch.Generator().manual_seed(0))]
+    a = nmr.render_silhouette(vertices, faces, camera, image_size=64)
+    assert a.any() and torch.equal(a, nmr.render_silhouette(vertices, permuted, camera, image_size=64))
+
+
+def test_hidden_faces_get_no_gradient():
+    near = torch.tensor([[-0.5, -0.5, 1.0], [0.5, -0.5, 1.0], [0.0, 0.6, 1.0]])
+    hidden = 0.3 * near + torch.tensor([0.0, 0.0, 1.7])
+    alone = render_with_gradient(near[None], torch.tensor([[0, 1, 2]]), image_size=32)
+    both = render_with_gradient(torch.cat([near, hidden])[None], torch.tensor([[0, 1, 2], [3, 4, 5]]), image_size=32)
+    assert torch.equal(both[0], alone[0])
+    assert torch.equal(both[1][:, :3], alone[1]) and alone[1].any() and not both[1][:, 3:].any()
+
+
+def test_row_zero_is_the_top_and_winding_matters_without_fill_back():
+    top_right = torch.tensor([[[0.2, 0.2, 1.0], [0.8, 0.2, 1.0], [0.8, 0.8, 1.0]]])
+    alpha = nmr.render_silhouette(top_right, torch.tensor([[0, 1, 2]]), image_size=10, fill_back=False)
+    assert alpha[0, :5, 5:].any() and not alpha[0, 5:].any() and not alpha[0, :, :5].any()
+    clockwise = torch.tensor([[0, 2, 1]])
+    assert not nmr.render_silhouette(top_right, clockwise, image_size=10, fill_back=False).any()
+    assert torch.equal(nmr.render_silhouette(top_right, clockwise, image_size=10), alpha)
+
+
+def test_gradient_descent_finds_the_target():
+    """What a user does with it: the silhouette of a sphere becomes that of a flat ellipsoid."""
+    vertices, faces = nmr.icosphere(2)
+    camera = nmr.LookAt.from_angles(2.732, 20.0, [0.0, 60.0, 120.0], half_fov_deg=20.0)
+    target = nmr.render_silhouette(vertices * torch.tensor([0.6, 0.25, 0.4]), faces, camera, image_size=48)
+    shape = (0.4 * vertices).requires_grad_()
+    optimizer = torch.optim.Adam([shape], lr=0.01)
+    losses = []
+    for _ in range(60):
+        optimizer.zero_grad()
+        loss = nmr.losses.soft_iou_loss(nmr.render_silhouette(shape, faces, camera, image_size=48), target)
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[0] > 0.3 and losses[-1] < 0.08
+
+
+def op_arguments(dtype=torch.float32, requires_grad=True):
+    vertices, faces = random_soup(0, dtype=dtype)
+    return vertices.requires_grad_(requires_grad), faces, 12, True, True, 0.1, 100.0, 1e-4
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_opcheck(dtype):
+    torch.library.opcheck(nmr.ops.silhouette, op_arguments(dtype))
+    _, index = nmr.ops.silhouette(*op_arguments(dtype, False))
+    vertices, faces = op_arguments(dtype, False)[:2]
+    upstream = torch.randn(2, 12, 12, dtype=dtype)
+    torch.library.opcheck(nmr.ops.silhouette_backward, (vertices, faces, index, upstream, 12, True, 1e-4))
+
+
+def test_compile_fullgraph():
+    vertices, faces, camera = bumpy_spheres(batch=2)
+
+    def loss(v):
+        return nmr.render_silhouette(v, faces, camera, image_size=32).square().mean()
+
+    eager, compiled = vertices.clone().requires_grad_(), vertices.clone().requires_grad_()
+    loss(eager).backward()
+    torch.compile(loss, fullgraph=True, backend="aot_eager")(compiled).backward()
+    torch.testing.assert_close(compiled.grad, eager.grad, rtol=1e-4, atol=1e-6)
+
+
+def test_second_derivative_is_refused():
+    vertices, faces = random_soup(0)
+    vertices.requires_grad_()
+    loss = nmr.render_silhouette(vertices, faces, image_size=12).square().sum()
+    (grad,) = torch.autograd.grad(loss, vertices, create_graph=True)
+    with pytest.raises(RuntimeError, match="no second derivative"):
+        grad.square().sum().backward()
+
+
+def test_one_openmp_runtime():
+    """torch and the extension must share libgomp, or threads are oversubscribed and forks hang."""
+    code = (
+        "import nmr, torch\n"
+        "v, f = nmr.icosphere(1); nmr.render_silhouette(v * .3 + torch.tensor([0, 0, 2.]), f, image_size=8)\n"
+        "maps = {line.split()[-1] for line in open('/proc/self/maps') if 'libgomp' in line}\n"
+        "assert len(maps) <= 1, maps"
+    )
+    if sys.platform != "linux":
+        pytest.skip("reads /proc/self/maps")
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------------
+
+NASTY = [0.0, -0.0, 1.0, -1.0, 0.5, 1e-45, 1e-30, 1e30, -1e30, 3.4e38, -3.4e38, np.inf, -np.inf, np.nan, 1e-7, 0.9999999]
+
+
+@st.composite
+def nasty_meshes(draw):
+    dtype = draw(st.sampled_from([np.float32, np.float64]))
+    num_vertices = draw(st.integers(1, 8))
+    numbers = st.one_of(
+        st.sampled_from(NASTY), st.floats(-2, 2, width=32), st.floats(allow_nan=True, allow_infinity=True, width=32)
+    ).map(dtype)
+    vertices = draw(hnp.arrays(dtype, (draw(st.integers(1, 2)), num_vertices, 3), elements=numbers))
+    faces = draw(hnp.arrays(np.int64, (draw(st.integers(0, 6)), 3), elements=st.integers(0, num_vertices - 1)))
+    return torch.from_numpy(vertices), torch.from_numpy(faces)
+
+
+@settings(max_examples=400, deadline=None)
+@given(nasty_meshes(), st.integers(1, 17), st.booleans(), st.booleans())
+def test_any_mesh_gives_finite_coverage_and_no_nan(mesh, image_size, anti_aliasing, fill_back):
+    vertices, faces = mesh
+    alpha, grad = render_with_gradient(
+        vertices, faces, image_size=image_size, anti_aliasing=anti_aliasing, fill_back=fill_back
+    )
+    assert ((alpha >= 0) & (alpha <= 1)).all()
+    assert not grad.isnan().any()
+    used = torch.zeros(vertices.shape[1], dtype=torch.bool)
+    used[faces.flatten()] = True
+    assert not grad[:, ~used].any()
+
+
+@settings(max_examples=100, deadline=None)
+@given(nasty_meshes())
+def test_any_mesh_through_a_camera(mesh):
+    vertices, faces = mesh
+    camera = nmr.LookAt.from_angles(2.0, 10.0, 20.0)
+    alpha = nmr.render_silhouette(vertices, faces, camera, image_size=8)
+    assert alpha.isfinite().all()
+
+
+def test_behind_the_camera_and_off_screen_draw_nothing():
+    vertices, faces = nmr.icosphere(1)
+    for shift in ([0, 0, -5.0], [5.0, 0, 3.0], [0, -7.0, 3.0], [0, 0, 500.0]):
+        alpha, grad = render_with_gradient(vertices[None] + torch.tensor(shift), faces, image_size=16)
+        assert not alpha.any() and not grad.any()
+
+
+@pytest.mark.parametrize("batch, num_faces", [(0, 5), (2, 0)])
+def test_empty_batches_and_meshes(batch, num_faces):
+    vertices = torch.zeros(batch, 15, 3, requires_grad=True)
+    alpha = nmr.render_silhouette(vertices, torch.zeros(num_faces, 3, dtype=torch.long), image_size=8)
+    alpha.sum().backward()
+    assert alpha.shape == (batch, 8, 8) and not alpha.any() and not vertices.grad.any()
+
+
+GOOD = dict(vertices=torch.zeros(2, 4, 3), faces=torch.zeros(5, 3, dtype=torch.long))
+
+
+@pytest.mark.parametrize(
+    "change, error, words",
+    [
+        (dict(vertices=[[0.0]]), TypeError, "use torch.as_tensor"),
+        (dict(vertices=torch.zeros(2, 4)), ValueError, r"vertices must have shape \[B, V, 3\].*float32 \[2, 4\]"),
+        (dict(vertices=torch.zeros(2, 4, 3, dtype=torch.bfloat16)), TypeError, r"bfloat16.*vertices.float\(\)"),
+        (dict(vertices=torch.zeros(2, 4, 3, dtype=torch.long)), TypeError, "float32 or float64"),
+        (dict(faces=torch.zeros(5, 3)), TypeError, r"integer tensor.*call faces.long\(\)"),
+        (dict(faces=np.zeros((5, 3), int)), TypeError, "use torch.as_tensor"),
+        (dict(faces=torch.zeros(5, 4, dtype=torch.long)), ValueError, r"\[F, 3\]"),
+        (dict(faces=torch.zeros(3, 5, 3, dtype=torch.long)), ValueError, "batch size of the vertices, 2"),
+        (dict(faces=torch.full((5, 3), 4)), ValueError, "vertex 4, but a mesh has vertices 0 to 3"),
+        (dict(faces=torch.full((5, 3), -1)), ValueError, "vertex -1"),
+        (dict(camera="front"), TypeError, "transform"),
+        (dict(image_size=0), ValueError, "image_size must lie in 1"),
+        (dict(image_size=8.0), TypeError, "image_size must be an integer"),
+        (dict(image_size=1 << 20), ValueError, "image_size"),
+        (dict(near=2.0, far=1.0), ValueError, "near < far"),
+        (dict(near=float("nan")), ValueError, "near < far"),
+        (dict(eps=0.0), ValueError, "eps must be positive"),
+        (dict(camera=nmr.LookAt(torch.rand(3, 3))), ValueError, "2 meshes"),
+    ],
+)
+def test_errors_say_what_was_wanted(change, error, words):
+    with pytest.raises(error, match=words):
+        nmr.render_silhouette(**{**GOOD, **change})
