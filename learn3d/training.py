@@ -22,6 +22,7 @@ from learn3d import checkpoint, figures
 from learn3d.config import TrainConfig, check_resume, config_from_dict, config_to_dict
 from learn3d.data.kato import KatoDataset
 from learn3d.evaluation import evaluate
+from learn3d.memory import keep_freed_memory
 from learn3d.methods.pose_invariant import Optimizers, create_optimizers, train_step, uses_discriminator
 from learn3d.networks import Networks, create_networks, resolve_precision
 from learn3d.runlog import RunLog
@@ -63,6 +64,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     FloatingPointError when a loss is no longer finite (the last checkpoint is from before that).
     """
     started = time.monotonic()
+    keep_freed_memory()
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     train_set = KatoDataset.load(config.data, config.category, "train")

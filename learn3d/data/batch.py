@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -21,16 +21,3 @@ class Batch:
     view_ids: torch.Tensor  # int64 [B] in 0 .. K-1: the pose class of each view
     object_ids: torch.Tensor  # int64 [B]: which object of the split each view shows
     voxels: torch.Tensor | None  # bool [B, 32, 32, 32] ground truth in the data set's axes, None where there is none
-
-    def to(self, device: torch.device | str) -> Batch:
-        """The same batch with every tensor (the cameras' too, where they have `to`) on `device`."""
-        cameras = self.cameras.to(device) if hasattr(self.cameras, "to") else self.cameras
-        return replace(
-            self,
-            images=self.images.to(device, non_blocking=True),
-            masks=self.masks.to(device, non_blocking=True),
-            cameras=cameras,
-            view_ids=self.view_ids.to(device),
-            object_ids=self.object_ids.to(device),
-            voxels=None if self.voxels is None else self.voxels.to(device),
-        )

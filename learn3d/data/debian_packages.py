@@ -120,7 +120,7 @@ def read_package(package: Package, suffixes: tuple[str, ...]) -> Iterator[tuple[
             path = check_member_path(line.lstrip("/"), f"the file list of {package.name}")
             file = package.root / path
             if path.endswith(suffixes) and file.is_file() and not file.is_symlink():
-                _check_size(file.stat().st_size, path, package.name)
+                _check_size(file.stat().st_size, path, package.name, MAX_FILE_BYTES)
                 yield path, file.read_bytes()
         return
     archive = package.deb.name
@@ -129,7 +129,7 @@ def read_package(package: Package, suffixes: tuple[str, ...]) -> Iterator[tuple[
             for member in tar:
                 path = check_member_path(member.name, archive)
                 if member.isreg() and path.endswith(suffixes):
-                    _check_size(member.size, path, archive)
+                    _check_size(member.size, path, archive, MAX_FILE_BYTES)
                     stream = tar.extractfile(member)
                     assert stream is not None
                     yield path, stream.read()
@@ -169,7 +169,7 @@ def read_member(archive: zipfile.ZipFile, path: str) -> bytes:
         raise ValueError(f"{path} cannot be read from the catalogue ({error})") from error
 
 
-def _check_size(size: int, path: str, archive: str, limit: int = MAX_FILE_BYTES) -> None:
+def _check_size(size: int, path: str, archive: str, limit: int) -> None:
     if size > limit:
         raise ValueError(f"{path} of {archive} is refused: {size} bytes, at most {limit} are read")
 

@@ -69,7 +69,7 @@ def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: b
         i, j = np.divmod(np.arange((count + 1) ** 2), count + 1)
         i, j = i[i + j <= count], j[i + j <= count]
         weights = np.stack([i, j, count - i - j], axis=1) / count
-        cells = np.einsum("sk,fkc->fsc", weights, corners[steps == count]).reshape(-1, 3)
+        cells = (weights @ corners[steps == count]).reshape(-1, 3)
         cells = np.clip(np.floor(cells).astype(np.int64), 0, size - 1)
         grid[cells[:, 0], cells[:, 1], cells[:, 2]] = True
     return grid

@@ -142,10 +142,15 @@ def fit_to_box(vertices: np.ndarray) -> np.ndarray:
 
 
 def is_watertight(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """True where every edge has exactly two faces, after vertices at equal positions are taken as one."""
-    _, welded = np.unique(vertices, axis=0, return_inverse=True)
-    corners = welded.reshape(-1)[faces]
-    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]  # degenerate faces close nothing
-    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-    _, counts = np.unique(edges[:, 0] * np.int64(len(vertices)) + edges[:, 1], return_counts=True)
-    return bool(len(counts)) and bool((counts == 2).all())
+    """True where every edge has exactly two faces: by vertex number, or with vertices at equal positions taken as one.
+
+    The second suits formats that repeat vertices (STL); the first, closed parts that touch each other.
+    """
+    return _closed(faces) or _closed(np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces])
+
+
+def _closed(faces: np.ndarray) -> bool:
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]  # degenerate faces close nothing
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    _, counts = np.unique(edges[:, 0] * (np.int64(faces.max(initial=0)) + 1) + edges[:, 1], return_counts=True)
+    return len(counts) > 0 and bool((counts == 2).all())

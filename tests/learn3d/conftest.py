@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from learn3d import training
 from learn3d.config import TrainConfig
 from learn3d.data.kato import KatoDataset
 from learn3d.training import train
@@ -83,6 +84,14 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable
     assert summary.step == 4
     yield folder
     shutil.rmtree(folder)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def small_picture_grids() -> Iterator[None]:
+    """Two rows instead of eight in the grids that a run draws."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "PICTURE_ROWS", 2)
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -171,6 +171,9 @@ def test_watertight():
     soup = box.vertices[box.faces].reshape(-1, 3)
     assert meshes.is_watertight(soup, np.arange(36).reshape(-1, 3))
     assert not meshes.is_watertight(box.vertices, box.faces[1:])
+    two = trimesh.util.concatenate([box, box.copy().apply_translation((1, 0, 0))])  # closed parts that touch
+    assert meshes.is_watertight(two.vertices, two.faces)
+    assert not meshes.is_watertight(box.vertices, np.array([[0, 0, 0]]))
 
 
 def test_same_seed_same_bytes_whatever_the_order_of_the_folder(tmp_path, folder, monkeypatch):

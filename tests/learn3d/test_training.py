@@ -45,7 +45,7 @@ def make_step(config: TrainConfig, data: KatoDataset):
 
 def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
     networks, step = make_step(tiny_config(tmp_path), tiny_set)
-    for iteration in (1, 2, 3, 4):
+    for iteration in (1, 2, 3):
         before = {name: snapshot(network) for name, network in networks.items()}
         losses = step(iteration)
         assert changed(networks.encoder, before["encoder"])
@@ -100,8 +100,8 @@ def test_vanilla_has_no_discriminator_and_no_code_losses(tiny_config, tiny_set, 
 
 def test_projection_loss_falls(tiny_config, tiny_set, tmp_path) -> None:
     _, step = make_step(tiny_config(tmp_path, method="vanilla", learning_rate=3e-4), tiny_set)
-    values = [step(iteration)["projection"] for iteration in range(1, 9)]
-    assert values[-1] < values[0] - 0.05
+    values = [step(iteration)["projection"] for iteration in range(1, 7)]
+    assert values[-1] < values[0] - 0.03
 
 
 def test_presets_differ_as_stated(tiny_config, tiny_set, tmp_path) -> None:

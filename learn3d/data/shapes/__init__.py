@@ -12,9 +12,18 @@ import trimesh
 from learn3d.data.shapes.airplane import make_airplane
 from learn3d.data.shapes.car import make_car
 from learn3d.data.shapes.chair import make_chair
+from learn3d.data.shapes.lamp import make_lamp
+from learn3d.data.shapes.sofa import make_sofa
 from learn3d.data.shapes.table import make_table
 
-_MAKERS = {"airplane": make_airplane, "car": make_car, "chair": make_chair, "table": make_table}
+_MAKERS = {
+    "airplane": make_airplane,
+    "car": make_car,
+    "chair": make_chair,
+    "lamp": make_lamp,
+    "sofa": make_sofa,
+    "table": make_table,
+}
 
 CATEGORIES: tuple[str, ...] = tuple(_MAKERS)
 
@@ -52,6 +61,6 @@ def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
         raise ValueError(f"category must be one of {', '.join(CATEGORIES)}; got {category!r}")
     if not isinstance(rng, np.random.Generator):
         raise TypeError(
-            f"rng must be a numpy.random.Generator, got {type(rng).__name__}; use numpy.random.default_rng(0)"
+            f"rng must be a numpy.random.Generator, got {type(rng).__name__}; use numpy.random.default_rng(seed)"
         )
     return _MAKERS[category](rng)

@@ -1,4 +1,4 @@
-"""Jet airplanes, fuselage about 1 long: airliners and freighters, business jets, fighters, supersonic planes, flying wings."""
+"""Jet airplanes, fuselage about 1 long: airliners, freighters, business jets, fighters, deltas, flying wings."""
 
 from __future__ import annotations
 

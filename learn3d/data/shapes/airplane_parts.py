@@ -89,8 +89,8 @@ def fuselage(
 ) -> Solid:
     """A fuselage along z from +length/2 (nose) to -length/2, `tall` times as high as wide.
 
-    nose is its length as a share of the whole, nose_power its bluntness (1 = cone, 2 = ellipse); upsweep lifts the end of
-    the tail and droop lowers the tip of the nose, in radii; tail_radius is what is left of the radius at the end.
+    nose is its length as a share of the whole, nose_power its bluntness (1 = cone, 2 = ellipse); upsweep lifts the
+    end of the tail and droop lowers the tip of the nose, in radii; tail_radius is what is left of the radius there.
     """
     ahead = np.array([0.0, 0.02, 0.07, 0.16, 0.3, 0.5, 0.75, 1.0])
     behind = np.array([0.15, 0.35, 0.6, 0.85, 1.0])
@@ -206,7 +206,7 @@ def winglets(rng: np.random.Generator, plan: Planform) -> list[Solid]:
 def landing_gear(
     belly: float, drop: float, main_z: float, other_z: float, main_x: float, taildragger: bool = False
 ) -> list[Solid]:
-    """A main gear at +-main_x and a nose (or tail) wheel, wheels standing `drop` below the axis; belly is its height."""
+    """A main gear at +-main_x and a nose (or tail) wheel, `drop` below the axis of a fuselage of radius `belly`."""
     main = wheel(0.026)
     top = -0.5 * belly
     solids = both_sides(bar((0.4 * main_x, top, main_z), (main_x, -drop, main_z), 0.016))

@@ -50,11 +50,11 @@ def hull(body: Body) -> Solid:
         knots += [b.rear_glass, (b.length - 0.08, b.tail), (b.length, 0.85 * b.tail)]
     else:
         knots += [b.rear_glass, (b.length, b.tail)]
-    line = rounded_path(np.array(knots, dtype=float), b.softness, 3)
+    line = rounded_path(np.array(knots, dtype=float), b.softness, 2)
     line[:, 0] = np.maximum.accumulate(line[:, 0] + 1e-4 * np.arange(len(line)))
-    stations = [line[:, 0], np.linspace(0, b.length, 9)]
+    stations = [line[:, 0], np.linspace(0, b.length, 7)]
     for axle in (b.front_axle, b.rear_axle):
-        stations += [axle + arch * np.array([-1.02, 1.02]), axle - arch * 0.999 * np.cos(np.linspace(0, np.pi, 9))]
+        stations += [axle + arch * np.array([-1.02, 1.02]), axle - arch * 0.999 * np.cos(np.linspace(0, np.pi, 8))]
     if b.open_to > b.open_from:
         stations += [np.array([b.open_from - 0.015, b.open_from + 0.015, b.open_to - 0.015, b.open_to + 0.015])]
     s = np.unique(np.concatenate(stations).round(3))
@@ -106,7 +106,6 @@ def road_wheel(radius: float, width: float, dish: float) -> Solid:
     """A wheel about the x axis, its hub dished by `dish` (share of the width) on both sides."""
     half = width / 2
     profile = [
-        (0.08, dish - 1), (0.5, dish - 1), (0.62, -0.92), (0.9, -1), (1, -0.7), (1, 0.7), (0.9, 1), (0.62, 0.92), (0.5, 1 - dish),
-        (0.08, 1 - dish),
+        (0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7), (1, 0.7), (0.92, 1), (0.62, 0.95), (0.5, 1 - dish),
     ]  # fmt: skip
     return revolve([(radius * r, half * y) for r, y in profile], 16).rotated("z", 90)

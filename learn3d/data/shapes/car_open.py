@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from learn3d.data.shapes.car_body import Body, hull
+from learn3d.data.shapes.car_body import Body, hull, road_wheel
 from learn3d.data.shapes.parts import (
     Solid,
     bar,
@@ -94,8 +94,9 @@ def vintage(rng: np.random.Generator) -> list[Solid]:
     end = rear + u(0.2, 0.45)
     body = Body(
         length=length - 0.2, half=narrow, wheel=0.1, front_axle=-9.0, rear_axle=99.0, clearance=0.3,
-        nose=belt - 0.08, hood=belt - 0.03, cowl=(cowl, belt + 0.08), roof=(cowl + u(0.1, 0.3), end - u(0.1, 0.4), height),
-        rear_glass=(min(end + 0.1, length - 0.35), belt), tail=0.7 * belt, belt=(belt - 0.03, belt + 0.02), tumble=u(0.05, 0.15),
+        nose=belt - 0.08, hood=belt - 0.03, cowl=(cowl, belt + 0.08),
+        roof=(cowl + u(0.1, 0.3), end - u(0.1, 0.4), height), rear_glass=(min(end + 0.1, length - 0.35), belt),
+        tail=0.7 * belt, belt=(belt - 0.03, belt + 0.02), tumble=u(0.05, 0.15),
         taper=(u(0.2, 0.35), u(0.1, 0.4)), ledge=0.01, tyre=0.05, softness=u(0.1, 0.4),
     )  # fmt: skip
     if not closed:

@@ -1,4 +1,4 @@
-"""Procedural chairs, in metres: a seat, what carries it, a back and arms, each in many kinds; plus whole-body families."""
+"""Procedural chairs, in metres: a seat, a support, a back and arms, each of many kinds; and one-piece chairs."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _jointed_chair(rng: np.random.Generator, family: str) -> list[Solid]:
             },
         )
     under = height - thickness
-    spread = 0.5 * (2 if exponent > 4 else 1.75 if exponent > 2.5 else 1.5) / 2
+    spread = 0.5 * 0.35 ** (1 / exponent)  # well inside the outline
     half_x, half_z = spread * width * (0.5 + 0.5 * taper) - 0.03, spread * depth - 0.03
     solids += supports.base(rng, kind, half_x, half_z, under)
 

@@ -1,4 +1,4 @@
-"""Backs of chairs, in metres, drawn upright in the plane z = 0 from y = 0: frames with many fillings, plates, pads, hoops."""
+"""Backs of chairs, in metres, upright in the plane z = 0 from y = 0: frames and their fillings, plates, pads, hoops."""
 
 from __future__ import annotations
 

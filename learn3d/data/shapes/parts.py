@@ -17,7 +17,7 @@ Point = Sequence[float] | np.ndarray
 
 # Bars thinner than THIN (of the longest side of the whole shape) get a ring at least every STEP: a voxeliser that casts
 # rays on a 32^3 grid can miss a bar between two grid lines, but it also marks the cell of every vertex.
-THIN, STEP = 0.08, 0.031
+THIN, STEP = 0.06, 0.031
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,12 @@ def ellipse(width: float, depth: float, count: int = 20, exponent: float = 2.0) 
 
 
 def rectangle(width: float, depth: float, radius: float | None = None, segments: int = 2) -> np.ndarray:
-    """A rectangle outline [4 (segments + 1), 2] with rounded corners (radius None: 12 % of the short side)."""
+    """A rectangle outline [4 (segments + 1), 2] with rounded corners; radius None: 12 % of the short side.
+
+    With 0 segments the corners are sharp.
+    """
+    if segments == 0:
+        return np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * np.array([width, depth]) / 2
     short = min(width, depth)
     radius = 0.12 * short if radius is None else min(max(radius, 0.01 * short), 0.49 * short)
     angle = np.concatenate([np.linspace(k, k + 1, segments + 1) for k in range(4)]) * (np.pi / 2)
@@ -121,7 +126,7 @@ def between(lower: Point, upper: Point, radius: float | None = None) -> Solid:
 
 
 def post(foot: Point, head: Point, outline: np.ndarray, profile: Sequence[tuple[float, float]]) -> Solid:
-    """A (slanted) post from `foot` to `head` with horizontal sections: profile = (height in 0..1, scale of the outline)."""
+    """A (slanted) post with horizontal sections; profile = [(height 0 at the foot .. 1, scale of the outline)]."""
     foot, head = np.asarray(foot, dtype=float), np.asarray(head, dtype=float)
     section = np.stack([outline[:, 0], np.zeros(len(outline)), outline[:, 1]], 1)
     return Solid(np.stack([foot + t * (head - foot) + scale * section for t, scale in profile]))
@@ -204,7 +209,11 @@ def tube(
 
 def bar(start: Point, end: Point, width: float, height: float | None = None, side: Point = (0.0, 0.0, 1.0)) -> Solid:
     """A straight bar: round with diameter `width`, or rectangular, width (along `side`) by height."""
-    section = ellipse(width, width, 6) if height is None else rectangle(width, height, segments=1)
+    section = (
+        ellipse(width, width, 6)
+        if height is None
+        else rectangle(width, height, segments=1 if max(width, height) > 0.04 else 0)
+    )
     return tube([start, end], 1.0, section, side=side)
 
 

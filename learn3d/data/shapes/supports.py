@@ -71,10 +71,11 @@ def four_legs(
     height: float,
     size: float | None = None,
     plain: bool = False,
+    shelf: bool = False,
 ) -> list[Solid]:
     """Four legs, straight or splayed, perhaps with stretchers and an apron; sometimes bent-wire (hairpin) legs.
 
-    `plain` ones are tapered and without an apron.
+    `plain` ones are tapered and without an apron; a `shelf` takes the place of stretchers.
     """
     size = rng.uniform(0.028, 0.055) if size is None else size
     splay = rng.uniform(0.02, 0.16) * height if maybe(rng, 0.55) else 0.0
@@ -98,9 +99,14 @@ def four_legs(
         return np.array([foot[0] + t * (corner[0] - foot[0]), t * height, foot[1] + t * (corner[1] - foot[1])])
 
     front, back = tuple(corners)
-    stretchers = pick(rng, {"none": 3, "H": 1, "box": 1, "sides": 0.7, "X": 0.4, "shelf": 0.0})
+    stretchers = pick(rng, {"none": 3, "H": 1, "box": 1, "sides": 0.7, "X": 0.4})
     t, thick = rng.uniform(0.15, 0.5), 0.55 * size
     flip = np.array([-1.0, 1.0, 1.0])
+    if shelf:
+        stretchers = "none"
+        (x, y, z), rear_z = at(front, t), at(back, t)[2]
+        board = slab(rectangle(2 * x, z - rear_z, 0.01, 1), 0.02)
+        solids.append(board.moved(y=y, z=(z + rear_z) / 2))
     if stretchers in ("H", "box", "sides"):
         solids += both_sides(bar(at(front, t), at(back, t), thick))
     if stretchers == "H":
@@ -212,7 +218,8 @@ def loops(rng: np.random.Generator, half_x: float, half_z: float, height: float)
     low, high = size / 2, height - 0.3 * size
     rear = half_z + rng.uniform(-0.3, 0.5) * lean
     corners = [
-        (half_x * spread, low, half_z + lean / 2), (half_x, high, half_z), (half_x, high, -half_z), (half_x * spread, low, -rear)
+        (half_x * spread, low, half_z + lean / 2), (half_x, high, half_z),
+        (half_x, high, -half_z), (half_x * spread, low, -rear),
     ]  # fmt: skip
     section = rectangle(1.5 * size, size, segments=1) if flat else ellipse(size, size, 8)
     bend = 0.012 if flat else rng.uniform(0.02, 0.09)

@@ -1,4 +1,4 @@
-"""Procedural tables, in metres: a top of many outlines on legs, pedestals, trestles or frames; plus whole-body families."""
+"""Procedural tables, in metres: tops of many outlines on legs, pedestals, trestles or frames; and one-piece tables."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _outline(
     if kind == "rounded":
         return rectangle(length, width, rng.uniform(0.1, 0.45) * width, 4), length, width, 0.85
     if kind == "super":
-        return ellipse(length, width, 32, rng.uniform(2.6, 5.0)), length, width, 0.8
+        return ellipse(length, width, 32, rng.uniform(2.6, 5.0)), length, width, 0.74
     if kind == "polygon":
         count = int(pick(rng, (6, 8, 8, 12)))
         return ellipse(length, length, count), length, length, 0.62
@@ -88,7 +88,7 @@ def _outline(
     if kind == "half":
         angle = np.linspace(0, np.pi, 20)
         outline = np.stack([length / 2 * np.cos(angle), width * np.sin(angle) ** 0.8 - width / 2], 1)
-        return outline, length, width, 0.66
+        return outline, length, width, 0.6
     return ellipse(length, width, 32), length, width, 0.64
 
 
@@ -105,7 +105,7 @@ def _legs(rng: np.random.Generator, half_x: float, half_z: float, under: float) 
     """Four legs at the corners, perhaps with an apron of drawers and a lower shelf."""
     size = rng.uniform(0.035, 0.11) * (0.5 + 0.7 * half_x)
     inset_x, inset_z = half_x - 0.6 * size - 0.01, half_z - 0.6 * size - 0.01
-    solids = supports.four_legs(rng, inset_x, inset_z, under, size)
+    solids = supports.four_legs(rng, inset_x, inset_z, under, size, shelf=maybe(rng, 0.3))
     if maybe(rng, 0.5):
         depth = rng.uniform(0.05, 0.16)
         solids += supports.apron(inset_x, inset_z, under, depth, 0.4 * size)
@@ -119,10 +119,6 @@ def _legs(rng: np.random.Generator, half_x: float, half_z: float, under: float) 
                     between((x - half, under - depth + 0.015, front - 0.01), (x + half, under - 0.015, front + 0.012))
                 )
                 solids.append(bar((x, under - depth / 2, front), (x, under - depth / 2, front + 0.03), 0.02))
-    if maybe(rng, 0.3):
-        y = rng.uniform(0.12, 0.4) * under
-        outline = rectangle(2 * inset_x + 0.5 * size, 2 * inset_z + 0.5 * size, 0.01, 1)
-        solids.append(slab(outline, 0.02).moved(y=y))
     return solids
 
 

@@ -93,7 +93,8 @@ def bent_table(rng: np.random.Generator) -> list[Solid]:
         level = rng.uniform(0.25, 0.65) * height
         reach = half + lean * (1 - level / height)
         solids.append(between((-reach, level, -0.45 * width), (reach, level + 0.02, 0.45 * width)))
-    return [*solids, between((-0.4 * half, y - t / 2 - 0.02, -0.3 * width), (0.4 * half, y - 0.2 * t, 0.3 * width))]
+    brace = between((-0.4 * half, height - t - 0.02, -0.3 * width), (0.4 * half, height - 0.7 * t, 0.3 * width))
+    return [*solids, brace.moved(y=t / 2 if closed else 0.0)]
 
 
 def drum_table(rng: np.random.Generator) -> list[Solid]:

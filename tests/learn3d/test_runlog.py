@@ -1,0 +1,68 @@
+"""What a run prints and records."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import numpy as np
+import pytest
+
+from learn3d.runlog import RunLog, read_metrics
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_terminal_shows_a_bar_with_losses_and_time_left(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    with RunLog(tmp_path, start=0, total=10) as log:
+        for step in range(1, 6):
+            log.step(step, {"projection": 0.25})
+        log._bar.refresh()
+        log.say("half way")
+    shown = terminal.getvalue()
+    assert "5/10" in shown
+    assert "projec 0.25" in shown
+    assert "half way" in shown
+
+
+def test_elsewhere_it_prints_few_lines(tmp_path, capsys) -> None:
+    with RunLog(tmp_path, start=4, total=100) as log:
+        for step in range(5, 101):
+            log.step(step, {"projection": 0.25})
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("step 5/100  projec 0.25")
+    assert lines[1].startswith("step 100/100")
+    assert lines[1].endswith("0:00:00 left")
+
+
+def test_metrics_can_be_read_back_and_later_ones_are_forgotten(tmp_path) -> None:
+    for start in (0, 1):
+        with RunLog(tmp_path, start=start, total=9) as log:
+            log.metrics(start + 1, "train", {"total": 0.5 + start})
+            log.metrics(start + 2, "val", {"voxel_iou": 0.25})
+            log.picture(start + 2, "val", np.zeros((4, 4, 3), np.uint8))
+    assert [(m["step"], m["split"]) for m in read_metrics(tmp_path)] == [(1, "train"), (2, "train"), (3, "val")]
+    assert read_metrics(tmp_path)[1]["total"] == 1.5
+
+
+def test_without_tensorboard_the_metrics_file_remains(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with RunLog(tmp_path, start=0, total=1) as log:
+        log.metrics(1, "train", {"total": 1.0})
+        log.picture(1, "val", np.zeros((4, 4, 3), np.uint8))
+    assert "tensorboard is not installed" in capsys.readouterr().err
+    assert read_metrics(tmp_path) == [{"step": 1, "split": "train", "total": 1.0}]
+    assert read_metrics(tmp_path / "nowhere") == []
+
+
+@pytest.mark.parametrize("line", ['{"step": 1, "spl', "{}", ""])
+def test_damaged_lines_are_dropped(tmp_path, line: str) -> None:
+    (tmp_path / "metrics.jsonl").write_text('{"step": 1, "split": "train"}\n' + line)
+    with RunLog(tmp_path, start=1, total=2):
+        pass
+    assert read_metrics(tmp_path) == [{"step": 1, "split": "train"}]

@@ -1,0 +1,39 @@
+# Sourced by quickstart.sh and test.sh: checks the machine, makes a virtual environment in .venv and installs the package.
+# Usage: . tools/setup.sh; setup EXTRA      afterwards $python is the environment's interpreter and the folder is the repository's.
+
+fail() {
+    printf 'error: %s\n' "$*" >&2
+    exit 1
+}
+
+step() {
+    printf '\n== %s\n' "$*"
+}
+
+check_machine() { # gigabytes of free disk wanted
+    base=${PYTHON:-python3}
+    command -v "$base" >/dev/null || fail "no $base found; install Python 3.10 or newer, or set PYTHON to its path"
+    "$base" -c 'import sys; sys.exit(sys.version_info < (3, 10))' ||
+        fail "Python 3.10 or newer is needed, $base is $("$base" --version 2>&1); set PYTHON to a newer one"
+    "$base" -c 'import venv, ensurepip' 2>/dev/null ||
+        fail "$base cannot make virtual environments; install its venv package (on Debian: apt-get install python3-venv)"
+    compiler=${CXX:-c++}
+    command -v "$compiler" >/dev/null || command -v g++ >/dev/null ||
+        fail "no C++ compiler found; install one (on Debian: apt-get install g++), or set CXX to its path"
+    [ -w . ] || fail "cannot write to $PWD; clone the repository to a folder of your own"
+    free=$(df -Pk . | awk 'NR == 2 {print int($4 / 1048576)}')
+    [ "$free" -ge "$1" ] || fail "only $free GB free on the disk of $PWD, $1 GB are needed; free some space"
+}
+
+setup() { # extra of the package: train or test
+    check_machine 4
+    python=$PWD/.venv/bin/python
+    if ! "$python" -c '' 2>/dev/null; then
+        step "Making a virtual environment in .venv"
+        "$base" -m venv --clear .venv || fail "could not make a virtual environment in $PWD/.venv"
+    fi
+    step "Installing the package and compiling the renderer (torch takes most of the time)"
+    "$python" -m pip install --quiet --disable-pip-version-check --constraint constraints.txt ".[$1]" ||
+        fail "the installation failed; the messages above say why (no network, no compiler, no disk space?)"
+    "$python" -P -c 'import nmr' || fail "the package was installed but cannot be imported"
+}
