@@ -11,8 +11,8 @@ _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # <malloc.h>
 def keep_freed_memory() -> bool:
     """Let this process reuse freed memory instead of returning it; True where that could be set (Linux with glibc).
 
-    Every large tensor is otherwise mapped, page by page, and unmapped again in each step: a quarter of the step's CPU time at
-    batch 128 (LOG.md). Resident memory stays at its peak.
+    Every large tensor is otherwise mapped, page by page, and unmapped again in each step: a quarter of the step's CPU
+    time at batch 128 (LOG.md). Resident memory stays at its peak.
     """
     if sys.platform != "linux":
         return False

@@ -8,8 +8,9 @@ voxelize            meshes -> filled occupancy grids (kato18, the published voxe
 LookAt, Camera      cameras: world space -> renderer space
 icosphere, edge_table, losses   meshes to deform, and what to minimise
 
-Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]``; in renderer space x points right, y up, both in
-[-1, 1] across the image, and z is the depth in front of the camera. Images are ``[B, S, S]`` with row 0 at the top.
+Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]``; in renderer space x points right, y
+up, both in [-1, 1] across the image, and z is the depth in front of the camera. Images are ``[B, S, S]`` with row 0
+at the top.
 """
 
 import torch as _torch  # noqa: F401  torch first: the extension then shares torch's OpenMP runtime

@@ -18,7 +18,9 @@ def describe(value: object) -> str:
 def check_vertices(vertices: object) -> Tensor:
     """``vertices`` as ``[B, V, 3]`` float32 or float64."""
     if not isinstance(vertices, Tensor):
-        raise TypeError(f"vertices must be a float tensor [B, V, 3] or [V, 3], got {describe(vertices)}; use torch.as_tensor()")
+        raise TypeError(
+            f"vertices must be a float tensor [B, V, 3] or [V, 3], got {describe(vertices)}; use torch.as_tensor()"
+        )
     if vertices.ndim not in (2, 3) or vertices.shape[-1] != 3:
         raise ValueError(f"vertices must have shape [B, V, 3] or [V, 3], got {describe(vertices)}")
     if vertices.dtype not in (torch.float32, torch.float64):
@@ -29,9 +31,13 @@ def check_vertices(vertices: object) -> Tensor:
 def check_faces(faces: object, batch: int, device: torch.device) -> Tensor:
     """``faces`` as int64 ``[F, 3]`` or ``[B, F, 3]`` on ``device``; their indices are checked by the kernels."""
     if not isinstance(faces, Tensor):
-        raise TypeError(f"faces must be an integer tensor [F, 3] or [B, F, 3], got {describe(faces)}; use torch.as_tensor()")
+        raise TypeError(
+            f"faces must be an integer tensor [F, 3] or [B, F, 3], got {describe(faces)}; use torch.as_tensor()"
+        )
     if faces.dtype not in _INTEGERS:
-        raise TypeError(f"faces must be an integer tensor [F, 3] or [B, F, 3], got {describe(faces)}; call faces.long()")
+        raise TypeError(
+            f"faces must be an integer tensor [F, 3] or [B, F, 3], got {describe(faces)}; call faces.long()"
+        )
     if faces.ndim not in (2, 3) or faces.shape[-1] != 3:
         raise ValueError(f"faces must have shape [F, 3] or [B, F, 3], got {describe(faces)}")
     if faces.ndim == 3 and faces.shape[0] != batch:

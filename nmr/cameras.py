@@ -18,7 +18,7 @@ class Camera(Protocol):
     """Anything that takes vertices into renderer space, differentiably."""
 
     def transform(self, vertices: Tensor) -> Tensor:
-        """``[B, V, 3]`` world coordinates to ``[B, V, 3]`` renderer coordinates; B of 1 may grow to the camera's batch."""
+        """``[B, V, 3]`` world to ``[B, V, 3]`` renderer coordinates; B of 1 may grow to the camera's batch."""
         ...
 
 
@@ -45,10 +45,10 @@ def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: S
 class LookAt:
     """A perspective camera at ``eye`` that looks at ``at``.
 
-    ``eye``, ``at``, ``up``: ``[3]`` or ``[B, 3]`` (tensors or sequences, world units); ``half_fov_deg``: half of the field of
-    view, in degrees, horizontal = vertical (the published renderer's ``viewing_angle``). A vertex v maps to
-    ``u = R (v - eye)`` with rows of R ``x = norm(up x z), y = norm(z x x), z = norm(at - eye)``, then to
-    ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``. Gradients reach tensors given as eye, at or up.
+    ``eye``, ``at``, ``up``: ``[3]`` or ``[B, 3]`` (tensors or sequences, world units); ``half_fov_deg``: half of the
+    field of view, in degrees, horizontal = vertical (the published renderer's ``viewing_angle``). A vertex v maps to
+    ``u = R (v - eye)`` with rows of R ``x = norm(up x z), y = norm(z x x), z = norm(at - eye)``, then to ``(u_x /
+    (u_z tan a), u_y / (u_z tan a), u_z)``. Gradients reach tensors given as eye, at or up.
 
     Raises
     ------
@@ -82,7 +82,9 @@ class LookAt:
         """``vertices [B, V, 3]`` (or ``[V, 3]``) to renderer space, ``[B, V, 3]``, in the dtype of ``vertices``."""
         if vertices.ndim == 2:
             vertices = vertices.unsqueeze(0)
-        eye, at, up = (x.to(vertices).expand(1, 3) if x.ndim == 1 else x.to(vertices) for x in (self.eye, self.at, self.up))
+        eye, at, up = (
+            x.to(vertices).expand(1, 3) if x.ndim == 1 else x.to(vertices) for x in (self.eye, self.at, self.up)
+        )
         sizes = {vertices.shape[0], eye.shape[0], at.shape[0], up.shape[0]} - {1}
         if len(sizes) > 1:
             raise ValueError(

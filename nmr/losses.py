@@ -18,8 +18,8 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     Returns
     -------
     scalar Tensor
-        0 where all pairs agree and are binary. A pair that is empty on both sides counts as agreement (the published code
-        returns NaN); its gradient is 0.
+        0 where all pairs agree and are binary. A pair that is empty on both sides counts as agreement (the published
+        code returns NaN); its gradient is 0.
 
     Raises
     ------
@@ -27,7 +27,9 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
         If the shapes differ.
     """
     if prediction.shape != target.shape:
-        raise ValueError(f"prediction and target must have one shape, got {describe(prediction)} and {describe(target)}")
+        raise ValueError(
+            f"prediction and target must have one shape, got {describe(prediction)} and {describe(target)}"
+        )
     prediction, target = prediction.flatten(1), target.flatten(1)
     product = prediction * target
     intersection = product.sum(1)
@@ -37,7 +39,9 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def smoothness_loss(vertices: Tensor, edges: Tensor) -> Tensor:
-    """How far neighbouring faces are from flat: mean over meshes of ``sum over edges (1 + cos(theta_e))^2`` (Kato et al. 2018).
+    """How far neighbouring faces are from flat: mean over meshes of ``sum over edges (1 + cos(theta_e))^2``.
+
+    The form is that of Kato et al. 2018.
 
     theta_e is the angle between the two faces at edge e: pi (cos = -1) when flat. With a = v1 - v0 along the edge and
     b = v_k - v0 to an opposite corner, each face has the height h = b - a (a.b) / (|a|^2 + e) of length

@@ -57,8 +57,8 @@ def edge_table(faces: Tensor) -> Tensor:
     Returns
     -------
     int64 Tensor [E, 4]
-        Row ``(v0, v1, v2, v3)``: the edge's vertices with v0 < v1, then the opposite corners of its two faces (in face order).
-        Rows are sorted by (v0, v1).
+        Row ``(v0, v1, v2, v3)``: the edge's vertices with v0 < v1, then the opposite corners of its two faces (in
+        face order). Rows are sorted by (v0, v1).
 
     Raises
     ------
@@ -81,7 +81,8 @@ def edge_table(faces: Tensor) -> Tensor:
         v0, v1 = edges[bad[0]].tolist()
         raise ValueError(
             f"every edge must have exactly two faces (a closed mesh), but {len(bad)} of {len(edges)} have not: "
-            f"edge ({v0}, {v1}) has {int(counts[bad[0]])}; close the mesh first (for example with trimesh.repair.fill_holes)"
+            f"edge ({v0}, {v1}) has {int(counts[bad[0]])}; "
+            "close the mesh first (for example with trimesh.repair.fill_holes)"
         )
     order = torch.argsort(edge_of_side, stable=True)
     return torch.cat([edges, opposite[order].view(-1, 2)], dim=1)

@@ -1,7 +1,7 @@
 """The torch operators behind the public functions: forward, fake, set-up and backward of each stand together.
 
-The kernels take NumPy views of the tensors (zero-copy on the CPU). Tensors of other devices are staged through the host and the
-results go back to the device. Arguments are trusted here; the public functions validate.
+The kernels take NumPy views of the tensors (zero-copy on the CPU). Tensors of other devices are staged through the
+host and the results go back to the device. Arguments are trusted here; the public functions validate.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ def _host_array(tensor: Tensor):
     return tensor.detach().cpu().contiguous().numpy()
 
 
-# --- silhouette ------------------------------------------------------------------------------------------------------------
+# --- silhouette
 
 
 @torch.library.custom_op("nmr::silhouette", mutates_args=())
@@ -32,8 +32,8 @@ def silhouette(
 ) -> tuple[Tensor, Tensor]:
     """Silhouettes and index maps of meshes in renderer space.
 
-    Returns ``alpha [B, S, S]`` (row 0 = top) and ``face_index`` int32 ``[B, R, R]`` at raster resolution (row 0 = bottom,
-    -1 = background, ``F + f`` = reversed copy of face f).
+    Returns ``alpha [B, S, S]`` (row 0 = top) and ``face_index`` int32 ``[B, R, R]`` at raster resolution (row 0 =
+    bottom, -1 = background, ``F + f`` = reversed copy of face f).
     """
     batch, raster_size = vertices.shape[0], image_size * (2 if anti_aliasing else 1)
     alpha = torch.empty((batch, image_size, image_size), dtype=vertices.dtype)
@@ -108,7 +108,7 @@ def _(vertices, faces, face_index, grad_alpha, image_size, anti_aliasing, eps):
     return vertices.new_empty(vertices.shape)
 
 
-# --- smoothness ------------------------------------------------------------------------------------------------------------
+# --- smoothness
 
 
 @torch.library.custom_op("nmr::smoothness", mutates_args=())
@@ -154,7 +154,7 @@ def _(vertices, edges, grad_loss):
     return vertices.new_empty(vertices.shape)
 
 
-# --- no second derivatives -------------------------------------------------------------------------------------------------
+# --- no second derivatives
 
 
 def _no_second_derivative(name):
@@ -171,7 +171,7 @@ silhouette_backward.register_autograd(_no_second_derivative("render_silhouette")
 smoothness_backward.register_autograd(_no_second_derivative("smoothness_loss"))
 
 
-# --- voxels ----------------------------------------------------------------------------------------------------------------
+# --- voxels
 
 
 @torch.library.custom_op("nmr::voxels", mutates_args=())

@@ -1,7 +1,7 @@
 """The renderer's definition in plain torch: slow and clear, for tests and for reading. One image, no shortcuts.
 
-Every face is tested against every pixel, every sweep visits every pixel of its line, and ``fill_back`` really appends the reversed
-faces, as the published kernels do. Works in the dtype of its input.
+Every face is tested against every pixel, every sweep visits every pixel of its line, and ``fill_back`` really appends
+the reversed faces, as the published kernels do. Works in the dtype of its input.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def _cross(p: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 def face_index(
     vertices: Tensor, faces: Tensor, raster_size: int, fill_back: bool = True, near: float = 0.1, far: float = 100.0
 ) -> Tensor:
-    """Index map ``[R, R]`` of one mesh ``[V, 3]``, ``[F, 3]``: row 0 = bottom, -1 = background, F + f = back copy of f."""
+    """Index map ``[R, R]`` of one mesh: row 0 = bottom, -1 = background, F + f = back copy of face f."""
     R = raster_size
     column = torch.arange(R)
     centre = (2 * column + 1 - R).to(vertices) / R
@@ -75,7 +75,7 @@ def silhouette_gradient(
     fill_back: bool = True,
     eps: float = 1e-4,
 ) -> Tensor:
-    """NMR's gradient ``[V, 3]`` of one image, given its index map ``[R, R]`` and the gradient ``[S, S]`` of its alpha."""
+    """NMR's gradient ``[V, 3]`` of one image, from its index map ``[R, R]`` and the gradient ``[S, S]`` of alpha."""
     R = index.shape[0]
     grad = grad_alpha
     if anti_aliasing:

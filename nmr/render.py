@@ -16,7 +16,9 @@ def _to_renderer_space(vertices: Tensor, faces: Tensor, camera: Camera | None) -
     vertices = check_vertices(vertices)
     if camera is not None:
         if not isinstance(camera, Camera):
-            raise TypeError(f"camera must have a method transform(vertices), as nmr.LookAt does, got {describe(camera)}")
+            raise TypeError(
+                f"camera must have a method transform(vertices), as nmr.LookAt does, got {describe(camera)}"
+            )
         vertices = check_vertices(camera.transform(vertices))
     return vertices, check_faces(faces, vertices.shape[0], vertices.device)
 
@@ -38,8 +40,8 @@ def render_silhouette(
     Parameters
     ----------
     vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
-        Without a camera in renderer space: x right, y up, both in [-1, 1] across the image, z = depth. With one, in the space
-        that the camera transforms from. One mesh and a camera with B poses give B images.
+        Without a camera in renderer space: x right, y up, both in [-1, 1] across the image, z = depth. With one, in
+        the space that the camera transforms from. One mesh and a camera with B poses give B images.
     faces : integer Tensor [F, 3], or [B, F, 3]
         Vertex indices; counter-clockwise on the screen is the front.
     camera : Camera, optional
@@ -61,12 +63,11 @@ def render_silhouette(
         ``alpha[b, y, x]`` is the covered share (0, 1/4, ... 1 with anti-aliasing) of the pixel in row y from the top.
 
     Notes
-    -----
-    Differentiable in x and y of ``vertices`` (and through the camera); z in renderer space gets 0. The gradient is defined,
-    not derived (Kato et al. 2018, section 3): every raster line that crosses an edge of a visible face lets each pixel m
-    whose change would lower the loss by D pull the edge's two vertices with D / (travel that brings the edge to m). The values
-    equal those of the published kernels in float32; ``docs/conventions.md`` lists the departures. Results do not
-    depend on the number of threads or on the batch size. There are no second derivatives.
+    ----- Differentiable in x and y of ``vertices`` (and through the camera); z in renderer space gets 0. The gradient
+    is defined, not derived (Kato et al. 2018, section 3): every raster line that crosses an edge of a visible face
+    lets each pixel m whose change would lower the loss by D pull the edge's two vertices with D / (travel that brings
+    the edge to m). The values equal those of the published kernels in float32; ``docs/conventions.md`` lists the
+    departures. Results do not depend on the number of threads or on the batch size. There are no second derivatives.
 
     Raises
     ------
@@ -107,8 +108,8 @@ def render_face_index(
     Returns
     -------
     int32 Tensor [B, S, S]
-        ``face_index[b, y, x] = f`` means face f is nearest there (seen from either side); -1 is background. Row 0 = top. Of
-        equally near faces the first wins. Not differentiable.
+        ``face_index[b, y, x] = f`` means face f is nearest there (seen from either side); -1 is background. Row 0 =
+        top. Of equally near faces the first wins. Not differentiable.
 
     Raises
     ------

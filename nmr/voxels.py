@@ -13,9 +13,9 @@ from ._validate import check_faces, check_size, check_vertices
 def voxelize(vertices: Tensor, faces: Tensor, size: int = 32, normalize: bool = False) -> Tensor:
     """Filled occupancy grids, in the definition behind the published voxel IoU figures ("kato18").
 
-    A cell is on the surface if a ray along an axis through one of its four corner lines (integer coordinates) meets a face in
-    it, or if it holds a vertex; it is occupied if it cannot be reached from the border of the grid through 6-connected
-    cells that are not on the surface. A shape that leaves the grid is open, hence hollow.
+    A cell is on the surface if a ray along an axis through one of its four corner lines (integer coordinates) meets a
+    face in it, or if it holds a vertex; it is occupied if it cannot be reached from the border of the grid through
+    6-connected cells that are not on the surface. A shape that leaves the grid is open, hence hollow.
 
     Parameters
     ----------

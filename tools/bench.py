@@ -1,6 +1,6 @@
-"""Measure the renderer and the voxeliser, beside other programs in the same run; speeds are only comparable within one run.
+"""Measure the renderer and the voxeliser, beside other programs in the same run (compare within one run only).
 
-    python tools/bench.py w1            64 spheres, 64x64 anti-aliased, forward + backward; deodr if installed; the slow definition
+    python tools/bench.py w1            64 spheres, 64x64 anti-aliased; also deodr, and the slow definition
     python tools/bench.py w2            one mesh of 81,920 faces, 512x512
     python tools/bench.py w3            one mesh of 1,280 faces, 1024x1024
     python tools/bench.py voxels        voxel IoU of 1000 predictions
@@ -43,7 +43,7 @@ class Workload:
 
 
 def deformed_spheres(batch: int, subdivisions: int, size: int, anti_aliasing: bool) -> Workload:
-    """Icospheres with random axis scales 0.4..1.2 and noise 0.03, times 0.5; distance 2.732, elevation 30, half fov 15."""
+    """Icospheres, axes scaled by 0.4..1.2, noise 0.03, times 0.5; distance 2.732, elevation 30, half fov 15."""
     g = torch.Generator().manual_seed(0)
     sphere, faces = nmr.icosphere(subdivisions)
     scale = 0.4 + 0.8 * torch.rand(batch, 1, 3, generator=g)
@@ -69,7 +69,7 @@ def target_images(workload: Workload) -> Tensor:
     )
 
 
-# --- the programs: each takes a workload and its targets, and returns (seconds forward, seconds in all) ---------------------
+# --- the programs: each takes a workload and its targets, and returns (seconds forward, seconds in all)
 
 
 def run_ours(workload: Workload, target: Tensor) -> tuple[float, float]:
@@ -195,7 +195,7 @@ class DeodrTwoProcesses:
             process.join()
 
 
-# --- running and reporting -------------------------------------------------------------------------------------------------
+# --- running and reporting
 
 
 def measure(programs: dict[str, Callable[[], tuple[float, float]]], repeats: int) -> list[dict]:

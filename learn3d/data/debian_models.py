@@ -137,7 +137,8 @@ def _write_all(config: FetchConfig, folder: Path, downloads: Path) -> Report:
         wanted.append((AIRCRAFT_PACKAGE, aircraft))
     found = []
     notes = []
-    for name, reader in tqdm(wanted, desc="finding packages", unit="package", disable=not config.progress, leave=False):
+    what = "downloading packages" if config.packages_dir is None and config.root is None else "finding packages"
+    for name, reader in tqdm(wanted, desc=what, unit="package", disable=not config.progress, leave=False):
         try:
             found.append((_locate(name, config, downloads), reader))
         except packages.PackageMissing as missing:

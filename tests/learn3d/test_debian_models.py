@@ -65,13 +65,18 @@ CHAIR = obj_text(((0, 4, 0), (4, 5, 4)), ((0, 5, 0), (4, 10, 0.5)), ((0, 0, 0), 
 TABLE = obj_text(((0, 4, 0), (8, 5, 5)), ((3, 0, 2), (5, 4, 3)))
 
 
-def deb(folder: Path, name: str, files: dict[str, bytes], version: str = "1%3a2.0-1") -> Path:
+def deb(folder: Path, name: str, files: dict[str, bytes | None], version: str = "1%3a2.0-1") -> Path:
+    """A package of these files; None makes a symbolic link that leads out of it."""
     data = io.BytesIO()
     with tarfile.open(fileobj=data, mode="w:xz") as tar:
         for path, content in files.items():
             info = tarfile.TarInfo(path)
-            info.size = len(content)
-            tar.addfile(info, io.BytesIO(content))
+            if content is None:
+                info.type, info.linkname = tarfile.SYMTYPE, "/etc/hostname"
+                tar.addfile(info)
+            else:
+                info.size = len(content)
+                tar.addfile(info, io.BytesIO(content))
     folder.mkdir(exist_ok=True)
     file = folder / f"{name}_{version}_all.deb"
     with file.open("wb") as out:
@@ -126,7 +131,8 @@ def debs(tmp_path: Path) -> Path:
         "Plane/Models/lights/RedLight.ac": ac_text(AIRPLANE[0]),
         "balloon/Models/balloon1.ac": ac_text(AIRPLANE[0]),
     }
-    deb(folder, "flightgear-data-ai", {f"./{AIRCRAFT}/{path}": text.encode() for path, text in aircraft.items()})
+    files: dict[str, bytes | None] = {f"./{AIRCRAFT}/{path}": text.encode() for path, text in aircraft.items()}
+    deb(folder, "flightgear-data-ai", {**files, f"./{AIRCRAFT}/Plane/Models/link.ac": None})
     return folder
 
 
@@ -206,7 +212,9 @@ def test_installed_packages_are_read_below_root(tmp_path: Path):
         "Package: other\nVersion: 9\n\nPackage: flightgear-data-ai\nVersion: 1:7-1\n"
     )
     config = FetchConfig(tmp_path / "out", ("airplane",), root=root, progress=False)
-    (model,) = fetch_debian_models(config).models
+    report = fetch_debian_models(config)
+    (model,) = report.models
+    assert not report.dropped  # the symbolic link was not followed, so there is no duplicate
     assert (model.version, model.source) == ("1:7-1", path)
     with pytest.raises(ValueError, match="sweethome3d-furniture is not installed below"):
         fetch_debian_models(FetchConfig(tmp_path / "out2", root=root, progress=False))

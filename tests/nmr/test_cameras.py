@@ -27,8 +27,12 @@ def test_axes_from_azimuth_zero():
 
 
 def test_points_from_angles():
-    torch.testing.assert_close(points_from_angles(2.0, 0.0, 90.0).float(), torch.tensor([2.0, 0.0, 0.0]), atol=1e-6, rtol=0)
-    torch.testing.assert_close(points_from_angles(2.0, 90.0, 0.0).float(), torch.tensor([0.0, 2.0, 0.0]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        points_from_angles(2.0, 0.0, 90.0).float(), torch.tensor([2.0, 0.0, 0.0]), atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(
+        points_from_angles(2.0, 90.0, 0.0).float(), torch.tensor([0.0, 2.0, 0.0]), atol=1e-6, rtol=0
+    )
     assert points_from_angles([1.0, 2.0], 30.0, torch.tensor([0.0, 10.0])).shape == (2, 3)
 
 
@@ -38,7 +42,9 @@ def test_published_training_render():
     eye = torch.from_numpy(np.atleast_1d(v["param_eye"]))
     vertices = torch.from_numpy(v["vertices"]).requires_grad_()
     camera = nmr.LookAt(eye, half_fov_deg=float(v["renderer_viewing_angle"]))
-    alpha = nmr.render_silhouette(vertices, torch.from_numpy(v["faces"]), camera, image_size=int(v["renderer_image_size"]))
+    alpha = nmr.render_silhouette(
+        vertices, torch.from_numpy(v["faces"]), camera, image_size=int(v["renderer_image_size"])
+    )
     image = next(k for k in v if k.startswith("out_"))
     alpha.backward(torch.from_numpy(v[image.replace("out_", "upstream_")]))
     assert np.array_equal(alpha.detach().numpy(), v[image])

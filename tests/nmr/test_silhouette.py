@@ -28,7 +28,9 @@ def bumpy_spheres(batch=4, seed=0):
     """Deformed icospheres and a camera that sees each from another side."""
     g = torch.Generator().manual_seed(seed)
     vertices, faces = nmr.icosphere(3)
-    vertices = 0.4 * vertices * (0.5 + torch.rand(batch, 1, 3, generator=g)) + 0.01 * torch.randn(batch, 642, 3, generator=g)
+    vertices = 0.4 * vertices * (0.5 + torch.rand(batch, 1, 3, generator=g)) + 0.01 * torch.randn(
+        batch, 642, 3, generator=g
+    )
     camera = nmr.LookAt.from_angles(2.732, 30.0, torch.arange(batch) * 37.0, half_fov_deg=15.0)
     return vertices, faces, camera
 
@@ -182,9 +184,26 @@ def test_one_openmp_runtime():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-# --- bad input -------------------------------------------------------------------------------------------------------------
+# --- bad input
 
-NASTY = [0.0, -0.0, 1.0, -1.0, 0.5, 1e-45, 1e-30, 1e30, -1e30, 3.4e38, -3.4e38, np.inf, -np.inf, np.nan, 1e-7, 0.9999999]
+NASTY = [
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    0.5,
+    1e-45,
+    1e-30,
+    1e30,
+    -1e30,
+    3.4e38,
+    -3.4e38,
+    np.inf,
+    -np.inf,
+    np.nan,
+    1e-7,
+    0.9999999,
+]
 
 
 @st.composite

@@ -1,4 +1,4 @@
-"""The reference vectors: silhouettes, their gradients and voxels of the published kernels, evaluated in plain float32."""
+"""The reference vectors: silhouettes and their gradients by the published kernels, evaluated in plain float32."""
 
 import numpy as np
 import pytest

@@ -42,7 +42,8 @@ def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
     -------
     trimesh.Trimesh
         Closed components, each watertight and oriented outwards, that overlap where the parts of the object are
-        joined; about 200 to 6000 faces. Box centred at the origin, longest side 1; y up, front towards +z.
+        joined; 150 to 8000 faces, mostly 1000 to 5000. Box centred at the origin, longest side 1; y up, front
+        towards +z.
 
     Raises
     ------
