@@ -106,7 +106,7 @@ struct Lever {
   T crossing;         // c
   T factor_p;         // (Qs - Ps) / (Qs - n): travel of P that moves the crossing by one
   T factor_q;         // (Qs - Ps) / (n - Ps)
-  bool p_acts, q_acts;  // false where the line passes through the other end
+  bool p_acts, q_acts;  // false where the line passes through the other end, or the factor overflows
   T raster_size, eps;
 };
 
@@ -114,14 +114,7 @@ struct Lever {
 template <class T, bool kPowerOfTwo>
 NMR_INLINE T travel(T factor, T offset, const Lever<T>& lever) {
   const T h = kPowerOfTwo ? factor * offset * (2 / lever.raster_size) : factor * offset * 2 / lever.raster_size;
-  return h > 0 ? h + lever.eps : h - lever.eps;
-}
-
-// The gradient pulled on an end by a pixel; 0 where the travel is undefined (coordinates near overflow).
-template <class T>
-NMR_INLINE T pull(T weight, T h) {
-  const T p = weight / h;
-  return p == p ? p : T(0);
+  return h + (h > 0 ? lever.eps : -lever.eps);
 }
 
 // Adds the pulls of listed pixels [first, last), one after the other: the order of summation is fixed.
@@ -132,8 +125,8 @@ NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, c
     T pull_p[kLanes], pull_q[kLanes];
     for (int32_t k = 0; k < kLanes; ++k) {
       const T offset = position[start + k] - lever.crossing;
-      pull_p[k] = pull(weight[start + k], travel<T, kPowerOfTwo>(lever.factor_p, offset, lever));
-      pull_q[k] = pull(weight[start + k], travel<T, kPowerOfTwo>(lever.factor_q, offset, lever));
+      pull_p[k] = weight[start + k] / travel<T, kPowerOfTwo>(lever.factor_p, offset, lever);
+      pull_q[k] = weight[start + k] / travel<T, kPowerOfTwo>(lever.factor_q, offset, lever);
     }
     const int32_t lanes = std::min<int32_t>(kLanes, count - start);
     for (int32_t k = 0; k < lanes; ++k) {
@@ -192,10 +185,10 @@ NMR_INLINE void sweep_edge(const SweepImage<T>& image, int axis, int32_t id, T p
     const bool out_is_background = index[out * step_t] < 0;
     if (!owns_in && !out_is_background) continue;
 
-    lever.p_acts = qs != line;
-    lever.q_acts = ps != line;
     lever.factor_p = (qs - ps) / (qs - line);
     lever.factor_q = (qs - ps) / (line - ps);
+    lever.p_acts = std::isfinite(lever.factor_p);
+    lever.q_acts = std::isfinite(lever.factor_q);
     lever.raster_size = static_cast<T>(R);
     lever.eps = image.eps;
 
@@ -219,8 +212,8 @@ NMR_INLINE void sweep_edge(const SweepImage<T>& image, int axis, int32_t id, T p
         const T g = axis == 0 ? image.grad(n, m) : image.grad(m, n);
         if (!(g > 0)) continue;
         const T offset = static_cast<T>(m) - lever.crossing;
-        if (lever.p_acts) grad_p -= pull(g, travel<T, kPowerOfTwo>(lever.factor_p, offset, lever));
-        if (lever.q_acts) grad_q -= pull(g, travel<T, kPowerOfTwo>(lever.factor_q, offset, lever));
+        if (lever.p_acts) grad_p -= g / travel<T, kPowerOfTwo>(lever.factor_p, offset, lever);
+        if (lever.q_acts) grad_q -= g / travel<T, kPowerOfTwo>(lever.factor_q, offset, lever);
       }
     }
   }

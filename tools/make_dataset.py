@@ -1,8 +1,8 @@
 """Make a data set in Kato's layout from a folder of meshes, a mesh pack or the procedural generator.
 
 Examples:
-  python tools/make_dataset.py --out data --category chair --source my_chairs --augment 5
-  python tools/make_dataset.py --out data --category airplane --procedural 300
+  python tools/make_dataset.py --output data --category chair --source my_chairs --augment 5
+  python tools/make_dataset.py --output data --category airplane --procedural 300
 """
 
 import sys

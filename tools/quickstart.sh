@@ -16,7 +16,7 @@ setup train
 mkdir -p "$out" || fail "cannot make the folder $out"
 
 step "Making $objects ${category}s, each rendered from 24 views"
-"$python" tools/make_dataset.py --out "$out/data" --category "$category" --procedural "$objects" --overwrite
+"$python" tools/make_dataset.py --output "$out/data" --category "$category" --procedural "$objects" --overwrite
 
 for method in proposed vanilla; do
     step "Training the method '$method' for $steps steps (Ctrl-C stops it cleanly)"

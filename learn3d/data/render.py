@@ -27,7 +27,7 @@ BYTES_PER_OBJECT = kato.NUM_VIEWS * 4 * kato.IMAGE_SIZE**2 + kato.VOXEL_SIZE**3
 class DatasetConfig:
     """What to make a data set from, and how."""
 
-    out: Path  # folder for the files; other categories may live in it too
+    output: Path  # folder for the files; other categories may live in it too
     category: str  # name of the category; Kato's 13 names become synset ids in the file names
     source: Path | None = None  # folder of meshes (searched recursively) or a mesh pack (.npz); not with --procedural
     procedural: int = 0  # make this many shapes with the procedural generator instead of reading meshes
@@ -130,7 +130,7 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
     _prepare_folder(config, prefix, sum(len(splits[s]) * copies[s] for s in splits))
 
     used, skipped, objects, sheet = [], [], {}, []
-    with tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=config.out) as temporary:
+    with tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=config.output) as temporary:
         bar = _progress_bar(sum(len(splits[s]) * copies[s] for s in splits), config.category, progress)
         for split in ("train", "val", "test"):
             numbers = splits[split]
@@ -155,8 +155,8 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
         _write_json(Path(temporary) / f"{prefix}_report.json", asdict(report))
         (Path(temporary) / f"{prefix}_report.txt").write_text(report.text() + "\n")
         for name in files:
-            os.replace(Path(temporary) / name, config.out / name)
-        for stale in _existing(config.out, prefix):  # of an earlier data set with more splits
+            os.replace(Path(temporary) / name, config.output / name)
+        for stale in _existing(config.output, prefix):  # of an earlier data set with more splits
             if stale.name not in files:
                 stale.unlink()
     return report
@@ -262,30 +262,32 @@ def _existing(out: Path, prefix: str) -> list[Path]:
 
 def _prepare_folder(config: DatasetConfig, prefix: str, objects: int) -> None:
     """Create the folder and check that it can take the files: nothing in the way, writable, room on the disk."""
-    existing = _existing(config.out, prefix)
+    existing = _existing(config.output, prefix)
     if existing and not config.overwrite:
         raise FileExistsError(
-            f"{config.out} already holds {existing[0].name} and {len(existing) - 1} more file(s) of {config.category}; "
-            "give another folder, or --overwrite to replace them"
+            f"{config.output} already holds {existing[0].name} and {len(existing) - 1} more file(s) of "
+            f"{config.category}; give another folder, or --overwrite to replace them"
         )
     try:
-        config.out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=config.out):
+        config.output.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=config.output):
             pass
     except OSError as error:
-        raise OSError(f"cannot write into the folder {config.out}: {error}; give another one with --out") from error
+        raise OSError(
+            f"cannot write into the folder {config.output}: {error}; give another one with --output"
+        ) from error
     needed = objects * BYTES_PER_OBJECT // 2 + 2**24  # compressed renderings take a tenth of it
-    free = shutil.disk_usage(config.out).free
+    free = shutil.disk_usage(config.output).free
     if free < needed:
         raise OSError(
-            f"{objects} objects may need {needed / 2**20:.0f} MiB but the disk of {config.out} has "
+            f"{objects} objects may need {needed / 2**20:.0f} MiB but the disk of {config.output} has "
             f"{free / 2**20:.0f} MiB free; free some, give another folder, or use fewer meshes or augmented copies"
         )
 
 
 def _card(config: DatasetConfig, objects: dict[str, int], used: list[dict]) -> dict:
     """The data set's card: everything needed to make it again, and which mesh went where."""
-    settings = {k: v for k, v in asdict(config).items() if k not in ("out", "overwrite")}
+    settings = {k: v for k, v in asdict(config).items() if k not in ("output", "overwrite")}
     settings["source"] = None if config.source is None else Path(config.source).name
     return {
         "images": "uint8 [N, 24, 4, 64, 64]: RGB = 255 - composite over white, alpha",

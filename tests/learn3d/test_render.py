@@ -36,7 +36,7 @@ def folder(tmp_path):
 
 def make(out, source, **settings):
     config = {"category": "chair", "test": 0, "val": 0, **settings}
-    return make_dataset(DatasetConfig(out=Path(out), source=source, **config), progress=False)
+    return make_dataset(DatasetConfig(output=Path(out), source=source, **config), progress=False)
 
 
 def placed(mesh, up="y", front="x"):
@@ -254,10 +254,10 @@ def test_colours_of_the_mesh_or_random_ones(tmp_path):
 
 
 def test_procedural_shapes(tmp_path):
-    config = DatasetConfig(out=tmp_path, category="chair", procedural=3, test=1, val=0)
+    config = DatasetConfig(output=tmp_path, category="chair", procedural=3, test=1, val=0)
     assert make_dataset(config, progress=False).objects == {"train": 2, "test": 1}
     with pytest.raises(ValueError, match="procedural generator makes"):
-        make_dataset(DatasetConfig(out=tmp_path, category="unicorn", procedural=3), progress=False)
+        make_dataset(DatasetConfig(output=tmp_path, category="unicorn", procedural=3), progress=False)
 
 
 def test_refuses_to_overwrite_and_removes_what_is_stale(tmp_path, folder):
@@ -318,7 +318,7 @@ def test_render_object_refuses_what_cannot_be_seen():
 
 def test_command_line(tmp_path, folder):
     tool = Path(__file__).parents[2] / "tools" / "make_dataset.py"
-    command = [sys.executable, str(tool), "--out", str(tmp_path / "data"), "--category", "chair"]
+    command = [sys.executable, str(tool), "--output", str(tmp_path / "data"), "--category", "chair"]
     done = subprocess.run([*command, "--source", str(folder)], capture_output=True, text=True)
     assert done.returncode == 0 and "6 meshes used" in done.stdout, done.stderr
     again = subprocess.run([*command, "--source", str(folder)], capture_output=True, text=True)
