@@ -57,8 +57,8 @@ MeshBatch<T> mesh_batch(const Array<T>& vertices, const Faces& faces) {
   const int64_t* index = faces.data();
   for (int64_t n = 0; n < faces.size(); ++n)
     if (index[n] < 0 || index[n] >= mesh.num_vertices)
-      throw std::invalid_argument("faces refer to vertex " + std::to_string(index[n]) + ", but a mesh has vertices 0 to " +
-                                  std::to_string(mesh.num_vertices - 1));
+      throw std::invalid_argument("faces refer to vertex " + std::to_string(index[n]) + ", but a mesh has " +
+                                  std::to_string(mesh.num_vertices) + " vertices (the first is 0)");
   return mesh;
 }
 
@@ -115,8 +115,8 @@ Smoothness<T> smoothness_args(const Array<T>& vertices, const Array<int64_t>& ed
                      nullptr,         nullptr,      nullptr,           num_threads};
   for (int64_t n = 0; n < edges.size(); ++n)
     if (args.edges[n] < 0 || args.edges[n] >= args.num_vertices)
-      throw std::invalid_argument("edges refer to vertex " + std::to_string(args.edges[n]) + ", but a mesh has vertices 0 to " +
-                                  std::to_string(args.num_vertices - 1));
+      throw std::invalid_argument("edges refer to vertex " + std::to_string(args.edges[n]) + ", but a mesh has " +
+                                  std::to_string(args.num_vertices) + " vertices (the first is 0)");
   return args;
 }
 

@@ -2,13 +2,13 @@
 #pragma once
 
 #include <cstdint>
+#include <exception>
 #include <vector>
 
-#include <omp.h>
-
 // A function marked NMR_CLONES is compiled for three levels of x86-64 and the loader picks one. Only code inlined into it
-// is cloned with it, so what it calls in its loops is marked NMR_INLINE. Elsewhere the macro is empty.
-#if defined(NMR_MULTIVERSION) && defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && !defined(__clang__)
+// is cloned with it, so what it calls in its loops is marked NMR_INLINE. Elsewhere the macro is empty: other processors, other
+// compilers, GCC before 12 (which does not know the levels), C libraries other than glibc (which cannot choose at load time).
+#if defined(NMR_MULTIVERSION) && defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && __GNUC__ >= 12
 #define NMR_CLONES __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4")))
 #else
 #define NMR_CLONES
@@ -23,7 +23,7 @@
 namespace nmr {
 
 // Calls body(i) for i in [0, count), each i on one thread. Iterations must be independent: then the result does not
-// depend on num_threads.
+// depend on num_threads. An exception (std::bad_alloc) reaches the caller after all threads have stopped.
 template <class Body>
 void parallel_for(int64_t count, int num_threads, const Body& body) {
   const int threads = static_cast<int>(count < num_threads ? count : num_threads);
@@ -31,11 +31,20 @@ void parallel_for(int64_t count, int num_threads, const Body& body) {
     for (int64_t i = 0; i < count; ++i) body(i);
     return;
   }
+  std::exception_ptr failure;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-  for (int64_t i = 0; i < count; ++i) body(i);
+  for (int64_t i = 0; i < count; ++i) {
+    try {
+      body(i);
+    } catch (...) {
+#pragma omp critical(nmr_failure)
+      if (!failure) failure = std::current_exception();
+    }
+  }
+  if (failure) std::rethrow_exception(failure);
 }
 
-// Memory that a thread keeps between calls. `Tag` separates users of the same element type.
+// Memory that a thread keeps between calls, one object per type.
 template <class Scratch>
 Scratch& thread_scratch() {
   static thread_local Scratch scratch;

@@ -1,7 +1,7 @@
 // Coverage, and NMR's gradient of it: for every edge of a visible face and every raster line that crosses it, pixels that
 // would change if the edge moved pull on its two vertices, each with strength (change of the loss) / (distance to move).
 #include <algorithm>
-#include <limits>
+#include <cmath>
 
 #include "geometry.h"
 #include "parallel.h"

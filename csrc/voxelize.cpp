@@ -30,8 +30,11 @@ struct Grid {
   }
 };
 
-// First and last integer in [0, size) within [lo, hi].
+// First and last integer in [0, size) within [lo, hi]; none if either is NaN.
 void lattice_range(float lo, float hi, int64_t size, int64_t& first, int64_t& last) {
+  first = 0;
+  last = -1;
+  if (std::isnan(lo) || std::isnan(hi)) return;
   const float end = static_cast<float>(size);
   first = static_cast<int64_t>(std::ceil(std::min(std::max(lo, 0.f), end)));
   last = static_cast<int64_t>(std::floor(std::min(std::max(hi, -1.f), end - 1)));

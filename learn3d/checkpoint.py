@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from learn3d import files
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict
 from learn3d.networks import Networks, create_networks
 
@@ -19,17 +19,18 @@ FORMAT = 1
 
 
 def save(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
-    """Write tensors and JSON metadata; the file appears under its name only when complete."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.partial")
+    """Write tensors and JSON metadata; the file appears under its name only when complete and on the disk.
+
+    Raises OSError where it cannot be written (no permission, no room).
+    """
     header = {"learn3d": json.dumps({"format": FORMAT, **metadata})}
     contiguous = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    try:
-        save_file(contiguous, temporary, metadata=header)
+    with files.replacing(path, sync=True) as temporary:
+        try:
+            save_file(contiguous, temporary, metadata=header)
+        except SafetensorError as error:
+            raise OSError(f"cannot write the checkpoint {path}: {error}") from None
         temporary.chmod(0o644)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def load(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

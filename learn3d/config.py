@@ -55,7 +55,8 @@ class TrainConfig:
     method: Method = "proposed"
     """proposed: with pose confusion and the Gaussian prior. vanilla: Vanilla-AE, the same with both at zero."""
     preset: Preset = "released"
-    """released: the loss forms of the published code. paper: the equations as printed."""
+    """released: the loss forms of the published code. paper: the equations as printed, but for the generator's factor
+    0.5 before (unit sphere + displacement), which both keep."""
     iterations: int = 20_000
     """Number of training steps."""
     batch_size: int = 128
@@ -83,7 +84,7 @@ class TrainConfig:
     validate_every: int = 1000
     """Steps between validations (voxel IoU and MMD); the last step is always validated."""
     max_val_images: int | None = None
-    """Validate on this many images, spread evenly over the split. None: all."""
+    """Validate on this many images, spread evenly over the objects and views of the split. None: all."""
     pictures_every: int = 1000
     """Steps between picture grids."""
     checkpoint_every: int = 1000

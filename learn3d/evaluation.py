@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 import itertools
+import math
 import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -57,12 +58,11 @@ def evaluate(
     """Mean voxel IoU over the images of a split, and the mean MMD over all pairs of views.
 
     Every image (object x view) is encoded, its mesh voxelised in the data set's convention and compared with the
-    object's voxels. With `max_images` only that many images, spread evenly over the split, are used. `paper_mmd` also
-    computes the MMD as the paper prints it.
+    object's voxels. With `max_images` only that many images are used, always the same ones: see `spread_samples`.
+    `paper_mmd` also computes the MMD as the paper prints it.
     """
-    total = len(dataset)
-    count = total if max_images is None else min(max_images, total)
-    indices = torch.linspace(0, total - 1, count).round().long() if count < total else torch.arange(total)
+    count = len(dataset) if max_images is None else min(max_images, len(dataset))
+    indices = spread_samples(dataset.num_objects, dataset.num_views, count)
     ious, codes, views = [], [], []
     for chosen in indices.split(batch_size):
         batch = dataset.batch(chosen)
@@ -84,6 +84,20 @@ def evaluate(
         images=count,
         undefined=undefined,
     )
+
+
+def spread_samples(num_objects: int, num_views: int, count: int) -> Tensor:
+    """`count` different samples object * num_views + view, int64 [count], ascending; a function of its arguments alone.
+
+    Every view is among them as often as any other, give or take one, and so is every object. Going through the views
+    and through the objects side by side meets each pair once in lcm(objects, views) steps; then the objects shift by
+    one. Both orders are shuffled, so that it is not always the same view that goes with an object.
+    """
+    generator = torch.Generator().manual_seed(0)
+    objects, views = (torch.randperm(n, generator=generator) for n in (num_objects, num_views))
+    k = torch.arange(count)
+    turn = k // math.lcm(num_objects, num_views)
+    return (objects[(k + turn) % num_objects] * num_views + views[k % num_views]).sort().values
 
 
 def mean_mmd(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 import nmr
+from learn3d import files
 from learn3d.data.kato import DISTANCE, ELEVATION_DEG, HALF_FOV_DEG, KatoDataset
 from learn3d.networks import IMAGE_SIZE, Networks, network_input
 from learn3d.shading import shade_mesh
@@ -123,7 +123,7 @@ def save_png(path: Path, rgb: np.ndarray) -> None:
     """Write a picture uint8 [H,W,3]."""
     buffer = io.BytesIO()
     Image.fromarray(rgb).save(buffer, format="PNG", optimize=True)
-    write_bytes(path, buffer.getvalue())
+    files.write_bytes(path, buffer.getvalue())
 
 
 def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0) -> None:
@@ -140,15 +140,7 @@ def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0)
         loop=0,
         optimize=True,
     )
-    write_bytes(path, buffer.getvalue())
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file that appears under its name only when complete."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.partial")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
+    files.write_bytes(path, buffer.getvalue())
 
 
 def _azimuth_deg(eye: Tensor) -> float:

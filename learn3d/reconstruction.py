@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import trimesh
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
-from learn3d import checkpoint, figures
+from learn3d import checkpoint, figures, files
 from learn3d.data.kato import KatoDataset, mesh_to_object
 from learn3d.networks import IMAGE_SIZE, Networks, network_input
 
@@ -86,7 +86,7 @@ def export_mesh(path: Path, vertices: Tensor, faces: Tensor) -> None:
     points = vertices.detach().cpu().double().numpy() @ mesh_to_object()
     mesh = trimesh.Trimesh(points, faces.cpu().numpy()[:, ::-1], process=False)
     content = mesh.export(file_type=kind)
-    figures.write_bytes(path, content.encode() if isinstance(content, str) else content)
+    files.write_bytes(path, content.encode() if isinstance(content, str) else content)
 
 
 def save_reconstruction(
@@ -180,14 +180,15 @@ def _resample(channel: np.ndarray, left: float, top: float, side: float) -> np.n
 
 
 def _open(path: Path) -> Image.Image:
+    """The image, upright: cameras write the pixels as they lie on the sensor, and the turn into the EXIF data."""
     try:
         image = Image.open(path)
         image.load()
+        return ImageOps.exif_transpose(image)
     except FileNotFoundError:
         raise ValueError(f"there is no image {path}") from None
     except (UnidentifiedImageError, OSError) as error:
         raise ValueError(f"{path} cannot be read as an image: {error}") from None
-    return image
 
 
 def _size(image: Image.Image) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections.abc import Mapping
@@ -13,6 +12,8 @@ from typing import Any
 
 import numpy as np
 from tqdm import tqdm
+
+from learn3d import files
 
 METRICS_FILE = "metrics.jsonl"
 
@@ -84,12 +85,6 @@ class RunLog:
             print(text, file=sys.stderr, flush=True)
 
 
-def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a run's metrics.jsonl, as dictionaries with step, split and values."""
-    path = Path(folder) / METRICS_FILE
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
 def _forget_after(path: Path, step: int) -> None:
     """Drop metrics of steps after `step`, and a last line cut short by a crash: the resumed run writes them again."""
     if not path.exists():
@@ -101,9 +96,7 @@ def _forget_after(path: Path, step: int) -> None:
                 kept.append(line + "\n")
         except (json.JSONDecodeError, KeyError):
             continue
-    temporary = path.with_name(f".{path.name}.partial")
-    temporary.write_text("".join(kept), encoding="utf-8")
-    os.replace(temporary, path)
+    files.write_bytes(path, "".join(kept).encode())
 
 
 def _tensorboard_writer(folder: Path, start: int) -> Any:

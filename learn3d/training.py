@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import json
-import os
+import shlex
 import shutil
 import signal
 import time
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learn3d import checkpoint, figures
+from learn3d import checkpoint, figures, files
 from learn3d.config import TrainConfig, check_resume, config_from_dict, config_to_dict
 from learn3d.data.kato import KatoDataset
 from learn3d.evaluation import evaluate
@@ -42,6 +42,15 @@ class Progress:
 
 
 @dataclass(frozen=True)
+class Conditions:
+    """What decides the next steps besides the options and the saved state; a resumed run must find it as it was."""
+
+    samples: int  # training images: their number decides the order
+    images: str  # CRC-32 of the training images, as stored
+    precision: str  # bf16 or fp32: what "auto" came to
+
+
+@dataclass(frozen=True)
 class Summary:
     """How a call of `train` ended."""
 
@@ -58,10 +67,12 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
 
     The folder receives config.json, last.safetensors (all that a resumption needs), best.safetensors (the networks with
     the best validation IoU), metrics.jsonl, tensorboard/ and pictures/. SIGINT and SIGTERM end the current step, save
-    and return. With `resume` the run continues from last.safetensors, bit for bit (same machine, number of threads).
+    and return. With `resume` the run continues from last.safetensors, bit for bit (same machine, device and number of
+    threads).
 
-    Raises ValueError for a folder in use, options that conflict with the resumed run or data that do not fit, and
-    FloatingPointError when a loss is no longer finite (the last checkpoint is from before that).
+    Raises ValueError for a folder in use, options or training data that conflict with the resumed run or data that do
+    not fit, FloatingPointError when a loss is no longer finite (the last checkpoint is from before that), and OSError
+    when something cannot be written.
     """
     started = time.monotonic()
     keep_freed_memory()
@@ -77,9 +88,10 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     )
     optimizers = create_optimizers(networks, config.learning_rate)
     progress = Progress(object_share=object_share(train_set))
+    conditions = Conditions(len(train_set), f"{zlib.crc32(np.ascontiguousarray(train_set.images)):08x}", precision)
     folder = config.output
     if resume:
-        restore(folder / "last.safetensors", config, networks, optimizers, progress)
+        restore(folder / "last.safetensors", config, conditions, networks, optimizers, progress)
     else:
         _claim_folder(folder, overwrite)
     if progress.step >= config.iterations:
@@ -87,7 +99,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
             f"{folder} has taken {progress.step} steps of {config.iterations} already; "
             "to continue ask for more iterations"
         )
-    _write_json(folder / CONFIG_FILE, config_to_dict(config))
+    files.write_json(folder / CONFIG_FILE, config_to_dict(config))
 
     with _stop_on_signal() as stop, RunLog(folder, start=progress.step, total=config.iterations) as log:
         log.say(_describe(config, precision, train_set, val_set, progress))
@@ -108,7 +120,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
             if last or step % config.pictures_every == 0:
                 _draw(config, networks, val_set, step, log)
             if last or stop.requested or step % config.checkpoint_every == 0:
-                save_last(folder, config, networks, optimizers, progress)
+                save_last(folder, config, conditions, networks, optimizers, progress)
             if stop.requested and not last:
                 log.say(f"stopped by {stop.name} after step {step}; continue with: {resume_command(folder)}")
                 break
@@ -168,7 +180,8 @@ def _validate(
     iou = -1.0 if result.voxel_iou is None else result.voxel_iou
     better = iou > progress.best_iou
     mark = " (best so far)" if better else ""
-    log.say(f"step {progress.step}: {config.val_split} voxel IoU {iou:.4f}{mmd}{mark}")
+    shown = "undefined" if result.voxel_iou is None else f"{iou:.4f}"
+    log.say(f"step {progress.step}: {config.val_split} voxel IoU {shown}{mmd}{mark}")
     if result.undefined:
         log.say(f"warning: {result.undefined} images have no IoU (prediction and truth are both empty); left out")
     if better:
@@ -191,9 +204,14 @@ def _draw(config: TrainConfig, networks: Networks, val_set: KatoDataset, step: i
 
 
 def save_last(
-    folder: Path, config: TrainConfig, networks: Networks, optimizers: Optimizers, progress: Progress
+    folder: Path,
+    config: TrainConfig,
+    conditions: Conditions,
+    networks: Networks,
+    optimizers: Optimizers,
+    progress: Progress,
 ) -> None:
-    """Write last.safetensors: networks, optimizers, random state, progress and configuration."""
+    """Write last.safetensors: networks, optimizers, random state, progress, configuration and conditions."""
     _check_networks(networks, folder)
     tensors = checkpoint.network_tensors(networks) | {"random.cpu": torch.get_rng_state()}
     if config.device == "cuda":
@@ -201,13 +219,29 @@ def save_last(
     for name, optimizer in optimizers.items():
         tensors |= checkpoint.optimizer_tensors(name, optimizer)
     metadata = checkpoint.networks_metadata(networks, config) | dataclasses.asdict(progress)
+    metadata["conditions"] = dataclasses.asdict(conditions)
     checkpoint.save(folder / "last.safetensors", tensors, metadata)
 
 
-def restore(path: Path, config: TrainConfig, networks: Networks, optimizers: Optimizers, progress: Progress) -> None:
-    """Bring everything back to the state that `save_last` wrote; a conflicting option is a ValueError that names it."""
+def restore(
+    path: Path,
+    config: TrainConfig,
+    conditions: Conditions,
+    networks: Networks,
+    optimizers: Optimizers,
+    progress: Progress,
+) -> None:
+    """Bring everything back to the state that `save_last` wrote.
+
+    An option or a condition that differs is a ValueError that names it. Conditions that an older checkpoint does not
+    record are not checked.
+    """
     tensors, metadata = checkpoint.load(path)
-    check_resume(config, config_from_dict(metadata["config"], source=str(path)))
+    saved, recorded = config_from_dict(metadata["config"], source=str(path)), metadata.get("conditions", {})
+    if recorded.get("precision") == conditions.precision:  # asked for by name or by "auto", it is the same
+        saved = dataclasses.replace(saved, precision=config.precision)
+    check_resume(config, saved)
+    _check_conditions(conditions, recorded, config.data)
     checkpoint.restore_networks(networks, tensors, path)
     for name, optimizer in optimizers.items():
         checkpoint.restore_optimizer(name, optimizer, tensors)
@@ -218,9 +252,29 @@ def restore(path: Path, config: TrainConfig, networks: Networks, optimizers: Opt
         torch.cuda.set_rng_state(tensors["random.cuda"])
 
 
+def _check_conditions(now: Conditions, recorded: dict[str, object], data: Path) -> None:
+    """Raise a ValueError naming what differs from the conditions that a checkpoint recorded."""
+    then = dataclasses.replace(now, **recorded)
+    if then.precision != now.precision:
+        raise ValueError(
+            f"cannot resume: the run computes in {then.precision}, but precision 'auto' means {now.precision} here; "
+            f"ask for precision {then.precision}"
+        )
+    if then.samples != now.samples:
+        raise ValueError(
+            f"cannot resume with other training data: {then.samples} images in the run, {now.samples} in {data}; "
+            "give the run's own data set, or start a new run"
+        )
+    if then.images != now.images:
+        raise ValueError(
+            f"cannot resume with other training data: the CRC-32 of the images was {then.images}, that of {data} is "
+            f"{now.images}; give the run's own data set, or start a new run"
+        )
+
+
 def resume_command(folder: Path) -> str:
-    """The command line that continues the run in `folder`."""
-    return f"python tools/train.py --output {folder} --resume"
+    """The command line that continues the run in `folder`, quoted for a POSIX shell."""
+    return f"python tools/train.py --output {shlex.quote(str(folder))} --resume"
 
 
 @dataclass
@@ -286,9 +340,3 @@ def _describe(config: TrainConfig, precision: str, train_set: KatoDataset, val_s
     data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
     verb = f"resuming at step {at.step}" if at.step else "training"
     return f"{verb}: {config.method} ({config.preset}) on {config.category}, {data}; {where}; output {config.output}"
-
-
-def _write_json(path: Path, value: object) -> None:
-    temporary = path.with_name(f".{path.name}.partial")
-    temporary.write_text(json.dumps(value, indent=2) + "\n")
-    os.replace(temporary, path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import operator
+
 import torch
 from torch import Tensor
 
@@ -50,8 +52,10 @@ def check_faces(faces: object, batch: int, device: torch.device) -> Tensor:
 
 def check_size(value: object, name: str, largest: int) -> int:
     """An integer in 1..largest."""
-    if isinstance(value, bool) or not isinstance(value, int | torch.SymInt):
-        raise TypeError(f"{name} must be an integer, got {describe(value)}")
+    if not isinstance(value, torch.SymInt):
+        if isinstance(value, bool) or not hasattr(value, "__index__") or isinstance(value, Tensor):
+            raise TypeError(f"{name} must be an integer, got {describe(value)}")
+        value = operator.index(value)
     if not 1 <= value <= largest:
         raise ValueError(f"{name} must lie in 1..{largest}, got {value}")
     return value

@@ -10,6 +10,9 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+# Lengths of vectors up to here neither overflow nor do their derivatives.
+_LARGEST = 1e15
+
 Scalars = float | Sequence[float] | Tensor
 
 
@@ -30,18 +33,23 @@ def _normalize(v: Tensor) -> Tensor:
 def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: Scalars) -> Tensor:
     """Points on a sphere around the origin: ``(d cos e sin a, d sin e, -d cos e cos a)``, ``[3]`` or ``[B, 3]``.
 
-    Scalars, sequences and tensors of one length broadcast. At azimuth 0 and elevation 0 the point is ``(0, 0, -d)``.
+    Numbers, sequences and tensors of one length broadcast; other lengths raise a ValueError. At azimuth 0 and
+    elevation 0 the point is ``(0, 0, -d)``.
     """
     d, e, a = (
         x if isinstance(x, Tensor) and x.is_floating_point() else torch.as_tensor(x, dtype=torch.float64)
         for x in (distance, elevation_deg, azimuth_deg)
     )
-    e, a = e * (math.pi / 180), a * (math.pi / 180)
-    d, e, a = torch.broadcast_tensors(d, e, a)
+    if len({x.shape for x in (d, e, a) if x.ndim}) > 1:
+        raise ValueError(
+            "distance, elevation_deg and azimuth_deg must be single numbers or have one length, got shapes "
+            f"{list(d.shape)}, {list(e.shape)}, {list(a.shape)}"
+        )
+    d, e, a = torch.broadcast_tensors(d, e * (math.pi / 180), a * (math.pi / 180))
     return torch.stack([d * e.cos() * a.sin(), d * e.sin(), -d * e.cos() * a.cos()], dim=-1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LookAt:
     """A perspective camera at ``eye`` that looks at ``at``.
 
@@ -62,8 +70,8 @@ class LookAt:
     half_fov_deg: float = 30.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.half_fov_deg < 90:
-            raise ValueError(f"half_fov_deg must lie between 0 and 90 degrees, got {self.half_fov_deg}")
+        if isinstance(self.half_fov_deg, Tensor) or not 0 < self.half_fov_deg < 90:
+            raise ValueError(f"half_fov_deg must be a number between 0 and 90 degrees, got {self.half_fov_deg}")
         for name in ("eye", "at", "up"):
             value = getattr(self, name)
             tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
@@ -79,22 +87,34 @@ class LookAt:
         return cls(eye=points_from_angles(distance, elevation_deg, azimuth_deg), half_fov_deg=half_fov_deg)
 
     def transform(self, vertices: Tensor) -> Tensor:
-        """``vertices [B, V, 3]`` (or ``[V, 3]``) to renderer space, ``[B, V, 3]``, in the dtype of ``vertices``."""
+        """``vertices [B, V, 3]`` (or ``[V, 3]``) to renderer space, ``[B, V, 3]``, in the dtype of ``vertices``.
+
+        A vertex that has no finite image (not finite itself, or in the plane of the eye, or seen by a camera that is
+        not finite or farther than 1e15) gets x = y = inf, so that its faces are not drawn, and no gradient.
+        """
         if vertices.ndim == 2:
             vertices = vertices.unsqueeze(0)
-        eye, at, up = (
-            x.to(vertices).expand(1, 3) if x.ndim == 1 else x.to(vertices) for x in (self.eye, self.at, self.up)
-        )
+        eye, at, up = (x.to(vertices).view(-1, 3) for x in (self.eye, self.at, self.up))
         sizes = {vertices.shape[0], eye.shape[0], at.shape[0], up.shape[0]} - {1}
         if len(sizes) > 1:
             raise ValueError(
                 f"vertices and camera must have one batch size (or 1), got {vertices.shape[0]} meshes, "
                 f"eye {list(self.eye.shape)}, at {list(self.at.shape)}, up {list(self.up.shape)}"
             )
+        # What is not finite is replaced before it enters any product: its zero gradient would become 0 * inf there.
+        usable = torch.stack(torch.broadcast_tensors(eye, at, up)).abs().amax((0, -1)).unsqueeze(-1) < _LARGEST
+        eye, at, up = (torch.where(usable, x, torch.zeros_like(x)) for x in (eye, at, up))
+        finite = vertices.isfinite().all(-1, keepdim=True)
         z = _normalize(at - eye)
         x = _normalize(torch.linalg.cross(up.expand_as(z), z, dim=-1))
         y = _normalize(torch.linalg.cross(z, x, dim=-1))
         rotation = torch.stack([x, y, z], dim=-2)
-        view = (vertices - eye.unsqueeze(-2)) @ rotation.transpose(-1, -2)
+        with torch.autocast(vertices.device.type, enabled=False):
+            offset = torch.where(finite, vertices, torch.zeros_like(vertices)) - eye.unsqueeze(-2)
+            view = offset @ rotation.transpose(-1, -2)
         depth = view[..., 2:]
-        return torch.cat([view[..., :2] / depth / math.tan(math.radians(self.half_fov_deg)), depth], dim=-1)
+        tangent = math.tan(math.radians(self.half_fov_deg))
+        # x / z^2 is the largest factor of the backward pass; where it overflows the image is as good as infinite.
+        visible = finite & usable.unsqueeze(-2) & (view[..., :2] / depth / depth).isfinite().all(-1, keepdim=True)
+        xy = view[..., :2] / torch.where(visible, depth, torch.ones_like(depth)) / tangent
+        return torch.cat([torch.where(visible, xy, torch.full_like(xy, math.inf)), depth], dim=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from . import ops
@@ -23,12 +24,15 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
     Raises
     ------
-    ValueError
-        If the shapes differ.
+    TypeError, ValueError
+        If the shapes differ, or there is nothing to compare.
     """
-    if prediction.shape != target.shape:
+    if not isinstance(prediction, Tensor) or not isinstance(target, Tensor):
+        raise TypeError(f"prediction and target must be tensors, got {describe(prediction)} and {describe(target)}")
+    if prediction.shape != target.shape or prediction.ndim < 2 or prediction.shape[0] == 0:
         raise ValueError(
-            f"prediction and target must have one shape, got {describe(prediction)} and {describe(target)}"
+            "prediction and target must have one shape [B, ...] with B >= 1, "
+            f"got {describe(prediction)} and {describe(target)}"
         )
     prediction, target = prediction.flatten(1), target.flatten(1)
     product = prediction * target
@@ -63,6 +67,10 @@ def smoothness_loss(vertices: Tensor, edges: Tensor) -> Tensor:
         For wrong types and shapes, and for edges that refer to missing vertices.
     """
     vertices = check_vertices(vertices)
-    if not isinstance(edges, Tensor) or edges.ndim != 2 or edges.shape[1] != 4 or edges.is_floating_point():
-        raise ValueError(f"edges must be an integer tensor [E, 4] made by nmr.edge_table(faces), got {describe(edges)}")
-    return ops.smoothness(vertices, edges.to(vertices.device).long()).mean()
+    if vertices.shape[0] == 0:
+        raise ValueError(f"vertices must hold at least one mesh, got {describe(vertices)}")
+    if not isinstance(edges, Tensor) or edges.dtype != torch.int64 or edges.ndim != 2 or edges.shape[1] != 4:
+        raise ValueError(
+            f"edges must be an int64 tensor [E, 4] as made by nmr.edge_table(faces), got {describe(edges)}"
+        )
+    return ops.smoothness(vertices, edges.to(vertices.device)).mean()

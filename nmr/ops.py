@@ -4,12 +4,17 @@ The kernels take NumPy views of the tensors (zero-copy on the CPU). Tensors of o
 host and the results go back to the device. Arguments are trusted here; the public functions validate.
 """
 
-from __future__ import annotations
-
+# No `from __future__ import annotations` here: torch 2.4 reads the operators' types from the annotations themselves.
 import torch
 from torch import Tensor
 
-from . import _C
+try:
+    from . import _C
+except ImportError as error:
+    raise ImportError(
+        "the compiled part of nmr is missing: this is the source folder, or the installation failed; "
+        "run `pip install .` in the repository and start Python elsewhere, or use `pip install -e .`"
+    ) from error
 
 
 def _host_array(tensor: Tensor):

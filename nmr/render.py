@@ -63,11 +63,15 @@ def render_silhouette(
         ``alpha[b, y, x]`` is the covered share (0, 1/4, ... 1 with anti-aliasing) of the pixel in row y from the top.
 
     Notes
-    ----- Differentiable in x and y of ``vertices`` (and through the camera); z in renderer space gets 0. The gradient
-    is defined, not derived (Kato et al. 2018, section 3): every raster line that crosses an edge of a visible face
-    lets each pixel m whose change would lower the loss by D pull the edge's two vertices with D / (travel that brings
-    the edge to m). The values equal those of the published kernels in float32; ``docs/conventions.md`` lists the
+    -----
+    Differentiable in x and y of ``vertices`` (and through the camera); z in renderer space gets 0. The gradient is
+    defined, not derived (Kato et al. 2018, section 3): every raster line that crosses an edge of a visible face lets
+    each pixel m whose change would lower the loss by D pull the edge's two vertices with D / (travel that brings the
+    edge to m). The values equal those of the published kernels in float32; ``docs/conventions.md`` lists the
     departures. Results do not depend on the number of threads or on the batch size. There are no second derivatives.
+
+    No mesh gives a NaN: faces with a non-finite corner draw nothing and get no gradient. (A loss whose own gradient is
+    not finite passes that on.)
 
     Raises
     ------
@@ -83,9 +87,9 @@ def render_silhouette(
     """
     check_size(image_size, "image_size", _LARGEST_IMAGE)
     check_depth_range(near, far)
-    if not 0 < eps < float("inf"):
-        raise ValueError(f"eps must be positive and finite, got {eps}")
     vertices, faces = _to_renderer_space(vertices, faces, camera)
+    if not torch.finfo(vertices.dtype).tiny <= eps < float("inf"):
+        raise ValueError(f"eps must be positive in {vertices.dtype} and finite, got {eps}")
     alpha, _ = ops.silhouette(
         vertices, faces, image_size, bool(anti_aliasing), bool(fill_back), float(near), float(far), float(eps)
     )

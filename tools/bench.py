@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Annotated
+from typing import Literal
 
 import numpy as np
 import torch
@@ -234,8 +234,8 @@ def report(title: str, rows: list[dict], settings: dict, json_path: Path | None)
 
 @dataclass(frozen=True)
 class Options:
-    workload: Annotated[str, tyro.conf.Positional] = "w1"
-    """w1, w2, w3 or voxels."""
+    workload: tyro.conf.Positional[Literal["w1", "w2", "w3", "voxels"]] = "w1"
+    """What to measure."""
     batch: int = 64
     """Meshes of w1."""
     threads: int = 2
@@ -326,10 +326,8 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     if options.workload == "voxels":
         bench_voxels(options)
-    elif options.workload in ("w1", "w2", "w3"):
-        bench_render(options)
     else:
-        raise SystemExit(f"workload must be w1, w2, w3 or voxels, got {options.workload!r}")
+        bench_render(options)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Measure trained models: voxel IoU per class and its mean, and the MMD over all pairs of views.
 
-python tools/evaluate.py runs/airplane runs/chair --data DATA --split test --json table.json
+Examples:
+  python tools/evaluate.py runs/airplane runs/chair --data DATA --split test --json table.json
 """
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Literal
 import tyro
 
 from learn3d.evaluation import evaluate_runs, format_table
-from learn3d.figures import write_bytes
+from learn3d.files import write_json
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def main() -> int:
             report_progress=lambda text: print(text, file=sys.stderr, flush=True),
         )
         if command.json is not None:
-            write_bytes(command.json, (json.dumps(report, indent=2) + "\n").encode())
+            write_json(command.json, report)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

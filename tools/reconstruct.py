@@ -1,8 +1,9 @@
 """Turn images into meshes, each with a turntable animation and a strip of views.
 
-python tools/reconstruct.py photo.png --run runs/airplane --output meshes    (transparent background)
-python tools/reconstruct.py photo.jpg --masks mask.png --run runs/airplane --output meshes
-python tools/reconstruct.py --dataset DATA --indices 0 31 62 --run runs/airplane --output meshes
+Examples:
+  python tools/reconstruct.py photo.png --run runs/airplane --output meshes    (transparent background)
+  python tools/reconstruct.py photo.jpg --masks mask.png --run runs/airplane --output meshes
+  python tools/reconstruct.py --dataset DATA --indices 0 31 62 --run runs/airplane --output meshes
 """
 
 from __future__ import annotations

@@ -35,5 +35,5 @@ setup() { # extra of the package: train or test
     step "Installing the package and compiling the renderer (torch takes most of the time)"
     "$python" -m pip install --quiet --disable-pip-version-check --constraint constraints.txt ".[$1]" ||
         fail "the installation failed; the messages above say why (no network, no compiler, no disk space?)"
-    "$python" -P -c 'import nmr' || fail "the package was installed but cannot be imported"
+    "$python" -I -c 'import nmr' || fail "the package was installed but cannot be imported"
 }

@@ -1,7 +1,8 @@
 """Train a model that turns one image into a 3D mesh.
 
-python tools/train.py --data DATA --category airplane --output runs/airplane
-python tools/train.py --output runs/airplane --resume
+Examples:
+  python tools/train.py --data DATA --category airplane --output runs/airplane
+  python tools/train.py --output runs/airplane --resume
 """
 
 from __future__ import annotations
@@ -46,13 +47,14 @@ def main() -> int:
         if command.resume and command.overwrite:
             raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
         summary = train(command.config, resume=command.resume, overwrite=command.overwrite)
-    except (ValueError, FileNotFoundError, FloatingPointError) as error:
+    except (ValueError, OSError, FloatingPointError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     state = "finished" if summary.finished else "stopped"
+    best = f"best validation voxel IoU {summary.best_iou:.4f} at step {summary.best_step}; "
     print(
-        f"{state} at step {summary.step} after {summary.seconds / 60:.1f} min; best validation voxel IoU "
-        f"{summary.best_iou:.4f} at step {summary.best_step}; everything is in {summary.folder}"
+        f"{state} at step {summary.step} after {summary.seconds / 60:.1f} min; "
+        f"{best if summary.best_step else ''}everything is in {summary.folder}"
     )
     return 0
 

@@ -23,8 +23,9 @@ from tqdm import tqdm
 from learn3d.data import debian_packages as packages
 from learn3d.data.debian_aircraft import AIRCRAFT_PACKAGE, aircraft_models
 from learn3d.data.debian_furniture import FURNITURE_PACKAGES, furniture_models
-from learn3d.data.mesh_cleaning import clean_mesh, is_watertight, overlap, surface_grid
+from learn3d.data.mesh_cleaning import clean_mesh, overlap, surface_grid
 from learn3d.data.mesh_text import write_ply
+from learn3d.data.meshes import is_watertight
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side when surfaces are compared
@@ -214,7 +215,7 @@ def _keep(
         source=candidate.source,
         vertices=len(vertices),
         faces=len(faces),
-        watertight=is_watertight(faces),
+        watertight=is_watertight(vertices, faces),
     )
 
 

@@ -184,7 +184,7 @@ def _read_array(path: Path, dtype: type, shape: tuple[int, ...], what: str) -> n
         with archive:
             keys = archive.files
             array = archive["arr_0"] if "arr_0" in keys else None
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, NotImplementedError, MemoryError) as error:
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
         raise ValueError(
             f"cannot read the {what} file {path}: {error}; it must be an npz file with {wanted} "
             "and no pickled objects. Perhaps the download or copy was cut short: fetch it again"

@@ -46,12 +46,6 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 1e-5)
     return points, faces.reshape(-1, 3).astype(np.int64)
 
 
-def is_watertight(faces: np.ndarray) -> bool:
-    """Whether each edge of the triangles [F, 3] belongs to exactly two of them."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())
-
-
 def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: bool = False) -> np.ndarray:
     """Cells bool [size, size, size] that the surface passes through, by samples at most a third of a cell apart.
 

@@ -6,12 +6,13 @@ and lenient about everything that they do not need.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from learn3d import files
 
 Polygon = Sequence[int]
 
@@ -186,7 +187,7 @@ def _cut_ears(polygon: Polygon, vertices: np.ndarray) -> list[tuple[int, int, in
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Write a binary little-endian PLY: float32 vertices [V, 3], int32 faces [F, 3]; to a temporary name first."""
+    """Write a binary little-endian PLY: float32 vertices [V, 3], int32 faces [F, 3]."""
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
         "property float x\nproperty float y\nproperty float z\n"
@@ -194,6 +195,4 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     )
     rows = np.empty(len(faces), dtype=[("size", "u1"), ("face", "<i4", 3)])
     rows["size"], rows["face"] = 3, faces
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_bytes(header.encode("ascii") + vertices.astype("<f4").tobytes() + rows.tobytes())
-    os.replace(temporary, path)
+    files.write_bytes(path, header.encode("ascii") + vertices.astype("<f4").tobytes() + rows.tobytes())

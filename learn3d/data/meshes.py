@@ -1,7 +1,7 @@
 """Meshes as they come: from a folder of files, from a mesh pack (npz) or from the procedural generator.
 
-Every source is a list of `MeshSource`, in an order that does not depend on the file system. Reading one may raise
-whatever the file's reader raises; `checked` raises ValueError with the reason where a mesh cannot be used.
+Every source is a list of `MeshSource`, in an order that does not depend on the file system. Reading one raises
+ValueError where the file cannot be read, and `checked` where a mesh cannot be used, each with the reason.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf", ".dae", ".3mf", ".3dxml")
+EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # what trimesh reads without further packages
 SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
 
 
@@ -65,7 +65,14 @@ def pack_sources(path: Path) -> list[MeshSource]:
     if count < 1 or missing:
         raise ValueError(f"{path} is no mesh pack: it must be {wanted}; n is {count}, missing keys: {missing[:4]}")
     width = len(str(count - 1))
-    return [MeshSource(f"{i:0{width}d}", lambda i=i: RawMesh(pack[f"v{i}"], pack[f"f{i}"])) for i in range(count)]
+
+    def read(i: int) -> RawMesh:
+        try:
+            return RawMesh(pack[f"v{i}"], pack[f"f{i}"])
+        except Exception as error:
+            raise _unreadable(error) from error
+
+    return [MeshSource(f"{i:0{width}d}", lambda i=i: read(i)) for i in range(count)]
 
 
 def procedural_sources(category: str, count: int, seed: int) -> list[MeshSource]:
@@ -83,11 +90,17 @@ def procedural_sources(category: str, count: int, seed: int) -> list[MeshSource]
 
 
 def read_mesh(path: Path) -> RawMesh:
-    """All triangles of a mesh file, scenes concatenated with their transforms, with their colours where it has any."""
+    """All triangles of a mesh file, scenes concatenated with their transforms, with their colours where it has any.
+
+    Raises ValueError where it cannot be read or holds no triangle.
+    """
     import trimesh
 
-    scene = trimesh.load(str(path), force="scene", process=False)
-    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    try:
+        scene = trimesh.load(str(path), force="scene", process=False)
+        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    except Exception as error:  # trimesh's readers raise whatever a foreign or truncated file makes them trip over
+        raise _unreadable(error) from error
     if not parts:
         raise ValueError("no faces")
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
@@ -96,6 +109,12 @@ def read_mesh(path: Path) -> RawMesh:
         faces=np.concatenate([np.asarray(p.faces, dtype=np.int64) + o for p, o in zip(parts, offsets, strict=True)]),
         face_colors=np.concatenate([_part_colors(part) for part in parts]),
     )
+
+
+def _unreadable(error: Exception) -> ValueError:
+    """A reader's exception as a ValueError of one line, with its kind where that says more than "ValueError"."""
+    reason = (str(error).strip().splitlines() or [""])[0][:300]
+    return ValueError(reason if reason and type(error) is ValueError else f"{type(error).__name__}: {reason}")
 
 
 def _part_colors(part) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
@@ -16,6 +15,7 @@ import torch
 
 import nmr
 from learn3d.data import kato, meshes
+from learn3d.files import write_json
 from learn3d.shading import shade_mesh
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -70,18 +70,22 @@ class DatasetReport:
 def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, np.ndarray]:
     """Object numbers per split, out of one permutation: the first are test, then val, the rest train.
 
-    `test` and `val` are shares (below 1; at least 4 objects, or half of them where there are fewer than 8) or counts.
+    `test` and `val` are counts, or shares (below 1) that give at least 4 objects, or an equal part where there are few.
     With test = 0.2 and val = 0, test is `default_rng(seed).permutation(count)[:max(4, round(0.2 * count))]`.
-    Raises ValueError for a negative or fractional count and for more than there are.
+    Raises ValueError for a negative or fractional count, and where none would be left to train on.
     """
     sizes = {}
+    equal = count // (1 + (test > 0) + (val > 0))
     for name, amount in (("test", test), ("val", val)):
         if not amount >= 0 or (amount >= 1 and amount != int(amount)):
             raise ValueError(f"{name} must be a share in 0 .. 1 or a whole number of meshes, got {amount}")
-        least = min(4, count // 2) if amount > 0 else 0
+        least = min(4, equal) if amount > 0 else 0
         sizes[name] = int(amount) if amount >= 1 else max(least, round(amount * count))
-    if sum(sizes.values()) > count:
-        raise ValueError(f"test ({sizes['test']}) and val ({sizes['val']}) need more meshes than there are ({count})")
+    if sum(sizes.values()) >= count:
+        raise ValueError(
+            f"test ({sizes['test']}) and val ({sizes['val']}) leave none of the {count} meshes to train on; "
+            "give more meshes, or a smaller test or val"
+        )
     order = np.random.default_rng(seed).permutation(count)
     bounds = np.cumsum([sizes["test"], sizes["val"]])
     return dict(zip(("test", "val", "train"), np.split(order, bounds), strict=True))
@@ -143,16 +147,17 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
             chosen = np.unique(np.linspace(0, len(images) - 1, 6).astype(int))
             sheet.append(contact_sheet(images[chosen], voxels[chosen]))
         bar.close()
-        if not used:
+        if "train" not in objects:
+            bad = [mesh for mesh in skipped if mesh["split"] == "train"]
             raise ValueError(
-                f"none of the {len(sources)} meshes can be used; the first reasons: "
-                + "; ".join(f"{mesh['name']}: {mesh['reason']}" for mesh in skipped[:3])
+                f"none of the {len(bad)} meshes to train on can be used; the first reasons: "
+                + "; ".join(f"{mesh['name']}: {mesh['reason']}" for mesh in bad[:3])
             )
         _write_png(Path(temporary) / f"{prefix}_contact.png", np.concatenate(sheet))
         files = sorted([p.name for p in Path(temporary).iterdir()] + [f"{prefix}_{n}" for n in _TEXT_FILES])
         report = DatasetReport(config.category, files, objects, used, skipped, dict(sorted(ignored.items())))
-        _write_json(Path(temporary) / f"{prefix}_card.json", _card(config, objects, used))
-        _write_json(Path(temporary) / f"{prefix}_report.json", asdict(report))
+        write_json(Path(temporary) / f"{prefix}_card.json", _card(config, objects, used))
+        write_json(Path(temporary) / f"{prefix}_report.json", asdict(report))
         (Path(temporary) / f"{prefix}_report.txt").write_text(report.text() + "\n")
         for name in files:
             os.replace(Path(temporary) / name, config.output / name)
@@ -209,15 +214,13 @@ def _render_split(
                 images[done + copy], voxels[done + copy] = render_object(placed, mesh.faces, color)
                 rendered += 1
                 bar.update()
-            watertight = meshes.is_watertight(mesh.vertices, mesh.faces)
-        except Exception as error:  # whatever one mesh does, the others go on
-            reason = (str(error).strip().splitlines() or [""])[0][:300]
-            kind = "" if type(error) is ValueError else f"{type(error).__name__}: "
-            skipped.append({"name": source.name, "split": split, "reason": kind + reason})
+        except ValueError as error:  # it cannot be read, rendered or seen: the others go on
+            skipped.append({"name": source.name, "split": split, "reason": str(error)})
             bar.update(copies - rendered)
             continue
         done += copies
         size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+        watertight = meshes.is_watertight(mesh.vertices, mesh.faces)
         used.append({"name": source.name, "split": split, **size, "watertight": watertight})
     return images[:done], voxels[:done]
 
@@ -306,10 +309,6 @@ def _progress_bar(total: int, name: str, show: bool):
     from tqdm import tqdm
 
     return tqdm(total=total, desc=name, unit="object", disable=not show, dynamic_ncols=True)
-
-
-def _write_json(path: Path, content: dict) -> None:
-    path.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:

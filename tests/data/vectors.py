@@ -1,12 +1,17 @@
-"""Reads the reference vectors: those of tests/data/vectors, and third-party meshes from ../shared where that exists."""
+"""Reads the reference vectors.
 
+Those that hold third-party meshes are not part of the repository: they are tested where a folder with them is at hand
+($NMR_VECTORS, or shared/vectors beside the checkout), and left out elsewhere.
+"""
+
+import os
 from pathlib import Path
 
 import numpy as np
 
 _FOLDERS = [
     Path(__file__).parent / "vectors",
-    Path(__file__).resolve().parents[3] / "shared" / "vectors",
+    Path(os.environ.get("NMR_VECTORS") or Path(__file__).resolve().parents[3] / "shared" / "vectors"),
 ]
 
 

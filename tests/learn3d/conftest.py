@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,18 +16,11 @@ from learn3d.config import TrainConfig
 from learn3d.data.kato import KatoDataset
 from learn3d.training import train
 
-VECTORS = Path(__file__).parents[1] / "data" / "vectors"
-
 
 @pytest.fixture(scope="session")
-def vectors() -> Callable[[str], dict[str, np.ndarray]]:
-    """Reads a file of reference vectors by name."""
-
-    def read(name: str) -> dict[str, np.ndarray]:
-        with np.load(VECTORS / f"{name}.npz", allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-
-    return read
+def read_metrics() -> Callable[[Path], list[dict[str, object]]]:
+    """Reads the metrics.jsonl of a run folder."""
+    return lambda folder: [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
 def tiny_arrays(objects: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

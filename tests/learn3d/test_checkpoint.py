@@ -37,6 +37,12 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
 
 
+def test_a_file_that_cannot_be_written_is_an_oserror(tmp_path) -> None:
+    path = tmp_path / "nowhere" / "a.safetensors"
+    with pytest.raises(OSError, match=r"cannot write the checkpoint .*a\.safetensors"):
+        checkpoint.save(path, {"x": torch.zeros(1)}, {"step": 1})
+
+
 @pytest.mark.parametrize("keep", [0, 4, 60, -1])
 def test_truncated_file(tmp_path, keep: int) -> None:
     path = tmp_path / "last.safetensors"

@@ -16,8 +16,9 @@ from learn3d.data import debian_packages as packages
 from learn3d.data.debian_aircraft import is_airplane_file, turn_to_front, without_effects
 from learn3d.data.debian_furniture import furniture_category, place_furniture, read_catalogue
 from learn3d.data.debian_models import FetchConfig, fetch_debian_models
-from learn3d.data.mesh_cleaning import clean_mesh, is_watertight, overlap, surface_grid
+from learn3d.data.mesh_cleaning import clean_mesh, overlap, surface_grid
 from learn3d.data.mesh_text import Part, read_ac3d, read_obj, triangulate, write_ply
+from learn3d.data.meshes import is_watertight
 
 CATALOGUE = "PluginFurnitureCatalog.properties"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
@@ -483,7 +484,7 @@ def test_clean_mesh_welds_and_drops():
     faces = np.concatenate([np.arange(36).reshape(-1, 3), [[0, 0, 1]], [[2, 1, 0]]])
     points, clean = clean_mesh(vertices, faces)
     assert (points.shape, clean.shape) == ((8, 3), (12, 3))
-    assert is_watertight(clean) and not is_watertight(clean[1:])
+    assert is_watertight(points, clean) and not is_watertight(points, clean[1:])
     np.testing.assert_allclose(np.ptp(points, axis=0), [1, 0.5, 0.5])
     np.testing.assert_allclose(points.min(axis=0) + points.max(axis=0), 0, atol=1e-12)
 

@@ -12,7 +12,16 @@ import pytest
 import torch
 
 import nmr
-from learn3d.evaluation import _class_means, evaluate, evaluate_runs, format_table, mean_mmd, versions, voxel_iou
+from learn3d.evaluation import (
+    _class_means,
+    evaluate,
+    evaluate_runs,
+    format_table,
+    mean_mmd,
+    spread_samples,
+    versions,
+    voxel_iou,
+)
 from learn3d.losses import mmd
 from learn3d.networks import create_networks
 
@@ -81,6 +90,30 @@ def test_images_without_iou_are_counted_and_left_out(networks, tiny_set) -> None
     assert (result.voxel_iou, result.undefined) == (0, 24)
     result = evaluate(nothing, dataclasses.replace(tiny_set, voxels=np.zeros_like(voxels)))
     assert (result.voxel_iou, result.undefined) == (None, 72)
+
+
+@pytest.mark.parametrize(
+    ("objects", "count"), [(25, 26), (25, 24), (25, 5), (24, 25), (24, 100), (18, 73), (18, 200), (1, 7), (2, 48)]
+)
+def test_spread_samples_meet_views_and_objects_evenly(objects: int, count: int) -> None:
+    samples = spread_samples(objects, 24, count)
+    assert samples.dtype == torch.int64
+    assert len(samples.unique()) == count
+    assert torch.equal(samples, samples.sort().values)
+    assert torch.equal(samples, spread_samples(objects, 24, count))
+    for numbers, size in ((samples % 24, 24), (samples // 24, objects)):
+        counts = torch.bincount(numbers, minlength=size)
+        assert len(counts) == size
+        assert counts.max() - counts.min() <= 1
+    assert torch.equal(spread_samples(objects, 24, objects * 24), torch.arange(objects * 24))
+
+
+def test_part_of_the_images_gives_codes_of_every_view(networks, tiny_set, monkeypatch) -> None:
+    seen = []
+    batch = type(tiny_set).batch
+    monkeypatch.setattr(type(tiny_set), "batch", lambda self, chosen: (seen.append(chosen), batch(self, chosen))[1])
+    evaluate(networks, tiny_set, max_images=25)  # of 72, three objects
+    assert len((torch.cat(seen) % 24).unique()) == 24
 
 
 @pytest.mark.parametrize("form", ["released", "paper"])

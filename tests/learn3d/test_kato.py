@@ -156,6 +156,16 @@ def test_foreign_truncated_and_pickled_files(tmp_path, arrays):
             KatoDataset.load(tmp_path, "chair", "test")
 
 
+def test_too_little_memory_is_not_called_a_damaged_file(tmp_path, arrays, monkeypatch):
+    def fail(*_, **__):
+        raise MemoryError
+
+    write(tmp_path, *arrays)
+    monkeypatch.setattr(np, "load", fail)
+    with pytest.raises(MemoryError):
+        KatoDataset.load(tmp_path, "chair", "test")
+
+
 def test_bad_indices(tmp_path, arrays):
     write(tmp_path, *arrays)
     dataset = KatoDataset.load(tmp_path, "chair", "test")

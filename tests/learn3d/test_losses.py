@@ -6,14 +6,15 @@ import itertools
 
 import pytest
 import torch
+from vectors import load_vector
 
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, mmd, pose_classification_loss
 from learn3d.networks import PoseDiscriminator
 
 
 @pytest.fixture(scope="module")
-def case(vectors) -> dict[str, torch.Tensor]:
-    return {k: torch.from_numpy(v) for k, v in vectors("loss_adversarial").items() if v.dtype.kind in "fi"}
+def case() -> dict[str, torch.Tensor]:
+    return {k: torch.from_numpy(v) for k, v in load_vector("loss_adversarial").items() if v.dtype.kind in "fi"}
 
 
 @pytest.fixture
@@ -90,8 +91,8 @@ def test_low_precision_inputs_give_float32_losses() -> None:
     assert all(loss.dtype == torch.float32 for loss in losses)
 
 
-def test_mmd_vectors(vectors) -> None:
-    case = {k: torch.from_numpy(v) for k, v in vectors("loss_mmd").items() if v.dtype.kind == "f"}
+def test_mmd_vectors() -> None:
+    case = {k: torch.from_numpy(v) for k, v in load_vector("loss_mmd").items() if v.dtype.kind == "f"}
     source, target = case["source"].clone().requires_grad_(), case["target"].clone().requires_grad_()
     value = mmd(source, target)
     value.backward()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from vectors import load_vector
 
 from learn3d import networks as networks_module
 from learn3d.networks import (
@@ -57,8 +58,8 @@ def test_networks_have_26_million_parameters() -> None:
     assert sum(p.numel() for _, network in networks.items() for p in network.parameters()) == 26_121_694
 
 
-def test_generator_rule_vectors(vectors) -> None:
-    case = {key: torch.from_numpy(value) for key, value in vectors("generator_rule").items() if value.ndim}
+def test_generator_rule_vectors() -> None:
+    case = {key: torch.from_numpy(value) for key, value in load_vector("generator_rule").items() if value.ndim}
     assert torch.equal(deform_sphere(case["base"], case["bias"]), case["vertices"])
 
 

@@ -65,6 +65,22 @@ def test_prepare_image_refuses_what_it_cannot_frame() -> None:
         prepare_image(np.zeros((4, 4, 3), np.uint8), np.full((4, 4), 9, np.uint8))
 
 
+@pytest.mark.parametrize("turned", ["image", "mask", "both"])
+def test_pictures_are_turned_upright(tmp_path, turned: str) -> None:
+    colors = np.zeros((6, 8, 3), np.uint8)
+    colors[1, 2] = (200, 100, 50)
+    mask = colors.max(axis=2)
+    for name, pixels in (("image", colors), ("mask", mask)):
+        exif = Image.Exif()
+        if turned in (name, "both"):
+            exif[0x0112] = 6  # stored lying on its left side: a viewer turns it by 90 degrees clockwise
+            pixels = np.rot90(pixels)
+        Image.fromarray(np.ascontiguousarray(pixels)).save(tmp_path / f"{name}.png", exif=exif)
+    read, read_mask = read_image(tmp_path / "image.png", tmp_path / "mask.png")
+    assert np.array_equal(read, colors)
+    assert np.array_equal(read_mask, mask)
+
+
 def test_read_image_with_transparency_or_mask(tmp_path) -> None:
     rgba = np.zeros((6, 8, 4), np.uint8)
     rgba[2:4, 3:5] = (200, 100, 50, 255)

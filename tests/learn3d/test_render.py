@@ -132,6 +132,7 @@ def test_bad_meshes_are_reported_and_the_others_made(tmp_path, folder):
     trimesh.PointCloud(vertices).export(folder / "points.ply")
     trimesh.creation.icosphere(4).export(folder / "large.stl")
     (folder / "notes.doc").write_text("not a mesh")
+    (folder / "scene.dae").write_text("trimesh reads it with another package only")
     report = make(tmp_path / "data", folder, max_faces=5000)
     reasons = {mesh["name"]: mesh["reason"] for mesh in report.skipped}
     assert report.objects == {"train": 6} and len(KatoDataset.load(tmp_path / "data", "chair", "train").images) == 6
@@ -143,9 +144,23 @@ def test_bad_meshes_are_reported_and_the_others_made(tmp_path, folder):
     assert "not finite" in reasons["nan.obj"] and "longest side" in reasons["point.obj"]
     assert "no view shows" in reasons["line.obj"]
     assert "5120 faces, the limit is 5000" in reasons["large.stl"]
-    assert all(reasons.values()) and report.ignored_files == {".doc": 1}
+    assert all(reasons.values()) and report.ignored_files == {".dae": 1, ".doc": 1}
     text = (tmp_path / "data" / "03001627_report.txt").read_text()
     assert "10 skipped" in text and "skipped nan.obj (train)" in text and "ignored 1 .doc" in text
+
+
+def test_our_own_mistakes_are_not_taken_for_bad_meshes(tmp_path, folder, monkeypatch):
+    def fail(*_):
+        raise IndexError("a slip in the renderer")
+
+    monkeypatch.setattr(render, "render_object", fail)
+    with pytest.raises(IndexError, match="a slip in the renderer"):
+        make(tmp_path / "data", folder)
+
+
+def test_only_formats_that_the_reader_knows_count_as_meshes():
+    known = trimesh.available_formats()
+    assert {extension.lstrip(".") for extension in meshes.EXTENSIONS} <= known
 
 
 def test_checks_of_arrays():
@@ -215,8 +230,13 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
     splits = split_objects(50, 7, 0.1, 5)
     assert [len(splits[s]) for s in ("test", "val", "train")] == [7, 5, 38]
     np.testing.assert_array_equal(np.concatenate(list(splits.values())), np.random.default_rng(5).permutation(50))
-    for bad in ((-1, 0), (2.5, 0), (8, 4), (float("nan"), 0)):
-        with pytest.raises(ValueError, match=r"share|need more"):
+    assert len(split_objects(10, 6, 3, 0)["train"]) == 1
+    for count in range(1, 40):
+        small = split_objects(count, 0.2, 0.1, 0)  # the tool's defaults leave something to train on
+        assert len(small["train"]) >= max(1, count // 3)
+        assert min(len(small["test"]), len(small["val"])) >= min(4, count // 3)
+    for bad in ((-1, 0), (2.5, 0), (8, 4), (6, 4), (float("nan"), 0)):
+        with pytest.raises(ValueError, match=r"share|leave none of the 10 meshes to train on"):
             split_objects(10, *bad, 0)
 
 
@@ -309,6 +329,16 @@ def test_errors_of_settings_and_folders(tmp_path, folder, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(2**30, 2**30, 1000))
     with pytest.raises(OSError, match="MiB free"):
         make(tmp_path / "data", folder)
+
+
+def test_a_data_set_without_training_objects_is_not_made(tmp_path, folder):
+    train = split_objects(6, 2, 2, seed=0)["train"]
+    sources, _ = meshes.folder_sources(folder)
+    for number in train:
+        (folder / sources[number].name).write_text("damaged")
+    with pytest.raises(ValueError, match="none of the 2 meshes to train on can be used"):
+        make(tmp_path / "data", folder, test=2, val=2)
+    assert list((tmp_path / "data").iterdir()) == []
 
 
 def test_render_object_refuses_what_cannot_be_seen():

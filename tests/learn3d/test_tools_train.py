@@ -15,6 +15,7 @@ from types import ModuleType
 import pytest
 
 from learn3d.config import load_config
+from learn3d.training import Summary
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -59,7 +60,10 @@ def test_help_explains_every_option(name: str, monkeypatch, capsys) -> None:
     with pytest.raises(SystemExit) as stop:
         tool(name).main()
     assert stop.value.code == 0
-    text = " ".join(capsys.readouterr().out.split())
+    out = capsys.readouterr().out
+    examples = [line for line in out.splitlines() if "python tools/" in line]
+    assert examples == [line for line in tool(name).__doc__.splitlines() if "python tools/" in line]
+    text = " ".join(out.split())
     assert f"python tools/{name}.py" in text
     assert {"train": "Images per step", "evaluate": "Run folders", "reconstruct": "turntable GIF"}[name] in text
 
@@ -82,6 +86,36 @@ def test_mistakes_are_one_clear_line(
     assert error.startswith("error: ")
     assert error.count("\n") == 1
     assert message in error
+
+
+def test_help_says_what_the_paper_preset_keeps(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["train", "--help"])
+    with pytest.raises(SystemExit):
+        tool("train").main()
+    assert "factor 0.5" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+
+@pytest.mark.parametrize("error", [PermissionError(13, "no permission"), OSError(28, "No space left on device")])
+def test_what_the_disk_refuses_is_one_clear_line(error: OSError, tmp_path, monkeypatch, capsys) -> None:
+    def fail(*_, **__):
+        raise error
+
+    module = tool("train")
+    monkeypatch.setattr(module, "train", fail)
+    assert call(module, monkeypatch, "--data", tmp_path, "--category", "chair", "--output", tmp_path) == 1
+    assert capsys.readouterr().err == f"error: {error}\n"
+
+
+@pytest.mark.parametrize(("best_step", "shown"), [(0, False), (500, True)])
+def test_best_iou_is_said_where_there_is_one(best_step: int, shown: bool, tmp_path, monkeypatch, capsys) -> None:
+    module = tool("train")
+    summary = Summary(tmp_path, 700, False, 0.25 if best_step else -1.0, best_step, 60.0)
+    monkeypatch.setattr(module, "train", lambda *_, **__: summary)
+    assert call(module, monkeypatch, "--data", tmp_path, "--category", "chair", "--output", tmp_path) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("stopped at step 700 after 1.0 min; ")
+    assert ("best validation voxel IoU 0.2500 at step 500" in out, "IoU" in out) == (shown, shown)
+    assert out.endswith(f"everything is in {tmp_path}\n")
 
 
 def test_resume_and_overwrite_exclude_each_other(finished_run, monkeypatch, capsys) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
+import shutil
 import signal
 
 import numpy as np
@@ -22,7 +24,6 @@ from learn3d.data.kato import KatoDataset
 from learn3d.methods import pose_invariant
 from learn3d.methods.pose_invariant import create_optimizers, train_step, uses_discriminator
 from learn3d.networks import create_networks
-from learn3d.runlog import read_metrics
 from learn3d.training import batch_indices, object_share, train
 
 
@@ -187,7 +188,7 @@ def test_object_share() -> None:
     assert object_share(data) == pytest.approx(0.25)  # the other twelve are empty
 
 
-def test_a_finished_run_leaves_everything(finished_run) -> None:
+def test_a_finished_run_leaves_everything(finished_run, read_metrics) -> None:
     names = {path.name for path in finished_run.iterdir()}
     assert names == {
         "config.json",
@@ -238,7 +239,9 @@ def test_a_second_interrupt_does_not_wait(tiny_config, run_folder, monkeypatch) 
         train(tiny_config(run_folder, method="vanilla"))
 
 
-def test_interrupted_run_resumes_bit_for_bit(tiny_config, finished_run, run_folder, monkeypatch, capsys) -> None:
+def test_interrupted_run_resumes_bit_for_bit(
+    tiny_config, finished_run, run_folder, monkeypatch, capsys, read_metrics
+) -> None:
     monkeypatch.setattr(training, "train_step", signal_after(signal.SIGINT, 2))
     summary = train(tiny_config(run_folder))
     assert (summary.step, summary.finished) == (2, False)
@@ -264,8 +267,78 @@ def test_interrupted_run_resumes_bit_for_bit(tiny_config, finished_run, run_fold
 def test_resume_refuses_conflicts_and_finished_runs(tiny_config, finished_run) -> None:
     with pytest.raises(ValueError, match=r"cannot resume with different options .*learning_rate"):
         train(tiny_config(finished_run, learning_rate=1e-3), resume=True)
-    with pytest.raises(ValueError, match="taken 4 steps of 4 already"):
+    with pytest.raises(ValueError, match=ALREADY):
         train(tiny_config(finished_run), resume=True)
+
+
+ALREADY = "taken 4 steps of 4 already"  # what a finished run says when everything fits
+
+
+def change_metadata(monkeypatch: pytest.MonkeyPatch, change) -> None:
+    """Let checkpoints be read as if they had been written with other metadata."""
+    load = checkpoint.load
+
+    def changed_load(path):
+        tensors, metadata = load(path)
+        return tensors, change(metadata)
+
+    monkeypatch.setattr(checkpoint, "load", changed_load)
+
+
+def write_images(tiny_folder, folder, change) -> None:
+    """A copy of the tiny data with other training images."""
+    shutil.copytree(tiny_folder, folder)
+    path = folder / "02691156_train_images.npz"
+    with np.load(path) as archive:
+        images = change(archive["arr_0"])
+    np.savez_compressed(path, images)
+    np.savez_compressed(folder / "02691156_train_voxels.npz", np.zeros((len(images), 32, 32, 32), bool))
+
+
+def one_pixel(images: np.ndarray) -> np.ndarray:
+    images[1, 5, 0, 30, 30] ^= 1
+    return images
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda images: images[:2], "other training data: 72 images in the run, 48 in"),
+        (one_pixel, "other training data: the CRC-32 of the images was"),
+    ],
+)
+def test_resume_refuses_other_data(tiny_config, tiny_folder, finished_run, tmp_path, change, message: str) -> None:
+    write_images(tiny_folder, tmp_path / "data", change)
+    with pytest.raises(ValueError, match=message):
+        train(tiny_config(finished_run, data=tmp_path / "data"), resume=True)
+
+
+def test_resume_finds_its_data_in_another_folder(tiny_config, tiny_folder, finished_run, tmp_path) -> None:
+    shutil.copytree(tiny_folder, tmp_path / "moved")
+    with pytest.raises(ValueError, match=ALREADY):
+        train(tiny_config(finished_run, data=tmp_path / "moved"), resume=True)
+
+
+def test_resume_refuses_another_arithmetic(tiny_config, finished_run, monkeypatch) -> None:
+    change_metadata(monkeypatch, lambda m: m | {"config": m["config"] | {"precision": "auto"}})
+    with pytest.raises(ValueError, match=ALREADY):  # fp32 by name is what "auto" was
+        train(tiny_config(finished_run, precision="fp32"), resume=True)
+    monkeypatch.setattr(training, "resolve_precision", lambda precision, device: "bf16")
+    with pytest.raises(ValueError, match="the run computes in fp32, but precision 'auto' means bf16 here; ask for"):
+        train(tiny_config(finished_run, precision="auto"), resume=True)
+
+
+def test_resume_from_a_checkpoint_without_conditions(tiny_config, tiny_folder, finished_run, monkeypatch) -> None:
+    change_metadata(monkeypatch, lambda m: {k: v for k, v in m.items() if k != "conditions"})
+    with pytest.raises(ValueError, match=ALREADY):
+        train(tiny_config(finished_run), resume=True)
+    with pytest.raises(ValueError, match="precision: 'fp32' in the run, 'bf16' asked for"):
+        train(tiny_config(finished_run, precision="bf16"), resume=True)
+
+
+def test_resume_command_is_quoted(tmp_path) -> None:
+    words = shlex.split(training.resume_command(tmp_path / "my runs" / "it's"))
+    assert words == ["python", "tools/train.py", "--output", str(tmp_path / "my runs" / "it's"), "--resume"]
 
 
 def test_resume_without_a_checkpoint(tiny_config, run_folder) -> None:
@@ -273,7 +346,9 @@ def test_resume_without_a_checkpoint(tiny_config, run_folder) -> None:
         train(tiny_config(run_folder), resume=True)
 
 
-def test_used_folder_is_refused_and_overwrite_keeps_foreign_files(tiny_config, run_folder, monkeypatch) -> None:
+def test_used_folder_is_refused_and_overwrite_keeps_foreign_files(
+    tiny_config, run_folder, monkeypatch, read_metrics
+) -> None:
     run_folder.mkdir()
     (run_folder / "notes.txt").write_text("mine")
     (run_folder / "metrics.jsonl").write_text('{"step": 0, "split": "train"}\n')
@@ -313,7 +388,7 @@ def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> 
         networks.generator.layers[0].bias[3] = float("inf")
     run_folder.mkdir()
     with pytest.raises(FloatingPointError, match="generator has weights that are not finite; there is no checkpoint"):
-        training.save_last(run_folder, tiny_config(run_folder), networks, None, training.Progress())
+        training.save_last(run_folder, tiny_config(run_folder), None, networks, None, training.Progress())
     assert not list(run_folder.iterdir())
 
 

@@ -49,7 +49,7 @@ def test_published_training_render():
     alpha.backward(torch.from_numpy(v[image.replace("out_", "upstream_")]))
     assert np.array_equal(alpha.detach().numpy(), v[image])
     difference = np.linalg.norm(vertices.grad.numpy() - v["grad_vertices"]) / np.linalg.norm(v["grad_vertices"])
-    assert difference < 1e-2
+    assert difference < 1e-4  # bit for bit with the same BLAS
 
 
 def test_one_mesh_many_views_and_many_meshes_one_view():
@@ -85,6 +85,11 @@ def test_any_object_with_transform_is_a_camera():
     [
         (lambda: nmr.LookAt([0.0, 1.0]), r"eye must have shape \[3\] or \[B, 3\], got \[2\]"),
         (lambda: nmr.LookAt([0.0, 0.0, 1.0], half_fov_deg=90.0), "between 0 and 90"),
+        (lambda: nmr.LookAt([0.0, 0.0, 1.0], half_fov_deg=torch.ones(2)), "must be a number"),
+        (
+            lambda: nmr.LookAt.from_angles([1.0, 2.0], 0.0, [0.0, 1.0, 2.0]),
+            r"one length, got shapes \[2\], \[\], \[3\]",
+        ),
         (lambda: nmr.LookAt(torch.rand(2, 3)).transform(torch.rand(3, 4, 3)), r"3 meshes, eye \[2, 3\]"),
     ],
 )

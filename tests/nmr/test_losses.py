@@ -85,10 +85,12 @@ def test_smoothness_same_bits_for_any_number_of_threads():
 
 def test_smoothness_errors():
     vertices = torch.zeros(1, 4, 3)
-    with pytest.raises(ValueError, match=r"made by nmr.edge_table.*\[2, 3\]"):
+    with pytest.raises(ValueError, match=r"as made by nmr.edge_table.*\[2, 3\]"):
         smoothness_loss(vertices, torch.zeros(2, 3, dtype=torch.long))
-    with pytest.raises(ValueError, match="vertex 9, but a mesh has vertices 0 to 3"):
+    with pytest.raises(ValueError, match="vertex 9, but a mesh has 4 vertices"):
         smoothness_loss(vertices, torch.full((1, 4), 9))
+    with pytest.raises(ValueError, match="at least one mesh"):
+        smoothness_loss(vertices[:0], torch.zeros(1, 4, dtype=torch.long))
 
 
 def test_soft_iou_vector():
@@ -112,5 +114,8 @@ def test_soft_iou_of_empty_images():
 
 
 def test_soft_iou_error():
-    with pytest.raises(ValueError, match=r"one shape, got float32 \[1, 4, 4\] and float32 \[1, 5, 4\]"):
-        soft_iou_loss(torch.zeros(1, 4, 4), torch.zeros(1, 5, 4))
+    for a, b in (((1, 4, 4), (1, 5, 4)), ((0, 4, 4), (0, 4, 4)), ((4,), (4,))):
+        with pytest.raises(ValueError, match=r"one shape \[B, \.\.\.\] with B >= 1, got float32"):
+            soft_iou_loss(torch.zeros(a), torch.zeros(b))
+    with pytest.raises(TypeError, match="must be tensors"):
+        soft_iou_loss([0.0], torch.zeros(1, 1))

@@ -232,13 +232,72 @@ def test_any_mesh_gives_finite_coverage_and_no_nan(mesh, image_size, anti_aliasi
     assert not grad[:, ~used].any()
 
 
-@settings(max_examples=100, deadline=None)
-@given(nasty_meshes())
-def test_any_mesh_through_a_camera(mesh):
+@settings(max_examples=200, deadline=None)
+@given(nasty_meshes(), hnp.arrays(np.float64, (3, 3), elements=st.sampled_from([0.0, 1.0, -2.0, 1e-30, 1e30, *NASTY])))
+def test_any_mesh_through_any_camera(mesh, pose):
     vertices, faces = mesh
-    camera = nmr.LookAt.from_angles(2.0, 10.0, 20.0)
-    alpha = nmr.render_silhouette(vertices, faces, camera, image_size=8)
-    assert alpha.isfinite().all()
+    eye, at, up = torch.from_numpy(pose).unbind(0)
+    eye.requires_grad_()
+    for camera in (nmr.LookAt(eye, at, up), nmr.LookAt.from_angles(2.0, 10.0, 20.0)):
+        alpha, grad = render_with_gradient(vertices, faces, camera=camera, image_size=8)
+        assert alpha.isfinite().all() and not grad.isnan().any()
+        assert eye.grad is None or not eye.grad.isnan().any()
+
+
+def test_vertices_without_a_finite_image_get_no_gradient_and_spoil_nothing():
+    """In the plane of the eye, at the eye, not a number: the other faces keep image and gradient."""
+    vertices, faces = nmr.icosphere(1)
+    bad = torch.tensor([[0.0, 1.0, -3.0], [0.0, 0.0, -3.0], [float("nan"), 0.0, 0.0]])
+    eye = torch.tensor([0.0, 0.0, -3.0], requires_grad=True)
+    extra = torch.tensor([[0, 1, len(vertices) + k] for k in range(3)])
+    good = render_with_gradient(vertices[None], faces, camera=nmr.LookAt(eye), image_size=16)
+    eye_grad, eye.grad = eye.grad, None
+    both = torch.cat([vertices, bad])[None]
+    spoiled = render_with_gradient(both, torch.cat([faces, extra]), camera=nmr.LookAt(eye), image_size=16)
+    assert torch.equal(spoiled[0], good[0]) and torch.equal(spoiled[1][:, :-3], good[1])
+    assert not spoiled[1][:, -3:].any() and torch.equal(eye.grad, eye_grad) and eye_grad.any()
+
+
+def test_autocast_leaves_the_renderer_alone():
+    vertices, faces, camera = bumpy_spheres(batch=2)
+    plain = render_with_gradient(vertices, faces, camera=camera, image_size=16)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        leaf = vertices.clone().requires_grad_()
+        alpha = nmr.render_silhouette(leaf, faces, camera, image_size=16)
+    alpha.backward(torch.randn(alpha.shape, generator=torch.Generator().manual_seed(0)))
+    assert torch.equal(alpha, plain[0]) and torch.equal(leaf.grad, plain[1])
+
+
+def test_running_out_of_memory_is_an_exception():
+    """Not the end of the process: the kernels' threads hand std::bad_alloc to the caller."""
+    code = (
+        "import resource, torch, nmr\n"
+        "torch.set_num_threads(2)\n"
+        "v, f = nmr.icosphere(1); v = (v * .3 + torch.tensor([0, 0, 2.])).expand(2, -1, -1)\n"
+        "nmr.render_silhouette(v, f, image_size=64)\n"
+        "held = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (held + 3 * 2**30, -1))\n"
+        "try: nmr.render_silhouette(v, f, image_size=8192)\n"
+        "except (MemoryError, RuntimeError): print('refused')\n"
+        "nmr.render_silhouette(v, f, image_size=64); print('alive')"
+    )
+    if sys.platform != "linux":
+        pytest.skip("sets RLIMIT_AS")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.split() == ["refused", "alive"], done.stderr
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_tensors_are_staged_through_the_host():
+    vertices, faces, camera = bumpy_spheres(batch=2)
+    cpu = render_with_gradient(camera.transform(vertices), faces, image_size=16)
+    leaf = camera.transform(vertices).cuda().requires_grad_()
+    alpha = nmr.render_silhouette(leaf, faces, image_size=16)
+    alpha.backward(torch.randn(alpha.shape, generator=torch.Generator().manual_seed(0)).cuda())
+    assert alpha.is_cuda and leaf.grad.is_cuda
+    assert torch.equal(alpha.cpu(), cpu[0]) and torch.equal(leaf.grad.cpu(), cpu[1])
+    edges = nmr.edge_table(faces)
+    assert nmr.losses.smoothness_loss(leaf, edges).is_cuda and nmr.voxelize(leaf, faces).is_cuda
 
 
 def test_behind_the_camera_and_off_screen_draw_nothing():
@@ -270,7 +329,7 @@ GOOD = dict(vertices=torch.zeros(2, 4, 3), faces=torch.zeros(5, 3, dtype=torch.l
         (dict(faces=np.zeros((5, 3), int)), TypeError, "use torch.as_tensor"),
         (dict(faces=torch.zeros(5, 4, dtype=torch.long)), ValueError, r"\[F, 3\]"),
         (dict(faces=torch.zeros(3, 5, 3, dtype=torch.long)), ValueError, "batch size of the vertices, 2"),
-        (dict(faces=torch.full((5, 3), 4)), ValueError, "vertex 4, but a mesh has vertices 0 to 3"),
+        (dict(faces=torch.full((5, 3), 4)), ValueError, "vertex 4, but a mesh has 4 vertices"),
         (dict(faces=torch.full((5, 3), -1)), ValueError, "vertex -1"),
         (dict(camera="front"), TypeError, "transform"),
         (dict(image_size=0), ValueError, "image_size must lie in 1"),
@@ -279,6 +338,7 @@ GOOD = dict(vertices=torch.zeros(2, 4, 3), faces=torch.zeros(5, 3, dtype=torch.l
         (dict(near=2.0, far=1.0), ValueError, "near < far"),
         (dict(near=float("nan")), ValueError, "near < far"),
         (dict(eps=0.0), ValueError, "eps must be positive"),
+        (dict(eps=1e-60), ValueError, "positive in torch.float32"),
         (dict(camera=nmr.LookAt(torch.rand(3, 3))), ValueError, "2 meshes"),
     ],
 )

@@ -22,6 +22,7 @@ from learn3d.data.shapes.airplane_parts import (
 )
 from learn3d.data.shapes.parts import (
     Solid,
+    all_moved,
     both_sides,
     both_sides_of,
     box,
@@ -69,7 +70,7 @@ def airliner(rng: np.random.Generator) -> list[Solid]:
     if mount.startswith("tail"):
         solids += tail_engines(rng, radius, 0.9 * size, z=rng.uniform(-0.32, -0.24))
     if mount.endswith("3"):
-        solids += [part.moved(y=1.35 * radius, z=-0.36) for part in nacelle(0.9 * size, 4.5 * size)]
+        solids += all_moved(nacelle(0.9 * size, 4.5 * size), y=1.35 * radius, z=-0.36)
     kind = "T" if freighter or mount.startswith("tail") else "conventional"
     solids += tail(rng, kind, radius, swept=True)
     if maybe(rng, 0.4):
@@ -220,11 +221,11 @@ def flying_wing(rng: np.random.Generator) -> list[Solid]:
         if kind == "humps":
             solids += both_sides(ellipsoid((0.09, 0.07, 0.8 * chord), (x, y + 0.02, z - 0.45 * chord)))
         elif kind == "pods":
-            pods = [p.moved(x, y + 0.045, z - 0.6 * chord) for p in nacelle(0.03, 0.14)]
+            pods = all_moved(nacelle(0.03, 0.14), x, y + 0.045, z - 0.6 * chord)
             solids += both_sides_of(pods)
         else:
             pod = streamlined(0.022, 0.2).rotated("y", 180).moved(x, y, z - chord + 0.05)
-            screw = [p.moved(x, y, z - chord - 0.05) for p in propeller(rng, 0.09, 3, hub=0.014)]
+            screw = all_moved(propeller(rng, 0.09, 3, hub=0.014), x, y, z - chord - 0.05)
             solids += both_sides_of([pod, *screw])
     if maybe(rng, 0.4):
         x, y, z, chord = plan.at(0.97)

@@ -8,6 +8,7 @@ import numpy as np
 
 from learn3d.data.shapes.parts import (
     Solid,
+    all_moved,
     bar,
     both_sides,
     both_sides_of,
@@ -169,7 +170,7 @@ def engine_pod(rng: np.random.Generator, plan: Planform, share: float, radius: f
         ],
         upright=True,
     )
-    return [pylon, *[part.moved(x, y - drop, forward) for part in nacelle(radius, length)]]
+    return [pylon, *all_moved(nacelle(radius, length), x, y - drop, forward)]
 
 
 def propeller(rng: np.random.Generator, radius: float, blades: int, hub: float) -> list[Solid]:
@@ -227,7 +228,7 @@ def tail_engines(rng: np.random.Generator, radius: float, size: float, z: float)
     """A pair of jet engines on short stubs at the rear fuselage."""
     x, y = 0.8 * radius + 1.1 * size, rng.uniform(0.1, 0.6) * radius
     stub = wing([(0.0, y, z + 0.02, 0.09, 0.12), (x, y, z + 0.01, 0.08, 0.12)])
-    return both_sides_of([*[p.moved(x, y, z) for p in nacelle(size, rng.uniform(4.0, 5.5) * size)], stub])
+    return both_sides_of([*all_moved(nacelle(size, rng.uniform(4.0, 5.5) * size), x, y, z), stub])
 
 
 def streamlined(radius: float, length: float) -> Solid:

@@ -18,6 +18,7 @@ from learn3d.data.shapes.airplane_parts import (
 )
 from learn3d.data.shapes.parts import (
     Solid,
+    all_moved,
     bar,
     both_sides,
     both_sides_of,
@@ -62,7 +63,7 @@ def turboprop(rng: np.random.Generator) -> list[Solid]:
         long = chord + rng.uniform(0.08, 0.13)
         pod = streamlined(size, long).moved(x, y - 0.2 * size, z - 0.5 * long + 0.075)
         screw = propeller(rng, disc, blades, hub=0.55 * size)
-        solids += both_sides_of([pod, *[p.moved(x, y - 0.2 * size, z + 0.075) for p in screw]])
+        solids += both_sides_of([pod, *all_moved(screw, x, y - 0.2 * size, z + 0.075)])
     kind = pick(rng, {"T": 2, "conventional": 2, "cross": 0.7} if high else {"conventional": 3, "twin": 1.2, "T": 0.6})
     solids += tail(rng, kind, radius, swept=maybe(rng, 0.5))
     if maybe(rng, 0.2):
@@ -104,7 +105,7 @@ def light_plane(rng: np.random.Generator) -> list[Solid]:
         else canopy(1.5 * radius, 1.3 * tall, rng.uniform(0.24, 0.36), (0, 0.72 * tall, 0.1))
     )
     screw_z = -0.515 if pusher else 0.497
-    solids += [p.moved(z=screw_z) for p in propeller(rng, rng.uniform(0.11, 0.16), int(rng.integers(2, 4)), hub=0.025)]
+    solids += all_moved(propeller(rng, rng.uniform(0.11, 0.16), int(rng.integers(2, 4)), hub=0.025), z=screw_z)
     swept = maybe(rng, 0.5)
     solids += tail(rng, pick(rng, {"conventional": 4, "T": 1, "V": 0.6, "cross": 0.5}), radius, swept=swept)
     if high and maybe(rng, 0.6):
@@ -185,9 +186,9 @@ def warbird(rng: np.random.Generator) -> list[Solid]:
     if twin:
         x, y, z, chord = plan.at(0.32)
         pod = streamlined(0.04, chord + 0.15).moved(x, y, z - 0.5 * chord + 0.0)
-        solids += both_sides_of([pod, *[p.moved(x, y, z + 0.075) for p in propeller(rng, disc, 3, hub=0.022)]])
+        solids += both_sides_of([pod, *all_moved(propeller(rng, disc, 3, hub=0.022), x, y, z + 0.075)])
     else:
-        solids += [p.moved(z=0.495) for p in propeller(rng, disc, int(rng.integers(2, 5)), hub=0.032)]
+        solids += all_moved(propeller(rng, disc, int(rng.integers(2, 5)), hub=0.032), z=0.495)
     solids += tail(rng, "twin" if twin and maybe(rng, 0.5) else "conventional", radius, swept=False)
     if maybe(rng, 0.3):
         solids += landing_gear(0.8 * radius, radius + 0.1, 0.2, -0.46, 0.16, True)
@@ -226,7 +227,7 @@ def biplane(rng: np.random.Generator) -> list[Solid]:
         solids += both_sides(
             bar((0.7 * radius, 0.5 * radius, top.z - along * chord), (0.08, top.y, top.z - along * chord), 0.012)
         )
-    solids += [p.moved(z=0.495) for p in propeller(rng, rng.uniform(0.12, 0.15), 2, hub=0.025)]
+    solids += all_moved(propeller(rng, rng.uniform(0.12, 0.15), 2, hub=0.025), z=0.495)
     solids += tail(rng, "conventional", radius, swept=False)
     solids += landing_gear(radius, 2.6 * radius, 0.27, -0.46, 0.11, True)
     return solids
@@ -255,9 +256,9 @@ def twin_boom(rng: np.random.Generator) -> list[Solid]:
     size = np.array([0.3, 0.7, 1.0, 1.0, 0.6, 0.4]) * thick
     parts = [tube(path, size, ellipse(2, 2, 10))]
     if front > z:
-        parts += [p.moved(x, y, front) for p in propeller(rng, min(0.12, 0.75 * x), 3, hub=0.02)]
+        parts += all_moved(propeller(rng, min(0.12, 0.75 * x), 3, hub=0.02), x, y, front)
     else:
-        solids += [p.moved(z=-0.2) for p in propeller(rng, min(0.1, 0.7 * x), 3, hub=0.03)]
+        solids += all_moved(propeller(rng, min(0.1, 0.7 * x), 3, hub=0.03), z=-0.2)
         solids.append(revolve([(0.03, -0.1), (0.03, 0.1)], 10).rotated("x", 90).moved(z=-0.11))
     height = rng.uniform(0.12, 0.18)
     parts.append(fin(height, 0.12, 0.07, rng.uniform(5, 30), z=-0.38).moved(x, y - 0.02))

@@ -7,6 +7,7 @@ import trimesh
 
 from learn3d.data.shapes.parts import (
     Solid,
+    all_moved,
     assemble,
     bar,
     box,
@@ -108,7 +109,7 @@ def _table_lamp(rng: np.random.Generator) -> list[Solid]:
     neck = base + rng.uniform(0.02, 0.06)
     solids.append(bar((0, 0.7 * base, 0), (0, neck + 0.03, 0), 0.025))
     shade = _shade(rng, rng.uniform(1.15, 2.2) * max(width, 0.09), height)
-    return solids + [part.moved(y=neck - 0.02) for part in shade]
+    return solids + all_moved(shade, y=neck - 0.02)
 
 
 def _stand(rng: np.random.Generator, height: float) -> list[Solid]:
@@ -166,9 +167,7 @@ def _floor_lamp(rng: np.random.Generator) -> list[Solid]:
         outer, inner = np.stack([r * t, h * t**2], 1), np.stack([0.94 * r * t, h * t**2 + 0.016], 1)[::-1]
         bowl = revolve(np.concatenate([outer, inner]), 20, hollow=True)
         return [*solids, bowl.moved(y=height - 0.015), ellipsoid((0.06, 0.1, 0.06), (0, height + 0.02, 0), 10, 6)]
-    return solids + [
-        part.moved(y=height - 0.02) for part in _shade(rng, rng.uniform(0.17, 0.3), rng.uniform(0.2, 0.36))
-    ]
+    return solids + all_moved(_shade(rng, rng.uniform(0.17, 0.3), rng.uniform(0.2, 0.36)), y=height - 0.02)
 
 
 def _arc_lamp(rng: np.random.Generator) -> list[Solid]:
@@ -183,7 +182,7 @@ def _arc_lamp(rng: np.random.Generator) -> list[Solid]:
     drop = rng.uniform(0.0, 0.2)
     height_of_shade = rng.uniform(0.14, 0.26)
     hang = end - [0, drop + height_of_shade, 0]
-    shade = [part.moved(*hang) for part in _shade(rng, rng.uniform(0.12, 0.24), height_of_shade)]
+    shade = all_moved(_shade(rng, rng.uniform(0.12, 0.24), height_of_shade), *hang)
     base = slab(pick(rng, (ellipse(0.36, 0.36, 20), rectangle(0.34, 0.34))), rng.uniform(0.03, 0.1))
     return [base, tube(path, 0.014), bar(end, hang + [0, 0.5 * height_of_shade, 0], 0.014), *shade]
 
@@ -219,7 +218,7 @@ def _desk_lamp(rng: np.random.Generator) -> list[Solid]:
     bulb = [ellipsoid((0.9 * size, size, 0.9 * size), (0, 0.7 * size, 0), 10, 6)]
     cap = revolve([(0.5 * size, 1.2 * size), (0.4 * size, 1.7 * size)], 12)
     parts = [p.moved(y=-1.5 * size).rotated("x", -tilt) for p in (shade, *bulb, cap)]
-    return solids + [p.moved(*head) for p in parts]
+    return solids + all_moved(parts, *head)
 
 
 def _pendant(rng: np.random.Generator) -> list[Solid]:
@@ -236,7 +235,7 @@ def _pendant(rng: np.random.Generator) -> list[Solid]:
     for k in range(count):  # all shades of the same kind
         rng.bit_generator.state = state
         x = 2.4 * radius * (k - (count - 1) / 2)
-        solids += [part.moved(x=x) for part in _shade(rng, radius, height)]
+        solids += all_moved(_shade(rng, radius, height), x=x)
         solids.append(bar((x, 0.6 * height, 0), (x, drop + height + 0.01, 0), 0.014))
     return solids
 

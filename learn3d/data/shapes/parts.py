@@ -6,7 +6,7 @@ are, so a shape made of solids is a union of closed, outward oriented components
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -56,6 +56,11 @@ def both_sides(solid: Solid) -> list[Solid]:
 def both_sides_of(parts: list[Solid]) -> list[Solid]:
     """The parts and their mirror images."""
     return [solid for part in parts for solid in both_sides(part)]
+
+
+def all_moved(parts: Iterable[Solid], x: float = 0.0, y: float = 0.0, z: float = 0.0) -> list[Solid]:
+    """The parts shifted by (x, y, z) together."""
+    return [part.moved(x, y, z) for part in parts]
 
 
 # --- outlines: closed curves [N, 2], counter-clockwise, star-shaped about their mean --------------------------------

@@ -1,0 +1,43 @@
+"""Whole files or nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from learn3d import files
+
+
+def test_files_are_replaced_whole(tmp_path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("a much longer content than the new one")
+    files.write_json(path, {"name": [1, None]})
+    assert json.loads(path.read_text()) == {"name": [1, None]}
+    files.write_bytes(path, b"x")
+    assert path.read_bytes() == b"x"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("sync", [False, True])
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path, sync: bool) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+    with pytest.raises(OSError, match="disk full"), files.replacing(path, sync=sync) as temporary:
+        assert temporary.parent == tmp_path
+        temporary.write_bytes(b"ne")
+        raise OSError("disk full")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_sync_comes_before_the_new_name(tmp_path, monkeypatch) -> None:
+    calls = []
+    replace = os.replace
+    monkeypatch.setattr(os, "fsync", lambda number: calls.append("fsync"))
+    monkeypatch.setattr(os, "replace", lambda a, b: (calls.append("replace"), replace(a, b)))
+    with files.replacing(tmp_path / "a", sync=True) as temporary:
+        Path(temporary).write_bytes(b"x")
+    assert calls == ["fsync", "replace"]
