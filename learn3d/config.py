@@ -55,8 +55,7 @@ class TrainConfig:
     method: Method = "proposed"
     """proposed: with pose confusion and the Gaussian prior. vanilla: Vanilla-AE, the same with both at zero."""
     preset: Preset = "released"
-    """released: the loss forms of the published code. paper: the equations as printed, but for the generator's factor
-    0.5 before (unit sphere + displacement), which both keep."""
+    """released: the published code's losses. paper: equations as printed, but the generator keeps the factor 0.5."""
     iterations: int = 20_000
     """Number of training steps."""
     batch_size: int = 128

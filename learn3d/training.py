@@ -246,7 +246,7 @@ def restore(
     for name, optimizer in optimizers.items():
         checkpoint.restore_optimizer(name, optimizer, tensors)
     for field in dataclasses.fields(Progress):
-        setattr(progress, field.name, metadata.get(field.name, field.default))
+        setattr(progress, field.name, metadata.get(field.name, getattr(progress, field.name)))
     torch.set_rng_state(tensors["random.cpu"])
     if config.device == "cuda" and "random.cuda" in tensors:
         torch.cuda.set_rng_state(tensors["random.cuda"])
