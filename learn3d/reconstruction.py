@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import skimage.transform
 import torch
 import trimesh
 from PIL import Image, ImageOps, UnidentifiedImageError
@@ -64,8 +65,8 @@ def prepare_image(
     else:
         centre_y, centre_x = mask.shape[0] / 2, mask.shape[1] / 2
         side = float(max(mask.shape))
-    channels = [_resample(stored[..., c], centre_x - side / 2, centre_y - side / 2, side) for c in range(4)]
-    return np.rint(np.stack(channels)).clip(0, 255).astype(np.uint8)
+    resized = _resample(stored, centre_x - side / 2, centre_y - side / 2, side)
+    return np.rint(resized.transpose(2, 0, 1)).clip(0, 255).astype(np.uint8)
 
 
 @torch.no_grad()
@@ -170,13 +171,12 @@ def _save_all(networks: Networks, folder: Path, names: list[str], images: np.nda
     return written
 
 
-def _resample(channel: np.ndarray, left: float, top: float, side: float) -> np.ndarray:
-    """The square with that corner and side, scaled to 64x64 (box filter, bicubic when enlarging); zero outside."""
-    pad = int(np.ceil(max(0, -left, -top, left + side - channel.shape[1], top + side - channel.shape[0])))
-    padded = Image.fromarray(np.pad(channel, pad).astype(np.float32), mode="F")
-    box = (left + pad, top + pad, left + pad + side, top + pad + side)
-    method = Image.Resampling.BOX if side >= IMAGE_SIZE else Image.Resampling.BICUBIC
-    return np.asarray(padded.resize((IMAGE_SIZE, IMAGE_SIZE), method, box=box))
+def _resample(stored: np.ndarray, left: float, top: float, side: float) -> np.ndarray:
+    """The square [H,W,C] with that corner and side (whole pixels), scaled to 64x64, anti-aliased; zero outside."""
+    left, top, side = round(left), round(top), max(1, round(side))
+    pad = max(0, -left, -top, left + side - stored.shape[1], top + side - stored.shape[0])
+    square = np.pad(stored, ((pad, pad), (pad, pad), (0, 0)))[top + pad :, left + pad :][:side, :side]
+    return skimage.transform.resize(square, (IMAGE_SIZE, IMAGE_SIZE), order=1, anti_aliasing=side > IMAGE_SIZE)
 
 
 def _open(path: Path) -> Image.Image:

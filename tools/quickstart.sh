@@ -9,8 +9,9 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 category=${1:-airplane}
 steps=${STEPS:-600}
 objects=${OBJECTS:-250}
-out=${OUT:-quickstart}
-case $out in /*) ;; *) [ "$out" = quickstart ] && out=$PWD/quickstart || out=$here/$out ;; esac
+out=$PWD/quickstart
+[ -z "${OUT:-}" ] || case $OUT in /*) out=$OUT ;; *) out=$here/$OUT ;; esac
+trap 'echo; echo "stopped; what is finished is in $out"; exit 130' INT
 
 setup train
 mkdir -p "$out" || fail "cannot make the folder $out"
@@ -19,7 +20,7 @@ step "Making $objects ${category}s, each rendered from 24 views"
 "$python" tools/make_dataset.py --output "$out/data" --category "$category" --procedural "$objects" --overwrite
 
 for method in proposed vanilla; do
-    step "Training the method '$method' for $steps steps (Ctrl-C stops it cleanly)"
+    step "Training the method '$method' for $steps steps"
     "$python" tools/train.py --data "$out/data" --category "$category" --method "$method" --output "$out/$method" \
         --overwrite --iterations "$steps" --validate-every 200 --pictures-every 200 --checkpoint-every 200
 done

@@ -94,7 +94,11 @@ def voxelize(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
     vertices float [B, V, 3] or [V, 3] within [-0.5, 0.5]; faces integer [F, 3] or [B, F, 3].
     """
     scale = (VOXEL_SIZE - 1) / VOXEL_SIZE
-    grid = nmr.voxelize(vertices * scale + 0.5, faces, size=VOXEL_SIZE)
+    return to_kato_axes(nmr.voxelize(vertices * scale + 0.5, faces, size=VOXEL_SIZE))
+
+
+def to_kato_axes(grid: torch.Tensor) -> torch.Tensor:
+    """Grids [B, s, s, s] with axes (x, y, z) of the object frame, in the axes (y, x, -z) of the stored voxels."""
     return grid.transpose(1, 2).flip(3)
 
 
