@@ -7,7 +7,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . tools/setup.sh
 
 category=${1:-airplane}
-steps=${STEPS:-600}
+steps=${STEPS:-800}
 objects=${OBJECTS:-250}
 out=$PWD/quickstart
 [ -z "${OUT:-}" ] || case $OUT in /*) out=$OUT ;; *) out=$here/$OUT ;; esac
