@@ -17,9 +17,12 @@ check_machine() { # gigabytes of free disk wanted
         fail "Python 3.10 or newer is needed, $base is $("$base" --version 2>&1); set PYTHON to a newer one"
     "$base" -c 'import venv, ensurepip' 2>/dev/null ||
         fail "$base cannot make virtual environments; install its venv package (on Debian: apt-get install python3-venv)"
-    compiler=${CXX:-c++}
-    command -v "$compiler" >/dev/null || command -v g++ >/dev/null ||
-        fail "no C++ compiler found; install one (on Debian: apt-get install g++), or set CXX to its path"
+    if [ -n "${CXX:-}" ]; then
+        command -v "$CXX" >/dev/null || fail "the C++ compiler that CXX names, $CXX, is not there; unset CXX or correct it"
+    else
+        command -v c++ >/dev/null || command -v g++ >/dev/null || command -v clang++ >/dev/null ||
+            fail "no C++ compiler found; install one (on Debian: apt-get install g++), or set CXX to its path"
+    fi
     [ -w . ] || fail "cannot write to $PWD; clone the repository to a folder of your own"
     free=$(df -Pk . | awk 'NR == 2 {print int($4 / 1048576)}')
     [ "$free" -ge "$1" ] || fail "only $free GB free on the disk of $PWD, $1 GB are needed; free some space"
