@@ -10,4 +10,4 @@ step "Style"
 .venv/bin/ruff format --check .
 step "Tests"
 # The script pytest, not python -m pytest: the latter would import the source folder in place of the installed package.
-exec .venv/bin/pytest --cov=nmr --cov=learn3d --cov-report=term:skip-covered "$@"
+exec .venv/bin/pytest --cov --cov-report=term:skip-covered "$@"

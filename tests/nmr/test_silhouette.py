@@ -181,7 +181,7 @@ def test_one_openmp_runtime():
     )
     if sys.platform != "linux":
         pytest.skip("reads /proc/self/maps")
-    subprocess.run([sys.executable, "-c", code], check=True)
+    subprocess.run([sys.executable, "-I", "-c", code], check=True)
 
 
 # --- bad input
@@ -283,7 +283,7 @@ def test_running_out_of_memory_is_an_exception():
     )
     if sys.platform != "linux":
         pytest.skip("sets RLIMIT_AS")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True)
     assert done.stdout.split() == ["refused", "alive"], done.stderr
 
 
