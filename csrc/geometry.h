@@ -44,9 +44,9 @@ NMR_INLINE Triangle<T> load_triangle(const T* vertices, const int64_t* face, boo
 template <class T>
 NMR_INLINE bool is_drawable(const Triangle<T>& t) {
   bool finite = true;
-  for (int k = 0; k < 3; ++k) finite &= std::isfinite(t.x[k]) & std::isfinite(t.y[k]) & !std::isnan(t.z[k]);
+  for (int k = 0; k < 3; ++k) finite = finite && std::isfinite(t.x[k]) && std::isfinite(t.y[k]) && !std::isnan(t.z[k]);
   const double x0 = t.x[0], y0 = t.y[0];
-  return finite & ((t.x[1] - x0) * (t.y[2] - y0) != (t.y[1] - y0) * (t.x[2] - x0));
+  return finite && ((t.x[1] - x0) * (t.y[2] - y0) != (t.y[1] - y0) * (t.x[2] - x0));
 }
 
 // Counter-clockwise (y up), or of exactly zero area. In floating point a sliver can pass in both vertex orders, or in neither.
