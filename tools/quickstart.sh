@@ -29,7 +29,7 @@ step "Measuring both on the test objects, which neither has seen"
 "$python" tools/evaluate.py "$out/proposed" "$out/vanilla" --data "$out/data" --json "$out/evaluation.json"
 
 step "Reconstructing four test images"
-"$python" tools/reconstruct.py --run "$out/proposed" --dataset "$out/data" --indices 31 85 159 193 --output "$out/meshes" \
+"$python" tools/reconstruct.py --run "$out/proposed" --dataset "$out/data" --indices 31 85 58 15 --output "$out/meshes" \
     --format glb
 
 cat <<TEXT
