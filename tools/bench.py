@@ -4,6 +4,7 @@
     python tools/bench.py w2            one mesh of 81,920 faces, 512x512
     python tools/bench.py w3            one mesh of 1,280 faces, 1024x1024
     python tools/bench.py voxels        voxel IoU of 1000 predictions
+    python tools/bench.py step          a whole training step of the proposed method, batch 128, in bf16 and in fp32
 
 Medians over repeats that alternate between the programs. `pip install deodr` for the comparison.
 """
@@ -28,6 +29,11 @@ import tyro
 from torch import Tensor
 
 import nmr
+from learn3d.config import TrainConfig
+from learn3d.data.batch import Batch
+from learn3d.memory import keep_freed_memory
+from learn3d.methods.pose_invariant import create_optimizers, train_step
+from learn3d.networks import create_networks
 from nmr import reference
 
 
@@ -234,7 +240,7 @@ def report(title: str, rows: list[dict], settings: dict, json_path: Path | None)
 
 @dataclass(frozen=True)
 class Options:
-    workload: tyro.conf.Positional[Literal["w1", "w2", "w3", "voxels"]] = "w1"
+    workload: tyro.conf.Positional[Literal["w1", "w2", "w3", "voxels", "step"]] = "w1"
     """What to measure."""
     batch: int = 64
     """Meshes of w1."""
@@ -321,11 +327,37 @@ def bench_voxels(options: Options) -> None:
     report("Voxel IoU of 1000 meshes of 1280 faces at 32^3", rows, {"threads": options.threads}, options.json)
 
 
+def bench_step(options: Options) -> None:
+    """Images are the silhouettes of deformed spheres: the cost of a step hardly depends on what is in them."""
+    keep_freed_memory()
+    spheres = deformed_spheres(128, 3, 64, True)
+    masks = target_images(spheres)
+    images = (255 * masks).round().to(torch.uint8)[:, None].expand(-1, 4, -1, -1).contiguous()
+    views = torch.arange(128) % 24
+    batch = Batch(images, masks, spheres.camera, view_ids=views, object_ids=views, voxels=None)
+    settings = TrainConfig(data=Path(), category="spheres", output=Path()).loss_settings()
+    programs = {}
+    for precision in ("bf16", "fp32"):
+        networks = create_networks(24, discriminator=True, device="cpu", seed=0)
+        programs[precision] = (networks, create_optimizers(networks, 1e-4))
+    seconds: dict[str, list[float]] = {precision: [] for precision in programs}
+    for iteration in range(1, options.repeats + 3):
+        for precision, (networks, optimizers) in programs.items():
+            start = time.perf_counter()
+            train_step(networks, optimizers, batch, iteration, settings, precision)
+            seconds[precision].append(time.perf_counter() - start)
+    print(f"training step, batch 128, {options.threads} threads, median of {options.repeats}")
+    for precision, times in seconds.items():
+        print(f"{precision}  {1e3 * median(times[2:]):.0f} ms")
+
+
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(options.threads)
     if options.workload == "voxels":
         bench_voxels(options)
+    elif options.workload == "step":
+        bench_step(options)
     else:
         bench_render(options)
 
