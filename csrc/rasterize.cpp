@@ -1,14 +1,26 @@
-#include "rasterize.h"
-
+// Which face is nearest at each pixel of each image.
 #include <algorithm>
 #include <cstring>
+#include <vector>
 
 #include "geometry.h"
+#include "parallel.h"
+#include "stages.h"
 
 namespace nmr {
 namespace {
 
 constexpr int64_t kLanes = 8;  // pixels handled together
+
+// Working memory of one image; rows are padded so that a vector of pixels may reach past the last column.
+template <class T>
+struct RasterScratch {
+  std::vector<T> centres;           // [stride] pixel centres in [-1, 1]
+  std::vector<T> columns;           // [stride] column numbers
+  std::vector<T> depth;             // [R, stride] depth of the nearest face so far
+  std::vector<int32_t> owner;       // [R, stride]
+  std::vector<int32_t> back_faces;  // faces whose reversed copy faces the camera
+};
 
 template <class T>
 struct Raster {
@@ -17,7 +29,7 @@ struct Raster {
   const T* columns;
   T near, far;
   T* depth;
-  int32_t* face_index;
+  int32_t* owner;
 };
 
 // First pixel whose centre is >= lo and last whose centre is <= hi, within the raster: a face covers no centre outside its
@@ -63,7 +75,7 @@ NMR_INLINE void draw_triangle(const Triangle<T>& t, int32_t id, const Raster<T>&
       }
       if (!any) continue;
       T* depth = r.depth + j * r.stride + i;
-      int32_t* index = r.face_index + j * r.stride + i;
+      int32_t* index = r.owner + j * r.stride + i;
       for (int32_t k = 0; k < kLanes; ++k) {
         T w0 = clamp_weight(w.m[0][0] * column[k] + w.m[0][1] * row + w.m[0][2]);
         T w1 = clamp_weight(w.m[1][0] * column[k] + w.m[1][1] * row + w.m[1][2]);
@@ -83,13 +95,16 @@ NMR_INLINE void draw_triangle(const Triangle<T>& t, int32_t id, const Raster<T>&
 }
 
 template <class T>
-NMR_INLINE void rasterize_image_body(const T* vertices, const int64_t* faces, int64_t num_faces,
-                                     const RasterSettings<T>& settings, RasterScratch<T>& scratch, int32_t* face_index) {
+NMR_INLINE void rasterize_image_body(const Rasterize<T>& args, int64_t b) {
+  const T* vertices = args.mesh.image_vertices(b);
+  const int64_t* faces = args.mesh.image_faces(b);
+  const int64_t num_faces = args.mesh.face_count(b);
+  RasterScratch<T>& scratch = thread_scratch<RasterScratch<T>>();
   Raster<T> r;
-  r.size = settings.raster_size;
+  r.size = args.settings.raster_size;
   r.stride = r.size + kLanes;
-  r.near = settings.near;
-  r.far = settings.far;
+  r.near = args.settings.near;
+  r.far = args.settings.far;
   if (static_cast<int64_t>(scratch.centres.size()) != r.stride) {
     scratch.centres.resize(r.stride);
     scratch.columns.resize(r.stride);
@@ -101,10 +116,10 @@ NMR_INLINE void rasterize_image_body(const T* vertices, const int64_t* faces, in
   r.centres = scratch.centres.data();
   r.columns = scratch.columns.data();
   r.depth = reserve(scratch.depth, r.size * r.stride);
-  r.face_index = reserve(scratch.face_index, r.size * r.stride);
+  r.owner = reserve(scratch.owner, r.size * r.stride);
   int32_t* back_faces = reserve(scratch.back_faces, num_faces);
-  std::fill_n(r.depth, r.size * r.stride, settings.far);
-  std::fill_n(r.face_index, r.size * r.stride, -1);
+  std::fill_n(r.depth, r.size * r.stride, r.far);
+  std::fill_n(r.owner, r.size * r.stride, -1);
 
   // All originals before all copies, so that an original wins a tie with any copy. Both vertex orders are tested: for slivers
   // the test is not antisymmetric in floating point.
@@ -113,28 +128,29 @@ NMR_INLINE void rasterize_image_body(const T* vertices, const int64_t* faces, in
     const Triangle<T> t = load_triangle(vertices, faces + 3 * f, false);
     if (!is_drawable(t)) continue;
     if (faces_camera(t)) draw_triangle(t, static_cast<int32_t>(f), r);
-    if (settings.fill_back && faces_camera(load_triangle(vertices, faces + 3 * f, true)))
+    if (args.settings.fill_back && faces_camera(load_triangle(vertices, faces + 3 * f, true)))
       back_faces[num_back++] = static_cast<int32_t>(f);
   }
   for (int64_t n = 0; n < num_back; ++n) {
     const int64_t f = back_faces[n];
     draw_triangle(load_triangle(vertices, faces + 3 * f, true), static_cast<int32_t>(num_faces + f), r);
   }
+  int32_t* owner = args.owner + b * r.size * r.size;
   for (int64_t j = 0; j < r.size; ++j)
-    std::memcpy(face_index + j * r.size, r.face_index + j * r.stride, r.size * sizeof(int32_t));
+    std::memcpy(owner + (r.size - 1 - j) * r.size, r.owner + j * r.stride, r.size * sizeof(int32_t));
 }
+
+NMR_CLONES void rasterize_image(const Rasterize<float>& args, int64_t b) { rasterize_image_body(args, b); }
+NMR_CLONES void rasterize_image(const Rasterize<double>& args, int64_t b) { rasterize_image_body(args, b); }
 
 }  // namespace
 
-NMR_CLONES void rasterize_image(const float* vertices, const int64_t* faces, int64_t num_faces,
-                                const RasterSettings<float>& settings, RasterScratch<float>& scratch, int32_t* face_index) {
-  rasterize_image_body(vertices, faces, num_faces, settings, scratch, face_index);
+template <class T>
+void rasterize(const Rasterize<T>& args) {
+  parallel_for(args.mesh.batch, args.num_threads, [&](int64_t b) { rasterize_image(args, b); });
 }
 
-NMR_CLONES void rasterize_image(const double* vertices, const int64_t* faces, int64_t num_faces,
-                                const RasterSettings<double>& settings, RasterScratch<double>& scratch,
-                                int32_t* face_index) {
-  rasterize_image_body(vertices, faces, num_faces, settings, scratch, face_index);
-}
+template void rasterize(const Rasterize<float>&);
+template void rasterize(const Rasterize<double>&);
 
 }  // namespace nmr

@@ -5,30 +5,25 @@
 
 #include "geometry.h"
 #include "parallel.h"
-#include "rasterize.h"
 #include "stages.h"
 
 namespace nmr {
 
 template <class T>
 void silhouette_forward(const SilhouetteForward<T>& args) {
-  const int64_t S = args.image_size, R = args.settings.raster_size;
-  parallel_for(args.mesh.batch, args.num_threads, [&](int64_t b) {
-    int32_t* index = args.face_index + b * R * R;
-    rasterize_image(args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.num_faces, args.settings,
-                    thread_scratch<RasterScratch<T>>(), index);
-    for (int64_t y = 0; y < S; ++y) {
-      T* alpha = args.alpha + (b * S + y) * S;
-      if (args.anti_aliasing) {
-        const int32_t* lower = index + (R - 2 - 2 * y) * R;
-        const int32_t* upper = lower + R;
-        for (int64_t x = 0; x < S; ++x) {
-          const int covered = (lower[2 * x] >= 0) + (lower[2 * x + 1] >= 0) + (upper[2 * x] >= 0) + (upper[2 * x + 1] >= 0);
-          alpha[x] = T(0.25) * static_cast<T>(covered);
-        }
-      } else {
-        const int32_t* row = index + (R - 1 - y) * R;
-        for (int64_t x = 0; x < S; ++x) alpha[x] = row[x] >= 0 ? T(1) : T(0);
+  const int64_t S = args.image_size, R = args.anti_aliasing ? 2 * S : S;
+  parallel_for(args.batch, args.num_threads, [&](int64_t b) {
+    const int32_t* owner = args.owner + b * R * R;
+    T* alpha = args.alpha + b * S * S;
+    if (!args.anti_aliasing) {
+      for (int64_t n = 0; n < S * S; ++n) alpha[n] = owner[n] >= 0 ? T(1) : T(0);
+      return;
+    }
+    for (int64_t y = 0; y < S; ++y, alpha += S) {
+      const int32_t *upper = owner + 2 * y * R, *lower = upper + R;
+      for (int64_t x = 0; x < S; ++x) {
+        const int covered = (lower[2 * x] >= 0) + (lower[2 * x + 1] >= 0) + (upper[2 * x] >= 0) + (upper[2 * x + 1] >= 0);
+        alpha[x] = T(0.25) * static_cast<T>(covered);
       }
     }
   });
@@ -58,7 +53,7 @@ struct SweepImage {
   int64_t R, S;
   bool anti_aliasing;
   T eps;
-  const int32_t* face_index;
+  const int32_t* owner;  // row 0 = top; pixel (column i, row j from the bottom) is owner[(R - 1 - j) R + i]
   const T* grad_alpha;
   const PullList<T>* lists;
 
@@ -80,12 +75,13 @@ NMR_INLINE void build_pull_lists(const SweepImage<T>& image, PullList<T>* lists)
   int32_t* before_row = rows.before.data();
   for (int64_t i = 0; i < R; ++i) columns.before[i * (R + 1)] = 0;
   for (int64_t j = 0; j < R; ++j, before_row += R + 1) {
+    const int32_t* owner = image.owner + (R - 1 - j) * R;
     int32_t count = 0;
     for (int64_t i = 0; i < R; ++i) {
       before_row[i] = count;
       int32_t* before_column = columns.before.data() + i * (R + 1) + j;
       int32_t column_count = *before_column;
-      if (image.face_index[j * R + i] < 0) {
+      if (owner[i] < 0) {
         const T g = image.grad(i, j);
         if (g < 0) {
           rows.position[j * stride + count] = static_cast<T>(i);
@@ -169,7 +165,9 @@ NMR_INLINE void sweep_edge(const SweepImage<T>& image, int axis, int32_t id, T p
   const int64_t n_last = high > -1 ? static_cast<int64_t>(high) : -1;
   const T slope = (qt - pt) / (qs - ps);
   const PullList<T>& list = image.lists[axis];
-  const int64_t step_s = axis == 0 ? 1 : R, step_t = axis == 0 ? R : 1;
+  // pixel m of line n: owner[n * step_s + m * step_t]
+  const int32_t* origin = image.owner + (R - 1) * R;
+  const int64_t step_s = axis == 0 ? 1 : -R, step_t = axis == 0 ? -R : 1;
 
   for (int64_t n = n_first; n <= n_last; ++n) {
     const T line = static_cast<T>(n);
@@ -180,9 +178,9 @@ NMR_INLINE void sweep_edge(const SweepImage<T>& image, int axis, int32_t id, T p
     const int64_t in = static_cast<int64_t>(rounded), out = in + d;
     if (out < 0 || out >= R) continue;
 
-    const int32_t* index = image.face_index + n * step_s;  // pixel m of this line: index[m * step_t]
-    const bool owns_in = index[in * step_t] == id;
-    const bool out_is_background = index[out * step_t] < 0;
+    const int32_t* owner = origin + n * step_s;
+    const bool owns_in = owner[in * step_t] == id;
+    const bool out_is_background = owner[out * step_t] < 0;
     if (!owns_in && !out_is_background) continue;
 
     lever.factor_p = (qs - ps) / (qs - line);
@@ -208,7 +206,7 @@ NMR_INLINE void sweep_edge(const SweepImage<T>& image, int axis, int32_t id, T p
       const int64_t limit = to_index(d > 0 ? std::ceil(far_side) : std::floor(far_side), int64_t(-1), R);
       const int64_t m_first = std::max<int64_t>(std::min(in, limit), 0), m_last = std::min(std::max(in, limit), R - 1);
       for (int64_t m = m_first; m <= m_last; ++m) {
-        if (index[m * step_t] != id) continue;
+        if (owner[m * step_t] != id) continue;
         const T g = axis == 0 ? image.grad(n, m) : image.grad(m, n);
         if (!(g > 0)) continue;
         const T offset = static_cast<T>(m) - lever.crossing;
@@ -222,22 +220,22 @@ NMR_INLINE void sweep_edge(const SweepImage<T>& image, int axis, int32_t id, T p
 template <class T, bool kPowerOfTwo>
 NMR_INLINE void backward_image(const SilhouetteBackward<T>& args, int64_t b) {
   const int64_t S = args.image_size, R = args.anti_aliasing ? 2 * S : S;
-  const int64_t F = args.mesh.num_faces;
+  const int64_t F = args.mesh.face_count(b), V = args.mesh.vertex_count(b);
   const T* vertices = args.mesh.image_vertices(b);
   const int64_t* faces = args.mesh.image_faces(b);
-  T* grad_vertices = args.grad_vertices + b * args.mesh.num_vertices * 3;
+  T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
   BackwardScratch<T>& scratch = thread_scratch<BackwardScratch<T>>();
 
-  SweepImage<T> image{R, S, args.anti_aliasing, args.eps, args.face_index + b * R * R, args.grad_alpha + b * S * S,
+  SweepImage<T> image{R, S, args.anti_aliasing, args.eps, args.owner + b * R * R, args.grad_alpha + b * S * S,
                       scratch.lists};
-  std::fill_n(grad_vertices, args.mesh.num_vertices * 3, T(0));
+  std::fill_n(grad_vertices, 3 * V, T(0));
   build_pull_lists(image, scratch.lists);
 
   // A face that owns no pixel gets exactly zero.
   uint8_t* visible = reserve(scratch.visible, 2 * F);
   std::fill_n(visible, 2 * F, uint8_t(0));
   for (int64_t n = 0; n < R * R; ++n)
-    if (image.face_index[n] >= 0) visible[image.face_index[n]] = 1;
+    if (image.owner[n] >= 0) visible[image.owner[n]] = 1;
 
   for (int64_t id = 0; id < 2 * F; ++id) {
     if (!visible[id]) continue;

@@ -1,11 +1,55 @@
-// The argument struct of each stage: what goes in, what comes out, sizes, settings. Raw arrays only, row-major.
+// The argument struct of each stage: what goes in, what comes out, sizes, settings. Raw arrays only, row-major. Every image has
+// row 0 at the top. Stages in the order of a render: camera, rasterize, then whatever is wanted of the owner map: silhouette,
+// fragments, depth, shading, resolve.
 #pragma once
 
 #include <cstdint>
 
 namespace nmr {
 
-// Settings that every raster stage shares.
+// A batch of meshes. In renderer space x, y lie in [-1, 1] on the screen (y up) and z is the depth.
+template <class T>
+struct MeshBatch {
+  const T* vertices;       // [B, V, 3], or packed [N, 3]
+  const int64_t* faces;    // [F, 3] shared, [B, F, 3], or packed [M, 3]; vertex numbers count from the mesh's own first vertex
+  int64_t batch;           // B
+  int64_t num_vertices;    // V (packed: N)
+  int64_t num_faces;       // F (packed: M)
+  bool faces_per_image;    // faces are [B, F, 3]
+  const int64_t* starts;   // packed: [B + 1, 2], first vertex and first face of each mesh, then N and M; else nullptr
+
+  int64_t vertex_start(int64_t b) const { return starts ? starts[2 * b] : b * num_vertices; }
+  int64_t face_start(int64_t b) const { return starts ? starts[2 * b + 1] : faces_per_image ? b * num_faces : 0; }
+  int64_t vertex_count(int64_t b) const { return starts ? starts[2 * b + 2] - starts[2 * b] : num_vertices; }
+  int64_t face_count(int64_t b) const { return starts ? starts[2 * b + 3] - starts[2 * b + 1] : num_faces; }
+  const T* image_vertices(int64_t b) const { return vertices + 3 * vertex_start(b); }
+  const int64_t* image_faces(int64_t b) const { return faces + 3 * face_start(b); }
+};
+
+// World space to renderer space (camera.cpp). Per image b: u = A v + t with [A | t] = matrix; then
+//   perspective:   p = (u_x / u_z, u_y / u_z), distorted as OpenCV does; out = (K00 p_x + K01 p_y + K02, K10 p_x + ..., u_z)
+//   orthographic:  the same with p = (u_x, u_y), without distortion.
+template <class T>
+struct Project {
+  const T* vertices;     // [B or 1, V, 3], or packed [N, 3]
+  const int64_t* starts; // packed: [B + 1, 2] as in MeshBatch; else nullptr
+  int64_t batch;         // B, of the output
+  int64_t vertex_batch;  // 1 or B when not packed
+  int64_t num_vertices;  // V
+  const T* matrix;       // [B, 3, 4]
+  const T* intrinsics;   // [B, 2, 3]: renderer-space x and y from p
+  const T* distortion;   // [B, 5] k1 k2 p1 p2 k3, or nullptr
+  bool perspective;
+  T* points;             // forward out [B, V, 3] or [N, 3]
+  const T* grad_points;  // backward in
+  T* grad_vertices;      // backward out, like vertices (summed over images when vertex_batch is 1), or nullptr
+  T* grad_matrix;        // backward out [B, 3, 4], or nullptr
+  T* grad_intrinsics;    // backward out [B, 2, 3], or nullptr
+  T* grad_distortion;    // backward out [B, 5], or nullptr
+  int num_threads;
+};
+
+// Settings of the rasterizer.
 template <class T>
 struct RasterSettings {
   int64_t raster_size;  // R: pixels per side of the raster (2 S with anti-aliasing, else S)
@@ -14,29 +58,23 @@ struct RasterSettings {
   T far;                // nor those with depth >= far
 };
 
-// A batch of meshes in renderer space: x, y in [-1, 1] on the screen (y up), z = depth.
+// Which face is nearest at each pixel (rasterize.cpp).
 template <class T>
-struct MeshBatch {
-  const T* vertices;       // [B, V, 3]
-  const int64_t* faces;    // [F, 3], or [B, F, 3] when faces_per_image
-  int64_t batch;           // B
-  int64_t num_vertices;    // V
-  int64_t num_faces;       // F
-  bool faces_per_image;
-
-  const T* image_vertices(int64_t b) const { return vertices + b * num_vertices * 3; }
-  const int64_t* image_faces(int64_t b) const { return faces_per_image ? faces + b * num_faces * 3 : faces; }
-};
-
-// Silhouettes of a batch (silhouette.cpp).
-template <class T>
-struct SilhouetteForward {
+struct Rasterize {
   MeshBatch<T> mesh;
   RasterSettings<T> settings;
-  int64_t image_size;   // S
-  bool anti_aliasing;   // R = 2 S, 2x2 mean
-  T* alpha;             // out [B, S, S], row 0 = top
-  int32_t* face_index;  // out [B, R, R], row 0 = bottom; -1 background, f front, F + f reversed copy
+  int32_t* owner;  // out [B, R, R]; -1 background, f front, F + f reversed copy of f
+  int num_threads;
+};
+
+// Coverage of an owner map, and NMR's gradient of it (silhouette.cpp).
+template <class T>
+struct SilhouetteForward {
+  const int32_t* owner;  // [B, R, R]
+  int64_t batch;
+  int64_t image_size;    // S
+  bool anti_aliasing;    // R = 2 S, 2x2 mean
+  T* alpha;              // out [B, S, S]
   int num_threads;
 };
 
@@ -45,10 +83,93 @@ struct SilhouetteBackward {
   MeshBatch<T> mesh;
   int64_t image_size;
   bool anti_aliasing;
-  T eps;                      // keeps the distance to an edge away from zero
-  const int32_t* face_index;  // [B, R, R] of the forward pass
-  const T* grad_alpha;        // [B, S, S]
-  T* grad_vertices;           // out [B, V, 3]; z gets 0
+  T eps;                // keeps the distance to an edge away from zero
+  const int32_t* owner; // [B, R, R]
+  const T* grad_alpha;  // [B, S, S]
+  T* grad_vertices;     // out, like mesh.vertices; z gets 0
+  int num_threads;
+};
+
+// Barycentric weights and depth of the owner at each pixel, and their derivatives (fragments.cpp).
+template <class T>
+struct Fragments {
+  MeshBatch<T> mesh;
+  int64_t raster_size;
+  T far;                 // depth of the background
+  const int32_t* owner;  // [B, R, R]
+  T* weights;            // forward out [B, R, R, 3]: of the face's own vertices 0, 1, 2, perspective-correct; 0 on background
+  T* depth;              // forward out [B, R, R]
+  const T* grad_weights; // backward in [B, R, R, 3], or nullptr
+  const T* grad_depth;   // backward in [B, R, R], or nullptr
+  T* grad_vertices;      // backward out, like mesh.vertices
+  int num_threads;
+};
+
+// Depth images: the same depth, averaged over 2x2 pixels with anti-aliasing (fragments.cpp).
+template <class T>
+struct DepthImage {
+  MeshBatch<T> mesh;
+  int64_t image_size;
+  bool anti_aliasing;
+  T far;
+  const int32_t* owner;
+  T* depth;             // forward out [B, S, S]
+  const T* grad_depth;  // backward in [B, S, S]
+  T* grad_vertices;     // backward out, like mesh.vertices
+  int num_threads;
+};
+
+// Colours from texture cubes (shade.cpp): axis k of a cube is the weight of the face's vertex k.
+template <class T>
+struct TextureCubes {
+  const int32_t* owner;    // [B, R, R]
+  const T* weights;        // [B, R, R, 3] of Fragments
+  int64_t batch, raster_size;
+  const T* textures;       // [B or 1, F, ts, ts, ts, C], or packed [M, ts, ts, ts, C]
+  int64_t texture_batch;   // 1 or B when not packed
+  int64_t num_faces;       // F (packed: M)
+  const int64_t* starts;   // packed: as in MeshBatch; else nullptr
+  int64_t texture_size;    // ts >= 2
+  int64_t channels;        // C
+  T eps;                   // coordinates are clamped to [0, ts - 1 - eps]
+  T* colors;               // forward out [B, R, R, C]; 0 on background
+  const T* grad_colors;    // backward in
+  T* grad_textures;        // backward out, like textures
+  int num_threads;
+};
+
+// Values given at the corners of faces, interpolated over the pixels (shade.cpp).
+template <class T>
+struct Interpolate {
+  const int32_t* owner;      // [B, R, R]
+  const T* weights;          // [B, R, R, 3] of Fragments
+  int64_t batch, raster_size;
+  const T* attributes;       // [B or 1, N, C], or packed [N, C]
+  int64_t attribute_batch;   // 1 or B when not packed
+  int64_t num_attributes;    // N
+  int64_t channels;          // C
+  const int64_t* corners;    // [F, 3] shared, [B, F, 3], or packed [M, 3]: rows of attributes, counted from the mesh's first
+  int64_t num_faces;         // F (packed: M)
+  bool corners_per_image;
+  const int64_t* starts;     // packed: [B + 1, 2], first attribute row and first face of each mesh; else nullptr
+  T* values;                 // forward out [B, R, R, C]; 0 on background
+  const T* grad_values;      // backward in
+  T* grad_attributes;        // backward out, like attributes, or nullptr
+  T* grad_weights;           // backward out [B, R, R, 3], or nullptr
+  int num_threads;
+};
+
+// NMR's gradient of an image of any channels (edges.cpp): every visible edge is moved by the pixels that moving it would improve.
+template <class T>
+struct EdgesBackward {
+  MeshBatch<T> mesh;
+  int64_t raster_size;
+  T eps;
+  const int32_t* owner;  // [B, R, R]
+  const T* image;        // [B, R, R, C]
+  int64_t channels;      // C
+  const T* grad_image;   // [B, R, R, C]
+  T* grad_vertices;      // out, like mesh.vertices; z gets 0
   int num_threads;
 };
 
@@ -72,8 +193,20 @@ struct Smoothness {
   int num_threads;
 };
 
+template <class T> void project_forward(const Project<T>& args);
+template <class T> void project_backward(const Project<T>& args);
+template <class T> void rasterize(const Rasterize<T>& args);
 template <class T> void silhouette_forward(const SilhouetteForward<T>& args);
 template <class T> void silhouette_backward(const SilhouetteBackward<T>& args);
+template <class T> void fragments_forward(const Fragments<T>& args);
+template <class T> void fragments_backward(const Fragments<T>& args);
+template <class T> void depth_forward(const DepthImage<T>& args);
+template <class T> void depth_backward(const DepthImage<T>& args);
+template <class T> void texture_cubes_forward(const TextureCubes<T>& args);
+template <class T> void texture_cubes_backward(const TextureCubes<T>& args);
+template <class T> void interpolate_forward(const Interpolate<T>& args);
+template <class T> void interpolate_backward(const Interpolate<T>& args);
+template <class T> void edges_backward(const EdgesBackward<T>& args);
 template <class T> void smoothness_forward(const Smoothness<T>& args);
 template <class T> void smoothness_backward(const Smoothness<T>& args);
 void voxelize(const Voxelize& args);

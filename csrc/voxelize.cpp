@@ -120,7 +120,7 @@ void voxelize(const Voxelize& args) {
     std::fill_n(grid.cells, num_cells, uint8_t(0));
     const float* vertices = args.mesh.image_vertices(b);
     const int64_t* faces = args.mesh.image_faces(b);
-    for (int64_t f = 0; f < args.mesh.num_faces; ++f) {
+    for (int64_t f = 0; f < args.mesh.face_count(b); ++f) {
       Vec3f corners[3];
       for (int k = 0; k < 3; ++k)
         corners[k] = Eigen::Map<const Vec3f>(vertices + 3 * faces[3 * f + k]) * static_cast<float>(s);

@@ -91,7 +91,7 @@ def render_silhouette(
     if not torch.finfo(vertices.dtype).tiny <= eps < float("inf"):
         raise ValueError(f"eps must be positive in {vertices.dtype} and finite, got {eps}")
     alpha, _ = ops.silhouette(
-        vertices, faces, image_size, bool(anti_aliasing), bool(fill_back), float(near), float(far), float(eps)
+        vertices, faces, None, image_size, bool(anti_aliasing), bool(fill_back), float(near), float(far), float(eps)
     )
     return alpha
 
@@ -123,7 +123,6 @@ def render_face_index(
     check_size(image_size, "image_size", _LARGEST_IMAGE)
     check_depth_range(near, far)
     vertices, faces = _to_renderer_space(vertices, faces, camera)
-    _, face_index = ops.silhouette(vertices, faces, image_size, False, bool(fill_back), float(near), float(far), 1e-4)
+    owner = ops.rasterize(vertices, faces, None, image_size, bool(fill_back), float(near), float(far))
     num_faces = faces.shape[-2]
-    face_index = face_index.flip(1)
-    return torch.where(face_index >= num_faces, face_index - num_faces, face_index)
+    return torch.where(owner >= num_faces, owner - num_faces, owner)

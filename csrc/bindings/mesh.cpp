@@ -1,0 +1,64 @@
+// Losses on meshes, and voxels.
+#include "arrays.h"
+
+namespace nmr {
+namespace {
+
+template <class T>
+Smoothness<T> smoothness_args(const Array<T>& vertices, const Array<int64_t>& edges, int num_threads) {
+  require(vertices.ndim() == 3 && vertices.shape(2) == 3, "vertices must have shape [B, V, 3], got " + shape_of(vertices));
+  require(edges.ndim() == 2 && edges.shape(1) == 4, "edges must have shape [E, 4], got " + shape_of(edges));
+  Smoothness<T> args{vertices.data(), edges.data(), vertices.shape(0), vertices.shape(1), edges.shape(0),
+                     nullptr,         nullptr,      nullptr,           num_threads};
+  require_indices(edges.data(), edges.size(), args.num_vertices, "edges", "vertex", "vertices");
+  return args;
+}
+
+template <class T>
+void smoothness_forward_py(const Array<T>& vertices, const Array<int64_t>& edges, Array<T>& loss, int num_threads) {
+  Smoothness<T> args = smoothness_args(vertices, edges, num_threads);
+  require_shape(loss, "loss", {args.batch});
+  args.loss = loss.mutable_data();
+  py::gil_scoped_release release;
+  smoothness_forward(args);
+}
+
+template <class T>
+void smoothness_backward_py(const Array<T>& vertices, const Array<int64_t>& edges, const Array<T>& grad_loss,
+                            Array<T>& grad_vertices, int num_threads) {
+  Smoothness<T> args = smoothness_args(vertices, edges, num_threads);
+  require_shape(grad_loss, "grad_loss", {args.batch});
+  require_shape(grad_vertices, "grad_vertices", {args.batch, args.num_vertices, 3});
+  args.grad_loss = grad_loss.data();
+  args.grad_vertices = grad_vertices.mutable_data();
+  py::gil_scoped_release release;
+  smoothness_backward(args);
+}
+
+void voxelize_py(const Array<float>& vertices, const Indices& faces, Array<bool>& voxels, int64_t size, int num_threads) {
+  const MeshBatch<float> mesh = mesh_batch(vertices, faces, std::nullopt);
+  require(size >= 1 && size <= 1024, "size must lie in 1..1024, got " + std::to_string(size));
+  require_shape(voxels, "voxels", {mesh.batch, size, size, size});
+  const Voxelize args{mesh, size, voxels.mutable_data(), num_threads};
+  py::gil_scoped_release release;
+  voxelize(args);
+}
+
+template <class T>
+void define_smoothness(py::module_& m) {
+  m.def("smoothness_forward", &smoothness_forward_py<T>, py::arg("vertices").noconvert(), py::arg("edges").noconvert(),
+        py::arg("loss").noconvert(), py::arg("num_threads"));
+  m.def("smoothness_backward", &smoothness_backward_py<T>, py::arg("vertices").noconvert(), py::arg("edges").noconvert(),
+        py::arg("grad_loss").noconvert(), py::arg("grad_vertices").noconvert(), py::arg("num_threads"));
+}
+
+}  // namespace
+
+void bind_mesh(py::module_& m) {
+  define_smoothness<float>(m);
+  define_smoothness<double>(m);
+  m.def("voxelize", &voxelize_py, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
+        py::arg("voxels").noconvert(), py::arg("size"), py::arg("num_threads"));
+}
+
+}  // namespace nmr

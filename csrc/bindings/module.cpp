@@ -1,0 +1,8 @@
+// nmr._C: the stages as functions of NumPy arrays.
+#include "arrays.h"
+
+PYBIND11_MODULE(_C, m) {
+  m.doc() = "Compiled kernels of nmr. Use the functions of the package nmr, which validate and document.";
+  nmr::bind_raster(m);
+  nmr::bind_mesh(m);
+}

@@ -1,0 +1,65 @@
+// The rasterizer and the silhouette.
+#include "arrays.h"
+
+namespace nmr {
+namespace {
+
+template <class T>
+void rasterize_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts, Array<int32_t>& owner,
+                  bool fill_back, double near, double far, int num_threads) {
+  const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
+  require(owner.ndim() == 3 && owner.shape(1) >= 1 && owner.shape(1) <= 16384,
+          "owner must have shape [B, R, R] with R in 1..16384, got " + shape_of(owner));
+  const int64_t raster_size = owner.shape(1);
+  require_shape(owner, "owner", {mesh.batch, raster_size, raster_size});
+  const Rasterize<T> args{mesh, {raster_size, fill_back, static_cast<T>(near), static_cast<T>(far)}, owner.mutable_data(), num_threads};
+  py::gil_scoped_release release;
+  rasterize(args);
+}
+
+template <class T>
+void silhouette_forward_py(const Array<int32_t>& owner, Array<T>& alpha, bool anti_aliasing, int num_threads) {
+  require(alpha.ndim() == 3, "alpha must have shape [B, S, S], got " + shape_of(alpha));
+  const int64_t batch = alpha.shape(0), image_size = alpha.shape(1), raster_size = anti_aliasing ? 2 * image_size : image_size;
+  require_shape(alpha, "alpha", {batch, image_size, image_size});
+  require_shape(owner, "owner", {batch, raster_size, raster_size});
+  const SilhouetteForward<T> args{owner.data(), batch, image_size, anti_aliasing, alpha.mutable_data(), num_threads};
+  py::gil_scoped_release release;
+  silhouette_forward(args);
+}
+
+template <class T>
+void silhouette_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
+                            const Array<int32_t>& owner, const Array<T>& grad_alpha, Array<T>& grad_vertices, bool anti_aliasing,
+                            double eps, int num_threads) {
+  const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
+  const int64_t raster_size = require_owner(owner, mesh), image_size = anti_aliasing ? raster_size / 2 : raster_size;
+  require(!anti_aliasing || raster_size % 2 == 0, "an anti-aliased owner map has an even size, got " + shape_of(owner));
+  require_shape(grad_alpha, "grad_alpha", {mesh.batch, image_size, image_size});
+  require_like(grad_vertices, "grad_vertices", vertices);
+  const SilhouetteBackward<T> args{mesh, image_size, anti_aliasing, static_cast<T>(eps), owner.data(), grad_alpha.data(),
+                                   grad_vertices.mutable_data(), num_threads};
+  py::gil_scoped_release release;
+  silhouette_backward(args);
+}
+
+template <class T>
+void define_raster(py::module_& m) {
+  m.def("rasterize", &rasterize_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("fill_back"), py::arg("near"), py::arg("far"),
+        py::arg("num_threads"));
+  m.def("silhouette_forward", &silhouette_forward_py<T>, py::arg("owner").noconvert(), py::arg("alpha").noconvert(),
+        py::arg("anti_aliasing"), py::arg("num_threads"));
+  m.def("silhouette_backward", &silhouette_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("grad_alpha").noconvert(),
+        py::arg("grad_vertices").noconvert(), py::arg("anti_aliasing"), py::arg("eps"), py::arg("num_threads"));
+}
+
+}  // namespace
+
+void bind_raster(py::module_& m) {
+  define_raster<float>(m);
+  define_raster<double>(m);
+}
+
+}  // namespace nmr

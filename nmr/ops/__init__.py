@@ -1,0 +1,17 @@
+"""The torch operators behind the public functions: forward, fake, set-up and backward of each stand together.
+
+The kernels take NumPy views of the tensors (zero-copy on the CPU). Tensors of other devices are staged through the
+host and the results go back to the device. Arguments are trusted here; the public functions validate.
+
+A batch of meshes is ``vertices [B, V, 3]`` with ``faces [F, 3]`` or ``[B, F, 3]`` and ``starts=None``, or packed:
+``vertices [N, 3]``, ``faces [M, 3]`` (vertex numbers count from the mesh's own first vertex) and ``starts`` int64
+``[B + 1, 2]`` in host memory: first vertex and first face of each mesh, then N and M. faces are int64.
+
+Rasters are ``[B, R, R]`` with R = 2S when anti-aliased, else S; row 0 = top, as in every image. An owner map is int32:
+-1 = background, f = face f is nearest, ``F + f`` = its reversed copy is (F = number of faces of that mesh).
+"""
+
+from .mesh import smoothness, smoothness_backward, voxels
+from .raster import rasterize, silhouette, silhouette_backward
+
+__all__ = ["rasterize", "silhouette", "silhouette_backward", "smoothness", "smoothness_backward", "voxels"]

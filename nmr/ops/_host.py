@@ -1,0 +1,40 @@
+"""What every operator shares: NumPy views of tensors, batch sizes, and the error for second derivatives."""
+
+import torch
+from torch import Tensor
+
+try:
+    from .. import _C
+except ImportError as error:
+    raise ImportError(
+        "the compiled part of nmr is missing: this is the source folder, or the installation failed; "
+        "run `pip install .` in the repository and start Python elsewhere, or use `pip install -e .`"
+    ) from error
+
+__all__ = ["_C", "batch_size", "host_array", "no_second_derivative", "num_threads"]
+
+
+def host_array(tensor):
+    """The tensor as a C-contiguous NumPy array in host memory (a view on the CPU); None stays None."""
+    return None if tensor is None else tensor.detach().cpu().contiguous().numpy()
+
+
+def num_threads() -> int:
+    return torch.get_num_threads()
+
+
+def batch_size(vertices: Tensor, starts) -> int:
+    """B of vertices ``[B, V, 3]``, or of packed vertices ``[N, 3]`` with starts ``[B + 1, 2]``."""
+    return vertices.shape[0] if starts is None else starts.shape[0] - 1
+
+
+def no_second_derivative(name: str):
+    """A backward for operators that are gradients themselves: raises a RuntimeError that names the public function."""
+
+    def backward(ctx, *grads):
+        raise RuntimeError(
+            f"{name} has no second derivative: its gradient is computed by a kernel that is not differentiable itself; "
+            "call backward() without create_graph=True"
+        )
+
+    return backward

@@ -1,0 +1,119 @@
+"""Operators: which face is nearest at each pixel, and silhouettes with NMR's gradient."""
+
+# No `from __future__ import annotations` here: torch 2.4 reads the operators' types from the annotations themselves.
+from typing import Optional  # noqa: UP035
+
+import torch
+from torch import Tensor
+
+from ._host import _C, batch_size, host_array, no_second_derivative, num_threads
+
+
+def _owner_map(vertices, faces, starts, raster_size, fill_back, near, far) -> Tensor:
+    owner = torch.empty((batch_size(vertices, starts), raster_size, raster_size), dtype=torch.int32)
+    arrays = host_array(vertices), host_array(faces), host_array(starts)
+    _C.rasterize(*arrays, owner.numpy(), fill_back, near, far, num_threads())
+    return owner
+
+
+# --- rasterize
+
+
+@torch.library.custom_op("nmr::rasterize", mutates_args=())
+def rasterize(
+    vertices: Tensor,
+    faces: Tensor,
+    starts: Optional[Tensor],  # noqa: UP045
+    raster_size: int,
+    fill_back: bool,
+    near: float,
+    far: float,
+) -> Tensor:
+    """Owner map ``[B, R, R]`` of meshes in renderer space; not differentiable."""
+    return _owner_map(vertices, faces, starts, raster_size, fill_back, near, far).to(vertices.device)
+
+
+@rasterize.register_fake
+def _(vertices, faces, starts, raster_size, fill_back, near, far):
+    return vertices.new_empty((batch_size(vertices, starts), raster_size, raster_size), dtype=torch.int32)
+
+
+# --- silhouette
+
+
+@torch.library.custom_op("nmr::silhouette", mutates_args=())
+def silhouette(
+    vertices: Tensor,
+    faces: Tensor,
+    starts: Optional[Tensor],  # noqa: UP045
+    image_size: int,
+    anti_aliasing: bool,
+    fill_back: bool,
+    near: float,
+    far: float,
+    eps: float,
+) -> tuple[Tensor, Tensor]:
+    """Silhouettes ``alpha [B, S, S]`` and the owner map ``[B, R, R]`` of meshes in renderer space."""
+    raster_size = image_size * (2 if anti_aliasing else 1)
+    owner = _owner_map(vertices, faces, starts, raster_size, fill_back, near, far)
+    alpha = torch.empty((owner.shape[0], image_size, image_size), dtype=vertices.dtype)
+    _C.silhouette_forward(owner.numpy(), alpha.numpy(), anti_aliasing, num_threads())
+    return alpha.to(vertices.device), owner.to(vertices.device)
+
+
+@silhouette.register_fake
+def _(vertices, faces, starts, image_size, anti_aliasing, fill_back, near, far, eps):
+    batch, raster_size = batch_size(vertices, starts), image_size * (2 if anti_aliasing else 1)
+    alpha = vertices.new_empty((batch, image_size, image_size))
+    return alpha, vertices.new_empty((batch, raster_size, raster_size), dtype=torch.int32)
+
+
+def _silhouette_setup(ctx, inputs, output):
+    vertices, faces, starts, _, anti_aliasing, _, _, _, eps = inputs
+    owner = output[1]
+    ctx.mark_non_differentiable(owner)
+    ctx.save_for_backward(vertices, faces, starts, owner)
+    ctx.settings = anti_aliasing, eps
+
+
+def _silhouette_backward(ctx, grad_alpha, _grad_owner):
+    vertices, faces, starts, owner = ctx.saved_tensors
+    grad_vertices = silhouette_backward(vertices, faces, starts, owner, grad_alpha, *ctx.settings)
+    return grad_vertices, None, None, None, None, None, None, None, None
+
+
+silhouette.register_autograd(_silhouette_backward, setup_context=_silhouette_setup)
+
+
+@torch.library.custom_op("nmr::silhouette_backward", mutates_args=())
+def silhouette_backward(
+    vertices: Tensor,
+    faces: Tensor,
+    starts: Optional[Tensor],  # noqa: UP045
+    owner: Tensor,
+    grad_alpha: Tensor,
+    anti_aliasing: bool,
+    eps: float,
+) -> Tensor:
+    """NMR's silhouette gradient, per vertex, of the shape of ``vertices``; zero in z."""
+    grad_vertices = torch.empty(vertices.shape, dtype=vertices.dtype)
+    _C.silhouette_backward(
+        host_array(vertices),
+        host_array(faces),
+        host_array(starts),
+        host_array(owner),
+        host_array(grad_alpha),
+        grad_vertices.numpy(),
+        anti_aliasing,
+        eps,
+        num_threads(),
+    )
+    return grad_vertices.to(vertices.device)
+
+
+@silhouette_backward.register_fake
+def _(vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps):
+    return vertices.new_empty(vertices.shape)
+
+
+silhouette_backward.register_autograd(no_second_derivative("render_silhouette"))
