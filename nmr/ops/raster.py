@@ -1,7 +1,7 @@
 """Operators: which face is nearest at each pixel, and silhouettes with NMR's gradient."""
 
 # No `from __future__ import annotations` here: torch 2.4 reads the operators' types from the annotations themselves.
-from typing import Optional  # noqa: UP035
+from typing import Optional
 
 import torch
 from torch import Tensor
