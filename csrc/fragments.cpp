@@ -17,12 +17,19 @@ namespace {
 constexpr int64_t kLanes = 16;  // faces set up together
 constexpr int64_t kEntry = 16;  // numbers per face in the table: columns 0, 1, 2 of M and the depths, each padded to four
 
+// What is known of the covered pixels of one row, from the first one on. Written in whole vectors: rows are padded.
+template <class T>
+struct PixelRow {
+  T* raw;      // [R + kLanes, 8] clamped weights and depths of the corners, each padded to four
+  T *w[3], *z; // [R + kLanes] normalised weights, depth
+  T* spare;    // [R + kLanes] a row of the image
+};
+
 template <class T>
 struct FragmentScratch {
   VisibleFaces visible;
   std::vector<T> table;  // [visible, kEntry]
-  std::vector<T> raw;    // [R, 8] clamped weights and depths of the corners at each pixel of a row
-  std::vector<T> row;    // [5, R] w_0, w_1, w_2, z; incoming gradient of z
+  std::vector<T> row;    // [13, R + kLanes] PixelRow
   std::vector<T> terms;  // [R, 12] what each pixel adds to its face
   std::vector<T> sums;   // [visible, 12]
 
@@ -30,13 +37,17 @@ struct FragmentScratch {
     const int64_t most = blocks.most_visible(num_faces);
     visible.reserve_for(num_faces, most);
     reserve(table, (most + 1 + kLanes) * kEntry);
-    reserve(raw, blocks.raster_size * 8);
-    reserve(row, blocks.raster_size * 5);
+    reserve(row, 13 * (blocks.raster_size + kLanes));
   }
   void reserve_for_backward(int64_t num_faces, const RowBlocks& blocks) {
     reserve_for(num_faces, blocks);
     reserve(terms, blocks.raster_size * 12);
     reserve(sums, (blocks.most_visible(num_faces) + 1) * 12);
+  }
+  NMR_INLINE PixelRow<T> pixel_row(int64_t raster_size) {
+    const int64_t stride = raster_size + kLanes;
+    T* r = row.data();
+    return {r, {r + 8 * stride, r + 9 * stride, r + 10 * stride}, r + 11 * stride, r + 12 * stride};
   }
 };
 
@@ -104,29 +115,36 @@ NMR_INLINE void covered_range(const int32_t* owner, int64_t R, int64_t& first, i
   while (last > first && owner[last - 1] < 0) --last;
 }
 
-// w_0, w_1, w_2 and z of the pixels [first, last) of raster row j (from the top) into scratch.row, from its beginning.
+// Weights and depth of the pixels [first, last) of raster row j (from the top).
 template <class T>
-NMR_INLINE void evaluate_row(const Block<T>& block, int64_t j, int64_t first, int64_t last, FragmentScratch<T>& scratch) {
+NMR_INLINE void evaluate_row(const Block<T>& block, int64_t j, int64_t first, int64_t last, const FragmentScratch<T>& scratch,
+                             const PixelRow<T>& row) {
   const int64_t R = block.raster_size;
   const int32_t* owner = block.owner + j * R;
   const int32_t* slots = scratch.visible.slots.data() + 1;
   const T* table = scratch.table.data();
   const T y = static_cast<T>(R - 1 - j);
-  T* raw = scratch.raw.data();
+  T* raw = row.raw;
   for (int64_t i = first; i < last; ++i, raw += 8) {
     const T* entry = table + slots[owner[i]] * kEntry;
     const T x = static_cast<T>(i);
-    for (int k = 0; k < 4; ++k) raw[k] = clamp_weight(entry[k] * x + entry[4 + k] * y + entry[8 + k]);
-    for (int k = 0; k < 4; ++k) raw[4 + k] = entry[12 + k];
+    T pixel[8];  // local, so that the compiler may use vectors of four without a fear of overlaps
+    for (int k = 0; k < 4; ++k) pixel[k] = clamp_weight(entry[k] * x + entry[4 + k] * y + entry[8 + k]);
+    for (int k = 0; k < 4; ++k) pixel[4 + k] = entry[12 + k];
+    for (int k = 0; k < 8; ++k) raw[k] = pixel[k];
   }
-  raw = scratch.raw.data();
-  T *w0 = scratch.row.data(), *w1 = w0 + R, *w2 = w1 + R, *z = w2 + R;
-  for (int64_t n = 0; n < last - first; ++n) {
-    const T sum = raw[8 * n] + raw[8 * n + 1] + raw[8 * n + 2];
-    w0[n] = raw[8 * n] / sum;
-    w1[n] = raw[8 * n + 1] / sum;
-    w2[n] = raw[8 * n + 2] / sum;
-    z[n] = 1 / (w0[n] / raw[8 * n + 4] + w1[n] / raw[8 * n + 5] + w2[n] / raw[8 * n + 6]);
+  raw = row.raw;
+  for (int64_t start = 0; start < last - first; start += kLanes, raw += 8 * kLanes) {
+    T w[3][kLanes], z[kLanes];
+    for (int64_t n = 0; n < kLanes; ++n) {
+      const T sum = raw[8 * n] + raw[8 * n + 1] + raw[8 * n + 2];
+      w[0][n] = raw[8 * n] / sum;
+      w[1][n] = raw[8 * n + 1] / sum;
+      w[2][n] = raw[8 * n + 2] / sum;
+      z[n] = 1 / (w[0][n] / raw[8 * n + 4] + w[1][n] / raw[8 * n + 5] + w[2][n] / raw[8 * n + 6]);
+    }
+    for (int k = 0; k < 3; ++k) std::copy_n(w[k], kLanes, row.w[k] + start);
+    std::copy_n(z, kLanes, row.z + start);
   }
 }
 
@@ -137,23 +155,22 @@ NMR_INLINE void depth_block_body(const DepthImage<T>& args, const Block<T>& bloc
   const int64_t R = block.raster_size, S = args.image_size;
   set_up_faces(block, scratch);
   T* image = args.depth + b * S * S;
-  const T* z = scratch.row.data() + 3 * R;
-  T* row = scratch.row.data() + 4 * R;
+  const PixelRow<T> row = scratch.pixel_row(R);
   for (int64_t j = block.first; j < block.last; ++j) {
     const int32_t* owner = block.owner + j * R;
     int64_t first, last;
     covered_range(owner, R, first, last);
-    evaluate_row(block, j, first, last, scratch);
-    T* out = args.anti_aliasing ? row : image + j * S;
+    evaluate_row(block, j, first, last, scratch, row);
+    T* out = args.anti_aliasing ? row.spare : image + j * S;
     std::fill_n(out, first, args.far);
-    for (int64_t i = first; i < last; ++i) out[i] = owner[i] < 0 ? args.far : z[i - first];
+    for (int64_t i = first; i < last; ++i) out[i] = owner[i] < 0 ? args.far : row.z[i - first];
     std::fill_n(out + last, R - last, args.far);
     if (!args.anti_aliasing) continue;
     T* mean = image + j / 2 * S;
     if (j % 2 == 0)
-      for (int64_t i = 0; i < S; ++i) mean[i] = row[2 * i] + row[2 * i + 1];
+      for (int64_t i = 0; i < S; ++i) mean[i] = out[2 * i] + out[2 * i + 1];
     else
-      for (int64_t i = 0; i < S; ++i) mean[i] = (mean[i] + row[2 * i] + row[2 * i + 1]) / 4;
+      for (int64_t i = 0; i < S; ++i) mean[i] = (mean[i] + out[2 * i] + out[2 * i + 1]) / 4;
   }
 }
 
@@ -161,22 +178,22 @@ template <class T>
 NMR_INLINE void fragments_block_body(const Fragments<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch) {
   const int64_t R = block.raster_size;
   set_up_faces(block, scratch);
-  const T *w0 = scratch.row.data(), *w1 = w0 + R, *w2 = w1 + R, *z = w2 + R;
-  const T* raw = scratch.raw.data();
+  const PixelRow<T> row = scratch.pixel_row(R);
   for (int64_t j = block.first; j < block.last; ++j) {
     const int32_t* owner = block.owner + j * R;
     T* depth = args.depth + (b * R + j) * R;
     T* weights = args.weights + 3 * (b * R + j) * R;
     int64_t first, last;
     covered_range(owner, R, first, last);
-    evaluate_row(block, j, first, last, scratch);
+    evaluate_row(block, j, first, last, scratch, row);
     std::fill_n(depth, R, args.far);
     std::fill_n(weights, 3 * R, T(0));
     depth += first;
     weights += 3 * first;
     owner += first;
     for (int64_t n = 0; n < last - first; ++n) {
-      const T b0 = w0[n] * z[n] / raw[8 * n + 4], b1 = w1[n] * z[n] / raw[8 * n + 5], b2 = w2[n] * z[n] / raw[8 * n + 6];
+      const T *z = row.z, *corner_z = row.raw + 8 * n + 4;
+      const T b0 = row.w[0][n] * z[n] / corner_z[0], b1 = row.w[1][n] * z[n] / corner_z[1], b2 = row.w[2][n] * z[n] / corner_z[2];
       const bool drawn = owner[n] >= 0, reversed = owner[n] >= block.num_faces;
       depth[n] = drawn ? z[n] : args.far;
       weights[3 * n] = drawn ? (reversed ? b2 : b0) : T(0);
@@ -220,8 +237,8 @@ NMR_INLINE void depth_gradient_block_body(const DepthImage<T>& args, const Block
                                           FaceGradients<T>& result) {
   const int64_t R = block.raster_size, S = args.image_size;
   set_up_faces(block, scratch);
-  T *w0 = scratch.row.data(), *w1 = w0 + R, *w2 = w1 + R, *z = w2 + R, *grad = z + R, *terms = scratch.terms.data();
-  T* sums = scratch.sums.data();
+  const PixelRow<T> row = scratch.pixel_row(R);
+  T *grad = row.spare, *terms = scratch.terms.data(), *sums = scratch.sums.data();
   const int32_t* slots = scratch.visible.slots.data() + 1;
   std::fill_n(sums, 4 * scratch.visible.count, T(0));
   for (int64_t j = block.first; j < block.last; ++j) {
@@ -229,7 +246,7 @@ NMR_INLINE void depth_gradient_block_body(const DepthImage<T>& args, const Block
     int64_t first, last;
     covered_range(owner, R, first, last);
     if (first == last) continue;
-    evaluate_row(block, j, first, last, scratch);
+    evaluate_row(block, j, first, last, scratch, row);
     if (args.anti_aliasing) {
       const T* quarter = args.grad_depth + (b * S + j / 2) * S;
       for (int64_t i = 0; i < S; ++i) grad[2 * i] = grad[2 * i + 1] = quarter[i] / 4;
@@ -237,10 +254,8 @@ NMR_INLINE void depth_gradient_block_body(const DepthImage<T>& args, const Block
       std::copy_n(args.grad_depth + (b * S + j) * S, S, grad);
     }
     for (int64_t n = 0; n < last - first; ++n) {
-      const T c = grad[first + n] * z[n] * z[n];
-      terms[4 * n] = c * w0[n];
-      terms[4 * n + 1] = c * w1[n];
-      terms[4 * n + 2] = c * w2[n];
+      const T c = grad[first + n] * row.z[n] * row.z[n];
+      for (int k = 0; k < 3; ++k) terms[4 * n + k] = c * row.w[k][n];
       terms[4 * n + 3] = 0;
     }
     const T* term = terms;
@@ -280,8 +295,7 @@ NMR_INLINE void fragments_gradient_block_body(const Fragments<T>& args, const Bl
                                               FaceGradients<T>& result) {
   const int64_t R = block.raster_size;
   set_up_faces(block, scratch);
-  T *w0 = scratch.row.data(), *w1 = w0 + R, *w2 = w1 + R, *z = w2 + R;
-  const T* raw = scratch.raw.data();
+  const PixelRow<T> row = scratch.pixel_row(R);
   T *sums = scratch.sums.data(), *terms = scratch.terms.data();
   const int32_t* slots = scratch.visible.slots.data() + 1;
   std::fill_n(sums, 12 * scratch.visible.count, T(0));
@@ -290,23 +304,23 @@ NMR_INLINE void fragments_gradient_block_body(const Fragments<T>& args, const Bl
     int64_t first, last;
     covered_range(owner, R, first, last);
     if (first == last) continue;
-    evaluate_row(block, j, first, last, scratch);
+    evaluate_row(block, j, first, last, scratch, row);
     const T* grad_depth = args.grad_depth ? args.grad_depth + (b * R + j) * R : nullptr;
     const T* grad_weights = args.grad_weights ? args.grad_weights + 3 * (b * R + j) * R : nullptr;
     for (int64_t n = 0; n < last - first; ++n) {
       const int64_t i = first + n;
-      const T w[4] = {w0[n], w1[n], w2[n], 0};
+      const T w[4] = {row.w[0][n], row.w[1][n], row.w[2][n], 0}, z = row.z[n];
       T h[3];
-      const T pull = grad_depth ? -grad_depth[i] * z[n] * z[n] : T(0);
+      const T pull = grad_depth ? -grad_depth[i] * z * z : T(0);
       for (int m = 0; m < 3; ++m) h[m] = pull;
       if (grad_weights) {
         const bool reversed = owner[i] >= block.num_faces;
         T u[3], mean = 0;
         for (int m = 0; m < 3; ++m) {
           u[m] = grad_weights[3 * i + (reversed ? 2 - m : m)];
-          mean += u[m] * (w[m] * z[n] / raw[8 * n + 4 + m]);
+          mean += u[m] * (w[m] * z / row.raw[8 * n + 4 + m]);
         }
-        for (int m = 0; m < 3; ++m) h[m] += z[n] * (u[m] - mean);
+        for (int m = 0; m < 3; ++m) h[m] += z * (u[m] - mean);
       }
       for (int m = 0; m < 3; ++m)
         for (int k = 0; k < 4; ++k) terms[12 * n + 4 * m + k] = h[m] * w[k];
