@@ -51,9 +51,13 @@ Scratch& thread_scratch() {
   return scratch;
 }
 
-// Grows a buffer (never shrinks it) and returns its storage.
+// Grows a buffer (never shrinks it) and returns its storage. With NMR_FRESH_SCRATCH (sanitizer builds) it is a new one of exactly
+// this size, full of rubbish: what reads beyond it, or reads what it has not written, cannot go unseen.
 template <class T>
 T* reserve(std::vector<T>& buffer, size_t size) {
+#ifdef NMR_FRESH_SCRATCH
+  buffer = std::vector<T>(size, T(93));
+#endif
   if (buffer.size() < size) buffer.resize(size);
   return buffer.data();
 }
