@@ -159,6 +159,20 @@ struct Interpolate {
   int num_threads;
 };
 
+// From raster pixels to image pixels: the mean of 2x2 with anti-aliasing, else a copy (edges.cpp).
+template <class T>
+struct Resolve {
+  int64_t batch;
+  int64_t image_size;      // S
+  bool anti_aliasing;      // R = 2 S
+  int64_t channels;        // C
+  const T* image;          // [B, R, R, C]
+  T* resolved;             // forward out [B, S, S, C]
+  const T* grad_resolved;  // backward in
+  T* grad_image;           // backward out [B, R, R, C]
+  int num_threads;
+};
+
 // NMR's gradient of an image of any channels (edges.cpp): every visible edge is moved by the pixels that moving it would improve.
 template <class T>
 struct EdgesBackward {
@@ -206,6 +220,8 @@ template <class T> void texture_cubes_forward(const TextureCubes<T>& args);
 template <class T> void texture_cubes_backward(const TextureCubes<T>& args);
 template <class T> void interpolate_forward(const Interpolate<T>& args);
 template <class T> void interpolate_backward(const Interpolate<T>& args);
+template <class T> void resolve_forward(const Resolve<T>& args);
+template <class T> void resolve_backward(const Resolve<T>& args);
 template <class T> void edges_backward(const EdgesBackward<T>& args);
 template <class T> void smoothness_forward(const Smoothness<T>& args);
 template <class T> void smoothness_backward(const Smoothness<T>& args);

@@ -11,6 +11,7 @@ Rasters are ``[B, R, R]`` with R = 2S when anti-aliased, else S; row 0 = top, as
 -1 = background, f = face f is nearest, ``F + f`` = its reversed copy is (F = number of faces of that mesh).
 """
 
+from .edges import edges_backward, resolve, resolve_backward
 from .fragments import depth_backward, depth_image, fragments, fragments_backward
 from .mesh import smoothness, smoothness_backward, voxels
 from .raster import rasterize, silhouette, silhouette_backward
@@ -18,9 +19,12 @@ from .raster import rasterize, silhouette, silhouette_backward
 __all__ = [
     "depth_backward",
     "depth_image",
+    "edges_backward",
     "fragments",
     "fragments_backward",
     "rasterize",
+    "resolve",
+    "resolve_backward",
     "silhouette",
     "silhouette_backward",
     "smoothness",
