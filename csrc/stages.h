@@ -129,7 +129,7 @@ struct TextureCubes {
   int64_t texture_batch;   // 1 or B when not packed
   int64_t num_faces;       // F (packed: M)
   const int64_t* starts;   // packed: as in MeshBatch; else nullptr
-  int64_t texture_size;    // ts >= 2
+  int64_t texture_size;    // ts; a cube of one texel is constant
   int64_t channels;        // C
   T eps;                   // coordinates are clamped to [0, ts - 1 - eps]
   T* colors;               // forward out [B, R, R, C]; 0 on background

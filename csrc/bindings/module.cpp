@@ -6,5 +6,6 @@ PYBIND11_MODULE(_C, m) {
   nmr::bind_raster(m);
   nmr::bind_fragments(m);
   nmr::bind_edges(m);
+  nmr::bind_shade(m);
   nmr::bind_mesh(m);
 }

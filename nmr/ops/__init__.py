@@ -15,6 +15,7 @@ from .edges import edges_backward, resolve, resolve_backward
 from .fragments import depth_backward, depth_image, fragments, fragments_backward
 from .mesh import smoothness, smoothness_backward, voxels
 from .raster import rasterize, silhouette, silhouette_backward
+from .shade import interpolate, interpolate_backward, sample_texture_cubes, texture_cubes_backward
 
 __all__ = [
     "depth_backward",
@@ -22,12 +23,16 @@ __all__ = [
     "edges_backward",
     "fragments",
     "fragments_backward",
+    "interpolate",
+    "interpolate_backward",
     "rasterize",
     "resolve",
     "resolve_backward",
+    "sample_texture_cubes",
     "silhouette",
     "silhouette_backward",
     "smoothness",
     "smoothness_backward",
+    "texture_cubes_backward",
     "voxels",
 ]
