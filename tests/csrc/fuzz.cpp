@@ -59,7 +59,7 @@ Scene<T> decode(Bytes bytes) {
   s.batch = more / 8 % 4;
   s.channels = 1 + more / 32 % 4;
   s.image_size = 1 + bytes.next() % (s.anti_aliasing ? 10 : 20);
-  s.texture_size = 2 + bytes.next() % 3;
+  s.texture_size = 1 + bytes.next() % 4;
   s.grid_size = 1 + bytes.next() % 6;
   const int planes = bytes.next();
   s.near = planes % 4 == 0 ? T(0.1) : T(planes % 16) / 8;

@@ -29,7 +29,7 @@ def encode(rng, number, flags, meshes, size, *, foreign=False, planes=0, spoil=F
     """The bytes that decode() of fuzz.cpp turns into these meshes; unless packed, all have the first one's sizes."""
     batch, packed = len(meshes), bool(flags & PACKED)
     more = (7 if foreign else 0) + 8 * batch + 32 * rng.randrange(4)
-    head = [number, flags, more, size, rng.randrange(3), rng.randrange(6), planes, rng.randrange(8), rng.randrange(256)]
+    head = [number, flags, more, size, rng.randrange(4), rng.randrange(6), planes, rng.randrange(8), rng.randrange(256)]
     shapes = meshes if packed else [meshes[0] if meshes else NOTHING]
     head += [len(vertices) + 16 * len(faces) for vertices, faces in shapes]
     lists = meshes if packed or flags & PER_IMAGE else shapes

@@ -9,7 +9,7 @@ namespace {
 
 // Streams of noise, one per input.
 enum Stream : uint64_t { kGradAlpha = 1, kGradWeights, kGradDepth, kGradDepthImage, kTextures, kGradColors, kAttributes,
-                         kGradValues, kImage, kGradImage, kMatrix, kIntrinsics, kDistortion, kGradPoints, kGradLoss, kOwner };
+                         kGradValues, kImage, kGradImage, kMatrix, kIntrinsics, kDistortion, kGradPoints, kGradLoss, kOwner, kGradResolved };
 
 template <class T>
 std::vector<T> input(const Scene<T>& scene, Stream stream, int64_t size) {
@@ -92,6 +92,15 @@ void run_edges(const Scene<T>& s, Results<T>& r, int num_threads) {
   r.grad_edges = unwritten<T>(3 * s.rows());
   edges_backward(EdgesBackward<T>{s.mesh(), s.raster_size(), s.eps, r.owner.data(), image.data(), s.channels, grad.data(),
                                   r.grad_edges.data(), num_threads});
+
+  const int64_t size = s.batch * s.image_size * s.image_size * s.channels;
+  const std::vector<T> grad_resolved = input(s, kGradResolved, size);
+  r.resolved = unwritten<T>(size);
+  r.grad_image = unwritten<T>(image.size());
+  Resolve<T> resolve{s.batch, s.image_size, s.anti_aliasing, s.channels, image.data(), r.resolved.data(), grad_resolved.data(),
+                     r.grad_image.data(), num_threads};
+  resolve_forward(resolve);
+  resolve_backward(resolve);
 }
 
 // A camera per image: nearly the identity, three units back.

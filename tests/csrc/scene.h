@@ -70,6 +70,7 @@ struct Results {
   std::vector<T> depth_image, grad_depth;
   std::vector<T> colors, grad_textures;
   std::vector<T> values, grad_attributes, grad_weights;
+  std::vector<T> resolved, grad_image;
   std::vector<T> grad_edges;
   std::vector<T> points, grad_world, grad_matrix, grad_intrinsics, grad_distortion;
   std::vector<T> loss, grad_loss;
@@ -90,6 +91,8 @@ struct Results {
     visit("values", values);
     visit("grad_attributes", grad_attributes);
     visit("grad_weights", grad_weights);
+    visit("resolved", resolved);
+    visit("grad_image", grad_image);
     visit("grad_edges", grad_edges);
     visit("points", points);
     visit("grad_world", grad_world);

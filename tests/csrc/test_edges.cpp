@@ -73,4 +73,27 @@ TEST_REAL(edge_gradients_of_an_image_of_one_colour_are_zero) {
   for (T g : gradient(scene, owner, image, grad)) CHECK_EQUAL(g, T(0));
 }
 
+TEST_REAL(resolve_is_a_mean_and_its_gradient_the_adjoint) {
+  for (bool anti_aliasing : {false, true})
+    for (int64_t C : {1, 3, 4}) {
+      const int64_t B = 2, S = 7, step = anti_aliasing ? 2 : 1, R = step * S;
+      const std::vector<T> image = noise_array<T>(1, B * R * R * C), grad_resolved = noise_array<T>(2, B * S * S * C);
+      std::vector<T> resolved = unwritten<T>(grad_resolved.size()), grad_image = unwritten<T>(image.size());
+      const Resolve<T> args{B, S, anti_aliasing, C, image.data(), resolved.data(), grad_resolved.data(), grad_image.data(), 2};
+      resolve_forward(args);
+      resolve_backward(args);
+      double product = 0, adjoint = 0;
+      for (int64_t n = 0; n < B * S * S * C; ++n) {
+        const int64_t c = n % C, x = n / C % S, y = n / C / S % S, b = n / C / S / S;
+        double sum = 0;
+        for (int64_t j = 0; j < step; ++j)
+          for (int64_t i = 0; i < step; ++i) sum += image[((b * R + step * y + j) * R + step * x + i) * C + c];
+        CHECK_NEAR(resolved[n], sum / double(step * step), 1e-6);
+        product += double(resolved[n]) * double(grad_resolved[n]);
+      }
+      for (size_t n = 0; n < image.size(); ++n) adjoint += double(image[n]) * double(grad_image[n]);
+      CHECK_NEAR(product, adjoint, 1e-4);
+    }
+}
+
 }  // namespace nmr::test

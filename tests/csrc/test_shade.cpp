@@ -68,6 +68,16 @@ TEST_REAL(texture_cubes_reproduce_linear_textures) {
   }
 }
 
+TEST_REAL(a_texture_of_one_texel_is_a_colour) {
+  const Fragment<T> f;
+  const std::vector<T> textures{1, 2, 3, 4, 5};
+  std::vector<T> colors = unwritten<T>(f.owner.size());
+  TextureCubes<T> args = cubes(f, textures, 1, 1, 1, T(1e-4));
+  args.colors = colors.data();
+  texture_cubes_forward(args);
+  for (size_t n = 0; n < f.owner.size(); ++n) CHECK_NEAR(colors[n], f.owner[n] < 0 ? 0 : double(f.face(n)) + 1, 1e-6);
+}
+
 // Colours are linear in the textures: <colors(t), g> = <t, grad(g)>.
 TEST_REAL(texture_cube_gradients_are_the_adjoint) {
   for (bool packed : {false, true})
