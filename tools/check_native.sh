@@ -4,7 +4,7 @@
 #   asan          the same under AddressSanitizer and UndefinedBehaviorSanitizer (CXX: g++ or clang++)
 #   tsan          the same under ThreadSanitizer, with a small OpenMP of our own that it can see through (g++)
 #   tsan-clang    the same with LLVM's OpenMP, which tells the sanitizer what it does (clang++)
-#   fuzz SECONDS  libFuzzer (clang++); what it finds stays in build/native/fuzz/finding-*, new inputs in build/native/corpus
+#   fuzz SECONDS  libFuzzer (clang++); findings: build/native/fuzz/finding-*; inputs: build/native/corpus
 #   count         instructions of workload W1 under callgrind, against tests/csrc/instructions.json
 #   variants      the same bits from every compiler and instruction set at hand
 #   coverage      lines and branches of csrc/ and nmr/ that the C++ and Python tests reach
@@ -41,7 +41,7 @@ build() { # name, compiler, flags, targets ("" for all), further cmake arguments
 
 run_tests() { # name of the build
     "build/native/$1/tests"
-    "build/native/$1/fuzz" tests/csrc/corpus
+    "build/native/$1/fuzz" tests/csrc/corpus.hex
 }
 
 check_tests() {
@@ -75,9 +75,9 @@ check_tsan_clang() {
 check_fuzz() {
     want clang++ libFuzzer
     build fuzz clang++ "$address -O2 -fsanitize=fuzzer-no-link" fuzz -DNMR_FUZZER=ON
-    mkdir -p build/native/corpus
+    "$python" tests/csrc/corpus.py unpack build/native/corpus
     nice -n 19 build/native/fuzz/fuzz -max_total_time="$1" -max_len=512 -print_final_stats=1 -timeout=10 -rss_limit_mb=2048 \
-        -artifact_prefix=build/native/fuzz/finding- build/native/corpus tests/csrc/corpus 2>&1 | tee build/native/fuzz.txt |
+        -artifact_prefix=build/native/fuzz/finding- build/native/corpus 2>&1 | tee build/native/fuzz.txt |
         grep -v -E "	(NEW|REDUCE|pulse) |NEW_FUNC"
 }
 

@@ -1,5 +1,5 @@
 // The fuzz target: bytes -> a scene -> every stage, forward and backward, on one thread and on three. Beyond what the sanitizers
-// find, it stops at a broken promise and at results that depend on the number of threads. make_corpus.py writes such bytes.
+// find, it stops at a broken promise and at results that depend on the number of threads. corpus.py writes such bytes.
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
@@ -95,11 +95,10 @@ void stop(const char* what, const char* which) {
 
 template <class T>
 void run(const Bytes& bytes) {
-  const bool compare = bytes.size > 0 && bytes.data[0] & 128;  // threads take time to start: not for every input
   const Scene<T> scene = decode<T>(bytes);
   const Results<T> one = run_stages(scene, 1);
   if (const char* broken = broken_promise(scene, one)) stop("broken promise", broken);
-  if (!compare) return;
+  if (scene.seed % 8 != 7) return;  // threads take time to start: not for every input
   if (const char* name = first_difference(one, run_stages(scene, 3))) stop("depends on the number of threads", name);
 }
 

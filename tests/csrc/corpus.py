@@ -1,6 +1,7 @@
-"""Writes seeds of the fuzz target (fuzz.cpp) into a folder: the layouts, special values and degenerate faces that it should start from.
+"""The corpus of the fuzz target (fuzz.cpp): corpus.hex, an input per line. libFuzzer wants a folder with a file per input.
 
-python tests/csrc/make_corpus.py FOLDER
+    python tests/csrc/corpus.py unpack FOLDER      writes the corpus into a folder
+    python tests/csrc/corpus.py pack FOLDER        makes the folder's files and the seeds of this script the corpus
 """
 
 import hashlib
@@ -8,8 +9,10 @@ import random
 import sys
 from pathlib import Path
 
+CORPUS = Path(__file__).with_name("corpus.hex")
+
 FLOAT, DOUBLE = 1, 0
-PACKED, PER_IMAGE, ANTI_ALIASED, FILL_BACK, VALUES_PER_IMAGE, PERSPECTIVE, DISTORTED, THREE_THREADS = (1 << n for n in range(8))
+PACKED, PER_IMAGE, ANTI_ALIASED, FILL_BACK, VALUES_PER_IMAGE, PERSPECTIVE, DISTORTED = (1 << n for n in range(7))
 SPECIAL = range(232, 247)
 
 # corners as bytes (see coordinate() of fuzz.cpp): x, y = (byte - 116) / 64, z = (byte - 32) / 16
@@ -29,7 +32,7 @@ def encode(rng, number, flags, meshes, size, *, foreign=False, planes=0, spoil=F
     """The bytes that decode() of fuzz.cpp turns into these meshes; unless packed, all have the first one's sizes."""
     batch, packed = len(meshes), bool(flags & PACKED)
     more = (7 if foreign else 0) + 8 * batch + 32 * rng.randrange(4)
-    head = [number, flags, more, size, rng.randrange(4), rng.randrange(6), planes, rng.randrange(8), rng.randrange(256)]
+    head = [number, flags, more, size, rng.randrange(4), rng.randrange(6), planes, rng.randrange(8), rng.choice((rng.randrange(256), 7))]
     shapes = meshes if packed else [meshes[0] if meshes else NOTHING]
     head += [len(vertices) + 16 * len(faces) for vertices, faces in shapes]
     lists = meshes if packed or flags & PER_IMAGE else shapes
@@ -47,7 +50,7 @@ def seeds() -> list[bytes]:
         for layout in (0, PER_IMAGE, PACKED):
             for mesh in MESHES:
                 batch = rng.choices(MESHES, k=2) + [mesh] if layout == PACKED else [mesh] * rng.randrange(1, 3)
-                for other in (ANTI_ALIASED | FILL_BACK | PERSPECTIVE | DISTORTED | THREE_THREADS, VALUES_PER_IMAGE | rng.choice((0, FILL_BACK))):
+                for other in (ANTI_ALIASED | FILL_BACK | PERSPECTIVE | DISTORTED, VALUES_PER_IMAGE | rng.choice((0, FILL_BACK))):
                     options = {"foreign": rng.random() < 0.1, "planes": rng.choice((0, 0, 0, 34, 200)), "spoil": rng.random() < 0.3}
                     found.append(encode(rng, number, layout | other, batch, rng.randrange(20), **options))
         found.append(encode(rng, number, 0, [], 8))
@@ -56,12 +59,18 @@ def seeds() -> list[bytes]:
     return found
 
 
-def main() -> None:
-    folder = Path(sys.argv[1])
+def unpack(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    for seed in seeds():
-        (folder / hashlib.sha1(seed).hexdigest()).write_bytes(seed)
+    for line in CORPUS.read_text().split():
+        (folder / hashlib.sha1(bytes.fromhex(line)).hexdigest()).write_bytes(bytes.fromhex(line))
+
+
+def pack(folder: Path) -> None:
+    found = {path.read_bytes() for path in folder.glob("*")} if folder.exists() else set()
+    lines = sorted({data.hex() for data in {*found, *seeds()}}, key=lambda line: (len(line), line))
+    CORPUS.write_text("".join(f"{line}\n" for line in lines))
+    print(f"{len(lines)} inputs, {CORPUS.stat().st_size} bytes")
 
 
 if __name__ == "__main__":
-    main()
+    {"unpack": unpack, "pack": pack}[sys.argv[1]](Path(sys.argv[2]))
