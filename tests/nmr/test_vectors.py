@@ -38,7 +38,7 @@ def relative_difference(value, expected):
 
 @pytest.mark.parametrize("name", SILHOUETTES)
 def test_silhouette_bit_for_bit_and_gradient(name):
-    """Pulls are summed in another order than published, and share a division: 2e-6 is far within the stated latitude."""
+    """Pulls are summed in another order than published, and two share a division: far within the stated latitude."""
     v = load_vector(name)
     vertices = torch.from_numpy(v["vertices"]).requires_grad_()
     alpha = nmr.render_silhouette(vertices, torch.from_numpy(v["faces"]), **settings_of(v))
