@@ -1,153 +1,358 @@
 // Which face is nearest at each pixel of each image.
+//
+// Three steps per image. Set-up: for each face, which vertex orders face the camera, its box of pixels, its range of depths. Fill:
+// face after face (all originals, then all reversed copies), mark the pixels inside. The exact depth needs seven divisions per
+// pixel, so it is computed only where two faces' ranges of depth overlap; elsewhere the ranges decide. Copy: into the owner map.
+// One image can be shared by several threads: set-up by chunks of faces, fill by bands of rows.
 #include <algorithm>
 #include <cstring>
+#include <limits>
 #include <vector>
 
 #include "geometry.h"
+#include "lanes.h"
 #include "parallel.h"
 #include "stages.h"
 
 namespace nmr {
 namespace {
 
-constexpr int64_t kLanes = 8;  // pixels handled together
+constexpr int64_t kChunk = 2048;    // faces that one thread sets up together
+constexpr int64_t kBlock = 8;       // pixels per side of a block whose farthest depth is known in the second pass
 
-// Working memory of one image; rows are padded so that a vector of pixels may reach past the last column.
+// What the fill needs of each face; arrays over faces.
 template <class T>
-struct RasterScratch {
-  std::vector<T> centres;           // [stride] pixel centres in [-1, 1]
-  std::vector<T> columns;           // [stride] column numbers
-  std::vector<T> depth;             // [R, stride] depth of the nearest face so far
-  std::vector<int32_t> owner;       // [R, stride]
-  std::vector<int32_t> back_faces;  // faces whose reversed copy faces the camera
+struct FaceTable {
+  std::vector<T> x[3], y[3];                     // corners, in the face's own order
+  std::vector<T> nearest, farthest;              // bounds of the depth at any pixel; see has_depth_bounds
+  std::vector<int32_t> column_first, column_last, row_first, row_last;  // pixels inside the bounding box
+  std::vector<int32_t> front, back;              // per chunk: the faces drawn as they are, and reversed, in ascending order
+  std::vector<int32_t> num_front, num_back;      // [chunks]
+  std::vector<T> front_depth, back_depth;        // [chunks] sums of `nearest` over them
+
+  void reserve_faces(int64_t num_faces) {
+    const size_t size = static_cast<size_t>(num_faces + kLanes * 2);
+    for (int k = 0; k < 3; ++k) {
+      reserve(x[k], size);
+      reserve(y[k], size);
+    }
+    reserve(nearest, size);
+    reserve(farthest, size);
+    for (std::vector<int32_t>* v : {&column_first, &column_last, &row_first, &row_last, &front, &back}) reserve(*v, size);
+    for (std::vector<int32_t>* v : {&num_front, &num_back}) reserve(*v, size / kChunk + 1);
+    for (std::vector<T>* v : {&front_depth, &back_depth}) reserve(*v, size / kChunk + 1);
+  }
+};
+
+// Rows of one band of an image, padded so that a vector of pixels may reach past the last column.
+template <class T>
+struct BandScratch {
+  std::vector<T> centres;        // [R + lanes] pixel centres in [-1, 1]
+  std::vector<T> farthest;       // [rows, R + lanes] upper bound of the owner's depth; infinity on background
+  std::vector<int32_t> owner;    // [rows, R + lanes]
+  std::vector<T> block_farthest; // [rows / block, R / block] the largest of `farthest` in a block
 };
 
 template <class T>
-struct Raster {
+struct Image {
+  const T* vertices;
+  const int64_t* faces;
+  int64_t num_faces;
+  RasterSettings<T> settings;
+  FaceTable<T>* table;
+};
+
+// Depth of face `id` (a reversed copy if id >= num_faces) at pixel (column i, row j), as published.
+template <class T>
+NMR_INLINE T exact_depth(const Image<T>& image, int32_t id, int64_t i, int64_t j) {
+  const bool reversed = id >= image.num_faces;
+  const Triangle<T> t = load_triangle(image.vertices, image.faces + 3 * (reversed ? id - image.num_faces : id), reversed);
+  const BarycentricMatrix<T> m = barycentric_matrix(t, static_cast<T>(image.settings.raster_size));
+  const T column = static_cast<T>(i), row = static_cast<T>(j);
+  T w[3];
+  for (int k = 0; k < 3; ++k) w[k] = clamp_weight(m.m[k][0] * column + m.m[k][1] * row + m.m[k][2]);
+  const T sum = w[0] + w[1] + w[2];
+  return 1 / (w[0] / sum / t.z[0] + w[1] / sum / t.z[1] + w[2] / sum / t.z[2]);
+}
+
+// Pixels along one axis whose centres lie in [lo, hi]: a face covers no centre outside its bounding box. (NMR itself tests every
+// pixel, and paints stray ones for slivers that are collinear up to rounding.)
+template <class T>
+NMR_INLINE void pixel_range(T lo, T hi, T size, int32_t& first, int32_t& last) {
+  const T from = to_pixel(lo, size), to = to_pixel(hi, size);
+  const int32_t f = static_cast<int32_t>(from > -2 ? (from < size + 1 ? from : size + 1) : T(-2));
+  const int32_t l = static_cast<int32_t>(to > -2 ? (to < size + 1 ? to : size + 1) : T(-2));
+  const int32_t n = static_cast<int32_t>(size);
+  // to_pixel is off by much less than one pixel: compare the two centres around it
+  const auto centre = [n, size](int32_t i) { return static_cast<T>(2 * i + 1 - n) / size; };
+  const int32_t a = f + (centre(f) < lo) + (centre(f + 1) < lo);
+  const int32_t b = l - 1 + (centre(l) <= hi) + (centre(l + 1) <= hi);
+  first = a > 0 ? a : 0;
+  last = b < n - 1 ? b : n - 1;
+}
+
+// Sets up faces [first, last) and lists those that are drawn.
+template <class T>
+NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
+  constexpr int64_t kGroup = 16;
+  FaceTable<T>& table = *image.table;
+  const int64_t first = chunk * kChunk, last = std::min(first + kChunk, image.num_faces);
+  const T size = static_cast<T>(image.settings.raster_size);
+  const T near = image.settings.near, far = image.settings.far;
+  const bool fill_back = image.settings.fill_back;
+  const T* vertices = image.vertices;
+  const T infinity = std::numeric_limits<T>::infinity();
+  const T round_down = 1 - 16 * std::numeric_limits<T>::epsilon(), round_up = 1 + 16 * std::numeric_limits<T>::epsilon();
+  const T resolution = 288 * std::numeric_limits<T>::epsilon();
+  int32_t num_front = 0, num_back = 0;
+  T front_depth = 0, back_depth = 0;
+  int32_t *front = table.front.data() + first, *back = table.back.data() + first;
+
+  for (int64_t f = first; f < last; f += kGroup) {
+    int32_t corner[3][kGroup];
+    const int64_t lanes = std::min(kGroup, last - f);
+    for (int64_t n = 0; n < kGroup; ++n) {
+      const int64_t* face = image.faces + 3 * (f + (n < lanes ? n : 0));
+      for (int k = 0; k < 3; ++k) corner[k][n] = static_cast<int32_t>(3 * face[k]);
+    }
+    T x[3][kGroup], y[3][kGroup], z[3][kGroup];
+    for (int k = 0; k < 3; ++k)
+      for (int64_t n = 0; n < kGroup; ++n) {
+        x[k][n] = vertices[corner[k][n]];
+        y[k][n] = vertices[corner[k][n] + 1];
+        z[k][n] = vertices[corner[k][n] + 2];
+      }
+    int32_t is_front[kGroup], is_back[kGroup];
+    T nearest[kGroup], farthest[kGroup];
+    int32_t i0[kGroup], i1[kGroup], j0[kGroup], j1[kGroup];
+    for (int64_t n = 0; n < kGroup; ++n) {
+      const T x0 = x[0][n], x1 = x[1][n], x2 = x[2][n], y0 = y[0][n], y1 = y[1][n], y2 = y[2][n];
+      const T z0 = z[0][n], z1 = z[1][n], z2 = z[2][n];
+      // Counter-clockwise as it is, and reversed: for slivers the test is not antisymmetric in floating point.
+      const bool ccw = !((y2 - y0) * (x1 - x0) < (y1 - y0) * (x2 - x0));
+      const bool cw = !((y0 - y2) * (x1 - x2) < (y1 - y2) * (x0 - x2));
+      const T largest = max3(max3(std::abs(x0), std::abs(x1), std::abs(x2)), max3(std::abs(y0), std::abs(y1), std::abs(y2)), T(1));
+      const bool usable = (std::abs(x0) < infinity) & (std::abs(x1) < infinity) & (std::abs(x2) < infinity) &
+                          (std::abs(y0) < infinity) & (std::abs(y1) < infinity) & (std::abs(y2) < infinity) & (z0 == z0) &
+                          (z1 == z1) & (z2 == z2);
+      const T lo = min3(z0, z1, z2), hi = max3(z0, z1, z2);
+      // The depth is a weighted mean of 1 / z, with weights >= 0 whatever their rounding: it lies between the corners'. The only
+      // exception is a face so thin that all three weights could round to nothing.
+      const T det = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0);
+      const bool bounded =
+          (std::abs(det) >= resolution * largest * largest) & (lo * round_down > near) & (hi * round_up < far) & (near >= 0);
+      nearest[n] = bounded ? lo * round_down : -infinity;
+      farthest[n] = bounded ? hi * round_up : infinity;
+      pixel_range(min3(x0, x1, x2), max3(x0, x1, x2), size, i0[n], i1[n]);
+      pixel_range(min3(y0, y1, y2), max3(y0, y1, y2), size, j0[n], j1[n]);
+      const bool drawn = usable & (i0[n] <= i1[n]) & (j0[n] <= j1[n]);
+      is_front[n] = drawn & ccw;
+      is_back[n] = drawn & cw & fill_back;
+    }
+    for (int k = 0; k < 3; ++k) {
+      std::copy_n(x[k], kGroup, table.x[k].data() + f);
+      std::copy_n(y[k], kGroup, table.y[k].data() + f);
+    }
+    std::copy_n(nearest, kGroup, table.nearest.data() + f);
+    std::copy_n(farthest, kGroup, table.farthest.data() + f);
+    std::copy_n(i0, kGroup, table.column_first.data() + f);
+    std::copy_n(i1, kGroup, table.column_last.data() + f);
+    std::copy_n(j0, kGroup, table.row_first.data() + f);
+    std::copy_n(j1, kGroup, table.row_last.data() + f);
+    for (int64_t n = 0; n < lanes; ++n) {
+      front[num_front] = static_cast<int32_t>(f + n);
+      num_front += is_front[n];
+      front_depth += is_front[n] && nearest[n] > 0 ? nearest[n] : 0;
+      back[num_back] = static_cast<int32_t>(f + n);
+      num_back += is_back[n];
+      back_depth += is_back[n] && nearest[n] > 0 ? nearest[n] : 0;
+    }
+  }
+  table.front_depth[chunk] = front_depth;
+  table.back_depth[chunk] = back_depth;
+  table.num_front[chunk] = num_front;
+  table.num_back[chunk] = num_back;
+}
+
+// One band of rows of an image.
+template <class T>
+struct Band {
+  int64_t row_first, row_last;  // inclusive, from the bottom
   int64_t size, stride;
   const T* centres;
-  const T* columns;
-  T near, far;
-  T* depth;
+  T* farthest;
   int32_t* owner;
 };
 
-// First pixel whose centre is >= lo and last whose centre is <= hi, within the raster: a face covers no centre outside its
-// bounding box. (NMR itself tests every pixel, and paints stray ones for slivers that are collinear up to rounding.)
+// Decides by exact depth between a face that covers a pixel and the pixel's owner. Of equally near faces the first one wins,
+// whatever the order in which they are filled.
 template <class T>
-NMR_INLINE void pixel_range(T lo, T hi, const Raster<T>& r, int64_t& first, int64_t& last) {
-  const T size = static_cast<T>(r.size);
-  const T from = std::min(std::max(to_pixel(lo, size), T(-1)), size);
-  const T to = std::min(std::max(to_pixel(hi, size), T(-1)), size);
-  first = std::max<int64_t>(static_cast<int64_t>(from) - 1, 0);
-  last = std::min<int64_t>(static_cast<int64_t>(to) + 1, r.size - 1);
-  while (first <= last && r.centres[first] < lo) ++first;
-  while (first <= last && r.centres[last] > hi) --last;
+NMR_INLINE void contest(const Image<T>& image, int32_t id, T farthest, int64_t i, int64_t j, T& pixel_farthest, int32_t& owner) {
+  if (owner >= 0) {
+    const int32_t other = owner < image.num_faces ? owner : owner - static_cast<int32_t>(image.num_faces);
+    if (farthest < image.table->nearest[other]) {
+      pixel_farthest = farthest;
+      owner = id;
+      return;
+    }
+  }
+  const T z = exact_depth(image, id, i, j);
+  if (!(z > image.settings.near && z < image.settings.far)) return;  // also NaN
+  if (owner >= 0) {
+    const T other = exact_depth(image, owner, i, j);
+    pixel_farthest = other;
+    if (z > other || (z == other && id > owner)) return;
+  }
+  pixel_farthest = z;
+  owner = id;
 }
 
-// Draws one face into the depth buffer and the index map.
+// Fills one face into a band.
 template <class T>
-NMR_INLINE void draw_triangle(const Triangle<T>& t, int32_t id, const Raster<T>& r) {
-  int64_t i_first, i_last, j_first, j_last;
-  pixel_range(min3(t.x[0], t.x[1], t.x[2]), max3(t.x[0], t.x[1], t.x[2]), r, i_first, i_last);
-  if (i_first > i_last) return;
-  pixel_range(min3(t.y[0], t.y[1], t.y[2]), max3(t.y[0], t.y[1], t.y[2]), r, j_first, j_last);
+NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const Band<T>& band) {
+  const FaceTable<T>& table = *image.table;
+  const int64_t i_first = table.column_first[f], i_last = table.column_last[f];
+  const int64_t j_first = std::max<int64_t>(table.row_first[f], band.row_first);
+  const int64_t j_last = std::min<int64_t>(table.row_last[f], band.row_last);
   if (j_first > j_last) return;
+  const int32_t id = reversed ? f + static_cast<int32_t>(image.num_faces) : f;
+  const T nearest = table.nearest[f], farthest = table.farthest[f];
+  const bool bounded = nearest > 0;
+  if (!bounded && !is_drawable(load_triangle(image.vertices, image.faces + 3 * f, false))) return;
+  const int k0 = reversed ? 2 : 0, k2 = reversed ? 0 : 2;
+  const T x0 = table.x[k0][f], x1 = table.x[1][f], x2 = table.x[k2][f];
+  const T y0 = table.y[k0][f], y1 = table.y[1][f], y2 = table.y[k2][f];
+  const T dx0 = x1 - x0, dx1 = x2 - x1, dx2 = x0 - x2;
+  const T dy0 = y1 - y0, dy1 = y2 - y1, dy2 = y0 - y2;
 
-  const BarycentricMatrix<T> w = barycentric_matrix(t, static_cast<T>(r.size));
-  const T dx0 = t.x[1] - t.x[0], dx1 = t.x[2] - t.x[1], dx2 = t.x[0] - t.x[2];
-  const T dy0 = t.y[1] - t.y[0], dy1 = t.y[2] - t.y[1], dy2 = t.y[0] - t.y[2];
-
-  for (int64_t j = j_first; j <= j_last; ++j) {
-    const T yp = r.centres[j];
-    const T row = r.columns[j];
-    const T e0 = (yp - t.y[0]) * dx0, e1 = (yp - t.y[1]) * dx1, e2 = (yp - t.y[2]) * dx2;
-    for (int64_t i = i_first; i <= i_last; i += kLanes) {
-      const T* xp = r.centres + i;
-      const T* column = r.columns + i;
-      const int32_t lanes = static_cast<int32_t>(i_last - i + 1);
-      int32_t inside[kLanes];
-      int32_t any = 0;
-      for (int32_t k = 0; k < kLanes; ++k) {
-        inside[k] = !(e0 < (xp[k] - t.x[0]) * dy0) & !(e1 < (xp[k] - t.x[1]) * dy1) & !(e2 < (xp[k] - t.x[2]) * dy2) &
-                    (k < lanes);
-        any |= inside[k];
+  for (int64_t i = i_first; i <= i_last; i += kLanes) {
+    const LaneMask<T> in_box = widen_mask<T>(lane_numbers() <= static_cast<int32_t>(i_last - i));
+    const Lanes<T> xp = load_lanes<Lanes<T>>(band.centres + i);
+    const Lanes<T> c0 = (xp - x0) * dy0, c1 = (xp - x1) * dy1, c2 = (xp - x2) * dy2;
+    T* farthest_at = band.farthest + (j_first - band.row_first) * band.stride + i;
+    int32_t* owner_at = band.owner + (j_first - band.row_first) * band.stride + i;
+    for (int64_t j = j_first; j <= j_last; ++j, farthest_at += band.stride, owner_at += band.stride) {
+      const T yp = band.centres[j];
+      const T e0 = (yp - y0) * dx0, e1 = (yp - y1) * dx1, e2 = (yp - y2) * dx2;
+      const LaneMask<T> inside = in_box & ~((e0 < c0) | (e1 < c1) | (e2 < c2));
+      const Lanes<T> pixel_farthest = load_lanes<Lanes<T>>(farthest_at);
+      const LaneMask<T> unsettled = inside & (pixel_farthest >= nearest);
+      if (!lane_bits(unsettled)) continue;
+      const Lanes32 owner = load_lanes<Lanes32>(owner_at);
+      LaneMask<T> contested = unsettled;
+      if (bounded) {
+        const LaneMask<T> open = unsettled & widen_mask<T>(owner < 0);
+        store_lanes(farthest_at, select(open, splat(farthest), pixel_farthest));
+        store_lanes(owner_at, select(narrow_mask(open), splat32(id), owner));
+        contested = unsettled & ~open;
       }
-      if (!any) continue;
-      T* depth = r.depth + j * r.stride + i;
-      int32_t* index = r.owner + j * r.stride + i;
-      for (int32_t k = 0; k < kLanes; ++k) {
-        T w0 = clamp_weight(w.m[0][0] * column[k] + w.m[0][1] * row + w.m[0][2]);
-        T w1 = clamp_weight(w.m[1][0] * column[k] + w.m[1][1] * row + w.m[1][2]);
-        T w2 = clamp_weight(w.m[2][0] * column[k] + w.m[2][1] * row + w.m[2][2]);
-        const T sum = w0 + w1 + w2;
-        w0 /= sum;
-        w1 /= sum;
-        w2 /= sum;
-        const T z = 1 / (w0 / t.z[0] + w1 / t.z[1] + w2 / t.z[2]);
-        // depth starts at far, so z < depth also tests the far plane; a NaN z fails every comparison
-        const bool nearest = inside[k] & (z > r.near) & (z < depth[k]);
-        depth[k] = nearest ? z : depth[k];
-        index[k] = nearest ? id : index[k];
+      for (uint32_t bits = lane_bits(contested); bits; bits &= bits - 1) {
+        const int64_t k = lowest_bit(bits);
+        contest(image, id, farthest, i + k, j, farthest_at[k], owner_at[k]);
       }
     }
   }
+}
+
+// The farthest depth in each block of pixels.
+template <class T>
+NMR_INLINE void bound_blocks(const Band<T>& band, int64_t blocks, T* block_farthest) {
+  static_assert(kBlock == kLanes, "a row of a block is one vector");
+  const int64_t rows = band.row_last - band.row_first + 1;
+  for (int64_t j = 0; j < rows; j += kBlock)
+    for (int64_t n = 0; n < blocks; ++n) {
+      const T* row = band.farthest + j * band.stride + n * kBlock;
+      Lanes<T> farthest = load_lanes<Lanes<T>>(row);
+      for (int64_t r = j + 1; r < std::min(j + kBlock, rows); ++r) {
+        row += band.stride;
+        const Lanes<T> z = load_lanes<Lanes<T>>(row);
+        farthest = select(z > farthest, z, farthest);
+      }
+      block_farthest[(j / kBlock) * blocks + n] = max_lanes(farthest);
+    }
+}
+
+// Whether every pixel of the face's box already has a nearer owner.
+template <class T>
+NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& band, int64_t blocks, const T* block_farthest) {
+  const int64_t j_first = std::max<int64_t>(table.row_first[f], band.row_first) - band.row_first;
+  const int64_t j_last = std::min<int64_t>(table.row_last[f], band.row_last) - band.row_first;
+  const T nearest = table.nearest[f];
+  for (int64_t j = j_first / kBlock; j <= j_last / kBlock; ++j)
+    for (int64_t n = table.column_first[f] / kBlock; n <= table.column_last[f] / kBlock; ++n)
+      if (!(nearest > block_farthest[j * blocks + n])) return false;
+  return true;
 }
 
 template <class T>
-NMR_INLINE void rasterize_image_body(const Rasterize<T>& args, int64_t b) {
-  const T* vertices = args.mesh.image_vertices(b);
-  const int64_t* faces = args.mesh.image_faces(b);
-  const int64_t num_faces = args.mesh.face_count(b);
-  RasterScratch<T>& scratch = thread_scratch<RasterScratch<T>>();
-  Raster<T> r;
-  r.size = args.settings.raster_size;
-  r.stride = r.size + kLanes;
-  r.near = args.settings.near;
-  r.far = args.settings.far;
-  if (static_cast<int64_t>(scratch.centres.size()) != r.stride) {
-    scratch.centres.resize(r.stride);
-    scratch.columns.resize(r.stride);
-    for (int64_t i = 0; i < r.stride; ++i) {
-      scratch.centres[i] = pixel_centre<T>(i, r.size);
-      scratch.columns[i] = static_cast<T>(i);
+NMR_INLINE void fill_band(const Image<T>& image, const Band<T>& band, int64_t blocks, T* block_farthest, int32_t* owner) {
+  const FaceTable<T>& table = *image.table;
+  const int64_t rows = band.row_last - band.row_first + 1, R = band.size;
+  std::fill_n(band.farthest, rows * band.stride, std::numeric_limits<T>::infinity());
+  std::fill_n(band.owner, rows * band.stride, -1);
+  const int64_t chunks = (image.num_faces + kChunk - 1) / kChunk;
+  // The nearer of the two lists first: then most of the other one is hidden.
+  T front_depth = 0, back_depth = 0;
+  int64_t num_front = 0, num_back = 0;
+  for (int64_t c = 0; c < chunks; ++c) {
+    front_depth += table.front_depth[c];
+    back_depth += table.back_depth[c];
+    num_front += table.num_front[c];
+    num_back += table.num_back[c];
+  }
+  const bool back_first = back_depth * static_cast<T>(num_front) < front_depth * static_cast<T>(num_back);
+  for (int pass = 0; pass < 2; ++pass) {
+    const bool reversed = (pass == 0) == back_first;
+    if (pass == 1) bound_blocks(band, blocks, block_farthest);
+    for (int64_t c = 0; c < chunks; ++c) {
+      const int32_t* list = (reversed ? table.back : table.front).data() + c * kChunk;
+      const int32_t count = (reversed ? table.num_back : table.num_front)[c];
+      for (int32_t n = 0; n < count; ++n)
+        if (pass == 0 || !is_hidden(table, list[n], band, blocks, block_farthest)) fill_face(image, list[n], reversed, band);
     }
   }
-  r.centres = scratch.centres.data();
-  r.columns = scratch.columns.data();
-  r.depth = reserve(scratch.depth, r.size * r.stride);
-  r.owner = reserve(scratch.owner, r.size * r.stride);
-  int32_t* back_faces = reserve(scratch.back_faces, num_faces);
-  std::fill_n(r.depth, r.size * r.stride, r.far);
-  std::fill_n(r.owner, r.size * r.stride, -1);
-
-  // All originals before all copies, so that an original wins a tie with any copy. Both vertex orders are tested: for slivers
-  // the test is not antisymmetric in floating point.
-  int64_t num_back = 0;
-  for (int64_t f = 0; f < num_faces; ++f) {
-    const Triangle<T> t = load_triangle(vertices, faces + 3 * f, false);
-    if (!is_drawable(t)) continue;
-    if (faces_camera(t)) draw_triangle(t, static_cast<int32_t>(f), r);
-    if (args.settings.fill_back && faces_camera(load_triangle(vertices, faces + 3 * f, true)))
-      back_faces[num_back++] = static_cast<int32_t>(f);
-  }
-  for (int64_t n = 0; n < num_back; ++n) {
-    const int64_t f = back_faces[n];
-    draw_triangle(load_triangle(vertices, faces + 3 * f, true), static_cast<int32_t>(num_faces + f), r);
-  }
-  int32_t* owner = args.owner + b * r.size * r.size;
-  for (int64_t j = 0; j < r.size; ++j)
-    std::memcpy(owner + (r.size - 1 - j) * r.size, r.owner + j * r.stride, r.size * sizeof(int32_t));
+  for (int64_t j = 0; j < rows; ++j)
+    std::memcpy(owner + (R - 1 - band.row_first - j) * R, band.owner + j * band.stride, R * sizeof(int32_t));
 }
 
-NMR_CLONES void rasterize_image(const Rasterize<float>& args, int64_t b) { rasterize_image_body(args, b); }
-NMR_CLONES void rasterize_image(const Rasterize<double>& args, int64_t b) { rasterize_image_body(args, b); }
+NMR_CLONES void set_up_chunk(const Image<float>& image, int64_t chunk) { set_up_faces(image, chunk); }
+NMR_CLONES void set_up_chunk(const Image<double>& image, int64_t chunk) { set_up_faces(image, chunk); }
+NMR_CLONES void fill(const Image<float>& image, const Band<float>& band, int64_t blocks, float* block_farthest, int32_t* owner) {
+  fill_band(image, band, blocks, block_farthest, owner);
+}
+NMR_CLONES void fill(const Image<double>& image, const Band<double>& band, int64_t blocks, double* block_farthest, int32_t* owner) {
+  fill_band(image, band, blocks, block_farthest, owner);
+}
 
 }  // namespace
 
 template <class T>
 void rasterize(const Rasterize<T>& args) {
-  parallel_for(args.mesh.batch, args.num_threads, [&](int64_t b) { rasterize_image(args, b); });
+  const int64_t R = args.settings.raster_size, batch = args.mesh.batch;
+  // Many images: one thread each. Few: all threads share one image after the other.
+  const bool share = batch < args.num_threads;
+  const int64_t bands = share ? std::min<int64_t>(args.num_threads * 4, (R + 2 * kBlock - 1) / (2 * kBlock)) : 1;
+  parallel_for(batch, share ? 1 : args.num_threads, [&](int64_t b) {
+    FaceTable<T>& table = thread_scratch<FaceTable<T>>();
+    const int64_t num_faces = args.mesh.face_count(b);
+    table.reserve_faces(num_faces);
+    const Image<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), num_faces, args.settings, &table};
+    const int threads = share ? args.num_threads : 1;
+    parallel_for((num_faces + kChunk - 1) / kChunk, threads, [&](int64_t chunk) { set_up_chunk(image, chunk); });
+    parallel_for(bands, threads, [&](int64_t n) {
+      BandScratch<T>& scratch = thread_scratch<BandScratch<T>>();
+      Band<T> band{n * R / bands, (n + 1) * R / bands - 1, R, R + kLanes, nullptr, nullptr, nullptr};
+      if (static_cast<int64_t>(scratch.centres.size()) != band.stride) {
+        scratch.centres.resize(band.stride);
+        for (int64_t i = 0; i < band.stride; ++i) scratch.centres[i] = pixel_centre<T>(i, R);
+      }
+      const int64_t rows = band.row_last - band.row_first + 1, blocks = (R + kBlock - 1) / kBlock;
+      band.centres = scratch.centres.data();
+      band.farthest = reserve(scratch.farthest, rows * band.stride);
+      band.owner = reserve(scratch.owner, rows * band.stride);
+      fill(image, band, blocks, reserve(scratch.block_farthest, (rows / kBlock + 1) * blocks), args.owner + b * R * R);
+    });
+  });
 }
 
 template void rasterize(const Rasterize<float>&);

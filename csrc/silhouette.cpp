@@ -2,8 +2,12 @@
 // would change if the edge moved pull on its two vertices, each with strength (change of the loss) / (distance to move).
 #include <algorithm>
 #include <cmath>
+#include <cstring>
+#include <limits>
+#include <vector>
 
 #include "geometry.h"
+#include "lanes.h"
 #include "parallel.h"
 #include "stages.h"
 
@@ -31,31 +35,47 @@ void silhouette_forward(const SilhouetteForward<T>& args) {
 
 namespace {
 
-constexpr int64_t kLanes = 8;
-
-// Background pixels that the loss wants covered (gradient < 0), line by line in ascending order.
+// Along the lines of one axis: which pixels can pull. Positions are in pixels along the line.
 template <class T>
-struct PullList {
-  std::vector<T> position;     // [R, R + lanes] coordinate along the line
-  std::vector<T> weight;       // [R, R + lanes] minus the pixel's gradient, > 0
-  std::vector<int32_t> before; // [R, R + 1] how many listed pixels of the line lie before each pixel
+struct PullLines {
+  std::vector<T> position, weight;        // [R, R + lanes] background pixels with gradient < 0, ascending, and -gradient; 0 after
+  std::vector<int32_t> count;             // [R] how many
+  std::vector<T> first, last;             // [R + lanes] the first and last of them; +-infinity if there is none
+  std::vector<T> gain_first, gain_last;   // [R + lanes] first and last covered pixel with gradient > 0
+
+  void reserve_lines(int64_t R) {
+    for (std::vector<T>* v : {&position, &weight}) reserve(*v, R * (R + kLanes));
+    for (std::vector<T>* v : {&first, &last, &gain_first, &gain_last}) reserve(*v, R + kLanes);
+    reserve(count, R);
+  }
 };
 
 template <class T>
 struct BackwardScratch {
-  PullList<T> lists[2];          // [0] columns: lines of constant x, swept along y; [1] rows
-  std::vector<uint8_t> visible;  // [2 F] face owns a pixel
+  PullLines<T> lines[2];         // [0] columns: lines of constant x, swept along y; [1] rows
+  std::vector<uint8_t> visible;  // [2 F + 1] face owns a pixel; the background counts as face -1
+  std::vector<int32_t> faces;    // the visible ones, ascending
+  std::vector<T> grad;           // [visible faces, 6] x and y of their corners
+};
+
+template <class T>
+struct RowScratch {
+  std::vector<T> grad_row;  // [R + lanes]
 };
 
 // What the sweeps read of one image.
 template <class T>
 struct SweepImage {
+  const T* vertices;
+  const int64_t* faces;
+  int64_t num_faces;
   int64_t R, S;
   bool anti_aliasing;
   T eps;
   const int32_t* owner;  // row 0 = top; pixel (column i, row j from the bottom) is owner[(R - 1 - j) R + i]
   const T* grad_alpha;
-  const PullList<T>* lists;
+  PullLines<T>* lines;
+  T largest_lever;  // above it, or with a tiny eps, the product of two travels could leave the range of T
 
   // Gradient of raster pixel (column i, row j): the image is flipped, and a 2x2 mean shares its gradient in quarters.
   NMR_INLINE T grad(int64_t i, int64_t j) const {
@@ -63,75 +83,142 @@ struct SweepImage {
   }
 };
 
+// Gradients of one row of raster pixels, from the bottom, with lanes of zeros after.
 template <class T>
-NMR_INLINE void build_pull_lists(const SweepImage<T>& image, PullList<T>* lists) {
-  const int64_t R = image.R, stride = R + kLanes;
-  for (int a = 0; a < 2; ++a) {
-    reserve(lists[a].position, R * stride);
-    reserve(lists[a].weight, R * stride);
-    reserve(lists[a].before, R * (R + 1));
+NMR_INLINE void expand_row(const SweepImage<T>& image, int64_t j, T* row) {
+  if (image.anti_aliasing) {
+    const T* grad = image.grad_alpha + (image.S - 1 - j / 2) * image.S;
+    for (int64_t x = 0; x < image.S; ++x) row[2 * x] = row[2 * x + 1] = grad[x] / 4;
+  } else {
+    std::copy_n(image.grad_alpha + (image.S - 1 - j) * image.S, image.S, row);
   }
-  PullList<T>&columns = lists[0], &rows = lists[1];
-  int32_t* before_row = rows.before.data();
-  for (int64_t i = 0; i < R; ++i) columns.before[i * (R + 1)] = 0;
-  for (int64_t j = 0; j < R; ++j, before_row += R + 1) {
-    const int32_t* owner = image.owner + (R - 1 - j) * R;
-    int32_t count = 0;
-    for (int64_t i = 0; i < R; ++i) {
-      before_row[i] = count;
-      int32_t* before_column = columns.before.data() + i * (R + 1) + j;
-      int32_t column_count = *before_column;
-      if (owner[i] < 0) {
-        const T g = image.grad(i, j);
-        if (g < 0) {
-          rows.position[j * stride + count] = static_cast<T>(i);
-          rows.weight[j * stride + count++] = -g;
-          columns.position[i * stride + column_count] = static_cast<T>(j);
-          columns.weight[i * stride + column_count++] = -g;
-        }
-      }
-      before_column[1] = column_count;
-    }
-    before_row[R] = count;
+  std::fill_n(row + image.R, kLanes, T(0));
+}
+
+// Empties lines [first, last).
+template <class T>
+NMR_INLINE void start_lines(PullLines<T>& lines, int64_t first, int64_t last) {
+  const T infinity = std::numeric_limits<T>::infinity();
+  std::fill(lines.count.begin() + first, lines.count.begin() + last, 0);
+  std::fill(lines.gain_first.begin() + first, lines.gain_first.begin() + last, infinity);
+  std::fill(lines.gain_last.begin() + first, lines.gain_last.begin() + last, -infinity);
+}
+
+template <class T>
+NMR_INLINE void append_pull(PullLines<T>& lines, int64_t stride, int64_t n, int64_t m, T weight) {
+  const int64_t at = n * stride + lines.count[n]++;
+  lines.position[at] = static_cast<T>(m);
+  lines.weight[at] = weight;
+}
+
+template <class T>
+NMR_INLINE void finish_lines(PullLines<T>& lines, int64_t stride, int64_t first, int64_t last) {
+  const T infinity = std::numeric_limits<T>::infinity();
+  for (int64_t n = first; n < last; ++n) {
+    const int32_t count = lines.count[n];
+    T* position = lines.position.data() + n * stride;
+    lines.first[n] = count ? position[0] : infinity;
+    lines.last[n] = count ? position[count - 1] : -infinity;
+    store_lanes(position + count, splat(count ? position[count - 1] : T(0)));
+    store_lanes(lines.weight.data() + n * stride + count, splat(T(0)));
   }
 }
 
-// How an edge P-Q, crossed at t = c by the current line, moves with each of its ends.
-template <class T>
-struct Lever {
-  T crossing;         // c
-  T factor_p;         // (Qs - Ps) / (Qs - n): travel of P that moves the crossing by one
-  T factor_q;         // (Qs - Ps) / (n - Ps)
-  bool p_acts, q_acts;  // false where the line passes through the other end, or the factor overflows
-  T raster_size, eps;
+// A part of both sets of lines: rows [row_first, row_last) and columns [column_first, column_last), the latter from all rows.
+struct LineRange {
+  int64_t row_first, row_last, column_first, column_last;
 };
 
-// Travel in [-1, 1] coordinates that brings the crossing to pixel m, kept away from zero by eps.
-template <class T, bool kPowerOfTwo>
-NMR_INLINE T travel(T factor, T offset, const Lever<T>& lever) {
-  const T h = kPowerOfTwo ? factor * offset * (2 / lever.raster_size) : factor * offset * 2 / lever.raster_size;
-  return h + (h > 0 ? lever.eps : -lever.eps);
-}
-
-// Adds the pulls of listed pixels [first, last), one after the other: the order of summation is fixed.
-template <class T, bool kPowerOfTwo>
-NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, const Lever<T>& lever, T& grad_p, T& grad_q) {
-  T p = grad_p, q = grad_q;
-  for (int32_t start = 0; start < count; start += kLanes) {
-    T pull_p[kLanes], pull_q[kLanes];
-    for (int32_t k = 0; k < kLanes; ++k) {
-      const T offset = position[start + k] - lever.crossing;
-      pull_p[k] = weight[start + k] / travel<T, kPowerOfTwo>(lever.factor_p, offset, lever);
-      pull_q[k] = weight[start + k] / travel<T, kPowerOfTwo>(lever.factor_q, offset, lever);
-    }
-    const int32_t lanes = std::min<int32_t>(kLanes, count - start);
-    for (int32_t k = 0; k < lanes; ++k) {
-      p -= pull_p[k];
-      q -= pull_q[k];
+// Fills the lines of a range. grad_row: [R + lanes] of scratch.
+template <class T>
+NMR_INLINE void collect_lines(const SweepImage<T>& image, const LineRange& range, T* grad_row) {
+  const int64_t R = image.R, stride = R + kLanes;
+  const bool any_column = range.column_first < range.column_last;
+  PullLines<T>&columns = image.lines[0], &rows = image.lines[1];
+  start_lines(columns, range.column_first, range.column_last);
+  start_lines(rows, range.row_first, range.row_last);
+  const int64_t j_first = any_column ? 0 : range.row_first, j_last = any_column ? R : range.row_last;
+  for (int64_t j = j_first; j < j_last; ++j) {
+    const bool in_rows = j >= range.row_first && j < range.row_last;
+    const int32_t* owner = image.owner + (R - 1 - j) * R;
+    if (j == j_first || !image.anti_aliasing || j % 2 == 0) expand_row(image, j, grad_row);
+    const int64_t i_last = in_rows ? R : range.column_last;
+    for (int64_t start = in_rows ? 0 : range.column_first; start < i_last; start += kLanes) {
+      const Lanes<T> g = load_lanes<Lanes<T>>(grad_row + start);
+      Lanes32 id = splat32(-1);
+      if (start + kLanes <= R)
+        id = load_lanes<Lanes32>(owner + start);
+      else
+        std::memcpy(&id, owner + start, (R - start) * sizeof(int32_t));
+      const Lanes32 background = id < 0, gains = narrow_mask(g > T(0)) & ~background;
+      for (uint32_t bits = lane_bits(narrow_mask(g < T(0)) & background); bits; bits &= bits - 1) {
+        const int64_t i = start + lowest_bit(bits);
+        if (in_rows) append_pull(rows, stride, j, i, -grad_row[i]);
+        if (i >= range.column_first && i < range.column_last) append_pull(columns, stride, i, j, -grad_row[i]);
+      }
+      const uint32_t gain_bits = lane_bits(gains);
+      if (!gain_bits) continue;
+      if (in_rows) {
+        rows.gain_first[j] = std::min(rows.gain_first[j], static_cast<T>(start));  // at least that
+        rows.gain_last[j] = static_cast<T>(start + kLanes - 1);                    // at most that
+      }
+      if (any_column) {
+        const LaneMask<T> here = widen_mask<T>(gains);
+        T *gain_first = columns.gain_first.data() + start, *gain_last = columns.gain_last.data() + start;
+        const Lanes<T> line_first = load_lanes<Lanes<T>>(gain_first), at = splat(static_cast<T>(j));
+        store_lanes(gain_first, select(here & (line_first > at), at, line_first));
+        store_lanes(gain_last, select(here, at, load_lanes<Lanes<T>>(gain_last)));
+      }
     }
   }
-  if (lever.p_acts) grad_p = p;
-  if (lever.q_acts) grad_q = q;
+  finish_lines(columns, stride, range.column_first, range.column_last);
+  finish_lines(rows, stride, range.row_first, range.row_last);
+}
+
+// How an edge P-Q, crossed at t = c by a line, moves with each of its ends.
+template <class T>
+struct Lever {
+  T crossing;  // c
+  T factor_p;  // 2 / R (Qs - Ps) / (Qs - n): travel of P, in [-1, 1] coordinates, that moves the crossing by one pixel
+  T factor_q;  // 2 / R (Qs - Ps) / (n - Ps)
+  T eps;
+};
+
+// Travel that brings the crossing by `offset` pixels, kept away from zero by eps.
+template <class T>
+NMR_INLINE T travel(T factor, T offset, T eps) {
+  const T h = factor * offset;
+  return h > 0 ? h + eps : h - eps;
+}
+// One pixel's pull, for pixels inside the face and for levers of extreme size. An end whose lever is not finite stays.
+template <class T>
+NMR_INLINE void pull(T weight, T offset, const Lever<T>& lever, T& grad_p, T& grad_q) {
+  if (std::isfinite(lever.factor_p)) grad_p -= weight / travel(lever.factor_p, offset, lever.eps);
+  if (std::isfinite(lever.factor_q)) grad_q -= weight / travel(lever.factor_q, offset, lever.eps);
+}
+
+// Adds up, per lane, the pulls of the listed pixels at or beyond `out` in direction d. The two quotients w / h_p and w / h_q share
+// one division: w / (h_p h_q) times h_q and h_p.
+template <class T>
+NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, T out, T d, const Lever<T>& lever, Lanes<T>& pulls_p,
+                            Lanes<T>& pulls_q) {
+  // All offsets have the sign of d, so both travels have one sign throughout.
+  const T eps_p = lever.factor_p * d > 0 ? lever.eps : -lever.eps, eps_q = lever.factor_q * d > 0 ? lever.eps : -lever.eps;
+  const Lanes<T> aside = splat(out - lever.crossing);  // for pixels that do not count
+  int32_t start = 0;
+  if (d > 0)
+    while (position[start + kLanes - 1] < out) start += kLanes;
+  for (; start < count; start += kLanes) {
+    const Lanes<T> m = load_lanes<Lanes<T>>(position + start);
+    const LaneMask<T> beyond = (m - out) * d >= T(0);
+    const Lanes<T> w = select(beyond, load_lanes<Lanes<T>>(weight + start), splat(T(0)));
+    const Lanes<T> offset = select(beyond, m - lever.crossing, aside);
+    const Lanes<T> h_p = offset * lever.factor_p + eps_p, h_q = offset * lever.factor_q + eps_q;
+    const Lanes<T> share = w / (h_p * h_q);
+    pulls_p = pulls_p + share * h_q;
+    pulls_q = pulls_q + share * h_p;
+    if (d < 0 && position[start + kLanes - 1] >= out) break;
+  }
 }
 
 // Float to int as the published kernels convert: truncated, saturated to the pixel range [lo, hi], NaN to 0.
@@ -149,135 +236,230 @@ NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
   return (bt - at) / (bs - as) * (n - as) + at;
 }
 
-// Both sweeps of edge P-Q (O is the third corner) along one axis. s is the scan coordinate, t the sweep coordinate: (x, y) for
-// axis 0, (y, x) for axis 1, all in pixels.
-template <class T, bool kPowerOfTwo>
-NMR_INLINE void sweep_edge(const SweepImage<T>& image, int axis, int32_t id, T ps, T pt, T qs, T qt, T os, T ot, T& grad_p,
-                           T& grad_q) {
-  if (ps == qs) return;  // the edge lies along the scan line: neither end can move its crossing
-  const int64_t R = image.R, stride = R + kLanes;
-  const T top = static_cast<T>(R - 1);
-  const int64_t d = ((ps < qs) == (axis == 0)) ? -1 : 1;  // outward
-  const T low = std::max(std::min(ps, qs), T(0)), high = std::min(std::max(ps, qs), top);
-  if (!(low <= top)) return;
-  const int64_t n_first = static_cast<int64_t>(std::ceil(low));
+// The six ways in which a face's three edges are crossed: lanes 0-2 are edges 01, 12, 20 crossed by columns (axis 0), lanes 3-5
+// the same by rows (axis 1), lanes 6-7 repeat. s is the scan coordinate, t the sweep coordinate: (x, y) for axis 0, (y, x) for
+// axis 1, all in pixels. P and Q are the ends of the edge.
+template <class T>
+struct Crossings {
+  T ps[kLanes], pt[kLanes], qs[kLanes], slope[kLanes], scale[kLanes];
+  int32_t n_first[kLanes], n_last[kLanes];  // the lines that cross
+  uint32_t outward_up;                      // bit: outward is towards larger t
+  uint32_t crossed;                         // bit: there is such a line
+};
+
+template <class T>
+NMR_INLINE void find_crossings(const T* X, const T* Y, T raster_size, Crossings<T>& c) {
+  const Lanes<T> ps{X[0], X[1], X[2], Y[0], Y[1], Y[2], X[0], X[0]}, pt{Y[0], Y[1], Y[2], X[0], X[1], X[2], Y[0], Y[0]};
+  const Lanes<T> qs{X[1], X[2], X[0], Y[1], Y[2], Y[0], X[1], X[1]}, qt{Y[1], Y[2], Y[0], X[1], X[2], X[0], Y[1], Y[1]};
+  const T top = raster_size - 1;
+  const LaneMask<T> ascending = ps < qs;
+  const Lanes<T> least = select(ascending, ps, qs), most = select(ascending, qs, ps);
+  const Lanes<T> low = select(least > T(0), least, splat(T(0))), high = select(most < top, most, splat(top));
+  // An edge along the scan line (least == most) is left out: neither end can move its crossing.
+  const LaneMask<T> in_reach = (least < most) & (low <= top) & (high > T(-1));
+  const Lanes<T> from = select(in_reach, low, splat(T(1))), to = select(in_reach, high, splat(T(0)));
+  Lanes<T> n_first = to_values<T>(truncate(from));
+  n_first = select(n_first < from, n_first + T(1), n_first);
   // Truncation towards zero, as published: an edge that ends in (-1, 0) is extrapolated onto line 0.
-  const int64_t n_last = high > -1 ? static_cast<int64_t>(high) : -1;
-  const T slope = (qt - pt) / (qs - ps);
-  const PullList<T>& list = image.lists[axis];
+  const Lanes<T> n_last = to_values<T>(truncate(to));
+  store_lanes(c.ps, ps);
+  store_lanes(c.pt, pt);
+  store_lanes(c.qs, qs);
+  store_lanes(c.slope, (qt - pt) / (qs - ps));
+  store_lanes(c.scale, (qs - ps) * T(2) / raster_size);
+  store_lanes(c.n_first, truncate(n_first));
+  store_lanes(c.n_last, truncate(n_last));
+  c.outward_up = lane_bits(ascending) ^ 0x07;
+  c.crossed = lane_bits(n_first <= n_last) & 0x3f;
+}
+
+// Both sweeps of edge P-Q along one axis; (os, ot) is the face's third corner. Eight lines are prepared together.
+template <class T>
+NMR_INLINE void sweep_edge(const SweepImage<T>& image, int32_t id, const Crossings<T>& c, int64_t e, T qt, T os, T ot, T& grad_p,
+                           T& grad_q) {
+  const int64_t R = image.R, stride = R + kLanes, n_first = c.n_first[e], n_last = c.n_last[e];
+  const int axis = e < 3 ? 0 : 1;
+  const int64_t d = c.outward_up >> e & 1 ? 1 : -1;
+  const T ps = c.ps[e], pt = c.pt[e], qs = c.qs[e], slope = c.slope[e], scale = c.scale[e], top = static_cast<T>(R - 1);
+  const PullLines<T>& lines = image.lines[axis];
   // pixel m of line n: owner[n * step_s + m * step_t]
   const int32_t* origin = image.owner + (R - 1) * R;
   const int64_t step_s = axis == 0 ? 1 : -R, step_t = axis == 0 ? -R : 1;
+  Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
+  bool any_pull = false;
 
-  for (int64_t n = n_first; n <= n_last; ++n) {
-    const T line = static_cast<T>(n);
-    Lever<T> lever;
-    lever.crossing = slope * (line - ps) + pt;
-    const T rounded = d > 0 ? std::floor(lever.crossing) : std::ceil(lever.crossing);
-    if (!(rounded >= 0 && rounded <= top)) continue;  // also NaN
-    const int64_t in = static_cast<int64_t>(rounded), out = in + d;
-    if (out < 0 || out >= R) continue;
+  for (int64_t start = n_first; start <= n_last; start += kLanes) {
+    const Lanes32 number = lane_numbers() + static_cast<int32_t>(start);
+    const Lanes<T> line = to_values<T>(number);
+    const Lanes<T> crossing = (line - ps) * slope + pt;
+    const LaneMask<T> on_screen = widen_mask<T>(number <= static_cast<int32_t>(n_last)) & (crossing >= T(-1)) & (crossing <= top + 1);
+    const Lanes<T> near_crossing = select(on_screen, crossing, splat(T(0)));
+    Lanes<T> in = to_values<T>(truncate(near_crossing));
+    in = d > 0 ? select(in > near_crossing, in - T(1), in) : select(in < near_crossing, in + T(1), in);
+    const Lanes<T> out = in + static_cast<T>(d);
+    const LaneMask<T> valid = on_screen & (in >= T(0)) & (in <= top) & (out >= T(0)) & (out <= top);
+    const LaneMask<T> pulled = d > 0 ? load_lanes<Lanes<T>>(lines.last.data() + start) >= out
+                                     : load_lanes<Lanes<T>>(lines.first.data() + start) <= out;
+    const LaneMask<T> gains = d > 0 ? load_lanes<Lanes<T>>(lines.gain_first.data() + start) <= in
+                                    : load_lanes<Lanes<T>>(lines.gain_last.data() + start) >= in;
+    const LaneMask<T> wanted = valid & (pulled | gains);
+    if (!lane_bits(wanted)) continue;
+    int32_t inner_at[kLanes], inner_owner[kLanes], outer_owner[kLanes];
+    store_lanes(inner_at, truncate(select(wanted, in, splat(static_cast<T>(d > 0 ? 0 : 1)))));
+    const int32_t* crossed = origin + start * step_s;
+    for (int64_t k = 0; k < kLanes; ++k) {
+      // a lane past the last line reads the last line's pixel
+      const int64_t at = std::min(k, n_last - start) * step_s + inner_at[k] * step_t;
+      inner_owner[k] = crossed[at];
+      outer_owner[k] = crossed[at + d * step_t];
+    }
+    const uint32_t pulled_bits = lane_bits(narrow_mask(valid & pulled) & (load_lanes<Lanes32>(inner_owner) >= id) &
+                                           (load_lanes<Lanes32>(inner_owner) <= id));
+    const uint32_t gain_bits = lane_bits(narrow_mask(valid & gains) & (load_lanes<Lanes32>(outer_owner) < 0));
+    if (!(pulled_bits | gain_bits)) continue;
+    const Lanes<T> lever_p = scale / (qs - line), lever_q = scale / (line - ps);
+    const LaneMask<T> regular = (lever_p < image.largest_lever) & (lever_p > -image.largest_lever) & (lever_q < image.largest_lever) &
+                                (lever_q > -image.largest_lever);
+    T crossing_at[kLanes], factor_p[kLanes], factor_q[kLanes];
+    store_lanes(crossing_at, crossing);
+    store_lanes(factor_p, lever_p);
+    store_lanes(factor_q, lever_q);
+    const uint32_t regular_bits = lane_bits(regular);
 
-    const int32_t* owner = origin + n * step_s;
-    const bool owns_in = owner[in * step_t] == id;
-    const bool out_is_background = owner[out * step_t] < 0;
-    if (!owns_in && !out_is_background) continue;
-
-    lever.factor_p = (qs - ps) / (qs - line);
-    lever.factor_q = (qs - ps) / (line - ps);
-    lever.p_acts = std::isfinite(lever.factor_p);
-    lever.q_acts = std::isfinite(lever.factor_q);
-    lever.raster_size = static_cast<T>(R);
-    lever.eps = image.eps;
-
-    // Outside: pixels from `out` to the border that should be covered. They gain if the edge moves out to them.
-    if (owns_in) {
-      const int32_t* before = list.before.data() + n * (R + 1);
-      const int32_t first = d > 0 ? before[out] : 0;
-      const int32_t last = d > 0 ? before[R] : before[out + 1];
-      if (last > first)
-        pull_listed<T, kPowerOfTwo>(list.position.data() + n * stride + first, list.weight.data() + n * stride + first,
-                                    last - first, lever, grad_p, grad_q);
+    // Outside: pixels from `outer` to the border that should be covered. They gain if the edge moves out to them.
+    for (uint32_t bits = pulled_bits; bits; bits &= bits - 1) {
+      const int64_t k = lowest_bit(bits), n = start + k, inner = inner_at[k];
+      const Lever<T> lever{crossing_at[k], factor_p[k], factor_q[k], image.eps};
+      const T *position = lines.position.data() + n * stride, *weight = lines.weight.data() + n * stride;
+      const T outer = static_cast<T>(inner + d);
+      if (regular_bits >> k & 1) {
+        pull_listed(position, weight, lines.count[n], outer, static_cast<T>(d), lever, pulls_p, pulls_q);
+        any_pull = true;
+      } else {
+        for (int32_t m = 0; m < lines.count[n]; ++m)
+          if (d > 0 ? position[m] >= outer : position[m] <= outer)
+            pull(weight[m], position[m] - lever.crossing, lever, grad_p, grad_q);
+      }
     }
     // Inside: own pixels that should be background. They gain if the edge moves in past them.
-    if (out_is_background) {
-      const bool beyond_p = (line - ps) * (line - os) < 0;
-      const T far_side = beyond_p ? line_height(ps, pt, os, ot, line) : line_height(qs, qt, os, ot, line);
+    for (uint32_t bits = gain_bits; bits; bits &= bits - 1) {
+      const int64_t k = lowest_bit(bits), n = start + k, inner = inner_at[k];
+      const int32_t* owner = origin + n * step_s;
+      const Lever<T> lever{crossing_at[k], factor_p[k], factor_q[k], image.eps};
+      const T at = static_cast<T>(n);
+      const bool beyond_p = (at - ps) * (at - os) < 0;
+      const T far_side = beyond_p ? line_height(ps, pt, os, ot, at) : line_height(qs, qt, os, ot, at);
       const int64_t limit = to_index(d > 0 ? std::ceil(far_side) : std::floor(far_side), int64_t(-1), R);
-      const int64_t m_first = std::max<int64_t>(std::min(in, limit), 0), m_last = std::min(std::max(in, limit), R - 1);
+      const int64_t m_first = std::max<int64_t>(std::min(inner, limit), 0), m_last = std::min(std::max(inner, limit), R - 1);
       for (int64_t m = m_first; m <= m_last; ++m) {
         if (owner[m * step_t] != id) continue;
         const T g = axis == 0 ? image.grad(n, m) : image.grad(m, n);
-        if (!(g > 0)) continue;
-        const T offset = static_cast<T>(m) - lever.crossing;
-        if (lever.p_acts) grad_p -= g / travel<T, kPowerOfTwo>(lever.factor_p, offset, lever);
-        if (lever.q_acts) grad_q -= g / travel<T, kPowerOfTwo>(lever.factor_q, offset, lever);
+        if (g > 0) pull(g, static_cast<T>(m) - lever.crossing, lever, grad_p, grad_q);
       }
     }
   }
+  if (!any_pull) return;
+  grad_p -= sum_lanes(pulls_p);
+  grad_q -= sum_lanes(pulls_q);
 }
 
-template <class T, bool kPowerOfTwo>
-NMR_INLINE void backward_image(const SilhouetteBackward<T>& args, int64_t b) {
-  const int64_t S = args.image_size, R = args.anti_aliasing ? 2 * S : S;
-  const int64_t F = args.mesh.face_count(b), V = args.mesh.vertex_count(b);
-  const T* vertices = args.mesh.image_vertices(b);
-  const int64_t* faces = args.mesh.image_faces(b);
-  T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
-  BackwardScratch<T>& scratch = thread_scratch<BackwardScratch<T>>();
-
-  SweepImage<T> image{R, S, args.anti_aliasing, args.eps, args.owner + b * R * R, args.grad_alpha + b * S * S,
-                      scratch.lists};
-  std::fill_n(grad_vertices, 3 * V, T(0));
-  build_pull_lists(image, scratch.lists);
-
-  // A face that owns no pixel gets exactly zero.
-  uint8_t* visible = reserve(scratch.visible, 2 * F);
-  std::fill_n(visible, 2 * F, uint8_t(0));
-  for (int64_t n = 0; n < R * R; ++n)
-    if (image.owner[n] >= 0) visible[image.owner[n]] = 1;
-
-  for (int64_t id = 0; id < 2 * F; ++id) {
-    if (!visible[id]) continue;
-    const bool reversed = id >= F;
-    const int64_t* face = faces + 3 * (reversed ? id - F : id);
-    const Triangle<T> t = load_triangle(vertices, face, reversed);
+// Gradients of the corners of visible faces [first, last) of the list.
+template <class T>
+NMR_INLINE void sweep_faces(const SweepImage<T>& image, const int32_t* ids, int64_t first, int64_t last, T* grad) {
+  for (int64_t n = first; n < last; ++n) {
+    const bool reversed = ids[n] >= image.num_faces;
+    const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
+    const Triangle<T> t = load_triangle(image.vertices, face, reversed);
     T X[3], Y[3], grad_x[3] = {0, 0, 0}, grad_y[3] = {0, 0, 0};
     for (int k = 0; k < 3; ++k) {
-      X[k] = to_pixel(t.x[k], static_cast<T>(R));
-      Y[k] = to_pixel(t.y[k], static_cast<T>(R));
+      X[k] = to_pixel(t.x[k], static_cast<T>(image.R));
+      Y[k] = to_pixel(t.y[k], static_cast<T>(image.R));
     }
-    for (int p = 0; p < 3; ++p) {
-      const int q = (p + 1) % 3, o = (p + 2) % 3;
-      sweep_edge<T, kPowerOfTwo>(image, 0, static_cast<int32_t>(id), X[p], Y[p], X[q], Y[q], X[o], Y[o], grad_y[p], grad_y[q]);
-      sweep_edge<T, kPowerOfTwo>(image, 1, static_cast<int32_t>(id), Y[p], X[p], Y[q], X[q], Y[o], X[o], grad_x[p], grad_x[q]);
+    Crossings<T> c;
+    find_crossings(X, Y, static_cast<T>(image.R), c);
+    for (uint32_t bits = c.crossed; bits; bits &= bits - 1) {
+      const int64_t e = lowest_bit(bits), p = e < 3 ? e : e - 3, q = p < 2 ? p + 1 : 0, o = p > 0 ? p - 1 : 2;
+      const T *s = e < 3 ? X : Y, *t = e < 3 ? Y : X;
+      T* moved = e < 3 ? grad_y : grad_x;
+      sweep_edge(image, ids[n], c, e, t[q], s[o], t[o], moved[p], moved[q]);
     }
     for (int k = 0; k < 3; ++k) {
-      T* grad = grad_vertices + 3 * face[reversed ? 2 - k : k];
-      grad[0] += grad_x[k];
-      grad[1] += grad_y[k];
+      grad[6 * n + 2 * k] = grad_x[k];
+      grad[6 * n + 2 * k + 1] = grad_y[k];
     }
   }
 }
 
-template <class T>
-NMR_INLINE void backward_image_body(const SilhouetteBackward<T>& args, int64_t b) {
-  const int64_t R = args.anti_aliasing ? 2 * args.image_size : args.image_size;
-  // Multiplying by 2 / R is exact when R is a power of two; otherwise the division is kept.
-  if ((R & (R - 1)) == 0)
-    backward_image<T, true>(args, b);
-  else
-    backward_image<T, false>(args, b);
+NMR_CLONES void collect(const SweepImage<float>& image, const LineRange& range, float* grad_row) {
+  collect_lines(image, range, grad_row);
+}
+NMR_CLONES void collect(const SweepImage<double>& image, const LineRange& range, double* grad_row) {
+  collect_lines(image, range, grad_row);
+}
+NMR_CLONES void sweep(const SweepImage<float>& image, const int32_t* ids, int64_t first, int64_t last, float* grad) {
+  sweep_faces(image, ids, first, last, grad);
+}
+NMR_CLONES void sweep(const SweepImage<double>& image, const int32_t* ids, int64_t first, int64_t last, double* grad) {
+  sweep_faces(image, ids, first, last, grad);
 }
 
-NMR_CLONES void silhouette_backward_image(const SilhouetteBackward<float>& args, int64_t b) { backward_image_body(args, b); }
-NMR_CLONES void silhouette_backward_image(const SilhouetteBackward<double>& args, int64_t b) { backward_image_body(args, b); }
+// Marks the faces that own a pixel (visible[id + 1] = 1) and lists them, ascending: all others get exactly zero.
+NMR_CLONES int64_t list_visible(const int32_t* owner, int64_t pixels, int64_t num_ids, uint8_t* visible, int32_t* ids) {
+  std::fill_n(visible, num_ids + 1, uint8_t(0));
+  int64_t n = 0;
+  for (; n + kLanes <= pixels; n += kLanes) {
+    if (!lane_bits(load_lanes<Lanes32>(owner + n) >= 0)) continue;
+    for (int64_t k = 0; k < kLanes; ++k) visible[owner[n + k] + 1] = 1;
+  }
+  for (; n < pixels; ++n) visible[owner[n] + 1] = 1;
+  int64_t count = 0;
+  for (int64_t id = 0; id < num_ids; ++id) {
+    ids[count] = static_cast<int32_t>(id);
+    count += visible[id + 1];
+  }
+  return count;
+}
 
 }  // namespace
 
 template <class T>
 void silhouette_backward(const SilhouetteBackward<T>& args) {
-  parallel_for(args.mesh.batch, args.num_threads, [&](int64_t b) { silhouette_backward_image(args, b); });
+  const int64_t S = args.image_size, R = args.anti_aliasing ? 2 * S : S, batch = args.mesh.batch;
+  // Many images: one thread each. Few: all threads share one image after the other.
+  const bool share = batch < args.num_threads;
+  const int threads = share ? args.num_threads : 1;
+  parallel_for(batch, share ? 1 : args.num_threads, [&](int64_t b) {
+    BackwardScratch<T>& scratch = thread_scratch<BackwardScratch<T>>();
+    const SweepImage<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b), R, S,
+                              args.anti_aliasing, args.eps, args.owner + b * R * R, args.grad_alpha + b * S * S, scratch.lines,
+                              args.eps > T(1e-15) ? T(1e15) : T(0)};
+    for (PullLines<T>& lines : scratch.lines) lines.reserve_lines(R);
+    // Shared: bands of columns, then bands of rows, each of whole vectors, so that no two threads write the same one.
+    const int64_t band = share ? std::max<int64_t>(R / threads / kLanes * kLanes, 64) : R, bands = (R + band - 1) / band;
+    parallel_for(share ? 2 * bands : 1, threads, [&](int64_t n) {
+      T* grad_row = reserve(thread_scratch<RowScratch<T>>().grad_row, R + kLanes);
+      const int64_t first = n % bands * band, last = std::min(first + band, R);
+      collect(image, share ? n < bands ? LineRange{0, 0, first, last} : LineRange{first, last, 0, 0} : LineRange{0, R, 0, R}, grad_row);
+    });
+    int32_t* ids = reserve(scratch.faces, 2 * image.num_faces + 1);
+    const int64_t count = list_visible(image.owner, R * R, 2 * image.num_faces, reserve(scratch.visible, 2 * image.num_faces + 1), ids);
+    const int64_t chunk = share ? 256 : std::max<int64_t>(count, 1);
+    T* grad = reserve(scratch.grad, 6 * count);
+    parallel_for((count + chunk - 1) / chunk, threads,
+                 [&](int64_t n) { sweep(image, ids, n * chunk, std::min((n + 1) * chunk, count), grad); });
+
+    T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
+    std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));
+    for (int64_t n = 0; n < count; ++n) {
+      const bool reversed = ids[n] >= image.num_faces;
+      const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
+      for (int k = 0; k < 3; ++k) {
+        T* corner = grad_vertices + 3 * face[reversed ? 2 - k : k];
+        corner[0] += grad[6 * n + 2 * k];
+        corner[1] += grad[6 * n + 2 * k + 1];
+      }
+    }
+  });
 }
 
 template void silhouette_forward(const SilhouetteForward<float>&);
