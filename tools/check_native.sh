@@ -14,6 +14,7 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 python=${PYTHON:-$PWD/.venv/bin/python}
+PATH=$(dirname "$python"):$PATH # cmake and ninja of the test extra
 export OMP_WAIT_POLICY=passive # more threads than cores: do not spin
 sanitize="-O1 -g -fno-omit-frame-pointer -fno-sanitize-recover=all -DNMR_FRESH_SCRATCH"
 address="$sanitize -fsanitize=address,undefined,float-cast-overflow -D_GLIBCXX_ASSERTIONS"
@@ -45,7 +46,7 @@ run_tests() { # name of the build
 }
 
 check_tests() {
-    build plain "${CXX:-c++}" -O2 ""
+    build plain "${CXX:-c++}" -O3 "" -DNMR_MULTIVERSION=ON # as it is shipped
     run_tests plain
 }
 
@@ -85,7 +86,7 @@ check_count() {
     want valgrind "the instruction count"
     [ "$(uname -m)" = x86_64 ] || skip "the bound is one of x86-64-v3"
     build count "${CXX:-c++}" "-O3 -g -march=x86-64-v3" workload
-    "${PYTHON:-python3}" tests/csrc/count.py build/native/count/workload "${CXX:-c++}" "$@"
+    "$python" tests/csrc/count.py build/native/count/workload "${CXX:-c++}" "$@"
 }
 
 check_variants() {
@@ -98,7 +99,7 @@ check_variants() {
             build "$name" "$compiler" "-O3 $flags" workload -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64
             qemu-aarch64 -L /usr/aarch64-linux-gnu "build/native/$name/workload" 2 >"build/native/$name.txt"
         else
-            [ "$(uname -m)" = x86_64 ] || [ -z "$flags" ] || continue
+            case $(uname -m)/$flags in x86_64/* | */ | */-D*) ;; *) continue ;; esac
             case $flags in *v4*) grep -q avx512vl /proc/cpuinfo || { echo "$name: no AVX-512 here, left out"; continue; } ;; esac
             local multi=OFF
             [ "$name" != dispatch ] || multi=ON
@@ -109,6 +110,7 @@ check_variants() {
         diff "$results" "build/native/$name.txt" && echo "$name: the same bits" || echo "$name: DIFFERENT" | tee -a build/native/different
     done <<'VARIANTS'
 baseline g++
+loops g++ -DNMR_NO_VECTOR_TYPES
 dispatch g++
 avx2 g++ -march=x86-64-v3
 avx512 g++ -march=x86-64-v4
@@ -137,12 +139,19 @@ check_coverage() {
         cmake --build $package/build --parallel "${JOBS:-2}" >>build/native/coverage-package.log 2>&1 ||
         { cat build/native/coverage-package.log; exit 1; }
     find $package/build -name '*.gcda' -delete
-    PYTHONPATH=$PWD/$package "$(dirname "$python")/pytest" -q tests/nmr --cov=nmr --cov-branch --cov-report= "$@"
-    "$python" -m coverage report --skip-covered
-    "$python" -m gcovr --root . --filter csrc/ --exclude-throw-branches --exclude-unreachable-branches --merge-mode-functions=separate \
-        --gcov-ignore-errors=no_working_dir_found --txt-metric branch --txt - build/native/coverage $package/build
-    "$python" -m gcovr --root . --filter csrc/ --exclude-throw-branches --exclude-unreachable-branches --merge-mode-functions=separate \
-        --gcov-ignore-errors=no_working_dir_found --print-summary --txt /dev/null build/native/coverage $package/build
+    # Started there, so that it is this package that is imported.
+    local root=$PWD
+    export COVERAGE_FILE=$root/build/native/coverage-python
+    (cd $package && "$python" -m pytest -q --rootdir="$root" -c "$root/pyproject.toml" "$root/tests/nmr" --cov=nmr --cov-branch \
+        --cov-report= "$@")
+    "$python" -m coverage report --skip-covered --include="*/nmr/*"
+    local gcovr=("$python" -m gcovr --root . --filter csrc/ --exclude-throw-branches --exclude-unreachable-branches
+        --merge-mode-functions=separate build/native/coverage $package/build)
+    "${gcovr[@]}" --json build/native/coverage.json
+    gcovr=("$python" -m gcovr --root . --add-tracefile build/native/coverage.json)
+    "${gcovr[@]}" --txt
+    "${gcovr[@]}" --txt-metric branch --txt
+    "${gcovr[@]}" --txt /dev/null --print-summary
 }
 
 [ $# -gt 0 ] || { sed -n '2,14s/^# \{0,1\}//p' "$0"; exit 2; }

@@ -1,7 +1,7 @@
 """The corpus of the fuzz target (fuzz.cpp): corpus.hex, an input per line. libFuzzer wants a folder with a file per input.
 
-    python tests/csrc/corpus.py unpack FOLDER      writes the corpus into a folder
-    python tests/csrc/corpus.py pack FOLDER        makes the folder's files and the seeds of this script the corpus
+python tests/csrc/corpus.py unpack FOLDER      writes the corpus into a folder
+python tests/csrc/corpus.py pack FOLDER        makes the folder's files and the seeds of this script the corpus
 """
 
 import hashlib
@@ -16,14 +16,20 @@ PACKED, PER_IMAGE, ANTI_ALIASED, FILL_BACK, VALUES_PER_IMAGE, PERSPECTIVE, DISTO
 SPECIAL = range(232, 247)
 
 # corners as bytes (see coordinate() of fuzz.cpp): x, y = (byte - 116) / 64, z = (byte - 32) / 16
-TETRAHEDRON = ([(70, 70, 64), (160, 75, 80), (110, 165, 72), (116, 116, 48)], [(0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0)])
+TETRAHEDRON = (
+    [(70, 70, 64), (160, 75, 80), (110, 165, 72), (116, 116, 48)],
+    [(0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0)],
+)
 SQUARE = ([(84, 84, 64), (148, 84, 64), (148, 148, 80), (84, 148, 80)], [(0, 1, 2), (0, 2, 3)])
 TWICE = ([(60, 60, 64), (170, 60, 64), (116, 170, 64)], [(0, 1, 2), (0, 2, 1), (0, 1, 2)])
 COLLINEAR = ([(60, 60, 64), (116, 116, 64), (172, 172, 64)], [(0, 1, 2), (2, 1, 0), (0, 0, 1)])
 SLIVER = ([(60, 80, 64), (170, 100, 64), (171, 100, 64)], [(0, 1, 2), (2, 1, 0)])
 BEHIND = ([(60, 60, 20), (170, 60, 64), (116, 170, 10)], [(0, 1, 2), (2, 1, 0)])
 BORDER = ([(52, 52, 64), (180, 52, 64), (51, 181, 64), (0, 231, 64)], [(0, 1, 2), (1, 3, 2)])
-LAYERS = ([(50, 50, 48), (180, 50, 48), (116, 180, 112), (50, 180, 64), (180, 180, 64), (116, 50, 64)], [(0, 1, 2), (3, 5, 4)])
+LAYERS = (
+    [(50, 50, 48), (180, 50, 48), (116, 180, 112), (50, 180, 64), (180, 180, 64), (116, 50, 64)],
+    [(0, 1, 2), (3, 5, 4)],
+)
 NOTHING = ([], [])
 MESHES = [TETRAHEDRON, SQUARE, TWICE, COLLINEAR, SLIVER, BEHIND, BORDER, LAYERS, NOTHING]
 
@@ -32,7 +38,17 @@ def encode(rng, number, flags, meshes, size, *, foreign=False, planes=0, spoil=F
     """The bytes that decode() of fuzz.cpp turns into these meshes; unless packed, all have the first one's sizes."""
     batch, packed = len(meshes), bool(flags & PACKED)
     more = (7 if foreign else 0) + 8 * batch + 32 * rng.randrange(4)
-    head = [number, flags, more, size, rng.randrange(4), rng.randrange(6), planes, rng.randrange(8), rng.choice((rng.randrange(256), 7))]
+    head = [
+        number,
+        flags,
+        more,
+        size,
+        rng.randrange(4),
+        rng.randrange(6),
+        planes,
+        rng.randrange(8),
+        rng.choice((rng.randrange(256), 7)),
+    ]
     shapes = meshes if packed else [meshes[0] if meshes else NOTHING]
     head += [len(vertices) + 16 * len(faces) for vertices, faces in shapes]
     lists = meshes if packed or flags & PER_IMAGE else shapes
@@ -50,8 +66,15 @@ def seeds() -> list[bytes]:
         for layout in (0, PER_IMAGE, PACKED):
             for mesh in MESHES:
                 batch = rng.choices(MESHES, k=2) + [mesh] if layout == PACKED else [mesh] * rng.randrange(1, 3)
-                for other in (ANTI_ALIASED | FILL_BACK | PERSPECTIVE | DISTORTED, VALUES_PER_IMAGE | rng.choice((0, FILL_BACK))):
-                    options = {"foreign": rng.random() < 0.1, "planes": rng.choice((0, 0, 0, 34, 200)), "spoil": rng.random() < 0.3}
+                for other in (
+                    ANTI_ALIASED | FILL_BACK | PERSPECTIVE | DISTORTED,
+                    VALUES_PER_IMAGE | rng.choice((0, FILL_BACK)),
+                ):
+                    options = {
+                        "foreign": rng.random() < 0.1,
+                        "planes": rng.choice((0, 0, 0, 34, 200)),
+                        "spoil": rng.random() < 0.3,
+                    }
                     found.append(encode(rng, number, layout | other, batch, rng.randrange(20), **options))
         found.append(encode(rng, number, 0, [], 8))
         found.append(encode(rng, number, PACKED, [], 8))

@@ -57,8 +57,12 @@ def main() -> None:
             continue
         ratio = instructions / bound
         exceeded |= ratio > SLACK
-        verdict = "MORE THAN THE BOUND ALLOWS" if ratio > SLACK else "ok" if ratio > 0.9 else "ok; the bound could be lowered"
-        print(f"W1 {name}: {instructions} instructions per image, bound {bound} ({compiler}), ratio {ratio:.3f}: {verdict}")
+        verdict = (
+            "MORE THAN THE BOUND ALLOWS" if ratio > SLACK else "ok" if ratio > 0.9 else "ok; the bound could be lowered"
+        )
+        print(
+            f"W1 {name}: {instructions} instructions per image, bound {bound} ({compiler}), ratio {ratio:.3f}: {verdict}"
+        )
     sys.exit(exceeded)
 
 
