@@ -7,6 +7,7 @@ render_face_index   meshes -> which face is nearest at each pixel
 voxelize            meshes -> filled occupancy grids (kato18, the published voxel IoU)
 LookAt, Camera      cameras: world space -> renderer space
 icosphere, edge_table, losses   meshes to deform, and what to minimise
+face_normals, vertex_normals    unit normals, differentiable
 
 Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]``; in renderer space x points right, y
 up, both in [-1, 1] across the image, and z is the depth in front of the camera. Images are ``[B, S, S]`` with row 0
@@ -17,7 +18,7 @@ import torch as _torch  # noqa: F401  torch first: the extension then shares tor
 
 from . import losses
 from .cameras import Camera, LookAt
-from .mesh import edge_table, icosphere
+from .mesh import edge_table, face_normals, icosphere, vertex_normals
 from .render import render_face_index, render_silhouette
 from .voxels import voxelize
 
@@ -25,9 +26,11 @@ __all__ = [
     "Camera",
     "LookAt",
     "edge_table",
+    "face_normals",
     "icosphere",
     "losses",
     "render_face_index",
     "render_silhouette",
+    "vertex_normals",
     "voxelize",
 ]

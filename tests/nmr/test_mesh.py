@@ -1,4 +1,4 @@
-"""icosphere and edge_table."""
+"""icosphere, edge_table, normals."""
 
 import pytest
 import torch
@@ -49,3 +49,64 @@ def test_edge_table_wants_a_closed_mesh():
         nmr.edge_table(faces[None])
     with pytest.raises(TypeError, match="integer"):
         nmr.edge_table(faces.float())
+
+
+def test_normals_of_a_sphere_point_outwards():
+    vertices, faces = nmr.icosphere(3)
+    centres = vertices[faces].mean(1)
+    normals = nmr.face_normals(vertices, faces)
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(len(faces)))
+    assert ((normals * centres).sum(1) > 0.99 * centres.norm(dim=1)).all()
+    torch.testing.assert_close(nmr.vertex_normals(vertices, faces), vertices, rtol=0, atol=0.02)
+
+
+def test_vertex_normals_weigh_by_area():
+    """Two faces at vertex 0: one of area 1 in the plane z = 0, one of area 2 in the plane y = 0."""
+    vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 2]])
+    faces = torch.tensor([[0, 1, 2], [0, 3, 1]])
+    normals = nmr.vertex_normals(vertices, faces)
+    torch.testing.assert_close(normals[0], torch.tensor([0, 2.0, 1]) / 5**0.5)
+    assert torch.equal(normals[2:], torch.tensor([[0.0, 0, 1], [0, 1, 0]]))
+
+
+@pytest.mark.parametrize("function", [nmr.face_normals, nmr.vertex_normals])
+def test_normals_of_batches(function):
+    """One list of faces, one per mesh, integers of any width; the sign follows the winding."""
+    vertices, faces = nmr.icosphere(1)
+    batch = torch.stack([vertices, vertices * torch.tensor([1.0, 2, 3])])
+    both = function(batch, torch.stack([faces, faces.flip(1)]).int())
+    torch.testing.assert_close(both[0], function(vertices, faces))
+    torch.testing.assert_close(both[1], -function(batch, faces)[1])
+
+
+@pytest.mark.parametrize("function", [nmr.face_normals, nmr.vertex_normals])
+def test_normals_gradcheck(function):
+    vertices, faces = nmr.icosphere(0)
+    vertices = (vertices * torch.tensor([1.0, 0.7, 0.5]))[None].double().requires_grad_()
+    torch.autograd.gradcheck(lambda x: function(x, faces), vertices)
+
+
+@pytest.mark.parametrize("function", [nmr.face_normals, nmr.vertex_normals])
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-12, 1e15])
+def test_normals_of_degenerate_and_of_tiny_and_huge_faces_are_finite(function, size):
+    vertices = size * torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [7, 7, 7]])
+    vertices.requires_grad_()
+    faces = torch.tensor([[0, 1, 2], [0, 1, 3], [0, 0, 3]])  # right-angled, collinear, two corners equal
+    normals = function(vertices, faces)
+    normals.sum().backward()
+    expected = torch.tensor([0.0, 0, 1 if size > 1e-18 else 0])  # the area of 1e-60 is 0 in float32
+    assert torch.equal(normals[0], expected) and not normals[-1].any()
+    assert vertices.grad.isfinite().all()
+
+
+def test_normals_errors():
+    vertices, faces = nmr.icosphere(0)
+    for function in (nmr.face_normals, nmr.vertex_normals):
+        with pytest.raises(ValueError, match="faces refer to vertex 12, but a mesh has 12 vertices"):
+            function(vertices, faces + 1)
+        with pytest.raises(ValueError, match="faces refer to vertex -1"):
+            function(vertices, faces - 1)
+        with pytest.raises(TypeError, match="vertices must be a float tensor"):
+            function([[0.0]], faces)
+        with pytest.raises(ValueError, match="batch size of the vertices, 1"):
+            function(vertices, faces.expand(2, -1, -1))
