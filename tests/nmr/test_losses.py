@@ -70,7 +70,7 @@ def test_smoothness_is_least_when_flat():
 
 def test_smoothness_same_bits_for_any_number_of_threads():
     vertices, faces = nmr.icosphere(2)
-    vertices = vertices + 0.1 * torch.randn(5, len(vertices), 3, generator=torch.Generator().manual_seed(0))
+    vertices = vertices + 0.1 * torch.randn(37, len(vertices), 3, generator=torch.Generator().manual_seed(0))
     edges, before, results = nmr.edge_table(faces), torch.get_num_threads(), []
     try:
         for threads in (1, 2, 5):
@@ -81,6 +81,22 @@ def test_smoothness_same_bits_for_any_number_of_threads():
     finally:
         torch.set_num_threads(before)
     assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_smoothness_same_bits_alone_and_in_a_batch(dtype):
+    """Meshes are taken 16 at a time while there are as many, and one by one, in groups of edges, after that."""
+    vertices, faces = nmr.icosphere(1)
+    g = torch.Generator().manual_seed(0)
+    vertices = (vertices + 0.1 * torch.randn(19, len(vertices), 3, generator=g)).to(dtype)
+    edges = nmr.edge_table(faces)[:-1]  # 119: not a multiple of the group
+    weights = torch.rand(19, generator=g).to(dtype)
+    loss = nmr.ops.smoothness(vertices, edges)
+    grad = nmr.ops.smoothness_backward(vertices, edges, weights)
+    for b in range(19):
+        assert torch.equal(loss[b : b + 1], nmr.ops.smoothness(vertices[b : b + 1], edges))
+        alone = nmr.ops.smoothness_backward(vertices[b : b + 1], edges, weights[b : b + 1])
+        assert torch.equal(grad[b : b + 1], alone)
 
 
 def test_smoothness_errors():
