@@ -37,8 +37,7 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
     faces[inward] = faces[inward].flip(1)
     vertices = vertices / vertices.norm(dim=1, keepdim=True)
     for _ in range(subdivisions):
-        pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
-        pairs, edge = torch.unique(pairs, dim=0, return_inverse=True)
+        pairs, edge = torch.unique(_sides(faces), dim=0, return_inverse=True)
         ab, bc, ca = (edge + len(vertices)).view(3, -1).unbind(0)
         a, b, c = faces.unbind(1)
         midpoints = vertices[pairs].sum(1)
@@ -47,12 +46,41 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
     return vertices.float(), faces
 
 
-def edge_table(faces: Tensor) -> Tensor:
-    """Every edge of a closed mesh with the two faces that share it.
+def unique_edges(faces: Tensor) -> Tensor:
+    """Every edge of a mesh once. The mesh may have borders, and edges with more than two faces.
 
     Parameters
     ----------
     faces : integer Tensor [F, 3]
+
+    Returns
+    -------
+    int64 Tensor [E, 2]
+        Row ``(v0, v1)``: an edge, v0 < v1. Rows are sorted. (A face that names a vertex twice has no edge there.)
+
+    Raises
+    ------
+    TypeError, ValueError
+        For a wrong type or shape.
+
+    Examples
+    --------
+    >>> _, faces = nmr.icosphere(3)
+    >>> nmr.unique_edges(faces).shape
+    torch.Size([1920, 2])
+    """
+    sides = _sides(_one_mesh(faces))
+    return torch.unique(sides[sides[:, 0] != sides[:, 1]], dim=0)
+
+
+def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
+    """Every edge with the two faces that share it.
+
+    Parameters
+    ----------
+    faces : integer Tensor [F, 3]
+    open_mesh : bool
+        Leave out the edges at a border, which have one face, instead of refusing them.
 
     Returns
     -------
@@ -63,29 +91,31 @@ def edge_table(faces: Tensor) -> Tensor:
     Raises
     ------
     TypeError, ValueError
-        For a wrong type or shape, and for a mesh with an edge that does not have exactly two faces (a boundary, a
-        non-manifold edge or a degenerate face): the message says how many edges and names the first.
+        For a wrong type or shape, and for a mesh with an edge that does not have exactly two faces (a border, unless
+        `open_mesh`; a non-manifold edge or a degenerate face): the message says how many edges and names the first.
     """
-    faces = check_faces(faces, 1, torch.device("cpu"))
-    if faces.ndim != 2:
-        raise ValueError(f"faces must have shape [F, 3], got {list(faces.shape)}; pass the faces of one mesh")
+    faces = _one_mesh(faces)
     # Sides 0-1, 1-2 and 2-0 with their opposite corners, grouped by edge; a stable sort keeps the face order.
-    sides = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
     opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
-    face = torch.arange(len(faces)).repeat(3)
-    order = torch.argsort(face, stable=True)
-    sides, opposite = sides[order], opposite[order]
+    order = torch.argsort(torch.arange(len(faces)).repeat(3), stable=True)
+    sides, opposite = _sides(faces)[order], opposite[order]
     edges, edge_of_side, counts = torch.unique(sides, dim=0, return_inverse=True, return_counts=True)
-    bad = torch.nonzero(counts != 2).flatten()
+    if open_mesh:
+        wrong, wanted = counts > 2, "at most two faces"
+        remedy = "remove the faces beyond, and those that name a vertex twice"
+    else:
+        wrong, wanted = counts != 2, "exactly two faces (a closed mesh)"
+        remedy = "close the mesh first (for example with trimesh.repair.fill_holes) or pass open_mesh=True"
+    bad = torch.nonzero(wrong | (edges[:, 0] == edges[:, 1])).flatten()
     if len(bad):
         v0, v1 = edges[bad[0]].tolist()
         raise ValueError(
-            f"every edge must have exactly two faces (a closed mesh), but {len(bad)} of {len(edges)} have not: "
-            f"edge ({v0}, {v1}) has {int(counts[bad[0]])}; "
-            "close the mesh first (for example with trimesh.repair.fill_holes)"
+            f"every edge must have two ends and {wanted}, but {len(bad)} of {len(edges)} have not: "
+            f"edge ({v0}, {v1}) has {int(counts[bad[0]])}; {remedy}"
         )
-    order = torch.argsort(edge_of_side, stable=True)
-    return torch.cat([edges, opposite[order].view(-1, 2)], dim=1)
+    inner = counts[edge_of_side] == 2
+    order = torch.argsort(edge_of_side[inner], stable=True)
+    return torch.cat([edges[counts == 2], opposite[inner][order].view(-1, 2)], dim=1)
 
 
 def face_vertices(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -183,6 +213,19 @@ def _unit(vectors: Tensor) -> Tensor:
     return torch.where(zero, 0.0, vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True))
 
 
+def _one_mesh(faces: Tensor) -> Tensor:
+    """``faces`` as int64 [F, 3] in host memory."""
+    faces = check_faces(faces, 1, torch.device("cpu"))
+    if faces.ndim != 2:
+        raise ValueError(f"faces must have shape [F, 3], got {list(faces.shape)}; pass the faces of one mesh")
+    return faces
+
+
+def _sides(faces: Tensor) -> Tensor:
+    """Vertices of all sides 0-1, then all 1-2, then all 2-0, [3 F, 2], the smaller first."""
+    return torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
+
+
 def _check_indices(indices: Tensor, num_vertices: int, name: str = "faces") -> None:
     """Every number in 0..V-1. (In a compiled graph, which has no values to look at, gathering them reports it.)"""
     if torch.compiler.is_compiling() or indices.numel() == 0:
@@ -190,8 +233,8 @@ def _check_indices(indices: Tensor, num_vertices: int, name: str = "faces") -> N
     low, high = (int(x) for x in indices.aminmax())
     if low < 0 or high >= num_vertices:
         raise ValueError(
-            f"{name} refer to vertex {low if low < 0 else high}, but a mesh has {num_vertices} vertices "
-            f"(numbered from 0)"
+            f"{name} refer to vertex {low if low < 0 else high}, "
+            f"but a mesh has {num_vertices} vertices (the first is 0)"
         )
 
 

@@ -1,4 +1,4 @@
-"""icosphere, edge_table, normals."""
+"""icosphere, tables of edges, normals."""
 
 import pytest
 import torch
@@ -49,6 +49,44 @@ def test_edge_table_wants_a_closed_mesh():
         nmr.edge_table(faces[None])
     with pytest.raises(TypeError, match="integer"):
         nmr.edge_table(faces.float())
+
+
+def test_edge_table_of_an_open_mesh_holds_the_inner_edges():
+    """A square of two triangles has one; a sphere without one face has three fewer."""
+    square = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    assert nmr.edge_table(square, open_mesh=True).tolist() == [[0, 2, 1, 3]]
+    _, faces = nmr.icosphere(1)
+    assert torch.equal(nmr.edge_table(faces, open_mesh=True), nmr.edge_table(faces))
+    part, whole = (set(map(tuple, nmr.edge_table(f, open_mesh=True).tolist())) for f in (faces[1:], faces))
+    assert len(whole - part) == 3 and part < whole
+    for fin in ([[0, 2, 4]], [[0, 0, 1]]):
+        with pytest.raises(ValueError, match=r"at most two faces, but [12] of \d have not: edge .* has .*beyond"):
+            nmr.edge_table(torch.cat([square, torch.tensor(fin)]), open_mesh=True)
+
+
+def test_edge_table_refuses_faces_that_name_a_vertex_twice():
+    tetrahedron = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2], [0, 0, 1], [0, 0, 1]])
+    with pytest.raises(ValueError, match=r"two ends and exactly two faces.*edge \(0, 0\) has 2"):
+        nmr.edge_table(tetrahedron)
+
+
+def test_unique_edges():
+    _, faces = nmr.icosphere(2)
+    assert torch.equal(nmr.unique_edges(faces), nmr.edge_table(faces)[:, :2])
+    fan = torch.tensor([[1, 0, 2], [1, 0, 3], [0, 1, 4], [5, 5, 0]])  # three faces at one edge; no face at all
+    expected = [[0, 1], [0, 2], [0, 3], [0, 4], [0, 5], [1, 2], [1, 3], [1, 4]]
+    assert nmr.unique_edges(fan.int()).tolist() == expected
+    with pytest.raises(ValueError, match="faces of one mesh"):
+        nmr.unique_edges(faces[None])
+
+
+def test_face_vertices():
+    vertices, faces = nmr.icosphere(1)
+    batch = torch.stack([vertices, 2 * vertices])
+    assert torch.equal(nmr.mesh.face_vertices(batch, faces), batch[:, faces])
+    assert torch.equal(nmr.mesh.face_vertices(vertices, faces), vertices[faces])
+    other = torch.stack([faces, faces.roll(1, 1)])
+    assert torch.equal(nmr.mesh.face_vertices(batch, other)[1], batch[1][other[1]])
 
 
 def test_normals_of_a_sphere_point_outwards():
