@@ -116,8 +116,8 @@ def test_distances_of_a_shifted_grid(search):
 
 def test_near_points_far_from_the_origin_are_told_apart(search):
     b = torch.tensor([[100.0, 0, 0], [100.001, 0, 0]])
-    a = torch.tensor([[100.0004, 0, 0]])
-    assert metrics._nearest(a[None], b[None]).tolist() == [[0]]
+    a = torch.tensor([[100.0006, 0, 0]])
+    assert metrics._nearest(a[None], b[None]).tolist() == [[1]]
 
 
 def test_f_score_of_uneven_sets(search):
