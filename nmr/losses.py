@@ -13,7 +13,7 @@ from torch import Tensor
 
 from . import ops
 from ._validate import check_vertices, describe
-from .mesh import _check_indices, _gather, _scatter_sum, _unit, face_normals, face_vertices
+from .mesh import _check_indices, face_normals, face_vertices
 
 
 def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
@@ -106,11 +106,12 @@ def laplacian_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     """
     vertices = _check_meshes(vertices)
     v0, v1 = _check_edges(edges, vertices)
-    difference = _gather(vertices, v1) - _gather(vertices, v0)
-    ends = torch.cat([v0, v1])
-    sums = _scatter_sum(torch.cat([difference, -difference], dim=1), ends, vertices.shape[1])
-    degree = vertices.new_zeros(vertices.shape[1]).index_add(0, ends, vertices.new_ones(len(ends)))
-    return (sums / degree.clamp_min(1)[:, None]).square().sum((1, 2)).mean()
+    rows = _batch_last(vertices)
+    difference = rows.index_select(0, v1) - rows.index_select(0, v0)
+    sums = torch.zeros_like(rows).index_add(0, v0, difference).index_add(0, v1, difference, alpha=-1)
+    one = vertices.new_ones(len(v0))
+    degree = vertices.new_zeros(len(rows)).index_add(0, v0, one).index_add(0, v1, one)
+    return (sums / degree.clamp_min(1)[:, None, None]).square().sum((0, 1)).mean()
 
 
 def edge_length_loss(vertices: Tensor, edges: Tensor, target: float | None = None) -> Tensor:
@@ -147,9 +148,10 @@ def edge_length_loss(vertices: Tensor, edges: Tensor, target: float | None = Non
     v0, v1 = _check_edges(edges, vertices)
     if target is not None and not (0 <= target < math.inf):
         raise ValueError(f"target must be a finite length >= 0, got {target}; leave it out for the mean length")
-    length = torch.linalg.vector_norm(_gather(vertices, v1) - _gather(vertices, v0), dim=-1)
-    goal = length.mean(1, keepdim=True) if target is None else target
-    return (length - goal).square().sum(1).mean()
+    rows = _batch_last(vertices)
+    length = _length(rows.index_select(0, v1) - rows.index_select(0, v0))
+    goal = length.mean(0) if target is None else target
+    return (length - goal).square().sum(0).mean()
 
 
 def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
@@ -167,7 +169,7 @@ def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     Returns
     -------
     scalar Tensor
-        Differentiable in ``vertices``. An edge at a face without area counts 1 and passes no gradient to that face.
+        Differentiable in ``vertices``. An edge at a face without area counts 1 and passes no gradient.
 
     Raises
     ------
@@ -185,11 +187,13 @@ def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     if len(edges) == 0:
         raise ValueError("edges must hold at least one edge, got int64 [0, 4]")
     _check_indices(edges, vertices.shape[1], "edges")
-    origin, end, left, right = _gather(vertices, edges.T.flatten()).unflatten(1, (4, -1)).unbind(1)
-    along = end - origin
-    normal = _unit(torch.linalg.cross(along, left - origin))
-    other = _unit(torch.linalg.cross(right - origin, along))
-    return (1 - (normal * other).sum(-1)).mean()
+    rows = _batch_last(vertices)
+    origin, end, left, right = (rows.index_select(0, column) for column in edges.unbind(1))
+    normal, other = _cross(end - origin, left - origin), _cross(right - origin, end - origin)
+    lengths = _length(normal) * _length(other)
+    flat = lengths == 0
+    cos = (normal * other).sum(1) / torch.where(flat, 1.0, lengths)
+    return (1 - torch.where(flat, 0.0, cos)).mean()
 
 
 def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -223,6 +227,24 @@ def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
     corners = face_vertices(vertices, faces)
     moved = corners.detach() + face_normals(vertices.detach(), faces).unsqueeze(2)
     return torch.linalg.vector_norm(moved - corners, dim=-1).sum((1, 2)).mean()
+
+
+def _batch_last(vertices: Tensor) -> Tensor:
+    """[B, V, 3] as [V, 3, B]: a row is then long enough to be copied and summed at the speed of memory."""
+    return vertices.permute(1, 2, 0).contiguous()
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross products of vectors [N, 3, B]."""
+    (a0, a1, a2), (b0, b1, b2) = a.unbind(1), b.unbind(1)
+    return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], dim=1)
+
+
+def _length(vectors: Tensor) -> Tensor:
+    """Lengths [N, B] of vectors [N, 3, B]; where it is 0, so is the gradient."""
+    square = vectors.square().sum(1)
+    zero = square == 0
+    return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())
 
 
 def _check_meshes(vertices: object) -> Tensor:

@@ -210,7 +210,7 @@ def _unit(vectors: Tensor) -> Tensor:
     scale = vectors.detach().abs().amax(-1, keepdim=True)
     zero = scale < torch.finfo(vectors.dtype).tiny
     vectors = torch.where(zero, 1.0, vectors / torch.where(zero, 1.0, scale))
-    return torch.where(zero, 0.0, vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True))
+    return torch.where(zero, 0.0, vectors / vectors.square().sum(-1, keepdim=True).sqrt())
 
 
 def _one_mesh(faces: Tensor) -> Tensor:
