@@ -158,18 +158,18 @@ namespace {
 // Where image b finds its rows and its corners.
 template <class T>
 struct ImageAttributes {
-  int64_t first_row, num_rows;  // of attributes
-  const int64_t* corners;       // [F, 3]
+  int64_t first_row;       // of attributes
+  const int64_t* corners;  // [F, 3]
   int64_t num_faces;
 };
 
 template <class T>
 ImageAttributes<T> image_attributes(const Interpolate<T>& args, int64_t b) {
   if (args.starts) {
-    const int64_t *s = args.starts + 2 * b, *next = s + 2;
-    return {s[0], next[0] - s[0], args.corners + 3 * s[1], next[1] - s[1]};
+    const int64_t* s = args.starts + 2 * b;
+    return {s[0], args.corners + 3 * s[1], s[3] - s[1]};
   }
-  return {args.attribute_batch == 1 ? 0 : b * args.num_attributes, args.num_attributes,
+  return {args.attribute_batch == 1 ? 0 : b * args.num_attributes,
           args.corners + (args.corners_per_image ? 3 * b * args.num_faces : 0), args.num_faces};
 }
 
@@ -254,41 +254,19 @@ void interpolate_forward(const Interpolate<T>& args) {
 
 template <class T>
 void interpolate_backward(const Interpolate<T>& args) {
-  const int64_t R = args.raster_size, C = args.channels;
-  const bool shared = !args.starts && args.attribute_batch == 1;
-  const auto clear = [&](int64_t b) {
-    const ImageAttributes<T> image = image_attributes(args, b);
-    if (args.grad_attributes) std::fill_n(args.grad_attributes + image.first_row * C, image.num_rows * C, T(0));
-  };
-  const auto produce = [&](int64_t b, int64_t block, CornerSums<T>& sums) {
-    const ImageAttributes<T> image = image_attributes(args, b);
-    with_channels(args.channels, [&](auto known) {
-      interpolate_block_backward<known()>(args, image, RowBlocks(R, image.num_faces), b, block, sums);
-    });
-  };
-  const auto consume = [&](int64_t b, const CornerSums<T>& sums) {
-    if (args.grad_attributes) scatter_corner_sums(args, image_attributes(args, b), sums);
-  };
-  if (!shared && args.batch >= args.num_threads) {
-    parallel_for(args.batch, args.num_threads, [&](int64_t b) {
-      clear(b);
-      const int64_t blocks = RowBlocks(R, image_attributes(args, b).num_faces).count;
-      CornerSums<T>& sums = thread_scratch<CornerSums<T>>();
-      for (int64_t block = 0; block < blocks; ++block) {
-        produce(b, block, sums);
-        consume(b, sums);
-      }
-    });
-    return;
-  }
-  // Blocks of all images, several at a time; their sums are added up in order.
-  for (int64_t b = 0; b < (shared ? 1 : args.batch); ++b) clear(b);
-  std::vector<std::pair<int64_t, int64_t>> tasks;
-  for (int64_t b = 0; b < args.batch; ++b)
-    for (int64_t block = 0; block < RowBlocks(R, image_attributes(args, b).num_faces).count; ++block) tasks.emplace_back(b, block);
-  produce_in_order(static_cast<int64_t>(tasks.size()), args.num_threads, thread_scratch<std::vector<CornerSums<T>>>(),
-                   [&](int64_t n, CornerSums<T>& sums) { produce(tasks[n].first, tasks[n].second, sums); },
-                   [&](int64_t n, const CornerSums<T>& sums) { consume(tasks[n].first, sums); });
+  const int64_t rows = args.num_attributes * (args.starts ? 1 : args.attribute_batch);
+  if (args.grad_attributes) std::fill_n(args.grad_attributes, rows * args.channels, T(0));
+  const auto blocks_of = [&](int64_t b) { return RowBlocks(args.raster_size, image_attributes(args, b).num_faces); };
+  sum_blocks<CornerSums<T>>(
+      args.batch, !args.starts && args.attribute_batch == 1, args.num_threads, [&](int64_t b) { return blocks_of(b).count; },
+      [&](int64_t b, int64_t block, CornerSums<T>& sums) {
+        with_channels(args.channels, [&](auto known) {
+          interpolate_block_backward<known()>(args, image_attributes(args, b), blocks_of(b), b, block, sums);
+        });
+      },
+      [&](int64_t b, const CornerSums<T>& sums) {
+        if (args.grad_attributes) scatter_corner_sums(args, image_attributes(args, b), sums);
+      });
 }
 
 template void texture_cubes_forward(const TextureCubes<float>&);

@@ -68,18 +68,16 @@ def silhouette(index: Tensor, anti_aliasing: bool, dtype: torch.dtype = torch.fl
 
 
 def fragments(vertices: Tensor, faces: Tensor, index: Tensor, far: float = 100.0) -> tuple[Tensor, Tensor]:
-    """Perspective-correct weights ``[R, R, 3]`` and depth ``[R, R]`` of an index map ``[R, R]``; autograd differentiates it."""
+    """Perspective-correct weights ``[R, R, 3]`` and depth ``[R, R]`` of an index map; autograd differentiates both."""
     R, drawn = index.shape[0], index >= 0
     x, y, z = vertices[with_back_faces(faces, True)[index.clamp_min(0)]].unbind(-1)
     X, Y = (x * R + R - 1) / 2, (y * R + R - 1) / 2
     column = torch.arange(R).to(vertices)
     x_pixel, y_pixel = torch.meshgrid(column, column, indexing="xy")
     a, b = [1, 2, 0], [2, 0, 1]
-    det = (
-        X[..., 2] * (Y[..., 0] - Y[..., 1]) + X[..., 0] * (Y[..., 1] - Y[..., 2]) + X[..., 1] * (Y[..., 2] - Y[..., 0])
-    )
-    linear = (Y[..., a] - Y[..., b]) * x_pixel[..., None] + (X[..., b] - X[..., a]) * y_pixel[..., None]
-    screen = ((linear + X[..., a] * Y[..., b] - X[..., b] * Y[..., a]) / det[..., None]).clamp(0, 1)
+    dx, dy = X[..., b] - X[..., a], Y[..., a] - Y[..., b]
+    linear = dy * x_pixel[..., None] + dx * y_pixel[..., None] + X[..., a] * Y[..., b] - X[..., b] * Y[..., a]
+    screen = (linear / (X * dy).sum(-1, keepdim=True)).clamp(0, 1)
     screen = screen / screen.sum(-1, keepdim=True)
     depth = 1 / (screen / z).sum(-1)
     weights = screen / z * depth[..., None]
@@ -97,7 +95,7 @@ def resolve(image: Tensor, anti_aliasing: bool) -> Tensor:
 
 
 def texture_color(texture: Tensor, weights: Tensor, eps: float) -> Tensor:
-    """Colour ``[C]`` of one pixel from its face's texture ``[ts, ts, ts, C]`` and the weights ``[3]`` of its vertices."""
+    """Colour ``[C]`` of one pixel: its face's texture ``[ts, ts, ts, C]`` at the weights ``[3]`` of its vertices."""
     size = texture.shape[0]
     t = (weights * (size - 1)).clamp_max(size - 1 - eps).clamp_min(0)
     color = torch.zeros_like(texture[0, 0, 0])
@@ -135,7 +133,10 @@ def edge_gradient(
     fill_back: bool = True,
     eps: float = 1e-4,
 ) -> Tensor:
-    """NMR's gradient ``[V, 3]`` of raster pixels ``[R, R, C]``, row 0 = bottom, from the gradient ``[S, S, C]``, row 0 = top."""
+    """NMR's gradient ``[V, 3]`` of one image ``[R, R, C]``, from the gradient ``[S, S, C]`` of the resolved image.
+
+    Index map and image have row 0 = bottom, the gradient has row 0 = top.
+    """
     R = index.shape[0]
     grad = grad_resolved
     if anti_aliasing:

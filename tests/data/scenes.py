@@ -4,7 +4,7 @@ import torch
 
 
 def random_soup(seed, batch=2, num_faces=12, dtype=torch.float64, size=0.5):
-    """Random triangles in renderer space, some of them partly off the screen: vertices ``[B, V, 3]``, faces ``[F, 3]``."""
+    """Random triangles in renderer space, some partly off the screen: vertices ``[B, V, 3]``, faces ``[F, 3]``."""
     g = torch.Generator().manual_seed(seed)
     centre = torch.rand(batch, num_faces, 1, 3, generator=g) * 2 - 1
     corners = centre + size * torch.randn(batch, num_faces, 3, 3, generator=g)

@@ -1,4 +1,4 @@
-"""sample_texture_cubes and interpolate: against slow definitions and finite differences, their invariances, bad input."""
+"""sample_texture_cubes and interpolate: slow definitions, finite differences, their invariances, bad input."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The reference vectors of depth and colour: images and gradients by the published kernels, evaluated in plain float32."""
+"""The reference vectors of depth and colour: images and gradients by the published kernels, in plain float32."""
 
 import numpy as np
 import pytest
