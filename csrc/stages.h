@@ -129,7 +129,7 @@ struct TextureCubes {
   int64_t texture_batch;   // 1 or B when not packed
   int64_t num_faces;       // F (packed: M)
   const int64_t* starts;   // packed: as in MeshBatch; else nullptr
-  int64_t texture_size;    // ts >= 2
+  int64_t texture_size;    // ts; a cube of one texel is constant
   int64_t channels;        // C
   T eps;                   // coordinates are clamped to [0, ts - 1 - eps]
   T* colors;               // forward out [B, R, R, C]; 0 on background
@@ -156,6 +156,20 @@ struct Interpolate {
   const T* grad_values;      // backward in
   T* grad_attributes;        // backward out, like attributes, or nullptr
   T* grad_weights;           // backward out [B, R, R, 3], or nullptr
+  int num_threads;
+};
+
+// From raster pixels to image pixels: the mean of 2x2 with anti-aliasing, else a copy (edges.cpp).
+template <class T>
+struct Resolve {
+  int64_t batch;
+  int64_t image_size;      // S
+  bool anti_aliasing;      // R = 2 S
+  int64_t channels;        // C
+  const T* image;          // [B, R, R, C]
+  T* resolved;             // forward out [B, S, S, C]
+  const T* grad_resolved;  // backward in
+  T* grad_image;           // backward out [B, R, R, C]
   int num_threads;
 };
 
@@ -206,6 +220,8 @@ template <class T> void texture_cubes_forward(const TextureCubes<T>& args);
 template <class T> void texture_cubes_backward(const TextureCubes<T>& args);
 template <class T> void interpolate_forward(const Interpolate<T>& args);
 template <class T> void interpolate_backward(const Interpolate<T>& args);
+template <class T> void resolve_forward(const Resolve<T>& args);
+template <class T> void resolve_backward(const Resolve<T>& args);
 template <class T> void edges_backward(const EdgesBackward<T>& args);
 template <class T> void smoothness_forward(const Smoothness<T>& args);
 template <class T> void smoothness_backward(const Smoothness<T>& args);

@@ -118,6 +118,9 @@ int64_t require_owner(const Array<int32_t>& owner, const MeshBatch<T>& mesh) {
 
 // The parts of the module, one per file.
 void bind_raster(py::module_& m);
+void bind_fragments(py::module_& m);
+void bind_edges(py::module_& m);
+void bind_shade(py::module_& m);
 void bind_mesh(py::module_& m);
 
 }  // namespace nmr

@@ -11,7 +11,28 @@ Rasters are ``[B, R, R]`` with R = 2S when anti-aliased, else S; row 0 = top, as
 -1 = background, f = face f is nearest, ``F + f`` = its reversed copy is (F = number of faces of that mesh).
 """
 
+from .edges import edges_backward, resolve, resolve_backward
+from .fragments import depth_backward, depth_image, fragments, fragments_backward
 from .mesh import smoothness, smoothness_backward, voxels
 from .raster import rasterize, silhouette, silhouette_backward
+from .shade import interpolate, interpolate_backward, sample_texture_cubes, texture_cubes_backward
 
-__all__ = ["rasterize", "silhouette", "silhouette_backward", "smoothness", "smoothness_backward", "voxels"]
+__all__ = [
+    "depth_backward",
+    "depth_image",
+    "edges_backward",
+    "fragments",
+    "fragments_backward",
+    "interpolate",
+    "interpolate_backward",
+    "rasterize",
+    "resolve",
+    "resolve_backward",
+    "sample_texture_cubes",
+    "silhouette",
+    "silhouette_backward",
+    "smoothness",
+    "smoothness_backward",
+    "texture_cubes_backward",
+    "voxels",
+]

@@ -1,0 +1,101 @@
+// Fragments and depth images of an owner map.
+#include "arrays.h"
+
+namespace nmr {
+namespace {
+
+template <class T>
+Fragments<T> fragments_args(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
+                            const Array<int32_t>& owner, double far, int num_threads) {
+  const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
+  const int64_t raster_size = require_owner(owner, mesh);
+  return {mesh, raster_size, static_cast<T>(far), owner.data(), nullptr, nullptr, nullptr, nullptr, nullptr, num_threads};
+}
+
+template <class T>
+void fragments_forward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
+                          const Array<int32_t>& owner, Array<T>& weights, Array<T>& depth, double far, int num_threads) {
+  Fragments<T> args = fragments_args(vertices, faces, starts, owner, far, num_threads);
+  require_shape(weights, "weights", {args.mesh.batch, args.raster_size, args.raster_size, 3});
+  require_shape(depth, "depth", {args.mesh.batch, args.raster_size, args.raster_size});
+  args.weights = weights.mutable_data();
+  args.depth = depth.mutable_data();
+  py::gil_scoped_release release;
+  fragments_forward(args);
+}
+
+template <class T>
+void fragments_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
+                           const Array<int32_t>& owner, const std::optional<Array<T>>& grad_weights,
+                           const std::optional<Array<T>>& grad_depth, Array<T>& grad_vertices, int num_threads) {
+  Fragments<T> args = fragments_args(vertices, faces, starts, owner, 0, num_threads);
+  if (grad_weights) {
+    require_shape(*grad_weights, "grad_weights", {args.mesh.batch, args.raster_size, args.raster_size, 3});
+    args.grad_weights = grad_weights->data();
+  }
+  if (grad_depth) {
+    require_shape(*grad_depth, "grad_depth", {args.mesh.batch, args.raster_size, args.raster_size});
+    args.grad_depth = grad_depth->data();
+  }
+  require_like(grad_vertices, "grad_vertices", vertices);
+  args.grad_vertices = grad_vertices.mutable_data();
+  py::gil_scoped_release release;
+  fragments_backward(args);
+}
+
+template <class T>
+DepthImage<T> depth_args(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
+                         const Array<int32_t>& owner, bool anti_aliasing, double far, int num_threads) {
+  const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
+  const int64_t raster_size = require_owner(owner, mesh), image_size = anti_aliasing ? raster_size / 2 : raster_size;
+  require(!anti_aliasing || raster_size % 2 == 0, "an anti-aliased owner map has an even size, got " + shape_of(owner));
+  return {mesh, image_size, anti_aliasing, static_cast<T>(far), owner.data(), nullptr, nullptr, nullptr, num_threads};
+}
+
+template <class T>
+void depth_forward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
+                      const Array<int32_t>& owner, Array<T>& depth, bool anti_aliasing, double far, int num_threads) {
+  DepthImage<T> args = depth_args(vertices, faces, starts, owner, anti_aliasing, far, num_threads);
+  require_shape(depth, "depth", {args.mesh.batch, args.image_size, args.image_size});
+  args.depth = depth.mutable_data();
+  py::gil_scoped_release release;
+  depth_forward(args);
+}
+
+template <class T>
+void depth_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
+                       const Array<int32_t>& owner, const Array<T>& grad_depth, Array<T>& grad_vertices, bool anti_aliasing,
+                       int num_threads) {
+  DepthImage<T> args = depth_args(vertices, faces, starts, owner, anti_aliasing, 0, num_threads);
+  require_shape(grad_depth, "grad_depth", {args.mesh.batch, args.image_size, args.image_size});
+  require_like(grad_vertices, "grad_vertices", vertices);
+  args.grad_depth = grad_depth.data();
+  args.grad_vertices = grad_vertices.mutable_data();
+  py::gil_scoped_release release;
+  depth_backward(args);
+}
+
+template <class T>
+void define_fragments(py::module_& m) {
+  m.def("fragments_forward", &fragments_forward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("weights").noconvert(), py::arg("depth").noconvert(),
+        py::arg("far"), py::arg("num_threads"));
+  m.def("fragments_backward", &fragments_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("grad_weights").noconvert(),
+        py::arg("grad_depth").noconvert(), py::arg("grad_vertices").noconvert(), py::arg("num_threads"));
+  m.def("depth_forward", &depth_forward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("depth").noconvert(), py::arg("anti_aliasing"),
+        py::arg("far"), py::arg("num_threads"));
+  m.def("depth_backward", &depth_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("grad_depth").noconvert(),
+        py::arg("grad_vertices").noconvert(), py::arg("anti_aliasing"), py::arg("num_threads"));
+}
+
+}  // namespace
+
+void bind_fragments(py::module_& m) {
+  define_fragments<float>(m);
+  define_fragments<double>(m);
+}
+
+}  // namespace nmr

@@ -1,0 +1,166 @@
+// Texture cubes and interpolation.
+#include "arrays.h"
+
+namespace nmr {
+namespace {
+
+// Checks weights [B, R, R, 3] and an owner map of the given number of faces (packed: those of starts).
+template <class T>
+void require_fragments(const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts,
+                       int64_t num_faces) {
+  const int64_t batch = starts ? starts->shape(0) - 1 : owner.ndim() == 3 ? owner.shape(0) : 0;
+  const int64_t* s = starts ? starts->data() : nullptr;
+  const int64_t R = require_owner(owner, batch, [&](int64_t b) { return s ? s[2 * b + 3] - s[2 * b + 1] : num_faces; });
+  require_shape(weights, "weights", {batch, R, R, 3});
+}
+
+// --- texture cubes
+
+template <class T>
+TextureCubes<T> texture_args(const Array<T>& textures, const Array<int32_t>& owner, const Array<T>& weights,
+                             const std::optional<Indices>& starts, double eps, int num_threads) {
+  const py::ssize_t lead = starts ? 1 : 2;
+  const std::string layout = starts ? "[M, ts, ts, ts, C]" : "[B or 1, F, ts, ts, ts, C]";
+  require(textures.ndim() == lead + 4, "textures must have shape " + layout + ", got " + shape_of(textures));
+  const int64_t ts = textures.shape(lead), channels = textures.shape(lead + 3), num_faces = textures.shape(lead - 1);
+  require(ts >= 1 && textures.shape(lead + 1) == ts && textures.shape(lead + 2) == ts && channels >= 1,
+          "textures must be cubes of the same size in all three directions, with channels, got " + shape_of(textures));
+  // Textures have no rows: whatever number of them starts ends with is right.
+  if (starts) require_starts(*starts, starts->ndim() == 2 && starts->size() >= 2 ? starts->data()[starts->size() - 2] : 0, num_faces);
+  require_fragments(owner, weights, starts, num_faces);
+  const int64_t texture_batch = starts ? 1 : textures.shape(0);
+  require(starts || texture_batch == 1 || texture_batch == owner.shape(0),
+          "textures must have the batch size " + std::to_string(owner.shape(0)) + " or 1, got " + shape_of(textures));
+  TextureCubes<T> args{};
+  args.owner = owner.data();
+  args.weights = weights.data();
+  args.batch = owner.shape(0);
+  args.raster_size = owner.shape(1);
+  args.textures = textures.data();
+  args.texture_batch = texture_batch;
+  args.num_faces = num_faces;
+  args.starts = starts ? starts->data() : nullptr;
+  args.texture_size = ts;
+  args.channels = channels;
+  args.eps = static_cast<T>(eps);
+  args.num_threads = num_threads;
+  return args;
+}
+
+template <class T>
+void texture_cubes_forward_py(const Array<T>& textures, const Array<int32_t>& owner, const Array<T>& weights,
+                              const std::optional<Indices>& starts, Array<T>& colors, double eps, int num_threads) {
+  TextureCubes<T> args = texture_args(textures, owner, weights, starts, eps, num_threads);
+  require_shape(colors, "colors", {args.batch, args.raster_size, args.raster_size, args.channels});
+  args.colors = colors.mutable_data();
+  py::gil_scoped_release release;
+  texture_cubes_forward(args);
+}
+
+// The gradient has the shape of the textures; their values are not needed.
+template <class T>
+void texture_cubes_backward_py(const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts,
+                               const Array<T>& grad_colors, Array<T>& grad_textures, double eps, int num_threads) {
+  TextureCubes<T> args = texture_args(grad_textures, owner, weights, starts, eps, num_threads);
+  require_shape(grad_colors, "grad_colors", {args.batch, args.raster_size, args.raster_size, args.channels});
+  args.textures = nullptr;
+  args.grad_colors = grad_colors.data();
+  args.grad_textures = grad_textures.mutable_data();
+  py::gil_scoped_release release;
+  texture_cubes_backward(args);
+}
+
+// --- interpolate
+
+template <class T>
+Interpolate<T> interpolate_args(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner,
+                                const Array<T>& weights, const std::optional<Indices>& starts, int num_threads) {
+  const bool packed = starts.has_value(), per_image = corners.ndim() == 3;
+  require(attributes.ndim() == (packed ? 2 : 3) && attributes.shape(attributes.ndim() - 1) >= 1,
+          std::string("attributes must have shape ") + (packed ? "[N, C]" : "[B or 1, N, C]") + ", got " + shape_of(attributes));
+  require((corners.ndim() == 2 || (per_image && !packed)) && corners.shape(corners.ndim() - 1) == 3,
+          std::string("corners must have shape ") + (packed ? "[M, 3]" : "[F, 3] or [B, F, 3]") + ", got " + shape_of(corners));
+  const int64_t num_attributes = attributes.shape(packed ? 0 : 1), num_faces = corners.shape(per_image ? 1 : 0);
+  if (packed) require_starts(*starts, num_attributes, num_faces);
+  require_fragments(owner, weights, starts, num_faces);
+  const int64_t batch = owner.shape(0), attribute_batch = packed ? 1 : attributes.shape(0);
+  require(packed || attribute_batch == 1 || attribute_batch == batch,
+          "attributes must have the batch size " + std::to_string(batch) + " or 1, got " + shape_of(attributes));
+  require(!per_image || corners.shape(0) == batch,
+          "corners [B, F, 3] must have the batch size " + std::to_string(batch) + ", got " + shape_of(corners));
+  for (int64_t b = 0; packed && b < batch; ++b) {
+    const int64_t* s = starts->data() + 2 * b;
+    require_indices(corners.data() + 3 * s[1], 3 * (s[3] - s[1]), s[2] - s[0], "corners", "attribute", "attributes");
+  }
+  if (!packed) require_indices(corners.data(), corners.size(), num_attributes, "corners", "attribute", "attributes");
+  Interpolate<T> args{};
+  args.owner = owner.data();
+  args.weights = weights.data();
+  args.batch = batch;
+  args.raster_size = owner.shape(1);
+  args.attributes = attributes.data();
+  args.attribute_batch = attribute_batch;
+  args.num_attributes = num_attributes;
+  args.channels = attributes.shape(packed ? 1 : 2);
+  args.corners = corners.data();
+  args.num_faces = num_faces;
+  args.corners_per_image = per_image;
+  args.starts = packed ? starts->data() : nullptr;
+  args.num_threads = num_threads;
+  return args;
+}
+
+template <class T>
+void interpolate_forward_py(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner,
+                            const Array<T>& weights, const std::optional<Indices>& starts, Array<T>& values, int num_threads) {
+  Interpolate<T> args = interpolate_args(attributes, corners, owner, weights, starts, num_threads);
+  require_shape(values, "values", {args.batch, args.raster_size, args.raster_size, args.channels});
+  args.values = values.mutable_data();
+  py::gil_scoped_release release;
+  interpolate_forward(args);
+}
+
+template <class T>
+void interpolate_backward_py(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner,
+                             const Array<T>& weights, const std::optional<Indices>& starts, const Array<T>& grad_values,
+                             std::optional<Array<T>> grad_attributes, std::optional<Array<T>> grad_weights, int num_threads) {
+  Interpolate<T> args = interpolate_args(attributes, corners, owner, weights, starts, num_threads);
+  require_shape(grad_values, "grad_values", {args.batch, args.raster_size, args.raster_size, args.channels});
+  args.grad_values = grad_values.data();
+  if (grad_attributes) {
+    require_like(*grad_attributes, "grad_attributes", attributes);
+    args.grad_attributes = grad_attributes->mutable_data();
+  }
+  if (grad_weights) {
+    require_like(*grad_weights, "grad_weights", weights);
+    args.grad_weights = grad_weights->mutable_data();
+  }
+  py::gil_scoped_release release;
+  interpolate_backward(args);
+}
+
+template <class T>
+void define_shade(py::module_& m) {
+  m.def("texture_cubes_forward", &texture_cubes_forward_py<T>, py::arg("textures").noconvert(), py::arg("owner").noconvert(),
+        py::arg("weights").noconvert(), py::arg("starts").noconvert(), py::arg("colors").noconvert(), py::arg("eps"),
+        py::arg("num_threads"));
+  m.def("texture_cubes_backward", &texture_cubes_backward_py<T>, py::arg("owner").noconvert(), py::arg("weights").noconvert(),
+        py::arg("starts").noconvert(), py::arg("grad_colors").noconvert(), py::arg("grad_textures").noconvert(), py::arg("eps"),
+        py::arg("num_threads"));
+  m.def("interpolate_forward", &interpolate_forward_py<T>, py::arg("attributes").noconvert(), py::arg("corners").noconvert(),
+        py::arg("owner").noconvert(), py::arg("weights").noconvert(), py::arg("starts").noconvert(), py::arg("values").noconvert(),
+        py::arg("num_threads"));
+  m.def("interpolate_backward", &interpolate_backward_py<T>, py::arg("attributes").noconvert(), py::arg("corners").noconvert(),
+        py::arg("owner").noconvert(), py::arg("weights").noconvert(), py::arg("starts").noconvert(),
+        py::arg("grad_values").noconvert(), py::arg("grad_attributes").noconvert(), py::arg("grad_weights").noconvert(),
+        py::arg("num_threads"));
+}
+
+}  // namespace
+
+void bind_shade(py::module_& m) {
+  define_shade<float>(m);
+  define_shade<double>(m);
+}
+
+}  // namespace nmr

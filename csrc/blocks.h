@@ -1,0 +1,128 @@
+// Work on an owner map in blocks of raster rows, and sums over blocks that do not depend on the number of threads: the blocks
+// are fixed by the sizes alone, each block sums on its own, and the sums are added up in the order of the blocks.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <utility>
+#include <vector>
+
+#include "parallel.h"
+
+namespace nmr {
+
+// The rows of one image, in blocks. An even number of rows each, so that no 2x2 mean crosses two blocks.
+struct RowBlocks {
+  int64_t raster_size;  // R
+  int64_t rows;         // per block
+  int64_t count;
+
+  // A block has at least 2^14 pixels and, as every block looks once at every face's mark, a quarter as many as faces.
+  RowBlocks(int64_t R, int64_t num_faces) : raster_size(R) {
+    const int64_t pixels = std::max<int64_t>(int64_t(1) << 14, num_faces / 2);
+    rows = (pixels + R - 1) / R;
+    rows = std::min(rows + rows % 2, R);
+    count = (R + rows - 1) / rows;
+  }
+  int64_t first(int64_t block) const { return block * rows; }
+  int64_t last(int64_t block) const { return std::min(first(block) + rows, raster_size); }
+  // Most faces (originals and copies) that can own a pixel of one block.
+  int64_t most_visible(int64_t num_faces) const { return std::min(2 * num_faces, rows * raster_size); }
+};
+
+// The faces that own a pixel, numbered from 1 in ascending order; the background is number 0.
+struct VisibleFaces {
+  std::vector<int32_t> slots;  // [2 F + 1] number of owner entry id at [id + 1]; only the entries of visible faces mean anything
+  std::vector<int32_t> ids;    // [count] owner entries; ids[0] = -1
+  int64_t count;
+
+  void reserve_for(int64_t num_faces, int64_t most_visible) {
+    reserve(slots, 2 * num_faces + 1);
+    reserve(ids, most_visible + 2);  // the search writes one entry beyond the last that it keeps
+  }
+
+  NMR_INLINE void find(const int32_t* owner, int64_t pixels, int64_t num_faces) {
+    int32_t *slot = slots.data(), *id = ids.data();
+    std::fill_n(slot, 2 * num_faces + 1, 0);
+    for (int64_t n = 0; n < pixels; ++n) slot[owner[n] + 1] = 1;
+    int32_t found = 1;
+    for (int64_t n = 0; n < 2 * num_faces; ++n) {
+      const int32_t visible = slot[n + 1];
+      id[found] = static_cast<int32_t>(n);
+      slot[n + 1] = found;
+      found += visible;
+    }
+    id[0] = -1;
+    slot[0] = 0;
+    count = found;
+  }
+};
+
+// First and one past the last covered pixel of a row; equal if there is none.
+NMR_INLINE void covered_range(const int32_t* owner, int64_t R, int64_t& first, int64_t& last) {
+  first = 0;
+  last = R;
+  while (first < R && owner[first] < 0) ++first;
+  while (last > first && owner[last - 1] < 0) --last;
+}
+
+// Calls produce(b, block, result) for every block of every image, on several threads, and consume(b, result) for each of them:
+// those that add to the same output one after the other in ascending order of (b, block). Images add to outputs of their own,
+// unless they share them. block_count(b) is the number of blocks of image b.
+template <class Result, class BlockCount, class Produce, class Consume>
+void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& block_count, const Produce& produce,
+                const Consume& consume) {
+  if (!shared && batch >= num_threads) {
+    parallel_for(batch, num_threads, [&](int64_t b) {
+      Result& result = thread_scratch<Result>();
+      for (int64_t block = 0; block < block_count(b); ++block) {
+        produce(b, block, result);
+        consume(b, result);
+      }
+    });
+    return;
+  }
+  // Some blocks at a time are produced, by all threads together, and then consumed in order.
+  std::vector<Result>& results = thread_scratch<std::vector<Result>>();
+  std::vector<std::pair<int64_t, int64_t>>& tasks = thread_scratch<std::vector<std::pair<int64_t, int64_t>>>();
+  tasks.clear();
+  const auto flush = [&] {
+    if (results.size() < tasks.size()) results.resize(tasks.size());
+    parallel_for(static_cast<int64_t>(tasks.size()), num_threads,
+                 [&](int64_t n) { produce(tasks[n].first, tasks[n].second, results[n]); });
+    for (size_t n = 0; n < tasks.size(); ++n) consume(tasks[n].first, results[n]);
+    tasks.clear();
+  };
+  const size_t wave = num_threads <= 1 ? 1 : 4 * static_cast<size_t>(num_threads);
+  for (int64_t b = 0; b < batch; ++b) {
+    for (int64_t block = 0; block < block_count(b); ++block) {
+      tasks.emplace_back(b, block);
+      if (tasks.size() == wave) flush();
+    }
+  }
+  flush();
+}
+
+// Gradients per visible face of a block, in the vertex order in which the face is drawn.
+template <class T>
+struct FaceGradients {
+  std::vector<int32_t> ids;  // [count] owner entries
+  std::vector<T> values;     // [count, 3, 3] of the three corners' x, y, z
+  int64_t count;
+};
+
+// Adds them to the vertices of one image (faces [F, 3]).
+template <class T>
+void scatter_face_gradients(const FaceGradients<T>& gradients, const int64_t* faces, int64_t num_faces, T* grad_vertices) {
+  const T* value = gradients.values.data();
+  for (int64_t n = 0; n < gradients.count; ++n) {
+    const bool reversed = gradients.ids[n] >= num_faces;
+    const int64_t* face = faces + 3 * (reversed ? gradients.ids[n] - num_faces : gradients.ids[n]);
+    for (int k = 0; k < 3; ++k, value += 3) {
+      T* grad = grad_vertices + 3 * face[reversed ? 2 - k : k];
+      for (int c = 0; c < 3; ++c) grad[c] += value[c];
+    }
+  }
+}
+
+}  // namespace nmr

@@ -1,0 +1,345 @@
+// NMR's gradient of an image of any channels: for every edge of a visible face and every raster line that crosses it, with c the
+// crossing, `in` the pixel just inside and `out` the one just outside,
+//   outside: if the face owns `in`, each pixel m from `out` to the border would become I(in) if the edge moved out to it;
+//   inside:  each own pixel m would become I(out) if the edge moved in past it.
+// Where that lowers the loss, D = sum over channels of (I(m) - I(in or out)) g(m) > 0, both ends of the edge are pulled by
+// D / (distance they must travel). Lines of constant x (axis 0) move y, lines of constant y (axis 1) move x.
+#include <algorithm>
+#include <cmath>
+
+#include "blocks.h"
+#include "geometry.h"
+#include "parallel.h"
+#include "stages.h"
+
+namespace nmr {
+
+template <class T>
+void resolve_forward(const Resolve<T>& args) {
+  const int64_t S = args.image_size, C = args.channels, R = args.anti_aliasing ? 2 * S : S;
+  parallel_for(args.batch * S, args.num_threads, [&](int64_t n) {  // n: image b, row y
+    const T* upper = args.image + n / S * R * R * C + n % S * (R / S) * R * C;
+    T* out = args.resolved + n * S * C;
+    if (!args.anti_aliasing) {
+      std::copy_n(upper, S * C, out);
+      return;
+    }
+    const T* lower = upper + R * C;
+    for (int64_t x = 0; x < S; ++x, upper += 2 * C, lower += 2 * C, out += C)
+      for (int64_t c = 0; c < C; ++c) out[c] = (upper[c] + upper[C + c] + lower[c] + lower[C + c]) / 4;
+  });
+}
+
+template <class T>
+void resolve_backward(const Resolve<T>& args) {
+  const int64_t S = args.image_size, C = args.channels, R = args.anti_aliasing ? 2 * S : S;
+  parallel_for(args.batch * R, args.num_threads, [&](int64_t n) {  // n: image b, raster row
+    const int64_t per_pixel = R / S;
+    const T* grad = args.grad_resolved + (n / R * S + n % R / per_pixel) * S * C;
+    T* out = args.grad_image + n * R * C;
+    if (!args.anti_aliasing) {
+      std::copy_n(grad, S * C, out);
+      return;
+    }
+    for (int64_t x = 0; x < S; ++x, grad += C, out += 2 * C)
+      for (int64_t c = 0; c < C; ++c) out[c] = out[C + c] = grad[c] / 4;
+  });
+}
+
+namespace {
+
+constexpr int64_t kLanes = 16;      // pixels handled together
+constexpr int64_t kTile = 16;       // lines listed together
+constexpr int64_t kFaceChunk = 32;  // faces swept together
+
+// The pixels of every line of one axis whose gradient is not zero, in ascending order. The others cannot pull.
+template <class T>
+struct LineLists {
+  std::vector<T> values;        // [R, 1 + 2 C, stride] position on the line; image; gradient
+  std::vector<int32_t> owner;   // [R, stride]
+  std::vector<int32_t> before;  // [R, R + 1] how many listed pixels of the line lie before each pixel
+};
+
+template <class T>
+struct EdgeScratch {
+  VisibleFaces visible;
+  LineLists<T> lists;
+  FaceGradients<T> gradients;
+};
+
+// What the sweeps along one axis read of one image. Pixel m of line n is column n, row m from the bottom for axis 0, and
+// column m, row n from the bottom for axis 1.
+template <class T>
+struct Lines {
+  int64_t R, C, stride;
+  int axis;
+  int64_t first, last;     // lines with a covered pixel lie in [first, last); no other line pulls
+  T eps;
+  const int32_t* owner;    // [R, R], row 0 = top
+  const T *image, *grad;   // [R, R, C]
+  LineLists<T>* lists;
+
+  NMR_INLINE int64_t pixel(int64_t n, int64_t m) const { return axis == 0 ? (R - 1 - m) * R + n : (R - 1 - n) * R + m; }
+};
+
+// Lists pixel m of line n, if it can pull, as number `count` of its line.
+template <int64_t kChannels, class T>
+NMR_INLINE void list_pixel(const Lines<T>& lines, int64_t n, int64_t m, int32_t& count) {
+  const int64_t C = kChannels ? kChannels : lines.C, stride = lines.stride, pixel = lines.pixel(n, m);
+  const T *image = lines.image + pixel * C, *grad = lines.grad + pixel * C;
+  T* out = lines.lists->values.data() + n * (1 + 2 * C) * stride + count;
+  T magnitude = 0;
+  out[0] = static_cast<T>(m);
+  for (int64_t c = 0; c < C; ++c) {
+    magnitude += std::abs(grad[c]);
+    out[(1 + c) * stride] = image[c];
+    out[(1 + C + c) * stride] = grad[c];
+  }
+  lines.lists->owner[n * stride + count] = lines.owner[pixel];
+  count += magnitude != 0;
+  lines.lists->before[n * (lines.R + 1) + m + 1] = count;
+}
+
+// kChannels is the number of channels, or 0 if it is not known beforehand.
+template <int64_t kChannels, class T>
+NMR_INLINE void list_lines(const Lines<T>& lines, int64_t first) {
+  const int64_t R = lines.R, last = std::min(first + kTile, lines.last);
+  int32_t count[kTile] = {};
+  for (int64_t n = first; n < last; ++n) lines.lists->before[n * (R + 1)] = 0;
+  if (lines.axis == 0) {  // a tile of columns, row by row
+    for (int64_t m = 0; m < R; ++m)
+      for (int64_t n = first; n < last; ++n) list_pixel<kChannels>(lines, n, m, count[n - first]);
+  } else {
+    for (int64_t n = first; n < last; ++n)
+      for (int64_t m = 0; m < R; ++m) list_pixel<kChannels>(lines, n, m, count[n - first]);
+  }
+}
+
+template <class T>
+NMR_INLINE void list_tile_body(const Lines<T>& lines, int64_t first) {
+  switch (lines.C) {
+    case 1: return list_lines<1>(lines, first);
+    case 3: return list_lines<3>(lines, first);
+    case 4: return list_lines<4>(lines, first);
+    default: return list_lines<0>(lines, first);
+  }
+}
+
+// How an edge P-Q, crossed at t = c by line n, moves with each of its ends.
+template <class T>
+struct Lever {
+  T crossing;         // c
+  T p, q;             // travel of P in [-1, 1] that moves the crossing by one pixel: 2 / R (Qs - Ps) / (Qs - n); that of Q
+  bool p_acts, q_acts;  // false where the line passes through the other end, or the factor overflows
+};
+
+// Pulls of an edge on its ends, in lanes.
+template <class T>
+struct Pulls {
+  T p[kLanes], q[kLanes];
+};
+
+// Adds the pulls of the listed pixels [first, last) of line n, of those that face `id` owns if kOwn, against a reference color.
+template <class T, bool kOwn>
+NMR_INLINE void pull_listed(const Lines<T>& lines, int64_t n, int32_t first, int32_t last, int32_t id, const T* reference,
+                            const Lever<T>& lever, Pulls<T>& pulls) {
+  const int64_t C = lines.C, stride = lines.stride;
+  const T* position = lines.lists->values.data() + n * (1 + 2 * C) * stride;
+  const int32_t* owner = lines.lists->owner.data() + n * stride;
+  for (int32_t start = first; start < last; start += kLanes) {
+    T gain[kLanes];
+    for (int k = 0; k < kLanes; ++k) gain[k] = 0;
+    for (int64_t c = 0; c < C; ++c) {
+      const T *image = position + (1 + c) * stride + start, *grad = image + C * stride;
+      for (int k = 0; k < kLanes; ++k) gain[k] += (image[k] - reference[c]) * grad[k];
+    }
+    const int32_t lanes = last - start;
+    for (int k = 0; k < kLanes; ++k) {
+      const bool counts = (k < lanes) & (gain[k] > 0) & (!kOwn | (owner[start + k] == id));
+      const T offset = position[start + k] - lever.crossing;
+      const T h_p = lever.p * offset, h_q = lever.q * offset;
+      pulls.p[k] -= (counts & lever.p_acts ? gain[k] : T(0)) / (h_p + (h_p > 0 ? lines.eps : -lines.eps));
+      pulls.q[k] -= (counts & lever.q_acts ? gain[k] : T(0)) / (h_q + (h_q > 0 ? lines.eps : -lines.eps));
+    }
+  }
+}
+
+template <class T>
+NMR_INLINE T sum_lanes(const T* lanes) {
+  T sum[kLanes];
+  std::copy_n(lanes, kLanes, sum);
+  for (int64_t width = kLanes / 2; width > 0; width /= 2)
+    for (int64_t k = 0; k < width; ++k) sum[k] += sum[k + width];
+  return sum[0];
+}
+
+// Float to int as the published kernels convert: truncated, saturated to the pixel range [lo, hi], NaN to 0.
+template <class T>
+NMR_INLINE int64_t to_index(T t, int64_t lo, int64_t hi) {
+  if (!(t == t)) return 0;
+  if (t <= static_cast<T>(lo)) return lo;
+  if (t >= static_cast<T>(hi)) return hi;
+  return static_cast<int64_t>(t);
+}
+
+// Height of the infinite line A-B over the scan coordinate n.
+template <class T>
+NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
+  return (bt - at) / (bs - as) * (n - as) + at;
+}
+
+// Both sweeps of edge P-Q (O is the third corner). s is the scan coordinate, t the sweep coordinate, in pixels.
+template <class T>
+NMR_INLINE void sweep_edge(const Lines<T>& lines, int32_t id, T ps, T pt, T qs, T qt, T os, T ot, T& grad_p, T& grad_q) {
+  if (ps == qs) return;  // the edge lies along the scan line: neither end can move its crossing
+  const int64_t R = lines.R;
+  const T top = static_cast<T>(R - 1), scale = 2 / static_cast<T>(R);
+  const int64_t d = ((ps < qs) == (lines.axis == 0)) ? -1 : 1;  // outward
+  const T low = std::max(std::min(ps, qs), T(0)), high = std::min(std::max(ps, qs), top);
+  if (!(low <= top)) return;
+  const int64_t n_first = std::max(static_cast<int64_t>(std::ceil(low)), lines.first);
+  // Truncation towards zero, as published: an edge that ends in (-1, 0) is extrapolated onto line 0.
+  const int64_t n_last = std::min(high > -1 ? static_cast<int64_t>(high) : -1, lines.last - 1);
+  if (n_first > n_last) return;
+  const T slope = (qt - pt) / (qs - ps);
+  Pulls<T> pulls;
+  for (int k = 0; k < kLanes; ++k) pulls.p[k] = pulls.q[k] = 0;
+
+  for (int64_t n = n_first; n <= n_last; ++n) {
+    const T line = static_cast<T>(n);
+    const int32_t* before = lines.lists->before.data() + n * (R + 1);
+    Lever<T> lever;
+    lever.crossing = slope * (line - ps) + pt;
+    const T rounded = d > 0 ? std::floor(lever.crossing) : std::ceil(lever.crossing);
+    if (!(rounded >= 0 && rounded <= top)) continue;  // also NaN
+    const int64_t in = static_cast<int64_t>(rounded), out = in + d;
+    if (out < 0 || out >= R) continue;
+
+    lever.p = (qs - ps) / (qs - line) * scale;
+    lever.q = (qs - ps) / (line - ps) * scale;
+    lever.p_acts = std::isfinite(lever.p);
+    lever.q_acts = std::isfinite(lever.q);
+    if (!lever.p_acts) lever.p = 0;
+    if (!lever.q_acts) lever.q = 0;
+
+    const int64_t in_pixel = lines.pixel(n, in);
+    if (lines.owner[in_pixel] == id) {
+      const int32_t first = d > 0 ? before[out] : 0, last = d > 0 ? before[R] : before[out + 1];
+      pull_listed<T, false>(lines, n, first, last, id, lines.image + in_pixel * lines.C, lever, pulls);
+    }
+    const bool beyond_p = (line - ps) * (line - os) < 0;
+    const T far_side = beyond_p ? line_height(ps, pt, os, ot, line) : line_height(qs, qt, os, ot, line);
+    const int64_t limit = to_index(d > 0 ? std::ceil(far_side) : std::floor(far_side), int64_t(-1), R);
+    const int64_t m_first = std::max<int64_t>(std::min(in, limit), 0), m_last = std::min(std::max(in, limit), R - 1);
+    const T* beyond = lines.image + lines.pixel(n, out) * lines.C;
+    pull_listed<T, true>(lines, n, before[m_first], before[m_last + 1], id, beyond, lever, pulls);
+  }
+  grad_p += sum_lanes(pulls.p);
+  grad_q += sum_lanes(pulls.q);
+}
+
+// The faces [first, last) among the visible ones.
+template <class T>
+NMR_INLINE void sweep_faces_body(const Lines<T>& lines, const T* vertices, const int64_t* faces, int64_t num_faces, int64_t first,
+                                 int64_t last, FaceGradients<T>& gradients) {
+  const T size = static_cast<T>(lines.R);
+  for (int64_t n = first; n < last; ++n) {
+    const int32_t id = gradients.ids[n];
+    const bool reversed = id >= num_faces;
+    const Triangle<T> t = load_triangle(vertices, faces + 3 * (reversed ? id - num_faces : id), reversed);
+    T s[3], u[3], grad[3] = {0, 0, 0};
+    for (int k = 0; k < 3; ++k) {
+      s[k] = to_pixel(lines.axis == 0 ? t.x[k] : t.y[k], size);
+      u[k] = to_pixel(lines.axis == 0 ? t.y[k] : t.x[k], size);
+    }
+    for (int p = 0; p < 3; ++p) {
+      const int q = (p + 1) % 3, o = (p + 2) % 3;
+      sweep_edge(lines, id, s[p], u[p], s[q], u[q], s[o], u[o], grad[p], grad[q]);
+    }
+    for (int k = 0; k < 3; ++k) gradients.values[9 * n + 3 * k + 1 - lines.axis] = grad[k];
+  }
+}
+
+#define NMR_DEFINE_SWEEPS(T)                                                                                         \
+  NMR_CLONES void list_tile(const Lines<T>& lines, int64_t first) { list_tile_body(lines, first); }                  \
+  NMR_CLONES void sweep_faces(const Lines<T>& lines, const T* vertices, const int64_t* faces, int64_t num_faces,     \
+                              int64_t first, int64_t last, FaceGradients<T>& gradients) {                            \
+    sweep_faces_body(lines, vertices, faces, num_faces, first, last, gradients);                                     \
+  }
+NMR_DEFINE_SWEEPS(float)
+NMR_DEFINE_SWEEPS(double)
+#undef NMR_DEFINE_SWEEPS
+
+// Columns [first[0], last[0]) and rows, from the bottom, [first[1], last[1]) that hold all covered pixels.
+NMR_INLINE void covered_box(const int32_t* owner, int64_t R, int64_t first[2], int64_t last[2]) {
+  first[0] = first[1] = R;
+  last[0] = last[1] = 0;
+  for (int64_t row = 0; row < R; ++row) {
+    int64_t i_first, i_last;
+    covered_range(owner + row * R, R, i_first, i_last);
+    if (i_first == i_last) continue;
+    first[0] = std::min(first[0], i_first);
+    last[0] = std::max(last[0], i_last);
+    first[1] = R - 1 - row;
+    last[1] = std::max(last[1], R - row);
+  }
+}
+
+template <class T>
+void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threads) {
+  const int64_t R = args.raster_size, C = args.channels, F = args.mesh.face_count(b);
+  const T* vertices = args.mesh.image_vertices(b);
+  const int64_t* faces = args.mesh.image_faces(b);
+  T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
+  std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));
+
+  EdgeScratch<T>& scratch = thread_scratch<EdgeScratch<T>>();
+  const int32_t* owner = args.owner + b * R * R;
+  VisibleFaces& visible = scratch.visible;
+  visible.reserve_for(F, std::min(2 * F, R * R));
+  visible.find(owner, R * R, F);
+  FaceGradients<T>& gradients = scratch.gradients;
+  gradients.count = visible.count - 1;
+  std::copy_n(visible.ids.data() + 1, gradients.count, reserve(gradients.ids, gradients.count));
+  std::fill_n(reserve(gradients.values, 9 * gradients.count), 9 * gradients.count, T(0));
+
+  int64_t first_line[2], last_line[2];
+  covered_box(owner, R, first_line, last_line);
+
+  // One axis after the other, in the same memory.
+  const int64_t stride = R + kLanes;
+  const T *image = args.image + b * R * R * C, *grad = args.grad_image + b * R * R * C;
+  reserve(scratch.lists.values, R * (1 + 2 * C) * stride);
+  reserve(scratch.lists.owner, R * stride);
+  reserve(scratch.lists.before, R * (R + 1));
+  for (int axis = 0; axis < 2 && gradients.count > 0; ++axis) {
+    const Lines<T> lines{R,     C,     stride, axis, first_line[axis], last_line[axis], args.eps,
+                         owner, image, grad,   &scratch.lists};
+    const int64_t tiles = (lines.last - lines.first + kTile - 1) / kTile;
+    parallel_for(tiles, num_threads, [&](int64_t tile) { list_tile(lines, lines.first + tile * kTile); });
+    parallel_for((gradients.count + kFaceChunk - 1) / kFaceChunk, num_threads, [&](int64_t chunk) {
+      const int64_t first = chunk * kFaceChunk;
+      sweep_faces(lines, vertices, faces, F, first, std::min(first + kFaceChunk, gradients.count), gradients);
+    });
+  }
+  scatter_face_gradients(gradients, faces, F, grad_vertices);
+}
+
+}  // namespace
+
+template <class T>
+void edges_backward(const EdgesBackward<T>& args) {
+  // Few images: all threads share the lines and the faces of one. Each face sums on its own, so the result is the same.
+  const bool share_images = args.mesh.batch < args.num_threads;
+  parallel_for(args.mesh.batch, share_images ? 1 : args.num_threads,
+               [&](int64_t b) { edges_backward_image(args, b, share_images ? args.num_threads : 1); });
+}
+
+template void resolve_forward(const Resolve<float>&);
+template void resolve_forward(const Resolve<double>&);
+template void resolve_backward(const Resolve<float>&);
+template void resolve_backward(const Resolve<double>&);
+template void edges_backward(const EdgesBackward<float>&);
+template void edges_backward(const EdgesBackward<double>&);
+
+}  // namespace nmr

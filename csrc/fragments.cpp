@@ -1,0 +1,416 @@
+// Barycentric weights and depth of the owner at each pixel. The owner map is given: at each of its pixels the owner's weights
+// and depth are computed again, by the same expressions as in the rasterizer.
+//
+// With w_k the normalised screen weights and q = sum_k w_k / z_k: depth z = 1 / q, perspective-correct weights b_k = z w_k / z_k.
+// Moving corner k by (dX, dY) pixels changes the weights at a fixed pixel by dw_m = -w_k (M_m0 dX + M_m1 dY), M as in geometry.h.
+#include <algorithm>
+#include <cmath>
+
+#include "blocks.h"
+#include "geometry.h"
+#include "parallel.h"
+#include "stages.h"
+
+namespace nmr {
+namespace {
+
+constexpr int64_t kLanes = 16;  // faces set up together
+constexpr int64_t kEntry = 16;  // numbers per face in the table: columns 0, 1, 2 of M and the depths, each padded to four
+
+// What is known of the covered pixels of one row, from the first one on. Written in whole vectors: rows are padded.
+template <class T>
+struct PixelRow {
+  T* raw;      // [R + kLanes, 8] clamped weights and depths of the corners, each padded to four
+  T *w[3], *z; // [R + kLanes] normalised weights, depth
+  T* spare;    // [R + kLanes] a row of the image
+};
+
+template <class T>
+struct FragmentScratch {
+  VisibleFaces visible;
+  std::vector<T> table;  // [visible, kEntry]
+  std::vector<T> row;    // [13, R + kLanes] PixelRow
+  std::vector<T> terms;  // [R, 12] what each pixel adds to its face
+  std::vector<T> sums;   // [visible, 12]
+
+  void reserve_for(int64_t num_faces, const RowBlocks& blocks) {
+    const int64_t most = blocks.most_visible(num_faces);
+    visible.reserve_for(num_faces, most);
+    reserve(table, (most + 1 + kLanes) * kEntry);
+    reserve(row, 13 * (blocks.raster_size + kLanes));
+  }
+  void reserve_for_backward(int64_t num_faces, const RowBlocks& blocks) {
+    reserve_for(num_faces, blocks);
+    reserve(terms, blocks.raster_size * 12);
+    reserve(sums, (blocks.most_visible(num_faces) + 1) * 12);
+  }
+  NMR_INLINE PixelRow<T> pixel_row(int64_t raster_size) {
+    const int64_t stride = raster_size + kLanes;
+    T* r = row.data();
+    return {r, {r + 8 * stride, r + 9 * stride, r + 10 * stride}, r + 11 * stride, r + 12 * stride};
+  }
+};
+
+// One block of rows of one image.
+template <class T>
+struct Block {
+  const T* vertices;
+  const int64_t* faces;
+  int64_t num_faces, raster_size;
+  const int32_t* owner;  // [R, R], row 0 = top
+  int64_t first, last;   // rows
+};
+
+template <class T>
+Block<T> make_block(const MeshBatch<T>& mesh, const int32_t* owner, const RowBlocks& blocks, int64_t b, int64_t block) {
+  const int64_t R = blocks.raster_size;
+  return {mesh.image_vertices(b), mesh.image_faces(b),  mesh.face_count(b), R,
+          owner + b * R * R,      blocks.first(block), blocks.last(block)};
+}
+
+// The table of the block's visible faces; entry 0 (background) has weights (1, 0, 0) and depth 1.
+template <class T>
+NMR_INLINE void set_up_faces(const Block<T>& block, FragmentScratch<T>& scratch) {
+  VisibleFaces& visible = scratch.visible;
+  visible.find(block.owner + block.first * block.raster_size, (block.last - block.first) * block.raster_size, block.num_faces);
+  T* table = scratch.table.data();
+  const T size = static_cast<T>(block.raster_size);
+  T corner[9][kLanes], matrix[9][kLanes];
+  for (int64_t start = 0; start < visible.count; start += kLanes) {
+    const int64_t lanes = std::min(kLanes, visible.count - start);
+    for (int64_t n = 0; n < kLanes; ++n) {
+      const int32_t id = n < lanes ? visible.ids[start + n] : -1;
+      const bool reversed = id >= block.num_faces;
+      const int64_t* face = block.faces + 3 * (reversed ? id - block.num_faces : id);
+      const Triangle<T> t = id < 0 ? Triangle<T>{{0, 1, 0}, {0, 0, 1}, {1, 1, 1}} : load_triangle(block.vertices, face, reversed);
+      for (int k = 0; k < 3; ++k) {
+        corner[k][n] = t.x[k];
+        corner[3 + k][n] = t.y[k];
+        corner[6 + k][n] = t.z[k];
+      }
+    }
+    for (int64_t n = 0; n < kLanes; ++n) {
+      const Triangle<T> t{{corner[0][n], corner[1][n], corner[2][n]}, {corner[3][n], corner[4][n], corner[5][n]}, {1, 1, 1}};
+      const BarycentricMatrix<T> m = barycentric_matrix(t, size);
+      for (int k = 0; k < 3; ++k)
+        for (int c = 0; c < 3; ++c) matrix[3 * c + k][n] = m.m[k][c];
+    }
+    for (int64_t n = 0; n < lanes; ++n) {
+      T* entry = table + (start + n) * kEntry;
+      for (int k = 0; k < 3; ++k) {
+        for (int c = 0; c < 3; ++c) entry[4 * c + k] = matrix[3 * c + k][n];
+        entry[12 + k] = corner[6 + k][n];
+      }
+      for (int c = 0; c < 3; ++c) entry[4 * c + 3] = 0;
+      entry[15] = 1;
+    }
+  }
+  for (int64_t n = 0; n < kEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);
+}
+
+// Weights and depth of the pixels [first, last) of raster row j (from the top).
+template <class T>
+NMR_INLINE void evaluate_row(const Block<T>& block, int64_t j, int64_t first, int64_t last, const FragmentScratch<T>& scratch,
+                             const PixelRow<T>& row) {
+  const int64_t R = block.raster_size;
+  const int32_t* owner = block.owner + j * R;
+  const int32_t* slots = scratch.visible.slots.data() + 1;
+  const T* table = scratch.table.data();
+  const T y = static_cast<T>(R - 1 - j);
+  T* raw = row.raw;
+  for (int64_t i = first; i < last; ++i, raw += 8) {
+    const T* entry = table + slots[owner[i]] * kEntry;
+    const T x = static_cast<T>(i);
+    T pixel[8];  // local, so that the compiler may use vectors of four without a fear of overlaps
+    for (int k = 0; k < 4; ++k) pixel[k] = clamp_weight(entry[k] * x + entry[4 + k] * y + entry[8 + k]);
+    for (int k = 0; k < 4; ++k) pixel[4 + k] = entry[12 + k];
+    for (int k = 0; k < 8; ++k) raw[k] = pixel[k];
+  }
+  raw = row.raw;
+  for (int64_t start = 0; start < last - first; start += kLanes, raw += 8 * kLanes) {
+    T w[3][kLanes], z[kLanes];
+    for (int64_t n = 0; n < kLanes; ++n) {
+      const T sum = raw[8 * n] + raw[8 * n + 1] + raw[8 * n + 2];
+      w[0][n] = raw[8 * n] / sum;
+      w[1][n] = raw[8 * n + 1] / sum;
+      w[2][n] = raw[8 * n + 2] / sum;
+      z[n] = 1 / (w[0][n] / raw[8 * n + 4] + w[1][n] / raw[8 * n + 5] + w[2][n] / raw[8 * n + 6]);
+    }
+    for (int k = 0; k < 3; ++k) std::copy_n(w[k], kLanes, row.w[k] + start);
+    std::copy_n(z, kLanes, row.z + start);
+  }
+}
+
+// --- forward
+
+template <class T>
+NMR_INLINE void depth_block_body(const DepthImage<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch) {
+  const int64_t R = block.raster_size, S = args.image_size;
+  set_up_faces(block, scratch);
+  T* image = args.depth + b * S * S;
+  const PixelRow<T> row = scratch.pixel_row(R);
+  for (int64_t j = block.first; j < block.last; ++j) {
+    const int32_t* owner = block.owner + j * R;
+    int64_t first, last;
+    covered_range(owner, R, first, last);
+    evaluate_row(block, j, first, last, scratch, row);
+    T* out = args.anti_aliasing ? row.spare : image + j * S;
+    std::fill_n(out, first, args.far);
+    for (int64_t i = first; i < last; ++i) out[i] = owner[i] < 0 ? args.far : row.z[i - first];
+    std::fill_n(out + last, R - last, args.far);
+    if (!args.anti_aliasing) continue;
+    T* mean = image + j / 2 * S;
+    if (j % 2 == 0)
+      for (int64_t i = 0; i < S; ++i) mean[i] = out[2 * i] + out[2 * i + 1];
+    else
+      for (int64_t i = 0; i < S; ++i) mean[i] = (mean[i] + out[2 * i] + out[2 * i + 1]) / 4;
+  }
+}
+
+template <class T>
+NMR_INLINE void fragments_block_body(const Fragments<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch) {
+  const int64_t R = block.raster_size;
+  set_up_faces(block, scratch);
+  const PixelRow<T> row = scratch.pixel_row(R);
+  for (int64_t j = block.first; j < block.last; ++j) {
+    const int32_t* owner = block.owner + j * R;
+    T* depth = args.depth + (b * R + j) * R;
+    T* weights = args.weights + 3 * (b * R + j) * R;
+    int64_t first, last;
+    covered_range(owner, R, first, last);
+    evaluate_row(block, j, first, last, scratch, row);
+    std::fill_n(depth, R, args.far);
+    std::fill_n(weights, 3 * R, T(0));
+    depth += first;
+    weights += 3 * first;
+    owner += first;
+    for (int64_t n = 0; n < last - first; ++n) {
+      const T *z = row.z, *corner_z = row.raw + 8 * n + 4;
+      const T b0 = row.w[0][n] * z[n] / corner_z[0], b1 = row.w[1][n] * z[n] / corner_z[1], b2 = row.w[2][n] * z[n] / corner_z[2];
+      const bool drawn = owner[n] >= 0, reversed = owner[n] >= block.num_faces;
+      depth[n] = drawn ? z[n] : args.far;
+      weights[3 * n] = drawn ? (reversed ? b2 : b0) : T(0);
+      weights[3 * n + 1] = drawn ? b1 : T(0);
+      weights[3 * n + 2] = drawn ? (reversed ? b0 : b2) : T(0);
+    }
+  }
+}
+
+// --- backward
+
+// dq/d(X, Y, z) of a face's corners, but for the weight of the pixel: 1 / z_m^2, and M_m / z_m for one m. What overflows is 0: a
+// face whose corner lies in the plane of the eye gives no gradient there instead of spoiling its other vertices.
+template <class T>
+NMR_INLINE T finite_or_zero(T value) {
+  return std::isfinite(value) ? value : T(0);
+}
+
+// grad z_k = S_k / z_k^2, grad X_k = S_k sum_m M_m0 / z_m with S_k = sum over pixels of g z^2 w_k.
+template <class T>
+NMR_INLINE void depth_gradients(const FragmentScratch<T>& scratch, int64_t raster_size, FaceGradients<T>& result) {
+  const T half = static_cast<T>(raster_size) / 2;
+  T* out = result.values.data();
+  result.count = scratch.visible.count - 1;
+  for (int64_t n = 1; n <= result.count; ++n, out += 9) {
+    const T *entry = scratch.table.data() + n * kEntry, *sum = scratch.sums.data() + 4 * n;
+    result.ids[n - 1] = scratch.visible.ids[n];
+    const T *mx = entry, *my = entry + 4, *z = entry + 12;
+    const T slope_x = finite_or_zero(mx[0] / z[0] + mx[1] / z[1] + mx[2] / z[2]) * half;
+    const T slope_y = finite_or_zero(my[0] / z[0] + my[1] / z[1] + my[2] / z[2]) * half;
+    for (int k = 0; k < 3; ++k) {
+      out[3 * k] = sum[k] * slope_x;
+      out[3 * k + 1] = sum[k] * slope_y;
+      out[3 * k + 2] = sum[k] * finite_or_zero(1 / (z[k] * z[k]));
+    }
+  }
+}
+
+template <class T>
+NMR_INLINE void depth_gradient_block_body(const DepthImage<T>& args, const Block<T>& block, int64_t b,
+                                          FragmentScratch<T>& scratch, FaceGradients<T>& result) {
+  const int64_t R = block.raster_size, S = args.image_size;
+  set_up_faces(block, scratch);
+  const PixelRow<T> row = scratch.pixel_row(R);
+  T *grad = row.spare, *terms = scratch.terms.data(), *sums = scratch.sums.data();
+  const int32_t* slots = scratch.visible.slots.data() + 1;
+  std::fill_n(sums, 4 * scratch.visible.count, T(0));
+  for (int64_t j = block.first; j < block.last; ++j) {
+    const int32_t* owner = block.owner + j * R;
+    int64_t first, last;
+    covered_range(owner, R, first, last);
+    if (first == last) continue;
+    evaluate_row(block, j, first, last, scratch, row);
+    if (args.anti_aliasing) {
+      const T* quarter = args.grad_depth + (b * S + j / 2) * S;
+      for (int64_t i = 0; i < S; ++i) grad[2 * i] = grad[2 * i + 1] = quarter[i] / 4;
+    } else {
+      std::copy_n(args.grad_depth + (b * S + j) * S, S, grad);
+    }
+    for (int64_t n = 0; n < last - first; ++n) {
+      const T c = grad[first + n] * row.z[n] * row.z[n];
+      for (int k = 0; k < 3; ++k) terms[4 * n + k] = c * row.w[k][n];
+      terms[4 * n + 3] = 0;
+    }
+    const T* term = terms;
+    for (int64_t i = first; i < last; ++i, term += 4) {
+      T* sum = sums + 4 * slots[owner[i]];
+      for (int k = 0; k < 4; ++k) sum[k] += term[k];
+    }
+  }
+  depth_gradients(scratch, R, result);
+}
+
+// With u_m = dL/db_m, g = dL/dz and h_m = z (u_m - sum_k u_k b_k) - g z^2:  dL = sum_m h_m d(w_m / z_m), so that
+// grad z_m = -H_mm / z_m^2 and grad X_k = -sum_m H_mk M_m0 / z_m with H_mk = sum over pixels of h_m w_k.
+template <class T>
+NMR_INLINE void fragment_gradients(const FragmentScratch<T>& scratch, int64_t raster_size, FaceGradients<T>& result) {
+  const T half = static_cast<T>(raster_size) / 2;
+  T* out = result.values.data();
+  result.count = scratch.visible.count - 1;
+  for (int64_t n = 1; n <= result.count; ++n, out += 9) {
+    const T *entry = scratch.table.data() + n * kEntry, *sum = scratch.sums.data() + 12 * n, *z = entry + 12;
+    result.ids[n - 1] = scratch.visible.ids[n];
+    T slope_x[3], slope_y[3];
+    for (int m = 0; m < 3; ++m) {
+      slope_x[m] = finite_or_zero(entry[m] / z[m]) * half;
+      slope_y[m] = finite_or_zero(entry[4 + m] / z[m]) * half;
+    }
+    for (int k = 0; k < 3; ++k) {
+      out[3 * k] = -(sum[k] * slope_x[0] + sum[4 + k] * slope_x[1] + sum[8 + k] * slope_x[2]);
+      out[3 * k + 1] = -(sum[k] * slope_y[0] + sum[4 + k] * slope_y[1] + sum[8 + k] * slope_y[2]);
+      out[3 * k + 2] = -sum[5 * k] * finite_or_zero(1 / (z[k] * z[k]));
+    }
+  }
+}
+
+template <class T>
+NMR_INLINE void fragments_gradient_block_body(const Fragments<T>& args, const Block<T>& block, int64_t b,
+                                              FragmentScratch<T>& scratch, FaceGradients<T>& result) {
+  const int64_t R = block.raster_size;
+  set_up_faces(block, scratch);
+  const PixelRow<T> row = scratch.pixel_row(R);
+  T *sums = scratch.sums.data(), *terms = scratch.terms.data();
+  const int32_t* slots = scratch.visible.slots.data() + 1;
+  std::fill_n(sums, 12 * scratch.visible.count, T(0));
+  for (int64_t j = block.first; j < block.last; ++j) {
+    const int32_t* owner = block.owner + j * R;
+    int64_t first, last;
+    covered_range(owner, R, first, last);
+    if (first == last) continue;
+    evaluate_row(block, j, first, last, scratch, row);
+    const T* grad_depth = args.grad_depth ? args.grad_depth + (b * R + j) * R : nullptr;
+    const T* grad_weights = args.grad_weights ? args.grad_weights + 3 * (b * R + j) * R : nullptr;
+    for (int64_t n = 0; n < last - first; ++n) {
+      const int64_t i = first + n;
+      const T w[4] = {row.w[0][n], row.w[1][n], row.w[2][n], 0}, z = row.z[n];
+      T h[3];
+      const T pull = grad_depth ? -grad_depth[i] * z * z : T(0);
+      for (int m = 0; m < 3; ++m) h[m] = pull;
+      if (grad_weights) {
+        const bool reversed = owner[i] >= block.num_faces;
+        T u[3], mean = 0;
+        for (int m = 0; m < 3; ++m) {
+          u[m] = grad_weights[3 * i + (reversed ? 2 - m : m)];
+          mean += u[m] * (w[m] * z / row.raw[8 * n + 4 + m]);
+        }
+        for (int m = 0; m < 3; ++m) h[m] += z * (u[m] - mean);
+      }
+      for (int m = 0; m < 3; ++m)
+        for (int k = 0; k < 4; ++k) terms[12 * n + 4 * m + k] = h[m] * w[k];
+    }
+    const T* term = terms;
+    for (int64_t i = first; i < last; ++i, term += 12) {
+      T* sum = sums + 12 * slots[owner[i]];
+      for (int k = 0; k < 12; ++k) sum[k] += term[k];
+    }
+  }
+  fragment_gradients(scratch, R, result);
+}
+
+#define NMR_DEFINE_BLOCKS(T)                                                                                              \
+  NMR_CLONES void forward_block(const DepthImage<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch) { \
+    depth_block_body(args, block, b, scratch);                                                                            \
+  }                                                                                                                       \
+  NMR_CLONES void forward_block(const Fragments<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch) { \
+    fragments_block_body(args, block, b, scratch);                                                                        \
+  }                                                                                                                       \
+  NMR_CLONES void backward_block(const DepthImage<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch, \
+                                 FaceGradients<T>& result) {                                                              \
+    depth_gradient_block_body(args, block, b, scratch, result);                                                           \
+  }                                                                                                                       \
+  NMR_CLONES void backward_block(const Fragments<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch,  \
+                                 FaceGradients<T>& result) {                                                              \
+    fragments_gradient_block_body(args, block, b, scratch, result);                                                       \
+  }
+NMR_DEFINE_BLOCKS(float)
+NMR_DEFINE_BLOCKS(double)
+#undef NMR_DEFINE_BLOCKS
+
+// Blocks of an image are cut by its own number of faces, so that an image does not depend on its neighbours in a packed batch.
+template <class Args, class T = std::remove_pointer_t<decltype(Args::depth)>>
+void forward(const Args& args, int64_t R) {
+  const MeshBatch<T>& mesh = args.mesh;
+  int64_t most_blocks = 1;
+  for (int64_t b = 0; b < mesh.batch; ++b) most_blocks = std::max(most_blocks, RowBlocks(R, mesh.face_count(b)).count);
+  parallel_for(mesh.batch * most_blocks, args.num_threads, [&](int64_t task) {
+    const int64_t b = task / most_blocks, block = task % most_blocks, F = mesh.face_count(b);
+    const RowBlocks blocks(R, F);
+    if (block >= blocks.count) return;
+    FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
+    scratch.reserve_for(F, blocks);
+    forward_block(args, make_block(mesh, args.owner, blocks, b, block), b, scratch);
+  });
+}
+
+template <class Args, class T = std::remove_pointer_t<decltype(Args::grad_vertices)>>
+void backward(const Args& args, int64_t R) {
+  const MeshBatch<T>& mesh = args.mesh;
+  std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
+  sum_blocks<FaceGradients<T>>(
+      mesh.batch, false, args.num_threads, [&](int64_t b) { return RowBlocks(R, mesh.face_count(b)).count; },
+      [&](int64_t b, int64_t block, FaceGradients<T>& result) {
+        const int64_t F = mesh.face_count(b);
+        const RowBlocks blocks(R, F);
+        FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
+        scratch.reserve_for_backward(F, blocks);
+        reserve(result.ids, blocks.most_visible(F));
+        reserve(result.values, 9 * blocks.most_visible(F));
+        backward_block(args, make_block(mesh, args.owner, blocks, b, block), b, scratch, result);
+      },
+      [&](int64_t b, const FaceGradients<T>& result) {
+        scatter_face_gradients(result, mesh.image_faces(b), mesh.face_count(b), args.grad_vertices + 3 * mesh.vertex_start(b));
+      });
+}
+
+}  // namespace
+
+template <class T>
+void fragments_forward(const Fragments<T>& args) {
+  forward(args, args.raster_size);
+}
+
+template <class T>
+void fragments_backward(const Fragments<T>& args) {
+  backward(args, args.raster_size);
+}
+
+template <class T>
+void depth_forward(const DepthImage<T>& args) {
+  forward(args, args.anti_aliasing ? 2 * args.image_size : args.image_size);
+}
+
+template <class T>
+void depth_backward(const DepthImage<T>& args) {
+  backward(args, args.anti_aliasing ? 2 * args.image_size : args.image_size);
+}
+
+template void fragments_forward(const Fragments<float>&);
+template void fragments_forward(const Fragments<double>&);
+template void fragments_backward(const Fragments<float>&);
+template void fragments_backward(const Fragments<double>&);
+template void depth_forward(const DepthImage<float>&);
+template void depth_forward(const DepthImage<double>&);
+template void depth_backward(const DepthImage<float>&);
+template void depth_backward(const DepthImage<double>&);
+
+}  // namespace nmr

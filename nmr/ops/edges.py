@@ -1,0 +1,105 @@
+"""Operators: from raster pixels to image pixels, with NMR's gradient of the edges."""
+
+# No `from __future__ import annotations` here: torch 2.4 reads the operators' types from the annotations themselves.
+from typing import Optional
+
+import torch
+from torch import Tensor
+
+from ._host import _C, host_array, no_second_derivative, num_threads
+
+
+def _image_shape(image, anti_aliasing) -> tuple[int, int, int, int]:
+    image_size = image.shape[1] // (2 if anti_aliasing else 1)
+    return image.shape[0], image_size, image_size, image.shape[3]
+
+
+# --- resolve
+
+
+@torch.library.custom_op("nmr::resolve", mutates_args=())
+def resolve(
+    image: Tensor,
+    vertices: Tensor,
+    faces: Tensor,
+    starts: Optional[Tensor],  # noqa: UP045
+    owner: Tensor,
+    anti_aliasing: bool,
+    eps: float,
+) -> Tensor:
+    """The image ``[B, S, S, C]`` of raster pixels ``[B, R, R, C]``: the mean of 2x2 with anti-aliasing, else a copy.
+
+    Its gradient in ``image`` is the mean's; that in x and y of ``vertices`` is NMR's, of all C channels together.
+    """
+    resolved = torch.empty(_image_shape(image, anti_aliasing), dtype=image.dtype)
+    _C.resolve_forward(host_array(image), resolved.numpy(), anti_aliasing, num_threads())
+    return resolved.to(image.device)
+
+
+@resolve.register_fake
+def _(image, vertices, faces, starts, owner, anti_aliasing, eps):
+    return image.new_empty(_image_shape(image, anti_aliasing))
+
+
+def _resolve_setup(ctx, inputs, output):
+    image, vertices, faces, starts, owner, anti_aliasing, eps = inputs
+    ctx.save_for_backward(image, vertices, faces, starts, owner)
+    ctx.settings = anti_aliasing, eps
+
+
+def _resolve_backward(ctx, grad_resolved):
+    image, vertices, faces, starts, owner = ctx.saved_tensors
+    anti_aliasing, eps = ctx.settings
+    grad_image = resolve_backward(grad_resolved, anti_aliasing)
+    grad_vertices = None
+    if ctx.needs_input_grad[1]:
+        grad_vertices = edges_backward(vertices, faces, starts, owner, image, grad_image, eps)
+    return grad_image, grad_vertices, None, None, None, None, None
+
+
+resolve.register_autograd(_resolve_backward, setup_context=_resolve_setup)
+
+
+@torch.library.custom_op("nmr::resolve_backward", mutates_args=())
+def resolve_backward(grad_resolved: Tensor, anti_aliasing: bool) -> Tensor:
+    """Gradient ``[B, R, R, C]`` of the mean in :func:`resolve`."""
+    batch, size, _, channels = grad_resolved.shape
+    raster_size = size * (2 if anti_aliasing else 1)
+    grad_image = torch.empty((batch, raster_size, raster_size, channels), dtype=grad_resolved.dtype)
+    _C.resolve_backward(host_array(grad_resolved), grad_image.numpy(), anti_aliasing, num_threads())
+    return grad_image.to(grad_resolved.device)
+
+
+@resolve_backward.register_fake
+def _(grad_resolved, anti_aliasing):
+    batch, size, _, channels = grad_resolved.shape
+    raster_size = size * (2 if anti_aliasing else 1)
+    return grad_resolved.new_empty((batch, raster_size, raster_size, channels))
+
+
+resolve_backward.register_autograd(no_second_derivative("render"))
+
+
+@torch.library.custom_op("nmr::edges_backward", mutates_args=())
+def edges_backward(
+    vertices: Tensor,
+    faces: Tensor,
+    starts: Optional[Tensor],  # noqa: UP045
+    owner: Tensor,
+    image: Tensor,
+    grad_image: Tensor,
+    eps: float,
+) -> Tensor:
+    """NMR's gradient of raster pixels ``[B, R, R, C]``, per vertex, of the shape of ``vertices``; zero in z."""
+    grad_vertices = torch.empty(vertices.shape, dtype=vertices.dtype)
+    arrays = vertices, faces, starts, owner, image, grad_image
+    _C.edges_backward(*map(host_array, arrays), grad_vertices.numpy(), eps, num_threads())
+    return grad_vertices.to(vertices.device)
+
+
+@edges_backward.register_fake
+def _(vertices, faces, starts, owner, image, grad_image, eps):
+    return vertices.new_empty(vertices.shape)
+
+
+edges_backward.register_autograd(no_second_derivative("render"))
