@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "parallel.h"
@@ -57,17 +58,49 @@ struct VisibleFaces {
   }
 };
 
-// produce(i, results[.]) for all i in [0, count), some at a time on several threads; then consume(i, result) one after the
-// other in ascending order of i.
-template <class Result, class Produce, class Consume>
-void produce_in_order(int64_t count, int num_threads, std::vector<Result>& results, const Produce& produce, const Consume& consume) {
-  const int64_t wave = std::min<int64_t>(count, num_threads <= 1 ? 1 : 4 * static_cast<int64_t>(num_threads));
-  if (static_cast<int64_t>(results.size()) < wave) results.resize(wave);
-  for (int64_t first = 0; first < count; first += wave) {
-    const int64_t size = std::min(wave, count - first);
-    parallel_for(size, num_threads, [&](int64_t n) { produce(first + n, results[n]); });
-    for (int64_t n = 0; n < size; ++n) consume(first + n, results[n]);
+// First and one past the last covered pixel of a row; equal if there is none.
+NMR_INLINE void covered_range(const int32_t* owner, int64_t R, int64_t& first, int64_t& last) {
+  first = 0;
+  last = R;
+  while (first < R && owner[first] < 0) ++first;
+  while (last > first && owner[last - 1] < 0) --last;
+}
+
+// Calls produce(b, block, result) for every block of every image, on several threads, and consume(b, result) for each of them:
+// those that add to the same output one after the other in ascending order of (b, block). Images add to outputs of their own,
+// unless they share them. block_count(b) is the number of blocks of image b.
+template <class Result, class BlockCount, class Produce, class Consume>
+void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& block_count, const Produce& produce,
+                const Consume& consume) {
+  if (!shared && batch >= num_threads) {
+    parallel_for(batch, num_threads, [&](int64_t b) {
+      Result& result = thread_scratch<Result>();
+      for (int64_t block = 0; block < block_count(b); ++block) {
+        produce(b, block, result);
+        consume(b, result);
+      }
+    });
+    return;
   }
+  // Some blocks at a time are produced, by all threads together, and then consumed in order.
+  std::vector<Result>& results = thread_scratch<std::vector<Result>>();
+  std::vector<std::pair<int64_t, int64_t>>& tasks = thread_scratch<std::vector<std::pair<int64_t, int64_t>>>();
+  tasks.clear();
+  const auto flush = [&] {
+    if (results.size() < tasks.size()) results.resize(tasks.size());
+    parallel_for(static_cast<int64_t>(tasks.size()), num_threads,
+                 [&](int64_t n) { produce(tasks[n].first, tasks[n].second, results[n]); });
+    for (size_t n = 0; n < tasks.size(); ++n) consume(tasks[n].first, results[n]);
+    tasks.clear();
+  };
+  const size_t wave = num_threads <= 1 ? 1 : 4 * static_cast<size_t>(num_threads);
+  for (int64_t b = 0; b < batch; ++b) {
+    for (int64_t block = 0; block < block_count(b); ++block) {
+      tasks.emplace_back(b, block);
+      if (tasks.size() == wave) flush();
+    }
+  }
+  flush();
 }
 
 // Gradients per visible face of a block, in the vertex order in which the face is drawn.

@@ -1,7 +1,7 @@
 // NMR's gradient of an image of any channels: for every edge of a visible face and every raster line that crosses it, with c the
 // crossing, `in` the pixel just inside and `out` the one just outside,
-//   outside: if the face owns `in`, each pixel m from `out` to the border would change by I(in) - I(m) if the edge moved out to it;
-//   inside:  each own pixel m would change by I(out) - I(m) if the edge moved in past it.
+//   outside: if the face owns `in`, each pixel m from `out` to the border would become I(in) if the edge moved out to it;
+//   inside:  each own pixel m would become I(out) if the edge moved in past it.
 // Where that lowers the loss, D = sum over channels of (I(m) - I(in or out)) g(m) > 0, both ends of the edge are pulled by
 // D / (distance they must travel). Lines of constant x (axis 0) move y, lines of constant y (axis 1) move x.
 #include <algorithm>
@@ -67,12 +67,13 @@ struct EdgeScratch {
   FaceGradients<T> gradients;
 };
 
-// What the sweeps along one axis read of one image. Pixel m of line n is column n, row m from the bottom for axis 0, and column m,
-// row n from the bottom for axis 1.
+// What the sweeps along one axis read of one image. Pixel m of line n is column n, row m from the bottom for axis 0, and
+// column m, row n from the bottom for axis 1.
 template <class T>
 struct Lines {
   int64_t R, C, stride;
   int axis;
+  int64_t first, last;     // lines with a covered pixel lie in [first, last); no other line pulls
   T eps;
   const int32_t* owner;    // [R, R], row 0 = top
   const T *image, *grad;   // [R, R, C]
@@ -81,34 +82,46 @@ struct Lines {
   NMR_INLINE int64_t pixel(int64_t n, int64_t m) const { return axis == 0 ? (R - 1 - m) * R + n : (R - 1 - n) * R + m; }
 };
 
-template <class T>
-NMR_INLINE void list_pixel(const Lines<T>& lines, int64_t n, int64_t m) {
-  const int64_t C = lines.C, pixel = lines.pixel(n, m);
-  int32_t* before = lines.lists->before.data() + n * (lines.R + 1) + m;
-  const int32_t count = before[0];
-  T* out = lines.lists->values.data() + n * (1 + 2 * C) * lines.stride + count;
+// Lists pixel m of line n, if it can pull, as number `count` of its line.
+template <int64_t kChannels, class T>
+NMR_INLINE void list_pixel(const Lines<T>& lines, int64_t n, int64_t m, int32_t& count) {
+  const int64_t C = kChannels ? kChannels : lines.C, stride = lines.stride, pixel = lines.pixel(n, m);
   const T *image = lines.image + pixel * C, *grad = lines.grad + pixel * C;
-  bool pulls = false;
-  for (int64_t c = 0; c < C; ++c) {
-    pulls |= grad[c] != 0;
-    out[(1 + c) * lines.stride] = image[c];
-    out[(1 + C + c) * lines.stride] = grad[c];
-  }
+  T* out = lines.lists->values.data() + n * (1 + 2 * C) * stride + count;
+  T magnitude = 0;
   out[0] = static_cast<T>(m);
-  lines.lists->owner[n * lines.stride + count] = lines.owner[pixel];
-  before[1] = count + pulls;
+  for (int64_t c = 0; c < C; ++c) {
+    magnitude += std::abs(grad[c]);
+    out[(1 + c) * stride] = image[c];
+    out[(1 + C + c) * stride] = grad[c];
+  }
+  lines.lists->owner[n * stride + count] = lines.owner[pixel];
+  count += magnitude != 0;
+  lines.lists->before[n * (lines.R + 1) + m + 1] = count;
+}
+
+// kChannels is the number of channels, or 0 if it is not known beforehand.
+template <int64_t kChannels, class T>
+NMR_INLINE void list_lines(const Lines<T>& lines, int64_t first) {
+  const int64_t R = lines.R, last = std::min(first + kTile, lines.last);
+  int32_t count[kTile] = {};
+  for (int64_t n = first; n < last; ++n) lines.lists->before[n * (R + 1)] = 0;
+  if (lines.axis == 0) {  // a tile of columns, row by row
+    for (int64_t m = 0; m < R; ++m)
+      for (int64_t n = first; n < last; ++n) list_pixel<kChannels>(lines, n, m, count[n - first]);
+  } else {
+    for (int64_t n = first; n < last; ++n)
+      for (int64_t m = 0; m < R; ++m) list_pixel<kChannels>(lines, n, m, count[n - first]);
+  }
 }
 
 template <class T>
 NMR_INLINE void list_tile_body(const Lines<T>& lines, int64_t first) {
-  const int64_t R = lines.R, last = std::min(first + kTile, R);
-  for (int64_t n = first; n < last; ++n) lines.lists->before[n * (R + 1)] = 0;
-  if (lines.axis == 0) {  // a tile of columns, row by row
-    for (int64_t m = 0; m < R; ++m)
-      for (int64_t n = first; n < last; ++n) list_pixel(lines, n, m);
-  } else {
-    for (int64_t n = first; n < last; ++n)
-      for (int64_t m = 0; m < R; ++m) list_pixel(lines, n, m);
+  switch (lines.C) {
+    case 1: return list_lines<1>(lines, first);
+    case 3: return list_lines<3>(lines, first);
+    case 4: return list_lines<4>(lines, first);
+    default: return list_lines<0>(lines, first);
   }
 }
 
@@ -184,9 +197,9 @@ NMR_INLINE void sweep_edge(const Lines<T>& lines, int32_t id, T ps, T pt, T qs, 
   const int64_t d = ((ps < qs) == (lines.axis == 0)) ? -1 : 1;  // outward
   const T low = std::max(std::min(ps, qs), T(0)), high = std::min(std::max(ps, qs), top);
   if (!(low <= top)) return;
-  const int64_t n_first = static_cast<int64_t>(std::ceil(low));
+  const int64_t n_first = std::max(static_cast<int64_t>(std::ceil(low)), lines.first);
   // Truncation towards zero, as published: an edge that ends in (-1, 0) is extrapolated onto line 0.
-  const int64_t n_last = high > -1 ? static_cast<int64_t>(high) : -1;
+  const int64_t n_last = std::min(high > -1 ? static_cast<int64_t>(high) : -1, lines.last - 1);
   if (n_first > n_last) return;
   const T slope = (qt - pt) / (qs - ps);
   Pulls<T> pulls;
@@ -218,7 +231,8 @@ NMR_INLINE void sweep_edge(const Lines<T>& lines, int32_t id, T ps, T pt, T qs, 
     const T far_side = beyond_p ? line_height(ps, pt, os, ot, line) : line_height(qs, qt, os, ot, line);
     const int64_t limit = to_index(d > 0 ? std::ceil(far_side) : std::floor(far_side), int64_t(-1), R);
     const int64_t m_first = std::max<int64_t>(std::min(in, limit), 0), m_last = std::min(std::max(in, limit), R - 1);
-    pull_listed<T, true>(lines, n, before[m_first], before[m_last + 1], id, lines.image + lines.pixel(n, out) * lines.C, lever, pulls);
+    const T* beyond = lines.image + lines.pixel(n, out) * lines.C;
+    pull_listed<T, true>(lines, n, before[m_first], before[m_last + 1], id, beyond, lever, pulls);
   }
   grad_p += sum_lanes(pulls.p);
   grad_q += sum_lanes(pulls.q);
@@ -246,15 +260,30 @@ NMR_INLINE void sweep_faces_body(const Lines<T>& lines, const T* vertices, const
   }
 }
 
-#define NMR_DEFINE_SWEEPS(T)                                                                                                       \
-  NMR_CLONES void list_tile(const Lines<T>& lines, int64_t first) { list_tile_body(lines, first); }                                \
-  NMR_CLONES void sweep_faces(const Lines<T>& lines, const T* vertices, const int64_t* faces, int64_t num_faces, int64_t first,    \
-                              int64_t last, FaceGradients<T>& gradients) {                                                         \
-    sweep_faces_body(lines, vertices, faces, num_faces, first, last, gradients);                                                   \
+#define NMR_DEFINE_SWEEPS(T)                                                                                         \
+  NMR_CLONES void list_tile(const Lines<T>& lines, int64_t first) { list_tile_body(lines, first); }                  \
+  NMR_CLONES void sweep_faces(const Lines<T>& lines, const T* vertices, const int64_t* faces, int64_t num_faces,     \
+                              int64_t first, int64_t last, FaceGradients<T>& gradients) {                            \
+    sweep_faces_body(lines, vertices, faces, num_faces, first, last, gradients);                                     \
   }
 NMR_DEFINE_SWEEPS(float)
 NMR_DEFINE_SWEEPS(double)
 #undef NMR_DEFINE_SWEEPS
+
+// Columns [first[0], last[0]) and rows, from the bottom, [first[1], last[1]) that hold all covered pixels.
+NMR_INLINE void covered_box(const int32_t* owner, int64_t R, int64_t first[2], int64_t last[2]) {
+  first[0] = first[1] = R;
+  last[0] = last[1] = 0;
+  for (int64_t row = 0; row < R; ++row) {
+    int64_t i_first, i_last;
+    covered_range(owner + row * R, R, i_first, i_last);
+    if (i_first == i_last) continue;
+    first[0] = std::min(first[0], i_first);
+    last[0] = std::max(last[0], i_last);
+    first[1] = R - 1 - row;
+    last[1] = std::max(last[1], R - row);
+  }
+}
 
 template <class T>
 void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threads) {
@@ -274,14 +303,20 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
   std::copy_n(visible.ids.data() + 1, gradients.count, reserve(gradients.ids, gradients.count));
   std::fill_n(reserve(gradients.values, 9 * gradients.count), 9 * gradients.count, T(0));
 
+  int64_t first_line[2], last_line[2];
+  covered_box(owner, R, first_line, last_line);
+
   // One axis after the other, in the same memory.
   const int64_t stride = R + kLanes;
+  const T *image = args.image + b * R * R * C, *grad = args.grad_image + b * R * R * C;
   reserve(scratch.lists.values, R * (1 + 2 * C) * stride);
   reserve(scratch.lists.owner, R * stride);
   reserve(scratch.lists.before, R * (R + 1));
   for (int axis = 0; axis < 2 && gradients.count > 0; ++axis) {
-    const Lines<T> lines{R, C, stride, axis, args.eps, owner, args.image + b * R * R * C, args.grad_image + b * R * R * C, &scratch.lists};
-    parallel_for((R + kTile - 1) / kTile, num_threads, [&](int64_t tile) { list_tile(lines, tile * kTile); });
+    const Lines<T> lines{R,     C,     stride, axis, first_line[axis], last_line[axis], args.eps,
+                         owner, image, grad,   &scratch.lists};
+    const int64_t tiles = (lines.last - lines.first + kTile - 1) / kTile;
+    parallel_for(tiles, num_threads, [&](int64_t tile) { list_tile(lines, lines.first + tile * kTile); });
     parallel_for((gradients.count + kFaceChunk - 1) / kFaceChunk, num_threads, [&](int64_t chunk) {
       const int64_t first = chunk * kFaceChunk;
       sweep_faces(lines, vertices, faces, F, first, std::min(first + kFaceChunk, gradients.count), gradients);

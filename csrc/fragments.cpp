@@ -64,7 +64,8 @@ struct Block {
 template <class T>
 Block<T> make_block(const MeshBatch<T>& mesh, const int32_t* owner, const RowBlocks& blocks, int64_t b, int64_t block) {
   const int64_t R = blocks.raster_size;
-  return {mesh.image_vertices(b), mesh.image_faces(b), mesh.face_count(b), R, owner + b * R * R, blocks.first(block), blocks.last(block)};
+  return {mesh.image_vertices(b), mesh.image_faces(b),  mesh.face_count(b), R,
+          owner + b * R * R,      blocks.first(block), blocks.last(block)};
 }
 
 // The table of the block's visible faces; entry 0 (background) has weights (1, 0, 0) and depth 1.
@@ -80,8 +81,8 @@ NMR_INLINE void set_up_faces(const Block<T>& block, FragmentScratch<T>& scratch)
     for (int64_t n = 0; n < kLanes; ++n) {
       const int32_t id = n < lanes ? visible.ids[start + n] : -1;
       const bool reversed = id >= block.num_faces;
-      const Triangle<T> t = id < 0 ? Triangle<T>{{0, 1, 0}, {0, 0, 1}, {1, 1, 1}}
-                                   : load_triangle(block.vertices, block.faces + 3 * (reversed ? id - block.num_faces : id), reversed);
+      const int64_t* face = block.faces + 3 * (reversed ? id - block.num_faces : id);
+      const Triangle<T> t = id < 0 ? Triangle<T>{{0, 1, 0}, {0, 0, 1}, {1, 1, 1}} : load_triangle(block.vertices, face, reversed);
       for (int k = 0; k < 3; ++k) {
         corner[k][n] = t.x[k];
         corner[3 + k][n] = t.y[k];
@@ -105,14 +106,6 @@ NMR_INLINE void set_up_faces(const Block<T>& block, FragmentScratch<T>& scratch)
     }
   }
   for (int64_t n = 0; n < kEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);
-}
-
-// First and one past the last covered pixel of a row; equal if there is none.
-NMR_INLINE void covered_range(const int32_t* owner, int64_t R, int64_t& first, int64_t& last) {
-  first = 0;
-  last = R;
-  while (first < R && owner[first] < 0) ++first;
-  while (last > first && owner[last - 1] < 0) --last;
 }
 
 // Weights and depth of the pixels [first, last) of raster row j (from the top).
@@ -233,8 +226,8 @@ NMR_INLINE void depth_gradients(const FragmentScratch<T>& scratch, int64_t raste
 }
 
 template <class T>
-NMR_INLINE void depth_gradient_block_body(const DepthImage<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch,
-                                          FaceGradients<T>& result) {
+NMR_INLINE void depth_gradient_block_body(const DepthImage<T>& args, const Block<T>& block, int64_t b,
+                                          FragmentScratch<T>& scratch, FaceGradients<T>& result) {
   const int64_t R = block.raster_size, S = args.image_size;
   set_up_faces(block, scratch);
   const PixelRow<T> row = scratch.pixel_row(R);
@@ -291,8 +284,8 @@ NMR_INLINE void fragment_gradients(const FragmentScratch<T>& scratch, int64_t ra
 }
 
 template <class T>
-NMR_INLINE void fragments_gradient_block_body(const Fragments<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch,
-                                              FaceGradients<T>& result) {
+NMR_INLINE void fragments_gradient_block_body(const Fragments<T>& args, const Block<T>& block, int64_t b,
+                                              FragmentScratch<T>& scratch, FaceGradients<T>& result) {
   const int64_t R = block.raster_size;
   set_up_faces(block, scratch);
   const PixelRow<T> row = scratch.pixel_row(R);
@@ -372,38 +365,21 @@ void forward(const Args& args, int64_t R) {
 template <class Args, class T = std::remove_pointer_t<decltype(Args::grad_vertices)>>
 void backward(const Args& args, int64_t R) {
   const MeshBatch<T>& mesh = args.mesh;
-  const auto produce = [&](int64_t b, int64_t block, FaceGradients<T>& result) {
-    const int64_t F = mesh.face_count(b);
-    const RowBlocks blocks(R, F);
-    FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
-    scratch.reserve_for_backward(F, blocks);
-    reserve(result.ids, blocks.most_visible(F));
-    reserve(result.values, 9 * blocks.most_visible(F));
-    backward_block(args, make_block(mesh, args.owner, blocks, b, block), b, scratch, result);
-  };
-  const auto image_gradient = [&](int64_t b) { return args.grad_vertices + 3 * mesh.vertex_start(b); };
-  const auto consume = [&](int64_t b, const FaceGradients<T>& result) {
-    scatter_face_gradients(result, mesh.image_faces(b), mesh.face_count(b), image_gradient(b));
-  };
-  // Few images: all threads share the blocks of one. The blocks and the order of their sums are the same either way.
-  const bool share_images = mesh.batch < args.num_threads;
-  if (share_images) {
-    for (int64_t b = 0; b < mesh.batch; ++b) {
-      std::fill_n(image_gradient(b), 3 * mesh.vertex_count(b), T(0));
-      produce_in_order(RowBlocks(R, mesh.face_count(b)).count, args.num_threads, thread_scratch<std::vector<FaceGradients<T>>>(),
-                       [&](int64_t block, FaceGradients<T>& result) { produce(b, block, result); },
-                       [&](int64_t, const FaceGradients<T>& result) { consume(b, result); });
-    }
-    return;
-  }
-  parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
-    std::fill_n(image_gradient(b), 3 * mesh.vertex_count(b), T(0));
-    FaceGradients<T>& result = thread_scratch<FaceGradients<T>>();
-    for (int64_t block = 0; block < RowBlocks(R, mesh.face_count(b)).count; ++block) {
-      produce(b, block, result);
-      consume(b, result);
-    }
-  });
+  std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
+  sum_blocks<FaceGradients<T>>(
+      mesh.batch, false, args.num_threads, [&](int64_t b) { return RowBlocks(R, mesh.face_count(b)).count; },
+      [&](int64_t b, int64_t block, FaceGradients<T>& result) {
+        const int64_t F = mesh.face_count(b);
+        const RowBlocks blocks(R, F);
+        FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
+        scratch.reserve_for_backward(F, blocks);
+        reserve(result.ids, blocks.most_visible(F));
+        reserve(result.values, 9 * blocks.most_visible(F));
+        backward_block(args, make_block(mesh, args.owner, blocks, b, block), b, scratch, result);
+      },
+      [&](int64_t b, const FaceGradients<T>& result) {
+        scatter_face_gradients(result, mesh.image_faces(b), mesh.face_count(b), args.grad_vertices + 3 * mesh.vertex_start(b));
+      });
 }
 
 }  // namespace

@@ -178,6 +178,11 @@ NMR_INLINE Lanes32 lane_numbers() {
   return Lanes32{0, 1, 2, 3, 4, 5, 6, 7};
 }
 
+// p[offset[0]], ..., p[offset[7]]
+NMR_INLINE Lanes32 gather_lanes(const int32_t* p, const int32_t* offset) {
+  return Lanes32{p[offset[0]], p[offset[1]], p[offset[2]], p[offset[3]], p[offset[4]], p[offset[5]], p[offset[6]], p[offset[7]]};
+}
+
 // Bit k is set where lane k of the mask is.
 NMR_INLINE uint32_t lane_bits(Lanes32 mask) {
 #if defined(__SSE2__)

@@ -237,7 +237,6 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
       const LaneMask<T> inside = in_box & ~((e0 < c0) | (e1 < c1) | (e2 < c2));
       const Lanes<T> pixel_farthest = load_lanes<Lanes<T>>(farthest_at);
       const LaneMask<T> unsettled = inside & (pixel_farthest >= nearest);
-      if (!lane_bits(unsettled)) continue;
       const Lanes32 owner = load_lanes<Lanes32>(owner_at);
       LaneMask<T> contested = unsettled;
       if (bounded) {

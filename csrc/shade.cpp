@@ -1,7 +1,9 @@
 // Colours from texture cubes, and interpolation of values given at the corners of faces. Both read the owner map and the
 // perspective-correct weights, in the vertex order of the original face: a reversed copy needs no other treatment.
 #include <algorithm>
-#include <cmath>
+#include <type_traits>
+#include <utility>
+#include <vector>
 
 #include "blocks.h"
 #include "parallel.h"
@@ -22,6 +24,17 @@ void for_rows(int64_t batch, int64_t R, int num_threads, const Body& body) {
   });
 }
 
+// Calls body(c) with the number of channels as a constant where it is 1, 3 or 4, and with 0 for any other number.
+template <class Body>
+void with_channels(int64_t channels, const Body& body) {
+  switch (channels) {
+    case 1: return body(std::integral_constant<int64_t, 1>());
+    case 3: return body(std::integral_constant<int64_t, 3>());
+    case 4: return body(std::integral_constant<int64_t, 4>());
+    default: return body(std::integral_constant<int64_t, 0>());
+  }
+}
+
 // The texels around one pixel: texture = sum over the 8 corners c of weight[c] texel[offset[c]], trilinear at t_k = b_k (ts - 1)
 // clamped to [0, ts - 1 - eps].
 template <class T>
@@ -33,13 +46,13 @@ struct Texels {
 template <class T>
 NMR_INLINE Texels<T> texels_of(const T* weights, int64_t texture_size, T eps) {
   const int64_t ts = texture_size, next = ts > 1 ? 1 : 0;  // a cube of one texel is constant
-  const T last = static_cast<T>(ts - 1);
+  const T last = static_cast<T>(ts - 1), limit = std::max(last - eps, T(0));
   int64_t cell[3];
   T fraction[3];
   for (int k = 0; k < 3; ++k) {
     T t = weights[k] * last;
-    t = t < last - eps ? t : last - eps;
     t = t > 0 ? t : T(0);  // also NaN
+    t = t < limit ? t : limit;
     cell[k] = std::max(std::min(static_cast<int64_t>(t), ts - 2), int64_t(0));  // eps may vanish beside ts - 1
     fraction[k] = t - static_cast<T>(cell[k]);
   }
@@ -51,6 +64,21 @@ NMR_INLINE Texels<T> texels_of(const T* weights, int64_t texture_size, T eps) {
                        (bit[2] ? fraction[2] : 1 - fraction[2]);
   }
   return texels;
+}
+
+// color = sum over the corners of weight texel; kChannels is the number of channels, or 0 if it is not known beforehand.
+template <int64_t kChannels, class T>
+NMR_INLINE void blend(const Texels<T>& texels, const T* texture, int64_t channels, T* color) {
+  if constexpr (kChannels > 0) {
+    T sum[kChannels] = {};
+    for (int c = 0; c < 8; ++c)
+      for (int64_t k = 0; k < kChannels; ++k) sum[k] += texels.weight[c] * texture[texels.offset[c] * kChannels + k];
+    for (int64_t k = 0; k < kChannels; ++k) color[k] = sum[k];
+  } else {
+    for (int64_t k = 0; k < channels; ++k) color[k] = 0;
+    for (int c = 0; c < 8; ++c)
+      for (int64_t k = 0; k < channels; ++k) color[k] += texels.weight[c] * texture[texels.offset[c] * channels + k];
+  }
 }
 
 // Number of faces of image b, and the first of its cubes.
@@ -68,42 +96,49 @@ int64_t first_cube(const TextureCubes<T>& args, int64_t b) {
 
 template <class T>
 void texture_cubes_forward(const TextureCubes<T>& args) {
-  const int64_t R = args.raster_size, C = args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
-  for_rows(args.batch, R, args.num_threads, [&](int64_t b, int64_t row) {
-    const int64_t start = (b * R + row) * R, F = face_count(args, b);
-    const T* textures = args.textures + first_cube(args, b) * cube;
-    T* color = args.colors + start * C;
-    std::fill_n(color, R * C, T(0));
-    for (int64_t n = start; n < start + R; ++n, color += C) {
-      const int64_t id = args.owner[n];
-      if (id < 0) continue;
-      const Texels<T> texels = texels_of(args.weights + 3 * n, ts, args.eps);
-      const T* texture = textures + (id < F ? id : id - F) * cube;
-      for (int c = 0; c < 8; ++c)
-        for (int64_t k = 0; k < C; ++k) color[k] += texels.weight[c] * texture[texels.offset[c] * C + k];
-    }
+  with_channels(args.channels, [&](auto known) {
+    const int64_t R = args.raster_size, C = known ? known() : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
+    for_rows(args.batch, R, args.num_threads, [&](int64_t b, int64_t row) {
+      const int64_t start = (b * R + row) * R, F = face_count(args, b);
+      const T* textures = args.textures + first_cube(args, b) * cube;
+      T* color = args.colors + start * C;
+      for (int64_t n = start; n < start + R; ++n, color += C) {
+        const int64_t id = args.owner[n];
+        if (id >= 0)
+          blend<known()>(texels_of(args.weights + 3 * n, ts, args.eps), textures + (id < F ? id : id - F) * cube, C, color);
+        else
+          for (int64_t k = 0; k < C; ++k) color[k] = 0;
+      }
+    });
   });
 }
+
+namespace {
+
+// Adds the gradients of the pixels of image b whose face lies in [first_face, last_face) to its cubes.
+template <int64_t kChannels, class T>
+void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first_face, int64_t last_face) {
+  const int64_t R = args.raster_size, C = kChannels ? kChannels : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
+  const int64_t F = face_count(args, b);
+  T* grad_textures = args.grad_textures + first_cube(args, b) * cube;
+  for (int64_t n = b * R * R; n < (b + 1) * R * R; ++n) {
+    const int64_t id = args.owner[n], f = id < F ? id : id - F;
+    if (f < first_face || f >= last_face) continue;  // also background
+    const Texels<T> texels = texels_of(args.weights + 3 * n, ts, args.eps);
+    const T* grad = args.grad_colors + n * C;
+    T* texture = grad_textures + f * cube;
+    for (int c = 0; c < 8; ++c)
+      for (int64_t k = 0; k < C; ++k) texture[texels.offset[c] * C + k] += texels.weight[c] * grad[k];
+  }
+}
+
+}  // namespace
 
 // Every texel sums over images and pixels in ascending order, on one thread. Where images share their textures, or are fewer than
 // threads, each thread reads all pixels and keeps those of its own range of faces.
 template <class T>
 void texture_cubes_backward(const TextureCubes<T>& args) {
-  const int64_t R = args.raster_size, C = args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
-  // Pixels of image b whose face lies in [first, last).
-  const auto add_pixels = [&](int64_t b, int64_t first, int64_t last) {
-    const int64_t F = face_count(args, b);
-    T* grad_textures = args.grad_textures + first_cube(args, b) * cube;
-    for (int64_t n = b * R * R; n < (b + 1) * R * R; ++n) {
-      const int64_t id = args.owner[n], f = id < F ? id : id - F;
-      if (f < first || f >= last) continue;  // also background: first >= 0
-      const Texels<T> texels = texels_of(args.weights + 3 * n, ts, args.eps);
-      const T* grad = args.grad_colors + n * C;
-      T* texture = grad_textures + f * cube;
-      for (int c = 0; c < 8; ++c)
-        for (int64_t k = 0; k < C; ++k) texture[texels.offset[c] * C + k] += texels.weight[c] * grad[k];
-    }
-  };
+  const int64_t ts = args.texture_size, cube = ts * ts * ts * args.channels;
   const bool shared = !args.starts && args.texture_batch == 1;
   const int64_t sets = shared ? 1 : args.batch, images = shared ? args.batch : 1;  // of textures; of each set
   const int64_t parts = sets >= args.num_threads ? 1 : 2 * static_cast<int64_t>(args.num_threads);
@@ -112,7 +147,9 @@ void texture_cubes_backward(const TextureCubes<T>& args) {
     const int64_t F = shared ? args.num_faces : face_count(args, set);
     const int64_t first = part * F / parts, last = (part + 1) * F / parts;
     std::fill_n(args.grad_textures + (first_cube(args, set) + first) * cube, (last - first) * cube, T(0));
-    for (int64_t b = set; b < set + images; ++b) add_pixels(b, first, last);
+    with_channels(args.channels, [&](auto known) {
+      for (int64_t b = set; b < set + images; ++b) add_texture_gradients<known()>(args, b, first, last);
+    });
   });
 }
 
@@ -121,18 +158,18 @@ namespace {
 // Where image b finds its rows and its corners.
 template <class T>
 struct ImageAttributes {
-  int64_t first_row, num_rows;  // of attributes
-  const int64_t* corners;       // [F, 3]
+  int64_t first_row;       // of attributes
+  const int64_t* corners;  // [F, 3]
   int64_t num_faces;
 };
 
 template <class T>
 ImageAttributes<T> image_attributes(const Interpolate<T>& args, int64_t b) {
   if (args.starts) {
-    const int64_t *s = args.starts + 2 * b, *next = s + 2;
-    return {s[0], next[0] - s[0], args.corners + 3 * s[1], next[1] - s[1]};
+    const int64_t* s = args.starts + 2 * b;
+    return {s[0], args.corners + 3 * s[1], s[3] - s[1]};
   }
-  return {args.attribute_batch == 1 ? 0 : b * args.num_attributes, args.num_attributes,
+  return {args.attribute_batch == 1 ? 0 : b * args.num_attributes,
           args.corners + (args.corners_per_image ? 3 * b * args.num_faces : 0), args.num_faces};
 }
 
@@ -144,10 +181,10 @@ struct CornerSums {
 };
 
 // grad_weights of a block's pixels, and its sums of b_k g.
-template <class T>
+template <int64_t kChannels, class T>
 void interpolate_block_backward(const Interpolate<T>& args, const ImageAttributes<T>& image, const RowBlocks& blocks, int64_t b,
                                 int64_t block, CornerSums<T>& sums) {
-  const int64_t R = args.raster_size, C = args.channels, F = image.num_faces;
+  const int64_t R = args.raster_size, C = kChannels ? kChannels : args.channels, F = image.num_faces;
   const int64_t begin = (b * R + blocks.first(block)) * R, end = (b * R + blocks.last(block)) * R;
   if (args.grad_attributes) {
     sums.visible.reserve_for(F, blocks.most_visible(F));
@@ -193,61 +230,43 @@ void scatter_corner_sums(const Interpolate<T>& args, const ImageAttributes<T>& i
 
 template <class T>
 void interpolate_forward(const Interpolate<T>& args) {
-  const int64_t R = args.raster_size, C = args.channels;
-  for_rows(args.batch, R, args.num_threads, [&](int64_t b, int64_t row) {
-    const ImageAttributes<T> image = image_attributes(args, b);
-    const T* attributes = args.attributes + image.first_row * C;
-    const int64_t start = (b * R + row) * R;
-    T* value = args.values + start * C;
-    for (int64_t n = start; n < start + R; ++n, value += C) {
-      const int64_t id = args.owner[n];
-      if (id < 0) {
-        std::fill_n(value, C, T(0));
-        continue;
+  with_channels(args.channels, [&](auto known) {
+    const int64_t R = args.raster_size, C = known ? known() : args.channels;
+    for_rows(args.batch, R, args.num_threads, [&](int64_t b, int64_t row) {
+      const ImageAttributes<T> image = image_attributes(args, b);
+      const T* attributes = args.attributes + image.first_row * C;
+      const int64_t start = (b * R + row) * R;
+      T* value = args.values + start * C;
+      for (int64_t n = start; n < start + R; ++n, value += C) {
+        const int64_t id = args.owner[n];
+        if (id < 0) {
+          for (int64_t c = 0; c < C; ++c) value[c] = 0;
+          continue;
+        }
+        const int64_t* corners = image.corners + 3 * (id < image.num_faces ? id : id - image.num_faces);
+        const T* w = args.weights + 3 * n;
+        const T *p = attributes + corners[0] * C, *q = attributes + corners[1] * C, *r = attributes + corners[2] * C;
+        for (int64_t c = 0; c < C; ++c) value[c] = w[0] * p[c] + w[1] * q[c] + w[2] * r[c];
       }
-      const int64_t* corners = image.corners + 3 * (id < image.num_faces ? id : id - image.num_faces);
-      const T* w = args.weights + 3 * n;
-      const T *p = attributes + corners[0] * C, *q = attributes + corners[1] * C, *r = attributes + corners[2] * C;
-      for (int64_t c = 0; c < C; ++c) value[c] = w[0] * p[c] + w[1] * q[c] + w[2] * r[c];
-    }
+    });
   });
 }
 
 template <class T>
 void interpolate_backward(const Interpolate<T>& args) {
-  const int64_t R = args.raster_size, C = args.channels;
-  const bool shared = !args.starts && args.attribute_batch == 1;
-  const auto clear = [&](int64_t b) {
-    const ImageAttributes<T> image = image_attributes(args, b);
-    if (args.grad_attributes) std::fill_n(args.grad_attributes + image.first_row * C, image.num_rows * C, T(0));
-  };
-  const auto produce = [&](int64_t b, int64_t block, CornerSums<T>& sums) {
-    const ImageAttributes<T> image = image_attributes(args, b);
-    interpolate_block_backward(args, image, RowBlocks(R, image.num_faces), b, block, sums);
-  };
-  const auto consume = [&](int64_t b, const CornerSums<T>& sums) {
-    if (args.grad_attributes) scatter_corner_sums(args, image_attributes(args, b), sums);
-  };
-  if (!shared && args.batch >= args.num_threads) {
-    parallel_for(args.batch, args.num_threads, [&](int64_t b) {
-      clear(b);
-      const int64_t blocks = RowBlocks(R, image_attributes(args, b).num_faces).count;
-      CornerSums<T>& sums = thread_scratch<CornerSums<T>>();
-      for (int64_t block = 0; block < blocks; ++block) {
-        produce(b, block, sums);
-        consume(b, sums);
-      }
-    });
-    return;
-  }
-  // Blocks of all images, several at a time; their sums are added up in order.
-  for (int64_t b = 0; b < (shared ? 1 : args.batch); ++b) clear(b);
-  std::vector<std::pair<int64_t, int64_t>> tasks;
-  for (int64_t b = 0; b < args.batch; ++b)
-    for (int64_t block = 0; block < RowBlocks(R, image_attributes(args, b).num_faces).count; ++block) tasks.emplace_back(b, block);
-  produce_in_order(static_cast<int64_t>(tasks.size()), args.num_threads, thread_scratch<std::vector<CornerSums<T>>>(),
-                   [&](int64_t n, CornerSums<T>& sums) { produce(tasks[n].first, tasks[n].second, sums); },
-                   [&](int64_t n, const CornerSums<T>& sums) { consume(tasks[n].first, sums); });
+  const int64_t rows = args.num_attributes * (args.starts ? 1 : args.attribute_batch);
+  if (args.grad_attributes) std::fill_n(args.grad_attributes, rows * args.channels, T(0));
+  const auto blocks_of = [&](int64_t b) { return RowBlocks(args.raster_size, image_attributes(args, b).num_faces); };
+  sum_blocks<CornerSums<T>>(
+      args.batch, !args.starts && args.attribute_batch == 1, args.num_threads, [&](int64_t b) { return blocks_of(b).count; },
+      [&](int64_t b, int64_t block, CornerSums<T>& sums) {
+        with_channels(args.channels, [&](auto known) {
+          interpolate_block_backward<known()>(args, image_attributes(args, b), blocks_of(b), b, block, sums);
+        });
+      },
+      [&](int64_t b, const CornerSums<T>& sums) {
+        if (args.grad_attributes) scatter_corner_sums(args, image_attributes(args, b), sums);
+      });
 }
 
 template void texture_cubes_forward(const TextureCubes<float>&);

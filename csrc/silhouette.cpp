@@ -236,158 +236,193 @@ NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
   return (bt - at) / (bs - as) * (n - as) + at;
 }
 
-// The six ways in which a face's three edges are crossed: lanes 0-2 are edges 01, 12, 20 crossed by columns (axis 0), lanes 3-5
-// the same by rows (axis 1), lanes 6-7 repeat. s is the scan coordinate, t the sweep coordinate: (x, y) for axis 0, (y, x) for
-// axis 1, all in pixels. P and Q are the ends of the edge.
+// Up to eight neighbouring lines that cross an edge P-Q: what their sweeps need. s is the scan coordinate, t the sweep coordinate:
+// (x, y) for axis 0, (y, x) for axis 1, all in pixels.
 template <class T>
-struct Crossings {
-  T ps[kLanes], pt[kLanes], qs[kLanes], slope[kLanes], scale[kLanes];
-  int32_t n_first[kLanes], n_last[kLanes];  // the lines that cross
-  uint32_t outward_up;                      // bit: outward is towards larger t
-  uint32_t crossed;                         // bit: there is such a line
+struct Sweep {
+  int32_t face;      // number in the list of visible faces
+  int32_t id;        // in the owner map
+  int32_t edge;      // 0-2: edges 01, 12, 20 crossed by columns (axis 0); 3-5: the same by rows (axis 1)
+  int32_t start;     // the first line
+  int32_t outward;   // 1: outward is towards larger t; -1
+  uint32_t pulled;   // bit: the face owns the inner pixel, and pixels beyond the outer one may pull
+  uint32_t gains;    // bit: the outer pixel is background, and inner pixels may gain
+  uint32_t regular;  // bit: levers of ordinary size
+  T crossing[kLanes], factor_p[kLanes], factor_q[kLanes];
+  int32_t inner[kLanes];
 };
 
+// The work of one chunk of faces: all lines are prepared before any is swept, so that the processor need not guess.
+constexpr int64_t kSweeps = 128;
+
 template <class T>
-NMR_INLINE void find_crossings(const T* X, const T* Y, T raster_size, Crossings<T>& c) {
+struct SweepScratch {
+  std::vector<Sweep<T>> sweeps;  // [kSweeps + 1]
+};
+
+// Corners of a face in pixels, in the vertex order in which it is drawn.
+template <class T>
+NMR_INLINE void corner_pixels(const SweepImage<T>& image, int32_t id, T* X, T* Y) {
+  const bool reversed = id >= image.num_faces;
+  const Triangle<T> t = load_triangle(image.vertices, image.faces + 3 * (reversed ? id - image.num_faces : id), reversed);
+  for (int k = 0; k < 3; ++k) {
+    X[k] = to_pixel(t.x[k], static_cast<T>(image.R));
+    Y[k] = to_pixel(t.y[k], static_cast<T>(image.R));
+  }
+}
+
+// Sweeps one group of lines.
+template <class T>
+NMR_INLINE void run_sweep(const SweepImage<T>& image, const Sweep<T>& sweep, T* grad) {
+  const int64_t R = image.R, stride = R + kLanes, d = sweep.outward;
+  const int axis = sweep.edge < 3 ? 0 : 1, p = sweep.edge - 3 * axis, q = p < 2 ? p + 1 : 0, o = p > 0 ? p - 1 : 2;
+  const PullLines<T>& lines = image.lines[axis];
+  T grad_p = 0, grad_q = 0;
+  Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
+
+  // Outside: pixels from the outer one to the border that should be covered. They gain if the edge moves out to them.
+  for (uint32_t bits = sweep.pulled; bits; bits &= bits - 1) {
+    const int64_t k = lowest_bit(bits), n = sweep.start + k;
+    const Lever<T> lever{sweep.crossing[k], sweep.factor_p[k], sweep.factor_q[k], image.eps};
+    const T *position = lines.position.data() + n * stride, *weight = lines.weight.data() + n * stride;
+    const T outer = static_cast<T>(sweep.inner[k] + d);
+    if (sweep.regular >> k & 1) {
+      pull_listed(position, weight, lines.count[n], outer, static_cast<T>(d), lever, pulls_p, pulls_q);
+    } else {
+      for (int32_t m = 0; m < lines.count[n]; ++m)
+        if (d > 0 ? position[m] >= outer : position[m] <= outer)
+          pull(weight[m], position[m] - lever.crossing, lever, grad_p, grad_q);
+    }
+  }
+  grad_p -= sum_lanes(pulls_p);
+  grad_q -= sum_lanes(pulls_q);
+
+  // Inside: own pixels that should be background. They gain if the edge moves in past them.
+  if (sweep.gains) {
+    T X[3], Y[3];
+    corner_pixels(image, sweep.id, X, Y);
+    const T *s = axis == 0 ? X : Y, *t = axis == 0 ? Y : X;
+    for (uint32_t bits = sweep.gains; bits; bits &= bits - 1) {
+      const int64_t k = lowest_bit(bits), n = sweep.start + k, inner = sweep.inner[k];
+      // pixel m of line n: owner[m * step]
+      const int32_t* owner = axis == 0 ? image.owner + (R - 1) * R + n : image.owner + (R - 1 - n) * R;
+      const int64_t step = axis == 0 ? -R : 1;
+      const Lever<T> lever{sweep.crossing[k], sweep.factor_p[k], sweep.factor_q[k], image.eps};
+      const T line = static_cast<T>(n);
+      const int end = (line - s[p]) * (line - s[o]) < 0 ? p : q;
+      const T far_side = line_height(s[end], t[end], s[o], t[o], line);
+      const int64_t limit = to_index(d > 0 ? std::ceil(far_side) : std::floor(far_side), int64_t(-1), R);
+      const int64_t m_first = std::max<int64_t>(std::min(inner, limit), 0), m_last = std::min(std::max(inner, limit), R - 1);
+      for (int64_t m = m_first; m <= m_last; ++m) {
+        if (owner[m * step] != sweep.id) continue;
+        const T g = axis == 0 ? image.grad(n, m) : image.grad(m, n);
+        if (g > 0) pull(g, static_cast<T>(m) - lever.crossing, lever, grad_p, grad_q);
+      }
+    }
+  }
+  // axis 0 moves y, axis 1 moves x
+  grad[6 * sweep.face + 2 * p + 1 - axis] += grad_p;
+  grad[6 * sweep.face + 2 * q + 1 - axis] += grad_q;
+}
+
+template <class T>
+NMR_INLINE void run_sweeps(const SweepImage<T>& image, const Sweep<T>* sweeps, int64_t count, T* grad) {
+  for (int64_t n = 0; n < count; ++n) run_sweep(image, sweeps[n], grad);
+}
+
+// Prepares the sweeps of one face; runs those of the scratch whenever it is full. Returns how many wait in it.
+template <class T>
+NMR_INLINE int64_t prepare_face(const SweepImage<T>& image, int32_t face, int32_t id, Sweep<T>* sweeps, int64_t count, T* grad) {
+  const int64_t R = image.R;
+  const T raster_size = static_cast<T>(R), top = raster_size - 1;
+  T X[3], Y[3];
+  corner_pixels(image, id, X, Y);
+  // All six crossings of edges and axes, one per lane; lanes 6 and 7 repeat.
   const Lanes<T> ps{X[0], X[1], X[2], Y[0], Y[1], Y[2], X[0], X[0]}, pt{Y[0], Y[1], Y[2], X[0], X[1], X[2], Y[0], Y[0]};
   const Lanes<T> qs{X[1], X[2], X[0], Y[1], Y[2], Y[0], X[1], X[1]}, qt{Y[1], Y[2], Y[0], X[1], X[2], X[0], Y[1], Y[1]};
-  const T top = raster_size - 1;
   const LaneMask<T> ascending = ps < qs;
   const Lanes<T> least = select(ascending, ps, qs), most = select(ascending, qs, ps);
   const Lanes<T> low = select(least > T(0), least, splat(T(0))), high = select(most < top, most, splat(top));
   // An edge along the scan line (least == most) is left out: neither end can move its crossing.
   const LaneMask<T> in_reach = (least < most) & (low <= top) & (high > T(-1));
   const Lanes<T> from = select(in_reach, low, splat(T(1))), to = select(in_reach, high, splat(T(0)));
-  Lanes<T> n_first = to_values<T>(truncate(from));
-  n_first = select(n_first < from, n_first + T(1), n_first);
+  Lanes<T> first = to_values<T>(truncate(from));
+  first = select(first < from, first + T(1), first);
   // Truncation towards zero, as published: an edge that ends in (-1, 0) is extrapolated onto line 0.
-  const Lanes<T> n_last = to_values<T>(truncate(to));
-  store_lanes(c.ps, ps);
-  store_lanes(c.pt, pt);
-  store_lanes(c.qs, qs);
-  store_lanes(c.slope, (qt - pt) / (qs - ps));
-  store_lanes(c.scale, (qs - ps) * T(2) / raster_size);
-  store_lanes(c.n_first, truncate(n_first));
-  store_lanes(c.n_last, truncate(n_last));
-  c.outward_up = lane_bits(ascending) ^ 0x07;
-  c.crossed = lane_bits(n_first <= n_last) & 0x3f;
-}
+  const Lanes<T> last = to_values<T>(truncate(to));
+  T ps_at[kLanes], pt_at[kLanes], qs_at[kLanes], slope_at[kLanes], scale_at[kLanes];
+  int32_t first_at[kLanes], last_at[kLanes];
+  store_lanes(ps_at, ps);
+  store_lanes(pt_at, pt);
+  store_lanes(qs_at, qs);
+  store_lanes(slope_at, (qt - pt) / (qs - ps));
+  store_lanes(scale_at, (qs - ps) * T(2) / raster_size);
+  store_lanes(first_at, truncate(first));
+  store_lanes(last_at, truncate(last));
+  const uint32_t outward_up = lane_bits(ascending) ^ 0x07;
 
-// Both sweeps of edge P-Q along one axis; (os, ot) is the face's third corner. Eight lines are prepared together.
-template <class T>
-NMR_INLINE void sweep_edge(const SweepImage<T>& image, int32_t id, const Crossings<T>& c, int64_t e, T qt, T os, T ot, T& grad_p,
-                           T& grad_q) {
-  const int64_t R = image.R, stride = R + kLanes, n_first = c.n_first[e], n_last = c.n_last[e];
-  const int axis = e < 3 ? 0 : 1;
-  const int64_t d = c.outward_up >> e & 1 ? 1 : -1;
-  const T ps = c.ps[e], pt = c.pt[e], qs = c.qs[e], slope = c.slope[e], scale = c.scale[e], top = static_cast<T>(R - 1);
-  const PullLines<T>& lines = image.lines[axis];
-  // pixel m of line n: owner[n * step_s + m * step_t]
-  const int32_t* origin = image.owner + (R - 1) * R;
-  const int64_t step_s = axis == 0 ? 1 : -R, step_t = axis == 0 ? -R : 1;
-  Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
-  bool any_pull = false;
+  for (uint32_t bits = lane_bits(first <= last) & 0x3f; bits; bits &= bits - 1) {
+    const int64_t e = lowest_bit(bits);
+    const bool by_columns = e < 3;
+    const PullLines<T>& lines = image.lines[by_columns ? 0 : 1];
+    const int32_t d = outward_up >> e & 1 ? 1 : -1;
+    // pixel m of line n: origin[n * step_s + m * step_t]
+    const int32_t* origin = image.owner + (R - 1) * R;
+    const int32_t step_s = by_columns ? 1 : static_cast<int32_t>(-R), step_t = by_columns ? static_cast<int32_t>(-R) : 1;
+    const T direction = static_cast<T>(d);
+    const T* pulls = d > 0 ? lines.last.data() : lines.first.data();
+    const T* gains = d > 0 ? lines.gain_first.data() : lines.gain_last.data();
+    for (int32_t start = first_at[e]; start <= last_at[e]; start += kLanes) {
+      const Lanes32 number = lane_numbers() + start, last_number = splat32(last_at[e]);
+      const Lanes<T> line = to_values<T>(number);
+      const Lanes<T> crossing = (line - ps_at[e]) * slope_at[e] + pt_at[e];
+      const LaneMask<T> on_screen = widen_mask<T>(number <= last_number) & (crossing >= T(-1)) & (crossing <= top + 1);
+      // The pixel on the inner side: floor(c) if outward is up, else ceil(c) = -floor(-c).
+      const Lanes<T> rising = select(on_screen, crossing * direction, splat(T(0)));
+      Lanes<T> in = to_values<T>(truncate(rising));
+      in = select(in > rising, in - T(1), in) * direction;
+      const Lanes<T> out = in + direction;
+      const LaneMask<T> valid = on_screen & (in >= T(0)) & (in <= top) & (out >= T(0)) & (out <= top);
+      const LaneMask<T> pulled = (load_lanes<Lanes<T>>(pulls + start) - out) * direction >= T(0);
+      const LaneMask<T> gained = (load_lanes<Lanes<T>>(gains + start) - in) * direction <= T(0);
+      // Owners of the pixels on both sides; a lane that does not count reads some pixel of the last line.
+      const Lanes32 inner = truncate(select(valid, in, splat(d > 0 ? T(0) : T(1))));
+      int32_t offset[kLanes];
+      store_lanes(offset, select(number < last_number, number, last_number) * step_s + inner * step_t);
+      const Lanes32 inner_owner = gather_lanes(origin, offset), outer_owner = gather_lanes(origin + d * step_t, offset);
+      const Lanes<T> factor_p = scale_at[e] / (qs_at[e] - line), factor_q = scale_at[e] / (line - ps_at[e]);
+      const T largest = image.largest_lever;
 
-  for (int64_t start = n_first; start <= n_last; start += kLanes) {
-    const Lanes32 number = lane_numbers() + static_cast<int32_t>(start);
-    const Lanes<T> line = to_values<T>(number);
-    const Lanes<T> crossing = (line - ps) * slope + pt;
-    const LaneMask<T> on_screen = widen_mask<T>(number <= static_cast<int32_t>(n_last)) & (crossing >= T(-1)) & (crossing <= top + 1);
-    const Lanes<T> near_crossing = select(on_screen, crossing, splat(T(0)));
-    Lanes<T> in = to_values<T>(truncate(near_crossing));
-    in = d > 0 ? select(in > near_crossing, in - T(1), in) : select(in < near_crossing, in + T(1), in);
-    const Lanes<T> out = in + static_cast<T>(d);
-    const LaneMask<T> valid = on_screen & (in >= T(0)) & (in <= top) & (out >= T(0)) & (out <= top);
-    const LaneMask<T> pulled = d > 0 ? load_lanes<Lanes<T>>(lines.last.data() + start) >= out
-                                     : load_lanes<Lanes<T>>(lines.first.data() + start) <= out;
-    const LaneMask<T> gains = d > 0 ? load_lanes<Lanes<T>>(lines.gain_first.data() + start) <= in
-                                    : load_lanes<Lanes<T>>(lines.gain_last.data() + start) >= in;
-    const LaneMask<T> wanted = valid & (pulled | gains);
-    if (!lane_bits(wanted)) continue;
-    int32_t inner_at[kLanes], inner_owner[kLanes], outer_owner[kLanes];
-    store_lanes(inner_at, truncate(select(wanted, in, splat(static_cast<T>(d > 0 ? 0 : 1)))));
-    const int32_t* crossed = origin + start * step_s;
-    for (int64_t k = 0; k < kLanes; ++k) {
-      // a lane past the last line reads the last line's pixel
-      const int64_t at = std::min(k, n_last - start) * step_s + inner_at[k] * step_t;
-      inner_owner[k] = crossed[at];
-      outer_owner[k] = crossed[at + d * step_t];
-    }
-    const uint32_t pulled_bits = lane_bits(narrow_mask(valid & pulled) & (load_lanes<Lanes32>(inner_owner) >= id) &
-                                           (load_lanes<Lanes32>(inner_owner) <= id));
-    const uint32_t gain_bits = lane_bits(narrow_mask(valid & gains) & (load_lanes<Lanes32>(outer_owner) < 0));
-    if (!(pulled_bits | gain_bits)) continue;
-    const Lanes<T> lever_p = scale / (qs - line), lever_q = scale / (line - ps);
-    const LaneMask<T> regular = (lever_p < image.largest_lever) & (lever_p > -image.largest_lever) & (lever_q < image.largest_lever) &
-                                (lever_q > -image.largest_lever);
-    T crossing_at[kLanes], factor_p[kLanes], factor_q[kLanes];
-    store_lanes(crossing_at, crossing);
-    store_lanes(factor_p, lever_p);
-    store_lanes(factor_q, lever_q);
-    const uint32_t regular_bits = lane_bits(regular);
-
-    // Outside: pixels from `outer` to the border that should be covered. They gain if the edge moves out to them.
-    for (uint32_t bits = pulled_bits; bits; bits &= bits - 1) {
-      const int64_t k = lowest_bit(bits), n = start + k, inner = inner_at[k];
-      const Lever<T> lever{crossing_at[k], factor_p[k], factor_q[k], image.eps};
-      const T *position = lines.position.data() + n * stride, *weight = lines.weight.data() + n * stride;
-      const T outer = static_cast<T>(inner + d);
-      if (regular_bits >> k & 1) {
-        pull_listed(position, weight, lines.count[n], outer, static_cast<T>(d), lever, pulls_p, pulls_q);
-        any_pull = true;
-      } else {
-        for (int32_t m = 0; m < lines.count[n]; ++m)
-          if (d > 0 ? position[m] >= outer : position[m] <= outer)
-            pull(weight[m], position[m] - lever.crossing, lever, grad_p, grad_q);
-      }
-    }
-    // Inside: own pixels that should be background. They gain if the edge moves in past them.
-    for (uint32_t bits = gain_bits; bits; bits &= bits - 1) {
-      const int64_t k = lowest_bit(bits), n = start + k, inner = inner_at[k];
-      const int32_t* owner = origin + n * step_s;
-      const Lever<T> lever{crossing_at[k], factor_p[k], factor_q[k], image.eps};
-      const T at = static_cast<T>(n);
-      const bool beyond_p = (at - ps) * (at - os) < 0;
-      const T far_side = beyond_p ? line_height(ps, pt, os, ot, at) : line_height(qs, qt, os, ot, at);
-      const int64_t limit = to_index(d > 0 ? std::ceil(far_side) : std::floor(far_side), int64_t(-1), R);
-      const int64_t m_first = std::max<int64_t>(std::min(inner, limit), 0), m_last = std::min(std::max(inner, limit), R - 1);
-      for (int64_t m = m_first; m <= m_last; ++m) {
-        if (owner[m * step_t] != id) continue;
-        const T g = axis == 0 ? image.grad(n, m) : image.grad(m, n);
-        if (g > 0) pull(g, static_cast<T>(m) - lever.crossing, lever, grad_p, grad_q);
+      Sweep<T>& sweep = sweeps[count];
+      sweep.face = face;
+      sweep.id = id;
+      sweep.edge = static_cast<int32_t>(e);
+      sweep.start = start;
+      sweep.outward = d;
+      sweep.pulled = lane_bits(narrow_mask(valid & pulled) & (inner_owner >= id) & (inner_owner <= id));
+      sweep.gains = lane_bits(narrow_mask(valid & gained) & (outer_owner < 0));
+      sweep.regular = lane_bits((factor_p < largest) & (factor_p > -largest) & (factor_q < largest) & (factor_q > -largest));
+      store_lanes(sweep.crossing, crossing);
+      store_lanes(sweep.factor_p, factor_p);
+      store_lanes(sweep.factor_q, factor_q);
+      store_lanes(sweep.inner, inner);
+      count += (sweep.pulled | sweep.gains) != 0;
+      if (count == kSweeps) {
+        run_sweeps(image, sweeps, count, grad);
+        count = 0;
       }
     }
   }
-  if (!any_pull) return;
-  grad_p -= sum_lanes(pulls_p);
-  grad_q -= sum_lanes(pulls_q);
+  return count;
 }
 
-// Gradients of the corners of visible faces [first, last) of the list.
+// Gradients of the corners of visible faces [first, last) of the list: x and y of corners 0, 1, 2 as drawn.
 template <class T>
-NMR_INLINE void sweep_faces(const SweepImage<T>& image, const int32_t* ids, int64_t first, int64_t last, T* grad) {
-  for (int64_t n = first; n < last; ++n) {
-    const bool reversed = ids[n] >= image.num_faces;
-    const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
-    const Triangle<T> t = load_triangle(image.vertices, face, reversed);
-    T X[3], Y[3], grad_x[3] = {0, 0, 0}, grad_y[3] = {0, 0, 0};
-    for (int k = 0; k < 3; ++k) {
-      X[k] = to_pixel(t.x[k], static_cast<T>(image.R));
-      Y[k] = to_pixel(t.y[k], static_cast<T>(image.R));
-    }
-    Crossings<T> c;
-    find_crossings(X, Y, static_cast<T>(image.R), c);
-    for (uint32_t bits = c.crossed; bits; bits &= bits - 1) {
-      const int64_t e = lowest_bit(bits), p = e < 3 ? e : e - 3, q = p < 2 ? p + 1 : 0, o = p > 0 ? p - 1 : 2;
-      const T *s = e < 3 ? X : Y, *t = e < 3 ? Y : X;
-      T* moved = e < 3 ? grad_y : grad_x;
-      sweep_edge(image, ids[n], c, e, t[q], s[o], t[o], moved[p], moved[q]);
-    }
-    for (int k = 0; k < 3; ++k) {
-      grad[6 * n + 2 * k] = grad_x[k];
-      grad[6 * n + 2 * k + 1] = grad_y[k];
-    }
-  }
+NMR_INLINE void sweep_faces(const SweepImage<T>& image, const int32_t* ids, int64_t first, int64_t last, Sweep<T>* sweeps, T* grad) {
+  std::fill_n(grad + 6 * first, 6 * (last - first), T(0));
+  int64_t count = 0;
+  for (int64_t n = first; n < last; ++n) count = prepare_face(image, static_cast<int32_t>(n), ids[n], sweeps, count, grad);
+  run_sweeps(image, sweeps, count, grad);
 }
 
 NMR_CLONES void collect(const SweepImage<float>& image, const LineRange& range, float* grad_row) {
@@ -396,11 +431,13 @@ NMR_CLONES void collect(const SweepImage<float>& image, const LineRange& range, 
 NMR_CLONES void collect(const SweepImage<double>& image, const LineRange& range, double* grad_row) {
   collect_lines(image, range, grad_row);
 }
-NMR_CLONES void sweep(const SweepImage<float>& image, const int32_t* ids, int64_t first, int64_t last, float* grad) {
-  sweep_faces(image, ids, first, last, grad);
+NMR_CLONES void sweep(const SweepImage<float>& image, const int32_t* ids, int64_t first, int64_t last, Sweep<float>* sweeps,
+                      float* grad) {
+  sweep_faces(image, ids, first, last, sweeps, grad);
 }
-NMR_CLONES void sweep(const SweepImage<double>& image, const int32_t* ids, int64_t first, int64_t last, double* grad) {
-  sweep_faces(image, ids, first, last, grad);
+NMR_CLONES void sweep(const SweepImage<double>& image, const int32_t* ids, int64_t first, int64_t last, Sweep<double>* sweeps,
+                      double* grad) {
+  sweep_faces(image, ids, first, last, sweeps, grad);
 }
 
 // Marks the faces that own a pixel (visible[id + 1] = 1) and lists them, ascending: all others get exactly zero.
@@ -445,8 +482,10 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
     const int64_t count = list_visible(image.owner, R * R, 2 * image.num_faces, reserve(scratch.visible, 2 * image.num_faces + 1), ids);
     const int64_t chunk = share ? 256 : std::max<int64_t>(count, 1);
     T* grad = reserve(scratch.grad, 6 * count);
-    parallel_for((count + chunk - 1) / chunk, threads,
-                 [&](int64_t n) { sweep(image, ids, n * chunk, std::min((n + 1) * chunk, count), grad); });
+    parallel_for((count + chunk - 1) / chunk, threads, [&](int64_t n) {
+      Sweep<T>* sweeps = reserve(thread_scratch<SweepScratch<T>>().sweeps, kSweeps + 1);
+      sweep(image, ids, n * chunk, std::min((n + 1) * chunk, count), sweeps, grad);
+    });
 
     T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
     std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));

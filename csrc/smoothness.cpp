@@ -1,6 +1,12 @@
 // Smoothness loss: sum over edges of (1 + cos(theta))^2, theta the angle between the two faces at the edge (-1 when flat), in
 // Kato's guarded form. theta is measured between the heights that the faces' other corners have over the edge.
-#include <Eigen/Core>
+//
+// All meshes share the edges, so kLanes meshes are handled together, one per lane: their vertices are interleaved first, and every
+// load and every sum of the gradient is then a whole vector. What remains of the batch takes kLanes edges of one mesh together.
+// A mesh's edges are summed in their order either way, so its bits do not depend on which.
+#include <algorithm>
+#include <cmath>
+#include <vector>
 
 #include "parallel.h"
 #include "stages.h"
@@ -9,104 +15,276 @@ namespace nmr {
 namespace {
 
 constexpr double kGuard = 1e-6;  // added to every squared length and denominator
+constexpr int kLanes = 16;
+constexpr int kCoordinates = 12;  // x, y, z of an edge's first and second vertex and of the two opposite ones
 
 template <class T>
-using Vec3 = Eigen::Matrix<T, 3, 1>;
+struct Vec3 {
+  T x, y, z;
+};
+
+template <class T>
+NMR_INLINE Vec3<T> operator+(const Vec3<T>& a, const Vec3<T>& b) {
+  return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+template <class T>
+NMR_INLINE Vec3<T> operator-(const Vec3<T>& a, const Vec3<T>& b) {
+  return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+template <class T>
+NMR_INLINE Vec3<T> operator*(T s, const Vec3<T>& a) {
+  return {s * a.x, s * a.y, s * a.z};
+}
+template <class T>
+NMR_INLINE T dot(const Vec3<T>& a, const Vec3<T>& b) {
+  return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+// The edge a, and what both heights over it need.
+template <class T>
+struct Base {
+  Vec3<T> a;
+  T length;     // sqrt(|a|^2 + e)
+  T inverse_2;  // 1 / (|a|^2 + e)
+};
+
+template <class T>
+NMR_INLINE Base<T> base(const Vec3<T>& a) {
+  const T a2 = dot(a, a) + T(kGuard);
+  return {a, std::sqrt(a2), 1 / a2};
+}
 
 // Height of one face over the edge a: b runs from the edge's first vertex to the face's other corner.
 template <class T>
 struct Height {
   Vec3<T> vector;  // b - a (a.b) / (|a|^2 + e)
-  T length;        // |b| sqrt(1 - cos^2 + e)
+  T length;        // |b| sin
+  T length_b;      // sqrt(|b|^2 + e)
+  T inverse_q;     // 1 / (|a| |b| + e)
+  T cos;           // a.b / (|a| |b| + e)
+  T sin;           // sqrt(1 - cos^2 + e)
+  T along;         // (a.b) / (|a|^2 + e)
 };
 
-// The parts of a height that its derivative needs again.
 template <class T>
-struct HeightParts {
-  T a2, ab, length_a, length_b, cos, sin, along;
-};
+NMR_INLINE Height<T> height(const Base<T>& base, const Vec3<T>& b) {
+  const T e = T(kGuard), ab = dot(base.a, b);
+  Height<T> h;
+  h.length_b = std::sqrt(dot(b, b) + e);
+  h.inverse_q = 1 / (base.length * h.length_b + e);
+  h.cos = ab * h.inverse_q;
+  h.sin = std::sqrt(1 - h.cos * h.cos + e);
+  h.along = ab * base.inverse_2;
+  h.vector = b - h.along * base.a;
+  h.length = h.length_b * h.sin;
+  return h;
+}
 
+// Adds to grad_a, sets grad_b.
 template <class T>
-inline Height<T> height(const Vec3<T>& a, const Vec3<T>& b, HeightParts<T>& p) {
-  const T e = T(kGuard);
-  p.a2 = a.squaredNorm();
-  p.ab = a.dot(b);
-  p.length_a = std::sqrt(p.a2 + e);
-  p.length_b = std::sqrt(b.squaredNorm() + e);
-  p.cos = p.ab / (p.length_a * p.length_b + e);
-  p.sin = std::sqrt(1 - p.cos * p.cos + e);
-  p.along = p.ab / (p.a2 + e);
-  return {b - a * p.along, p.length_b * p.sin};
+NMR_INLINE void height_backward(const Base<T>& base, const Vec3<T>& b, const Height<T>& h, const Vec3<T>& grad_vector,
+                                T grad_length, Vec3<T>& grad_a, Vec3<T>& grad_b) {
+  const T inverse_length = 1 / h.length;  // its products with |b| and sin are 1 / sin and 1 / |b|
+  const T grad_cos = -grad_length * h.length_b * h.cos * (inverse_length * h.length_b);
+  const T grad_q = -grad_cos * h.cos * h.inverse_q;
+  const T grad_along = -dot(base.a, grad_vector);
+  const T grad_ab = grad_along * base.inverse_2 + grad_cos * h.inverse_q;
+  const T grad_length_b = grad_length * h.sin + grad_q * base.length;
+  const T twice_grad_a2 = (grad_q * h.length_b * base.length - 2 * grad_along * h.along) * base.inverse_2;
+  grad_a = grad_a + grad_ab * b + twice_grad_a2 * base.a - h.along * grad_vector;
+  grad_b = grad_vector + grad_ab * base.a + (grad_length_b * (inverse_length * h.sin)) * b;
 }
 
 template <class T>
-inline void height_backward(const Vec3<T>& a, const Vec3<T>& b, const HeightParts<T>& p, const Vec3<T>& grad_vector,
-                            T grad_length, Vec3<T>& grad_a, Vec3<T>& grad_b) {
-  const T e = T(kGuard);
-  const T q = p.length_a * p.length_b + e;
-  const T grad_cos = -grad_length * p.length_b * p.cos / p.sin;
-  const T grad_q = -grad_cos * p.cos / q;
-  const T grad_along = -a.dot(grad_vector);
-  const T grad_ab = grad_along / (p.a2 + e) + grad_cos / q;
-  const T grad_length_a = grad_q * p.length_b;
-  const T grad_length_b = grad_length * p.sin + grad_q * p.length_a;
-  const T grad_a2 = -grad_along * p.along / (p.a2 + e) + grad_length_a / (2 * p.length_a);
-  grad_a += -p.along * grad_vector + grad_ab * b + 2 * grad_a2 * a;
-  grad_b = grad_vector + grad_ab * a + (grad_length_b / p.length_b) * b;
+NMR_INLINE T edge_loss(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>& left, const Vec3<T>& right) {
+  const Base<T> a = base(end - origin);
+  const Height<T> h1 = height(a, left - origin), h2 = height(a, right - origin);
+  const T cos = dot(h1.vector, h2.vector) / (h1.length * h2.length + T(kGuard));
+  return (1 + cos) * (1 + cos);
+}
+
+// The gradient with respect to end, left and right; that of origin is minus their sum.
+template <class T>
+NMR_INLINE void edge_backward(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>& left, const Vec3<T>& right, T grad_loss,
+                              Vec3<T>& grad_end, Vec3<T>& grad_left, Vec3<T>& grad_right) {
+  const Base<T> a = base(end - origin);
+  const Vec3<T> b1 = left - origin, b2 = right - origin;
+  const Height<T> h1 = height(a, b1), h2 = height(a, b2);
+  const T inverse = 1 / (h1.length * h2.length + T(kGuard));
+  const T cos = dot(h1.vector, h2.vector) * inverse;
+  const T grad_dot = 2 * (1 + cos) * grad_loss * inverse;
+  const T grad_denominator = -grad_dot * cos;
+  grad_end = {0, 0, 0};
+  height_backward(a, b1, h1, grad_dot * h2.vector, grad_denominator * h2.length, grad_end, grad_left);
+  height_backward(a, b2, h2, grad_dot * h1.vector, grad_denominator * h1.length, grad_end, grad_right);
+}
+
+// kLanes points, as [3, kLanes].
+template <class T>
+NMR_INLINE Vec3<T> point(const T* points, int l) {
+  return {points[l], points[kLanes + l], points[2 * kLanes + l]};
+}
+template <class T>
+NMR_INLINE void set_point(T* points, int l, const Vec3<T>& p) {
+  points[l] = p.x;
+  points[kLanes + l] = p.y;
+  points[2 * kLanes + l] = p.z;
 }
 
 template <class T>
-struct Edge {
-  Eigen::Map<const Vec3<T>> origin, end, left, right;
-  Edge(const T* vertices, const int64_t* e)
-      : origin(vertices + 3 * e[0]), end(vertices + 3 * e[1]), left(vertices + 3 * e[2]), right(vertices + 3 * e[3]) {}
+NMR_INLINE void lanes_forward(const T* __restrict origin, const T* __restrict end, const T* __restrict left,
+                              const T* __restrict right, T* __restrict loss) {
+  for (int l = 0; l < kLanes; ++l) loss[l] = edge_loss(point(origin, l), point(end, l), point(left, l), point(right, l));
+}
+
+template <class T>
+NMR_INLINE void lanes_backward(const T* __restrict origin, const T* __restrict end, const T* __restrict left,
+                               const T* __restrict right, const T* __restrict grad_loss, T* __restrict grad) {
+  for (int l = 0; l < kLanes; ++l) {
+    Vec3<T> g1, g2, g3;
+    edge_backward(point(origin, l), point(end, l), point(left, l), point(right, l), grad_loss[l], g1, g2, g3);
+    set_point(grad, l, T(-1) * (g1 + g2 + g3));
+    set_point(grad + 3 * kLanes, l, g1);
+    set_point(grad + 6 * kLanes, l, g2);
+    set_point(grad + 9 * kLanes, l, g3);
+  }
+}
+
+template <int64_t count, class T>
+NMR_INLINE void add(const T* __restrict values, T* __restrict sums) {
+  for (int64_t n = 0; n < count; ++n) sums[n] += values[n];
+}
+
+// kLanes meshes from image b on: [V * 3] of each <-> [V * 3, kLanes].
+template <class T>
+NMR_INLINE void interleave(const T* from, int64_t rows, T* to) {
+  for (int64_t r = 0; r < rows; ++r)
+    for (int l = 0; l < kLanes; ++l) to[r * kLanes + l] = from[l * rows + r];
+}
+template <class T>
+NMR_INLINE void separate(const T* from, int64_t rows, T* to) {
+  for (int l = 0; l < kLanes; ++l)
+    for (int64_t r = 0; r < rows; ++r) to[l * rows + r] = from[r * kLanes + l];
+}
+
+template <class T>
+struct SmoothnessScratch {
+  std::vector<T> vertices, grad;  // [V, 3, kLanes]
 };
+
+template <class T>
+NMR_INLINE void meshes_forward_body(const Smoothness<T>& args, int64_t b, T* vertices) {
+  interleave(args.vertices + b * args.num_vertices * 3, args.num_vertices * 3, vertices);
+  double sum[kLanes] = {};
+  for (int64_t n = 0; n < args.num_edges; ++n) {
+    const int64_t* e = args.edges + 4 * n;
+    constexpr int64_t stride = 3 * kLanes;
+    T loss[kLanes];
+    lanes_forward(vertices + stride * e[0], vertices + stride * e[1], vertices + stride * e[2], vertices + stride * e[3], loss);
+    for (int l = 0; l < kLanes; ++l) sum[l] += static_cast<double>(loss[l]);
+  }
+  for (int l = 0; l < kLanes; ++l) args.loss[b + l] = static_cast<T>(sum[l]);
+}
+
+template <class T>
+NMR_INLINE void meshes_backward_body(const Smoothness<T>& args, int64_t b, T* vertices, T* grad) {
+  const int64_t rows = args.num_vertices * 3;
+  interleave(args.vertices + b * rows, rows, vertices);
+  std::fill_n(grad, rows * kLanes, T(0));
+  T grad_loss[kLanes];
+  for (int l = 0; l < kLanes; ++l) grad_loss[l] = args.grad_loss[b + l];
+  for (int64_t n = 0; n < args.num_edges; ++n) {
+    const int64_t* e = args.edges + 4 * n;
+    constexpr int64_t stride = 3 * kLanes;
+    T g[kCoordinates][kLanes];
+    lanes_backward(vertices + stride * e[0], vertices + stride * e[1], vertices + stride * e[2], vertices + stride * e[3],
+                   grad_loss, g[0]);
+    for (int i = 0; i < 4; ++i) add<stride>(g[3 * i], grad + stride * e[i]);
+  }
+  separate(grad, rows, args.grad_vertices + b * rows);
+}
+
+// kLanes edges of one mesh, the last one repeated where there are not as many.
+template <class T>
+NMR_INLINE void gather(const T* vertices, const int64_t* edges, int64_t count, T (&points)[kCoordinates][kLanes]) {
+  for (int64_t l = 0; l < kLanes; ++l) {
+    const int64_t* e = edges + 4 * std::min(l, count - 1);
+    for (int k = 0; k < kCoordinates; ++k) points[k][l] = vertices[3 * e[k / 3] + k % 3];
+  }
+}
+
+template <class T>
+NMR_INLINE void mesh_forward_body(const Smoothness<T>& args, int64_t b) {
+  const T* vertices = args.vertices + b * args.num_vertices * 3;
+  double sum = 0;
+  for (int64_t n = 0; n < args.num_edges; n += kLanes) {
+    const int64_t count = std::min<int64_t>(kLanes, args.num_edges - n);
+    T p[kCoordinates][kLanes], loss[kLanes];
+    gather(vertices, args.edges + 4 * n, count, p);
+    lanes_forward(p[0], p[3], p[6], p[9], loss);
+    for (int64_t l = 0; l < count; ++l) sum += static_cast<double>(loss[l]);
+  }
+  args.loss[b] = static_cast<T>(sum);
+}
+
+template <class T>
+NMR_INLINE void mesh_backward_body(const Smoothness<T>& args, int64_t b) {
+  const T* vertices = args.vertices + b * args.num_vertices * 3;
+  T* grad = args.grad_vertices + b * args.num_vertices * 3;
+  std::fill_n(grad, args.num_vertices * 3, T(0));
+  T grad_loss[kLanes];
+  std::fill_n(grad_loss, kLanes, args.grad_loss[b]);
+  for (int64_t n = 0; n < args.num_edges; n += kLanes) {
+    const int64_t count = std::min<int64_t>(kLanes, args.num_edges - n);
+    T p[kCoordinates][kLanes], g[kCoordinates][kLanes];
+    gather(vertices, args.edges + 4 * n, count, p);
+    lanes_backward(p[0], p[3], p[6], p[9], grad_loss, g[0]);
+    for (int64_t l = 0; l < count; ++l) {
+      const int64_t* e = args.edges + 4 * (n + l);
+      for (int k = 0; k < kCoordinates; ++k) grad[3 * e[k / 3] + k % 3] += g[k][l];
+    }
+  }
+}
+
+NMR_CLONES void meshes_forward(const Smoothness<float>& args, int64_t b, float* v) { meshes_forward_body(args, b, v); }
+NMR_CLONES void meshes_forward(const Smoothness<double>& args, int64_t b, double* v) { meshes_forward_body(args, b, v); }
+NMR_CLONES void meshes_backward(const Smoothness<float>& args, int64_t b, float* v, float* g) { meshes_backward_body(args, b, v, g); }
+NMR_CLONES void meshes_backward(const Smoothness<double>& args, int64_t b, double* v, double* g) { meshes_backward_body(args, b, v, g); }
+NMR_CLONES void mesh_forward(const Smoothness<float>& args, int64_t b) { mesh_forward_body(args, b); }
+NMR_CLONES void mesh_forward(const Smoothness<double>& args, int64_t b) { mesh_forward_body(args, b); }
+NMR_CLONES void mesh_backward(const Smoothness<float>& args, int64_t b) { mesh_backward_body(args, b); }
+NMR_CLONES void mesh_backward(const Smoothness<double>& args, int64_t b) { mesh_backward_body(args, b); }
+
+// Calls meshes(b) for groups of kLanes images from b on, and mesh(b) for what remains.
+template <class Meshes, class Mesh>
+void for_groups(int64_t batch, int num_threads, const Meshes& meshes, const Mesh& mesh) {
+  const int64_t groups = batch / kLanes;
+  parallel_for(groups + batch % kLanes, num_threads, [&](int64_t i) {
+    if (i < groups)
+      meshes(i * kLanes);
+    else
+      mesh(groups * kLanes + i - groups);
+  });
+}
 
 }  // namespace
 
 template <class T>
 void smoothness_forward(const Smoothness<T>& args) {
-  parallel_for(args.batch, args.num_threads, [&](int64_t b) {
-    const T* vertices = args.vertices + b * args.num_vertices * 3;
-    double sum = 0;
-    for (int64_t n = 0; n < args.num_edges; ++n) {
-      const Edge<T> edge(vertices, args.edges + 4 * n);
-      const Vec3<T> a = edge.end - edge.origin;
-      HeightParts<T> parts;
-      const Height<T> h1 = height<T>(a, edge.left - edge.origin, parts);
-      const Height<T> h2 = height<T>(a, edge.right - edge.origin, parts);
-      const T cos = h1.vector.dot(h2.vector) / (h1.length * h2.length + T(kGuard));
-      sum += static_cast<double>((1 + cos) * (1 + cos));
-    }
-    args.loss[b] = static_cast<T>(sum);
-  });
+  const auto meshes = [&](int64_t b) {
+    meshes_forward(args, b, reserve(thread_scratch<SmoothnessScratch<T>>().vertices, args.num_vertices * 3 * kLanes));
+  };
+  for_groups(args.batch, args.num_threads, meshes, [&](int64_t b) { mesh_forward(args, b); });
 }
 
 template <class T>
 void smoothness_backward(const Smoothness<T>& args) {
-  parallel_for(args.batch, args.num_threads, [&](int64_t b) {
-    const T* vertices = args.vertices + b * args.num_vertices * 3;
-    T* grad = args.grad_vertices + b * args.num_vertices * 3;
-    std::fill_n(grad, args.num_vertices * 3, T(0));
-    for (int64_t n = 0; n < args.num_edges; ++n) {
-      const int64_t* e = args.edges + 4 * n;
-      const Edge<T> edge(vertices, e);
-      const Vec3<T> a = edge.end - edge.origin, b1 = edge.left - edge.origin, b2 = edge.right - edge.origin;
-      HeightParts<T> p1, p2;
-      const Height<T> h1 = height<T>(a, b1, p1), h2 = height<T>(a, b2, p2);
-      const T denominator = h1.length * h2.length + T(kGuard);
-      const T cos = h1.vector.dot(h2.vector) / denominator;
-      const T grad_dot = 2 * (1 + cos) * args.grad_loss[b] / denominator;
-      const T grad_denominator = -grad_dot * cos;
-      Vec3<T> grad_a = Vec3<T>::Zero(), grad_b1, grad_b2;
-      height_backward<T>(a, b1, p1, grad_dot * h2.vector, grad_denominator * h2.length, grad_a, grad_b1);
-      height_backward<T>(a, b2, p2, grad_dot * h1.vector, grad_denominator * h1.length, grad_a, grad_b2);
-      Eigen::Map<Vec3<T>>(grad + 3 * e[0]) -= grad_a + grad_b1 + grad_b2;
-      Eigen::Map<Vec3<T>>(grad + 3 * e[1]) += grad_a;
-      Eigen::Map<Vec3<T>>(grad + 3 * e[2]) += grad_b1;
-      Eigen::Map<Vec3<T>>(grad + 3 * e[3]) += grad_b2;
-    }
-  });
+  const auto meshes = [&](int64_t b) {
+    SmoothnessScratch<T>& scratch = thread_scratch<SmoothnessScratch<T>>();
+    T* vertices = reserve(scratch.vertices, args.num_vertices * 3 * kLanes);
+    meshes_backward(args, b, vertices, reserve(scratch.grad, args.num_vertices * 3 * kLanes));
+  };
+  for_groups(args.batch, args.num_threads, meshes, [&](int64_t b) { mesh_backward(args, b); });
 }
 
 template void smoothness_forward(const Smoothness<float>&);

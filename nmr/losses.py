@@ -1,12 +1,19 @@
-"""Losses on silhouettes and meshes."""
+"""Losses on silhouettes and meshes.
+
+Those on meshes take a table of the mesh's topology that is made once: ``edges = nmr.edge_table(faces)`` serves them
+all; :func:`nmr.unique_edges` is enough for those that do not look at faces, and knows open and non-manifold meshes.
+"""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
 
 from . import ops
 from ._validate import check_vertices, describe
+from .mesh import _check_indices, face_normals, face_vertices
 
 
 def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
@@ -45,7 +52,7 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
 def smoothness_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     """How far neighbouring faces are from flat: mean over meshes of ``sum over edges (1 + cos(theta_e))^2``.
 
-    The form is that of Kato et al. 2018.
+    The form is that of Kato et al. 2018; SoftRas calls it the flattening loss.
 
     theta_e is the angle between the two faces at edge e: pi (cos = -1) when flat. With a = v1 - v0 along the edge and
     b = v_k - v0 to an opposite corner, each face has the height h = b - a (a.b) / (|a|^2 + e) of length
@@ -66,11 +73,203 @@ def smoothness_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     TypeError, ValueError
         For wrong types and shapes, and for edges that refer to missing vertices.
     """
+    vertices = _check_meshes(vertices)
+    return ops.smoothness(vertices, _check_edge_table(edges).to(vertices.device)).mean()
+
+
+def laplacian_loss(vertices: Tensor, edges: Tensor) -> Tensor:
+    """How far the vertices are from the mean of their neighbours: mean over meshes of ``sum_i |v_i - mean_j v_j|^2``.
+
+    j runs over the vertices that share an edge with i: the uniform Laplacian. This is the published form of SoftRas and
+    of Kato and Harada 2019; PyTorch3D takes the mean of the lengths instead.
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
+    edges : int64 Tensor [E, 2] of :func:`nmr.unique_edges`, or [E, 4] of :func:`nmr.edge_table`
+
+    Returns
+    -------
+    scalar Tensor
+        Differentiable in ``vertices``. Vertices without edges count nothing.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, and for edges that refer to missing vertices.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> edges = nmr.unique_edges(faces)
+    >>> nmr.losses.laplacian_loss(vertices, edges)
+    """
+    vertices = _check_meshes(vertices)
+    v0, v1 = _check_edges(edges, vertices)
+    rows = _batch_last(vertices)
+    difference = rows.index_select(0, v1) - rows.index_select(0, v0)
+    sums = torch.zeros_like(rows).index_add(0, v0, difference).index_add(0, v1, difference, alpha=-1)
+    one = vertices.new_ones(len(v0))
+    degree = vertices.new_zeros(len(rows)).index_add(0, v0, one).index_add(0, v1, one)
+    return (sums / degree.clamp_min(1)[:, None, None]).square().sum((0, 1)).mean()
+
+
+def edge_length_loss(vertices: Tensor, edges: Tensor, target: float | None = None) -> Tensor:
+    """How much the edges differ in length: mean over meshes of ``sum over edges (|v1 - v0| - target)^2``.
+
+    Kato and Harada's 2019 code counts an edge once for each of its faces: on a closed mesh that is twice this loss.
+    PyTorch3D takes the mean over the edges instead of the sum.
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
+    edges : int64 Tensor [E, 2] of :func:`nmr.unique_edges`, or [E, 4] of :func:`nmr.edge_table`
+    target : float, optional
+        The length to reach, in the unit of the vertices; by default the mean length of each mesh's own edges.
+
+    Returns
+    -------
+    scalar Tensor
+        Differentiable in ``vertices``; an edge of length 0 passes no gradient.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, for edges that refer to missing vertices, and for a target that is negative or not
+        finite.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> edges = nmr.unique_edges(faces)
+    >>> nmr.losses.edge_length_loss(vertices, edges)
+    """
+    vertices = _check_meshes(vertices)
+    v0, v1 = _check_edges(edges, vertices)
+    if target is not None and not (0 <= target < math.inf):
+        raise ValueError(f"target must be a finite length >= 0, got {target}; leave it out for the mean length")
+    rows = _batch_last(vertices)
+    length = _length(rows.index_select(0, v1) - rows.index_select(0, v0))
+    goal = length.mean(0) if target is None else target
+    return (length - goal).square().sum(0).mean()
+
+
+def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
+    """How much neighbouring faces differ in direction: mean over meshes and edges of ``1 - cos(n, n')``.
+
+    n and n' are the normals of the two faces at an edge, both seen from one side of the surface, whatever the order of
+    the faces' vertices. 0 when flat. This is PyTorch3D's definition (``mesh_normal_consistency``) for meshes whose
+    edges have one face or two.
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
+    edges : int64 Tensor [E, 4] of :func:`nmr.edge_table`, E >= 1
+
+    Returns
+    -------
+    scalar Tensor
+        Differentiable in ``vertices``. An edge at a face without area counts 1 and passes no gradient.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, and for edges that refer to missing vertices.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> edges = nmr.edge_table(faces)
+    >>> nmr.losses.normal_consistency_loss(vertices, edges)
+    """
+    vertices = _check_meshes(vertices)
+    edges = _check_edge_table(edges).to(vertices.device)
+    if len(edges) == 0:
+        raise ValueError("edges must hold at least one edge, got int64 [0, 4]")
+    _check_indices(edges, vertices.shape[1], "edges")
+    rows = _batch_last(vertices)
+    origin, end, left, right = (rows.index_select(0, column) for column in edges.unbind(1))
+    normal, other = _cross(end - origin, left - origin), _cross(right - origin, end - origin)
+    lengths = _length(normal) * _length(other)
+    flat = lengths == 0
+    cos = (normal * other).sum(1) / torch.where(flat, 1.0, lengths)
+    return (1 - torch.where(flat, 0.0, cos)).mean()
+
+
+def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
+    """A pressure from inside: mean over meshes of ``sum over faces f and their corners k |v_k + n_f - v_k|``.
+
+    The first v_k and the unit normal n_f are constants for the gradient. The value is thus 3 for every face; what
+    matters is the gradient, ``-n_f`` for each corner: a step against it moves every vertex outwards. From the code of
+    Kato and Harada 2019 (view prior learning).
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
+    faces : integer Tensor [F, 3] or [B, F, 3], counter-clockwise seen from outside
+
+    Returns
+    -------
+    scalar Tensor
+        Its gradient in ``vertices`` is as said, and not the derivative of the value. Faces without area count nothing.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, and for faces that refer to missing vertices.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> nmr.losses.inflation_loss(vertices, faces)  # 3840
+    """
+    vertices = _check_meshes(vertices)
+    corners = face_vertices(vertices, faces)
+    moved = corners.detach() + face_normals(vertices.detach(), faces).unsqueeze(2)
+    return torch.linalg.vector_norm(moved - corners, dim=-1).sum((1, 2)).mean()
+
+
+def _batch_last(vertices: Tensor) -> Tensor:
+    """[B, V, 3] as [V, 3, B]: a row is then long enough to be copied and summed at the speed of memory."""
+    return vertices.permute(1, 2, 0).contiguous()
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross products of vectors [N, 3, B]."""
+    (a0, a1, a2), (b0, b1, b2) = a.unbind(1), b.unbind(1)
+    return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], dim=1)
+
+
+def _length(vectors: Tensor) -> Tensor:
+    """Lengths [N, B] of vectors [N, 3, B]; where it is 0, so is the gradient."""
+    square = vectors.square().sum(1)
+    zero = square == 0
+    return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())
+
+
+def _check_meshes(vertices: object) -> Tensor:
+    """``vertices`` as [B, V, 3], B >= 1."""
     vertices = check_vertices(vertices)
     if vertices.shape[0] == 0:
         raise ValueError(f"vertices must hold at least one mesh, got {describe(vertices)}")
+    return vertices
+
+
+def _check_edge_table(edges: object) -> Tensor:
     if not isinstance(edges, Tensor) or edges.dtype != torch.int64 or edges.ndim != 2 or edges.shape[1] != 4:
         raise ValueError(
             f"edges must be an int64 tensor [E, 4] as made by nmr.edge_table(faces), got {describe(edges)}"
         )
-    return ops.smoothness(vertices, edges.to(vertices.device)).mean()
+    return edges
+
+
+def _check_edges(edges: object, vertices: Tensor) -> tuple[Tensor, Tensor]:
+    """First and second vertices of the edges, [E] each, on the device of the vertices."""
+    if not isinstance(edges, Tensor) or edges.dtype != torch.int64 or edges.ndim != 2 or edges.shape[1] not in (2, 4):
+        raise ValueError(
+            "edges must be an int64 tensor [E, 2] or [E, 4] as made by nmr.unique_edges(faces) or "
+            f"nmr.edge_table(faces), got {describe(edges)}"
+        )
+    edges = edges[:, :2].to(vertices.device)
+    _check_indices(edges, vertices.shape[1], "edges")
+    return edges[:, 0], edges[:, 1]

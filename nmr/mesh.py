@@ -1,11 +1,11 @@
-"""Mesh topology: the sphere to deform, and which faces meet at which edge."""
+"""Meshes: the sphere to deform, which faces meet at which edge, normals."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from ._validate import check_faces
+from ._validate import check_faces, check_vertices
 
 
 def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
@@ -37,8 +37,7 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
     faces[inward] = faces[inward].flip(1)
     vertices = vertices / vertices.norm(dim=1, keepdim=True)
     for _ in range(subdivisions):
-        pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
-        pairs, edge = torch.unique(pairs, dim=0, return_inverse=True)
+        pairs, edge = torch.unique(_sides(faces), dim=0, return_inverse=True)
         ab, bc, ca = (edge + len(vertices)).view(3, -1).unbind(0)
         a, b, c = faces.unbind(1)
         midpoints = vertices[pairs].sum(1)
@@ -47,12 +46,41 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
     return vertices.float(), faces
 
 
-def edge_table(faces: Tensor) -> Tensor:
-    """Every edge of a closed mesh with the two faces that share it.
+def unique_edges(faces: Tensor) -> Tensor:
+    """Every edge of a mesh once. The mesh may have borders, and edges with more than two faces.
 
     Parameters
     ----------
     faces : integer Tensor [F, 3]
+
+    Returns
+    -------
+    int64 Tensor [E, 2]
+        Row ``(v0, v1)``: an edge, v0 < v1. Rows are sorted. (A face that names a vertex twice has no edge there.)
+
+    Raises
+    ------
+    TypeError, ValueError
+        For a wrong type or shape.
+
+    Examples
+    --------
+    >>> _, faces = nmr.icosphere(3)
+    >>> nmr.unique_edges(faces).shape
+    torch.Size([1920, 2])
+    """
+    sides = _sides(_one_mesh(faces))
+    return torch.unique(sides[sides[:, 0] != sides[:, 1]], dim=0)
+
+
+def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
+    """Every edge with the two faces that share it.
+
+    Parameters
+    ----------
+    faces : integer Tensor [F, 3]
+    open_mesh : bool
+        Leave out the edges at a border, which have one face, instead of refusing them.
 
     Returns
     -------
@@ -63,26 +91,164 @@ def edge_table(faces: Tensor) -> Tensor:
     Raises
     ------
     TypeError, ValueError
-        For a wrong type or shape, and for a mesh with an edge that does not have exactly two faces (a boundary, a
-        non-manifold edge or a degenerate face): the message says how many edges and names the first.
+        For a wrong type or shape, and for a mesh with an edge that does not have exactly two faces (a border, unless
+        `open_mesh`; a non-manifold edge or a degenerate face): the message says how many edges and names the first.
     """
-    faces = check_faces(faces, 1, torch.device("cpu"))
-    if faces.ndim != 2:
-        raise ValueError(f"faces must have shape [F, 3], got {list(faces.shape)}; pass the faces of one mesh")
+    faces = _one_mesh(faces)
     # Sides 0-1, 1-2 and 2-0 with their opposite corners, grouped by edge; a stable sort keeps the face order.
-    sides = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
     opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
-    face = torch.arange(len(faces)).repeat(3)
-    order = torch.argsort(face, stable=True)
-    sides, opposite = sides[order], opposite[order]
+    order = torch.argsort(torch.arange(len(faces)).repeat(3), stable=True)
+    sides, opposite = _sides(faces)[order], opposite[order]
     edges, edge_of_side, counts = torch.unique(sides, dim=0, return_inverse=True, return_counts=True)
-    bad = torch.nonzero(counts != 2).flatten()
+    if open_mesh:
+        wrong, wanted = counts > 2, "at most two faces"
+        remedy = "remove the faces beyond, and those that name a vertex twice"
+    else:
+        wrong, wanted = counts != 2, "exactly two faces (a closed mesh)"
+        remedy = "close the mesh first (for example with trimesh.repair.fill_holes) or pass open_mesh=True"
+    bad = torch.nonzero(wrong | (edges[:, 0] == edges[:, 1])).flatten()
     if len(bad):
         v0, v1 = edges[bad[0]].tolist()
         raise ValueError(
-            f"every edge must have exactly two faces (a closed mesh), but {len(bad)} of {len(edges)} have not: "
-            f"edge ({v0}, {v1}) has {int(counts[bad[0]])}; "
-            "close the mesh first (for example with trimesh.repair.fill_holes)"
+            f"every edge must have two ends and {wanted}, but {len(bad)} of {len(edges)} have not: "
+            f"edge ({v0}, {v1}) has {int(counts[bad[0]])}; {remedy}"
         )
-    order = torch.argsort(edge_of_side, stable=True)
-    return torch.cat([edges, opposite[order].view(-1, 2)], dim=1)
+    inner = counts[edge_of_side] == 2
+    order = torch.argsort(edge_of_side[inner], stable=True)
+    return torch.cat([edges[counts == 2], opposite[inner][order].view(-1, 2)], dim=1)
+
+
+def face_vertices(vertices: Tensor, faces: Tensor) -> Tensor:
+    """The corners of every face, ``[B, F, 3 corners, 3]`` (``[F, 3, 3]`` for vertices ``[V, 3]``).
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
+    faces : integer Tensor [F, 3] or [B, F, 3]
+
+    Returns
+    -------
+    Tensor
+        ``face_vertices[b, f, k]`` is vertex ``faces[f, k]`` of mesh b. Differentiable in ``vertices``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, and for faces that refer to missing vertices.
+    """
+    batched = check_vertices(vertices)
+    faces = check_faces(faces, batched.shape[0], batched.device)
+    _check_indices(faces, batched.shape[1])
+    corners = _gather(batched, faces.flatten(-2)).unflatten(1, (-1, 3))
+    return corners if vertices.ndim == 3 else corners.squeeze(0)
+
+
+def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Unit normals of the faces: ``(p1 - p0) x (p2 - p0)``, normalised, p0, p1, p2 the face's corners in order.
+
+    Counter-clockwise faces of a right-handed world (as those of :func:`icosphere`) have normals that point outwards.
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
+    faces : integer Tensor [F, 3] or [B, F, 3]
+
+    Returns
+    -------
+    Tensor [B, F, 3], or [F, 3] for vertices [V, 3]
+        Of length 1; 0 for a face without area. Differentiable in ``vertices`` (a face without area passes no gradient).
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, and for faces that refer to missing vertices.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> nmr.face_normals(vertices, faces).shape
+    torch.Size([1280, 3])
+    """
+    return _unit(_face_cross(face_vertices(vertices, faces)))
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Unit normals at the vertices: the normals of the faces around each, weighted by their areas, normalised.
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
+    faces : integer Tensor [F, 3] or [B, F, 3]
+
+    Returns
+    -------
+    Tensor like vertices
+        Of length 1; 0 at a vertex that no face with an area touches. Differentiable in ``vertices``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, and for faces that refer to missing vertices.
+    """
+    batched = check_vertices(vertices)
+    faces = check_faces(faces, batched.shape[0], batched.device)
+    cross = _face_cross(face_vertices(batched, faces))  # twice the area long
+    normals = _unit(_scatter_sum(cross.repeat_interleave(3, dim=1), faces.flatten(-2), batched.shape[1]))
+    return normals if vertices.ndim == 3 else normals.squeeze(0)
+
+
+def _face_cross(corners: Tensor) -> Tensor:
+    """Normals twice as long as the faces' areas, [..., F, 3]."""
+    p0, p1, p2 = corners.unbind(-2)
+    return torch.linalg.cross(p1 - p0, p2 - p0)
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    """Vectors over their lengths; 0, with gradient 0, where the length is 0."""
+    # Scaled to a largest coordinate of 1 first, so that the squares neither under- nor overflow. The result does not
+    # depend on the scale, so neither does its derivative.
+    scale = vectors.detach().abs().amax(-1, keepdim=True)
+    zero = scale < torch.finfo(vectors.dtype).tiny
+    vectors = torch.where(zero, 1.0, vectors / torch.where(zero, 1.0, scale))
+    return torch.where(zero, 0.0, vectors / vectors.square().sum(-1, keepdim=True).sqrt())
+
+
+def _one_mesh(faces: Tensor) -> Tensor:
+    """``faces`` as int64 [F, 3] in host memory."""
+    faces = check_faces(faces, 1, torch.device("cpu"))
+    if faces.ndim != 2:
+        raise ValueError(f"faces must have shape [F, 3], got {list(faces.shape)}; pass the faces of one mesh")
+    return faces
+
+
+def _sides(faces: Tensor) -> Tensor:
+    """Vertices of all sides 0-1, then all 1-2, then all 2-0, [3 F, 2], the smaller first."""
+    return torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
+
+
+def _check_indices(indices: Tensor, num_vertices: int, name: str = "faces") -> None:
+    """Every number in 0..V-1. (In a compiled graph, which has no values to look at, gathering them reports it.)"""
+    if torch.compiler.is_compiling() or indices.numel() == 0:
+        return
+    low, high = (int(x) for x in indices.aminmax())
+    if low < 0 or high >= num_vertices:
+        raise ValueError(
+            f"{name} refer to vertex {low if low < 0 else high}, "
+            f"but a mesh has {num_vertices} vertices (the first is 0)"
+        )
+
+
+def _expanded(indices: Tensor, batch: int) -> Tensor:
+    """Indices [N] or [B, N] as [B, N, 3], without a copy."""
+    return indices.expand(batch, -1).unsqueeze(-1).expand(-1, -1, 3)
+
+
+def _gather(rows: Tensor, indices: Tensor) -> Tensor:
+    """Rows ``[B, N, 3]`` of ``[B, V, 3]``. The fastest of torch's ways on a CPU, in both directions."""
+    return torch.gather(rows, 1, _expanded(indices, rows.shape[0]))
+
+
+def _scatter_sum(rows: Tensor, indices: Tensor, count: int) -> Tensor:
+    """Sums ``[B, count, 3]`` of the rows ``[B, N, 3]`` that go to the same index."""
+    sums = rows.new_zeros(rows.shape[0], count, 3)
+    return sums.scatter_add(1, _expanded(indices, rows.shape[0]), rows)

@@ -6,6 +6,7 @@ the reversed faces, as the published kernels do. Works in the dtype of its input
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
@@ -66,6 +67,48 @@ def silhouette(index: Tensor, anti_aliasing: bool, dtype: torch.dtype = torch.fl
     return alpha.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2)) if anti_aliasing else alpha
 
 
+def fragments(vertices: Tensor, faces: Tensor, index: Tensor, far: float = 100.0) -> tuple[Tensor, Tensor]:
+    """Perspective-correct weights ``[R, R, 3]`` and depth ``[R, R]`` of an index map; autograd differentiates both."""
+    R, drawn = index.shape[0], index >= 0
+    x, y, z = vertices[with_back_faces(faces, True)[index.clamp_min(0)]].unbind(-1)
+    X, Y = (x * R + R - 1) / 2, (y * R + R - 1) / 2
+    column = torch.arange(R).to(vertices)
+    x_pixel, y_pixel = torch.meshgrid(column, column, indexing="xy")
+    a, b = [1, 2, 0], [2, 0, 1]
+    dx, dy = X[..., b] - X[..., a], Y[..., a] - Y[..., b]
+    linear = dy * x_pixel[..., None] + dx * y_pixel[..., None] + X[..., a] * Y[..., b] - X[..., b] * Y[..., a]
+    screen = (linear / (X * dy).sum(-1, keepdim=True)).clamp(0, 1)
+    screen = screen / screen.sum(-1, keepdim=True)
+    depth = 1 / (screen / z).sum(-1)
+    weights = screen / z * depth[..., None]
+    weights = torch.where((index >= len(faces))[..., None], weights.flip(-1), weights)
+    return (
+        torch.where(drawn[..., None], weights, torch.zeros_like(weights)),
+        torch.where(drawn, depth, torch.full_like(depth, far)),
+    )
+
+
+def resolve(image: Tensor, anti_aliasing: bool) -> Tensor:
+    """The image ``[S, S, C]``, row 0 = top, of raster pixels ``[R, R, C]``, row 0 = bottom."""
+    image = image.flip(0)
+    return image.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2)) if anti_aliasing else image
+
+
+def texture_color(texture: Tensor, weights: Tensor, eps: float) -> Tensor:
+    """Colour ``[C]`` of one pixel: its face's texture ``[ts, ts, ts, C]`` at the weights ``[3]`` of its vertices."""
+    size = texture.shape[0]
+    t = (weights * (size - 1)).clamp_max(size - 1 - eps).clamp_min(0)
+    color = torch.zeros_like(texture[0, 0, 0])
+    for corner in itertools.product((0, 1), repeat=3):
+        cell, share = [], 1.0
+        for k, upper in enumerate(corner):
+            below = math.floor(t[k])
+            cell.append(min(below + upper, size - 1))
+            share = share * (t[k] - below if upper else 1 - (t[k] - below))
+        color = color + share * texture[tuple(cell)]
+    return color
+
+
 def silhouette_gradient(
     vertices: Tensor,
     faces: Tensor,
@@ -76,10 +119,28 @@ def silhouette_gradient(
     eps: float = 1e-4,
 ) -> Tensor:
     """NMR's gradient ``[V, 3]`` of one image, from its index map ``[R, R]`` and the gradient ``[S, S]`` of alpha."""
+    image = (index >= 0).to(vertices)[..., None]
+    return edge_gradient(vertices, faces, index, image, grad_alpha[..., None], anti_aliasing, fill_back, eps)
+
+
+def edge_gradient(
+    vertices: Tensor,
+    faces: Tensor,
+    index: Tensor,
+    image: Tensor,
+    grad_resolved: Tensor,
+    anti_aliasing: bool,
+    fill_back: bool = True,
+    eps: float = 1e-4,
+) -> Tensor:
+    """NMR's gradient ``[V, 3]`` of one image ``[R, R, C]``, from the gradient ``[S, S, C]`` of the resolved image.
+
+    Index map and image have row 0 = bottom, the gradient has row 0 = top.
+    """
     R = index.shape[0]
-    grad = grad_alpha
+    grad = grad_resolved
     if anti_aliasing:
-        grad = (grad_alpha / 4).repeat_interleave(2, 0).repeat_interleave(2, 1)
+        grad = (grad / 4).repeat_interleave(2, 0).repeat_interleave(2, 1)
     grad = grad.flip(0)
     result = torch.zeros_like(vertices)
     for f, face in enumerate(with_back_faces(faces, fill_back)):
@@ -89,17 +150,18 @@ def silhouette_gradient(
         for p in range(3):
             q, o = (p + 1) % 3, (p + 2) % 3
             for axis in (0, 1):  # 0: lines of constant x, swept along y, which moves y; 1: the other way round
-                lines = index.T if axis == 0 else index
-                line_grad = grad.T if axis == 0 else grad
+                lines, line_image, line_grad = (t.transpose(0, 1) if axis == 0 else t for t in (index, image, grad))
                 corners = pixel if axis == 0 else pixel.flip(1)
-                pull_p, pull_q = _sweep_edge(corners[p], corners[q], corners[o], axis, f, lines, line_grad, eps)
+                pull_p, pull_q = _sweep_edge(
+                    corners[p], corners[q], corners[o], axis, f, lines, line_image, line_grad, eps
+                )
                 result[face[p], 1 - axis] += pull_p
                 result[face[q], 1 - axis] += pull_q
     return result
 
 
 def _sweep_edge(
-    p: Tensor, q: Tensor, o: Tensor, axis: int, f: int, lines: Tensor, line_grad: Tensor, eps: float
+    p: Tensor, q: Tensor, o: Tensor, axis: int, f: int, lines: Tensor, image: Tensor, grad: Tensor, eps: float
 ) -> tuple[float, float]:
     """Gradients of the sweep coordinates of p and q; points are (scan, sweep), ``lines[n]`` is the line at scan n."""
     R = lines.shape[0]
@@ -119,17 +181,16 @@ def _sweep_edge(
         if min(inner, outer) < 0 or max(inner, outer) > R - 1:
             continue
         m = torch.arange(R)
-        covered = (lines[n] >= 0).to(line_grad)
         # Outside: what changes if a pixel takes the value of the inner one.
         beyond = m >= outer if direction > 0 else m <= outer
-        outside = (covered - covered[inner]) * line_grad[n]
+        outside = ((image[n] - image[n, inner]) * grad[n]).sum(-1)
         outside = torch.where(beyond & (lines[n, inner] == f), outside, torch.zeros_like(outside))
         # Inside: what changes if an own pixel takes the value of the outer one.
         limit = _height(p, o, n) if (n - p[0]) * (n - o[0]) < 0 else _height(q, o, n)
         limit = 0 if math.isnan(limit) else max(min(limit, R), -1)
         limit = math.ceil(limit) if direction > 0 else math.floor(limit)
         between = (m >= min(inner, limit)) & (m <= max(inner, limit))
-        inside = (covered - covered[outer]) * line_grad[n]
+        inside = ((image[n] - image[n, outer]) * grad[n]).sum(-1)
         inside = torch.where(between & (lines[n] == f), inside, torch.zeros_like(inside))
         gain = outside.clamp_min(0) + inside.clamp_min(0)
         for end, other in ((p, q), (q, p)):

@@ -6,7 +6,8 @@ namespace {
 
 // Checks weights [B, R, R, 3] and an owner map of the given number of faces (packed: those of starts).
 template <class T>
-void require_fragments(const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts, int64_t num_faces) {
+void require_fragments(const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts,
+                       int64_t num_faces) {
   const int64_t batch = starts ? starts->shape(0) - 1 : owner.ndim() == 3 ? owner.shape(0) : 0;
   const int64_t* s = starts ? starts->data() : nullptr;
   const int64_t R = require_owner(owner, batch, [&](int64_t b) { return s ? s[2 * b + 3] - s[2 * b + 1] : num_faces; });
@@ -19,12 +20,13 @@ template <class T>
 TextureCubes<T> texture_args(const Array<T>& textures, const Array<int32_t>& owner, const Array<T>& weights,
                              const std::optional<Indices>& starts, double eps, int num_threads) {
   const py::ssize_t lead = starts ? 1 : 2;
-  require(textures.ndim() == lead + 4, std::string("textures must have shape ") +
-                                           (starts ? "[M, ts, ts, ts, C]" : "[B or 1, F, ts, ts, ts, C]") + ", got " + shape_of(textures));
+  const std::string layout = starts ? "[M, ts, ts, ts, C]" : "[B or 1, F, ts, ts, ts, C]";
+  require(textures.ndim() == lead + 4, "textures must have shape " + layout + ", got " + shape_of(textures));
   const int64_t ts = textures.shape(lead), channels = textures.shape(lead + 3), num_faces = textures.shape(lead - 1);
   require(ts >= 1 && textures.shape(lead + 1) == ts && textures.shape(lead + 2) == ts && channels >= 1,
           "textures must be cubes of the same size in all three directions, with channels, got " + shape_of(textures));
-  if (starts) require_starts(*starts, starts->ndim() == 2 && starts->shape(0) > 0 ? starts->data()[2 * starts->shape(0) - 2] : 0, num_faces);
+  // Textures have no rows: whatever number of them starts ends with is right.
+  if (starts) require_starts(*starts, starts->ndim() == 2 && starts->size() >= 2 ? starts->data()[starts->size() - 2] : 0, num_faces);
   require_fragments(owner, weights, starts, num_faces);
   const int64_t texture_batch = starts ? 1 : textures.shape(0);
   require(starts || texture_batch == 1 || texture_batch == owner.shape(0),
@@ -109,8 +111,8 @@ Interpolate<T> interpolate_args(const Array<T>& attributes, const Indices& corne
 }
 
 template <class T>
-void interpolate_forward_py(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner, const Array<T>& weights,
-                            const std::optional<Indices>& starts, Array<T>& values, int num_threads) {
+void interpolate_forward_py(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner,
+                            const Array<T>& weights, const std::optional<Indices>& starts, Array<T>& values, int num_threads) {
   Interpolate<T> args = interpolate_args(attributes, corners, owner, weights, starts, num_threads);
   require_shape(values, "values", {args.batch, args.raster_size, args.raster_size, args.channels});
   args.values = values.mutable_data();
@@ -119,8 +121,8 @@ void interpolate_forward_py(const Array<T>& attributes, const Indices& corners, 
 }
 
 template <class T>
-void interpolate_backward_py(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner, const Array<T>& weights,
-                             const std::optional<Indices>& starts, const Array<T>& grad_values,
+void interpolate_backward_py(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner,
+                             const Array<T>& weights, const std::optional<Indices>& starts, const Array<T>& grad_values,
                              std::optional<Array<T>> grad_attributes, std::optional<Array<T>> grad_weights, int num_threads) {
   Interpolate<T> args = interpolate_args(attributes, corners, owner, weights, starts, num_threads);
   require_shape(grad_values, "grad_values", {args.batch, args.raster_size, args.raster_size, args.channels});

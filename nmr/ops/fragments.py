@@ -21,7 +21,8 @@ def fragments(
 ) -> tuple[Tensor, Tensor]:
     """Perspective-correct weights ``[B, R, R, 3]`` of the owner's own vertices 0, 1, 2, and depth ``[B, R, R]``.
 
-    On the background the weights are 0 and the depth is ``far``. Both are differentiable in the vertices, at a fixed owner.
+    On the background the weights are 0 and the depth is ``far``. Both are differentiable in the vertices at a fixed
+    owner.
     """
     weights = torch.empty((*owner.shape, 3), dtype=vertices.dtype)
     depth = torch.empty(owner.shape, dtype=vertices.dtype)
@@ -86,9 +87,9 @@ def depth_image(
     anti_aliasing: bool,
     far: float,
 ) -> Tensor:
-    """Depth ``[B, S, S]`` of an owner map; with anti-aliasing the mean of 2x2 pixels, ``far`` of the background included.
+    """Depth ``[B, S, S]`` of an owner map; with anti-aliasing the mean of 2x2 pixels, ``far`` mixed in.
 
-    The same numbers as the depth of :func:`fragments`, and a true derivative at a fixed owner; faster, and without weights.
+    The same numbers as the depth of :func:`fragments`, with a true derivative at a fixed owner, but faster.
     """
     batch, image_size = owner.shape[0], owner.shape[1] // (2 if anti_aliasing else 1)
     depth = torch.empty((batch, image_size, image_size), dtype=vertices.dtype)

@@ -19,8 +19,9 @@ def sample_texture_cubes(
     starts: Optional[Tensor],  # noqa: UP045
     eps: float,
 ) -> Tensor:
-    """Colours ``[B, R, R, C]`` from textures ``[B or 1, F, ts, ts, ts, C]``, packed ``[M, ts, ts, ts, C]``; 0 on background.
+    """Colours ``[B, R, R, C]`` from texture cubes; 0 on background.
 
+    textures are ``[B or 1, F, ts, ts, ts, C]``, packed ``[M, ts, ts, ts, C]``.
     Axis k of a cube is the weight of the face's vertex k: sampled trilinearly at ``weights * (ts - 1)``, clamped to
     ``[0, ts - 1 - eps]``. Differentiable in ``textures`` only, as published.
     """
@@ -60,7 +61,7 @@ def texture_cubes_backward(
     shape: list[int],
     eps: float,
 ) -> Tensor:
-    """Gradient of :func:`sample_texture_cubes` in its textures of the given shape; shared textures sum over the images."""
+    """Gradient of :func:`sample_texture_cubes` in its textures, of the given shape; shared ones sum over images."""
     grad_textures = torch.empty(shape, dtype=grad_colors.dtype)
     arrays = owner, weights, starts, grad_colors
     _C.texture_cubes_backward(*map(host_array, arrays), grad_textures.numpy(), eps, num_threads())
@@ -88,8 +89,8 @@ def interpolate(
 ) -> Tensor:
     """``values[b, y, x] = sum_k weights[b, y, x, k] attributes[b, corners[f, k]]`` ``[B, R, R, C]``; 0 on background.
 
-    attributes are ``[B or 1, N, C]``, packed ``[N, C]``; corners ``[F, 3]``, ``[B, F, 3]`` or packed ``[M, 3]`` are rows of
-    them, counted from the mesh's first; packed, ``starts`` are first row and first face of each mesh.
+    attributes are ``[B or 1, N, C]``, packed ``[N, C]``; corners ``[F, 3]``, ``[B, F, 3]`` or packed ``[M, 3]`` are
+    rows of them, counted from the mesh's first; packed, ``starts`` are first row and first face of each mesh.
     """
     values = torch.empty((*owner.shape, attributes.shape[-1]), dtype=attributes.dtype)
     arrays = attributes, corners, owner, weights, starts

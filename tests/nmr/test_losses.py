@@ -1,4 +1,4 @@
-"""soft_iou_loss and smoothness_loss: published values and gradients, true derivatives, errors."""
+"""The losses: published values and gradients, closed forms, true derivatives, errors."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,14 @@ import torch
 from vectors import load_vector, vector_names
 
 import nmr
-from nmr.losses import smoothness_loss, soft_iou_loss
+from nmr.losses import (
+    edge_length_loss,
+    inflation_loss,
+    laplacian_loss,
+    normal_consistency_loss,
+    smoothness_loss,
+    soft_iou_loss,
+)
 
 
 def relative_l2(a, b):
@@ -70,7 +77,7 @@ def test_smoothness_is_least_when_flat():
 
 def test_smoothness_same_bits_for_any_number_of_threads():
     vertices, faces = nmr.icosphere(2)
-    vertices = vertices + 0.1 * torch.randn(5, len(vertices), 3, generator=torch.Generator().manual_seed(0))
+    vertices = vertices + 0.1 * torch.randn(37, len(vertices), 3, generator=torch.Generator().manual_seed(0))
     edges, before, results = nmr.edge_table(faces), torch.get_num_threads(), []
     try:
         for threads in (1, 2, 5):
@@ -81,6 +88,22 @@ def test_smoothness_same_bits_for_any_number_of_threads():
     finally:
         torch.set_num_threads(before)
     assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_smoothness_same_bits_alone_and_in_a_batch(dtype):
+    """Meshes are taken 16 at a time while there are as many, and one by one, in groups of edges, after that."""
+    vertices, faces = nmr.icosphere(1)
+    g = torch.Generator().manual_seed(0)
+    vertices = (vertices + 0.1 * torch.randn(19, len(vertices), 3, generator=g)).to(dtype)
+    edges = nmr.edge_table(faces)[:-1]  # 119: not a multiple of the group
+    weights = torch.rand(19, generator=g).to(dtype)
+    loss = nmr.ops.smoothness(vertices, edges)
+    grad = nmr.ops.smoothness_backward(vertices, edges, weights)
+    for b in range(19):
+        assert torch.equal(loss[b : b + 1], nmr.ops.smoothness(vertices[b : b + 1], edges))
+        alone = nmr.ops.smoothness_backward(vertices[b : b + 1], edges, weights[b : b + 1])
+        assert torch.equal(grad[b : b + 1], alone)
 
 
 def test_smoothness_errors():
@@ -119,3 +142,146 @@ def test_soft_iou_error():
             soft_iou_loss(torch.zeros(a), torch.zeros(b))
     with pytest.raises(TypeError, match="must be tensors"):
         soft_iou_loss([0.0], torch.zeros(1, 1))
+
+
+def octahedron():
+    """Vertices at distance 1 on the axes; every vertex is the middle of its neighbours but for its own axis."""
+    vertices = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+    faces = torch.tensor([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+    return vertices, faces
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("key", ["laplacian", "edge", "inflation"])
+def test_published_losses(key, dtype):
+    v = load_vector("loss_extra")
+    vertices, faces = torch.from_numpy(v["vertices"]).to(dtype).requires_grad_(), torch.from_numpy(v["faces"])
+    if key == "laplacian":
+        loss = laplacian_loss(vertices, nmr.unique_edges(faces))
+    elif key == "edge":
+        loss = 2 * edge_length_loss(vertices, nmr.unique_edges(faces))  # published: once for each face of an edge
+    else:
+        loss = inflation_loss(vertices, faces)  # published: sqrt(|n|^2 + 1e-5), which is 5e-6 more
+    loss.backward()
+    np.testing.assert_allclose(loss.item(), v[key], rtol=1e-5)
+    assert relative_l2(vertices.grad.numpy(), v[f"grad_{key}"]) < 1e-5
+
+
+def test_closed_forms_on_an_octahedron():
+    vertices, faces = octahedron()
+    edges = nmr.edge_table(faces)
+    for scale in (1.0, 3.0):
+        x = scale * vertices
+        # The four neighbours of a vertex have mean 0.
+        assert laplacian_loss(x, edges).item() == pytest.approx(6 * scale**2)
+        # All edges are sqrt(2) long.
+        assert edge_length_loss(x, edges).item() == pytest.approx(0, abs=1e-20)
+        assert edge_length_loss(x, edges, target=scale).item() == pytest.approx(12 * (2**0.5 - 1) ** 2 * scale**2)
+        assert edge_length_loss(x, edges, target=0).item() == pytest.approx(24 * scale**2)
+        # Normals (+-1, +-1, +-1) / sqrt(3): those of neighbours differ in one sign.
+        assert normal_consistency_loss(x, edges).item() == pytest.approx(2 / 3)
+
+
+def test_batches_are_means_over_their_meshes():
+    vertices, faces = octahedron()
+    edges = nmr.edge_table(faces)
+    batch = torch.stack([vertices, 3 * vertices, vertices * torch.tensor([1.0, 2, 3])])
+    tables = {normal_consistency_loss: edges, laplacian_loss: edges, edge_length_loss: edges, inflation_loss: faces}
+    for loss, table in tables.items():
+        mean = sum(loss(x, table) for x in batch) / 3
+        torch.testing.assert_close(loss(batch, table), mean)
+        assert loss(vertices, table).shape == ()
+
+
+def test_flat_and_evenly_spaced_is_least():
+    """A hexagon around its middle: the middle is the mean of its neighbours, all edges are 1 long, all faces flat."""
+    angle = torch.arange(6) * torch.pi / 3
+    rim = torch.stack([angle.cos(), angle.sin(), torch.zeros(6)], dim=1)
+    vertices = torch.cat([torch.zeros(1, 3), rim]).double()
+    faces = torch.tensor([[0, k + 1, (k + 1) % 6 + 1] for k in range(6)])
+    inner = nmr.edge_table(faces, open_mesh=True)
+    middle = torch.tensor([[0, k] for k in range(1, 7)])
+    assert edge_length_loss(vertices, nmr.unique_edges(faces)) < 1e-12
+    assert normal_consistency_loss(vertices, inner) == 0
+    vertices[0, 2] = 0.5
+    # Of the middle alone: |0.5|^2; the rim's vertices have one neighbour each.
+    expected = 0.5**2 + 6 * (1 + 0.5**2)
+    assert laplacian_loss(vertices, middle).item() == pytest.approx(expected)
+    assert normal_consistency_loss(vertices, inner) > 0.01
+
+
+def test_normal_consistency_does_not_depend_on_the_winding():
+    vertices, faces = octahedron()
+    vertices = vertices * torch.tensor([1.0, 0.7, 0.5])
+    mixed = torch.cat([faces[:3].flip(1), faces[3:]])
+    values = [normal_consistency_loss(vertices, nmr.edge_table(f)) for f in (faces, mixed)]
+    torch.testing.assert_close(*values)
+
+
+@pytest.mark.parametrize("loss", [laplacian_loss, edge_length_loss, normal_consistency_loss])
+def test_losses_gradcheck(loss):
+    vertices, faces = nmr.icosphere(0)
+    vertices = (vertices[None] * torch.tensor([[[1.0, 0.7, 0.5]], [[0.4, 1.0, 0.9]]])).double().requires_grad_()
+    edges = nmr.edge_table(faces)
+    torch.autograd.gradcheck(lambda x: loss(x, edges), vertices)
+    torch.autograd.gradcheck(lambda x: edge_length_loss(x, edges, 0.5), vertices)
+
+
+def test_inflation_pulls_every_corner_along_the_normal():
+    vertices, faces = octahedron()
+    vertices.requires_grad_()
+    loss = inflation_loss(vertices, faces)
+    loss.backward()
+    assert loss.item() == pytest.approx(3 * 8)
+    # The four normals at a vertex add up to 4 / sqrt(3) along its axis.
+    torch.testing.assert_close(vertices.grad, -4 / 3**0.5 * vertices.detach())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_collapsed_meshes_have_finite_gradients(dtype):
+    vertices, faces = nmr.icosphere(0)
+    edges = nmr.edge_table(faces)
+    for x in (0 * vertices, vertices * torch.tensor([1.0, 0, 0])):
+        x = x.to(dtype).requires_grad_()
+        total = inflation_loss(x, faces)
+        for loss in (laplacian_loss, edge_length_loss, normal_consistency_loss, smoothness_loss):
+            total = total + loss(x, edges)
+        total.backward()
+        assert total.isfinite() and x.grad.isfinite().all()
+
+
+def test_vertices_without_edges_count_nothing():
+    vertices, faces = octahedron()
+    more = torch.cat([vertices, torch.full((1, 3), 7.0, dtype=torch.float64)]).requires_grad_()
+    loss = laplacian_loss(more, nmr.unique_edges(faces))
+    loss.backward()
+    assert loss.item() == pytest.approx(6) and not more.grad[-1].any()
+
+
+@pytest.mark.parametrize("loss", [laplacian_loss, edge_length_loss, normal_consistency_loss, inflation_loss])
+def test_mesh_loss_errors(loss):
+    vertices, table = torch.zeros(1, 4, 3), torch.zeros(1, 3 if loss is inflation_loss else 4, dtype=torch.long)
+    name = "faces" if loss is inflation_loss else "edges"
+    with pytest.raises(ValueError, match=f"{name} refer to vertex 9, but a mesh has 4 vertices"):
+        loss(vertices, table + 9)
+    with pytest.raises(ValueError, match=f"{name} refer to vertex -1, but a mesh has 4 vertices"):
+        loss(vertices, table - 1)
+    with pytest.raises(ValueError, match=r"at least one mesh, got float32 \[0, 4, 3\]"):
+        loss(vertices[:0], table)
+    with pytest.raises(TypeError, match="vertices must be float32 or float64"):
+        loss(vertices.half(), table)
+    with pytest.raises((ValueError, TypeError), match=f"{name} must be an int.*got float32"):
+        loss(vertices, table.float())
+
+
+def test_edges_errors():
+    vertices = torch.zeros(4, 3)
+    with pytest.raises(ValueError, match=r"made by nmr.unique_edges\(faces\) or nmr.edge_table.*int64 \[1, 3\]"):
+        laplacian_loss(vertices, torch.zeros(1, 3, dtype=torch.long))
+    with pytest.raises(ValueError, match=r"as made by nmr.edge_table\(faces\), got int64 \[1, 2\]"):
+        normal_consistency_loss(vertices, torch.zeros(1, 2, dtype=torch.long))
+    with pytest.raises(ValueError, match="at least one edge"):
+        normal_consistency_loss(vertices, torch.zeros(0, 4, dtype=torch.long))
+    for target in (-1, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=r"finite length >= 0, got .*leave it out"):
+            edge_length_loss(vertices, torch.zeros(1, 2, dtype=torch.long), target)

@@ -1,4 +1,4 @@
-"""icosphere and edge_table."""
+"""icosphere, tables of edges, normals."""
 
 import pytest
 import torch
@@ -49,3 +49,102 @@ def test_edge_table_wants_a_closed_mesh():
         nmr.edge_table(faces[None])
     with pytest.raises(TypeError, match="integer"):
         nmr.edge_table(faces.float())
+
+
+def test_edge_table_of_an_open_mesh_holds_the_inner_edges():
+    """A square of two triangles has one; a sphere without one face has three fewer."""
+    square = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    assert nmr.edge_table(square, open_mesh=True).tolist() == [[0, 2, 1, 3]]
+    _, faces = nmr.icosphere(1)
+    assert torch.equal(nmr.edge_table(faces, open_mesh=True), nmr.edge_table(faces))
+    part, whole = (set(map(tuple, nmr.edge_table(f, open_mesh=True).tolist())) for f in (faces[1:], faces))
+    assert len(whole - part) == 3 and part < whole
+    for fin in ([[0, 2, 4]], [[0, 0, 1]]):
+        with pytest.raises(ValueError, match=r"at most two faces, but [12] of \d have not: edge .* has .*beyond"):
+            nmr.edge_table(torch.cat([square, torch.tensor(fin)]), open_mesh=True)
+
+
+def test_edge_table_refuses_faces_that_name_a_vertex_twice():
+    tetrahedron = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2], [0, 0, 1], [0, 0, 1]])
+    with pytest.raises(ValueError, match=r"two ends and exactly two faces.*edge \(0, 0\) has 2"):
+        nmr.edge_table(tetrahedron)
+
+
+def test_unique_edges():
+    _, faces = nmr.icosphere(2)
+    assert torch.equal(nmr.unique_edges(faces), nmr.edge_table(faces)[:, :2])
+    fan = torch.tensor([[1, 0, 2], [1, 0, 3], [0, 1, 4], [5, 5, 0]])  # three faces at one edge; no face at all
+    expected = [[0, 1], [0, 2], [0, 3], [0, 4], [0, 5], [1, 2], [1, 3], [1, 4]]
+    assert nmr.unique_edges(fan.int()).tolist() == expected
+    with pytest.raises(ValueError, match="faces of one mesh"):
+        nmr.unique_edges(faces[None])
+
+
+def test_face_vertices():
+    vertices, faces = nmr.icosphere(1)
+    batch = torch.stack([vertices, 2 * vertices])
+    assert torch.equal(nmr.mesh.face_vertices(batch, faces), batch[:, faces])
+    assert torch.equal(nmr.mesh.face_vertices(vertices, faces), vertices[faces])
+    other = torch.stack([faces, faces.roll(1, 1)])
+    assert torch.equal(nmr.mesh.face_vertices(batch, other)[1], batch[1][other[1]])
+
+
+def test_normals_of_a_sphere_point_outwards():
+    vertices, faces = nmr.icosphere(3)
+    centres = vertices[faces].mean(1)
+    normals = nmr.face_normals(vertices, faces)
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(len(faces)))
+    assert ((normals * centres).sum(1) > 0.99 * centres.norm(dim=1)).all()
+    torch.testing.assert_close(nmr.vertex_normals(vertices, faces), vertices, rtol=0, atol=0.02)
+
+
+def test_vertex_normals_weigh_by_area():
+    """Two faces at vertex 0: one of area 1 in the plane z = 0, one of area 2 in the plane y = 0."""
+    vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 2]])
+    faces = torch.tensor([[0, 1, 2], [0, 3, 1]])
+    normals = nmr.vertex_normals(vertices, faces)
+    torch.testing.assert_close(normals[0], torch.tensor([0, 2.0, 1]) / 5**0.5)
+    assert torch.equal(normals[2:], torch.tensor([[0.0, 0, 1], [0, 1, 0]]))
+
+
+@pytest.mark.parametrize("function", [nmr.face_normals, nmr.vertex_normals])
+def test_normals_of_batches(function):
+    """One list of faces, one per mesh, integers of any width; the sign follows the winding."""
+    vertices, faces = nmr.icosphere(1)
+    batch = torch.stack([vertices, vertices * torch.tensor([1.0, 2, 3])])
+    both = function(batch, torch.stack([faces, faces.flip(1)]).int())
+    torch.testing.assert_close(both[0], function(vertices, faces))
+    torch.testing.assert_close(both[1], -function(batch, faces)[1])
+
+
+@pytest.mark.parametrize("function", [nmr.face_normals, nmr.vertex_normals])
+def test_normals_gradcheck(function):
+    vertices, faces = nmr.icosphere(0)
+    vertices = (vertices * torch.tensor([1.0, 0.7, 0.5]))[None].double().requires_grad_()
+    torch.autograd.gradcheck(lambda x: function(x, faces), vertices)
+
+
+@pytest.mark.parametrize("function", [nmr.face_normals, nmr.vertex_normals])
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-12, 1e15])
+def test_normals_of_degenerate_and_of_tiny_and_huge_faces_are_finite(function, size):
+    vertices = size * torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [7, 7, 7]])
+    vertices.requires_grad_()
+    faces = torch.tensor([[0, 1, 2], [0, 1, 3], [0, 0, 3]])  # right-angled, collinear, two corners equal
+    normals = function(vertices, faces)
+    normals.sum().backward()
+    expected = torch.tensor([0.0, 0, 1 if size > 1e-18 else 0])  # the area of 1e-60 is 0 in float32
+    assert torch.equal(normals[0], expected) and not normals[-1].any()
+    assert vertices.grad.isfinite().all()
+
+
+def test_normals_errors():
+    vertices, faces = nmr.icosphere(0)
+    for function in (nmr.face_normals, nmr.vertex_normals):
+        with pytest.raises(ValueError, match="faces refer to vertex 12, but a mesh has 12 vertices"):
+            function(vertices, faces + 1)
+        with pytest.raises(ValueError, match="faces refer to vertex -1"):
+            function(vertices, faces - 1)
+        with pytest.raises(TypeError, match="vertices must be a float tensor"):
+            function([[0.0]], faces)
+        with pytest.raises(ValueError, match="batch size of the vertices, 1"):
+            function(vertices, faces.expand(2, -1, -1))

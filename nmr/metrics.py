@@ -1,0 +1,256 @@
+"""How near a shape is to another: points on surfaces, Chamfer distance, F-score, IoU of grids.
+
+Nearest points are found by SciPy's k-d tree where SciPy is installed and the points lie in host memory, else by
+comparing all pairs, in chunks. Both are exact: they differ in speed alone (10,000 points with 10,000: 7 ms and 0.3 s on
+two cores), and in which of several equally near points they name.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ._validate import check_size, check_vertices, describe
+from .mesh import _face_cross, _gather, _unit, face_vertices
+
+try:
+    from scipy.spatial import cKDTree
+except ImportError:
+    cKDTree = None
+
+_CHUNK = 1 << 19  # distances that are in memory at once, where there is no tree
+
+
+class SurfacePoints(NamedTuple):
+    """Points on the surfaces of meshes; without the leading B for vertices [V, 3]."""
+
+    points: Tensor  # [B, N, 3], differentiable in the vertices
+    normals: Tensor  # [B, N, 3], of the faces they lie on; differentiable
+    face_index: Tensor  # int64 [B, N], the faces they lie on
+
+
+def sample_surface(
+    vertices: Tensor, faces: Tensor, count: int, generator: torch.Generator | None = None
+) -> SurfacePoints:
+    """Random points on meshes, uniform over their area.
+
+    A face is drawn with probability proportional to its area, then a point on it, p = (1 - r) p0 + r (1 - s) p1 +
+    r s p2 with r^2 and s uniform in [0, 1].
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
+    faces : integer Tensor [F, 3] or [B, F, 3]
+    count : int
+        N, points per mesh.
+    generator : torch.Generator, optional
+        Where the random numbers come from, on the device of the vertices; by default torch's own.
+
+    Returns
+    -------
+    SurfacePoints (points, normals, face_index)
+        ``points[b, n]`` lies on face ``face_index[b, n]`` of mesh b, whose unit normal is ``normals[b, n]``. points and
+        normals are differentiable in ``vertices``; which faces are drawn is not.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, faces that refer to missing vertices, and a mesh without area.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> points, normals, face_index = nmr.metrics.sample_surface(vertices, faces, 1000)
+    >>> points.shape
+    torch.Size([1000, 3])
+    """
+    count = check_size(count, "count", 1 << 30)
+    batched = check_vertices(vertices)
+    corners = face_vertices(batched, faces)
+    cross = _face_cross(corners)
+    area = torch.linalg.vector_norm(cross.detach().double(), dim=-1)
+    total = area.sum(1)
+    bad = (~(total.isfinite() & (total > 0))).nonzero()
+    if len(bad):
+        raise ValueError(f"every mesh must have a finite area above 0 to draw points from, mesh {int(bad[0])} has not")
+    face_index = torch.multinomial(area, count, replacement=True, generator=generator)
+    random = torch.rand(2, *face_index.shape, 1, generator=generator, dtype=batched.dtype, device=batched.device)
+    r, s = random[0].sqrt(), random[1]
+    p0, p1, p2 = (_gather(corner, face_index) for corner in corners.unbind(2))
+    points = (1 - r) * p0 + r * (1 - s) * p1 + r * s * p2
+    normals = _unit(_gather(cross, face_index))
+    if vertices.ndim == 2:
+        return SurfacePoints(points.squeeze(0), normals.squeeze(0), face_index.squeeze(0))
+    return SurfacePoints(points, normals, face_index)
+
+
+def chamfer_distance(points_a: Tensor, points_b: Tensor, form: Literal["squared", "l1"] = "squared") -> Tensor:
+    """How far two sets of points are from each other, in both directions.
+
+    With d(x, Y) = min_{y in Y} |x - y|:
+
+    - "squared": ``mean_a d(a, B)^2 + mean_b d(b, A)^2``, the usual loss (PyTorch3D's default);
+    - "l1": ``(mean_a d(a, B) + mean_b d(b, A)) / 2``, the "Chamfer-L1" of Occupancy Networks: mean of accuracy and
+      completeness, in the unit of the points (of Euclidean distances, in spite of the name).
+
+    Parameters
+    ----------
+    points_a : Tensor [B, N, 3] or [N, 3], float32 or float64
+    points_b : Tensor [B, M, 3] or [M, 3], of the same type
+    form : "squared" or "l1"
+
+    Returns
+    -------
+    Tensor [B], or a scalar for points [N, 3]
+        Differentiable in both sets: each point is pulled to its nearest one (not at all where the distance is 0).
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, empty sets, coordinates that are not finite, and an unknown form.
+
+    Examples
+    --------
+    >>> a = nmr.metrics.sample_surface(*nmr.icosphere(3), 10000).points
+    >>> b = nmr.metrics.sample_surface(*nmr.icosphere(2), 10000).points
+    >>> nmr.metrics.chamfer_distance(a, b, "l1")
+    """
+    if form not in ("squared", "l1"):
+        raise ValueError(f"form must be 'squared' or 'l1', got {form!r}")
+    a, b = _check_points(points_a, points_b)
+    ab, ba = _to_nearest(a, b), _to_nearest(b, a)
+    if form == "squared":
+        distance = ab.square().sum(-1).mean(1) + ba.square().sum(-1).mean(1)
+    else:
+        distance = (_length(ab).mean(1) + _length(ba).mean(1)) / 2
+    return distance if points_a.ndim == 3 else distance.squeeze(0)
+
+
+@torch.no_grad()
+def f_score(points_a: Tensor, points_b: Tensor, threshold: float) -> Tensor:
+    """How many points have one of the other set near: ``2 P R / (P + R)``, precision P and recall R at a distance.
+
+    P is the share of the points a that are nearer than the threshold to some b, R the share of the points b that are
+    nearer than the threshold to some a (Tatarchenko et al. 2019).
+
+    Parameters
+    ----------
+    points_a : Tensor [B, N, 3] or [N, 3], float32 or float64
+    points_b : Tensor [B, M, 3] or [M, 3], of the same type
+    threshold : float
+        In the unit of the points; often 1 % of the side of the bounding box.
+
+    Returns
+    -------
+    Tensor [B], or a scalar for points [N, 3]
+        From 0 (no point is near) to 1. Not differentiable.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, empty sets, coordinates that are not finite, and a threshold that is not above 0.
+
+    Examples
+    --------
+    >>> a = nmr.metrics.sample_surface(*nmr.icosphere(3), 10000).points
+    >>> b = nmr.metrics.sample_surface(*nmr.icosphere(2), 10000).points
+    >>> nmr.metrics.f_score(a, b, 0.02)
+    """
+    if not threshold > 0:
+        raise ValueError(f"threshold must be a distance above 0, got {threshold}")
+    a, b = _check_points(points_a, points_b)
+    precision = (_length(_to_nearest(a, b)) < threshold).to(a.dtype).mean(1)
+    recall = (_length(_to_nearest(b, a)) < threshold).to(a.dtype).mean(1)
+    score = 2 * precision * recall / (precision + recall).clamp_min(torch.finfo(a.dtype).tiny)
+    return score if points_a.ndim == 3 else score.squeeze(0)
+
+
+def voxel_iou(prediction: Tensor, target: Tensor) -> Tensor:
+    """Intersection over union of occupancy grids.
+
+    Parameters
+    ----------
+    prediction, target : bool Tensor [B, ...], of one shape, as made by :func:`nmr.voxelize`
+
+    Returns
+    -------
+    float64 Tensor [B]
+        NaN where both grids are empty.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If they are no bool tensors, or differ in shape.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> a, b = (nmr.voxelize(r * vertices + 0.5, faces) for r in (0.3, 0.4))
+    >>> nmr.metrics.voxel_iou(a, b)  # about (3 / 4)^3
+    """
+    for grid in (prediction, target):
+        if not isinstance(grid, Tensor) or grid.dtype != torch.bool:
+            raise TypeError(
+                "prediction and target must be bool tensors [B, ...], "
+                f"got {describe(prediction)} and {describe(target)}; compare with a threshold first"
+            )
+    if prediction.shape != target.shape or prediction.ndim < 2:
+        raise ValueError(
+            f"prediction and target must have one shape [B, ...], got {describe(prediction)} and {describe(target)}"
+        )
+    prediction, target = prediction.flatten(1), target.flatten(1)
+    return (prediction & target).sum(1).double() / (prediction | target).sum(1).double()
+
+
+def _check_points(a: object, b: object) -> tuple[Tensor, Tensor]:
+    """Both sets as [B, N, 3]."""
+    for points in (a, b):
+        if not isinstance(points, Tensor) or points.dtype not in (torch.float32, torch.float64):
+            raise TypeError(
+                "points_a and points_b must be float32 or float64 tensors [B, N, 3] or [N, 3], "
+                f"got {describe(a)} and {describe(b)}"
+            )
+    if (
+        a.dtype != b.dtype
+        or a.ndim not in (2, 3)
+        or a.ndim != b.ndim
+        or (a.shape[-1], b.shape[-1]) != (3, 3)
+        or a.shape[:-2] != b.shape[:-2]
+        or 0 in (a.numel(), b.numel())
+    ):
+        raise ValueError(
+            "points_a and points_b must be [B, N, 3] and [B, M, 3], or [N, 3] and [M, 3], of one type and with at "
+            f"least one point each, got {describe(a)} and {describe(b)}"
+        )
+    if not (a.isfinite().all() and b.isfinite().all()):
+        raise ValueError("points_a and points_b must be finite, but have coordinates that are infinite or NaN")
+    return (a, b) if a.ndim == 3 else (a.unsqueeze(0), b.unsqueeze(0))
+
+
+def _to_nearest(a: Tensor, b: Tensor) -> Tensor:
+    """From each point of a [B, N, 3] to the nearest one of b [B, M, 3]. Differentiable in both at a fixed choice."""
+    return _gather(b, _nearest(a.detach(), b.detach())) - a
+
+
+def _length(vectors: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(vectors, dim=-1)
+
+
+def _nearest(a: Tensor, b: Tensor) -> Tensor:
+    """Number [B, N] of the point of b [B, M, 3] that is nearest to each point of a [B, N, 3]."""
+    search = _search_tree if cKDTree is not None and a.device.type == "cpu" else _search_all
+    return torch.stack([search(x, y) for x, y in zip(a, b, strict=True)])
+
+
+def _search_tree(a: Tensor, b: Tensor) -> Tensor:
+    _, number = cKDTree(b.numpy()).query(a.numpy(), workers=torch.get_num_threads())
+    return torch.from_numpy(number)
+
+
+def _search_all(a: Tensor, b: Tensor) -> Tensor:
+    # The fast formula |x|^2 - 2 x.y + |y|^2 loses the digits that tell near points apart.
+    exact = "donot_use_mm_for_euclid_dist"
+    chunks = a.split(max(1, _CHUNK // len(b)))
+    return torch.cat([torch.cdist(chunk, b, compute_mode=exact).argmin(1) for chunk in chunks])

@@ -1,0 +1,177 @@
+"""Points on surfaces, Chamfer distance, F-score, IoU of grids: brute force and closed forms."""
+
+import math
+
+import pytest
+import torch
+
+import nmr
+from nmr import metrics
+from nmr.metrics import chamfer_distance, f_score, sample_surface, voxel_iou
+
+
+@pytest.fixture(params=["tree", "all pairs"])
+def search(request, monkeypatch):
+    """Both ways to find the nearest points; the second in several chunks."""
+    if request.param == "tree":
+        pytest.importorskip("scipy")
+    else:
+        monkeypatch.setattr(metrics, "cKDTree", None)
+        monkeypatch.setattr(metrics, "_CHUNK", 1000)
+
+
+def random_points(*shape, seed=0):
+    return torch.rand(*shape, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+# --- sample_surface
+
+
+def test_points_lie_on_their_faces_and_carry_their_normals():
+    vertices, faces = nmr.icosphere(1)
+    batch = torch.stack([vertices, vertices * torch.tensor([1.0, 2, 3])])
+    sample = sample_surface(batch, faces, 500, torch.Generator().manual_seed(0))
+    assert sample.points.shape == sample.normals.shape == (2, 500, 3) and sample.face_index.shape == (2, 500)
+    for b in range(2):
+        corners = batch[b][faces[sample.face_index[b]]]
+        weights = torch.linalg.solve(corners.mT, sample.points[b])
+        assert (weights > -1e-5).all()
+        torch.testing.assert_close(weights.sum(1), torch.ones(500))
+        torch.testing.assert_close(sample.normals[b], nmr.face_normals(batch[b], faces)[sample.face_index[b]])
+
+
+def test_points_are_uniform_over_the_area():
+    """Two triangles of areas 1 and 3: their shares; within each, the centroid and the mean square distance to it."""
+    vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 5], [3, 0, 5], [0, 2, 5]], dtype=torch.float64)
+    faces = torch.tensor([[0, 1, 2], [3, 4, 5], [0, 0, 4]])  # the last one has no area
+    count = 100_000
+    points, _, face_index = sample_surface(vertices, faces, count, torch.Generator().manual_seed(0))
+    assert face_index.bincount(minlength=3)[2] == 0
+    assert (face_index == 1).double().mean().item() == pytest.approx(3 / 4, abs=4 * math.sqrt(3 / 16 / count))
+    for f in (0, 1):
+        corners, mine = vertices[faces[f]], points[face_index == f]
+        assert (mine.mean(0) - corners.mean(0)).norm() < 0.02
+        sides = (corners - corners.roll(1, 0)).square().sum()
+        spread = (mine - corners.mean(0)).square().sum(1).mean()
+        assert spread.item() == pytest.approx(sides.item() / 36, rel=0.02)
+
+
+def test_points_of_a_sphere():
+    """Uniform on the unit sphere: mean 0, E[x^2] = 1/3, E[x^4] = 1/5."""
+    points = sample_surface(*nmr.icosphere(4), 50_000, torch.Generator().manual_seed(0)).points
+    assert points.mean(0).abs().max() < 0.01
+    torch.testing.assert_close(points.square().mean(0), torch.full((3,), 1 / 3), rtol=0, atol=0.01)
+    torch.testing.assert_close(points.pow(4).mean(0), torch.full((3,), 1 / 5), rtol=0, atol=0.01)
+
+
+def test_points_repeat_with_the_generator_and_are_differentiable():
+    vertices, faces = nmr.icosphere(0)
+    vertices = vertices.double().requires_grad_()
+
+    def draw(x, seed=1):
+        return sample_surface(x, faces, 20, torch.Generator().manual_seed(seed))
+
+    assert torch.equal(draw(vertices).points, draw(vertices).points)
+    assert not torch.equal(draw(vertices).points, draw(vertices, seed=2).points)
+    torch.autograd.gradcheck(lambda x: draw(x)[:2], vertices)
+
+
+def test_sample_surface_errors():
+    vertices, faces = nmr.icosphere(0)
+    for bad in (0 * vertices, vertices * math.nan, vertices * math.inf):
+        with pytest.raises(ValueError, match="a finite area above 0 to draw points from, mesh 1 has not"):
+            sample_surface(torch.stack([vertices, bad]), faces, 10)
+    with pytest.raises(ValueError, match="count must lie in"):
+        sample_surface(vertices, faces, 0)
+    with pytest.raises(ValueError, match="faces refer to vertex 12"):
+        sample_surface(vertices, faces + 1, 10)
+
+
+# --- distances of points
+
+
+def test_distances_equal_brute_force(search):
+    a, b = random_points(2, 300), random_points(2, 211, seed=1)
+    all_pairs = (a[:, :, None] - b[:, None]).norm(dim=-1)
+    ab, ba = all_pairs.amin(2), all_pairs.amin(1)
+    torch.testing.assert_close(chamfer_distance(a, b), ab.square().mean(1) + ba.square().mean(1))
+    torch.testing.assert_close(chamfer_distance(a, b, "l1"), (ab.mean(1) + ba.mean(1)) / 2)
+    p, r = (ab < 0.08).double().mean(1), (ba < 0.08).double().mean(1)
+    torch.testing.assert_close(f_score(a, b, 0.08), 2 * p * r / (p + r))
+    torch.testing.assert_close(chamfer_distance(a.float(), b.float()), chamfer_distance(a, b).float())
+    torch.testing.assert_close(chamfer_distance(a[1], b[1]), chamfer_distance(a, b)[1])
+    assert f_score(a[1], b[1], 0.08).shape == ()
+
+
+def test_distances_of_a_shifted_grid(search):
+    """Every point is 0.3 from its copy and farther from all others."""
+    axis = torch.arange(5.0)
+    grid = torch.cartesian_prod(axis, axis, axis)
+    shifted = grid + torch.tensor([0.0, 0.3, 0.0])
+    torch.testing.assert_close(chamfer_distance(grid, shifted), torch.tensor(2 * 0.3**2))
+    torch.testing.assert_close(chamfer_distance(grid, shifted, "l1"), torch.tensor(0.3))
+    assert f_score(grid, shifted, 0.31) == 1 and f_score(grid, shifted, 0.29) == 0
+    assert chamfer_distance(grid, grid) == 0 and chamfer_distance(grid, grid, "l1") == 0
+
+
+def test_near_points_far_from_the_origin_are_told_apart(search):
+    b = torch.tensor([[100.0, 0, 0], [100.001, 0, 0]])
+    a = torch.tensor([[100.0006, 0, 0]])
+    assert metrics._nearest(a[None], b[None]).tolist() == [[1]]
+
+
+def test_f_score_of_uneven_sets(search):
+    """Three of four points a are near, both points b: P = 3/4, R = 1."""
+    a = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [5, 0, 0], [9, 9, 9]])
+    b = torch.tensor([[0.05, 0, 0], [5, 0.05, 0]])
+    assert f_score(a, b, 0.06).item() == pytest.approx(6 / 7)
+    assert f_score(b, a, 0.06).item() == pytest.approx(6 / 7)
+
+
+@pytest.mark.parametrize("form", ["squared", "l1"])
+def test_chamfer_gradcheck(form, search):
+    a, b = random_points(2, 12).requires_grad_(), random_points(2, 9, seed=1).requires_grad_()
+    torch.autograd.gradcheck(lambda x, y: chamfer_distance(x, y, form), (a, b))
+
+
+def test_chamfer_of_equal_points_has_a_gradient_of_zero(search):
+    a = random_points(10).requires_grad_()
+    for form in ("squared", "l1"):
+        (grad,) = torch.autograd.grad(chamfer_distance(a, a.detach(), form), a)
+        assert not grad.any()
+
+
+def test_distance_errors():
+    a = torch.zeros(2, 5, 3)
+    with pytest.raises(ValueError, match="form must be 'squared' or 'l1', got 'l2'"):
+        chamfer_distance(a, a, "l2")
+    with pytest.raises(TypeError, match=r"float32 or float64 tensors .*int64 \[2, 5, 3\] and float32"):
+        chamfer_distance(a.long(), a)
+    for other in (a[:1], a[0], a[..., :2], a[:, :0], a.double()):
+        with pytest.raises(ValueError, match=r"with at least one point each, got float32 \[2, 5, 3\] and"):
+            chamfer_distance(a, other)
+    for bad in (math.nan, math.inf):
+        with pytest.raises(ValueError, match="must be finite"):
+            f_score(a, a + bad, 0.1)
+    for threshold in (0, -1, math.nan):
+        with pytest.raises(ValueError, match="threshold must be a distance above 0"):
+            f_score(a, a, threshold)
+
+
+# --- voxel_iou
+
+
+def test_voxel_iou_of_boxes():
+    a, b = torch.zeros(2, 3, 8, 8, 8, dtype=torch.bool)
+    a[0, :4] = b[0, 2:6] = True  # 2 of 6 slices are shared
+    a[1, :4] = b[1, :4] = True
+    iou = voxel_iou(a, b)
+    assert iou[:2].tolist() == [1 / 3, 1] and iou[2].isnan()
+
+
+def test_voxel_iou_errors():
+    grid = torch.zeros(2, 4, 4, 4, dtype=torch.bool)
+    with pytest.raises(TypeError, match=r"must be bool tensors .*float32.*threshold first"):
+        voxel_iou(grid, grid.float())
+    with pytest.raises(ValueError, match=r"one shape \[B, \.\.\.\]"):
+        voxel_iou(grid, grid[:1])
