@@ -2,7 +2,9 @@
 #pragma once
 
 #include <cstdint>
+#include <cstring>
 #include <exception>
+#include <type_traits>
 #include <vector>
 
 // A function marked NMR_CLONES is compiled for three levels of x86-64 and the loader picks one. Only code inlined into it
@@ -56,7 +58,9 @@ Scratch& thread_scratch() {
 template <class T>
 T* reserve(std::vector<T>& buffer, size_t size) {
 #ifdef NMR_FRESH_SCRATCH
-  buffer = std::vector<T>(size, T(93));
+  buffer = std::vector<T>(size);
+  if constexpr (std::is_trivially_copyable_v<T>)
+    if (size > 0) std::memset(static_cast<void*>(buffer.data()), 93, size * sizeof(T));
 #endif
   if (buffer.size() < size) buffer.resize(size);
   return buffer.data();

@@ -1,4 +1,4 @@
-"""The corpus of the fuzz target (fuzz.cpp): corpus.hex, an input per line. libFuzzer wants a folder with a file per input.
+"""The corpus of the fuzz target (fuzz.cpp): corpus.hex, an input per line. libFuzzer wants a file for each.
 
 python tests/csrc/corpus.py unpack FOLDER      writes the corpus into a folder
 python tests/csrc/corpus.py pack FOLDER        makes the folder's files and the seeds of this script the corpus
@@ -38,17 +38,8 @@ def encode(rng, number, flags, meshes, size, *, foreign=False, planes=0, spoil=F
     """The bytes that decode() of fuzz.cpp turns into these meshes; unless packed, all have the first one's sizes."""
     batch, packed = len(meshes), bool(flags & PACKED)
     more = (7 if foreign else 0) + 8 * batch + 32 * rng.randrange(4)
-    head = [
-        number,
-        flags,
-        more,
-        size,
-        rng.randrange(4),
-        rng.randrange(6),
-        planes,
-        rng.randrange(8),
-        rng.choice((rng.randrange(256), 7)),
-    ]
+    seed = rng.choice((rng.randrange(256), 7))  # 7: also on three threads
+    head = [number, flags, more, size, rng.randrange(4), rng.randrange(6), planes, rng.randrange(8), seed]
     shapes = meshes if packed else [meshes[0] if meshes else NOTHING]
     head += [len(vertices) + 16 * len(faces) for vertices, faces in shapes]
     lists = meshes if packed or flags & PER_IMAGE else shapes
@@ -66,10 +57,8 @@ def seeds() -> list[bytes]:
         for layout in (0, PER_IMAGE, PACKED):
             for mesh in MESHES:
                 batch = rng.choices(MESHES, k=2) + [mesh] if layout == PACKED else [mesh] * rng.randrange(1, 3)
-                for other in (
-                    ANTI_ALIASED | FILL_BACK | PERSPECTIVE | DISTORTED,
-                    VALUES_PER_IMAGE | rng.choice((0, FILL_BACK)),
-                ):
+                rich = ANTI_ALIASED | FILL_BACK | PERSPECTIVE | DISTORTED
+                for other in (rich, VALUES_PER_IMAGE | rng.choice((0, FILL_BACK))):
                     options = {
                         "foreign": rng.random() < 0.1,
                         "planes": rng.choice((0, 0, 0, 34, 200)),

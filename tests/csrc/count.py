@@ -1,9 +1,10 @@
 """Counts the instructions of workload W1 under callgrind and compares them with the stored bound (instructions.json).
 
-    python tests/csrc/count.py build/native/count/workload g++            prints count and bound; exit status 1 above the bound
+    python tests/csrc/count.py build/native/count/workload g++            prints both; status 1 above the bound
     python tests/csrc/count.py build/native/count/workload g++ --store    makes what is counted the bound
 
-The bound belongs to one compiler (its major version) and one instruction set, x86-64-v3. Another compiler's count is only printed.
+The bound belongs to one compiler (its major version) and one instruction set, x86-64-v3; another compiler's count is
+only printed.
 """
 
 import argparse
@@ -57,12 +58,8 @@ def main() -> None:
             continue
         ratio = instructions / bound
         exceeded |= ratio > SLACK
-        verdict = (
-            "MORE THAN THE BOUND ALLOWS" if ratio > SLACK else "ok" if ratio > 0.9 else "ok; the bound could be lowered"
-        )
-        print(
-            f"W1 {name}: {instructions} instructions per image, bound {bound} ({compiler}), ratio {ratio:.3f}: {verdict}"
-        )
+        verdict = "MORE THAN IS ALLOWED" if ratio > SLACK else "ok" if ratio > 0.9 else "ok; the bound could be lowered"
+        print(f"W1 {name}: {instructions} instructions per image, bound {bound} ({compiler}), {ratio:.3f}: {verdict}")
     sys.exit(exceeded)
 
 
