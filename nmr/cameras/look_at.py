@@ -62,8 +62,13 @@ def _check_pose(camera: ProjectingCamera, *names: str, **scalar: float | Tensor)
     )
 
 
-def _posed(eye: Tensor, forward: Tensor, up: Tensor, **rest: Tensor | bool | None) -> Projection:
-    """The projection of a camera at ``eye [B, 3]`` with the axes of :class:`LookAt`; NaN where they are not finite."""
+def _between(eye: Tensor, at: Tensor) -> Tensor:
+    return batched(at, torch.float64, 3) - batched(eye, torch.float64, 3)
+
+
+def _posed(eye: Tensor, forward: Tensor, up: Tensor, dtype: torch.dtype, **rest: Tensor | bool | None) -> Projection:
+    """The projection of a camera at ``eye`` with the axes of :class:`LookAt`; NaN where they are not finite."""
+    eye, forward, up = (batched(x, dtype, 3) for x in (eye, forward, up))
     batch = max(forward.shape[0], up.shape[0])
     return Projection(ops.pose(forward.expand(batch, 3), up.expand(batch, 3)), origin=eye, **rest)
 
@@ -121,8 +126,7 @@ class LookAt(ProjectingCamera):
         return cls(eye=points_from_angles(distance, elevation_deg, azimuth_deg), half_fov_deg=half_fov_deg)
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        eye, at, up = (batched(x, dtype, 3) for x in (self.eye, self.at, self.up))
-        return _posed(eye, at - eye, up, **_perspective(self.half_fov_deg, dtype))
+        return _posed(self.eye, _between(self.eye, self.at), self.up, dtype, **_perspective(self.half_fov_deg, dtype))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +150,7 @@ class Look(ProjectingCamera):
         _check_pose(self, "eye", "direction", "up", half_fov_deg=_fov(self.half_fov_deg))
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        eye, direction, up = (batched(x, dtype, 3) for x in (self.eye, self.direction, self.up))
-        return _posed(eye, direction, up, **_perspective(self.half_fov_deg, dtype))
+        return _posed(self.eye, self.direction, self.up, dtype, **_perspective(self.half_fov_deg, dtype))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +176,6 @@ class Orthographic(ProjectingCamera):
         _check_pose(self, "eye", "at", "up", scale=scale)
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        eye, at, up = (batched(x, dtype, 3) for x in (self.eye, self.at, self.up))
         scale = batched(self.scale, dtype, 1, 1) if isinstance(self.scale, Tensor) else self.scale
-        return _posed(eye, at - eye, up, intrinsics=scale * _Y_UP.to(dtype), perspective=False)
+        intrinsics = scale * _Y_UP.to(dtype)
+        return _posed(self.eye, _between(self.eye, self.at), self.up, dtype, intrinsics=intrinsics, perspective=False)
