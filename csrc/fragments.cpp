@@ -5,6 +5,8 @@
 // Moving corner k by (dX, dY) pixels changes the weights at a fixed pixel by dw_m = -w_k (M_m0 dX + M_m1 dY), M as in geometry.h.
 #include <algorithm>
 #include <cmath>
+#include <limits>
+#include <type_traits>
 
 #include "blocks.h"
 #include "geometry.h"
@@ -81,7 +83,7 @@ NMR_INLINE void set_up_faces(const Block<T>& block, FragmentScratch<T>& scratch)
     for (int64_t n = 0; n < kLanes; ++n) {
       const int32_t id = n < lanes ? visible.ids[start + n] : -1;
       const bool reversed = id >= block.num_faces;
-      const int64_t* face = block.faces + 3 * (reversed ? id - block.num_faces : id);
+      const int64_t* face = block.faces + 3 * (id < 0 ? 0 : reversed ? id - block.num_faces : id);
       const Triangle<T> t = id < 0 ? Triangle<T>{{0, 1, 0}, {0, 0, 1}, {1, 1, 1}} : load_triangle(block.vertices, face, reversed);
       for (int k = 0; k < 3; ++k) {
         corner[k][n] = t.x[k];
@@ -198,11 +200,11 @@ NMR_INLINE void fragments_block_body(const Fragments<T>& args, const Block<T>& b
 
 // --- backward
 
-// dq/d(X, Y, z) of a face's corners, but for the weight of the pixel: 1 / z_m^2, and M_m / z_m for one m. What overflows is 0: a
-// face whose corner lies in the plane of the eye gives no gradient there instead of spoiling its other vertices.
+// dq/d(X, Y, z) of a face's corners, but for the weight of the pixel: 1 / z_m^2 and M_m / z_m. Those that come near to an
+// overflow count as 0: a corner in the plane of the eye gets no gradient, and spoils none.
 template <class T>
-NMR_INLINE T finite_or_zero(T value) {
-  return std::isfinite(value) ? value : T(0);
+NMR_INLINE T moderate_or_zero(T value) {
+  return std::abs(value) < std::sqrt(std::numeric_limits<T>::max()) ? value : T(0);
 }
 
 // grad z_k = S_k / z_k^2, grad X_k = S_k sum_m M_m0 / z_m with S_k = sum over pixels of g z^2 w_k.
@@ -215,12 +217,12 @@ NMR_INLINE void depth_gradients(const FragmentScratch<T>& scratch, int64_t raste
     const T *entry = scratch.table.data() + n * kEntry, *sum = scratch.sums.data() + 4 * n;
     result.ids[n - 1] = scratch.visible.ids[n];
     const T *mx = entry, *my = entry + 4, *z = entry + 12;
-    const T slope_x = finite_or_zero(mx[0] / z[0] + mx[1] / z[1] + mx[2] / z[2]) * half;
-    const T slope_y = finite_or_zero(my[0] / z[0] + my[1] / z[1] + my[2] / z[2]) * half;
+    const T slope_x = moderate_or_zero(mx[0] / z[0] + mx[1] / z[1] + mx[2] / z[2]) * half;
+    const T slope_y = moderate_or_zero(my[0] / z[0] + my[1] / z[1] + my[2] / z[2]) * half;
     for (int k = 0; k < 3; ++k) {
       out[3 * k] = sum[k] * slope_x;
       out[3 * k + 1] = sum[k] * slope_y;
-      out[3 * k + 2] = sum[k] * finite_or_zero(1 / (z[k] * z[k]));
+      out[3 * k + 2] = sum[k] * moderate_or_zero(1 / (z[k] * z[k]));
     }
   }
 }
@@ -272,13 +274,13 @@ NMR_INLINE void fragment_gradients(const FragmentScratch<T>& scratch, int64_t ra
     result.ids[n - 1] = scratch.visible.ids[n];
     T slope_x[3], slope_y[3];
     for (int m = 0; m < 3; ++m) {
-      slope_x[m] = finite_or_zero(entry[m] / z[m]) * half;
-      slope_y[m] = finite_or_zero(entry[4 + m] / z[m]) * half;
+      slope_x[m] = moderate_or_zero(entry[m] / z[m]) * half;
+      slope_y[m] = moderate_or_zero(entry[4 + m] / z[m]) * half;
     }
     for (int k = 0; k < 3; ++k) {
       out[3 * k] = -(sum[k] * slope_x[0] + sum[4 + k] * slope_x[1] + sum[8 + k] * slope_x[2]);
       out[3 * k + 1] = -(sum[k] * slope_y[0] + sum[4 + k] * slope_y[1] + sum[8 + k] * slope_y[2]);
-      out[3 * k + 2] = -sum[5 * k] * finite_or_zero(1 / (z[k] * z[k]));
+      out[3 * k + 2] = -sum[5 * k] * moderate_or_zero(1 / (z[k] * z[k]));
     }
   }
 }

@@ -26,9 +26,28 @@ struct MeshBatch {
   const int64_t* image_faces(int64_t b) const { return faces + 3 * face_start(b); }
 };
 
-// World space to renderer space (camera.cpp). Per image b: u = A v + t with [A | t] = matrix; then
-//   perspective:   p = (u_x / u_z, u_y / u_z), distorted as OpenCV does; out = (K00 p_x + K01 p_y + K02, K10 p_x + ..., u_z)
+// The pose of a camera that looks along `forward` (pose.cpp): rows x, -y, z of A (camera axes: x right, y down, z forward);
+// z = n(forward), x = n(up x z), y = n(z x x), n(v) = v / max(|v|, 1e-5). All NaN where a number is not finite or beyond 1e15;
+// such a pose gets no gradient.
+template <class T>
+struct Pose {
+  const T* forward;      // [B, 3]
+  const T* up;           // [B, 3]
+  int64_t batch;
+  T* matrix;             // forward out [B, 3, 4]: [A | 0]
+  const T* grad_matrix;  // backward in [B, 3, 4]
+  T* grad_forward;       // backward out [B, 3]
+  T* grad_up;            // backward out [B, 3]
+};
+
+// World space to renderer space (camera.cpp). Per image b: u = A (v - origin) + t with [A | t] = matrix; then
+//   perspective:   p = (u_x / u_z, u_y / u_z), distorted as OpenCV does; q = p / extent; out = (K00 q_x + K01 q_y + K02, K10 q_x + ...,
+//                  u_z), K = intrinsics
 //   orthographic:  the same with p = (u_x, u_y), without distortion.
+// Origin and extent are arguments of their own because a look-at camera subtracts and divides; its images and gradients are then
+// the published ones bit for bit. A vertex without a finite image (it is not finite itself, in the plane of the eye, x / z^2
+// overflows, or the camera is not finite) gets out = (inf, inf, any finite number), so that its faces are not drawn, and exactly
+// 0 as its gradient.
 template <class T>
 struct Project {
   const T* vertices;     // [B or 1, V, 3], or packed [N, 3]
@@ -37,8 +56,10 @@ struct Project {
   int64_t vertex_batch;  // 1 or B when not packed
   int64_t num_vertices;  // V
   const T* matrix;       // [B, 3, 4]
-  const T* intrinsics;   // [B, 2, 3]: renderer-space x and y from p
+  const T* intrinsics;   // [B, 2, 3]: renderer-space x and y from q
   const T* distortion;   // [B, 5] k1 k2 p1 p2 k3, or nullptr
+  const T* origin;       // [B, 3], or nullptr (0)
+  const T* extent;       // [B], or nullptr (1)
   bool perspective;
   T* points;             // forward out [B, V, 3] or [N, 3]
   const T* grad_points;  // backward in
@@ -46,6 +67,8 @@ struct Project {
   T* grad_matrix;        // backward out [B, 3, 4], or nullptr
   T* grad_intrinsics;    // backward out [B, 2, 3], or nullptr
   T* grad_distortion;    // backward out [B, 5], or nullptr
+  T* grad_origin;        // backward out [B, 3], or nullptr
+  T* grad_extent;        // backward out [B], or nullptr
   int num_threads;
 };
 
@@ -207,6 +230,8 @@ struct Smoothness {
   int num_threads;
 };
 
+template <class T> void pose_forward(const Pose<T>& args);
+template <class T> void pose_backward(const Pose<T>& args);
 template <class T> void project_forward(const Project<T>& args);
 template <class T> void project_backward(const Project<T>& args);
 template <class T> void rasterize(const Rasterize<T>& args);

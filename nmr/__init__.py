@@ -1,37 +1,74 @@
-"""nmr: the Neural Mesh Renderer of Kato et al. 2018 as a compiled CPU operator for torch.
+"""nmr: the Neural Mesh Renderer of Kato et al. 2018 as compiled CPU operators for torch.
 
 Public names
 ------------
+render              meshes -> several of the images below in one pass
 render_silhouette   meshes -> anti-aliased silhouettes, differentiable with NMR's gradient
+render_rgb          meshes -> colour images, with the same gradient
+render_depth        meshes -> depth images, with their true derivative
+render_normals      meshes -> normals in world space
+render_fragments    meshes -> Fragments: face, weights and depth at each pixel, to shade by yourself
 render_face_index   meshes -> which face is nearest at each pixel
+VertexColors, FaceColors, TextureCubes, UVTexture   colours of meshes; any object with sample(fragments) is, too: Colors
+Lights              ambient and directional lights, flat or smooth
+LookAt, Look, Pinhole, Orthographic, Camera   cameras: world space -> renderer space; ``nmr.cameras`` converts them
 voxelize            meshes -> filled occupancy grids (kato18, the published voxel IoU)
-LookAt, Camera      cameras: world space -> renderer space
 icosphere, edge_table, unique_edges, losses   meshes to deform, and what to minimise
 metrics             points on surfaces, Chamfer distance, F-score, IoU of grids
 face_normals, vertex_normals    unit normals, differentiable
 
-Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]``; in renderer space x points right, y
-up, both in [-1, 1] across the image, and z is the depth in front of the camera. Images are ``[B, S, S]`` with row 0
+Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]`` with faces ``[F, 3]`` or
+``[B, F, 3]``, or lists of ``[V_b, 3]`` and ``[F_b, 3]``. In renderer space x points right, y up, both in [-1, 1] across
+the image, and z is the depth in front of the camera. Images are ``[B, S, S]``, with channels ``[B, S, S, C]``; row 0 is
 at the top.
 """
 
 import torch as _torch  # noqa: F401  torch first: the extension then shares torch's OpenMP runtime
 
-from . import losses, metrics
-from .cameras import Camera, LookAt
+from . import cameras, losses, metrics
+from .cameras import Camera, Look, LookAt, Orthographic, Pinhole
+from .fragments import Fragments
+from .lights import Lights
 from .mesh import edge_table, face_normals, icosphere, unique_edges, vertex_normals
-from .render import render_face_index, render_silhouette
+from .render import (
+    Images,
+    render,
+    render_depth,
+    render_face_index,
+    render_fragments,
+    render_normals,
+    render_rgb,
+    render_silhouette,
+)
+from .textures import Colors, FaceColors, TextureCubes, UVTexture, VertexColors
 from .voxels import voxelize
 
 __all__ = [
     "Camera",
+    "Colors",
+    "FaceColors",
+    "Fragments",
+    "Images",
+    "Lights",
+    "Look",
     "LookAt",
+    "Orthographic",
+    "Pinhole",
+    "TextureCubes",
+    "UVTexture",
+    "VertexColors",
+    "cameras",
     "edge_table",
     "face_normals",
     "icosphere",
     "losses",
     "metrics",
+    "render",
+    "render_depth",
     "render_face_index",
+    "render_fragments",
+    "render_normals",
+    "render_rgb",
     "render_silhouette",
     "unique_edges",
     "vertex_normals",

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import operator
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+_FLOATS = (torch.float32, torch.float64)
 
 
 def describe(value: object) -> str:
@@ -21,33 +24,79 @@ def check_vertices(vertices: object) -> Tensor:
     """``vertices`` as ``[B, V, 3]`` float32 or float64."""
     if not isinstance(vertices, Tensor):
         raise TypeError(
-            f"vertices must be a float tensor [B, V, 3] or [V, 3], got {describe(vertices)}; use torch.as_tensor()"
+            "vertices must be a float tensor [B, V, 3] or [V, 3], or a list of [V_b, 3], "
+            f"got {describe(vertices)}; use torch.as_tensor()"
         )
     if vertices.ndim not in (2, 3) or vertices.shape[-1] != 3:
         raise ValueError(f"vertices must have shape [B, V, 3] or [V, 3], got {describe(vertices)}")
-    if vertices.dtype not in (torch.float32, torch.float64):
+    if vertices.dtype not in _FLOATS:
         raise TypeError(f"vertices must be float32 or float64, got {describe(vertices)}; call vertices.float()")
     return vertices if vertices.ndim == 3 else vertices.unsqueeze(0)
 
 
-def check_faces(faces: object, batch: int, device: torch.device) -> Tensor:
+def check_faces(faces: object, batch: int, device: torch.device, name: str = "faces") -> Tensor:
     """``faces`` as int64 ``[F, 3]`` or ``[B, F, 3]`` on ``device``; their indices are checked by the kernels."""
     if not isinstance(faces, Tensor):
         raise TypeError(
-            f"faces must be an integer tensor [F, 3] or [B, F, 3], got {describe(faces)}; use torch.as_tensor()"
+            f"{name} must be an integer tensor [F, 3] or [B, F, 3], got {describe(faces)}; use torch.as_tensor()"
         )
     if faces.dtype not in _INTEGERS:
         raise TypeError(
-            f"faces must be an integer tensor [F, 3] or [B, F, 3], got {describe(faces)}; call faces.long()"
+            f"{name} must be an integer tensor [F, 3] or [B, F, 3], got {describe(faces)}; call {name}.long()"
         )
     if faces.ndim not in (2, 3) or faces.shape[-1] != 3:
-        raise ValueError(f"faces must have shape [F, 3] or [B, F, 3], got {describe(faces)}")
+        raise ValueError(f"{name} must have shape [F, 3] or [B, F, 3], got {describe(faces)}")
     if faces.ndim == 3 and faces.shape[0] != batch:
         raise ValueError(
-            f"faces [B, F, 3] must have the batch size of the vertices, {batch}, got {describe(faces)}; "
+            f"{name} [B, F, 3] must have the batch size of the vertices, {batch}, got {describe(faces)}; "
             "share one [F, 3] among all meshes, or expand it"
         )
     return faces.to(device=device, dtype=torch.int64)
+
+
+def check_camera(camera: object, packed: bool) -> None:
+    """Something with ``transform(vertices)``; for lists of meshes with ``transform(vertices, starts)``."""
+    if not callable(getattr(camera, "transform", None)):
+        raise TypeError(f"camera must have a method transform(vertices), as nmr.LookAt does, got {describe(camera)}")
+    if packed and "starts" not in inspect.signature(camera.transform).parameters:
+        raise TypeError(
+            f"for a list of meshes, {type(camera).__name__}.transform must take (vertices [N, 3], starts [B + 1, 2]), "
+            "as that of nmr.LookAt; it takes vertices alone"
+        )
+
+
+def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor, ...]:
+    """Float values of meshes: a tensor with the axes (or those behind a batch axis), or one such per mesh.
+
+    Returns the tensor with its batch axis, or a tuple of tensors without one. ``axes`` is like ``"V, C"``.
+    """
+    ndim = axes.count(",") + 1
+    wanted = f"{name} must be a float tensor [{axes}] or [B, {axes}], or a list of [{axes}], one per mesh"
+    if isinstance(values, Sequence) and not isinstance(values, str) and len(values):
+        for value in values:
+            if not isinstance(value, Tensor) or value.dtype not in _FLOATS:
+                raise TypeError(f"{wanted}; the list holds {describe(value)}")
+            if value.ndim != ndim or value.shape[-1] != values[0].shape[-1] or value.dtype != values[0].dtype:
+                raise ValueError(f"{wanted}; the list holds {describe(value)} beside {describe(values[0])}")
+        return tuple(values)
+    if not isinstance(values, Tensor) or values.dtype not in _FLOATS:
+        raise TypeError(f"{wanted}, got {describe(values)}; use torch.as_tensor() and .float()")
+    if values.ndim not in (ndim, ndim + 1) or values.shape[-1] == 0:
+        raise ValueError(f"{wanted}, got {describe(values)}")
+    return values if values.ndim == ndim + 1 else values.unsqueeze(0)
+
+
+def as_floats(value: object, name: str, wanted: str) -> Tensor:
+    """Numbers, nested sequences of numbers or tensors, or a tensor, as a float tensor; tensors keep their gradient."""
+    try:
+        if isinstance(value, Sequence) and any(isinstance(part, Tensor) for part in value):
+            value = torch.stack([torch.as_tensor(part) for part in value])
+        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name} must be {wanted}, got {describe(value)}: {error}") from error
+    if not tensor.is_floating_point():
+        raise TypeError(f"{name} must be {wanted} of floats, got {describe(tensor)}; call .float()")
+    return tensor
 
 
 def check_size(value: object, name: str, largest: int) -> int:
@@ -65,3 +114,9 @@ def check_depth_range(near: float, far: float) -> None:
     """0 <= near < far, both finite."""
     if not (0 <= near < far < float("inf")):
         raise ValueError(f"near and far must be finite with 0 <= near < far, got near={near}, far={far}")
+
+
+def check_eps(eps: float, dtype: torch.dtype) -> None:
+    """Positive in the dtype, and finite."""
+    if not torch.finfo(dtype).tiny <= eps < float("inf"):
+        raise ValueError(f"eps must be positive in {dtype} and finite, got {eps}")

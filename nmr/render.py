@@ -2,30 +2,195 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import torch
 from torch import Tensor
 
-from . import ops
-from ._validate import check_depth_range, check_faces, check_size, check_vertices, describe
+from ._scene import Meshes, average, make_scene, shade
+from ._validate import describe
 from .cameras import Camera
+from .fragments import Fragments
+from .lights import Lights
+from .textures import Colors
 
-_LARGEST_IMAGE = 8192
+_OUTPUTS = ("rgb", "alpha", "depth", "normals", "fragments")
 
 
-def _to_renderer_space(vertices: Tensor, faces: Tensor, camera: Camera | None) -> tuple[Tensor, Tensor]:
-    vertices = check_vertices(vertices)
-    if camera is not None:
-        if not isinstance(camera, Camera):
-            raise TypeError(
-                f"camera must have a method transform(vertices), as nmr.LookAt does, got {describe(camera)}"
-            )
-        vertices = check_vertices(camera.transform(vertices))
-    return vertices, check_faces(faces, vertices.shape[0], vertices.device)
+class Images:
+    """What :func:`render` returns: the outputs asked for, as attributes and, in the order asked, by unpacking.
+
+    ``rgb [B, S, S, C]``, ``alpha [B, S, S]``, ``depth [B, S, S]``, ``normals [B, S, S, 3]``, ``fragments``
+    (:class:`Fragments`). Others raise an AttributeError.
+    """
+
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor
+    normals: Tensor
+    fragments: Fragments
+
+    def __init__(self, outputs: dict[str, Tensor | Fragments]) -> None:
+        self.__dict__.update(outputs)
+
+    def __getattr__(self, name: str) -> Tensor | Fragments:
+        if name in _OUTPUTS:
+            raise AttributeError(f"{name} was not rendered; ask for it: outputs={(*self.__dict__, name)}")
+        raise AttributeError(f"Images has no attribute {name!r}; it has {', '.join(self.__dict__)}")
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError(f"Images cannot be changed, so {name} cannot be set")
+
+    def __iter__(self) -> Iterator[Tensor | Fragments]:
+        return iter(self.__dict__.values())
+
+    def __repr__(self) -> str:
+        return f"Images({', '.join(f'{name}: {describe(value)}' for name, value in self.__dict__.items())})"
+
+
+def render(
+    vertices: Meshes,
+    faces: Meshes,
+    camera: Camera | None = None,
+    *,
+    outputs: Sequence[str] = ("rgb", "alpha", "depth"),
+    colors: Colors | None = None,
+    lights: Lights | None = None,
+    background: float | Sequence[float] | Tensor = 0.0,
+    image_size: int = 256,
+    anti_aliasing: bool = True,
+    fill_back: bool = True,
+    near: float = 0.1,
+    far: float = 100.0,
+    eps: float = 1e-4,
+    smooth_normals: bool = False,
+    interpolation_gradient: bool = False,
+) -> Images:
+    """Several images of meshes in one pass: the meshes are transformed and rasterized once.
+
+    Parameters
+    ----------
+    vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, eps
+        As :func:`render_silhouette`.
+    outputs : sequence of "rgb", "alpha", "depth", "normals", "fragments"
+        What to draw; the names of the attributes of the result.
+    colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
+        For rgb. Without them the meshes are white.
+    lights : Lights, optional
+        What colours are multiplied with. Without them colours appear as they are.
+    background : number, [C], or Tensor [B, C]
+        Colour where there is no face.
+    smooth_normals : bool
+        For normals: those of the vertices, interpolated, instead of those of the faces.
+    interpolation_gradient : bool
+        Adds, for rgb, the true derivative of interpolated colours by where on the face a pixel lies: a texture that
+        slides under the pixels moves vertices. The published definition does not have it: there colour moves vertices
+        by edges only.
+
+    Returns
+    -------
+    Images
+        ``images.rgb[b, y, x]`` is the colour [C] of the pixel in row y from the top, mean of 2x2 with anti-aliasing
+        (background mixed in at edges); alpha, depth, normals as of :func:`render_silhouette`, :func:`render_depth` and
+        :func:`render_normals`; fragments at the resolution of the raster (2 S with anti-aliasing).
+
+    Notes
+    -----
+    Differentiable in vertices and camera: rgb and alpha by NMR's edges (if both are asked for, all their channels
+    decide together which pixels pull, as in the published renderer), depth and normals by their true derivatives at
+    fixed coverage. Differentiable in colours, background and the parameters of lights exactly. No second derivatives.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As :func:`render_silhouette`; for unknown outputs; for colours, lights and backgrounds that do not fit.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> camera = nmr.LookAt.from_angles(2.732, 30.0, [0.0, 90.0])
+    >>> rgb, depth = nmr.render(vertices, faces, camera, outputs=("rgb", "depth"), lights=nmr.Lights(), image_size=64)
+    """
+    unknown = [name for name in outputs if name not in _OUTPUTS] if not isinstance(outputs, str) else [outputs]
+    if unknown or not len(outputs) or len(set(outputs)) != len(outputs):
+        raise ValueError(
+            f"outputs must be different names out of {_OUTPUTS}, at least one, in a tuple; got {outputs!r}"
+        )
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, eps)
+    images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the order asked
+    if "alpha" in images and "rgb" not in images:
+        images["alpha"], owner = scene.silhouette(anti_aliasing, fill_back, near, far, eps)
+    else:
+        owner = scene.rasterize(fill_back, near, far)
+    if "depth" in images:
+        images["depth"] = scene.depth(owner, anti_aliasing, far)
+    if not {"rgb", "normals", "fragments"}.isdisjoint(images):
+        fragments = scene.fragments(owner, anti_aliasing, far, eps)
+        if "rgb" in images:
+            image = shade(fragments, colors, lights, background, interpolation_gradient)
+            if "alpha" in images:
+                image = torch.cat([image, fragments.covered.unsqueeze(-1).to(image)], dim=-1)
+            image = fragments.resolve(image)
+            if "alpha" in images:
+                image, images["alpha"] = image[..., :-1], image[..., -1]
+            images["rgb"] = image
+        if "normals" in images:
+            images["normals"] = average(fragments.normals(smooth_normals), anti_aliasing)
+        if "fragments" in images:
+            images["fragments"] = fragments
+    return Images(images)
+
+
+def render_rgb(
+    vertices: Meshes,
+    faces: Meshes,
+    camera: Camera | None = None,
+    *,
+    colors: Colors | None = None,
+    lights: Lights | None = None,
+    background: float | Sequence[float] | Tensor = 0.0,
+    image_size: int = 256,
+    anti_aliasing: bool = True,
+    fill_back: bool = True,
+    near: float = 0.1,
+    far: float = 100.0,
+    eps: float = 1e-4,
+    interpolation_gradient: bool = False,
+) -> Tensor:
+    """Colour images of meshes; the arguments, gradients and errors are those of :func:`render`.
+
+    Returns
+    -------
+    Tensor [B, S, S, C]
+        ``rgb[b, y, x]`` is the colour of the pixel in row y from the top, with as many channels as ``colors`` have.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> colors, lights = nmr.VertexColors((vertices + 1) / 2), nmr.Lights(smooth=True)
+    >>> rgb = nmr.render_rgb(0.8 * vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), colors=colors, lights=lights)
+    """
+    return render(
+        vertices,
+        faces,
+        camera,
+        outputs=("rgb",),
+        colors=colors,
+        lights=lights,
+        background=background,
+        image_size=image_size,
+        anti_aliasing=anti_aliasing,
+        fill_back=fill_back,
+        near=near,
+        far=far,
+        eps=eps,
+        interpolation_gradient=interpolation_gradient,
+    ).rgb
 
 
 def render_silhouette(
-    vertices: Tensor,
-    faces: Tensor,
+    vertices: Meshes,
+    faces: Meshes,
     camera: Camera | None = None,
     *,
     image_size: int = 256,
@@ -39,10 +204,11 @@ def render_silhouette(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
+    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
         Without a camera in renderer space: x right, y up, both in [-1, 1] across the image, z = depth. With one, in
-        the space that the camera transforms from. One mesh and a camera with B poses give B images.
-    faces : integer Tensor [F, 3], or [B, F, 3]
+        the space that the camera transforms from. One mesh and a camera with B poses give B images. The meshes of
+        a list may have different sizes; they are laid end to end, without padding, and drawn as one by one.
+    faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
         Vertex indices; counter-clockwise on the screen is the front.
     camera : Camera, optional
         For example :class:`nmr.LookAt`.
@@ -85,21 +251,134 @@ def render_silhouette(
     >>> nmr.render_silhouette(0.4 * vertices, faces, camera, image_size=64).shape
     torch.Size([2, 64, 64])
     """
-    check_size(image_size, "image_size", _LARGEST_IMAGE)
-    check_depth_range(near, far)
-    vertices, faces = _to_renderer_space(vertices, faces, camera)
-    if not torch.finfo(vertices.dtype).tiny <= eps < float("inf"):
-        raise ValueError(f"eps must be positive in {vertices.dtype} and finite, got {eps}")
-    alpha, _ = ops.silhouette(
-        vertices, faces, None, image_size, bool(anti_aliasing), bool(fill_back), float(near), float(far), float(eps)
-    )
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, eps)
+    alpha, _ = scene.silhouette(anti_aliasing, fill_back, near, far, eps)
     return alpha
+
+
+def render_depth(
+    vertices: Meshes,
+    faces: Meshes,
+    camera: Camera | None = None,
+    *,
+    image_size: int = 256,
+    anti_aliasing: bool = True,
+    fill_back: bool = True,
+    near: float = 0.1,
+    far: float = 100.0,
+) -> Tensor:
+    """Depth images of meshes; the arguments are those of :func:`render_silhouette`.
+
+    Returns
+    -------
+    Tensor [B, S, S]
+        ``depth[b, y, x]`` is z of the nearest face at the pixel in row y from the top, ``far`` where there is none.
+        With anti-aliasing the mean of 2x2, far mixed in at edges, as published; without it z is exact.
+
+    Notes
+    -----
+    Differentiable in x, y and z of the vertices (and through the camera): the true derivative of z at each pixel.
+    Coverage is fixed: edges are not moved by depth. No second derivative.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As :func:`render_silhouette`.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
+    >>> depth = nmr.render_depth(vertices, faces, camera, anti_aliasing=False)  # 2 in the middle
+    """
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far)
+    return scene.depth(scene.rasterize(fill_back, near, far), anti_aliasing, far)
+
+
+def render_normals(
+    vertices: Meshes,
+    faces: Meshes,
+    camera: Camera | None = None,
+    *,
+    smooth: bool = False,
+    image_size: int = 256,
+    anti_aliasing: bool = True,
+    fill_back: bool = True,
+    near: float = 0.1,
+    far: float = 100.0,
+) -> Tensor:
+    """Normals of meshes in world space; the arguments are those of :func:`render_silhouette`.
+
+    Returns
+    -------
+    Tensor [B, S, S, 3]
+        ``normals[b, y, x]`` is the unit normal, on the side that is seen (:meth:`Fragments.normals`), at the pixel in
+        row y from the top; of the face, or with ``smooth`` interpolated between those of its vertices. 0 where there is
+        no face. With anti-aliasing the mean of 2x2: shorter than 1 at edges.
+
+    Notes
+    -----
+    Differentiable in the vertices: the true derivative at fixed coverage. (For edges moved by normals, shade by
+    yourself: ``fragments.resolve(fragments.normals())``.)
+
+    Raises
+    ------
+    TypeError, ValueError
+        As :func:`render_silhouette`.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
+    >>> picture = (1 + nmr.render_normals(vertices, faces, camera, smooth=True)) / 2
+    """
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far)
+    fragments = scene.fragments(scene.rasterize(fill_back, near, far), anti_aliasing, far, 1e-4)
+    return average(fragments.normals(smooth), anti_aliasing)
+
+
+def render_fragments(
+    vertices: Meshes,
+    faces: Meshes,
+    camera: Camera | None = None,
+    *,
+    image_size: int = 256,
+    anti_aliasing: bool = False,
+    fill_back: bool = True,
+    near: float = 0.1,
+    far: float = 100.0,
+    eps: float = 1e-4,
+) -> Fragments:
+    """Face, weights and depth at each pixel, to shade by yourself; arguments as of :func:`render_silhouette`.
+
+    Returns
+    -------
+    Fragments
+        At S x S pixels; with ``anti_aliasing`` at the 2S x 2S of the raster, which :meth:`Fragments.resolve` averages.
+
+    Notes
+    -----
+    weights and depth have true derivatives by the vertices, :meth:`Fragments.resolve` has NMR's.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As :func:`render_silhouette`.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> fragments = nmr.render_fragments(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), anti_aliasing=True)
+    >>> image = fragments.resolve(fragments.interpolate(vertices).sin())
+    """
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, eps)
+    return scene.fragments(scene.rasterize(fill_back, near, far), anti_aliasing, far, eps)
 
 
 @torch.no_grad()
 def render_face_index(
-    vertices: Tensor,
-    faces: Tensor,
+    vertices: Meshes,
+    faces: Meshes,
     camera: Camera | None = None,
     *,
     image_size: int = 256,
@@ -120,9 +399,7 @@ def render_face_index(
     TypeError, ValueError
         As :func:`render_silhouette`.
     """
-    check_size(image_size, "image_size", _LARGEST_IMAGE)
-    check_depth_range(near, far)
-    vertices, faces = _to_renderer_space(vertices, faces, camera)
-    owner = ops.rasterize(vertices, faces, None, image_size, bool(fill_back), float(near), float(far))
-    num_faces = faces.shape[-2]
+    scene = make_scene(vertices, faces, camera, image_size, False, near, far)
+    owner = scene.rasterize(fill_back, near, far)
+    num_faces = scene.mesh.num_faces
     return torch.where(owner >= num_faces, owner - num_faces, owner)

@@ -117,6 +117,7 @@ int64_t require_owner(const Array<int32_t>& owner, const MeshBatch<T>& mesh) {
 }
 
 // The parts of the module, one per file.
+void bind_camera(py::module_& m);
 void bind_raster(py::module_& m);
 void bind_fragments(py::module_& m);
 void bind_edges(py::module_& m);

@@ -11,6 +11,7 @@ Rasters are ``[B, R, R]`` with R = 2S when anti-aliased, else S; row 0 = top, as
 -1 = background, f = face f is nearest, ``F + f`` = its reversed copy is (F = number of faces of that mesh).
 """
 
+from .camera import pose, pose_backward, project, project_backward
 from .edges import edges_backward, resolve, resolve_backward
 from .fragments import depth_backward, depth_image, fragments, fragments_backward
 from .mesh import smoothness, smoothness_backward, voxels
@@ -25,6 +26,10 @@ __all__ = [
     "fragments_backward",
     "interpolate",
     "interpolate_backward",
+    "pose",
+    "pose_backward",
+    "project",
+    "project_backward",
     "rasterize",
     "resolve",
     "resolve_backward",

@@ -154,6 +154,25 @@ def test_a_corner_in_the_plane_of_the_eye_gives_no_gradient_and_spoils_nothing()
         assert not depth.isnan().any() and not grad.isnan().any() and not grad_depth.isnan().any()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_any_mesh_gives_depths_and_gradients(dtype):
+    """Coordinates of every kind: what is drawn has a depth in (near, far) and gradients that are numbers."""
+    g = torch.Generator().manual_seed(0)
+    odd = torch.tensor([0.0, -0.0, 1.0, -1.0, 0.5, 1e-45, 1e-30, 1e30, -1e30, 3e38, float("inf"), float("nan"), 1e-7])
+    drawn = 0
+    for _ in range(150):
+        vertices = 2 * torch.randn(2, 7, 3, generator=g, dtype=dtype)
+        choose = torch.rand(vertices.shape, generator=g) < 0.25
+        vertices[choose] = odd[torch.randint(0, len(odd), (int(choose.sum()),), generator=g)].to(dtype)
+        faces = torch.randint(0, 7, (6, 3), generator=g)
+        owner = owner_of(vertices, faces, 12)
+        weights, depth, grad, image, grad_image = gradients(vertices, faces, None, owner)
+        assert ((depth > 0.1) & (depth <= FAR)).all() and ((image > 0.1) & (image <= FAR)).all()
+        assert not (weights.isnan().any() or grad.isnan().any() or grad_image.isnan().any())
+        drawn += int((owner >= 0).any())
+    assert drawn > 100
+
+
 @pytest.mark.parametrize("batch, num_faces", [(0, 5), (2, 0)])
 def test_empty_batches_and_meshes(batch, num_faces):
     vertices, faces = torch.zeros(batch, 15, 3), torch.zeros(num_faces, 3, dtype=torch.long)

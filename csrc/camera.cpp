@@ -1,0 +1,350 @@
+// World space to renderer space, forward and backward: what the published renderer does in a chain of tensor operations.
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "parallel.h"
+#include "stages.h"
+
+namespace nmr {
+namespace {
+
+constexpr int kLanes = 16;       // vertices side by side, and partial sums per gradient; the same on every processor
+constexpr int64_t kChunk = 512;  // vertices per task: sums are taken per chunk, then over chunks
+constexpr int kSums = 12 + 6 + 5;        // sums over vertices per camera: gradients of matrix, intrinsics, distortion
+constexpr int kTotals = kSums + 3 + 1;   // and what follows from them: gradients of origin, extent
+
+// Beyond this a derivative, or a gradient multiplied with it, counts as infinite; small enough that sums cannot overflow.
+template <class T> constexpr T kLimit = T(1e200);
+template <> constexpr float kLimit<float> = 1e30f;
+
+// The camera of one image.
+template <class T>
+struct Lens {
+  T a[12], k[6], d[5], o[3], extent, inverse_extent;
+  T largest_a, largest_k, largest_d;  // largest |a|, |k / extent|, |d|; the first and the last at least 1
+  bool usable;                        // all of it is finite, and extent is not 0
+
+  Lens(const Project<T>& args, int64_t b) : d{}, o{}, extent(1), largest_a(1), largest_k(0), largest_d(1), usable(true) {
+    std::copy_n(args.matrix + 12 * b, 12, a);
+    std::copy_n(args.intrinsics + 6 * b, 6, k);
+    if (args.distortion) std::copy_n(args.distortion + 5 * b, 5, d);
+    if (args.origin) std::copy_n(args.origin + 3 * b, 3, o);
+    if (args.extent) extent = args.extent[b];
+    inverse_extent = 1 / extent;
+    for (T value : a) largest_a = std::max(largest_a, std::abs(value));
+    for (T value : k) largest_k = std::max(largest_k, std::abs(value * inverse_extent));
+    for (T value : d) largest_d = std::max(largest_d, std::abs(value));
+    for (T value : a) usable = usable && std::isfinite(value);
+    for (T value : k) usable = usable && std::isfinite(value * inverse_extent);
+    for (T value : d) usable = usable && std::abs(value) < kLimit<T>;
+    for (T value : o) usable = usable && std::isfinite(value);
+    usable = usable && std::isfinite(extent) && std::isfinite(inverse_extent);
+  }
+};
+
+template <class T>
+NMR_INLINE T larger(T a, T b) {
+  return a > b ? a : b;
+}
+
+template <class T>
+NMR_INLINE bool is_finite(T value) {
+  return std::abs(value) <= std::numeric_limits<T>::max();
+}
+
+// Where a vertex is seen. Without an image (the vertex not finite, in the plane of the eye, or so near to it that x / z^2
+// overflows) `visible` is false and the rest is without meaning.
+template <class T>
+struct Sight {
+  T inverse_z;
+  T px, py;    // before the distortion
+  T qx, qy;    // after it, divided by the extent
+  T x, y, z;   // in renderer space
+  T slope;     // bounds the derivative of extent q to the vertex in camera axes, but for a factor below 10
+  bool visible;
+};
+
+// x, y, z are relative to the origin. The image divides, and so rounds as the published one; derivatives (kExact false) take one
+// reciprocal instead, a third of their time.
+template <class T, bool kPerspective, bool kDistorted, bool kExact>
+NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
+  Sight<T> s;
+  const T ux = c.a[0] * x + c.a[1] * y + c.a[2] * z + c.a[3];
+  const T uy = c.a[4] * x + c.a[5] * y + c.a[6] * z + c.a[7];
+  s.z = c.a[8] * x + c.a[9] * y + c.a[10] * z + c.a[11];
+  s.inverse_z = kPerspective ? 1 / s.z : T(1);
+  s.px = !kPerspective ? ux : kExact ? ux / s.z : ux * s.inverse_z;
+  s.py = !kPerspective ? uy : kExact ? uy / s.z : uy * s.inverse_z;
+  const T reach = larger(larger(std::abs(s.px), std::abs(s.py)), T(1));
+  s.slope = kPerspective ? reach * std::abs(s.inverse_z) : T(1);
+  s.qx = s.px;
+  s.qy = s.py;
+  if (kDistorted) {  // q = p (1 + k1 r^2 + k2 r^4 + k3 r^6) + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y)
+    const T r2 = s.px * s.px + s.py * s.py, xy = s.px * s.py;
+    const T radial = 1 + r2 * (c.d[0] + r2 * (c.d[1] + r2 * c.d[4]));
+    s.qx = s.px * radial + 2 * c.d[2] * xy + c.d[3] * (r2 + 2 * s.px * s.px);
+    s.qy = s.py * radial + c.d[2] * (r2 + 2 * s.py * s.py) + 2 * c.d[3] * xy;
+    s.slope *= 1 + r2 * (std::abs(c.d[0]) + r2 * (std::abs(c.d[1]) + r2 * std::abs(c.d[4]))) +
+               reach * (std::abs(c.d[2]) + std::abs(c.d[3]));
+  }
+  s.qx = kExact ? s.qx / c.extent : s.qx * c.inverse_extent;
+  s.qy = kExact ? s.qy / c.extent : s.qy * c.inverse_extent;
+  s.x = c.k[0] * s.qx + c.k[1] * s.qy + c.k[2];
+  s.y = c.k[3] * s.qx + c.k[4] * s.qy + c.k[5];
+  s.visible = is_finite(s.x) & is_finite(s.y) & is_finite(s.z) & (s.slope < kLimit<T>);
+  return s;
+}
+
+template <class T, bool kPerspective, bool kDistorted>
+NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T* __restrict points) {
+  const T infinity = std::numeric_limits<T>::infinity();
+  for (int l = 0; l < kLanes; ++l) {
+    const Sight<T> s = sight_of<T, kPerspective, kDistorted, true>(c, vertices[3 * l] - c.o[0], vertices[3 * l + 1] - c.o[1],
+                                                               vertices[3 * l + 2] - c.o[2]);
+    points[3 * l] = s.visible ? s.x : infinity;
+    points[3 * l + 1] = s.visible ? s.y : infinity;
+    points[3 * l + 2] = is_finite(s.z) ? s.z : T(0);
+  }
+}
+
+// Adds the gradient of kLanes vertices to grad_vertices, and that of the camera to the partial sums. A vertex without an image
+// gets and gives exactly 0; so does one whose gradient would overflow. (An upstream NaN is passed on.)
+template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
+NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, const T* __restrict grad_points,
+                               T* __restrict grad_vertices, T (*__restrict sums)[kLanes]) {
+  for (int l = 0; l < kLanes; ++l) {
+    T x = vertices[3 * l] - c.o[0], y = vertices[3 * l + 1] - c.o[1], z = vertices[3 * l + 2] - c.o[2];
+    T gx = grad_points[3 * l], gy = grad_points[3 * l + 1], gz = grad_points[3 * l + 2];
+    Sight<T> s = sight_of<T, kPerspective, kDistorted, false>(c, x, y, z);
+    T reach = larger(std::abs(s.qx), std::abs(s.qy)) + c.largest_k * s.slope;
+    if (kDistorted) {
+      const T r2 = 1 + s.px * s.px + s.py * s.py;
+      reach = (reach + c.largest_k * r2 * r2 * r2 * r2) * c.largest_d;
+    }
+    const T bound = ((std::abs(gx) + std::abs(gy)) * reach + std::abs(gz)) * c.largest_a *
+                    larger(larger(larger(std::abs(x), std::abs(y)), std::abs(z)), T(1));
+    const bool keep = s.visible & !(bound >= kLimit<T>);
+    // What is left out is replaced before it enters a product, so that nothing becomes 0 * inf.
+    x = keep ? x : T(0), y = keep ? y : T(0), z = keep ? z : T(0);
+    gx = keep ? gx : T(0), gy = keep ? gy : T(0), gz = keep ? gz : T(0);
+    s.px = keep ? s.px : T(0), s.py = keep ? s.py : T(0);
+    s.qx = keep ? s.qx : T(0), s.qy = keep ? s.qy : T(0);
+    if (kPerspective) s.inverse_z = keep ? s.inverse_z : T(0);
+
+    const T gqx = (c.k[0] * gx + c.k[3] * gy) * c.inverse_extent;
+    const T gqy = (c.k[1] * gx + c.k[4] * gy) * c.inverse_extent;
+    T gpx = gqx, gpy = gqy;
+    if (kDistorted) {
+      const T r2 = s.px * s.px + s.py * s.py, xy = s.px * s.py;
+      const T radial = 1 + r2 * (c.d[0] + r2 * (c.d[1] + r2 * c.d[4]));
+      const T along = gqx * s.px + gqy * s.py;  // gradient of `radial`
+      const T g_r2 = along * (c.d[0] + r2 * (2 * c.d[1] + r2 * (3 * c.d[4]))) + gqx * c.d[3] + gqy * c.d[2];
+      const T cross = 2 * (gqx * c.d[2] + gqy * c.d[3]);  // gradient of x y
+      gpx = gqx * radial + cross * s.py + 4 * gqx * c.d[3] * s.px + 2 * g_r2 * s.px;
+      gpy = gqy * radial + cross * s.px + 4 * gqy * c.d[2] * s.py + 2 * g_r2 * s.py;
+      if (kSumCamera) {
+        sums[18][l] += along * r2;
+        sums[19][l] += along * r2 * r2;
+        sums[20][l] += 2 * gqx * xy + gqy * (r2 + 2 * s.py * s.py);
+        sums[21][l] += gqx * (r2 + 2 * s.px * s.px) + 2 * gqy * xy;
+        sums[22][l] += along * r2 * r2 * r2;
+      }
+    }
+    const T gux = kPerspective ? gpx * s.inverse_z : gpx, guy = kPerspective ? gpy * s.inverse_z : gpy;
+    const T guz = kPerspective ? gz - (gux * s.px + guy * s.py) : gz;
+    grad_vertices[3 * l] += c.a[0] * gux + c.a[4] * guy + c.a[8] * guz;
+    grad_vertices[3 * l + 1] += c.a[1] * gux + c.a[5] * guy + c.a[9] * guz;
+    grad_vertices[3 * l + 2] += c.a[2] * gux + c.a[6] * guy + c.a[10] * guz;
+    if (kSumCamera) {
+      const T gu[3] = {gux, guy, guz}, g[2] = {gx, gy};
+      for (int i = 0; i < 3; ++i) {
+        sums[4 * i][l] += gu[i] * x;
+        sums[4 * i + 1][l] += gu[i] * y;
+        sums[4 * i + 2][l] += gu[i] * z;
+        sums[4 * i + 3][l] += gu[i];
+      }
+      for (int i = 0; i < 2; ++i) {
+        sums[12 + 3 * i][l] += g[i] * s.qx;
+        sums[13 + 3 * i][l] += g[i] * s.qy;
+        sums[14 + 3 * i][l] += g[i];
+      }
+    }
+  }
+}
+
+// A run of vertices of one image: first rows of the vertices and of the points.
+struct Run {
+  int64_t image, vertices, points, count;
+};
+
+// The last, partial group of a run passes through padded copies, in which the vertices without an owner are NaN: no image.
+template <class T>
+struct Padded {
+  T vertices[3 * kLanes], grad_points[3 * kLanes], out[3 * kLanes];
+
+  Padded(const T* from, int64_t count) : grad_points{}, out{} {
+    std::fill_n(vertices, 3 * kLanes, std::numeric_limits<T>::quiet_NaN());
+    std::copy_n(from, 3 * count, vertices);
+  }
+};
+
+template <class T, bool kPerspective, bool kDistorted>
+NMR_INLINE void forward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run) {
+  const T* vertices = args.vertices + 3 * run.vertices;
+  T* points = args.points + 3 * run.points;
+  const int64_t whole = run.count / kLanes * kLanes, rest = run.count - whole;
+  Padded<T> last(vertices + 3 * whole, rest);
+  for (int64_t n = 0; n < run.count; n += kLanes)  // one call, so that it is inlined into each clone
+    forward_lanes<T, kPerspective, kDistorted>(lens, n < whole ? vertices + 3 * n : last.vertices, n < whole ? points + 3 * n : last.out);
+  std::copy_n(last.out, 3 * rest, points + 3 * whole);
+}
+
+template <class T>
+NMR_INLINE void forward_run_body(const Project<T>& args, const Run& run) {
+  const Lens<T> lens(args, run.image);
+  if (!lens.usable) {
+    T* points = args.points + 3 * run.points;
+    for (int64_t n = 0; n < run.count; ++n) {
+      points[3 * n] = points[3 * n + 1] = std::numeric_limits<T>::infinity();
+      points[3 * n + 2] = 0;
+    }
+  } else if (!args.perspective) {
+    forward_run_of<T, false, false>(args, lens, run);
+  } else if (!args.distortion) {
+    forward_run_of<T, true, false>(args, lens, run);
+  } else {
+    forward_run_of<T, true, true>(args, lens, run);
+  }
+}
+
+template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
+NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run, T* grad_vertices, double* total) {
+  T sums[kSums][kLanes] = {};
+  const T* vertices = args.vertices + 3 * run.vertices;
+  const T* grad_points = args.grad_points + 3 * run.points;
+  const int64_t whole = run.count / kLanes * kLanes, rest = run.count - whole;
+  Padded<T> last(vertices + 3 * whole, rest);
+  std::copy_n(grad_points + 3 * whole, 3 * rest, last.grad_points);
+  std::copy_n(grad_vertices + 3 * whole, 3 * rest, last.out);
+  for (int64_t n = 0; n < run.count; n += kLanes) {
+    const bool inside = n < whole;
+    backward_lanes<T, kPerspective, kDistorted, kSumCamera>(lens, inside ? vertices + 3 * n : last.vertices,
+                                                            inside ? grad_points + 3 * n : last.grad_points,
+                                                            inside ? grad_vertices + 3 * n : last.out, sums);
+  }
+  std::copy_n(last.out, 3 * rest, grad_vertices + 3 * whole);
+  if (!kSumCamera) return;
+  for (int k = 0; k < kSums; ++k) {
+    total[k] = 0;
+    for (int l = 0; l < kLanes; ++l) total[k] += static_cast<double>(sums[k][l]);
+  }
+  // u depends on v - origin and q on p / extent.
+  const double* t = total;
+  for (int j = 0; j < 3; ++j)
+    total[kSums + j] = -(double(lens.a[j]) * t[3] + double(lens.a[4 + j]) * t[7] + double(lens.a[8 + j]) * t[11]);
+  total[kSums + 3] = -(double(lens.k[0]) * t[12] + double(lens.k[1]) * t[13] + double(lens.k[3]) * t[15] +
+                       double(lens.k[4]) * t[16]) / double(lens.extent);
+}
+
+// total: kTotals gradients of the camera over this run, or nullptr.
+template <class T>
+NMR_INLINE void backward_run_body(const Project<T>& args, const Run& run, T* grad_vertices, double* total) {
+  const Lens<T> lens(args, run.image);
+  if (!lens.usable) {
+    if (total) std::fill_n(total, kTotals, 0.0);
+  } else if (!args.perspective) {
+    total ? backward_run_of<T, false, false, true>(args, lens, run, grad_vertices, total)
+          : backward_run_of<T, false, false, false>(args, lens, run, grad_vertices, total);
+  } else if (!args.distortion) {
+    total ? backward_run_of<T, true, false, true>(args, lens, run, grad_vertices, total)
+          : backward_run_of<T, true, false, false>(args, lens, run, grad_vertices, total);
+  } else {
+    total ? backward_run_of<T, true, true, true>(args, lens, run, grad_vertices, total)
+          : backward_run_of<T, true, true, false>(args, lens, run, grad_vertices, total);
+  }
+}
+
+NMR_CLONES void forward_run(const Project<float>& args, const Run& run) { forward_run_body(args, run); }
+NMR_CLONES void forward_run(const Project<double>& args, const Run& run) { forward_run_body(args, run); }
+NMR_CLONES void backward_run(const Project<float>& args, const Run& run, float* grad_vertices, double* total) {
+  backward_run_body(args, run, grad_vertices, total);
+}
+NMR_CLONES void backward_run(const Project<double>& args, const Run& run, double* grad_vertices, double* total) {
+  backward_run_body(args, run, grad_vertices, total);
+}
+
+struct ProjectScratch {
+  std::vector<Run> runs;
+  std::vector<double> totals;
+};
+
+// All runs, image after image.
+template <class T>
+const std::vector<Run>& runs_of(const Project<T>& args, ProjectScratch& scratch) {
+  scratch.runs.clear();
+  for (int64_t b = 0; b < args.batch; ++b) {
+    const int64_t points = args.starts ? args.starts[2 * b] : b * args.num_vertices;
+    const int64_t vertices = args.starts || args.vertex_batch != 1 ? points : 0;
+    const int64_t count = args.starts ? args.starts[2 * b + 2] - points : args.num_vertices;
+    for (int64_t n = 0; n < count; n += kChunk) scratch.runs.push_back({b, vertices + n, points + n, std::min(kChunk, count - n)});
+  }
+  return scratch.runs;
+}
+
+template <class T>
+void write(const double* sum, int count, T* grad, int64_t b) {
+  for (int k = 0; k < count && grad; ++k) grad[count * b + k] = static_cast<T>(sum[k]);
+}
+
+}  // namespace
+
+template <class T>
+void project_forward(const Project<T>& args) {
+  const std::vector<Run>& runs = runs_of(args, thread_scratch<ProjectScratch>());
+  parallel_for(static_cast<int64_t>(runs.size()), args.num_threads, [&](int64_t r) { forward_run(args, runs[r]); });
+}
+
+template <class T>
+void project_backward(const Project<T>& args) {
+  ProjectScratch& scratch = thread_scratch<ProjectScratch>();
+  const std::vector<Run>& runs = runs_of(args, scratch);
+  const int64_t num_runs = static_cast<int64_t>(runs.size());
+  const bool sum_camera =
+      args.grad_matrix || args.grad_intrinsics || args.grad_distortion || args.grad_origin || args.grad_extent;
+  double* totals = sum_camera ? reserve(scratch.totals, num_runs * kTotals) : nullptr;
+
+  // Vertices that all images share are owned by the task of their chunk, which visits the images in order.
+  const bool shared = !args.starts && args.vertex_batch == 1 && args.batch > 1;
+  const int64_t images = shared ? args.batch : 1, tasks = num_runs / images;
+  parallel_for(tasks, args.num_threads, [&](int64_t task) {
+    T discarded[3 * kChunk];
+    T* grad = args.grad_vertices ? args.grad_vertices + 3 * runs[task].vertices : discarded;
+    std::fill_n(grad, 3 * runs[task].count, T(0));
+    for (int64_t b = 0; b < images; ++b) {
+      const int64_t r = b * tasks + task;
+      backward_run(args, runs[r], grad, totals ? totals + r * kTotals : nullptr);
+    }
+  });
+  if (!sum_camera) return;
+
+  int64_t r = 0;
+  for (int64_t b = 0; b < args.batch; ++b) {
+    double sum[kTotals] = {};
+    for (; r < num_runs && runs[r].image == b; ++r)
+      for (int k = 0; k < kTotals; ++k) sum[k] += totals[r * kTotals + k];
+    write(sum, 12, args.grad_matrix, b);
+    write(sum + 12, 6, args.grad_intrinsics, b);
+    write(sum + 18, 5, args.grad_distortion, b);
+    write(sum + kSums, 3, args.grad_origin, b);
+    write(sum + kSums + 3, 1, args.grad_extent, b);
+  }
+}
+
+template void project_forward(const Project<float>&);
+template void project_forward(const Project<double>&);
+template void project_backward(const Project<float>&);
+template void project_backward(const Project<double>&);
+
+}  // namespace nmr

@@ -1,0 +1,151 @@
+"""Batches of meshes as the operators take them: meshes of one size stacked, meshes of many sizes packed end to end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import accumulate
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ._validate import check_faces, check_vertices, describe
+
+Values = Tensor | tuple[Tensor, ...]  # of check_values: with a batch axis, or one tensor per mesh
+
+
+class MeshBatch(NamedTuple):
+    """B meshes: vertices ``[B, V, 3]`` with faces ``[F, 3]`` or ``[B, F, 3]``, or packed ``[N, 3]`` and ``[M, 3]``."""
+
+    vertices: Tensor
+    faces: Tensor  # int64; vertex numbers count from the mesh's own first vertex
+    starts: Tensor | None = None  # packed: int64 [B + 1, 2] on the host, first vertex and face of each mesh, then N, M
+    vertex_counts: tuple[int, ...] = ()  # packed: V of each mesh
+    face_counts: tuple[int, ...] = ()  # packed: F of each mesh
+
+    @property
+    def batch(self) -> int:
+        return self.vertices.shape[0] if self.starts is None else len(self.vertex_counts)
+
+    @property
+    def num_faces(self) -> int | Tensor:
+        """F; of packed meshes int32 ``[B, 1, 1]``."""
+        if self.starts is None:
+            return self.faces.shape[-2]
+        return torch.tensor(self.face_counts, dtype=torch.int32, device=self.faces.device).view(-1, 1, 1)
+
+    def first_faces(self, value_batch: int) -> int | Tensor:
+        """Where the faces of each image begin when per-face values ``[value_batch, F, ...]`` are laid end to end."""
+        if self.starts is not None:
+            return self.starts[:-1, 1].to(self.faces.device).view(-1, 1, 1)
+        if value_batch == 1:
+            return 0
+        return torch.arange(value_batch, device=self.faces.device).view(-1, 1, 1) * self.faces.shape[-2]
+
+    def spread(self, rows: Tensor) -> Tensor:
+        """A row per image, ``[B | 1, C]``, given to each of its faces: ``[B | 1, 1, C]``, packed ``[M | 1, C]``."""
+        if self.starts is None:
+            return rows.unsqueeze(1)
+        if len(rows) == 1:
+            return rows
+        image = torch.arange(self.batch, device=rows.device)
+        counts = torch.tensor(self.face_counts, device=rows.device)
+        return F.embedding(torch.repeat_interleave(image, counts, output_size=len(self.faces)), rows)
+
+    def corner_rows(self) -> Tensor:
+        """Rows of ``vertices.reshape(-1, 3)`` at the corners of all faces: int64 ``[B F | M, 3]``."""
+        device = self.faces.device
+        if self.starts is None:
+            first = torch.arange(self.batch, device=device) * self.vertices.shape[1]
+            return (self.faces + first.view(-1, 1, 1)).reshape(-1, 3)
+        counts = torch.tensor(self.face_counts, device=device)
+        first = torch.repeat_interleave(self.starts[:-1, 0].to(device), counts, output_size=len(self.faces))
+        return self.faces + first.unsqueeze(1)
+
+    def values(self, values: Values, name: str, per: str | None = None) -> Tensor:
+        """Values in the layout of these meshes, ``[B | 1, n, ...]`` or packed ``[sum of n_b, ...]``.
+
+        ``per`` says what must have one row each, ``"vertex"`` or ``"face"``; None is any number of rows.
+        """
+        if self.starts is None:
+            values = torch.stack(self._one_size(values, name)) if isinstance(values, tuple) else values
+            if values.shape[0] not in (1, self.batch):
+                raise ValueError(f"{name} must have batch size 1 or {self.batch} as the images, got {describe(values)}")
+            wanted = {"vertex": self.vertices.shape[1], "face": self.faces.shape[-2], None: values.shape[1]}[per]
+            if values.shape[1] != wanted:
+                raise ValueError(f"{name} must have one row per {per}, {wanted} of them, got {describe(values)}")
+            return values.to(self.vertices)
+        rows = tuple(len(part) for part in self._one_per_mesh(values, name))
+        wanted = {"vertex": self.vertex_counts, "face": self.face_counts, None: rows}[per]
+        if rows != wanted:
+            raise ValueError(f"{name} must have one row per {per}, {list(wanted)} in the meshes, got {list(rows)}")
+        return torch.cat(values).to(self.vertices)
+
+    def corners(self, corners: object, attributes: Values, name: str) -> tuple[Tensor, Tensor | None]:
+        """Faces that count rows of attributes instead of vertices, as (corners, starts) of the operators."""
+        device = self.faces.device
+        if self.starts is None:
+            if is_list(corners):
+                corners = torch.stack(self._one_size([check_faces(part, 1, device, name) for part in corners], name))
+            corners = check_faces(corners, self.batch, device, name)
+            if corners.shape[-2] != self.faces.shape[-2]:
+                raise ValueError(
+                    f"{name} must have one row per face, {self.faces.shape[-2]} of them, got {describe(corners)}"
+                )
+            return corners, None
+        parts = [check_faces(part, 1, device, name) for part in self._one_per_mesh(corners, name)]
+        rows = tuple(part.shape[0] for part in parts)
+        if rows != self.face_counts or any(part.ndim != 2 for part in parts):
+            raise ValueError(f"{name} must have one row [3] per face, {list(self.face_counts)}, got {list(rows)}")
+        return torch.cat(parts), _starts([len(part) for part in attributes], rows)
+
+    def _one_size(self, parts: Sequence[Tensor], name: str) -> tuple[Tensor, ...]:
+        if len({part.shape for part in parts}) != 1:
+            raise ValueError(f"the meshes have one size, {name} has several: {[list(p.shape) for p in parts]}")
+        return tuple(parts)
+
+    def _one_per_mesh(self, parts: object, name: str) -> Sequence[Tensor]:
+        if not is_list(parts) or len(parts) != self.batch:
+            got = f"{len(parts)}" if is_list(parts) else describe(parts)
+            raise ValueError(f"{name} must be a list as the meshes are, of {self.batch} tensors, got {got}")
+        return parts
+
+
+def _starts(rows: Sequence[int], faces: Sequence[int]) -> Tensor:
+    return torch.tensor([[0, *accumulate(rows)], [0, *accumulate(faces)]]).T.contiguous()
+
+
+def is_list(value: object) -> bool:
+    return isinstance(value, list | tuple)
+
+
+def pack_meshes(vertices: object, faces: object) -> MeshBatch:
+    """Meshes given as lists, checked and laid end to end; a list of one becomes the batch ``[1, V, 3]``."""
+    if is_list(vertices):
+        for part in vertices:
+            check_vertices(part)
+            if part.ndim != 2:
+                raise ValueError(f"a list of vertices must hold tensors [V_b, 3], it holds {describe(part)}")
+            if (part.dtype, part.device) != (vertices[0].dtype, vertices[0].device):
+                raise ValueError(
+                    "the meshes of a list must have one dtype and device, "
+                    f"got {part.dtype} on {part.device} beside {vertices[0].dtype} on {vertices[0].device}"
+                )
+    else:
+        vertices = check_vertices(vertices).unbind(0)
+    if isinstance(faces, Tensor):
+        faces = faces.unbind(0) if faces.ndim == 3 else [faces] * len(vertices)
+    if not is_list(faces) or len(faces) != len(vertices) or not len(vertices):
+        got = f"{len(faces)}" if is_list(faces) else describe(faces)
+        raise ValueError(
+            f"a list of meshes needs faces for each, and at least one; got {len(vertices)} vertices and {got} faces"
+        )
+    faces = [check_faces(part, 1, vertices[0].device) for part in faces]
+    if any(part.ndim != 2 for part in faces):
+        raise ValueError(f"a list of faces must hold tensors [F_b, 3], it holds {[list(p.shape) for p in faces]}")
+    if len(vertices) == 1:
+        return MeshBatch(vertices[0].unsqueeze(0), faces[0])
+    vertex_counts, face_counts = tuple(len(part) for part in vertices), tuple(len(part) for part in faces)
+    starts = _starts(vertex_counts, face_counts)
+    return MeshBatch(torch.cat(tuple(vertices)), torch.cat(faces), starts, vertex_counts, face_counts)

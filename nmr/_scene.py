@@ -1,0 +1,131 @@
+"""What the rendering functions share: checked arguments in renderer space, and what the operators make of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from . import ops
+from ._packing import MeshBatch, is_list, pack_meshes
+from ._validate import (
+    as_floats,
+    check_camera,
+    check_depth_range,
+    check_eps,
+    check_faces,
+    check_size,
+    check_vertices,
+    describe,
+)
+from .cameras import Camera
+from .fragments import Fragments
+from .lights import Lights
+from .textures import Colors
+
+_LARGEST_IMAGE = 8192
+
+Meshes = Tensor | Sequence[Tensor]
+
+
+class Scene(NamedTuple):
+    """Checked arguments: meshes before and after the camera, and the size of the raster."""
+
+    world: Tensor
+    mesh: MeshBatch
+    camera: Camera | None
+    raster_size: int
+
+    def rasterize(self, fill_back: bool, near: float, far: float) -> Tensor:
+        return ops.rasterize(*self.mesh[:3], self.raster_size, bool(fill_back), float(near), float(far))
+
+    def silhouette(self, anti_aliasing: bool, fill_back: bool, near: float, far: float, eps: float):
+        size = self.raster_size // 2 if anti_aliasing else self.raster_size
+        return ops.silhouette(
+            *self.mesh[:3], size, bool(anti_aliasing), bool(fill_back), float(near), float(far), float(eps)
+        )
+
+    def depth(self, owner: Tensor, anti_aliasing: bool, far: float) -> Tensor:
+        return ops.depth_image(*self.mesh[:3], owner, bool(anti_aliasing), float(far))
+
+    def fragments(self, owner: Tensor, anti_aliasing: bool, far: float, eps: float) -> Fragments:
+        weights, depth = ops.fragments(*self.mesh[:3], owner, float(far))
+        return Fragments(owner, weights, depth, self.mesh, self.world, self.camera, bool(anti_aliasing), float(eps))
+
+
+def make_scene(
+    vertices: Meshes,
+    faces: Meshes,
+    camera: Camera | None,
+    image_size: int,
+    anti_aliasing: bool,
+    near: float,
+    far: float,
+    eps: float = 1e-4,
+) -> Scene:
+    size = check_size(image_size, "image_size", _LARGEST_IMAGE)
+    check_depth_range(near, far)
+    packed = is_list(vertices) or is_list(faces)
+    mesh = pack_meshes(vertices, faces) if packed else MeshBatch(check_vertices(vertices), faces)
+    world = mesh.vertices
+    if camera is not None:
+        check_camera(camera, mesh.starts is not None)
+        if mesh.starts is None:
+            mesh = mesh._replace(vertices=check_vertices(camera.transform(world)))
+        else:
+            mesh = mesh._replace(vertices=camera.transform(world, starts=mesh.starts))
+            if not isinstance(mesh.vertices, Tensor) or mesh.vertices.shape != world.shape:
+                raise ValueError(
+                    f"camera.transform must return packed vertices {list(world.shape)}, got {describe(mesh.vertices)}"
+                )
+    mesh = mesh._replace(faces=check_faces(mesh.faces, mesh.batch, mesh.vertices.device))
+    check_eps(eps, mesh.vertices.dtype)
+    return Scene(world, mesh, camera, size * 2 if anti_aliasing else size)
+
+
+def shade(
+    fragments: Fragments,
+    colors: Colors | None,
+    lights: Lights | None,
+    background: float | Sequence[float] | Tensor,
+    interpolation_gradient: bool,
+) -> Tensor:
+    """The raster ``[B, R, R, C]``, background filled in."""
+    if not interpolation_gradient:
+        fragments = replace(fragments, weights=fragments.weights.detach())
+    shape, covered = fragments.owner.shape, fragments.covered.unsqueeze(-1)
+    if colors is None:
+        image = covered.to(fragments.weights).expand(*shape, 3)
+    else:
+        if not callable(getattr(colors, "sample", None)):
+            raise TypeError(
+                "colors must be nmr.VertexColors, FaceColors, TextureCubes, UVTexture or have sample(fragments), "
+                f"got {describe(colors)}"
+            )
+        image = colors.sample(fragments)
+        if not isinstance(image, Tensor) or image.ndim != 4 or image.shape[:3] != shape or not image.shape[3]:
+            raise ValueError(f"colors.sample must return a tensor {[*shape, 'C']}, got {describe(image)}")
+    if lights is not None:
+        if not isinstance(lights, Lights):
+            raise TypeError(f"lights must be nmr.Lights, got {describe(lights)}")
+        if image.shape[-1] not in (1, 3):
+            raise ValueError(f"lights need colours of 3 channels (or 1), got {image.shape[-1]}")
+        image = image * lights.shade(fragments)
+    channels = image.shape[-1]
+    wanted = f"a number, [{channels}] or [{shape[0]}, {channels}]"
+    behind = as_floats(background, "background", wanted).to(image)
+    if behind.ndim > 2 or any(n not in (1, m) for n, m in zip(behind.shape[::-1], (channels, shape[0]), strict=False)):
+        raise ValueError(f"background must be {wanted}, got {describe(behind)}")
+    behind = behind.view(-1, 1, 1, behind.shape[-1]) if behind.ndim else behind
+    return torch.where(covered, image, behind).to(fragments.weights)
+
+
+def average(image: Tensor, anti_aliasing: bool) -> Tensor:
+    """Mean of 2x2 pixels, without the gradient of edges."""
+    if not anti_aliasing:
+        return image
+    batch, size, _, channels = image.shape
+    return image.view(batch, size // 2, 2, size // 2, 2, channels).mean((2, 4))

@@ -1,0 +1,297 @@
+"""Cameras from and to the conventions of OpenCV, OpenGL and PyTorch3D. Differentiable; results are float64.
+
+Those worlds are right-handed, and a camera that comes from one of them shows the same picture here, not mirrored.
+:class:`nmr.LookAt`, :class:`nmr.Look` and :class:`nmr.Orthographic` treat the world as left-handed, as the published
+renderer does, so that what they see is the mirror image of what a right-handed look-at sees. Converted, they still put
+every vertex on the same pixel, and so their rotation has determinant -1. Where a proper rotation is needed, give the
+other renderer mirrored vertices ``v * (1, 1, -1)`` and ``R @ diag(1, 1, -1)`` (PyTorch3D: ``diag(1, 1, -1) @ R``).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .pinhole import Pinhole
+from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched
+
+# Camera axes here: x right, y down, z away (OpenCV). OpenGL: right, up, towards the viewer; PyTorch3D: left, up, away.
+_OPENGL_AXES = torch.tensor([[1.0], [-1.0], [-1.0]], dtype=torch.float64)
+_PYTORCH3D_AXES = torch.tensor([[-1.0], [-1.0], [1.0]], dtype=torch.float64)
+
+
+def _row(*entries: Tensor | float) -> Tensor:
+    """``[B, len(entries)]`` of tensors ``[B]`` and numbers."""
+    batch = max((x.shape[0] for x in entries if isinstance(x, Tensor)), default=1)
+    return torch.stack([torch.as_tensor(x, dtype=torch.float64).expand(batch) for x in entries], dim=-1)
+
+
+def _size(height: float, width: float) -> tuple[float, float]:
+    if not (0 < height < float("inf") and 0 < width < float("inf")):
+        raise ValueError(f"height and width must be positive, got {height} and {width}")
+    return float(height), float(width)
+
+
+def _without_distortion(camera: ProjectingCamera, target: str) -> Projection:
+    projection = camera.projection().plain()
+    if projection.distortion is not None and projection.perspective and projection.distortion.any():
+        raise ValueError(f"{target} has no lens distortion; undistort the images and drop dist_coeffs")
+    return projection
+
+
+# --- OpenCV
+
+
+def from_opencv(
+    K: Numbers,
+    R: Numbers,
+    t: Numbers,
+    dist_coeffs: Numbers | None = None,
+    *,
+    height: float,
+    width: float,
+    pixel_center: float = 0.0,
+) -> Pinhole:
+    """A camera of OpenCV: ``c = R v + t``, distorted, ``(u, v) = K (c_x / c_z, c_y / c_z, 1)`` in pixels.
+
+    Parameters
+    ----------
+    K, R : [3, 3] or [B, 3, 3]
+        For a rotation vector use ``cv2.Rodrigues`` first.
+    t : [3], [3, 1], [B, 3] or [B, 3, 1]
+    dist_coeffs : [4] or [5], [B, 4] or [B, 5], also as a column, optional
+        k1, k2, p1, p2 and k3.
+    height, width : number
+        The image that K belongs to. The rendered square shows all of it, stretched if it is not square.
+    pixel_center : float
+        Coordinate of the centre of the first pixel: 0 in OpenCV, 0.5 where pixel coordinates begin at its corner
+        (COLMAP; :class:`nmr.Pinhole` itself).
+
+    Returns
+    -------
+    Pinhole
+        At ``image_size`` = height = width, a vertex that OpenCV projects to (u, v) lies in row v, column u.
+
+    Raises
+    ------
+    ValueError
+        For other shapes, also those of OpenCV's longer distortion models.
+    """
+    height, width = _size(height, width)
+    K = batched(as_parameter(K, "K", 3, 3), torch.float64, 3, 3)
+    shift = torch.zeros(3, 3, dtype=torch.float64)
+    shift[:2, 2] = 0.5 - pixel_center
+    t = t if isinstance(t, Tensor) else torch.as_tensor(t, dtype=torch.float64)
+    t = t.squeeze(-1) if t.shape[-1:] == (1,) else t
+    if dist_coeffs is not None:
+        d = dist_coeffs if isinstance(dist_coeffs, Tensor) else torch.as_tensor(dist_coeffs, dtype=torch.float64)
+        d = d.squeeze(-1) if d.ndim > 1 and d.shape[-1] == 1 else d
+        if d.ndim not in (1, 2) or d.shape[-1] not in (4, 5):
+            raise ValueError(
+                f"dist_coeffs must be k1, k2, p1, p2 or k1, k2, p1, p2, k3, got shape {list(d.shape)}; "
+                "OpenCV's models with 8, 12 and 14 numbers are not supported"
+            )
+        dist_coeffs = d if d.shape[-1] == 5 else torch.cat([d, torch.zeros_like(d[..., :1])], dim=-1)
+    return Pinhole(K + shift, R, t, dist_coeffs, orig_size=(height, width))
+
+
+def to_opencv(
+    camera: ProjectingCamera, *, height: float, width: float, pixel_center: float = 0.0
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """``K [B, 3, 3]``, ``R [B, 3, 3]``, ``t [B, 3]`` and ``dist_coeffs [B, 5]`` or None, as :func:`from_opencv` takes.
+
+    The determinant of R is -1 for the cameras of a left-handed world (see above). An orthographic camera raises a
+    ValueError.
+    """
+    height, width = _size(height, width)
+    projection = camera.projection().plain()
+    if not projection.perspective:
+        raise ValueError("OpenCV has no orthographic camera; use to_opengl or to_pytorch3d")
+    x, y = projection.intrinsics.unbind(1)
+    corner = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    shift = (0.5 - pixel_center) * corner
+    third = corner.expand_as(x)
+    K = torch.stack([width / 2 * (corner + x) - shift, height / 2 * (corner - y) - shift, third], dim=1)
+    matrix = projection.matrix
+    return K, matrix[:, :, :3], matrix[:, :, 3], projection.distortion
+
+
+# --- OpenGL
+
+
+def from_opengl(view: Numbers, projection: Numbers) -> Projection:
+    """A camera of OpenGL: ``clip = projection @ view @ (v, 1)``, ``(x, y) = clip_xy / clip_w``.
+
+    Parameters
+    ----------
+    view, projection : [4, 4] or [B, 4, 4]
+        For column vectors, as in the specification (a flat array in OpenGL's memory order is the transpose). The last
+        row of ``projection`` is (0, 0, -1, 0) for a perspective and (0, 0, 0, 1) for an orthographic camera.
+
+    Returns
+    -------
+    Projection
+        x and y are OpenGL's normalized device coordinates. z is the distance ``-z_eye`` from the plane of the eye, and
+        not OpenGL's depth: near and far of ``projection`` are arguments of the rendering functions here.
+
+    Raises
+    ------
+    ValueError
+        For other shapes, or matrices that no camera of this form has.
+    """
+    view = batched(as_parameter(view, "view", 4, 4), torch.float64, 4, 4)
+    clip = batched(as_parameter(projection, "projection", 4, 4), torch.float64, 4, 4)
+    last = torch.tensor([[0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
+    perspective = bool((clip[:, 3] == last[0]).all())
+    if not (view[:, 3] == last[1]).all():
+        raise ValueError("the last row of view must be (0, 0, 0, 1); are the matrices transposed?")
+    if not perspective and not (clip[:, 3] == last[1]).all():
+        raise ValueError("the last row of projection must be (0, 0, -1, 0) or (0, 0, 0, 1); is it transposed?")
+    offset, shear = (clip[:, :2, 3], clip[:, :2, 2]) if perspective else (clip[:, :2, 2], clip[:, :2, 3])
+    if offset.any():
+        column = 3 if perspective else 2
+        raise ValueError(f"projection[0:2, {column}] must be 0: x and y of the image would depend on z in a second way")
+    third = -shear if perspective else shear
+    intrinsics = torch.stack([clip[:, :2, 0], -clip[:, :2, 1], third], dim=-1)
+    return Projection(_OPENGL_AXES * view[:, :3], intrinsics, perspective=perspective)
+
+
+def to_opengl(camera: ProjectingCamera, *, near: float, far: float) -> tuple[Tensor, Tensor]:
+    """``view`` and ``projection``, ``[B, 4, 4]``, as :func:`from_opengl` takes them; near and far map to -1 and 1 in z.
+
+    The determinant of ``view`` is -1 for the cameras of a left-handed world (see above); the winding of a face on the
+    screen is the same as here. A distorted camera raises a ValueError.
+    """
+    if not 0 <= near < far < float("inf"):
+        raise ValueError(f"near and far must be finite with 0 <= near < far, got near={near}, far={far}")
+    camera = _without_distortion(camera, "OpenGL")
+    matrix, intrinsics = camera.matrix, camera.intrinsics
+    last = torch.tensor([[[0.0, 0.0, 0.0, 1.0]]], dtype=torch.float64)
+    view = torch.cat([_OPENGL_AXES * matrix, last.expand(matrix.shape[0], 1, 4)], dim=1)
+    x, y, third = intrinsics.unbind(-1)
+    zero, depth = torch.zeros_like(x), far - near
+    if camera.perspective:
+        top = torch.stack([x, -y, -third, zero], dim=-1)
+        bottom = [[0.0, 0.0, -(far + near) / depth, -2 * far * near / depth], [0.0, 0.0, -1.0, 0.0]]
+    else:
+        top = torch.stack([x, -y, zero, third], dim=-1)
+        bottom = [[0.0, 0.0, -2 / depth, -(far + near) / depth], [0.0, 0.0, 0.0, 1.0]]
+    return view, torch.cat([top, torch.tensor([bottom], dtype=torch.float64).expand(len(top), 2, 4)], dim=1)
+
+
+# --- PyTorch3D
+
+
+def _pairs(value: Numbers, name: str) -> Tensor:
+    """``[B, 2]`` from a number, ``[B]`` or ``[B, 2]``."""
+    value = value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+    if value.ndim > 2 or (value.ndim == 2 and value.shape[1] != 2):
+        raise ValueError(f"{name} must be a number or have shape [B] or [B, 2], got {list(value.shape)}")
+    value = value.to("cpu", torch.float64)
+    return value if value.ndim == 2 else value.reshape(-1, 1).expand(-1, 2)
+
+
+def from_pytorch3d(
+    R: Numbers,
+    T: Numbers,
+    focal_length: Numbers = 1.0,
+    principal_point: Numbers = 0.0,
+    *,
+    in_ndc: bool = True,
+    image_size: tuple[float, float] | None = None,
+    orthographic: bool = False,
+) -> Projection:
+    """A ``PerspectiveCameras`` or ``OrthographicCameras`` of PyTorch3D.
+
+    There ``(X, Y, Z) = v R + T`` with row vectors and X left, Y up, Z away; ``x_ndc = fx X / Z + px`` (``fx X + px``
+    if orthographic), y likewise; +1 is the left and the upper border of a square image.
+
+    Parameters
+    ----------
+    R : [3, 3] or [B, 3, 3]
+    T : [3] or [B, 3]
+    focal_length, principal_point : number, [B] or [B, 2]
+    in_ndc : bool
+        False: in pixels from the upper left corner of the image; ``image_size`` is then needed.
+    image_size : (height, width), optional
+        Of an image that is not square: its shorter side spans [-1, 1] there. The rendered square shows all of it.
+    orthographic : bool
+
+    Returns
+    -------
+    Projection
+        With the same picture; z is PyTorch3D's depth Z.
+
+    Raises
+    ------
+    ValueError
+        For other shapes, or a missing or impossible image_size.
+    """
+    R, T = (
+        batched(as_parameter(R, "R", 3, 3), torch.float64, 3, 3),
+        batched(as_parameter(T, "T", 3), torch.float64, 3, 1),
+    )
+    batch = max(R.shape[0], T.shape[0])
+    matrix = torch.cat([R.transpose(1, 2).expand(batch, 3, 3), T.expand(batch, 3, 1)], dim=-1)
+    focal, centre = _pairs(focal_length, "focal_length"), _pairs(principal_point, "principal_point")
+    if image_size is None and not in_ndc:
+        raise ValueError("image_size=(height, width) is needed with in_ndc=False")
+    height, width = _size(*(image_size or (1, 1)))
+    shorter, size = min(height, width), torch.tensor([width, height], dtype=torch.float64)
+    if not in_ndc:
+        focal, centre = focal * (2 / shorter), -(centre - size / 2) * (2 / shorter)
+    focal, centre = focal * (shorter / size), centre * (shorter / size)
+    # x = -x_ndc here; X of the camera axes is turned likewise, so that only the principal point shows it.
+    intrinsics = torch.stack([_row(focal[:, 0], 0, -centre[:, 0]), _row(0, -focal[:, 1], centre[:, 1])], dim=1)
+    return Projection(_PYTORCH3D_AXES * matrix, intrinsics, perspective=not orthographic)
+
+
+def from_pytorch3d_fov(
+    R: Numbers,
+    T: Numbers,
+    fov: Numbers = 60.0,
+    aspect_ratio: float = 1.0,
+    *,
+    degrees: bool = True,
+    image_size: tuple[float, float] | None = None,
+) -> Projection:
+    """A ``FoVPerspectiveCameras`` of PyTorch3D: ``fov``, a number or [B], is the WHOLE vertical field of view.
+
+    Its focal lengths are ``1 / (aspect_ratio tan(fov / 2))`` and ``1 / tan(fov / 2)``; the rest is
+    :func:`from_pytorch3d`.
+    """
+    fov = as_parameter(fov, "fov").to("cpu", torch.float64).reshape(-1)
+    focal = 1 / torch.tan((torch.deg2rad(fov) if degrees else fov) / 2)
+    return from_pytorch3d(R, T, torch.stack([focal / aspect_ratio, focal], dim=-1), image_size=image_size)
+
+
+def to_pytorch3d(
+    camera: ProjectingCamera, *, image_size: tuple[float, float] | None = None, in_ndc: bool = True
+) -> dict[str, Tensor | bool]:
+    """Arguments of ``PerspectiveCameras(**...)``, or of ``OrthographicCameras`` for an orthographic camera.
+
+    ``R [B, 3, 3]``, ``T [B, 3]``, ``focal_length [B, 2]``, ``principal_point [B, 2]``, ``in_ndc``, and ``image_size
+    [1, 2]`` (height, width) if given: it must be, for an image that is not square, and with ``in_ndc=False``. The
+    determinant of R is -1 for the cameras of a left-handed world (see above).
+
+    Raises
+    ------
+    ValueError
+        For a camera with distortion or skew, or a missing or impossible image_size.
+    """
+    camera = _without_distortion(camera, "PyTorch3D")
+    if image_size is None and not in_ndc:
+        raise ValueError("image_size=(height, width) is needed with in_ndc=False")
+    height, width = _size(*(image_size or (1, 1)))
+    shorter, size = min(height, width), torch.tensor([width, height], dtype=torch.float64)
+    intrinsics, matrix = camera.intrinsics, _PYTORCH3D_AXES * camera.matrix
+    if intrinsics[:, 0, 1].any() or intrinsics[:, 1, 0].any():
+        raise ValueError("PyTorch3D's focal_length and principal_point cannot express the skew of this camera")
+    focal = torch.stack([intrinsics[:, 0, 0], -intrinsics[:, 1, 1]], dim=-1) * (size / shorter)
+    centre = torch.stack([-intrinsics[:, 0, 2], intrinsics[:, 1, 2]], dim=-1) * (size / shorter)
+    if not in_ndc:
+        focal, centre = focal * (shorter / 2), size / 2 - centre * (shorter / 2)
+    arguments = dict(
+        R=matrix[:, :, :3].transpose(1, 2), T=matrix[:, :, 3], focal_length=focal, principal_point=centre, in_ndc=in_ndc
+    )
+    return arguments if image_size is None else arguments | {"image_size": torch.tensor([[height, width]])}

@@ -1,0 +1,181 @@
+"""Cameras given by where they are and where they look: LookAt, Look, Orthographic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .. import ops
+from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched, common_batch
+
+Scalars = float | Sequence[float] | Tensor
+
+# Camera axes have y down, renderer space has y up.
+_Y_UP = torch.tensor([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]])
+_NARROWEST_DEG = 1e-9  # there float still holds what is divided by the tangent
+
+
+def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: Scalars) -> Tensor:
+    """Points on a sphere around the origin: ``(d cos e sin a, d sin e, -d cos e cos a)``, ``[3]`` or ``[B, 3]``.
+
+    Numbers, sequences and tensors of one length broadcast; other lengths raise a ValueError. At azimuth 0 and
+    elevation 0 the point is ``(0, 0, -d)``.
+    """
+    d, e, a = (
+        x if isinstance(x, Tensor) and x.is_floating_point() else torch.as_tensor(x, dtype=torch.float64)
+        for x in (distance, elevation_deg, azimuth_deg)
+    )
+    if len({x.shape for x in (d, e, a) if x.ndim}) > 1:
+        raise ValueError(
+            "distance, elevation_deg and azimuth_deg must be single numbers or have one length, got shapes "
+            f"{list(d.shape)}, {list(e.shape)}, {list(a.shape)}"
+        )
+    d, e, a = torch.broadcast_tensors(d, e * (math.pi / 180), a * (math.pi / 180))
+    return torch.stack([d * e.cos() * a.sin(), d * e.sin(), -d * e.cos() * a.cos()], dim=-1)
+
+
+def _scalar(value: Scalars, name: str, low: float, high: float, wanted: str) -> float | Tensor:
+    """A number, or a float tensor [] or [B], strictly between low and high."""
+    if not isinstance(value, (int, float)):
+        value = as_parameter(value, name)
+    if not torch.as_tensor((low < value) & (value < high)).all():
+        raise ValueError(f"{name} must lie {wanted}, got {value}")
+    return value
+
+
+def _fov(half_fov_deg: Scalars) -> float | Tensor:
+    return _scalar(half_fov_deg, "half_fov_deg", _NARROWEST_DEG, 90, "between 0 and 90 degrees")
+
+
+def _check_pose(camera: ProjectingCamera, *names: str, **scalar: float | Tensor) -> None:
+    """Stores the vectors of a camera as tensors, and a scalar; their batch sizes must agree."""
+    vectors = {name: as_parameter(getattr(camera, name), name, 3) for name in names}
+    for name, value in (vectors | scalar).items():
+        object.__setattr__(camera, name, value)
+    common_batch(
+        **{name: x for name, x in vectors.items() if x.ndim == 2},
+        **{name: x for name, x in scalar.items() if isinstance(x, Tensor) and x.ndim == 1},
+    )
+
+
+def _between(eye: Tensor, at: Tensor) -> Tensor:
+    return batched(at, torch.float64, 3) - batched(eye, torch.float64, 3)
+
+
+def _posed(eye: Tensor, forward: Tensor, up: Tensor, dtype: torch.dtype, **rest: Tensor | bool | None) -> Projection:
+    """The projection of a camera at ``eye`` with the axes of :class:`LookAt`; NaN where they are not finite."""
+    eye, forward, up = (batched(x, dtype, 3) for x in (eye, forward, up))
+    batch = max(forward.shape[0], up.shape[0])
+    return Projection(ops.pose(forward.expand(batch, 3), up.expand(batch, 3)), origin=eye, **rest)
+
+
+def _perspective(half_fov_deg: float | Tensor, dtype: torch.dtype) -> dict[str, Tensor]:
+    if isinstance(half_fov_deg, Tensor):
+        angle = (half_fov_deg.to("cpu", torch.float64) * (math.pi / 180)).to(dtype).reshape(-1)
+    else:
+        angle = torch.tensor([math.radians(half_fov_deg)], dtype=dtype)
+    return {"intrinsics": _Y_UP.to(dtype), "extent": torch.tan(angle)}
+
+
+@dataclass(frozen=True, eq=False)
+class LookAt(ProjectingCamera):
+    """A perspective camera at ``eye`` that looks at ``at``.
+
+    A vertex v maps to ``u = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at - eye)``, then to
+    ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``; n(v) = v / max(abs(v), 1e-5), so that an eye on the up axis is
+    degenerate (x = y = 0) and no error. The world is left-handed (x right, y up, z away), as the published renderer's.
+
+    Parameters
+    ----------
+    eye, at, up : [3] or [B, 3], tensors or sequences, world units
+        A pose that is not finite, or farther away than 1e15, sees nothing.
+    half_fov_deg : float, or Tensor [] or [B]
+        a: half of the field of view, in degrees, horizontal = vertical (the published ``viewing_angle``).
+
+    Differentiable in every parameter that is given as a tensor.
+
+    Raises
+    ------
+    ValueError
+        For a shape other than those, batch sizes that differ, or half_fov_deg outside (0, 90).
+
+    Examples
+    --------
+    >>> camera = nmr.LookAt([[0.0, 0.0, -2.0], [2.0, 0.0, 0.0]], half_fov_deg=15.0)
+    >>> camera.transform(torch.zeros(1, 1, 3))[:, 0, 2]
+    tensor([2., 2.])
+    """
+
+    eye: Numbers
+    at: Numbers = (0.0, 0.0, 0.0)
+    up: Numbers = (0.0, 1.0, 0.0)
+    half_fov_deg: Scalars = 30.0
+
+    def __post_init__(self) -> None:
+        _check_pose(self, "eye", "at", "up", half_fov_deg=_fov(self.half_fov_deg))
+
+    @classmethod
+    def from_angles(
+        cls, distance: Scalars, elevation_deg: Scalars, azimuth_deg: Scalars, *, half_fov_deg: Scalars = 30.0
+    ) -> LookAt:
+        """The camera that looks at the origin from :func:`points_from_angles`."""
+        return cls(eye=points_from_angles(distance, elevation_deg, azimuth_deg), half_fov_deg=half_fov_deg)
+
+    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
+        return _posed(self.eye, _between(self.eye, self.at), self.up, dtype, **_perspective(self.half_fov_deg, dtype))
+
+
+@dataclass(frozen=True, eq=False)
+class Look(ProjectingCamera):
+    """A perspective camera at ``eye`` that looks along ``direction`` (of any length).
+
+    ``z = n(direction)``; everything else is as in :class:`LookAt`.
+
+    Raises
+    ------
+    ValueError
+        As :class:`LookAt`.
+    """
+
+    eye: Numbers
+    direction: Numbers = (0.0, 0.0, 1.0)
+    up: Numbers = (0.0, 1.0, 0.0)
+    half_fov_deg: Scalars = 30.0
+
+    def __post_init__(self) -> None:
+        _check_pose(self, "eye", "direction", "up", half_fov_deg=_fov(self.half_fov_deg))
+
+    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
+        return _posed(self.eye, self.direction, self.up, dtype, **_perspective(self.half_fov_deg, dtype))
+
+
+@dataclass(frozen=True, eq=False)
+class Orthographic(ProjectingCamera):
+    """A camera without perspective, posed as :class:`LookAt`: ``(scale u_x, scale u_y, u_z)``.
+
+    ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half the width of what is seen, in world units.
+    The published renderer's ``perspective=False`` has scale 1. Differentiable in every parameter given as a tensor.
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape, batch sizes that differ, or a scale that is not positive and finite.
+    """
+
+    eye: Numbers
+    at: Numbers = (0.0, 0.0, 0.0)
+    up: Numbers = (0.0, 1.0, 0.0)
+    scale: Scalars = 1.0
+
+    def __post_init__(self) -> None:
+        scale = _scalar(self.scale, "scale", 0, math.inf, "between 0 and infinity")
+        _check_pose(self, "eye", "at", "up", scale=scale)
+
+    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
+        scale = batched(self.scale, dtype, 1, 1) if isinstance(self.scale, Tensor) else self.scale
+        intrinsics = scale * _Y_UP.to(dtype)
+        return _posed(self.eye, _between(self.eye, self.at), self.up, dtype, intrinsics=intrinsics, perspective=False)

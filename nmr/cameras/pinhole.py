@@ -1,0 +1,81 @@
+"""A camera given by a calibration: K, R, t and OpenCV's distortion."""
+
+from __future__ import annotations
+
+from dataclasses import KW_ONLY, dataclass
+
+import torch
+from torch import Tensor
+
+from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched, common_batch
+
+# From pixels (u right, v down) to [-1, 1]: x = 2 u / width - 1, y = 1 - 2 v / height.
+_CENTRE = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Pinhole(ProjectingCamera):
+    """The published renderer's ``projection`` camera: a calibrated pinhole with OpenCV's distortion.
+
+    ``c = R v + t``; ``p = (c_x, c_y) / c_z``, distorted; pixel ``(u, v) = K (p_x, p_y, 1)``, u right and v DOWN; then
+    ``x = 2 u / width - 1``, ``y = 1 - 2 v / height``, depth ``c_z``. Pixels are counted from the corner of the first
+    one, whose centre is (0.5, 0.5); :func:`nmr.cameras.from_opencv` converts from OpenCV's, where it is (0, 0).
+    Camera axes are x right, y down, z away: a right-handed world is not mirrored.
+
+    Parameters
+    ----------
+    K : [3, 3] or [B, 3, 3]
+        Pixels of an image of ``orig_size``; only the first two rows are used.
+    R : [3, 3] or [B, 3, 3]
+    t : [3], [B, 3] or [B, 1, 3]
+    dist_coeffs : [5] or [B, 5], optional
+        k1, k2, p1, p2, k3. The r^2 of the polynomial is computed without a root: the gradient is finite on the axis.
+    orig_size : number or (height, width), by name
+        The image that K belongs to. It is mapped onto the whole rendered square, stretched if it is not one.
+
+    All but orig_size are tensors or sequences, and differentiable if tensors.
+
+    Raises
+    ------
+    ValueError
+        For a shape other than those, batch sizes that differ, or an orig_size that is not positive.
+
+    Examples
+    --------
+    >>> K = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
+    >>> camera = nmr.Pinhole(K, torch.eye(3), [0.0, 0.0, 2.0], orig_size=(480, 640))
+    >>> camera.transform(torch.zeros(1, 1, 3))
+    tensor([[[0., 0., 2.]]])
+    """
+
+    K: Numbers
+    R: Numbers
+    t: Numbers
+    dist_coeffs: Numbers | None = None
+    _: KW_ONLY
+    orig_size: float | tuple[float, float]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "K", as_parameter(self.K, "K", 3, 3))
+        object.__setattr__(self, "R", as_parameter(self.R, "R", 3, 3))
+        t = self.t if isinstance(self.t, Tensor) else torch.as_tensor(self.t, dtype=torch.float64)
+        t = t.squeeze(1) if t.ndim == 3 and t.shape[1] == 1 else t
+        object.__setattr__(self, "t", as_parameter(t, "t", 3))
+        if self.dist_coeffs is not None:
+            object.__setattr__(self, "dist_coeffs", as_parameter(self.dist_coeffs, "dist_coeffs", 5))
+        size = self.orig_size
+        height, width = (float(x) for x in (size if isinstance(size, (tuple, list)) else (size, size)))
+        if not (0 < height < float("inf") and 0 < width < float("inf")):
+            raise ValueError(f"orig_size must be positive numbers (height, width), or one number, got {size}")
+        object.__setattr__(self, "orig_size", (height, width))
+        named = {"K": (self.K, 3), "R": (self.R, 3), "t": (self.t, 2), "dist_coeffs": (self.dist_coeffs, 2)}
+        common_batch(**{name: x for name, (x, ndim) in named.items() if x is not None and x.ndim == ndim})
+
+    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
+        K, R, t = batched(self.K, torch.float64, 3, 3), batched(self.R, dtype, 3, 3), batched(self.t, dtype, 3, 1)
+        batch = max(R.shape[0], t.shape[0])
+        matrix = torch.cat([R.expand(batch, 3, 3), t.expand(batch, 3, 1)], dim=-1)
+        height, width = self.orig_size
+        intrinsics = K[:, :2] * torch.tensor([[2 / width], [-2 / height]], dtype=K.dtype) + _CENTRE
+        distortion = None if self.dist_coeffs is None else batched(self.dist_coeffs, dtype, 5)
+        return Projection(matrix, intrinsics.to(dtype), distortion)

@@ -1,0 +1,190 @@
+"""What every camera comes down to: a rigid (or any affine) motion, a perspective division, and the way to the image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import ops
+from .._validate import check_vertices, describe
+
+Numbers = float | Sequence | np.ndarray | Tensor
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """Anything that takes vertices into renderer space, differentiably.
+
+    A camera of your own that has only ``transform(vertices)`` serves for batches ``[B, V, 3]``; packed batches need
+    ``starts``, too.
+    """
+
+    def transform(self, vertices: Tensor, starts: Tensor | None = None) -> Tensor:
+        """World to renderer coordinates: ``[B, V, 3]`` to the same, where a B of 1 may grow to the camera's batch.
+
+        Packed vertices ``[N, 3]`` come with ``starts [B + 1, 2]``, whose first column says where each mesh begins.
+        """
+        ...
+
+
+class ProjectingCamera:
+    """A camera that is defined by its :meth:`projection`; it brings :meth:`transform`."""
+
+    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
+        """The camera in its general form, computed in ``dtype`` in host memory; differentiable in its parameters."""
+        raise NotImplementedError
+
+    def transform(self, vertices: Tensor, starts: Tensor | None = None) -> Tensor:
+        """Vertices from world to renderer space, in the dtype of ``vertices``.
+
+        Parameters
+        ----------
+        vertices : Tensor [B, V, 3] or [V, 3], float32 or float64; or packed [N, 3] with ``starts``
+        starts : int64 Tensor [B + 1, 2] in host memory, optional
+            First vertex and first face of each packed mesh; last row: N and the number of faces.
+
+        Returns
+        -------
+        Tensor [B, V, 3], or [N, 3] if packed
+            ``x, y`` are in [-1, 1] across the image (x right, y up), z is the depth. One mesh and B poses give B
+            meshes. A vertex that has no finite image (not finite itself, or in the plane of the eye, or seen by a
+            camera that is not finite) gets x = y = inf, so that its faces are not drawn, and no gradient.
+
+        Notes
+        -----
+        Differentiable in the vertices and in the camera's parameters; there are no second derivatives. Results do not
+        depend on the number of threads or on the batch. Nothing becomes NaN that was not NaN in the upstream gradient.
+
+        Raises
+        ------
+        TypeError, ValueError
+            For wrong types and shapes, or a camera with another batch size than the vertices.
+        """
+        vertices, meshes = _check_batch(vertices, starts)
+        camera = self.projection(vertices.dtype)
+        batch = camera.batch
+        if batch != meshes and batch != 1 and (meshes != 1 or starts is not None):
+            raise ValueError(
+                f"vertices and camera must have one batch size (or 1), got {meshes} meshes and {batch} poses"
+                + ("" if starts is None else "; packed meshes need one pose each, or one for all")
+            )
+        size = meshes if batch == 1 else batch
+        parameters = (None if x is None else x.to(vertices).expand(size, *x.shape[1:]) for x in camera.parameters())
+        return ops.project(vertices, *parameters, starts, camera.perspective)
+
+
+@dataclass(frozen=True, eq=False)
+class Projection(ProjectingCamera):
+    """The general camera, which all others come down to.
+
+    ``u = A (v - origin) + t``; ``p = (u_x, u_y) / u_z``, distorted; ``(x, y) = intrinsics (p / extent, 1)``; the depth
+    is ``u_z``. The camera axes are OpenCV's: x right, y down, z away from the viewer. A batch of 1 serves every image;
+    the parameters may mix 1 and B.
+
+    Parameters
+    ----------
+    matrix : Tensor [B, 3, 4]
+        ``[A | t]``, world to camera axes.
+    intrinsics : Tensor [B, 2, 3]
+        From p to renderer space, so that its second row usually turns y up.
+    distortion : Tensor [B, 5], optional
+        OpenCV's k1, k2, p1, p2, k3. Not used without perspective.
+    perspective : bool
+        False: ``p = (u_x, u_y)``.
+    origin : Tensor [B, 3], optional
+        Where the camera is; 0 by default. It could be part of t, and ``extent`` of the intrinsics: they stand apart so
+        that a look-at camera subtracts and divides, and rounds, as the published one does.
+    extent : Tensor [B], optional
+        Half the width of the image at depth 1; 1 by default.
+
+    Raises
+    ------
+    ValueError
+        For other shapes.
+    """
+
+    matrix: Tensor
+    intrinsics: Tensor
+    distortion: Tensor | None = None
+    perspective: bool = True
+    origin: Tensor | None = None
+    extent: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        shapes = (("matrix", (3, 4)), ("intrinsics", (2, 3)), ("distortion", (5,)), ("origin", (3,)), ("extent", ()))
+        for name, shape in shapes:
+            value = getattr(self, name)
+            if value is None and name not in ("matrix", "intrinsics"):
+                continue
+            if not isinstance(value, Tensor) or value.ndim != len(shape) + 1 or value.shape[1:] != shape:
+                wanted = ", ".join(["B", *map(str, shape)])
+                raise ValueError(f"{name} must be a tensor of shape [{wanted}], got {describe(value)}")
+        _ = self.batch
+
+    @property
+    def batch(self) -> int:
+        """Number of cameras; 1 serves every image."""
+        matrix, intrinsics, distortion, origin, extent = self.parameters()
+        return common_batch(matrix=matrix, intrinsics=intrinsics, distortion=distortion, origin=origin, extent=extent)
+
+    def parameters(self) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, Tensor | None]:
+        """matrix, intrinsics, distortion, origin, extent."""
+        return self.matrix, self.intrinsics, self.distortion, self.origin, self.extent
+
+    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
+        """The camera itself."""
+        return self
+
+    def plain(self) -> Projection:
+        """The same camera in float64, without origin and extent."""
+        matrix, intrinsics, distortion, origin, extent = (
+            None if x is None else x.to("cpu", torch.float64) for x in self.parameters()
+        )
+        if origin is not None:
+            offset = matrix[:, :, 3] - (matrix[:, :, :3] * origin[:, None]).sum(-1)
+            rotation = matrix[:, :, :3].expand(offset.shape[0], 3, 3)
+            matrix = torch.cat([rotation, offset.unsqueeze(-1)], dim=-1)
+        if extent is not None:
+            ones = torch.ones_like(extent)
+            intrinsics = intrinsics / torch.stack([extent, extent, ones], dim=-1).unsqueeze(1)
+        return Projection(matrix, intrinsics, distortion, self.perspective)
+
+
+def _check_batch(vertices: object, starts: object) -> tuple[Tensor, int]:
+    """Vertices ``[B, V, 3]``, or packed ``[N, 3]`` with starts, and the number of meshes."""
+    if starts is None:
+        vertices = check_vertices(vertices)
+        return vertices, vertices.shape[0]
+    if not isinstance(starts, Tensor) or starts.dtype != torch.int64 or starts.ndim != 2 or starts.shape[1] != 2:
+        raise ValueError(f"starts must be an int64 tensor [B + 1, 2], got {describe(starts)}")
+    if not isinstance(vertices, Tensor) or vertices.ndim != 2:
+        raise ValueError(f"with starts, vertices must be packed [N, 3], got {describe(vertices)}")
+    return check_vertices(vertices)[0], starts.shape[0] - 1
+
+
+def common_batch(**parameters: Tensor | None) -> int:
+    """The batch size that all parameters ``[B or 1, ...]`` share; a ValueError names those that differ."""
+    sizes = {x.shape[0] for x in parameters.values() if x is not None} - {1}
+    if len(sizes) > 1:
+        shapes = ", ".join(f"{name} {list(x.shape)}" for name, x in parameters.items() if x is not None)
+        raise ValueError(f"the parameters of a camera must have one batch size (or 1), got {shapes}")
+    return sizes.pop() if sizes else 1
+
+
+def as_parameter(value: Numbers, name: str, *shape: int) -> Tensor:
+    """``value`` as a float tensor ``[*shape]`` or ``[B, *shape]``; numbers that are not tensors become float64."""
+    tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+    if tensor.ndim not in (len(shape), len(shape) + 1) or tensor.shape[tensor.ndim - len(shape) :] != shape:
+        one, many = (", ".join([*first, *map(str, shape)]) for first in ([], ["B"]))
+        raise ValueError(f"{name} must have shape [{one}] or [{many}], got {list(tensor.shape)}")
+    return tensor
+
+
+def batched(tensor: Tensor, dtype: torch.dtype, *shape: int) -> Tensor:
+    """A parameter as ``[B, *shape]`` in host memory, where the few numbers of a camera are dealt with."""
+    return tensor.to("cpu", dtype).reshape(-1, *shape)

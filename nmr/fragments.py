@@ -1,0 +1,203 @@
+"""Fragments: what the rasterizer knows of each pixel, and what one needs to shade it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from . import ops
+from ._packing import MeshBatch
+from ._validate import check_values, describe
+
+if TYPE_CHECKING:
+    from .cameras import Camera
+
+# Products of three coordinates up to here are finite.
+_LARGEST = 1e12
+
+
+@dataclass(frozen=True, eq=False)
+class Fragments:
+    """The nearest face at each centre of the raster, made by :func:`nmr.render_fragments`.
+
+    R is the image size S, or 2 S with anti-aliasing. Row 0 is the top. To shade by yourself, compute an image
+    ``[B, R, R, C]`` from these and call :meth:`resolve`, which averages and gives vertices NMR's gradient.
+
+    Attributes
+    ----------
+    owner : int32 Tensor [B, R, R]
+        ``owner[b, y, x] = f``: face f is nearest and seen from its front; ``F + f``: from its back; -1: background.
+    weights : Tensor [B, R, R, 3]
+        Perspective-correct barycentric weights of the face's vertices in their own order; sum 1, on background 0.
+        Differentiable in the vertices (at fixed owner); use ``weights.detach()`` for NMR's definition, where colour
+        moves vertices by edges only.
+    depth : Tensor [B, R, R]
+        z of the nearest point, ``far`` on background. Differentiable in the vertices (at fixed owner).
+    vertices, faces
+        The meshes in renderer space, ``[B, V, 3]``; of a list of meshes ``[N, 3]``, end to end.
+    """
+
+    owner: Tensor
+    weights: Tensor
+    depth: Tensor
+    mesh: MeshBatch  # in renderer space
+    world: Tensor  # the vertices before the camera, [B or 1, V, 3] or packed
+    camera: Camera | None
+    anti_aliasing: bool
+    eps: float
+
+    @property
+    def vertices(self) -> Tensor:
+        return self.mesh.vertices
+
+    @property
+    def faces(self) -> Tensor:
+        return self.mesh.faces
+
+    @property
+    def covered(self) -> Tensor:
+        """bool ``[B, R, R]``: some face is there."""
+        return self.owner >= 0
+
+    @property
+    def is_back(self) -> Tensor:
+        """bool ``[B, R, R]``: the face there is seen from its back (its vertices run clockwise on the screen)."""
+        return self.owner >= self.mesh.num_faces
+
+    @property
+    def face_index(self) -> Tensor:
+        """int32 ``[B, R, R]``: f where face f is nearest, seen from either side; -1 is background."""
+        return torch.where(self.is_back, self.owner - self.mesh.num_faces, self.owner)
+
+    def interpolate(self, attributes: Tensor | list[Tensor], corners: Tensor | list[Tensor] | None = None) -> Tensor:
+        """Values given at vertices, interpolated at each pixel: ``[B, R, R, C]``, 0 on background.
+
+        Parameters
+        ----------
+        attributes : float Tensor [V, C] or [B, V, C]; for a list of meshes a list of [V_b, C]
+        corners : integer Tensor [F, 3] or [B, F, 3] (or a list), optional
+            Rows of attributes at the corners of each face, where they are not its vertices: a texture with seams.
+
+        Differentiable in attributes, and in weights.
+        """
+        return self._interpolate(attributes, corners, "attributes", "corners")
+
+    def _interpolate(self, attributes: object, corners: object, name: str, corners_name: str) -> Tensor:
+        values, starts, faces = check_values(attributes, name, "V, C"), self.mesh.starts, self.faces
+        if corners is None:
+            attributes = self.mesh.values(values, name, "vertex")
+        else:
+            attributes = self.mesh.values(values, name)
+            faces, starts = self.mesh.corners(corners, values, corners_name)
+        return ops.interpolate(attributes, faces, self.owner, self.weights, starts)
+
+    def per_face(self, values: Tensor | list[Tensor]) -> Tensor:
+        """Values of faces, ``[F, C]``, ``[B, F, C]`` or a list, at each pixel: ``[B, R, R, C]``, 0 on background."""
+        return self._per_face(values, "values")
+
+    def _per_face(self, values: object, name: str) -> Tensor:
+        return self._per_side(self.mesh.values(check_values(values, name, "F, C"), name, "face"))
+
+    def _per_side(self, front: Tensor, back: Tensor | None = None) -> Tensor:
+        """Values of faces, ``[B | 1, F, C]`` or packed ``[M, C]``, at each pixel; back: where the normal is turned."""
+        rows = front.reshape(-1, front.shape[-1])
+        index = self.face_index.long() + self.mesh.first_faces(len(front))
+        if back is not None:
+            turned = self.is_back != self._mirrored()
+            index = torch.where(turned, index + len(rows), index)
+            rows = torch.cat([rows, back.reshape(-1, back.shape[-1])])
+        rows = torch.cat([rows, rows.new_zeros(1, rows.shape[1])])
+        index = torch.where(self.covered, index, len(rows) - 1)
+        # embedding: its backward sums in a fixed order, that of indexing does not.
+        return F.embedding(index, rows, padding_idx=len(rows) - 1)
+
+    def normals(self, smooth: bool = False) -> Tensor:
+        """Unit normals in world space of the side that is seen, ``[B, R, R, 3]``, 0 on background.
+
+        Flat: of the face. Smooth: those of its vertices (means of the faces around, by area) interpolated. The side
+        that is seen is told by the camera: where it shows the world without mirroring it (as LookAt does), the front of
+        face (v0, v1, v2) has the normal ``(v0 - v1) x (v2 - v1)``, as in the published renderer. Differentiable in the
+        world-space vertices and, where smooth, in weights.
+        """
+        if not smooth:
+            front = self._face_normals()
+            return self._per_side(front, -front)
+        world, across, rows = self._across()
+        sums = torch.zeros_like(world.vertices).view(-1, 3)
+        sums = sums.scatter_add(0, rows.reshape(-1, 1).expand(-1, 3), across.repeat_interleave(3, dim=0))
+        at_vertices = _unit(sums).view(world.vertices.shape)
+        normals = _unit(ops.interpolate(at_vertices, self.faces, self.owner, self.weights, self.mesh.starts))
+        turned = self.is_back != self._mirrored()
+        return torch.where(turned.unsqueeze(-1), -normals, normals)
+
+    def _face_normals(self) -> Tensor:
+        """``(v0 - v1) x (v2 - v1)`` in world space, of unit length: ``[B | 1, F, 3]``, packed ``[M, 3]``."""
+        world, across, _ = self._across()
+        return _unit(across).view(*world.vertices.shape[:-2], self.faces.shape[-2], 3)
+
+    def _across(self) -> tuple[MeshBatch, Tensor, Tensor]:
+        """The meshes in world space, ``(v0 - v1) x (v2 - v1)`` of all faces ``[., 3]``, the rows of their corners."""
+        world = _usable(self.world.expand(len(self.faces), -1, -1) if self.faces.ndim == 3 else self.world)
+        world = self.mesh._replace(vertices=world)
+        rows = world.corner_rows()
+        v0, v1, v2 = F.embedding(rows, world.vertices.reshape(-1, 3)).unbind(-2)
+        return world, torch.linalg.cross(v0 - v1, v2 - v1, dim=-1), rows
+
+    def _mirrored(self) -> bool | Tensor:
+        """Whether the way from world to renderer space is a reflection: bool ``[B, 1, 1]``.
+
+        The camera is asked for the image of a small right-angled corner in the middle of each mesh.
+        """
+        if self.camera is None:
+            return False
+        points = _usable(self.world.detach())
+        axes = torch.cat([points.new_zeros(1, 3), torch.eye(3).to(points)])
+
+        def corner(mesh: Tensor) -> Tensor:  # [V, 3] -> [4, 3]
+            middle = mesh.mean(-2, keepdim=True)
+            return middle + 0.1 * (mesh - middle).abs().amax((-2, -1), keepdim=True) * axes
+
+        if self.mesh.starts is None:
+            if points.shape[1] == 0:
+                return False
+            with torch.no_grad():
+                probe = self.camera.transform(corner(points))
+        else:
+            probe = torch.cat([corner(m) if len(m) else axes for m in points.split(self.mesh.vertex_counts)])
+            starts = 4 * torch.arange(self.mesh.batch + 1).view(-1, 1).expand(-1, 2)
+            with torch.no_grad():
+                probe = self.camera.transform(probe, starts=starts.contiguous()).view(-1, 4, 3)
+        sides = probe[:, 1:] - probe[:, :1]
+        return (torch.linalg.cross(sides[:, 0], sides[:, 1], dim=-1) * sides[:, 2]).sum(-1).view(-1, 1, 1) < 0
+
+    def resolve(self, image: Tensor) -> Tensor:
+        """The image ``[B, S, S, C]`` of a shaded raster ``[B, R, R, C]``, with NMR's gradient.
+
+        The mean of 2x2 pixels with anti-aliasing, else the image as it is. Its gradient goes back to the raster, and by
+        NMR's rule to x and y of the vertices: every visible edge is pulled by the pixels that would come closer to what
+        the loss wants if the edge moved over them. All C channels decide together. No second derivative.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If image is not a float tensor [B, R, R, C] of the dtype of the vertices.
+        """
+        if not isinstance(image, Tensor) or image.dtype != self.vertices.dtype:
+            raise TypeError(f"image must be a tensor of {self.vertices.dtype} as the vertices, got {describe(image)}")
+        if image.ndim != 4 or image.shape[:3] != self.owner.shape:
+            raise ValueError(f"image must have shape {[*self.owner.shape, 'C']}, got {describe(image)}")
+        return ops.resolve(image, *self.mesh[:3], self.owner, self.anti_aliasing, self.eps)
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    # As in the published renderer: a vector shorter than 1e-5 stays short, and is no error.
+    return F.normalize(vectors, dim=-1, eps=1e-5)
+
+
+def _usable(points: Tensor) -> Tensor:
+    """Points that are not finite, or so far that a product overflows, are put at the origin and get no gradient."""
+    return torch.where((points.abs() < _LARGEST).all(-1, keepdim=True), points, torch.zeros_like(points))

@@ -1,0 +1,338 @@
+"""Conversions: round trips, and pixels as each convention's own formulas put them (in NumPy, one vertex at a time)."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import nmr
+from nmr import cameras
+
+SIZE = 48  # pixels of a square image
+
+
+def rotation(seed):
+    """A proper rotation."""
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return q * np.linalg.det(q)
+
+
+def points(seed=0, n=20):
+    return np.random.default_rng(seed).uniform(-0.5, 0.5, size=(n, 3))
+
+
+def pixels(camera, vertices, size=SIZE):
+    """(column, row, depth) where `camera` puts vertices in our images: centres of pixels are integers, row 0 = top."""
+    x, y, z = camera.transform(torch.from_numpy(vertices)[None])[0].detach().numpy().T
+    return np.stack([((x + 1) * size - 1) / 2, ((1 - y) * size - 1) / 2, z], axis=1)
+
+
+K = np.array([[60.0, 2.0, 22.0], [0.0, 55.0, 26.0], [0.0, 0.0, 1.0]])
+DISTORTION = np.array([0.1, -0.05, 0.01, -0.02, 0.03])
+
+
+# --- OpenCV
+
+
+def opencv_pixels(vertices, K, R, t, d):
+    """The formulas of OpenCV's calib3d page; centres of pixels are integers."""
+    k1, k2, p1, p2, k3 = d
+    out = []
+    for X in vertices:
+        x, y, z = R @ X + t
+        a, b = x / z, y / z
+        r2 = a * a + b * b
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        u = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+        v = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+        out.append([K[0, 0] * u + K[0, 1] * v + K[0, 2], K[1, 1] * v + K[1, 2], z])
+    return np.array(out)
+
+
+T = np.array([0.1, -0.2, 3.0])
+
+
+@pytest.mark.parametrize("column", [False, True])
+@pytest.mark.parametrize("count", [0, 4, 5])
+def test_opencv_pixels(count, column):
+    d = np.zeros(5)
+    d[:count] = DISTORTION[:count]
+    shape = (-1, 1) if column else (-1,)
+    camera = cameras.from_opencv(
+        K, rotation(1), T.reshape(shape), d[:count].reshape(shape) if count else None, height=SIZE, width=SIZE
+    )
+    np.testing.assert_allclose(pixels(camera, points()), opencv_pixels(points(), K, rotation(1), T, d), atol=1e-10)
+
+
+def test_opencv_images_that_are_not_square_are_stretched():
+    camera = cameras.from_opencv(K, rotation(1), T, height=SIZE, width=2 * SIZE)
+    u, v, _ = opencv_pixels(points(), K, rotation(1), T, np.zeros(5)).T
+    column, row, _ = pixels(camera, points()).T
+    np.testing.assert_allclose(column, (u + 0.5) / 2 - 0.5, atol=1e-10)
+    np.testing.assert_allclose(row, v, atol=1e-10)
+
+
+def test_pixel_center_is_where_counting_begins():
+    """A calibration that counts from the corner of the first pixel is what Pinhole itself takes."""
+    camera = cameras.from_opencv(K, rotation(1), T, height=SIZE, width=SIZE, pixel_center=0.5)
+    plain = nmr.Pinhole(K, rotation(1), T, orig_size=SIZE)
+    np.testing.assert_allclose(pixels(camera, points()), pixels(plain, points()), atol=1e-12)
+    back = cameras.to_opencv(plain, height=SIZE, width=SIZE, pixel_center=0.5)
+    for a, b in zip(back[:3], (K, rotation(1), T), strict=True):
+        np.testing.assert_allclose(a[0], b, atol=1e-12)
+
+
+def test_opencv_round_trip():
+    given = torch.from_numpy(K)[None], torch.from_numpy(rotation(2))[None], torch.from_numpy(T)[None]
+    camera = cameras.from_opencv(*given, torch.from_numpy(DISTORTION)[None], height=40, width=60)
+    back = cameras.to_opencv(camera, height=40, width=60)
+    for a, b in zip(back, (*given, torch.from_numpy(DISTORTION)[None]), strict=True):
+        torch.testing.assert_close(a, b)
+
+
+# --- OpenGL
+
+
+def opengl_pixels(vertices, view, projection):
+    """clip = P V (X, 1), divided by w; the viewport has its origin at the lower left, centres at half-integers."""
+    out = []
+    for X in vertices:
+        eye = view @ [*X, 1.0]
+        clip = projection @ eye
+        x, y = clip[:2] / clip[3]
+        from_left, from_below = (x + 1) / 2 * SIZE, (y + 1) / 2 * SIZE
+        out.append([from_left - 0.5, SIZE - from_below - 0.5, -eye[2]])
+    return np.array(out)
+
+
+def gl_view(seed=3):
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = rotation(seed), [0.1, 0.2, -3.0]
+    return view
+
+
+def gl_frustum(left, right, bottom, top, n, f):
+    """As glFrustum documents it."""
+    return np.array(
+        [
+            [2 * n / (right - left), 0, (right + left) / (right - left), 0],
+            [0, 2 * n / (top - bottom), (top + bottom) / (top - bottom), 0],
+            [0, 0, -(f + n) / (f - n), -2 * f * n / (f - n)],
+            [0, 0, -1, 0],
+        ]
+    )
+
+
+def gl_ortho(left, right, bottom, top, n, f):
+    """As glOrtho documents it."""
+    return np.array(
+        [
+            [2 / (right - left), 0, 0, -(right + left) / (right - left)],
+            [0, 2 / (top - bottom), 0, -(top + bottom) / (top - bottom)],
+            [0, 0, -2 / (f - n), -(f + n) / (f - n)],
+            [0, 0, 0, 1],
+        ]
+    )
+
+
+@pytest.mark.parametrize("make", [gl_frustum, gl_ortho])
+def test_opengl_pixels_and_round_trip(make):
+    projection = make(-0.3, 0.2, -0.1, 0.4, 0.5, 20.0)
+    camera = cameras.from_opengl(gl_view(), projection)
+    np.testing.assert_allclose(pixels(camera, points()), opengl_pixels(points(), gl_view(), projection), atol=1e-10)
+    view, back = cameras.to_opengl(camera, near=0.5, far=20.0)
+    np.testing.assert_allclose(view[0], gl_view(), atol=1e-12)
+    np.testing.assert_allclose(back[0], projection, atol=1e-12)
+
+
+# --- PyTorch3D
+
+
+def pytorch3d_pixels(vertices, R, T, focal, principal, height, width, orthographic=False):
+    """NDC as the page on cameras documents it: X left, Y up; the shorter side of the image spans [-1, 1]."""
+    out = []
+    for X in vertices:
+        x, y, z = X @ R + T
+        depth = 1.0 if orthographic else z
+        x_ndc, y_ndc = focal[0] * x / depth + principal[0], focal[1] * y / depth + principal[1]
+        shorter = min(height, width)
+        from_left, from_top = width / 2 - x_ndc * shorter / 2, height / 2 - y_ndc * shorter / 2
+        # our square image shows all of theirs
+        out.append([from_left / width * SIZE - 0.5, from_top / height * SIZE - 0.5, z])
+    return np.array(out)
+
+
+FOCAL, PRINCIPAL = [1.3, 1.1], [0.2, -0.1]
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("height, width", [(48, 48), (40, 60), (60, 40)])
+def test_pytorch3d_pixels_and_round_trip(height, width, orthographic):
+    camera = cameras.from_pytorch3d(
+        rotation(4), T, [FOCAL], [PRINCIPAL], image_size=(height, width), orthographic=orthographic
+    )
+    wanted = pytorch3d_pixels(points(), rotation(4), T, FOCAL, PRINCIPAL, height, width, orthographic)
+    np.testing.assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
+    back = cameras.to_pytorch3d(camera, image_size=(height, width))
+    assert back["in_ndc"] is True and back["image_size"].tolist() == [[height, width]]
+    for name, value in {"R": rotation(4), "T": T, "focal_length": FOCAL, "principal_point": PRINCIPAL}.items():
+        np.testing.assert_allclose(back[name][0], value, atol=1e-12)
+
+
+@pytest.mark.parametrize("height, width", [(40, 60), (60, 40)])
+def test_pytorch3d_screen_space(height, width):
+    """f_ndc = 2 f / s, p_ndc = -(p - size / 2) 2 / s with s the shorter side."""
+    s, focal, principal = min(height, width), np.array([50.0, 45.0]), np.array([27.0, 22.0])
+    camera = cameras.from_pytorch3d(rotation(4), T, [focal], [principal], in_ndc=False, image_size=(height, width))
+    ndc = -(principal - np.array([width, height]) / 2) * 2 / s
+    wanted = pytorch3d_pixels(points(), rotation(4), T, focal * 2 / s, ndc, height, width)
+    np.testing.assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
+    back = cameras.to_pytorch3d(camera, in_ndc=False, image_size=(height, width))
+    np.testing.assert_allclose(back["focal_length"][0], focal)
+    np.testing.assert_allclose(back["principal_point"][0], principal)
+
+
+@pytest.mark.parametrize("degrees", [True, False])
+def test_pytorch3d_field_of_view(degrees):
+    """The whole vertical angle; a wider aspect ratio makes x smaller."""
+    fov = 50.0 if degrees else math.radians(50.0)
+    camera = cameras.from_pytorch3d_fov(rotation(4), T, fov, 1.25, degrees=degrees)
+    focal = 1 / math.tan(math.radians(25.0))
+    wanted = pytorch3d_pixels(points(), rotation(4), T, [focal / 1.25, focal], [0, 0], SIZE, SIZE)
+    np.testing.assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
+
+
+# --- across conventions, and the left-handed cameras
+
+
+CAMERAS = {
+    "LookAt": nmr.LookAt.from_angles(2.0, [10.0, 20.0], [30.0, 200.0], half_fov_deg=[25.0, 30.0]),
+    "Look": nmr.Look([0.1, 0.2, -2.0], [0.0, -0.1, 1.0]),
+    "Orthographic": nmr.Orthographic([0.1, 0.2, -2.0], scale=0.8),
+    "Pinhole": nmr.Pinhole(
+        np.diag([60.0, 55.0, 1.0]) + [[0, 0, 22], [0, 0, 26], [0, 0, 0]], rotation(1), T, orig_size=48
+    ),
+}
+
+
+def through(camera, convention):
+    if convention == "opencv":
+        return cameras.from_opencv(*cameras.to_opencv(camera, height=40, width=60), height=40, width=60)
+    if convention == "opengl":
+        return cameras.from_opengl(*cameras.to_opengl(camera, near=0.1, far=10.0))
+    arguments = cameras.to_pytorch3d(camera)
+    return cameras.from_pytorch3d(**arguments, orthographic=not camera.projection().perspective)
+
+
+@pytest.mark.parametrize("convention", ["opencv", "opengl", "pytorch3d"])
+@pytest.mark.parametrize("name", CAMERAS)
+def test_every_camera_survives_every_convention(name, convention):
+    camera = CAMERAS[name]
+    if (name, convention) == ("Orthographic", "opencv"):
+        pytest.skip("OpenCV has no orthographic camera")
+    vertices = torch.from_numpy(points())[None]
+    torch.testing.assert_close(through(camera, convention).transform(vertices), camera.transform(vertices))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_which_cameras_mirror(name):
+    """Proper rotations for Pinhole; determinant -1 for the cameras of a left-handed world, as their docs say."""
+    camera, sign = CAMERAS[name], 1 if name == "Pinhole" else -1
+    rotations = [cameras.to_opengl(camera, near=0.1, far=9.0)[0][:, :3, :3], cameras.to_pytorch3d(camera)["R"]]
+    if name != "Orthographic":
+        rotations.append(cameras.to_opencv(camera, height=9, width=9)[1])
+    for R in rotations:
+        torch.testing.assert_close(torch.linalg.det(R), torch.full((len(R),), float(sign), dtype=torch.float64))
+
+
+def test_a_proper_rotation_for_mirrored_vertices():
+    """The recipe of the module's docs: vertices * (1, 1, -1) and R diag(1, 1, -1)."""
+    mirror = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    vertices = torch.from_numpy(points())[None]
+    K, R, t, _ = cameras.to_opencv(CAMERAS["LookAt"], height=48, width=48)
+    proper = cameras.from_opencv(K, R @ mirror, t, height=48, width=48)
+    wanted = CAMERAS["LookAt"].transform(vertices)
+    torch.testing.assert_close(proper.transform(vertices @ mirror), wanted)
+    given = cameras.to_pytorch3d(CAMERAS["Look"])
+    proper = cameras.from_pytorch3d(**given | {"R": mirror @ given["R"]})
+    torch.testing.assert_close(proper.transform(vertices @ mirror), CAMERAS["Look"].transform(vertices))
+
+
+def test_winding_follows_the_screen():
+    """A triangle that an OpenGL camera sees counter-clockwise is a front face here, too."""
+    triangle = torch.tensor([[[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.5, 0.0]]], dtype=torch.float64)
+    view = np.eye(4)
+    view[2, 3] = -3.0  # the eye at z = 3 looks along -z: x right, y up
+    camera = cameras.from_opengl(view, gl_frustum(-0.1, 0.1, -0.1, 0.1, 0.2, 9.0))
+    for faces, seen in (([[0, 1, 2]], True), ([[2, 1, 0]], False)):
+        alpha = nmr.render_silhouette(triangle, torch.tensor(faces), camera, image_size=16, fill_back=False)
+        assert alpha.any() == seen
+
+
+def test_conversions_are_differentiable():
+    def parameter(values):
+        return torch.as_tensor(values, dtype=torch.float64).requires_grad_()
+
+    vertices = torch.from_numpy(points(n=4))[None]
+
+    def opencv(K, R, t, d):
+        return through(cameras.from_opencv(K, R, t, d, height=SIZE, width=SIZE), "opencv").transform(vertices)
+
+    assert torch.autograd.gradcheck(opencv, tuple(map(parameter, (K, rotation(1), T, DISTORTION))))
+
+    def pytorch3d(R, t, f, p, eye):
+        first = cameras.from_pytorch3d(R, t, f, p, image_size=(4, 5))
+        second = through(nmr.LookAt(eye), "pytorch3d")
+        return through(first, "pytorch3d").transform(vertices) + through(second, "opengl").transform(vertices)
+
+    values = rotation(4), T, [FOCAL], [PRINCIPAL], [0.1, 0.2, -2.0]
+    assert torch.autograd.gradcheck(pytorch3d, tuple(map(parameter, values)))
+    fov = parameter([40.0, 50.0])
+    assert torch.autograd.gradcheck(lambda x: cameras.from_pytorch3d_fov(rotation(4), T, x).transform(vertices), fov)
+
+
+# --- errors
+
+EYE = [0.0, 0.0, -2.0]
+I4 = np.eye(4)
+FRUSTUM = gl_frustum(-1, 1, -1, 1, 0.5, 2)
+
+
+def with_entry(matrix, row, column, value):
+    matrix = matrix.copy()
+    matrix[row, column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda: cameras.from_opencv(K, K, T, height=0, width=4), "height and width must be positive, got 0 and 4"),
+        (lambda: cameras.to_opencv(nmr.LookAt(EYE), height=4, width=-1), "must be positive, got 4 and -1"),
+        (lambda: cameras.from_opencv(K, K, T, [0.1] * 8, height=4, width=4), r"got shape \[8\]; .* 8, 12 and 14"),
+        (lambda: cameras.from_opencv(K, [0.0] * 3, T, height=4, width=4), r"R must have shape \[3, 3\]"),
+        (lambda: cameras.to_opencv(nmr.Orthographic(EYE), height=4, width=4), "OpenCV has no orthographic camera"),
+        (lambda: cameras.from_opengl(I4[:3], I4), r"view must have shape \[4, 4\] or \[B, 4, 4\]"),
+        (lambda: cameras.from_opengl(gl_view().T, FRUSTUM), r"last row of view must be \(0, 0, 0, 1\)"),
+        (lambda: cameras.from_opengl(I4, FRUSTUM.T), "last row of projection must be"),
+        (lambda: cameras.from_opengl(I4, with_entry(FRUSTUM, 0, 3, 1)), r"projection\[0:2, 3\] must be 0"),
+        (lambda: cameras.from_opengl(I4, with_entry(I4, 1, 2, 1)), r"projection\[0:2, 2\] must be 0"),
+        (lambda: cameras.to_opengl(nmr.LookAt(EYE), near=1, far=1), "0 <= near < far, got near=1, far=1"),
+        (
+            lambda: cameras.to_opengl(nmr.Pinhole(K, K, T, DISTORTION, orig_size=4), near=1, far=2),
+            "OpenGL has no lens distortion",
+        ),
+        (lambda: cameras.from_pytorch3d(K, T, torch.ones(2, 3)), r"focal_length must be a number .*, got \[2, 3\]"),
+        (lambda: cameras.from_pytorch3d(K, T, in_ndc=False), r"image_size=\(height, width\) is needed"),
+        (lambda: cameras.to_pytorch3d(nmr.LookAt(EYE), in_ndc=False), r"image_size=\(height, width\) is needed"),
+        (
+            lambda: cameras.to_pytorch3d(nmr.Pinhole(K, K, T, DISTORTION, orig_size=4)),
+            "PyTorch3D has no lens distortion",
+        ),
+        (lambda: cameras.to_pytorch3d(nmr.Pinhole(K, K, T, orig_size=4)), "cannot express the skew"),
+    ],
+)
+def test_errors(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
