@@ -2,7 +2,9 @@
 #pragma once
 
 #include <cstdint>
+#include <cstring>
 #include <exception>
+#include <type_traits>
 #include <vector>
 
 // A function marked NMR_CLONES is compiled for three levels of x86-64 and the loader picks one. Only code inlined into it
@@ -51,9 +53,15 @@ Scratch& thread_scratch() {
   return scratch;
 }
 
-// Grows a buffer (never shrinks it) and returns its storage.
+// Grows a buffer (never shrinks it) and returns its storage. With NMR_FRESH_SCRATCH (sanitizer builds) it is a new one of exactly
+// this size, full of rubbish: what reads beyond it, or reads what it has not written, cannot go unseen.
 template <class T>
 T* reserve(std::vector<T>& buffer, size_t size) {
+#ifdef NMR_FRESH_SCRATCH
+  buffer = std::vector<T>(size);
+  if constexpr (std::is_trivially_copyable_v<T>)
+    if (size > 0) std::memset(static_cast<void*>(buffer.data()), 93, size * sizeof(T));
+#endif
   if (buffer.size() < size) buffer.resize(size);
   return buffer.data();
 }

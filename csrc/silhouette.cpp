@@ -191,6 +191,7 @@ NMR_INLINE void run_sweeps(const SweepImage<T>& image, const Sweep<T>* sweeps, i
 template <class T>
 NMR_INLINE int64_t prepare_face(const SweepImage<T>& image, int32_t face, int32_t id, Sweep<T>* sweeps, int64_t count, T* grad) {
   const int64_t R = image.R;
+  if (R == 1) return count;  // no line has two pixels for a crossing to lie between
   const T raster_size = static_cast<T>(R), top = raster_size - 1;
   T X[3], Y[3];
   corner_pixels(image, id, X, Y);

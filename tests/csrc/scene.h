@@ -1,0 +1,120 @@
+// A batch of meshes with everything the stages ask for, and one call that runs them all. Shared by the tests, the fuzz target and
+// the instruction count.
+#pragma once
+
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+#include "../../csrc/stages.h"
+
+namespace nmr::test {
+
+// A number in [-1, 1) with 20 bits, the same on every machine (splitmix64 of the arguments).
+inline double noise(uint64_t seed, uint64_t index) {
+  uint64_t x = seed * 0x9e3779b97f4a7c15ull + (index + 1) * 0xd1b54a32d192ed03ull;
+  x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9ull;
+  x = (x ^ (x >> 27)) * 0x94d049bb133111ebull;
+  x ^= x >> 31;
+  return static_cast<double>(static_cast<int64_t>(x >> 44)) / 524288.0 - 1.0;
+}
+
+template <class T>
+std::vector<T> noise_array(uint64_t seed, int64_t size) {
+  std::vector<T> values(size);
+  for (int64_t n = 0; n < size; ++n) values[n] = static_cast<T>(noise(seed, n));
+  return values;
+}
+
+// Memory that a stage must overwrite: what stays NaN was forgotten.
+template <class T>
+std::vector<T> unwritten(int64_t size) {
+  return std::vector<T>(size, std::numeric_limits<T>::quiet_NaN());
+}
+
+template <class T>
+struct Scene {
+  int64_t batch = 0, num_vertices = 0, num_faces = 0;  // as in MeshBatch: packed, the sums over all meshes
+  bool faces_per_image = false;
+  std::vector<T> vertices;
+  std::vector<int64_t> faces;
+  std::vector<int64_t> starts;  // empty unless packed
+
+  int64_t image_size = 8;
+  bool anti_aliasing = true, fill_back = true;
+  T near = T(0.1), far = T(100), eps = T(1e-4);
+  int64_t channels = 3, texture_size = 2, grid_size = 4;
+  bool per_image_values = false;  // textures and attributes of each image, not shared
+  bool perspective = true, distorted = true;
+  bool foreign_owner = false;  // backward stages get a made-up owner map: any in range is allowed
+  uint64_t seed = 1;           // of textures, attributes, cameras and upstream gradients
+
+  bool packed() const { return !starts.empty(); }
+  int64_t raster_size() const { return anti_aliasing ? 2 * image_size : image_size; }
+  int64_t pixels() const { return batch * raster_size() * raster_size(); }
+  MeshBatch<T> mesh() const {
+    return {vertices.data(), faces.data(), batch, num_vertices, num_faces, faces_per_image, packed() ? starts.data() : nullptr};
+  }
+  void add_start() {  // of the next packed mesh, or the end
+    starts.push_back(num_vertices);
+    starts.push_back(num_faces);
+  }
+  int64_t rows() const { return packed() ? num_vertices : batch * num_vertices; }  // of vertices
+};
+
+template <class T>
+struct Results {
+  std::vector<int32_t> owner;
+  std::vector<T> alpha, grad_silhouette;
+  std::vector<T> weights, depth, grad_fragments;
+  std::vector<T> depth_image, grad_depth;
+  std::vector<T> colors, grad_textures;
+  std::vector<T> values, grad_attributes, grad_weights;
+  std::vector<T> resolved, grad_image;
+  std::vector<T> grad_edges;
+  std::vector<T> points, grad_world, grad_matrix, grad_intrinsics, grad_distortion;
+  std::vector<T> loss, grad_loss;
+  std::vector<unsigned char> voxels;
+
+  template <class Visit>
+  void for_each(const Visit& visit) const {
+    visit("owner", owner);
+    visit("alpha", alpha);
+    visit("grad_silhouette", grad_silhouette);
+    visit("weights", weights);
+    visit("depth", depth);
+    visit("grad_fragments", grad_fragments);
+    visit("depth_image", depth_image);
+    visit("grad_depth", grad_depth);
+    visit("colors", colors);
+    visit("grad_textures", grad_textures);
+    visit("values", values);
+    visit("grad_attributes", grad_attributes);
+    visit("grad_weights", grad_weights);
+    visit("resolved", resolved);
+    visit("grad_image", grad_image);
+    visit("grad_edges", grad_edges);
+    visit("points", points);
+    visit("grad_world", grad_world);
+    visit("grad_matrix", grad_matrix);
+    visit("grad_intrinsics", grad_intrinsics);
+    visit("grad_distortion", grad_distortion);
+    visit("loss", loss);
+    visit("grad_loss", grad_loss);
+    visit("voxels", voxels);
+  }
+};
+
+// Runs every stage of csrc, forward and backward.
+template <class T>
+Results<T> run_stages(const Scene<T>& scene, int num_threads);
+
+// The name of the first result that differs in a bit, or nullptr.
+template <class T>
+const char* first_difference(const Results<T>& a, const Results<T>& b);
+
+// What holds for every scene, however hostile; nullptr, or a sentence that says what does not.
+template <class T>
+const char* broken_promise(const Scene<T>& scene, const Results<T>& results);
+
+}  // namespace nmr::test

@@ -1,0 +1,99 @@
+#include "check.h"
+#include "meshes.h"
+#include "slow.h"
+
+namespace nmr::test {
+namespace {
+
+template <class T>
+std::vector<int32_t> owner_of(const Scene<T>& scene) {
+  std::vector<int32_t> owner(scene.pixels());
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), scene.fill_back, scene.near, scene.far}, owner.data(), 1});
+  return owner;
+}
+
+template <class T>
+std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& owner, const std::vector<T>& image, const std::vector<T>& grad) {
+  std::vector<T> result = unwritten<T>(3 * scene.rows());
+  edges_backward(EdgesBackward<T>{scene.mesh(), scene.raster_size(), scene.eps, owner.data(), image.data(),
+                                  static_cast<int64_t>(image.size()) / std::max<int64_t>(1, scene.pixels()), grad.data(), result.data(), 2});
+  return result;
+}
+
+template <class T>
+void check_close(const std::vector<T>& a, const std::vector<T>& b, double tolerance) {
+  double difference = 0, norm = 0;
+  for (size_t n = 0; n < b.size(); ++n) {
+    difference += (double(a[n]) - double(b[n])) * (double(a[n]) - double(b[n]));
+    norm += double(b[n]) * double(b[n]);
+  }
+  CHECK(norm > 0);
+  CHECK_NEAR(std::sqrt(difference / norm), 0, tolerance);
+}
+
+}  // namespace
+
+TEST_REAL(edge_gradients_are_the_definition) {
+  for (int64_t channels : {1, 3, 4})
+    for (uint64_t seed = 0; seed < 4; ++seed) {
+      Scene<T> scene = seed == 0 ? pack<T>({sphere(1, 1), Mesh{}, soup(6, 5)}) : stack<T>({soup(8, seed), soup(8, seed + 50)}, seed % 2);
+      scene.image_size = 13;
+      const int64_t R = scene.raster_size();
+      const std::vector<int32_t> owner = owner_of(scene);
+      const std::vector<T> image = noise_array<T>(1, scene.pixels() * channels), grad = noise_array<T>(2, scene.pixels() * channels);
+      std::vector<T> expected(3 * scene.rows(), T(0));
+      for (int64_t b = 0; b < scene.batch; ++b)
+        slow_edge_gradient(scene, b, owner.data() + b * R * R, image.data() + b * R * R * channels, grad.data() + b * R * R * channels,
+                           channels, expected.data() + 3 * scene.mesh().vertex_start(b));
+      check_close(gradient(scene, owner, image, grad), expected, sizeof(T) == 4 ? 1e-4 : 1e-11);
+    }
+}
+
+// An image that is its own coverage has the silhouette's gradient.
+TEST_REAL(edge_gradients_of_coverage_are_the_silhouettes) {
+  Scene<T> scene = stack<T>({sphere(2, 1), sphere(2, 2)}, true);
+  scene.image_size = 16;
+  const int64_t S = 16, R = 32;
+  const std::vector<int32_t> owner = owner_of(scene);
+  const std::vector<T> grad_alpha = noise_array<T>(3, 2 * S * S);
+  std::vector<T> image(scene.pixels()), grad(scene.pixels()), expected(3 * scene.rows());
+  for (int64_t n = 0; n < scene.pixels(); ++n) {
+    image[n] = T(owner[n] >= 0);
+    grad[n] = grad_alpha[(n / R / R * S + n / R % R / 2) * S + n % R / 2] / 4;
+  }
+  silhouette_backward(SilhouetteBackward<T>{scene.mesh(), S, true, scene.eps, owner.data(), grad_alpha.data(), expected.data(), 1});
+  check_close(gradient(scene, owner, image, grad), expected, sizeof(T) == 4 ? 1e-5 : 1e-12);
+}
+
+TEST_REAL(edge_gradients_of_an_image_of_one_colour_are_zero) {
+  Scene<T> scene = single<T>(sphere(1, 1));
+  scene.image_size = 12;
+  const std::vector<int32_t> owner = owner_of(scene);
+  const std::vector<T> image(2 * scene.pixels(), T(0.3)), grad = noise_array<T>(1, 2 * scene.pixels());
+  for (T g : gradient(scene, owner, image, grad)) CHECK_EQUAL(g, T(0));
+}
+
+TEST_REAL(resolve_is_a_mean_and_its_gradient_the_adjoint) {
+  for (bool anti_aliasing : {false, true})
+    for (int64_t C : {1, 3, 4}) {
+      const int64_t B = 2, S = 7, step = anti_aliasing ? 2 : 1, R = step * S;
+      const std::vector<T> image = noise_array<T>(1, B * R * R * C), grad_resolved = noise_array<T>(2, B * S * S * C);
+      std::vector<T> resolved = unwritten<T>(grad_resolved.size()), grad_image = unwritten<T>(image.size());
+      const Resolve<T> args{B, S, anti_aliasing, C, image.data(), resolved.data(), grad_resolved.data(), grad_image.data(), 2};
+      resolve_forward(args);
+      resolve_backward(args);
+      double product = 0, adjoint = 0;
+      for (int64_t n = 0; n < B * S * S * C; ++n) {
+        const int64_t c = n % C, x = n / C % S, y = n / C / S % S, b = n / C / S / S;
+        double sum = 0;
+        for (int64_t j = 0; j < step; ++j)
+          for (int64_t i = 0; i < step; ++i) sum += image[((b * R + step * y + j) * R + step * x + i) * C + c];
+        CHECK_NEAR(resolved[n], sum / double(step * step), 1e-6);
+        product += double(resolved[n]) * double(grad_resolved[n]);
+      }
+      for (size_t n = 0; n < image.size(); ++n) adjoint += double(image[n]) * double(grad_image[n]);
+      CHECK_NEAR(product, adjoint, 1e-4);
+    }
+}
+
+}  // namespace nmr::test

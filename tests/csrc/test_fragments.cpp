@@ -1,0 +1,127 @@
+#include "check.h"
+#include "meshes.h"
+#include "slow.h"
+
+namespace nmr::test {
+namespace {
+
+template <class T>
+std::vector<int32_t> owner_of(const Scene<T>& scene) {
+  std::vector<int32_t> owner(scene.pixels());
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), scene.fill_back, scene.near, scene.far}, owner.data(), 1});
+  return owner;
+}
+
+template <class T>
+void fragments(const Scene<T>& scene, const std::vector<int32_t>& owner, std::vector<T>& weights, std::vector<T>& depth) {
+  weights = unwritten<T>(3 * scene.pixels());
+  depth = unwritten<T>(scene.pixels());
+  fragments_forward(Fragments<T>{scene.mesh(), scene.raster_size(), scene.far, owner.data(), weights.data(), depth.data(), nullptr,
+                                 nullptr, nullptr, 1});
+}
+
+template <class T>
+std::vector<T> depth_image(const Scene<T>& scene, const std::vector<int32_t>& owner) {
+  std::vector<T> depth = unwritten<T>(scene.batch * scene.image_size * scene.image_size);
+  depth_forward(DepthImage<T>{scene.mesh(), scene.image_size, scene.anti_aliasing, scene.far, owner.data(), depth.data(), nullptr, nullptr, 1});
+  return depth;
+}
+
+std::vector<Mesh> meshes() { return {soup(10, 1), sphere(1, 2), Mesh{}}; }
+
+}  // namespace
+
+TEST_REAL(fragments_are_the_definition) {
+  Scene<T> scene = pack<T>(meshes());
+  scene.image_size = 21;
+  const int64_t R = scene.raster_size();
+  const std::vector<int32_t> owner = owner_of(scene);
+  std::vector<T> weights, depth;
+  fragments(scene, owner, weights, depth);
+  const double tolerance = sizeof(T) == 4 ? 1e-4 : 1e-12;
+  int64_t covered = 0;
+  for (int64_t n = 0; n < scene.pixels(); ++n) {
+    const T* w = weights.data() + 3 * n;
+    if (owner[n] < 0) {
+      CHECK(w[0] == 0 && w[1] == 0 && w[2] == 0 && depth[n] == scene.far);
+      continue;
+    }
+    ++covered;
+    const int64_t b = n / (R * R), F = scene.mesh().face_count(b);
+    const SlowHit<T> hit = SlowFace<T>(scene, b, owner[n]).at(n % R, R - 1 - n / R % R, R);
+    CHECK_NEAR(depth[n], hit.depth, tolerance * hit.depth);
+    // A point of the face: its depth and its place on the screen are those of the pixel.
+    double z = 0, xz = 0, yz = 0;
+    for (int k = 0; k < 3; ++k) {
+      const T* v = scene.mesh().image_vertices(b) + 3 * scene.mesh().image_faces(b)[3 * (owner[n] % F) + k];
+      CHECK_NEAR(w[k], hit.weights[owner[n] < F ? k : 2 - k] * hit.depth / v[2], tolerance);
+      z += double(w[k]) * double(v[2]);
+      xz += double(w[k]) * double(v[2]) * double(v[0]);
+      yz += double(w[k]) * double(v[2]) * double(v[1]);
+    }
+    CHECK_NEAR(w[0] + w[1] + w[2], 1, tolerance);
+    CHECK_NEAR(z, depth[n], tolerance * z);
+    CHECK_NEAR(xz / z, static_cast<double>(2 * (n % R) + 1 - R) / static_cast<double>(R), 5 * tolerance);
+    CHECK_NEAR(yz / z, static_cast<double>(R - 1 - 2 * (n / R % R)) / static_cast<double>(R), 5 * tolerance);
+  }
+  CHECK(covered > 1000);
+}
+
+TEST_REAL(depth_images_are_means_of_the_fragments) {
+  for (bool anti_aliasing : {false, true}) {
+    Scene<T> scene = pack<T>(meshes());
+    scene.image_size = 15;
+    scene.anti_aliasing = anti_aliasing;
+    scene.far = T(50);
+    const int64_t S = 15, R = scene.raster_size(), step = anti_aliasing ? 2 : 1;
+    const std::vector<int32_t> owner = owner_of(scene);
+    std::vector<T> weights, depth;
+    fragments(scene, owner, weights, depth);
+    const std::vector<T> image = depth_image(scene, owner);
+    for (int64_t n = 0; n < scene.batch * S * S; ++n) {
+      double sum = 0;
+      for (int64_t j = 0; j < step; ++j)
+        for (int64_t i = 0; i < step; ++i) sum += depth[(n / S / S * R + step * (n / S % S) + j) * R + step * (n % S) + i];
+      CHECK_NEAR(image[n], sum / (step * step), 1e-5 * sum);
+    }
+  }
+}
+
+// Central differences with the owner map held fixed.
+TEST(fragment_gradients_are_the_derivative) {
+  Scene<double> scene = pack<double>(meshes());
+  scene.image_size = 7;
+  const std::vector<int32_t> owner = owner_of(scene);
+  const std::vector<double> u = noise_array<double>(1, 3 * scene.pixels()), g = noise_array<double>(2, scene.pixels());
+  const std::vector<double> h = noise_array<double>(3, scene.batch * 49);
+  std::vector<double> of_weights = unwritten<double>(3 * scene.rows()), of_depth = of_weights, of_both = of_weights, of_image = of_weights;
+  const auto backward = [&](const double* grad_weights, const double* grad_depth, std::vector<double>& out) {
+    fragments_backward(Fragments<double>{scene.mesh(), scene.raster_size(), scene.far, owner.data(), nullptr, nullptr, grad_weights,
+                                         grad_depth, out.data(), 2});
+  };
+  backward(u.data(), nullptr, of_weights);
+  backward(nullptr, g.data(), of_depth);
+  backward(u.data(), g.data(), of_both);
+  depth_backward(DepthImage<double>{scene.mesh(), 7, true, scene.far, owner.data(), nullptr, h.data(), of_image.data(), 2});
+  const std::vector<double> original = scene.vertices;
+  for (size_t n = 0; n < original.size(); ++n) {
+    double difference[3] = {0, 0, 0};
+    for (int side : {1, -1}) {
+      scene.vertices = original;
+      scene.vertices[n] += side * 1e-6;
+      std::vector<double> weights, depth;
+      fragments(scene, owner, weights, depth);
+      const std::vector<double> image = depth_image(scene, owner);
+      for (size_t m = 0; m < weights.size(); ++m) difference[0] += side * u[m] * weights[m] / 2e-6;
+      for (size_t m = 0; m < depth.size(); ++m) difference[1] += side * g[m] * depth[m] / 2e-6;
+      for (size_t m = 0; m < image.size(); ++m) difference[2] += side * h[m] * image[m] / 2e-6;
+    }
+    const double scale = 1e-5 * (1 + std::abs(difference[0]) + std::abs(difference[1]) + std::abs(difference[2]));
+    CHECK_NEAR(of_weights[n], difference[0], scale);
+    CHECK_NEAR(of_depth[n], difference[1], scale);
+    CHECK_NEAR(of_both[n], difference[0] + difference[1], scale);
+    CHECK_NEAR(of_image[n], difference[2], scale);
+  }
+}
+
+}  // namespace nmr::test

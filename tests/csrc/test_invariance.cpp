@@ -1,0 +1,94 @@
+// Every stage: the same bits for any number of threads, alone or in company, packed or not.
+#include "check.h"
+#include "meshes.h"
+
+namespace nmr::test {
+namespace {
+
+std::vector<Mesh> meshes() { return {sphere(1, 1), sphere(1, 2), sphere(1, 3), sphere(1, 4), sphere(1, 5)}; }
+
+template <class T>
+std::vector<Scene<T>> scenes() {
+  std::vector<Scene<T>> all{stack<T>(meshes(), true), stack<T>(meshes(), false),
+                            pack<T>({sphere(1, 1), Mesh{}, soup(9, 2), sphere(2, 3), soup(1, 4), Mesh{}})};
+  all.push_back(all[0]);
+  all[1].per_image_values = true;
+  all[3].anti_aliasing = all[3].fill_back = all[3].perspective = false;
+  all[3].image_size = 19;
+  all[3].channels = 1;
+  all.push_back(single<T>(sphere(2, 6)));  // a raster that is worked on in blocks
+  all[4].image_size = 110;
+  return all;
+}
+
+// The parts of a result array that belong to image b, when every image has the same share.
+template <class Values>
+Values share(const Values& values, int64_t b, int64_t batch) {
+  const auto size = static_cast<std::ptrdiff_t>(values.size()) / batch;
+  return Values(values.begin() + b * size, values.begin() + (b + 1) * size);
+}
+
+}  // namespace
+
+TEST_REAL(any_number_of_threads_gives_the_same_bits) {
+  for (const Scene<T>& scene : scenes<T>()) {
+    const Results<T> one = run_stages(scene, 1);
+    CHECK_EQUAL(std::string(broken_promise(scene, one) ? broken_promise(scene, one) : ""), "");
+    for (int threads : {2, 5}) {
+      const char* difference = first_difference(one, run_stages(scene, threads));
+      CHECK_EQUAL(std::string(difference ? difference : ""), "");
+    }
+  }
+}
+
+TEST_REAL(an_image_does_not_depend_on_its_company) {
+  const std::vector<Mesh> all = meshes();
+  const Results<T> together = run_stages(stack<T>(all, true), 2);
+  for (int64_t b = 0; b < 5; ++b) {
+    // Upstream gradients are numbered within the batch, so only what does not depend on them is compared.
+    const Results<T> alone = run_stages(stack<T>({all[b]}, true), 1);
+    CHECK(alone.owner == share(together.owner, b, 5));
+    CHECK(alone.alpha == share(together.alpha, b, 5));
+    CHECK(alone.weights == share(together.weights, b, 5));
+    CHECK(alone.depth == share(together.depth, b, 5));
+    CHECK(alone.depth_image == share(together.depth_image, b, 5));
+    CHECK(alone.colors == share(together.colors, b, 5));
+    CHECK(alone.values == share(together.values, b, 5));
+    CHECK(alone.loss == share(together.loss, b, 5));
+    CHECK(alone.voxels == share(together.voxels, b, 5));
+    if (b > 0) continue;
+    CHECK(alone.grad_silhouette == share(together.grad_silhouette, b, 5));
+    CHECK(alone.grad_fragments == share(together.grad_fragments, b, 5));
+    CHECK(alone.grad_depth == share(together.grad_depth, b, 5));
+    CHECK(alone.grad_weights == share(together.grad_weights, b, 5));
+    CHECK(alone.grad_edges == share(together.grad_edges, b, 5));
+    CHECK(alone.points == share(together.points, b, 5));
+    CHECK(alone.grad_world == share(together.grad_world, b, 5));
+  }
+}
+
+TEST_REAL(packed_meshes_give_what_stacked_ones_give) {
+  Scene<T> stacked = stack<T>(meshes(), false), packed = pack<T>(meshes());
+  stacked.per_image_values = true;
+  const Results<T> a = run_stages(stacked, 2), b = run_stages(packed, 2);
+  CHECK(a.owner == b.owner);
+  CHECK(a.alpha == b.alpha);
+  CHECK(a.grad_silhouette == b.grad_silhouette);
+  CHECK(a.weights == b.weights);
+  CHECK(a.depth == b.depth);
+  CHECK(a.grad_fragments == b.grad_fragments);
+  CHECK(a.depth_image == b.depth_image);
+  CHECK(a.grad_depth == b.grad_depth);
+  CHECK(a.colors == b.colors);
+  CHECK(a.grad_textures == b.grad_textures);
+  CHECK(a.values == b.values);
+  CHECK(a.grad_attributes == b.grad_attributes);
+  CHECK(a.grad_weights == b.grad_weights);
+  CHECK(a.grad_edges == b.grad_edges);
+  CHECK(a.points == b.points);
+  CHECK(a.grad_world == b.grad_world);
+  CHECK(a.grad_matrix == b.grad_matrix);
+  CHECK(a.voxels == b.voxels);
+}
+
+}  // namespace nmr::test

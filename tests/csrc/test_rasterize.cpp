@@ -1,0 +1,114 @@
+#include "check.h"
+#include "meshes.h"
+#include "slow.h"
+
+namespace nmr::test {
+namespace {
+
+template <class T>
+std::vector<int32_t> rasterized(const Scene<T>& scene, int num_threads = 1) {
+  std::vector<int32_t> owner(scene.pixels(), -7);
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), scene.fill_back, scene.near, scene.far}, owner.data(), num_threads});
+  return owner;
+}
+
+template <class T>
+Scene<T> raster_of(const Mesh& mesh, int64_t raster_size, bool fill_back = true) {
+  Scene<T> scene = single<T>(mesh);
+  scene.image_size = raster_size;
+  scene.anti_aliasing = false;
+  scene.fill_back = fill_back;
+  return scene;
+}
+
+int64_t covered(const std::vector<int32_t>& owner) {
+  return std::count_if(owner.begin(), owner.end(), [](int32_t id) { return id >= 0; });
+}
+
+// Coverage exactly; the owner, too, unless two faces are equally deep to rounding.
+template <class T>
+void check_against_definition(const Scene<T>& scene) {
+  const int64_t R = scene.raster_size();
+  const std::vector<int32_t> owner = rasterized(scene);
+  for (int64_t b = 0; b < scene.batch; ++b) {
+    std::vector<int32_t> expected;
+    std::vector<T> depth;
+    slow_rasterize(scene, b, expected, depth);
+    for (int64_t n = 0; n < R * R; ++n) {
+      const int32_t id = owner[b * R * R + n];
+      CHECK_EQUAL(id >= 0, expected[n] >= 0);
+      if (id == expected[n]) continue;
+      const SlowHit<T> hit = SlowFace<T>(scene, b, id).at(n % R, R - 1 - n / R, R);
+      CHECK(hit.inside);
+      CHECK_NEAR(hit.depth, depth[n], 1e-5 * depth[n]);
+    }
+  }
+}
+
+}  // namespace
+
+TEST_REAL(rasterize_draws_the_definition) {
+  for (uint64_t seed = 0; seed < 6; ++seed) {
+    for (int64_t R : {1, 2, 7, 24, 33, 64}) check_against_definition(raster_of<T>(soup(12, seed), R, seed % 2));
+    check_against_definition(raster_of<T>(sphere(2, seed), 40, seed % 2));
+  }
+  Scene<T> packed = pack<T>({sphere(1, 1), soup(5, 2), Mesh{}, soup(30, 3)});
+  packed.image_size = 20;
+  check_against_definition(packed);
+}
+
+// Corners on pixel centres and borders: every comparison is exact, so no rounding excuses a difference.
+TEST_REAL(rasterize_edges_are_inclusive) {
+  for (uint64_t seed = 0; seed < 40; ++seed) {
+    Mesh mesh = soup(3, seed);
+    for (size_t n = 0; n < mesh.vertices.size(); ++n)
+      if (n % 3 != 2) mesh.vertices[n] = (2 * std::floor(8 * (mesh.vertices[n] + 1)) + 1 - 16) / 16;
+    check_against_definition(raster_of<T>(mesh, 16));
+  }
+  const double c = 0.75;  // the four outer pixel centres of a 4x4 raster
+  CHECK_EQUAL(covered(rasterized(raster_of<T>(Mesh{{-c, -c, 1, c, -c, 1, c, c, 1, -c, c, 1}, {0, 1, 2, 0, 2, 3}}, 4))), 16);
+}
+
+TEST_REAL(rasterize_of_equally_near_faces_the_first_wins) {
+  const Mesh once = triangle({-0.9, -0.9, 2, 0.9, -0.9, 2, 0, 0.9, 2});
+  Mesh twice = once;
+  twice.faces = {2, 1, 0, 0, 1, 2, 0, 1, 2};  // the first one's reversed copy is the others, to the last bit
+  for (int32_t id : rasterized(raster_of<T>(twice, 16))) CHECK(id == -1 || id == 1);
+  twice.faces = {2, 1, 0, 2, 1, 0};
+  for (int32_t id : rasterized(raster_of<T>(twice, 16))) CHECK(id == -1 || id == 2);
+  CHECK_EQUAL(covered(rasterized(raster_of<T>(twice, 16, false))), 0);
+}
+
+TEST_REAL(rasterize_row_0_is_the_top) {
+  const std::vector<int32_t> owner = rasterized(raster_of<T>(triangle({-1, 0.1, 1, 1, 0.1, 1, -1, 1, 1}), 8));
+  for (int n = 32; n < 64; ++n) CHECK_EQUAL(owner[n], -1);
+  CHECK_EQUAL(owner[8 * 3], 0);  // just above the middle, at the left
+}
+
+// z is linear in 1/z on the screen: a slanted face meets near and far where the closed form says.
+TEST_REAL(rasterize_near_and_far_cut_each_pixel) {
+  Scene<T> scene = raster_of<T>(Mesh{{-2, -1, 1, 2, -1, 5, 2, 1, 5, -2, 1, 1}, {0, 1, 2, 0, 2, 3}}, 64);
+  scene.near = T(2);
+  scene.far = T(3);
+  const std::vector<int32_t> owner = rasterized(scene);
+  for (int64_t n = 0; n < 64 * 64; ++n) {
+    const double x = static_cast<double>(2 * (n % 64) + 1 - 64) / 64, z = 1 / (1 + (0.2 - 1) * (x + 2) / 4);
+    if (std::abs(z - 2) > 1e-4 && std::abs(z - 3) > 1e-4) CHECK_EQUAL(owner[n] >= 0, z > 2 && z < 3);
+  }
+  scene.near = scene.far = T(2.5);
+  CHECK_EQUAL(covered(rasterized(scene)), 0);
+}
+
+TEST_REAL(rasterize_permuted_faces_cover_the_same) {
+  const Mesh mesh = soup(20, 5);
+  Mesh turned = mesh;
+  for (size_t f = 0; f < 20; ++f)
+    for (int k = 0; k < 3; ++k) turned.faces[3 * f + k] = mesh.faces[3 * ((7 * f + 3) % 20) + (k + f) % 3];
+  const std::vector<int32_t> a = rasterized(raster_of<T>(mesh, 48)), b = rasterized(raster_of<T>(turned, 48));
+  for (size_t n = 0; n < a.size(); ++n) {
+    CHECK_EQUAL(a[n] < 0, b[n] < 0);
+    if (a[n] >= 0) CHECK_EQUAL(a[n] % 20, (7 * (b[n] % 20) + 3) % 20);
+  }
+}
+
+}  // namespace nmr::test

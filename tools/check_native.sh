@@ -1,0 +1,165 @@
+#!/usr/bin/env bash
+# Checks of the kernels (csrc/) alone, in builds of their own under build/native. Usage: bash tools/check_native.sh CHECK...
+#   tests         the C++ tests, and the fuzz target over its corpus
+#   asan          the same under AddressSanitizer and UndefinedBehaviorSanitizer (CXX: g++ or clang++)
+#   tsan          the same under ThreadSanitizer, with a small OpenMP of our own that it can see through (g++)
+#   tsan-clang    the same with LLVM's OpenMP, which tells the sanitizer what it does (clang++)
+#   fuzz SECONDS  libFuzzer (clang++); findings: build/native/fuzz/finding-*; inputs: build/native/corpus
+#   count         instructions of workload W1 under callgrind, against tests/csrc/instructions.json
+#   variants      the same bits from every compiler and instruction set at hand
+#   coverage      lines and branches of csrc/ and nmr/ that the C++ and Python tests reach
+# Exit status 77 and a line that says why: the machine has not got what the check needs. PYTHON: an interpreter that has cmeel-eigen
+# (for coverage also the test extra); default .venv/bin/python.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+python=${PYTHON:-$PWD/.venv/bin/python}
+PATH=$(dirname "$python"):$PATH # cmake and ninja of the test extra
+export OMP_WAIT_POLICY=passive # more threads than cores: do not spin
+sanitize="-O1 -g -fno-omit-frame-pointer -fno-sanitize-recover=all -DNMR_FRESH_SCRATCH"
+address="$sanitize -fsanitize=address,undefined,float-cast-overflow -D_GLIBCXX_ASSERTIONS"
+
+skip() {
+    printf 'skipped: %s\n' "$*"
+    exit 77
+}
+
+want() { # program, what for
+    command -v "$1" >/dev/null || skip "no $1 on this machine, which $2 needs"
+}
+
+build() { # name, compiler, flags, targets ("" for all), further cmake arguments
+    local name=$1 compiler=$2 flags=$3 targets=$4
+    shift 4
+    local generator=()
+    command -v ninja >/dev/null && generator=(-G Ninja)
+    # shellcheck disable=SC2086
+    cmake -S tests/csrc -B "build/native/$name" "${generator[@]}" -DCMAKE_CXX_COMPILER="$compiler" -DCMAKE_CXX_FLAGS="$flags" \
+        -DCMAKE_BUILD_TYPE=None -DPython_EXECUTABLE="$python" "$@" >"build/native/$name.log" 2>&1 &&
+        cmake --build "build/native/$name" --parallel "${JOBS:-2}" ${targets:+--target $targets} >>"build/native/$name.log" 2>&1 ||
+        { grep -E -A8 "error|Error|FAILED" "build/native/$name.log" | head -60; echo "the whole log: build/native/$name.log"; exit 1; }
+}
+
+run_tests() { # name of the build
+    "build/native/$1/tests"
+    "build/native/$1/fuzz" tests/csrc/corpus.hex
+}
+
+check_tests() {
+    build plain "${CXX:-c++}" -O3 "" -DNMR_MULTIVERSION=ON # as it is shipped
+    run_tests plain
+}
+
+check_asan() {
+    build asan "${CXX:-c++}" "$address" ""
+    export UBSAN_OPTIONS=print_stacktrace=1
+    run_tests asan
+}
+
+check_tsan() {
+    want g++ "the ThreadSanitizer check"
+    build tsan g++ "$sanitize -fsanitize=thread" "" -DNMR_OWN_GOMP=ON
+    run_tests tsan
+}
+
+check_tsan_clang() {
+    want clang++ "the ThreadSanitizer check with LLVM's OpenMP"
+    build tsan-clang clang++ "$sanitize -fsanitize=thread" ""
+    # The OpenMP library itself is not instrumented; archer reports its synchronisation instead, or there is no check.
+    local archer
+    archer=$(clang++ -print-resource-dir)/../../libarcher.so
+    [ -f "$archer" ] || skip "no libarcher.so beside LLVM's OpenMP"
+    export TSAN_OPTIONS=ignore_noninstrumented_modules=1 OMP_TOOL_LIBRARIES=$archer ARCHER_OPTIONS=verbose=1
+    run_tests tsan-clang
+}
+
+check_fuzz() {
+    want clang++ libFuzzer
+    build fuzz clang++ "$address -O2 -fsanitize=fuzzer-no-link" fuzz -DNMR_FUZZER=ON
+    "$python" tests/csrc/corpus.py unpack build/native/corpus
+    nice -n 19 build/native/fuzz/fuzz -max_total_time="$1" -max_len=512 -print_final_stats=1 -timeout=10 -rss_limit_mb=2048 \
+        -artifact_prefix=build/native/fuzz/finding- build/native/corpus 2>&1 | tee build/native/fuzz.txt |
+        grep -v -E "	(NEW|REDUCE|pulse) |NEW_FUNC"
+}
+
+check_count() {
+    want valgrind "the instruction count"
+    [ "$(uname -m)" = x86_64 ] || skip "the bound is one of x86-64-v3"
+    build count "${CXX:-c++}" "-O3 -g -march=x86-64-v3" workload
+    "$python" tests/csrc/count.py build/native/count/workload "${CXX:-c++}" "$@"
+}
+
+check_variants() {
+    local name compiler flags results=build/native/variants.txt
+    rm -f "$results"
+    while read -r name compiler flags; do
+        command -v "$compiler" >/dev/null || { echo "$name: no $compiler, left out"; continue; }
+        if [ "$name" = arm64 ]; then
+            command -v qemu-aarch64 >/dev/null || { echo "$name: no qemu-aarch64, left out"; continue; }
+            build "$name" "$compiler" "-O3 $flags" workload -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64
+            qemu-aarch64 -L /usr/aarch64-linux-gnu "build/native/$name/workload" 2 >"build/native/$name.txt"
+        else
+            case $(uname -m)/$flags in x86_64/* | */ | */-D*) ;; *) continue ;; esac
+            case $flags in *v4*) grep -q avx512vl /proc/cpuinfo || { echo "$name: no AVX-512 here, left out"; continue; } ;; esac
+            local multi=OFF
+            [ "$name" != dispatch ] || multi=ON
+            build "$name" "$compiler" "-O3 $flags" workload -DNMR_MULTIVERSION=$multi
+            "build/native/$name/workload" 2 >"build/native/$name.txt"
+        fi
+        [ -f "$results" ] || { cp "build/native/$name.txt" "$results"; cat "$results"; }
+        diff "$results" "build/native/$name.txt" && echo "$name: the same bits" || echo "$name: DIFFERENT" | tee -a build/native/different
+    done <<'VARIANTS'
+baseline g++
+loops g++ -DNMR_NO_VECTOR_TYPES
+dispatch g++
+avx2 g++ -march=x86-64-v3
+avx512 g++ -march=x86-64-v4
+clang clang++
+clang-avx2 clang++ -march=x86-64-v3
+clang-avx512 clang++ -march=x86-64-v4
+arm64 aarch64-linux-gnu-g++
+VARIANTS
+    [ ! -f build/native/different ] || { rm build/native/different; exit 1; }
+}
+
+check_coverage() {
+    "$python" -c 'import gcovr' 2>/dev/null || skip "no gcovr in $python (it comes with the test extra)"
+    build coverage g++ "-O0 -g --coverage" ""
+    find build/native/coverage -name '*.gcda' -delete
+    run_tests coverage
+    # The package beside the build: Python tests run with the instrumented kernels and their bindings.
+    local package=build/native/coverage-package
+    mkdir -p $package
+    rm -rf $package/nmr
+    cp -r nmr $package/nmr
+    rm -f $package/nmr/_C*
+    cmake -S . -B $package/build -DCMAKE_BUILD_TYPE=None -DCMAKE_CXX_FLAGS="-O0 -g --coverage" -DNMR_MULTIVERSION=OFF \
+        -DPython_EXECUTABLE="$python" -Dpybind11_DIR="$("$python" -m pybind11 --cmakedir)" -DCMAKE_LIBRARY_OUTPUT_DIRECTORY="$PWD/$package/nmr" \
+        >build/native/coverage-package.log 2>&1 &&
+        cmake --build $package/build --parallel "${JOBS:-2}" >>build/native/coverage-package.log 2>&1 ||
+        { cat build/native/coverage-package.log; exit 1; }
+    find $package/build -name '*.gcda' -delete
+    # Started there, so that it is this package that is imported.
+    local root=$PWD
+    export COVERAGE_FILE=$root/build/native/coverage-python
+    (cd $package && "$python" -m pytest -q --rootdir="$root" -c "$root/pyproject.toml" "$root/tests/nmr" --cov=nmr --cov-branch \
+        --cov-report= "$@")
+    "$python" -m coverage report --skip-covered --include="*/nmr/*"
+    local gcovr=("$python" -m gcovr --root . --filter csrc/ --exclude-throw-branches --exclude-unreachable-branches
+        --merge-mode-functions=separate build/native/coverage $package/build)
+    "${gcovr[@]}" --json build/native/coverage.json
+    gcovr=("$python" -m gcovr --root . --add-tracefile build/native/coverage.json)
+    "${gcovr[@]}" --txt
+    "${gcovr[@]}" --txt-metric branch --txt
+    "${gcovr[@]}" --txt /dev/null --print-summary
+}
+
+[ $# -gt 0 ] || { sed -n '2,14s/^# \{0,1\}//p' "$0"; exit 2; }
+mkdir -p build/native
+check=$1
+shift
+case $check in
+tests | asan | tsan | count | variants | coverage | fuzz) "check_$check" "$@" ;;
+tsan-clang) check_tsan_clang ;;
+*) echo "no check of that name: $check"; exit 2 ;;
+esac
