@@ -9,7 +9,8 @@ namespace {
 
 // Streams of noise, one per input.
 enum Stream : uint64_t { kGradAlpha = 1, kGradWeights, kGradDepth, kGradDepthImage, kTextures, kGradColors, kAttributes,
-                         kGradValues, kImage, kGradImage, kMatrix, kIntrinsics, kDistortion, kGradPoints, kGradLoss, kOwner, kGradResolved };
+                         kGradValues, kImage, kGradImage, kMatrix, kIntrinsics, kDistortion, kGradPoints, kGradLoss, kOwner, kGradResolved,
+                         kOrigin, kExtent, kGradPose };
 
 template <class T>
 std::vector<T> input(const Scene<T>& scene, Stream stream, int64_t size) {
@@ -118,14 +119,35 @@ void run_camera(const Scene<T>& s, Results<T>& r, int num_threads) {
   r.grad_world = unwritten<T>(3 * s.rows());
   r.grad_matrix = unwritten<T>(12 * s.batch);
   r.grad_intrinsics = unwritten<T>(6 * s.batch);
-  const bool distorted = s.distorted && s.perspective;
+  const bool distorted = s.distorted && s.perspective, placed = !s.distorted;
   if (distorted) r.grad_distortion = unwritten<T>(5 * s.batch);
+  std::vector<T> origin = input(s, kOrigin, 3 * s.batch), extent = input(s, kExtent, s.batch);
+  for (T& x : extent) x = T(0.25) + x * x;
+  if (placed) {
+    r.grad_origin = unwritten<T>(3 * s.batch);
+    r.grad_extent = unwritten<T>(s.batch);
+  }
+  const auto pointer = [](bool wanted, auto& values) { return wanted ? values.data() : nullptr; };
   Project<T> args{s.vertices.data(), s.packed() ? s.starts.data() : nullptr, s.batch, s.batch, s.num_vertices, matrix.data(),
-                  intrinsics.data(), distorted ? distortion.data() : nullptr, s.perspective, r.points.data(), grad_points.data(),
-                  r.grad_world.data(), r.grad_matrix.data(), r.grad_intrinsics.data(),
-                  distorted ? r.grad_distortion.data() : nullptr, num_threads};
+                  intrinsics.data(), pointer(distorted, distortion), pointer(placed, origin), pointer(placed, extent), s.perspective,
+                  r.points.data(), grad_points.data(), r.grad_world.data(), r.grad_matrix.data(), r.grad_intrinsics.data(),
+                  pointer(distorted, r.grad_distortion), pointer(placed, r.grad_origin), pointer(placed, r.grad_extent), num_threads};
   project_forward(args);
   project_backward(args);
+}
+
+// Directions from the vertices, with whatever they hold; a pose for each pair of them.
+template <class T>
+void run_pose(const Scene<T>& s, Results<T>& r) {
+  const int64_t poses = s.rows() / 2;
+  const T *forward = s.vertices.data(), *up = forward + 3 * poses;
+  const std::vector<T> grad_matrix = input(s, kGradPose, 12 * poses);
+  r.pose = unwritten<T>(12 * poses);
+  r.grad_forward = unwritten<T>(3 * poses);
+  r.grad_up = unwritten<T>(3 * poses);
+  const Pose<T> args{forward, up, poses, r.pose.data(), grad_matrix.data(), r.grad_forward.data(), r.grad_up.data()};
+  pose_forward(args);
+  pose_backward(args);
 }
 
 // The edges are made up: corners of consecutive faces of the first mesh. Packed vertices count as one mesh.
@@ -184,18 +206,11 @@ Results<T> run_stages(const Scene<T>& scene, int num_threads) {
   rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), scene.fill_back, scene.near, scene.far}, r.owner.data(), num_threads});
   if (scene.foreign_owner) r.owner = made_up_owner(scene);
   run_silhouette(scene, r, num_threads);
-#ifdef NMR_HAS_FRAGMENTS
   run_fragments(scene, r, num_threads);
-#endif
-#ifdef NMR_HAS_SHADE
   run_shading(scene, r, num_threads);
-#endif
-#ifdef NMR_HAS_EDGES
   run_edges(scene, r, num_threads);
-#endif
-#ifdef NMR_HAS_CAMERA
   run_camera(scene, r, num_threads);
-#endif
+  run_pose(scene, r);
   run_smoothness(scene, r, num_threads);
   run_voxels(scene, r, num_threads);
   return r;
@@ -261,6 +276,13 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     if (!all_finite(r.grad_silhouette)) return "the silhouette's gradient is finite";
     if (!all_finite(r.grad_edges)) return "the edges' gradient is finite";
   }
+  for (size_t n = 0; n < r.points.size(); ++n)
+    if (n % 3 == 2 ? !std::isfinite(r.points[n]) : std::isnan(r.points[n])) return "a projected vertex has a depth and a place, or is at infinity";
+  for (const std::vector<T>* grad : {&r.grad_world, &r.grad_matrix, &r.grad_intrinsics, &r.grad_distortion, &r.grad_origin, &r.grad_extent})
+    if (!all_finite(*grad)) return "the gradient of the projection is finite";
+  for (size_t n = 0; n < r.pose.size(); ++n)
+    if (std::isfinite(r.pose[n]) != std::isfinite(r.pose[n - n % 12]) || std::isinf(r.pose[n])) return "a pose is finite or all NaN";
+  if (!all_finite(r.grad_forward) || !all_finite(r.grad_up)) return "the gradient of a pose is finite";
   for (size_t n = 0; n < r.depth.size(); ++n) {
     if (r.owner[n] >= 0) continue;
     if (r.depth[n] != scene.far) return "the background's depth is far";
@@ -280,7 +302,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   const char* not_finite = nullptr;
   r.for_each([&](const char* name, const auto& values) {
     if constexpr (std::is_same_v<std::decay_t<decltype(values[0])>, T>)
-      if (!not_finite && !all_finite(values)) not_finite = name;
+      if (!not_finite && &values != &r.points && &values != &r.pose && !all_finite(values)) not_finite = name;
   });
   return not_finite;
 }

@@ -45,7 +45,7 @@ struct Scene {
   T near = T(0.1), far = T(100), eps = T(1e-4);
   int64_t channels = 3, texture_size = 2, grid_size = 4;
   bool per_image_values = false;  // textures and attributes of each image, not shared
-  bool perspective = true, distorted = true;
+  bool perspective = true, distorted = true;  // the camera; undistorted ones have an origin and an extent
   bool foreign_owner = false;  // backward stages get a made-up owner map: any in range is allowed
   uint64_t seed = 1;           // of textures, attributes, cameras and upstream gradients
 
@@ -72,7 +72,8 @@ struct Results {
   std::vector<T> values, grad_attributes, grad_weights;
   std::vector<T> resolved, grad_image;
   std::vector<T> grad_edges;
-  std::vector<T> points, grad_world, grad_matrix, grad_intrinsics, grad_distortion;
+  std::vector<T> points, grad_world, grad_matrix, grad_intrinsics, grad_distortion, grad_origin, grad_extent;
+  std::vector<T> pose, grad_forward, grad_up;
   std::vector<T> loss, grad_loss;
   std::vector<unsigned char> voxels;
 
@@ -99,6 +100,11 @@ struct Results {
     visit("grad_matrix", grad_matrix);
     visit("grad_intrinsics", grad_intrinsics);
     visit("grad_distortion", grad_distortion);
+    visit("grad_origin", grad_origin);
+    visit("grad_extent", grad_extent);
+    visit("pose", pose);
+    visit("grad_forward", grad_forward);
+    visit("grad_up", grad_up);
     visit("loss", loss);
     visit("grad_loss", grad_loss);
     visit("voxels", voxels);

@@ -13,6 +13,7 @@ std::vector<Scene<T>> scenes() {
                             pack<T>({sphere(1, 1), Mesh{}, soup(9, 2), sphere(2, 3), soup(1, 4), Mesh{}})};
   all.push_back(all[0]);
   all[1].per_image_values = true;
+  all[1].distorted = false;
   all[3].anti_aliasing = all[3].fill_back = all[3].perspective = false;
   all[3].image_size = 19;
   all[3].channels = 1;
