@@ -1,4 +1,4 @@
-"""The operators behind the cameras: values and gradients against a chain of tensor operations, opcheck, threads, errors."""
+"""The operators behind the cameras: against a chain of tensor operations, opcheck, threads, refused shapes."""
 
 import pytest
 import torch
