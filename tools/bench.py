@@ -13,8 +13,8 @@
     python tools/bench.py scaling       w1, w2, w3 at 1, 2, 4, 8, 16 threads, as far as there are cores
     python tools/bench.py count         the work in w1 (faces, pixels, sweeps, divisions, bytes) and the floor it sets
 
-Medians over repeats that alternate between the programs, and the fastest. Freed memory is kept for all of them, as in training
-(learn3d/memory.py). `pip install deodr` for the comparison.
+Medians over repeats that alternate between the programs, and the fastest. Freed memory is kept for all of them, as in
+training (learn3d/memory.py). `pip install deodr` for the comparison.
 """
 
 from __future__ import annotations
