@@ -7,6 +7,7 @@
 #include <utility>
 #include <vector>
 
+#include "lanes.h"
 #include "parallel.h"
 
 namespace nmr {
@@ -44,12 +45,17 @@ struct VisibleFaces {
   NMR_INLINE void find(const int32_t* owner, int64_t pixels, int64_t num_faces) {
     int32_t *slot = slots.data(), *id = ids.data();
     std::fill_n(slot, 2 * num_faces + 1, 0);
-    for (int64_t n = 0; n < pixels; ++n) slot[owner[n] + 1] = 1;
+    int64_t n = 0;
+    for (; n + kLanes <= pixels; n += kLanes) {
+      if (!lane_bits(load_lanes<Lanes32>(owner + n) >= 0)) continue;  // background
+      for (int64_t k = 0; k < kLanes; ++k) slot[owner[n + k] + 1] = 1;
+    }
+    for (; n < pixels; ++n) slot[owner[n] + 1] = 1;
     int32_t found = 1;
-    for (int64_t n = 0; n < 2 * num_faces; ++n) {
-      const int32_t visible = slot[n + 1];
-      id[found] = static_cast<int32_t>(n);
-      slot[n + 1] = found;
+    for (int64_t f = 0; f < 2 * num_faces; ++f) {
+      const int32_t visible = slot[f + 1];
+      id[found] = static_cast<int32_t>(f);
+      slot[f + 1] = found;
       found += visible;
     }
     id[0] = -1;

@@ -55,7 +55,7 @@ NMR_INLINE bool is_finite(T value) {
 }
 
 // Where a vertex is seen. Without an image (the vertex not finite, in the plane of the eye, or so near to it that x / z^2
-// overflows) `visible` is false and the rest is without meaning.
+// overflows) `size` is not finite and the rest is without meaning. (One number and one comparison: loops over `&&` stay scalar.)
 template <class T>
 struct Sight {
   T inverse_z;
@@ -63,7 +63,7 @@ struct Sight {
   T qx, qy;    // after it, divided by the extent
   T x, y, z;   // in renderer space
   T slope;     // bounds the derivative of extent q to the vertex in camera axes, but for a factor below 10
-  bool visible;
+  T size;      // |x| + |y| + |z|
 };
 
 // x, y, z are relative to the origin. The image divides, and so rounds as the published one; derivatives (kExact false) take one
@@ -93,7 +93,7 @@ NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
   s.qy = kExact ? s.qy / c.extent : s.qy * c.inverse_extent;
   s.x = c.k[0] * s.qx + c.k[1] * s.qy + c.k[2];
   s.y = c.k[3] * s.qx + c.k[4] * s.qy + c.k[5];
-  s.visible = is_finite(s.x) & is_finite(s.y) & is_finite(s.z) & (s.slope < kLimit<T>);
+  s.size = s.slope < kLimit<T> ? std::abs(s.x) + std::abs(s.y) + std::abs(s.z) : std::numeric_limits<T>::infinity();
   return s;
 }
 
@@ -103,8 +103,8 @@ NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T*
   for (int l = 0; l < kLanes; ++l) {
     const Sight<T> s = sight_of<T, kPerspective, kDistorted, true>(c, vertices[3 * l] - c.o[0], vertices[3 * l + 1] - c.o[1],
                                                                vertices[3 * l + 2] - c.o[2]);
-    points[3 * l] = s.visible ? s.x : infinity;
-    points[3 * l + 1] = s.visible ? s.y : infinity;
+    points[3 * l] = is_finite(s.size) ? s.x : infinity;
+    points[3 * l + 1] = is_finite(s.size) ? s.y : infinity;
     points[3 * l + 2] = is_finite(s.z) ? s.z : T(0);
   }
 }
@@ -125,7 +125,7 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
     }
     const T bound = ((std::abs(gx) + std::abs(gy)) * reach + std::abs(gz)) * c.largest_a *
                     larger(larger(larger(std::abs(x), std::abs(y)), std::abs(z)), T(1));
-    const bool keep = s.visible & !(bound >= kLimit<T>);
+    const bool keep = is_finite(bound >= kLimit<T> ? std::numeric_limits<T>::infinity() : s.size);
     // What is left out is replaced before it enters a product, so that nothing becomes 0 * inf.
     x = keep ? x : T(0), y = keep ? y : T(0), z = keep ? z : T(0);
     gx = keep ? gx : T(0), gy = keep ? gy : T(0), gz = keep ? gz : T(0);
@@ -295,7 +295,8 @@ const std::vector<Run>& runs_of(const Project<T>& args, ProjectScratch& scratch)
 
 template <class T>
 void write(const double* sum, int count, T* grad, int64_t b) {
-  for (int k = 0; k < count && grad; ++k) grad[count * b + k] = static_cast<T>(sum[k]);
+  const double largest = std::numeric_limits<T>::max();
+  for (int k = 0; k < count && grad; ++k) grad[count * b + k] = static_cast<T>(std::clamp(sum[k], -largest, largest));
 }
 
 }  // namespace

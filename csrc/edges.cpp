@@ -48,7 +48,7 @@ void resolve_backward(const Resolve<T>& args) {
 
 namespace {
 
-constexpr int64_t kLanes = 16;      // pixels handled together
+constexpr int64_t kWidth = 16;      // pixels handled together
 constexpr int64_t kTile = 16;       // lines listed together
 constexpr int64_t kFaceChunk = 32;  // faces swept together
 
@@ -136,7 +136,7 @@ struct Lever {
 // Pulls of an edge on its ends, in lanes.
 template <class T>
 struct Pulls {
-  T p[kLanes], q[kLanes];
+  T p[kWidth], q[kWidth];
 };
 
 // Adds the pulls of the listed pixels [first, last) of line n, of those that face `id` owns if kOwn, against a reference color.
@@ -146,15 +146,15 @@ NMR_INLINE void pull_listed(const Lines<T>& lines, int64_t n, int32_t first, int
   const int64_t C = lines.C, stride = lines.stride;
   const T* position = lines.lists->values.data() + n * (1 + 2 * C) * stride;
   const int32_t* owner = lines.lists->owner.data() + n * stride;
-  for (int32_t start = first; start < last; start += kLanes) {
-    T gain[kLanes];
-    for (int k = 0; k < kLanes; ++k) gain[k] = 0;
+  for (int32_t start = first; start < last; start += kWidth) {
+    T gain[kWidth];
+    for (int k = 0; k < kWidth; ++k) gain[k] = 0;
     for (int64_t c = 0; c < C; ++c) {
       const T *image = position + (1 + c) * stride + start, *grad = image + C * stride;
-      for (int k = 0; k < kLanes; ++k) gain[k] += (image[k] - reference[c]) * grad[k];
+      for (int k = 0; k < kWidth; ++k) gain[k] += (image[k] - reference[c]) * grad[k];
     }
     const int32_t lanes = last - start;
-    for (int k = 0; k < kLanes; ++k) {
+    for (int k = 0; k < kWidth; ++k) {
       const bool counts = (k < lanes) & (gain[k] > 0) & (!kOwn | (owner[start + k] == id));
       const T offset = position[start + k] - lever.crossing;
       const T h_p = lever.p * offset, h_q = lever.q * offset;
@@ -165,27 +165,12 @@ NMR_INLINE void pull_listed(const Lines<T>& lines, int64_t n, int32_t first, int
 }
 
 template <class T>
-NMR_INLINE T sum_lanes(const T* lanes) {
-  T sum[kLanes];
-  std::copy_n(lanes, kLanes, sum);
-  for (int64_t width = kLanes / 2; width > 0; width /= 2)
+NMR_INLINE T sum_pulls(const T* lanes) {
+  T sum[kWidth];
+  std::copy_n(lanes, kWidth, sum);
+  for (int64_t width = kWidth / 2; width > 0; width /= 2)
     for (int64_t k = 0; k < width; ++k) sum[k] += sum[k + width];
   return sum[0];
-}
-
-// Float to int as the published kernels convert: truncated, saturated to the pixel range [lo, hi], NaN to 0.
-template <class T>
-NMR_INLINE int64_t to_index(T t, int64_t lo, int64_t hi) {
-  if (!(t == t)) return 0;
-  if (t <= static_cast<T>(lo)) return lo;
-  if (t >= static_cast<T>(hi)) return hi;
-  return static_cast<int64_t>(t);
-}
-
-// Height of the infinite line A-B over the scan coordinate n.
-template <class T>
-NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
-  return (bt - at) / (bs - as) * (n - as) + at;
 }
 
 // Both sweeps of edge P-Q (O is the third corner). s is the scan coordinate, t the sweep coordinate, in pixels.
@@ -203,7 +188,7 @@ NMR_INLINE void sweep_edge(const Lines<T>& lines, int32_t id, T ps, T pt, T qs, 
   if (n_first > n_last) return;
   const T slope = (qt - pt) / (qs - ps);
   Pulls<T> pulls;
-  for (int k = 0; k < kLanes; ++k) pulls.p[k] = pulls.q[k] = 0;
+  for (int k = 0; k < kWidth; ++k) pulls.p[k] = pulls.q[k] = 0;
 
   for (int64_t n = n_first; n <= n_last; ++n) {
     const T line = static_cast<T>(n);
@@ -229,13 +214,13 @@ NMR_INLINE void sweep_edge(const Lines<T>& lines, int32_t id, T ps, T pt, T qs, 
     }
     const bool beyond_p = (line - ps) * (line - os) < 0;
     const T far_side = beyond_p ? line_height(ps, pt, os, ot, line) : line_height(qs, qt, os, ot, line);
-    const int64_t limit = to_index(d > 0 ? std::ceil(far_side) : std::floor(far_side), int64_t(-1), R);
+    const int64_t limit = sweep_limit(far_side, d, R);
     const int64_t m_first = std::max<int64_t>(std::min(in, limit), 0), m_last = std::min(std::max(in, limit), R - 1);
     const T* beyond = lines.image + lines.pixel(n, out) * lines.C;
     pull_listed<T, true>(lines, n, before[m_first], before[m_last + 1], id, beyond, lever, pulls);
   }
-  grad_p += sum_lanes(pulls.p);
-  grad_q += sum_lanes(pulls.q);
+  grad_p += sum_pulls(pulls.p);
+  grad_q += sum_pulls(pulls.q);
 }
 
 // The faces [first, last) among the visible ones.
@@ -307,7 +292,7 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
   covered_box(owner, R, first_line, last_line);
 
   // One axis after the other, in the same memory.
-  const int64_t stride = R + kLanes;
+  const int64_t stride = R + kWidth;
   const T *image = args.image + b * R * R * C, *grad = args.grad_image + b * R * R * C;
   reserve(scratch.lists.values, R * (1 + 2 * C) * stride);
   reserve(scratch.lists.owner, R * stride);

@@ -16,30 +16,30 @@
 namespace nmr {
 namespace {
 
-constexpr int64_t kLanes = 16;  // faces set up together
+constexpr int64_t kWidth = 16;  // faces set up together
 constexpr int64_t kEntry = 16;  // numbers per face in the table: columns 0, 1, 2 of M and the depths, each padded to four
 
 // What is known of the covered pixels of one row, from the first one on. Written in whole vectors: rows are padded.
 template <class T>
 struct PixelRow {
-  T* raw;      // [R + kLanes, 8] clamped weights and depths of the corners, each padded to four
-  T *w[3], *z; // [R + kLanes] normalised weights, depth
-  T* spare;    // [R + kLanes] a row of the image
+  T* raw;      // [R + kWidth, 8] clamped weights and depths of the corners, each padded to four
+  T *w[3], *z; // [R + kWidth] normalised weights, depth
+  T* spare;    // [R + kWidth] a row of the image
 };
 
 template <class T>
 struct FragmentScratch {
   VisibleFaces visible;
   std::vector<T> table;  // [visible, kEntry]
-  std::vector<T> row;    // [13, R + kLanes] PixelRow
+  std::vector<T> row;    // [13, R + kWidth] PixelRow
   std::vector<T> terms;  // [R, 12] what each pixel adds to its face
   std::vector<T> sums;   // [visible, 12]
 
   void reserve_for(int64_t num_faces, const RowBlocks& blocks) {
     const int64_t most = blocks.most_visible(num_faces);
     visible.reserve_for(num_faces, most);
-    reserve(table, (most + 1 + kLanes) * kEntry);
-    reserve(row, 13 * (blocks.raster_size + kLanes));
+    reserve(table, (most + 1 + kWidth) * kEntry);
+    reserve(row, 13 * (blocks.raster_size + kWidth));
   }
   void reserve_for_backward(int64_t num_faces, const RowBlocks& blocks) {
     reserve_for(num_faces, blocks);
@@ -47,7 +47,7 @@ struct FragmentScratch {
     reserve(sums, (blocks.most_visible(num_faces) + 1) * 12);
   }
   NMR_INLINE PixelRow<T> pixel_row(int64_t raster_size) {
-    const int64_t stride = raster_size + kLanes;
+    const int64_t stride = raster_size + kWidth;
     T* r = row.data();
     return {r, {r + 8 * stride, r + 9 * stride, r + 10 * stride}, r + 11 * stride, r + 12 * stride};
   }
@@ -77,10 +77,10 @@ NMR_INLINE void set_up_faces(const Block<T>& block, FragmentScratch<T>& scratch)
   visible.find(block.owner + block.first * block.raster_size, (block.last - block.first) * block.raster_size, block.num_faces);
   T* table = scratch.table.data();
   const T size = static_cast<T>(block.raster_size);
-  T corner[9][kLanes], matrix[9][kLanes];
-  for (int64_t start = 0; start < visible.count; start += kLanes) {
-    const int64_t lanes = std::min(kLanes, visible.count - start);
-    for (int64_t n = 0; n < kLanes; ++n) {
+  T corner[9][kWidth], matrix[9][kWidth];
+  for (int64_t start = 0; start < visible.count; start += kWidth) {
+    const int64_t lanes = std::min(kWidth, visible.count - start);
+    for (int64_t n = 0; n < kWidth; ++n) {
       const int32_t id = n < lanes ? visible.ids[start + n] : -1;
       const bool reversed = id >= block.num_faces;
       const int64_t* face = block.faces + 3 * (id < 0 ? 0 : reversed ? id - block.num_faces : id);
@@ -91,7 +91,7 @@ NMR_INLINE void set_up_faces(const Block<T>& block, FragmentScratch<T>& scratch)
         corner[6 + k][n] = t.z[k];
       }
     }
-    for (int64_t n = 0; n < kLanes; ++n) {
+    for (int64_t n = 0; n < kWidth; ++n) {
       const Triangle<T> t{{corner[0][n], corner[1][n], corner[2][n]}, {corner[3][n], corner[4][n], corner[5][n]}, {1, 1, 1}};
       const BarycentricMatrix<T> m = barycentric_matrix(t, size);
       for (int k = 0; k < 3; ++k)
@@ -129,17 +129,17 @@ NMR_INLINE void evaluate_row(const Block<T>& block, int64_t j, int64_t first, in
     for (int k = 0; k < 8; ++k) raw[k] = pixel[k];
   }
   raw = row.raw;
-  for (int64_t start = 0; start < last - first; start += kLanes, raw += 8 * kLanes) {
-    T w[3][kLanes], z[kLanes];
-    for (int64_t n = 0; n < kLanes; ++n) {
+  for (int64_t start = 0; start < last - first; start += kWidth, raw += 8 * kWidth) {
+    T w[3][kWidth], z[kWidth];
+    for (int64_t n = 0; n < kWidth; ++n) {
       const T sum = raw[8 * n] + raw[8 * n + 1] + raw[8 * n + 2];
       w[0][n] = raw[8 * n] / sum;
       w[1][n] = raw[8 * n + 1] / sum;
       w[2][n] = raw[8 * n + 2] / sum;
       z[n] = 1 / (w[0][n] / raw[8 * n + 4] + w[1][n] / raw[8 * n + 5] + w[2][n] / raw[8 * n + 6]);
     }
-    for (int k = 0; k < 3; ++k) std::copy_n(w[k], kLanes, row.w[k] + start);
-    std::copy_n(z, kLanes, row.z + start);
+    for (int k = 0; k < 3; ++k) std::copy_n(w[k], kWidth, row.w[k] + start);
+    std::copy_n(z, kWidth, row.z + start);
   }
 }
 

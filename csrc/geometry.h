@@ -82,6 +82,23 @@ NMR_INLINE T clamp_weight(T w) {
   return w < 1 ? w : T(1);
 }
 
+// Height of the infinite line A-B over the scan coordinate n; s is the scan coordinate, t the other one.
+template <class T>
+NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
+  return (bt - at) / (bs - as) * (n - as) + at;
+}
+
+// The last pixel that a sweep into a face visits, at most one beyond [0, R): where it leaves the face again, towards t = -infinity if
+// d > 0 and +infinity if d < 0. Rounded and converted as published: truncated, saturated, NaN to 0.
+template <class T>
+NMR_INLINE int64_t sweep_limit(T far_side, int64_t d, int64_t R) {
+  const T t = d > 0 ? std::ceil(far_side) : std::floor(far_side);
+  if (!(t == t)) return 0;
+  if (t <= -1) return -1;
+  if (t >= static_cast<T>(R)) return R;
+  return static_cast<int64_t>(t);
+}
+
 template <class T>
 NMR_INLINE T min3(T a, T b, T c) {
   const T ab = a < b ? a : b;

@@ -103,6 +103,7 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
   const T* vertices = image.vertices;
   const T infinity = std::numeric_limits<T>::infinity();
   const T round_down = 1 - 16 * std::numeric_limits<T>::epsilon(), round_up = 1 + 16 * std::numeric_limits<T>::epsilon();
+  const T moderate = std::sqrt(std::numeric_limits<T>::max()) / 4;  // products of two pixel coordinates stay finite
   const T resolution = 288 * std::numeric_limits<T>::epsilon();
   int32_t num_front = 0, num_back = 0;
   T front_depth = 0, back_depth = 0;
@@ -140,7 +141,7 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
       // exception is a face so thin that all three weights could round to nothing.
       const T det = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0);
       const bool bounded =
-          (std::abs(det) >= resolution * largest * largest) & (lo * round_down > near) & (hi * round_up < far) & (near >= 0);
+          (std::abs(det) >= resolution * largest * largest) & (largest * size < moderate) & (lo * round_down > near) & (hi * round_up < far) & (near >= 0);
       nearest[n] = bounded ? lo * round_down : -infinity;
       farthest[n] = bounded ? hi * round_up : infinity;
       pixel_range(min3(x0, x1, x2), max3(x0, x1, x2), size, i0[n], i1[n]);

@@ -2,13 +2,13 @@
 // would change if the edge moved pull on its two vertices, each with strength (change of the loss) / (distance to move).
 #include <algorithm>
 #include <cmath>
-#include <cstring>
-#include <limits>
 #include <vector>
 
+#include "blocks.h"
 #include "geometry.h"
 #include "lanes.h"
 #include "parallel.h"
+#include "pull_lines.h"
 #include "stages.h"
 
 namespace nmr {
@@ -35,145 +35,17 @@ void silhouette_forward(const SilhouetteForward<T>& args) {
 
 namespace {
 
-// Along the lines of one axis: which pixels can pull. Positions are in pixels along the line.
-template <class T>
-struct PullLines {
-  std::vector<T> position, weight;        // [R, R + lanes] background pixels with gradient < 0, ascending, and -gradient; 0 after
-  std::vector<int32_t> count;             // [R] how many
-  std::vector<T> first, last;             // [R + lanes] the first and last of them; +-infinity if there is none
-  std::vector<T> gain_first, gain_last;   // [R + lanes] first and last covered pixel with gradient > 0
-
-  void reserve_lines(int64_t R) {
-    for (std::vector<T>* v : {&position, &weight}) reserve(*v, R * (R + kLanes));
-    for (std::vector<T>* v : {&first, &last, &gain_first, &gain_last}) reserve(*v, R + kLanes);
-    reserve(count, R);
-  }
-};
-
 template <class T>
 struct BackwardScratch {
-  PullLines<T> lines[2];         // [0] columns: lines of constant x, swept along y; [1] rows
-  std::vector<uint8_t> visible;  // [2 F + 1] face owns a pixel; the background counts as face -1
-  std::vector<int32_t> faces;    // the visible ones, ascending
-  std::vector<T> grad;           // [visible faces, 6] x and y of their corners
+  PullLines<T> lines[2];       // [0] columns: lines of constant x, swept along y; [1] rows
+  VisibleFaces visible;
+  FaceGradients<T> gradients;  // of their corners
 };
 
 template <class T>
 struct RowScratch {
   std::vector<T> grad_row;  // [R + lanes]
 };
-
-// What the sweeps read of one image.
-template <class T>
-struct SweepImage {
-  const T* vertices;
-  const int64_t* faces;
-  int64_t num_faces;
-  int64_t R, S;
-  bool anti_aliasing;
-  T eps;
-  const int32_t* owner;  // row 0 = top; pixel (column i, row j from the bottom) is owner[(R - 1 - j) R + i]
-  const T* grad_alpha;
-  PullLines<T>* lines;
-  T largest_lever;  // above it, or with a tiny eps, the product of two travels could leave the range of T
-
-  // Gradient of raster pixel (column i, row j): the image is flipped, and a 2x2 mean shares its gradient in quarters.
-  NMR_INLINE T grad(int64_t i, int64_t j) const {
-    return anti_aliasing ? grad_alpha[(S - 1 - j / 2) * S + i / 2] / 4 : grad_alpha[(S - 1 - j) * S + i];
-  }
-};
-
-// Gradients of one row of raster pixels, from the bottom, with lanes of zeros after.
-template <class T>
-NMR_INLINE void expand_row(const SweepImage<T>& image, int64_t j, T* row) {
-  if (image.anti_aliasing) {
-    const T* grad = image.grad_alpha + (image.S - 1 - j / 2) * image.S;
-    for (int64_t x = 0; x < image.S; ++x) row[2 * x] = row[2 * x + 1] = grad[x] / 4;
-  } else {
-    std::copy_n(image.grad_alpha + (image.S - 1 - j) * image.S, image.S, row);
-  }
-  std::fill_n(row + image.R, kLanes, T(0));
-}
-
-// Empties lines [first, last).
-template <class T>
-NMR_INLINE void start_lines(PullLines<T>& lines, int64_t first, int64_t last) {
-  const T infinity = std::numeric_limits<T>::infinity();
-  std::fill(lines.count.begin() + first, lines.count.begin() + last, 0);
-  std::fill(lines.gain_first.begin() + first, lines.gain_first.begin() + last, infinity);
-  std::fill(lines.gain_last.begin() + first, lines.gain_last.begin() + last, -infinity);
-}
-
-template <class T>
-NMR_INLINE void append_pull(PullLines<T>& lines, int64_t stride, int64_t n, int64_t m, T weight) {
-  const int64_t at = n * stride + lines.count[n]++;
-  lines.position[at] = static_cast<T>(m);
-  lines.weight[at] = weight;
-}
-
-template <class T>
-NMR_INLINE void finish_lines(PullLines<T>& lines, int64_t stride, int64_t first, int64_t last) {
-  const T infinity = std::numeric_limits<T>::infinity();
-  for (int64_t n = first; n < last; ++n) {
-    const int32_t count = lines.count[n];
-    T* position = lines.position.data() + n * stride;
-    lines.first[n] = count ? position[0] : infinity;
-    lines.last[n] = count ? position[count - 1] : -infinity;
-    store_lanes(position + count, splat(count ? position[count - 1] : T(0)));
-    store_lanes(lines.weight.data() + n * stride + count, splat(T(0)));
-  }
-}
-
-// A part of both sets of lines: rows [row_first, row_last) and columns [column_first, column_last), the latter from all rows.
-struct LineRange {
-  int64_t row_first, row_last, column_first, column_last;
-};
-
-// Fills the lines of a range. grad_row: [R + lanes] of scratch.
-template <class T>
-NMR_INLINE void collect_lines(const SweepImage<T>& image, const LineRange& range, T* grad_row) {
-  const int64_t R = image.R, stride = R + kLanes;
-  const bool any_column = range.column_first < range.column_last;
-  PullLines<T>&columns = image.lines[0], &rows = image.lines[1];
-  start_lines(columns, range.column_first, range.column_last);
-  start_lines(rows, range.row_first, range.row_last);
-  const int64_t j_first = any_column ? 0 : range.row_first, j_last = any_column ? R : range.row_last;
-  for (int64_t j = j_first; j < j_last; ++j) {
-    const bool in_rows = j >= range.row_first && j < range.row_last;
-    const int32_t* owner = image.owner + (R - 1 - j) * R;
-    if (j == j_first || !image.anti_aliasing || j % 2 == 0) expand_row(image, j, grad_row);
-    const int64_t i_last = in_rows ? R : range.column_last;
-    for (int64_t start = in_rows ? 0 : range.column_first; start < i_last; start += kLanes) {
-      const Lanes<T> g = load_lanes<Lanes<T>>(grad_row + start);
-      Lanes32 id = splat32(-1);
-      if (start + kLanes <= R)
-        id = load_lanes<Lanes32>(owner + start);
-      else
-        std::memcpy(&id, owner + start, (R - start) * sizeof(int32_t));
-      const Lanes32 background = id < 0, gains = narrow_mask(g > T(0)) & ~background;
-      for (uint32_t bits = lane_bits(narrow_mask(g < T(0)) & background); bits; bits &= bits - 1) {
-        const int64_t i = start + lowest_bit(bits);
-        if (in_rows) append_pull(rows, stride, j, i, -grad_row[i]);
-        if (i >= range.column_first && i < range.column_last) append_pull(columns, stride, i, j, -grad_row[i]);
-      }
-      const uint32_t gain_bits = lane_bits(gains);
-      if (!gain_bits) continue;
-      if (in_rows) {
-        rows.gain_first[j] = std::min(rows.gain_first[j], static_cast<T>(start));  // at least that
-        rows.gain_last[j] = static_cast<T>(start + kLanes - 1);                    // at most that
-      }
-      if (any_column) {
-        const LaneMask<T> here = widen_mask<T>(gains);
-        T *gain_first = columns.gain_first.data() + start, *gain_last = columns.gain_last.data() + start;
-        const Lanes<T> line_first = load_lanes<Lanes<T>>(gain_first), at = splat(static_cast<T>(j));
-        store_lanes(gain_first, select(here & (line_first > at), at, line_first));
-        store_lanes(gain_last, select(here, at, load_lanes<Lanes<T>>(gain_last)));
-      }
-    }
-  }
-  finish_lines(columns, stride, range.column_first, range.column_last);
-  finish_lines(rows, stride, range.row_first, range.row_last);
-}
 
 // How an edge P-Q, crossed at t = c by a line, moves with each of its ends.
 template <class T>
@@ -219,21 +91,6 @@ NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, T
     pulls_q = pulls_q + share * h_p;
     if (d < 0 && position[start + kLanes - 1] >= out) break;
   }
-}
-
-// Float to int as the published kernels convert: truncated, saturated to the pixel range [lo, hi], NaN to 0.
-template <class T>
-NMR_INLINE int64_t to_index(T t, int64_t lo, int64_t hi) {
-  if (!(t == t)) return 0;
-  if (t <= static_cast<T>(lo)) return lo;
-  if (t >= static_cast<T>(hi)) return hi;
-  return static_cast<int64_t>(t);
-}
-
-// Height of the infinite line A-B over the scan coordinate n.
-template <class T>
-NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
-  return (bt - at) / (bs - as) * (n - as) + at;
 }
 
 // Up to eight neighbouring lines that cross an edge P-Q: what their sweeps need. s is the scan coordinate, t the sweep coordinate:
@@ -311,7 +168,7 @@ NMR_INLINE void run_sweep(const SweepImage<T>& image, const Sweep<T>& sweep, T* 
       const T line = static_cast<T>(n);
       const int end = (line - s[p]) * (line - s[o]) < 0 ? p : q;
       const T far_side = line_height(s[end], t[end], s[o], t[o], line);
-      const int64_t limit = to_index(d > 0 ? std::ceil(far_side) : std::floor(far_side), int64_t(-1), R);
+      const int64_t limit = sweep_limit(far_side, d, R);
       const int64_t m_first = std::max<int64_t>(std::min(inner, limit), 0), m_last = std::min(std::max(inner, limit), R - 1);
       for (int64_t m = m_first; m <= m_last; ++m) {
         if (owner[m * step] != sweep.id) continue;
@@ -321,8 +178,8 @@ NMR_INLINE void run_sweep(const SweepImage<T>& image, const Sweep<T>& sweep, T* 
     }
   }
   // axis 0 moves y, axis 1 moves x
-  grad[6 * sweep.face + 2 * p + 1 - axis] += grad_p;
-  grad[6 * sweep.face + 2 * q + 1 - axis] += grad_q;
+  grad[9 * sweep.face + 3 * p + 1 - axis] += grad_p;
+  grad[9 * sweep.face + 3 * q + 1 - axis] += grad_q;
 }
 
 template <class T>
@@ -417,10 +274,10 @@ NMR_INLINE int64_t prepare_face(const SweepImage<T>& image, int32_t face, int32_
   return count;
 }
 
-// Gradients of the corners of visible faces [first, last) of the list: x and y of corners 0, 1, 2 as drawn.
+// Gradients [3, 3] of the corners of visible faces [first, last) of the list, in the order in which they are drawn.
 template <class T>
 NMR_INLINE void sweep_faces(const SweepImage<T>& image, const int32_t* ids, int64_t first, int64_t last, Sweep<T>* sweeps, T* grad) {
-  std::fill_n(grad + 6 * first, 6 * (last - first), T(0));
+  std::fill_n(grad + 9 * first, 9 * (last - first), T(0));
   int64_t count = 0;
   for (int64_t n = first; n < last; ++n) count = prepare_face(image, static_cast<int32_t>(n), ids[n], sweeps, count, grad);
   run_sweeps(image, sweeps, count, grad);
@@ -441,21 +298,9 @@ NMR_CLONES void sweep(const SweepImage<double>& image, const int32_t* ids, int64
   sweep_faces(image, ids, first, last, sweeps, grad);
 }
 
-// Marks the faces that own a pixel (visible[id + 1] = 1) and lists them, ascending: all others get exactly zero.
-NMR_CLONES int64_t list_visible(const int32_t* owner, int64_t pixels, int64_t num_ids, uint8_t* visible, int32_t* ids) {
-  std::fill_n(visible, num_ids + 1, uint8_t(0));
-  int64_t n = 0;
-  for (; n + kLanes <= pixels; n += kLanes) {
-    if (!lane_bits(load_lanes<Lanes32>(owner + n) >= 0)) continue;
-    for (int64_t k = 0; k < kLanes; ++k) visible[owner[n + k] + 1] = 1;
-  }
-  for (; n < pixels; ++n) visible[owner[n] + 1] = 1;
-  int64_t count = 0;
-  for (int64_t id = 0; id < num_ids; ++id) {
-    ids[count] = static_cast<int32_t>(id);
-    count += visible[id + 1];
-  }
-  return count;
+// The faces that own a pixel: all others get exactly zero.
+NMR_CLONES void find_visible(const int32_t* owner, int64_t pixels, int64_t num_faces, VisibleFaces& visible) {
+  visible.find(owner, pixels, num_faces);
 }
 
 }  // namespace
@@ -479,26 +324,21 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
       const int64_t first = n % bands * band, last = std::min(first + band, R);
       collect(image, share ? n < bands ? LineRange{0, 0, first, last} : LineRange{first, last, 0, 0} : LineRange{0, R, 0, R}, grad_row);
     });
-    int32_t* ids = reserve(scratch.faces, 2 * image.num_faces + 1);
-    const int64_t count = list_visible(image.owner, R * R, 2 * image.num_faces, reserve(scratch.visible, 2 * image.num_faces + 1), ids);
-    const int64_t chunk = share ? 256 : std::max<int64_t>(count, 1);
-    T* grad = reserve(scratch.grad, 6 * count);
-    parallel_for((count + chunk - 1) / chunk, threads, [&](int64_t n) {
+    VisibleFaces& visible = scratch.visible;
+    visible.reserve_for(image.num_faces, std::min(2 * image.num_faces, R * R));
+    find_visible(image.owner, R * R, image.num_faces, visible);
+    FaceGradients<T>& gradients = scratch.gradients;
+    gradients.count = visible.count - 1;
+    gradients.ids.assign(visible.ids.begin() + 1, visible.ids.begin() + visible.count);
+    T* grad = reserve(gradients.values, 9 * gradients.count);
+    const int64_t chunk = share ? 256 : std::max<int64_t>(gradients.count, 1);
+    parallel_for((gradients.count + chunk - 1) / chunk, threads, [&](int64_t n) {
       Sweep<T>* sweeps = reserve(thread_scratch<SweepScratch<T>>().sweeps, kSweeps + 1);
-      sweep(image, ids, n * chunk, std::min((n + 1) * chunk, count), sweeps, grad);
+      sweep(image, gradients.ids.data(), n * chunk, std::min((n + 1) * chunk, gradients.count), sweeps, grad);
     });
-
     T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
     std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));
-    for (int64_t n = 0; n < count; ++n) {
-      const bool reversed = ids[n] >= image.num_faces;
-      const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
-      for (int k = 0; k < 3; ++k) {
-        T* corner = grad_vertices + 3 * face[reversed ? 2 - k : k];
-        corner[0] += grad[6 * n + 2 * k];
-        corner[1] += grad[6 * n + 2 * k + 1];
-      }
-    }
+    scatter_face_gradients(gradients, image.faces, image.num_faces, grad_vertices);
   });
 }
 

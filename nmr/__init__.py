@@ -16,6 +16,7 @@ voxelize            meshes -> filled occupancy grids (kato18, the published voxe
 icosphere, edge_table, unique_edges, losses   meshes to deform, and what to minimise
 metrics             points on surfaces, Chamfer distance, F-score, IoU of grids
 face_normals, vertex_normals    unit normals, differentiable
+neural_renderer     the interface of neural_renderer_pytorch 1.1.3, to be imported by itself
 
 Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]`` with faces ``[F, 3]`` or
 ``[B, F, 3]``, or lists of ``[V_b, 3]`` and ``[F_b, 3]``. In renderer space x points right, y up, both in [-1, 1] across

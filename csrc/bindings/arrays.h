@@ -11,6 +11,7 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include "../parallel.h"
 #include "../stages.h"
 
 namespace py = pybind11;
@@ -95,25 +96,24 @@ MeshBatch<T> mesh_batch(const Array<T>& vertices, const Indices& faces, const st
 
 // R of an owner map [B, R, R]; each of its entries must name a face of its image, or a reversed copy of one.
 template <class FaceCount>
-int64_t require_owner(const Array<int32_t>& owner, int64_t batch, const FaceCount& face_count) {
+int64_t require_owner(const Array<int32_t>& owner, int64_t batch, const FaceCount& face_count, int num_threads) {
   require(owner.ndim() == 3 && owner.shape(0) == batch && owner.shape(1) == owner.shape(2),
           "owner must have shape [" + std::to_string(batch) + ", R, R], got " + shape_of(owner));
   const int64_t pixels = owner.shape(1) * owner.shape(2);
-  const int32_t* entry = owner.data();
-  for (int64_t b = 0; b < batch; ++b, entry += pixels) {
-    int32_t largest = -1, least = 0;
-    for (int64_t n = 0; n < pixels; ++n) {
-      largest = entry[n] > largest ? entry[n] : largest;
-      least = entry[n] < least ? entry[n] : least;
-    }
-    require(least >= -1 && largest < 2 * face_count(b), "the owner map does not belong to these faces");
-  }
+  const int32_t* entries = owner.data();
+  parallel_for(batch, num_threads, [&](int64_t b) {
+    const uint32_t limit = static_cast<uint32_t>(2 * face_count(b));
+    const int32_t* entry = entries + b * pixels;
+    uint32_t wrong = 0;
+    for (int64_t n = 0; n < pixels; ++n) wrong |= static_cast<uint32_t>(entry[n]) + 1 > limit;
+    require(!wrong, "the owner map does not belong to these faces");
+  });
   return owner.shape(1);
 }
 
 template <class T>
-int64_t require_owner(const Array<int32_t>& owner, const MeshBatch<T>& mesh) {
-  return require_owner(owner, mesh.batch, [&](int64_t b) { return mesh.face_count(b); });
+int64_t require_owner(const Array<int32_t>& owner, const MeshBatch<T>& mesh, int num_threads) {
+  return require_owner(owner, mesh.batch, [&](int64_t b) { return mesh.face_count(b); }, num_threads);
 }
 
 // The parts of the module, one per file.

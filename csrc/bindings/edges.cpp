@@ -39,7 +39,7 @@ void edges_backward_py(const Array<T>& vertices, const Indices& faces, const std
                        const Array<int32_t>& owner, const Array<T>& image, const Array<T>& grad_image, Array<T>& grad_vertices,
                        double eps, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const int64_t raster_size = require_owner(owner, mesh);
+  const int64_t raster_size = require_owner(owner, mesh, num_threads);
   require(image.ndim() == 4 && image.shape(3) >= 1, "image must have shape [B, R, R, C], got " + shape_of(image));
   require_shape(image, "image", {mesh.batch, raster_size, raster_size, image.shape(3)});
   require_like(grad_image, "grad_image", image);

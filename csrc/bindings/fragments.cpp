@@ -8,7 +8,7 @@ template <class T>
 Fragments<T> fragments_args(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
                             const Array<int32_t>& owner, double far, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const int64_t raster_size = require_owner(owner, mesh);
+  const int64_t raster_size = require_owner(owner, mesh, num_threads);
   return {mesh, raster_size, static_cast<T>(far), owner.data(), nullptr, nullptr, nullptr, nullptr, nullptr, num_threads};
 }
 
@@ -47,7 +47,7 @@ template <class T>
 DepthImage<T> depth_args(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
                          const Array<int32_t>& owner, bool anti_aliasing, double far, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const int64_t raster_size = require_owner(owner, mesh), image_size = anti_aliasing ? raster_size / 2 : raster_size;
+  const int64_t raster_size = require_owner(owner, mesh, num_threads), image_size = anti_aliasing ? raster_size / 2 : raster_size;
   require(!anti_aliasing || raster_size % 2 == 0, "an anti-aliased owner map has an even size, got " + shape_of(owner));
   return {mesh, image_size, anti_aliasing, static_cast<T>(far), owner.data(), nullptr, nullptr, nullptr, num_threads};
 }

@@ -33,7 +33,7 @@ void silhouette_backward_py(const Array<T>& vertices, const Indices& faces, cons
                             const Array<int32_t>& owner, const Array<T>& grad_alpha, Array<T>& grad_vertices, bool anti_aliasing,
                             double eps, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const int64_t raster_size = require_owner(owner, mesh), image_size = anti_aliasing ? raster_size / 2 : raster_size;
+  const int64_t raster_size = require_owner(owner, mesh, num_threads), image_size = anti_aliasing ? raster_size / 2 : raster_size;
   require(!anti_aliasing || raster_size % 2 == 0, "an anti-aliased owner map has an even size, got " + shape_of(owner));
   require_shape(grad_alpha, "grad_alpha", {mesh.batch, image_size, image_size});
   require_like(grad_vertices, "grad_vertices", vertices);

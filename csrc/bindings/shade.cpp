@@ -7,10 +7,10 @@ namespace {
 // Checks weights [B, R, R, 3] and an owner map of the given number of faces (packed: those of starts).
 template <class T>
 void require_fragments(const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts,
-                       int64_t num_faces) {
+                       int64_t num_faces, int num_threads) {
   const int64_t batch = starts ? starts->shape(0) - 1 : owner.ndim() == 3 ? owner.shape(0) : 0;
   const int64_t* s = starts ? starts->data() : nullptr;
-  const int64_t R = require_owner(owner, batch, [&](int64_t b) { return s ? s[2 * b + 3] - s[2 * b + 1] : num_faces; });
+  const int64_t R = require_owner(owner, batch, [&](int64_t b) { return s ? s[2 * b + 3] - s[2 * b + 1] : num_faces; }, num_threads);
   require_shape(weights, "weights", {batch, R, R, 3});
 }
 
@@ -27,7 +27,7 @@ TextureCubes<T> texture_args(const Array<T>& textures, const Array<int32_t>& own
           "textures must be cubes of the same size in all three directions, with channels, got " + shape_of(textures));
   // Textures have no rows: whatever number of them starts ends with is right.
   if (starts) require_starts(*starts, starts->ndim() == 2 && starts->size() >= 2 ? starts->data()[starts->size() - 2] : 0, num_faces);
-  require_fragments(owner, weights, starts, num_faces);
+  require_fragments(owner, weights, starts, num_faces, num_threads);
   const int64_t texture_batch = starts ? 1 : textures.shape(0);
   require(starts || texture_batch == 1 || texture_batch == owner.shape(0),
           "textures must have the batch size " + std::to_string(owner.shape(0)) + " or 1, got " + shape_of(textures));
@@ -82,7 +82,7 @@ Interpolate<T> interpolate_args(const Array<T>& attributes, const Indices& corne
           std::string("corners must have shape ") + (packed ? "[M, 3]" : "[F, 3] or [B, F, 3]") + ", got " + shape_of(corners));
   const int64_t num_attributes = attributes.shape(packed ? 0 : 1), num_faces = corners.shape(per_image ? 1 : 0);
   if (packed) require_starts(*starts, num_attributes, num_faces);
-  require_fragments(owner, weights, starts, num_faces);
+  require_fragments(owner, weights, starts, num_faces, num_threads);
   const int64_t batch = owner.shape(0), attribute_batch = packed ? 1 : attributes.shape(0);
   require(packed || attribute_batch == 1 || attribute_batch == batch,
           "attributes must have the batch size " + std::to_string(batch) + " or 1, got " + shape_of(attributes));

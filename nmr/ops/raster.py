@@ -72,11 +72,14 @@ def _silhouette_setup(ctx, inputs, output):
     vertices, faces, starts, _, anti_aliasing, _, _, _, eps = inputs
     owner = output[1]
     ctx.mark_non_differentiable(owner)
+    ctx.set_materialize_grads(False)  # no zeros in the shape of the owner map
     ctx.save_for_backward(vertices, faces, starts, owner)
     ctx.settings = anti_aliasing, eps
 
 
 def _silhouette_backward(ctx, grad_alpha, _grad_owner):
+    if grad_alpha is None:
+        return (None,) * 9
     vertices, faces, starts, owner = ctx.saved_tensors
     grad_vertices = silhouette_backward(vertices, faces, starts, owner, grad_alpha, *ctx.settings)
     return grad_vertices, None, None, None, None, None, None, None, None

@@ -105,9 +105,9 @@ def test_channels_act_together():
     torch.testing.assert_close(spread(two, [1.0, -2.0]), spread(covered, [-1.0]))
 
 
-@pytest.mark.parametrize("batch, raster_size", [(5, 40), (1, 100)])
+@pytest.mark.parametrize("batch, raster_size", [(5, 40), (2, 100)])
 def test_same_bits_for_any_number_of_threads(batch, raster_size):
-    """Also of one image, whose lines and faces the threads share."""
+    """Also of fewer images than threads: then the threads share the lines and faces of each."""
     vertices, faces = random_soup(2, batch, 100, torch.float32)
     owner = owner_of(vertices, faces, raster_size)
     assert len(owner[0].unique()) > 64  # several chunks of faces

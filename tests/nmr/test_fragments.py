@@ -113,9 +113,9 @@ def test_one_of_the_two_gradients():
     assert grads[0].any() and grads[1].any()
 
 
-@pytest.mark.parametrize("batch, raster_size", [(5, 40), (1, 300)])
+@pytest.mark.parametrize("batch, raster_size", [(5, 40), (2, 300)])
 def test_same_bits_for_any_number_of_threads(batch, raster_size):
-    """Also of one image large enough to be cut into blocks."""
+    """Also of fewer images than threads, large enough to be cut into blocks."""
     vertices, faces = random_soup(2, batch, 60, torch.float32)
     owner = owner_of(vertices, faces, raster_size)
     results = for_threads((1, 2, 5), lambda: gradients(vertices, faces, None, owner))

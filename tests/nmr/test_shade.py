@@ -154,7 +154,7 @@ def test_interpolate_computes_only_the_gradients_asked_for(of_attributes, of_wei
 # --- both
 
 
-@pytest.mark.parametrize("batch, raster_size", [(5, 40), (1, 300)])
+@pytest.mark.parametrize("batch, raster_size", [(5, 40), (2, 300)])
 @pytest.mark.parametrize("shared", [False, True])
 def test_same_bits_for_any_number_of_threads(batch, raster_size, shared):
     vertices, faces = random_soup(4, batch, 60, torch.float32)

@@ -1,0 +1,141 @@
+// What the sweeps of a silhouette's gradient read: on every row and column of an image, the pixels that can pull.
+#pragma once
+
+#include <algorithm>
+#include <cstring>
+#include <limits>
+#include <vector>
+
+#include "lanes.h"
+#include "parallel.h"
+
+namespace nmr {
+
+// Along the lines of one axis: which pixels can pull. Positions are in pixels along the line.
+template <class T>
+struct PullLines {
+  std::vector<T> position, weight;        // [R, R + lanes] background pixels with gradient < 0, ascending, and -gradient; 0 after
+  std::vector<int32_t> count;             // [R] how many
+  std::vector<T> first, last;             // [R + lanes] the first and last of them; +-infinity if there is none
+  std::vector<T> gain_first, gain_last;   // [R + lanes] first and last covered pixel with gradient > 0
+
+  void reserve_lines(int64_t R) {
+    for (std::vector<T>* v : {&position, &weight}) reserve(*v, R * (R + kLanes));
+    for (std::vector<T>* v : {&first, &last, &gain_first, &gain_last}) reserve(*v, R + kLanes);
+    reserve(count, R);
+  }
+};
+
+// What the sweeps read of one image.
+template <class T>
+struct SweepImage {
+  const T* vertices;
+  const int64_t* faces;
+  int64_t num_faces;
+  int64_t R, S;
+  bool anti_aliasing;
+  T eps;
+  const int32_t* owner;  // row 0 = top; pixel (column i, row j from the bottom) is owner[(R - 1 - j) R + i]
+  const T* grad_alpha;
+  PullLines<T>* lines;
+  T largest_lever;  // above it, or with a tiny eps, the product of two travels could leave the range of T
+
+  // Gradient of raster pixel (column i, row j): the image is flipped, and a 2x2 mean shares its gradient in quarters.
+  NMR_INLINE T grad(int64_t i, int64_t j) const {
+    return anti_aliasing ? grad_alpha[(S - 1 - j / 2) * S + i / 2] / 4 : grad_alpha[(S - 1 - j) * S + i];
+  }
+};
+
+// Gradients of one row of raster pixels, from the bottom, with lanes of zeros after.
+template <class T>
+NMR_INLINE void expand_row(const SweepImage<T>& image, int64_t j, T* row) {
+  if (image.anti_aliasing) {
+    const T* grad = image.grad_alpha + (image.S - 1 - j / 2) * image.S;
+    for (int64_t x = 0; x < image.S; ++x) row[2 * x] = row[2 * x + 1] = grad[x] / 4;
+  } else {
+    std::copy_n(image.grad_alpha + (image.S - 1 - j) * image.S, image.S, row);
+  }
+  std::fill_n(row + image.R, kLanes, T(0));
+}
+
+// Empties lines [first, last).
+template <class T>
+NMR_INLINE void start_lines(PullLines<T>& lines, int64_t first, int64_t last) {
+  const T infinity = std::numeric_limits<T>::infinity();
+  std::fill(lines.count.begin() + first, lines.count.begin() + last, 0);
+  std::fill(lines.gain_first.begin() + first, lines.gain_first.begin() + last, infinity);
+  std::fill(lines.gain_last.begin() + first, lines.gain_last.begin() + last, -infinity);
+}
+
+template <class T>
+NMR_INLINE void append_pull(PullLines<T>& lines, int64_t stride, int64_t n, int64_t m, T weight) {
+  const int64_t at = n * stride + lines.count[n]++;
+  lines.position[at] = static_cast<T>(m);
+  lines.weight[at] = weight;
+}
+
+template <class T>
+NMR_INLINE void finish_lines(PullLines<T>& lines, int64_t stride, int64_t first, int64_t last) {
+  const T infinity = std::numeric_limits<T>::infinity();
+  for (int64_t n = first; n < last; ++n) {
+    const int32_t count = lines.count[n];
+    T* position = lines.position.data() + n * stride;
+    lines.first[n] = count ? position[0] : infinity;
+    lines.last[n] = count ? position[count - 1] : -infinity;
+    store_lanes(position + count, splat(count ? position[count - 1] : T(0)));
+    store_lanes(lines.weight.data() + n * stride + count, splat(T(0)));
+  }
+}
+
+// A part of both sets of lines: rows [row_first, row_last) and columns [column_first, column_last), the latter from all rows.
+struct LineRange {
+  int64_t row_first, row_last, column_first, column_last;
+};
+
+// Fills the lines of a range. grad_row: [R + lanes] of scratch.
+template <class T>
+NMR_INLINE void collect_lines(const SweepImage<T>& image, const LineRange& range, T* grad_row) {
+  const int64_t R = image.R, stride = R + kLanes;
+  const bool any_column = range.column_first < range.column_last;
+  PullLines<T>&columns = image.lines[0], &rows = image.lines[1];
+  start_lines(columns, range.column_first, range.column_last);
+  start_lines(rows, range.row_first, range.row_last);
+  const int64_t j_first = any_column ? 0 : range.row_first, j_last = any_column ? R : range.row_last;
+  for (int64_t j = j_first; j < j_last; ++j) {
+    const bool in_rows = j >= range.row_first && j < range.row_last;
+    const int32_t* owner = image.owner + (R - 1 - j) * R;
+    if (j == j_first || !image.anti_aliasing || j % 2 == 0) expand_row(image, j, grad_row);
+    const int64_t i_last = in_rows ? R : range.column_last;
+    for (int64_t start = in_rows ? 0 : range.column_first; start < i_last; start += kLanes) {
+      const Lanes<T> g = load_lanes<Lanes<T>>(grad_row + start);
+      Lanes32 id = splat32(-1);
+      if (start + kLanes <= R)
+        id = load_lanes<Lanes32>(owner + start);
+      else
+        std::memcpy(&id, owner + start, (R - start) * sizeof(int32_t));
+      const Lanes32 background = id < 0, gains = narrow_mask(g > T(0)) & ~background;
+      for (uint32_t bits = lane_bits(narrow_mask(g < T(0)) & background); bits; bits &= bits - 1) {
+        const int64_t i = start + lowest_bit(bits);
+        if (in_rows) append_pull(rows, stride, j, i, -grad_row[i]);
+        if (i >= range.column_first && i < range.column_last) append_pull(columns, stride, i, j, -grad_row[i]);
+      }
+      const uint32_t gain_bits = lane_bits(gains);
+      if (!gain_bits) continue;
+      if (in_rows) {
+        rows.gain_first[j] = std::min(rows.gain_first[j], static_cast<T>(start));  // at least that
+        rows.gain_last[j] = static_cast<T>(start + kLanes - 1);                    // at most that
+      }
+      if (any_column) {
+        const LaneMask<T> here = widen_mask<T>(gains);
+        T *gain_first = columns.gain_first.data() + start, *gain_last = columns.gain_last.data() + start;
+        const Lanes<T> line_first = load_lanes<Lanes<T>>(gain_first), at = splat(static_cast<T>(j));
+        store_lanes(gain_first, select(here & (line_first > at), at, line_first));
+        store_lanes(gain_last, select(here, at, load_lanes<Lanes<T>>(gain_last)));
+      }
+    }
+  }
+  finish_lines(columns, stride, range.column_first, range.column_last);
+  finish_lines(rows, stride, range.row_first, range.row_last);
+}
+
+}  // namespace nmr

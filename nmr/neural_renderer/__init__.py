@@ -1,0 +1,43 @@
+"""The interface of neural_renderer_pytorch 1.1.3, on the CPU: ``import nmr.neural_renderer as nr``.
+
+Names, arguments, their order and defaults are those published; the images and gradients, too, but for defects that are
+put right (``docs/from-neural-renderer.md`` lists them). Everything is drawn by the operators of :mod:`nmr`. Images are
+``[B, 3, S, S]`` and ``[B, S, S]`` with row 0 at the top; vertices ``[B, V, 3]``, faces ``[B, F, 3]``, textures
+``[B, F, ts, ts, ts, 3]``.
+"""
+
+from .get_points_from_angles import get_points_from_angles
+from .lighting import lighting
+from .load_obj import load_obj
+from .look import look
+from .look_at import look_at
+from .mesh import Mesh
+from .perspective import perspective
+from .projection import projection
+from .rasterize import Rasterize, rasterize, rasterize_depth, rasterize_rgbad, rasterize_silhouettes
+from .renderer import Renderer
+from .save_obj import save_obj
+from .vertices_to_faces import vertices_to_faces
+
+__all__ = [
+    "Mesh",
+    "Rasterize",
+    "Renderer",
+    "get_points_from_angles",
+    "lighting",
+    "load_obj",
+    "look",
+    "look_at",
+    "perspective",
+    "projection",
+    "rasterize",
+    "rasterize_depth",
+    "rasterize_rgbad",
+    "rasterize_silhouettes",
+    "save_obj",
+    "vertices_to_faces",
+]
+
+# Of the interface; scripts ask for it.
+__version__ = "1.1.3"
+name = "neural_renderer_pytorch"

@@ -1,0 +1,36 @@
+"""Image files, for textures."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+_PILLOW = (
+    "images of textures are read and written by Pillow, which is not installed; run `pip install pillow`, or install "
+    "nmr-learn3d[data]"
+)
+
+
+def read_image(filename: str) -> np.ndarray:
+    """Colours ``[H, W, 3]`` float32 in [0, 1], row 0 = top: grey becomes RGB, alpha is left out, 16 bits stay."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError(_PILLOW) from error
+    with Image.open(filename) as image:
+        if image.mode.startswith("I"):
+            grey = np.asarray(image, dtype=np.float32) / 65535
+            return np.repeat(grey[:, :, None], 3, axis=2)
+        return np.asarray(image.convert("RGB"), dtype=np.float32) / 255
+
+
+def write_png(filename: str, image: np.ndarray) -> None:
+    """Colours ``[H, W, 3]``, clamped to [0, 1], as 8 bits."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError(_PILLOW) from error
+    partial = f"{filename}.part"
+    Image.fromarray(np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)).save(partial, format="PNG")
+    os.replace(partial, filename)

@@ -1,0 +1,28 @@
+"""Positions of a camera on a sphere."""
+
+from __future__ import annotations
+
+import numbers
+
+import torch
+from torch import Tensor
+
+from ..cameras import points_from_angles
+from ._convert import Numbers
+
+
+def get_points_from_angles(
+    distance: Numbers, elevation: Numbers, azimuth: Numbers, degrees: bool = True
+) -> tuple[float, float, float] | Tensor:
+    """Points ``(d cos e sin a, d sin e, -d cos e cos a)``: see :func:`nmr.cameras.points_from_angles`.
+
+    Three numbers give a tuple of three floats; where tensors, lists or arrays of B are among them the result is a
+    tensor ``[B, 3]``, which carries the gradients of the tensors. ``degrees=False`` takes the angles in radians.
+
+    >>> renderer.eye = nr.get_points_from_angles(2.732, 30, 45)
+    """
+    given = (distance, elevation, azimuth)
+    dtype = next((x.dtype for x in given if isinstance(x, Tensor) and x.is_floating_point()), torch.float64)
+    d, e, a = (torch.as_tensor(x, dtype=dtype) for x in given)
+    points = points_from_angles(d, e, a) if degrees else points_from_angles(d, torch.rad2deg(e), torch.rad2deg(a))
+    return tuple(points.tolist()) if all(isinstance(x, numbers.Real) for x in given) else points

@@ -1,0 +1,229 @@
+"""Wavefront .obj files, with their materials baked into texture cubes."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ._images import read_image
+
+WRAPPINGS = ("REPEAT", "MIRRORED_REPEAT", "CLAMP_TO_EDGE", "CLAMP_TO_BORDER")
+_GREY = 0.5  # of faces without a material
+
+
+@dataclass
+class _Obj:
+    """The lines of an .obj file that matter; polygons are fans of triangles, numbers count from 0."""
+
+    vertices: list = field(default_factory=list)
+    uv: list = field(default_factory=list)
+    faces: list = field(default_factory=list)  # (v0, v1, v2)
+    uv_faces: list = field(default_factory=list)  # (vt0, vt1, vt2), or (-1, -1, -1) without texture coordinates
+    materials: list = field(default_factory=list)  # of each face
+    libraries: list = field(default_factory=list)  # names of .mtl files
+
+
+def load_obj(
+    filename_obj: str | os.PathLike,
+    normalization: bool = True,
+    texture_size: int = 4,
+    load_texture: bool = False,
+    texture_wrapping: str = "REPEAT",
+    use_bilinear: bool = True,
+) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
+    """Read a mesh; polygons become fans of triangles.
+
+    Parameters
+    ----------
+    filename_obj : str or path
+    normalization : bool
+        Move and scale the mesh so that its box is centred on the origin with longest side 2.
+    texture_size : int
+        ts, texels along each axis of a texture cube.
+    load_texture : bool
+        Read the materials (``Kd``, ``map_Kd``) and the images, too. Needs Pillow where there are images.
+    texture_wrapping : {"REPEAT", "MIRRORED_REPEAT", "CLAMP_TO_EDGE", "CLAMP_TO_BORDER"}
+        What texture coordinates outside [0, 1] mean: see :func:`bake_textures`.
+    use_bilinear : bool
+        Blend the four nearest pixels of the image; otherwise take the nearest.
+
+    Returns
+    -------
+    vertices : float32 Tensor [V, 3]
+    faces : int32 Tensor [F, 3]
+    textures : float32 Tensor [F, ts, ts, ts, 3]
+        Only with ``load_texture``: the image where a material has one, else its colour ``Kd``, else grey.
+
+    Raises
+    ------
+    ValueError
+        For a file without vertices or faces, for a line that cannot be read or that refers to missing elements (the
+        message gives file and line), for another wrapping, and with ``load_texture`` for a file that names no .mtl.
+    FileNotFoundError
+        For a missing .obj, .mtl or image.
+    ImportError
+        If an image is wanted and Pillow is missing.
+
+    >>> vertices, faces, textures = nr.load_obj("chair.obj", texture_size=8, load_texture=True)
+    """
+    filename_obj = os.fspath(filename_obj)
+    if texture_wrapping not in WRAPPINGS:
+        raise ValueError(f"texture_wrapping must be one of {', '.join(WRAPPINGS)}, got {texture_wrapping!r}")
+    obj = _read_obj(filename_obj)
+    vertices = torch.tensor(obj.vertices, dtype=torch.float32)
+    faces = torch.tensor(obj.faces, dtype=torch.int32)
+    if normalization:
+        vertices = vertices - vertices.amin(0)
+        vertices = vertices / vertices.abs().max() * 2
+        vertices = vertices - vertices.amax(0) / 2
+    if not load_texture:
+        return vertices, faces
+    return vertices, faces, _textures(filename_obj, obj, texture_size, texture_wrapping, use_bilinear)
+
+
+def _read_obj(filename: str) -> _Obj:
+    obj, material = _Obj(), ""
+    with open(filename, encoding="utf-8", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            keyword, _, rest = line.strip().partition(" ")
+            try:
+                if keyword == "v":
+                    obj.vertices.append(_numbers(rest, 3))
+                elif keyword == "vt":
+                    obj.uv.append(_numbers(rest, 2))
+                elif keyword == "f":
+                    _add_polygon(obj, rest.split(), material)
+                elif keyword == "usemtl":
+                    material = rest.strip()
+                elif keyword == "mtllib":
+                    obj.libraries.append(rest.strip())
+            except (ValueError, IndexError) as error:
+                raise ValueError(f"{filename}, line {number}: {line.strip()!r} cannot be read: {error}") from None
+    if not obj.vertices or not obj.faces:
+        missing = "vertices (lines `v x y z`)" if not obj.vertices else "faces (lines `f 1 2 3`)"
+        raise ValueError(f"{filename} has no {missing}")
+    last = max(map(max, obj.faces))
+    if last >= len(obj.vertices):
+        raise ValueError(f"{filename}: a face refers to vertex {last + 1}, but there are {len(obj.vertices)}")
+    last = max(map(max, obj.uv_faces))
+    if last >= len(obj.uv):
+        raise ValueError(f"{filename}: a face refers to texture coordinate {last + 1}, but there are {len(obj.uv)}")
+    return obj
+
+
+def _numbers(rest: str, count: int) -> tuple[float, ...]:
+    values = tuple(float(x) for x in rest.split()[:count])
+    if len(values) < count:
+        raise ValueError(f"{count} numbers are needed")
+    return values
+
+
+def _add_polygon(obj: _Obj, corners: list[str], material: str) -> None:
+    if len(corners) < 3:
+        raise ValueError("a face needs three corners")
+    parts = [corner.split("/") for corner in corners]
+    points = [_index(part[0], len(obj.vertices)) for part in parts]
+    has_uv = all(len(part) > 1 and part[1] for part in parts)
+    uvs = [_index(part[1], len(obj.uv)) for part in parts] if has_uv else [-1] * len(parts)
+    for i in range(1, len(parts) - 1):
+        obj.faces.append((points[0], points[i], points[i + 1]))
+        obj.uv_faces.append((uvs[0], uvs[i], uvs[i + 1]))
+        obj.materials.append(material)
+
+
+def _index(text: str, count: int) -> int:
+    """From 1 for the first; negative numbers count back from the last one read."""
+    index = int(text)
+    if index == 0 or index < -count:
+        raise ValueError(f"there is no element {index}")
+    return index - 1 if index > 0 else count + index
+
+
+def load_mtl(filename_mtl: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Colours ``Kd`` and image names ``map_Kd`` of the materials of an .mtl file."""
+    colors, images, material = {}, {}, ""
+    with open(filename_mtl, encoding="utf-8", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            keyword, _, rest = line.strip().partition(" ")
+            if keyword == "newmtl":
+                material = rest.strip()
+            elif keyword == "map_Kd":
+                images[material] = rest.strip().replace("\\", "/")
+            elif keyword == "Kd":
+                try:
+                    colors[material] = np.array(_numbers(rest, 3), dtype=np.float32)
+                except ValueError as error:
+                    raise ValueError(
+                        f"{filename_mtl}, line {number}: {line.strip()!r} cannot be read: {error}"
+                    ) from None
+    return colors, images
+
+
+def _textures(filename_obj: str, obj: _Obj, texture_size: int, wrapping: str, bilinear: bool) -> Tensor:
+    if not obj.libraries:
+        raise ValueError(
+            f"{filename_obj} names no .mtl file (line `mtllib ...`); call load_obj with load_texture=False"
+        )
+    folder = os.path.dirname(filename_obj)
+    colors, images = {}, {}
+    for library in obj.libraries:
+        for one in [library] if os.path.exists(os.path.join(folder, library)) else library.split():
+            more_colors, more_images = load_mtl(os.path.join(folder, one))
+            colors.update(more_colors)
+            images.update(more_images)
+    materials = np.array(obj.materials)
+    uv_faces = np.array(obj.uv_faces)
+    textures = np.full((len(materials), texture_size, texture_size, texture_size, 3), _GREY, dtype=np.float32)
+    for name, color in colors.items():
+        textures[materials == name] = color
+    for name, filename in images.items():
+        chosen = (materials == name) & (uv_faces >= 0).all(1)
+        if chosen.any():
+            path = os.path.join(folder, filename)
+            if not os.path.exists(path):  # map_Kd may have options before the name
+                path = os.path.join(folder, filename.split()[-1])
+            uv = np.array(obj.uv, dtype=np.float32)[uv_faces[chosen]]
+            textures[chosen] = bake_textures(read_image(path), uv, texture_size, wrapping, bilinear)
+    return torch.from_numpy(textures)
+
+
+def bake_textures(image: np.ndarray, uv: np.ndarray, texture_size: int, wrapping: str, bilinear: bool) -> np.ndarray:
+    """Texture cubes ``[F, ts, ts, ts, 3]`` of faces with texture coordinates ``uv [F, 3, 2]`` in ``image [H, W, 3]``.
+
+    Texel (i, j, k) is the image at ``(i uv0 + j uv1 + k uv2) / (i + j + k)``, texel (0, 0, 0) at (0, 0); (0, 0) is the
+    centre of the pixel at the lower left, (1, 1) of that at the upper right. float32.
+
+    As in the published renderer the *corners* of a face are wrapped: a face over a seam of the image is drawn
+    backwards across it (split such faces, or use :class:`nmr.UVTexture`, which wraps at each pixel), and
+    "CLAMP_TO_BORDER" is black everywhere. Faces within one copy of the image keep their exact coordinates, 0 and 1
+    included (the published kernel wraps them again in each thread and exchanges 0 and 1 at random).
+    """
+    ts = texture_size
+    if wrapping == "CLAMP_TO_BORDER":
+        return np.zeros((len(uv), ts, ts, ts, 3), dtype=np.float32)
+    axis = np.linspace(0, 1, ts, dtype=np.float32)
+    weights = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    weights /= np.maximum(weights.sum(1, keepdims=True), np.float32(1e-12))
+    points = weights @ _wrap(np.asarray(uv, dtype=np.float32), wrapping)  # [F, ts^3, 2]
+    flipped = image[::-1].astype(np.float32)
+    if bilinear:
+        grid, source = torch.from_numpy(2 * points - 1), torch.tensor(flipped).permute(2, 0, 1)
+        colors = torch.nn.functional.grid_sample(source[None], grid[None], padding_mode="border", align_corners=True)
+        return colors[0].permute(1, 2, 0).reshape(len(uv), ts, ts, ts, 3).numpy()
+    x, y = np.floor(points * np.float32([image.shape[1] - 1, image.shape[0] - 1]) + 0.5).astype(np.int64).T
+    return flipped[y.T, x.T].reshape(len(uv), ts, ts, ts, 3)
+
+
+def _wrap(uv: np.ndarray, wrapping: str) -> np.ndarray:
+    if wrapping == "CLAMP_TO_EDGE":
+        return uv.clip(0, 1)
+    if wrapping == "MIRRORED_REPEAT":
+        return 1 - np.abs(np.mod(uv, 2) - 1)
+    # The copy of the image that holds the whole face, if one does; else each corner by itself.
+    low, high = uv.min(1, keepdims=True), uv.max(1, keepdims=True)
+    copy = np.minimum(np.floor(low), np.maximum(np.ceil(high) - 1, 0))
+    return np.where(high <= copy + 1, uv - copy, np.mod(uv, 1))

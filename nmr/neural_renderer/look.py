@@ -1,0 +1,21 @@
+"""From world space to the axes of a camera that looks in a direction."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..cameras import Orthographic
+from ._convert import Numbers, check_batch
+
+
+def look(vertices: Tensor, eye: Numbers, direction: Numbers = (0, 1, 0), up: Numbers | None = None) -> Tensor:
+    """Vertices in the axes of a camera at ``eye`` that looks along ``direction``: x right, y up, z forward.
+
+    As :func:`look_at`, with ``z = n(direction)``. ``up`` is (0, 1, 0) unless given; the default direction, which is
+    published so, is then degenerate: give another one.
+
+    >>> nr.perspective(nr.look(vertices, [0, 0, -3], [0, 0, 1]))
+    """
+    eye, direction = (torch.as_tensor(x).double() for x in (eye, direction))
+    return Orthographic(eye, eye + direction, (0, 1, 0) if up is None else up).transform(check_batch(vertices))

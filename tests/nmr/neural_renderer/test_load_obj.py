@@ -1,0 +1,145 @@
+import builtins
+
+import numpy as np
+import pytest
+import torch
+from vectors import load_vector, vector_names
+
+import nmr.neural_renderer as nr
+from nmr.neural_renderer.load_obj import bake_textures, load_mtl
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+
+def write(folder, **files):
+    for name, text in files.items():
+        (folder / name.replace("_", ".")).write_text(text)
+    return str(folder / "a.obj")
+
+
+def test_vertices_and_faces(tmp_path):
+    v = load_vector("load_obj")
+    path = write(tmp_path, a_obj=str(v["text"]))
+    vertices, faces = nr.load_obj(path, normalization=False)
+    assert vertices.dtype == torch.float32 and faces.dtype == torch.int32
+    assert np.array_equal(vertices.numpy(), v["vertices_raw"]) and np.array_equal(faces.numpy(), v["faces"])
+    vertices, _ = nr.load_obj(path)
+    np.testing.assert_allclose(vertices.numpy(), v["vertices_normalized"], atol=1e-6)
+
+
+def test_numbers_from_the_end_and_files_of_other_programs(tmp_path):
+    text = TRIANGLE.replace(" ", "\t", 1).replace("\t", " ") + "g x\nvn 0 0 1\nf -3//1 -2//1 -1//1\nv 9 9 9 1.0\n"
+    vertices, faces = nr.load_obj(tmp_path / write(tmp_path, a_obj=text.replace("\n", "\r\n")), False)
+    assert faces.tolist() == [[0, 1, 2]] and vertices.shape == (4, 3)
+
+
+@pytest.mark.parametrize("name", vector_names("texload_*"))
+def test_bake_textures(name):
+    v = load_vector(name)
+    # The vectors' image starts at the bottom, as the kernel gets it.
+    baked = bake_textures(v["image"][::-1], v["uv"], int(v["texture_size"]), str(v["wrapping"]), bool(v["bilinear"]))
+    chosen = v["is_update"] == 1
+    np.testing.assert_allclose(baked[chosen], v["textures"][chosen], atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (4, 1)])
+@pytest.mark.parametrize("bilinear", [True, False])
+def test_bake_images_of_one_row_or_column(shape, bilinear):
+    image = np.random.default_rng(0).random((*shape, 3), dtype=np.float32)
+    corner = np.array([[[0, 0], [1, 0], [1, 1]]], dtype=np.float32)
+    baked = bake_textures(image, corner, 3, "REPEAT", bilinear)
+    expected = image[-1, 0], image[-1, -1], image[0, -1]
+    for k, color in enumerate(expected):
+        np.testing.assert_allclose(baked[(0, *(2 * (np.arange(3) == k)))], color, atol=1e-6)
+
+
+def materials(tmp_path):
+    """Four faces: red by Kd, an image, no material, an image but no texture coordinates (its Kd counts)."""
+    image_module = pytest.importorskip("PIL.Image")
+    pixels = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    (tmp_path / "images").mkdir()
+    image_module.fromarray(pixels).save(tmp_path / "images" / "wood dark.png")
+    obj = "mtllib a.mtl\n" + TRIANGLE + "vt 0 0\nvt 1 0\nvt 1 1\nf 1 2 3\nusemtl red\nf 1 2 3\n"
+    obj += "usemtl dark wood\nf 1/1 2/2 3/3\nf 1 2 3\n"
+    mtl = "newmtl red\nKd 1 0 0.25\nnewmtl dark wood\nKd 0 0 1\nmap_Kd images\\wood dark.png\n"
+    return write(tmp_path, a_obj=obj, a_mtl=mtl), pixels
+
+
+def test_textures_of_materials(tmp_path):
+    path, pixels = materials(tmp_path)
+    _, faces, textures = nr.load_obj(path, texture_size=2, load_texture=True)
+    assert faces.shape == (4, 3) and textures.shape == (4, 2, 2, 2, 3) and textures.dtype == torch.float32
+    assert torch.all(textures[0] == 0.5)
+    assert torch.all(textures[1] == torch.tensor([1, 0, 0.25]))
+    for index, pixel in zip([(1, 0, 0), (0, 1, 0), (0, 0, 1)], [(7, 0), (7, 7), (0, 7)], strict=True):
+        np.testing.assert_allclose(textures[2][index].numpy(), pixels[pixel] / 255, atol=1e-5)
+    assert torch.all(textures[3] == torch.tensor([0, 0, 1.0]))
+
+
+def test_options_before_the_image_name_are_skipped(tmp_path):
+    image_module = pytest.importorskip("PIL.Image")
+    image_module.new("L", (2, 2), 51).save(tmp_path / "grey.png")
+    image_module.fromarray(np.full((2, 2), 13107, dtype=np.uint16)).save(tmp_path / "deep.png")
+    image_module.new("RGBA", (2, 2), (51, 51, 51, 0)).save(tmp_path / "clear.png")
+    for name in ("grey", "deep", "clear"):
+        obj = "mtllib a.mtl\n" + TRIANGLE + "vt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
+        path = write(tmp_path, a_obj=obj, a_mtl=f"newmtl m\nmap_Kd -s 1 1 1 {name}.png\n")
+        _, _, textures = nr.load_obj(path, load_texture=True)
+        torch.testing.assert_close(textures, torch.full_like(textures, 0.2))
+
+
+def test_material_file_beside_the_obj_is_found_from_elsewhere(tmp_path, monkeypatch):
+    write(tmp_path, a_obj="mtllib a.mtl\n" + TRIANGLE + "f 1 2 3\n", a_mtl="newmtl x\nKd 1 1 1\n")
+    monkeypatch.chdir(tmp_path.parent)
+    assert len(nr.load_obj(f"{tmp_path.name}/a.obj", load_texture=True)) == 3
+    assert load_mtl(tmp_path / "a.mtl")[0]["x"].tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("f 1 2 3\n", "there is no element|refers to vertex|no vertices"),
+        (TRIANGLE, r"has no faces"),
+        ("", "has no vertices"),
+        (TRIANGLE + "f 1 2 4\n", "refers to vertex 4, but there are 3"),
+        (TRIANGLE + "f 1 2 0\n", "line 4: 'f 1 2 0' cannot be read: there is no element 0"),
+        (TRIANGLE + "f 1 2 -4\n", "there is no element -4"),
+        (TRIANGLE + "f 1 2\n", "a face needs three corners"),
+        (TRIANGLE + "f a b c\n", "line 4.*cannot be read"),
+        ("v 1 2\n", "line 1.*3 numbers are needed"),
+        (TRIANGLE + "vt 0 0\nf 1/1 2/2 3/1\n", "refers to texture coordinate 2, but there are 1"),
+    ],
+)
+def test_errors_of_files(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        nr.load_obj(write(tmp_path, a_obj=text))
+
+
+def test_errors(tmp_path, monkeypatch):
+    path = write(tmp_path, a_obj=TRIANGLE + "f 1 2 3\n")
+    with pytest.raises(ValueError, match="names no"):
+        nr.load_obj(path, load_texture=True)
+    with pytest.raises(ValueError, match="texture_wrapping must be one of REPEAT"):
+        nr.load_obj(path, texture_wrapping="WRAP")
+    with pytest.raises(FileNotFoundError):
+        nr.load_obj(tmp_path / "b.obj")
+    (tmp_path / "a.mtl").write_text("newmtl x\nKd 1 1\n")
+    with pytest.raises(ValueError, match=r"a.mtl, line 2.*3 numbers are needed"):
+        load_mtl(tmp_path / "a.mtl")
+
+
+def test_images_without_pillow(tmp_path, monkeypatch):
+    path, _ = materials(tmp_path)
+    original = builtins.__import__
+
+    def without_pillow(name, *args, **kwargs):
+        if name.startswith("PIL"):
+            raise ImportError(name)
+        return original(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without_pillow)
+    assert len(nr.load_obj(path)) == 2
+    with pytest.raises(ImportError, match=r"pip install pillow"):
+        nr.load_obj(path, load_texture=True)
+    with pytest.raises(ImportError, match=r"pip install pillow"):
+        nr.save_obj(tmp_path / "b.obj", torch.rand(3, 3), torch.tensor([[0, 1, 2]]), torch.rand(1, 2, 2, 2, 3))

@@ -1,0 +1,308 @@
+import copy
+import inspect
+import math
+
+import numpy as np
+import pytest
+import torch
+from vectors import load_vector, vector_names
+
+import nmr
+import nmr.neural_renderer as nr
+
+RENDERERS = vector_names("renderer_*")
+OUTPUTS = {"rgb": ("rgb",), "silhouettes": ("alpha",), "depth": ("depth",), "all": ("rgb", "depth", "alpha")}
+
+
+def sphere(batch=2):
+    vertices, faces = nmr.icosphere(1)
+    return vertices.expand(batch, -1, -1), faces.expand(batch, -1, -1)
+
+
+@pytest.mark.parametrize("name", RENDERERS)
+def test_vectors(name):
+    v = load_vector(name)
+    renderer = nr.Renderer(camera_mode=str(v["camera_mode"]))
+    for key in v:
+        if key.startswith("renderer_"):
+            setattr(renderer, key.removeprefix("renderer_"), v[key].tolist())
+    inputs = {key: torch.from_numpy(v[key]).requires_grad_() for key in ("vertices", "textures")}
+    inputs |= {
+        key.removeprefix("param_"): torch.from_numpy(v[key]).requires_grad_() for key in v if key.startswith("param_")
+    }
+    for key in set(inputs) - {"vertices", "textures"}:
+        setattr(renderer, key, inputs[key])
+    faces = torch.from_numpy(v["faces"]).expand(len(v["vertices"]), -1, -1)
+    mode = str(v["output"])
+    images = renderer(inputs["vertices"], faces, inputs["textures"], mode=None if mode == "all" else mode)
+    images = dict(zip(OUTPUTS[mode], images if mode == "all" else [images], strict=True))
+    torch.autograd.backward(list(images.values()), [torch.from_numpy(v[f"upstream_{o}"]) for o in images])
+    for output, image in images.items():
+        close = np.isclose(image.detach().numpy(), v[f"out_{output}"], rtol=1e-5, atol=1e-5)
+        close[tuple(v[f"fragile_{output}"].T)] = True
+        assert close.all(), f"{output}: {np.argwhere(~close)[:5]}"
+    for key in inputs:
+        if f"grad_{key}" in v:
+            expected = v[f"grad_{key}"]
+            # How far a contracted multiply-add moves the published gradient says how far rounding may.
+            latitude = np.linalg.norm(v.get(f"grad_{key}_fma", expected) - expected) / np.linalg.norm(expected)
+            error = np.linalg.norm(inputs[key].grad.numpy() - expected) / np.linalg.norm(expected)
+            # The camera rounds otherwise, too: its published formula in float64 moves gradients by up to 2e-4.
+            assert error <= max(5 * latitude, 1e-3), f"{key}: {error}, latitude {latitude}"
+
+
+def test_arguments_and_defaults_of_the_published_interface():
+    camera = "K=None, R=None, t=None, dist_coeffs=None, orig_size=None"
+    raster = "image_size=256, anti_aliasing=True, near=0.1, far=100, eps=0.0001"
+    published = {
+        nr.Renderer: "image_size=256, anti_aliasing=True, background_color=(0, 0, 0), fill_back=True, "
+        "camera_mode='projection', K=None, R=None, t=None, dist_coeffs=None, orig_size=1024, perspective=True, "
+        "viewing_angle=30, camera_direction=(0, 0, 1), near=0.1, far=100, light_intensity_ambient=0.5, "
+        "light_intensity_directional=0.5, light_color_ambient=(1, 1, 1), light_color_directional=(1, 1, 1), "
+        "light_direction=(0, 1, 0)",
+        nr.Renderer.forward: f"self, vertices, faces, textures=None, mode=None, {camera}",
+        nr.Renderer.render: f"self, vertices, faces, textures, {camera}",
+        nr.Renderer.render_rgb: f"self, vertices, faces, textures, {camera}",
+        nr.Renderer.render_silhouettes: f"self, vertices, faces, {camera}",
+        nr.Renderer.render_depth: f"self, vertices, faces, {camera}",
+        nr.rasterize_rgbad: f"faces, textures=None, {raster}, background_color=(0, 0, 0), return_rgb=True, "
+        "return_alpha=True, return_depth=True",
+        nr.rasterize: f"faces, textures, {raster}, background_color=(0, 0, 0)",
+        nr.rasterize_silhouettes: f"faces, {raster}",
+        nr.rasterize_depth: f"faces, {raster}",
+        nr.Rasterize: "image_size, near, far, eps, background_color, return_rgb=False, return_alpha=False, "
+        "return_depth=False",
+        nr.look_at: "vertices, eye, at=(0, 0, 0), up=(0, 1, 0)",
+        nr.look: "vertices, eye, direction=(0, 1, 0), up=None",
+        nr.perspective: "vertices, angle=30.0",
+        nr.projection: "vertices, K, R, t, dist_coeffs, orig_size, eps=1e-09",
+        nr.get_points_from_angles: "distance, elevation, azimuth, degrees=True",
+        nr.lighting: "faces, textures, intensity_ambient=0.5, intensity_directional=0.5, color_ambient=(1, 1, 1), "
+        "color_directional=(1, 1, 1), direction=(0, 1, 0)",
+        nr.vertices_to_faces: "vertices, faces",
+        nr.load_obj: "filename_obj, normalization=True, texture_size=4, load_texture=False, "
+        "texture_wrapping='REPEAT', use_bilinear=True",
+        nr.save_obj: "filename, vertices, faces, textures=None",
+        nr.Mesh: "vertices, faces, textures=None, texture_size=4",
+        nr.Mesh.fromobj: "filename_obj, normalization=True, load_texture=False, texture_size=4",
+    }
+    for function, expected in published.items():
+        parameters = inspect.signature(function).parameters.values()
+        plain = [p.replace(annotation=inspect.Parameter.empty) for p in parameters]
+        assert ", ".join(map(str, plain)) == expected, function
+    assert nr.__version__ == "1.1.3"
+
+
+def test_modules_of_the_published_package():
+    from nmr.neural_renderer.get_points_from_angles import get_points_from_angles
+    from nmr.neural_renderer.lighting import lighting
+    from nmr.neural_renderer.load_obj import load_mtl, load_obj
+    from nmr.neural_renderer.look import look
+    from nmr.neural_renderer.look_at import look_at
+    from nmr.neural_renderer.mesh import Mesh
+    from nmr.neural_renderer.perspective import perspective
+    from nmr.neural_renderer.projection import projection
+    from nmr.neural_renderer.rasterize import DEFAULT_BACKGROUND_COLOR, Rasterize, rasterize_depth
+    from nmr.neural_renderer.renderer import Renderer
+    from nmr.neural_renderer.save_obj import create_texture_image, save_obj
+    from nmr.neural_renderer.vertices_to_faces import vertices_to_faces
+
+    names = (get_points_from_angles, lighting, load_obj, look, look_at, Mesh, perspective, projection, Rasterize)
+    for one in (*names, rasterize_depth, Renderer, save_obj, vertices_to_faces):
+        assert getattr(nr, one.__name__) is one
+    assert callable(load_mtl) and callable(create_texture_image) and DEFAULT_BACKGROUND_COLOR == (0, 0, 0)
+
+
+def test_defaults_of_attributes():
+    renderer = nr.Renderer(camera_mode="look_at", viewing_angle=15)
+    assert renderer.eye == [0, 0, -(1 / math.tan(math.radians(15)) + 1)]
+    assert renderer.rasterizer_eps == 1e-3 and isinstance(renderer, torch.nn.Module)
+    assert not list(renderer.parameters()) and not renderer.state_dict()
+
+
+def test_modes_of_a_call():
+    vertices, faces = sphere()
+    textures = torch.rand(2, 80, 2, 2, 2, 3)
+    renderer = nr.Renderer(camera_mode="look_at", image_size=16)
+    rgb, depth, alpha = renderer(vertices, faces, textures)
+    assert torch.equal(renderer(vertices, faces, textures, mode="rgb"), rgb)
+    assert torch.equal(renderer(vertices, faces, textures, "".join(["r", "gb"])), rgb)
+    assert torch.equal(renderer(vertices, faces, mode="silhouettes"), alpha)
+    assert torch.equal(renderer(vertices, faces, mode="depth"), depth)
+    with pytest.raises(ValueError, match="mode must be None, 'rgb', 'silhouettes' or 'depth', got 'normals'"):
+        renderer(vertices, faces, mode="normals")
+
+
+@pytest.mark.parametrize("mode", ["None", "none", None])
+def test_vertices_in_renderer_space(mode):
+    vertices, faces = sphere()
+    vertices = vertices * 0.5 + torch.tensor([0, 0, 2.0])
+    image = nr.Renderer(camera_mode=mode, image_size=16).render_silhouettes(vertices, faces)
+    assert torch.equal(image, nmr.render_silhouette(vertices, faces, image_size=16))
+    renderer = nr.Renderer(image_size=16)
+    renderer.camera_mode = mode
+    assert torch.equal(image, renderer.render_silhouettes(vertices, faces))
+
+
+def test_chainer_default_is_look_at():
+    vertices, faces = sphere()
+    image = nr.Renderer(image_size=16).render_silhouettes(vertices, faces)
+    assert image.any() and torch.equal(
+        image, nr.Renderer(image_size=16, camera_mode="look_at").render_silhouettes(vertices, faces)
+    )
+
+
+def test_cameras_of_a_call_win_over_those_of_the_renderer():
+    vertices, faces = sphere()
+    K, R, t = np.diag([64.0, 64, 1]).astype(np.float32), np.eye(3, dtype=np.float32), np.array([[[0, 0, 4.0]]])
+    K[:2, 2] = 32
+    expected = nr.Renderer(16, K=K[None], R=R[None], t=t, orig_size=64).render_silhouettes(vertices, faces)
+    assert 0.05 < expected.mean() < 0.9
+    renderer = nr.Renderer(16, K=torch.eye(3)[None], R=torch.eye(3)[None], t=torch.zeros(1, 1, 3))
+    given = dict(K=torch.from_numpy(K)[None], R=torch.from_numpy(R)[None], t=torch.from_numpy(t), orig_size=64)
+    assert torch.equal(renderer(vertices, faces, mode="silhouettes", **given), expected)
+    given["dist_coeffs"] = torch.tensor([[0.5, 0, 0, 0, 0]])
+    assert not torch.equal(renderer.render_silhouettes(vertices, faces, **given), expected)
+
+
+@pytest.mark.parametrize(
+    "convert", [list, tuple, np.array, torch.tensor, lambda x: torch.nn.Parameter(torch.tensor(x))]
+)
+@pytest.mark.parametrize("batch", [False, True])
+def test_eyes_and_colours_in_any_container(convert, batch):
+    vertices, faces = sphere()
+    renderer = nr.Renderer(camera_mode="look", image_size=16)
+    textures = torch.rand(2, 80, 2, 2, 2, 3)
+
+    def give(value):
+        return convert([value] * 2 if batch else value)
+
+    def images():
+        renderer.eye, renderer.camera_direction = give([0.5, 0.6, -3.0]), give([-0.5, -0.6, 3.0])
+        renderer.background_color, renderer.light_direction = give([0.1, 0.2, 0.3]), give([0.0, 1.0, -1.0])
+        renderer.light_color_ambient = renderer.light_color_directional = give([0.9, 0.8, 0.7])
+        return renderer(vertices, faces, textures, mode="rgb")
+
+    out = images()
+    batch, convert = False, torch.tensor
+    torch.testing.assert_close(images(), out)
+
+
+@pytest.mark.parametrize("dtype", [torch.int16, torch.int32, torch.int64, torch.float32])
+def test_faces_of_any_type(dtype):
+    vertices, faces = sphere()
+    renderer = nr.Renderer(camera_mode="look_at", image_size=16)
+    expected = renderer.render_silhouettes(vertices, faces)
+    assert torch.equal(renderer.render_silhouettes(vertices, faces.to(dtype)), expected)
+    assert torch.equal(renderer.render_silhouettes(vertices, faces[:1].to(dtype)), expected)
+    assert torch.equal(renderer.render_silhouettes(vertices, faces[0].to(dtype)), expected)
+
+
+def test_one_mesh_seen_by_many_cameras():
+    vertices, faces = sphere(1)
+    textures = torch.rand(1, 80, 2, 2, 2, 3)
+    renderer = nr.Renderer(camera_mode="look_at", image_size=16)
+    eyes = nr.get_points_from_angles(torch.full((3,), 3.0), torch.zeros(3), torch.tensor([0.0, 100, 200]))
+    renderer.eye = eyes
+    rgb, depth, alpha = renderer(vertices, faces, textures)
+    for b in range(3):
+        renderer.eye = eyes[b]
+        for one, image in zip(renderer(vertices, faces, textures), (rgb, depth, alpha), strict=True):
+            torch.testing.assert_close(one[0], image[b])
+
+
+def test_different_faces_of_one_set_of_vertices():
+    vertices, faces = sphere(2)
+    faces = torch.stack([faces[0], faces[1].roll(7, 0)])
+    textures = torch.rand(2, 80, 2, 2, 2, 3)
+    renderer = nr.Renderer(camera_mode="look_at", image_size=16)
+    rgb = renderer.render_rgb(vertices[:1], faces, textures)
+    assert torch.equal(rgb, renderer.render_rgb(vertices, faces, textures))
+
+
+def test_silhouettes_and_depth_have_their_own_range_as_published():
+    vertices, faces = sphere()
+    renderer = nr.Renderer(camera_mode="look_at", image_size=16, near=1e-3, far=1.5)
+    assert renderer.render_silhouettes(vertices, faces).any() and renderer.render_depth(vertices, faces).max() == 100
+    _, depth, alpha = renderer(vertices, faces, torch.rand(2, 80, 2, 2, 2, 3))
+    assert not alpha.any() and torch.all(depth == 1.5)
+
+
+def test_light_without_direction_leaves_flat_colours():
+    vertices, faces = sphere()
+    renderer = nr.Renderer(camera_mode="look_at", image_size=16, anti_aliasing=False)
+    renderer.light_intensity_directional, renderer.light_intensity_ambient = 0, 1
+    rgb, _, alpha = renderer(vertices, faces, torch.full((2, 80, 2, 2, 2, 3), 0.25))
+    torch.testing.assert_close(rgb, 0.25 * alpha[:, None].expand(-1, 3, -1, -1))
+
+
+def test_renderers_can_be_copied_and_nested():
+    class Model(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.renderer = nr.Renderer(camera_mode="look_at", image_size=16)
+            self.renderer.eye = torch.nn.Parameter(torch.tensor([0.0, 0, -3]))
+
+    model = copy.deepcopy(Model())
+    assert [name for name, _ in model.named_parameters()] == ["renderer.eye"]
+    model.renderer.eye = nr.get_points_from_angles(2.7, 0, 90)
+    assert not list(model.parameters()) and model.renderer.render_silhouettes(*sphere()).any()
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda r, v, f: r.render_silhouettes(v[0], f), ValueError, r"use vertices\[None\]"),
+        (lambda r, v, f: r.render_silhouettes(v.numpy(), f), TypeError, "vertices must be a float tensor"),
+        (lambda r, v, f: r.render_silhouettes(v.half(), f), TypeError, "vertices.float()"),
+        (lambda r, v, f: r.render_silhouettes(v, f.tolist()), TypeError, "faces must be an integer tensor"),
+        (lambda r, v, f: r.render_silhouettes(v, f + 1), ValueError, "faces"),
+        (lambda r, v, f: r.render_rgb(v, f + 1, torch.rand(2, 80, 2, 2, 2, 3)), ValueError, "faces"),
+        (lambda r, v, f: r.render_silhouettes(v[:1].expand(3, -1, -1), f), ValueError, "batch size"),
+        (lambda r, v, f: r.render_rgb(v, f, torch.rand(2, 79, 2, 2, 2, 3)), ValueError, "number of faces"),
+        (lambda r, v, f: r.render_rgb(v, f, None), ValueError, "RGB images need textures"),
+        (lambda r, v, f: r(v, f), ValueError, "RGB images need textures"),
+        (
+            lambda r, v, f: nr.Renderer(K=torch.eye(3), t=[0, 0, 1]).render_depth(v, f),
+            ValueError,
+            "K, R and t; missing: R;",
+        ),
+        (lambda r, v, f: nr.Renderer(K=torch.eye(3)).render_depth(v, f), ValueError, "missing: R, t;"),
+        (lambda r, v, f: nr.Renderer(camera_mode="orthographic"), ValueError, "camera_mode must be"),
+    ],
+)
+def test_errors(call, error, message):
+    with pytest.raises(error, match=message):
+        call(nr.Renderer(camera_mode="look_at", image_size=16), *sphere())
+
+
+def test_a_mesh_without_faces():
+    vertices, faces = sphere()
+    renderer = nr.Renderer(camera_mode="look_at", image_size=16, background_color=[0.1, 0.2, 0.3])
+    rgb, depth, alpha = renderer(vertices, faces[:, :0], torch.rand(2, 0, 2, 2, 2, 3))
+    assert torch.equal(rgb[1, :, 3, 4], torch.tensor([0.1, 0.2, 0.3])) and torch.all(depth == 100) and not alpha.any()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_tensors_are_staged_through_the_host():
+    vertices, faces = sphere()
+    textures = torch.rand(2, 80, 2, 2, 2, 3)
+    leaf = vertices.cuda().requires_grad_()
+    renderer = nr.Renderer(camera_mode="look", image_size=16).cuda()
+    images = renderer(leaf, faces.cuda(), textures.cuda())
+    sum(image.sum() for image in images).backward()
+    assert leaf.grad.is_cuda and leaf.grad.any()
+    for image, expected in zip(images, renderer(vertices, faces, textures), strict=True):
+        assert image.is_cuda
+        torch.testing.assert_close(image.cpu(), expected)
+
+
+def test_cameras_and_light_of_different_batches():
+    vertices, faces = sphere()
+    renderer = nr.Renderer(camera_mode="look_at", image_size=16)
+    renderer.eye = torch.rand(3, 3)
+    with pytest.raises(ValueError, match="one batch size"):
+        renderer.render_silhouettes(vertices, faces)
+    renderer.light_direction = torch.rand(2, 3)
+    with pytest.raises(ValueError, match="light for 2 images, but 3 are drawn"):
+        renderer(vertices[:1], faces[:1], torch.rand(1, 80, 2, 2, 2, 3))

@@ -1,0 +1,177 @@
+"""tools/bench.py: every program does the same work, the counts are right, and the table tells a missed target."""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import nmr
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
+
+import bench
+import bench_count
+import bench_memory
+import bench_peers
+import bench_step
+import bench_work
+
+needs_deodr = pytest.mark.skipif(not bench_peers.has_deodr(), reason="deodr is not installed")
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Calls bench.main with arguments; without deodr, and torch keeps its threads."""
+    threads = torch.get_num_threads()
+    monkeypatch.setattr(bench_peers, "has_deodr", lambda: False)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["bench.py", *map(str, arguments)])
+        bench.main()
+
+    yield call
+    torch.set_num_threads(threads)
+
+
+@needs_deodr
+def test_deodr_must_draw_what_we_draw():
+    spheres = bench_work.deformed_spheres(2, 3, 64, True, ("depth",))
+    bench_peers.check_same_image(spheres, bench_peers.deodr_mesh(spheres.faces))
+    with pytest.raises(SystemExit, match="different images"):
+        bench_peers.check_same_image(spheres, bench_peers.deodr_mesh(spheres.faces.flip(1)))  # the far side
+
+
+@needs_deodr
+def test_deodrs_depth_has_our_gradient():
+    spheres = bench_work.deformed_spheres(1, 3, 64, False, ("depth",))
+    vertices, mesh = spheres.camera.transform(spheres.vertices), bench_peers.deodr_mesh(spheres.faces)
+    inner = torch.zeros(1, 64, 64)
+    inner[:, 24:40, 24:40] = 1
+    grads = []
+    for draw in (
+        lambda leaf: nmr.render_depth(leaf, spheres.faces, image_size=64, anti_aliasing=False),
+        lambda leaf: bench_peers.DeodrImages.apply(leaf, 64, mesh, "depth"),
+    ):
+        leaf = vertices.clone().requires_grad_()
+        draw(leaf).backward(inner)
+        grads.append(leaf.grad[..., 2].flatten())
+    assert torch.corrcoef(torch.stack(grads))[0, 1] > 0.98
+
+
+def test_a_chain_of_torch_calls_is_our_function():
+    spheres = bench_work.deformed_spheres(3, 2, 8, True)
+    edges, camera = nmr.edge_table(spheres.faces), spheres.camera
+    for ours, chain in (
+        (lambda v: nmr.losses.smoothness_loss(v, edges), lambda v: bench_peers.smoothness_chain(v, edges)),
+        (camera.transform, lambda v: bench_peers.camera_chain(v, camera.eye, camera.half_fov_deg)),
+    ):
+        grads = []
+        for function in (ours, chain):
+            leaf = spheres.vertices.double().requires_grad_()
+            function(leaf).square().sum().backward()
+            grads.append(leaf.grad)
+        torch.testing.assert_close(*grads, rtol=1e-6, atol=1e-8)
+        with pytest.raises(SystemExit, match="comparison is invalid"):
+            bench_peers.against_chain(ours, lambda v, chain=chain: 1.1 * chain(v), spheres.vertices, 1e-5, 1)
+
+
+def test_counts_of_a_triangle():
+    """Legs along pixel borders: columns 3..10 hold 8..1 pixels, all from row 3 on."""
+    corners = np.array([[[2.5, 2.5, 1.0], [10.5, 2.5, 1.0], [2.5, 10.5, 1.0]]])
+    fill, owner = bench_count.count_fill(corners, 16)
+    assert fill["faces filled"] == 1 and fill["rows of eight tested"] == 8
+    assert fill["pixels inside"] == fill["pixels covered"] == 36
+    # By columns and by rows: two edges of eight lines. Beyond a leg there are 3 pixels, beyond the long side 13 - k.
+    n = bench_count.count_sweeps(corners, owner, np.where(owner < 0, -1.0, 1.0))
+    assert n["crossings prepared"] == n["sweeps outside"] == n["sweeps inside"] == 2 * 2 * 8
+    assert n["pulls outside"] == 2 * (8 * 3 + sum(13 - k for k in range(1, 9)))
+    assert n["pulls inside"] == 2 * 2 * 36
+    # A leg's three come in one vector; of the 16 - k of a column all are read, since the first vector holds some.
+    assert n["pulls outside, by eight"] == 2 * (8 + 7 * 2 + 1)
+
+
+def test_depths_are_computed_only_where_ranges_overlap():
+    triangle = np.array([[[2.5, 2.5, 1.0], [10.5, 2.5, 1.0], [2.5, 10.5, 1.0]]])
+    behind, tilted = triangle + [0, 0, 1], triangle + [[[0, 0, 0.5], [0, 0, -0.5], [0, 0, 0.5]]]
+    for faces, expected in (
+        ((triangle, behind), 0),
+        ((behind, triangle), 0),
+        ((triangle, tilted), 72),
+        ((tilted, triangle), 72),
+    ):
+        assert bench_count.count_fill(np.concatenate(faces), 16)[0]["exact depths"] == expected
+
+
+def test_counted_owners_are_the_kernels():
+    counts = bench_count.count(bench_work.deformed_spheres(2, 2, 24, True))
+    assert counts["disagreement"] == 0
+    assert counts["pixels covered"] > 0 and counts["exact depths"] > 0 and counts["pulls outside"] > 0
+
+
+class SlowBackward(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x):
+        return 2 * x
+
+    @staticmethod
+    def backward(ctx, grad):
+        time.sleep(0.01)
+        return 2 * grad
+
+
+def test_the_stopwatch_times_both_ways_and_changes_no_gradient():
+    watch = bench_step.Stopwatch()
+    x = torch.ones(3, requires_grad=True)
+    y = watch.timed("slow", SlowBackward.apply)(x)
+    watch.timed("sum", torch.sum)(y * y).backward()
+    assert x.grad.tolist() == [8.0, 8.0, 8.0]
+    assert watch.seconds["slow", "backward"] >= 0.01
+    assert set(watch.seconds) == {(part, way) for part in ("slow", "sum") for way in ("forward", "backward")}
+
+
+@pytest.mark.skipif(not bench_memory.STATUS.exists(), reason="only Linux has /proc")
+def test_the_peak_is_no_less_than_what_is_there():
+    before = bench_memory.resident("VmRSS")
+    block = torch.ones(1 << 23)
+    assert bench_memory.resident("VmRSS") - before > 0.9 * block.nbytes
+    assert bench_memory.resident("VmHWM") >= 0.99 * bench_memory.resident("VmRSS")
+
+
+def result(key, *programs):
+    rows = [bench_work.Row(name, None, total, total / 2) for name, total in programs]
+    return bench_work.Result(key, f"workload {key}", rows)
+
+
+def test_the_table_marks_what_misses_its_target():
+    fast = result("w3", ("nmr, 2 threads", 7.9), ("deodr, 1 process", 11.6))
+    slow = result("w4, 64", ("nmr, 2 threads", 8.1), ("nmr, 2 threads, both", 20.0), ("deodr", 51.6))
+    other = result("cameras", ("nmr, 2 threads", 1000.0))
+    assert list(map(bench.missed, (fast, slow, other))) == [False, True, False]
+    assert bench.markdown([fast, slow, other]).splitlines()[2:] == [
+        "| workload w3 | **7.90** ms (2 threads); fastest 3.95 | deodr, 1 process 11.6 | <= 8 ms |",
+        "| workload w4, 64 | **8.10** ms (2 threads); fastest 4.05 | deodr 51.6 | <= 8 ms: missed |",
+        "|  | **20.00** ms (2 threads, both); fastest 10.00 | - | - |",
+        "| workload cameras | **1000.00** ms (2 threads); fastest 500.00 | - | - |",
+    ]
+
+
+def test_a_missed_target_is_exit_code_1(command, monkeypatch, capsys):
+    monkeypatch.setattr(bench, "bench_all", lambda options: [result("w2", ("nmr", 12.1))])
+    with pytest.raises(SystemExit, match=r"targets missed:\nworkload w2: 12\.10 > 12 "):
+        command("all")
+    monkeypatch.setattr(bench, "bench_all", lambda options: [result("w2", ("nmr", 11.9))])
+    command("all")
+
+
+def test_commands(command, tmp_path, capsys):
+    for workload in ("w1", "w4"):
+        command(workload, "--batch", 2, "--repeats", 1, "--no-definition", "--json", tmp_path / "figures.json")
+        (figures,) = json.loads((tmp_path / "figures.json").read_text())
+        assert figures["key"] == f"{workload}, 2" and figures["settings"]["batch"] == 2
+        assert all(row["total"] > row["forward"] > 0 for row in figures["rows"])
+    command("count", "--batch", 1)
+    assert "pulls outside" in capsys.readouterr().out

@@ -1,0 +1,228 @@
+"""Other programs for the same work: deodr, the slow definition, and chains of torch calls."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import multiprocessing
+import time
+
+import numpy as np
+import torch
+from bench_work import Program, Timing, Workload, run_chain
+from torch import Tensor
+
+import nmr
+from nmr import reference
+
+FAR = 100.0  # nmr.render_depth's default
+
+# --- deodr: a 2.5-D renderer with derivatives, one mesh at a time on one thread
+
+
+def has_deodr() -> bool:
+    return importlib.util.find_spec("deodr") is not None
+
+
+def deodr_mesh(faces: Tensor):
+    from deodr.triangulated_mesh import TriMeshAdjacencies
+
+    return TriMeshAdjacencies(
+        faces.numpy().astype(np.uint32), clockwise=True
+    )  # on the screen: the world is left-handed
+
+
+class DeodrImages(torch.autograd.Function):
+    """Vertices in renderer space to images ``[B, S, S]``: silhouettes, or depths as a colour of the vertices."""
+
+    @staticmethod
+    def forward(ctx, vertices: Tensor, size: int, mesh, output: str) -> Tensor:
+        from deodr.differentiable_renderer import Scene2D
+
+        points, ctx.size, ctx.output, ctx.scenes, images = vertices.detach().double().numpy(), size, output, [], []
+        num_vertices, num_faces = points.shape[1], mesh.faces.shape[0]
+        zeros, no_faces = np.zeros((num_vertices, 2)), np.zeros(num_faces, dtype=bool)
+        for xyz in points:
+            ij = np.stack([(xyz[:, 0] + 1) * size / 2 - 0.5, (1 - xyz[:, 1]) * size / 2 - 0.5], axis=1)
+            scene = Scene2D(
+                faces=mesh.faces,
+                faces_uv=mesh.faces,
+                ij=ij,
+                depths=xyz[:, 2].copy(),
+                textured=no_faces,
+                uv=zeros,
+                shade=np.zeros(num_vertices),
+                colors=np.ones((num_vertices, 1)) if output == "alpha" else xyz[:, 2:].copy(),
+                shaded=no_faces,
+                edgeflags=mesh.edge_on_silhouette(ij),
+                height=size,
+                width=size,
+                nb_colors=1,
+                texture=np.zeros((0, 0, 1)),
+                background_color=np.zeros(1) if output == "alpha" else np.full(1, FAR),
+                clockwise=mesh.clockwise,
+                backface_culling=True,
+            )
+            images.append(scene.render()[0][..., 0])
+            ctx.scenes.append(scene)
+        return torch.from_numpy(np.stack(images)).to(vertices)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):
+        result = np.zeros((len(ctx.scenes), ctx.scenes[0].ij.shape[0], 3))
+        for b, scene in enumerate(ctx.scenes):
+            scene.clear_gradients()
+            scene.render_backward(grad[b].double().numpy()[..., None].copy())
+            result[b, :, 0] = scene.ij_b[:, 0] * ctx.size / 2
+            result[b, :, 1] = -scene.ij_b[:, 1] * ctx.size / 2
+            if ctx.output == "depth":
+                result[b, :, 2] = scene.colors_b[:, 0]
+        return torch.from_numpy(result).to(grad), None, None, None
+
+
+def run_deodr(workload: Workload, targets: tuple[Tensor, ...], mesh, pooled: bool) -> Timing:
+    """At the size of the image; or pooled, at the inner resolution of ours and averaged."""
+    (output,) = workload.outputs
+    leaf = workload.vertices.clone().requires_grad_()
+    start = time.perf_counter()
+    size = workload.raster_size if pooled else workload.size
+    image = DeodrImages.apply(workload.camera.transform(leaf), size, mesh, output)
+    if pooled:
+        image = torch.nn.functional.avg_pool2d(image[:, None], 2)[:, 0]
+    forward = time.perf_counter()
+    workload.loss((image,), targets).backward()
+    return forward - start, time.perf_counter() - start
+
+
+def deodr_process(connection, workload: Workload, targets: tuple[Tensor, ...]) -> None:
+    """Serves a part of the batch: renders whenever it is asked to, pooled or not, until it gets None."""
+    torch.set_num_threads(1)
+    mesh = deodr_mesh(workload.faces)
+    while (pooled := connection.recv()) is not None:
+        connection.send(run_deodr(workload, targets, mesh, pooled))
+
+
+class DeodrProcesses:
+    """deodr with the batch shared among processes; the slowest one counts."""
+
+    def __init__(self, workload: Workload, targets: tuple[Tensor, ...], count: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connections, self.processes = [], []
+        for which in range(count):
+            ours, theirs = context.Pipe()
+            arguments = (theirs, workload.part(which, count), tuple(t[which::count] for t in targets))
+            self.processes.append(context.Process(target=deodr_process, args=arguments, daemon=True))
+            self.processes[-1].start()
+            self.connections.append(ours)
+
+    def __call__(self, pooled: bool) -> Timing:
+        for connection in self.connections:
+            connection.send(pooled)
+        results = [connection.recv() for connection in self.connections]
+        return max(r[0] for r in results), max(r[1] for r in results)
+
+    def close(self) -> None:
+        for connection, process in zip(self.connections, self.processes, strict=True):
+            connection.send(None)
+            process.join()
+
+
+def check_same_image(workload: Workload, mesh) -> str:
+    """Both programs must draw the same thing, or the comparison means nothing."""
+    (output,), size = workload.outputs, workload.size
+    with torch.no_grad():
+        vertices = workload.camera.transform(workload.vertices)
+        theirs = DeodrImages.apply(vertices, size, mesh, output)
+        if output == "alpha":
+            ours = nmr.render_silhouette(vertices, workload.faces, image_size=size)
+            overlap = 1 - float(nmr.losses.soft_iou_loss(ours, theirs))
+            agree, how = overlap >= 0.9, f"to a soft IoU of {overlap:.4f}"
+        else:
+            ours = nmr.render_depth(vertices, workload.faces, image_size=size, anti_aliasing=False)
+            both = (ours < FAR) & (theirs < ours.where(ours < FAR, ours.new_zeros(())).max())
+            difference = float((ours - theirs)[both].abs().median())
+            agree, how = difference < 1e-3, f"to {difference:.1e} in depth (median over covered pixels)"
+    if not agree:
+        raise SystemExit(f"nmr and deodr draw different images (they agree {how}): the comparison is invalid")
+    return how
+
+
+def deodr_programs(
+    workload: Workload, targets: tuple[Tensor, ...], num_processes: int
+) -> tuple[dict[str, Program], DeodrProcesses | None]:
+    """deodr in one process, and in several; at the size of the image, and at our inner resolution."""
+    mesh = deodr_mesh(workload.faces)
+    print(f"images of nmr and deodr agree {check_same_image(workload, mesh)}")
+    processes = None
+    if 1 < num_processes <= len(workload.vertices):
+        processes = DeodrProcesses(workload, targets, num_processes)
+    programs = {}
+    for pooled in (False, True)[: 1 + workload.anti_aliasing]:
+        where = ", our inner resolution" if pooled else ""
+        programs[f"deodr, 1 process{where}"] = lambda pooled=pooled: run_deodr(workload, targets, mesh, pooled)
+        if processes:
+            programs[f"deodr, {num_processes} processes{where}"] = lambda pooled=pooled: processes(pooled)
+    return programs, processes
+
+
+# --- the slow definition
+
+
+def run_definition(workload: Workload, targets: tuple[Tensor, ...]) -> Timing:
+    """nmr/reference.py on the silhouette of the first mesh, times the batch."""
+    vertices = workload.camera.transform(workload.vertices)[0]
+    aa, batch = workload.anti_aliasing, len(workload.vertices)
+    start = time.perf_counter()
+    index = reference.face_index(vertices, workload.faces, workload.raster_size)
+    alpha = reference.silhouette(index, aa).requires_grad_()
+    forward = time.perf_counter()
+    nmr.losses.soft_iou_loss(alpha[None], targets[0][:1]).backward()
+    reference.silhouette_gradient(vertices, workload.faces, index, alpha.grad, aa)
+    return batch * (forward - start), batch * (time.perf_counter() - start)
+
+
+# --- chains of torch calls
+
+
+def smoothness_chain(vertices: Tensor, edges: Tensor, e: float = 1e-6) -> Tensor:
+    """The formula of nmr.losses.smoothness_loss."""
+    v0, v1, *opposite = vertices[:, edges].unbind(2)
+    a = v1 - v0
+    a_squared, heights, lengths = a.square().sum(-1), [], []
+    for corner in opposite:
+        b = corner - v0
+        ab, b_squared = (a * b).sum(-1), b.square().sum(-1)
+        heights.append(b - a * (ab / (a_squared + e)).unsqueeze(-1))
+        cos = ab / ((a_squared + e).sqrt() * (b_squared + e).sqrt() + e)
+        lengths.append((b_squared + e).sqrt() * (1 - cos.square() + e).sqrt())
+    cos = (heights[0] * heights[1]).sum(-1) / (lengths[0] * lengths[1] + e)
+    return (1 + cos).square().sum(1).mean()
+
+
+def camera_chain(vertices: Tensor, eye: Tensor, half_fov_deg: float) -> Tensor:
+    """The formula of nmr.LookAt, looking at the origin, without its care for what is not finite."""
+
+    def unit(v: Tensor) -> Tensor:
+        return v / v.norm(dim=-1, keepdim=True).clamp_min(1e-5)
+
+    eye = eye.to(vertices)
+    z = unit(-eye)
+    x = unit(torch.linalg.cross(vertices.new_tensor([0.0, 1.0, 0.0]).expand_as(z), z, dim=-1))
+    y = unit(torch.linalg.cross(z, x, dim=-1))
+    view = (vertices - eye.unsqueeze(-2)) @ torch.stack([x, y, z], dim=-2).transpose(-1, -2)
+    depth = view[..., 2:]
+    return torch.cat([view[..., :2] / depth / math.tan(math.radians(half_fov_deg)), depth], dim=-1)
+
+
+def against_chain(ours, chain, vertices: Tensor, tolerance: float, threads: int) -> dict[str, Program]:
+    """Our function and a chain of torch calls for the same, which must agree; the gradient is by all that comes out."""
+    with torch.no_grad():
+        result, expected = ours(vertices), chain(vertices)
+    difference = float((result - expected).abs().max() / expected.abs().max())
+    if not difference <= tolerance:
+        raise SystemExit(f"nmr and the chain of torch calls differ by {difference:.1e}: the comparison is invalid")
+    grad = torch.randn(result.shape, generator=torch.Generator().manual_seed(0)) if result.ndim else None
+    return {
+        f"nmr, {threads} threads": lambda: run_chain(ours, vertices, grad),
+        f"torch calls, {threads} threads": lambda: run_chain(chain, vertices, grad),
+    }
