@@ -148,7 +148,7 @@ check_coverage() {
     local gcovr=("$python" -m gcovr --root . --filter csrc/ --exclude-throw-branches --exclude-unreachable-branches
         --merge-mode-functions=separate build/native/coverage $package/build)
     "${gcovr[@]}" --json build/native/coverage.json
-    gcovr=("$python" -m gcovr --root . --add-tracefile build/native/coverage.json)
+    gcovr=("$python" -m gcovr --root . --merge-lines --add-tracefile build/native/coverage.json)
     "${gcovr[@]}" --txt
     "${gcovr[@]}" --txt-metric branch --txt
     "${gcovr[@]}" --txt /dev/null --print-summary

@@ -56,8 +56,8 @@ template <class... Parts>
 
 #define CHECK_EQUAL(a, b)                                                                                    \
   do {                                                                                                       \
-    const auto& left_ = (a);                                                                                 \
-    const auto& right_ = (b);                                                                                \
+    const auto left_ = (a);                                                                                  \
+    const auto right_ = (b);                                                                                 \
     if (!(left_ == right_)) ::nmr::test::fail(__FILE__, __LINE__, #a " == " #b ": ", left_, " and ", right_); \
   } while (false)
 

@@ -14,6 +14,7 @@ CORPUS = Path(__file__).with_name("corpus.hex")
 FLOAT, DOUBLE = 1, 0
 PACKED, PER_IMAGE, ANTI_ALIASED, FILL_BACK, VALUES_PER_IMAGE, PERSPECTIVE, DISTORTED = (1 << n for n in range(7))
 SPECIAL = range(232, 247)
+BATCHES = [0, 1, 2, 9]
 
 # corners as bytes (see coordinate() of fuzz.cpp): x, y = (byte - 116) / 64, z = (byte - 32) / 16
 TETRAHEDRON = (
@@ -37,7 +38,7 @@ MESHES = [TETRAHEDRON, SQUARE, TWICE, COLLINEAR, SLIVER, BEHIND, BORDER, LAYERS,
 def encode(rng, number, flags, meshes, size, *, foreign=False, planes=0, spoil=False) -> bytes:
     """The bytes that decode() of fuzz.cpp turns into these meshes; unless packed, all have the first one's sizes."""
     batch, packed = len(meshes), bool(flags & PACKED)
-    more = (7 if foreign else 0) + 8 * batch + 32 * rng.randrange(4)
+    more = (7 if foreign else 0) + 8 * BATCHES.index(batch) + 32 * rng.randrange(4)
     seed = rng.choice((rng.randrange(256), 7))  # 7: also on three threads
     head = [number, flags, more, size, rng.randrange(4), rng.randrange(6), planes, rng.randrange(8), seed]
     shapes = meshes if packed else [meshes[0] if meshes else NOTHING]
@@ -56,7 +57,8 @@ def seeds() -> list[bytes]:
     for number in (FLOAT, DOUBLE):
         for layout in (0, PER_IMAGE, PACKED):
             for mesh in MESHES:
-                batch = rng.choices(MESHES, k=2) + [mesh] if layout == PACKED else [mesh] * rng.randrange(1, 3)
+                size = rng.choice(BATCHES[1:])
+                batch = rng.choices(MESHES, k=size - 1) + [mesh] if layout == PACKED else [mesh] * size
                 rich = ANTI_ALIASED | FILL_BACK | PERSPECTIVE | DISTORTED
                 for other in (rich, VALUES_PER_IMAGE | rng.choice((0, FILL_BACK))):
                     options = {

@@ -56,7 +56,8 @@ Scene<T> decode(Bytes bytes) {
   s.perspective = flags & 32;
   s.distorted = flags & 64;
   s.foreign_owner = more % 8 == 7;
-  s.batch = more / 8 % 4;
+  constexpr int64_t batches[] = {0, 1, 2, 9};
+  s.batch = batches[more / 8 % 4];
   s.channels = 1 + more / 32 % 4;
   s.image_size = 1 + bytes.next() % (s.anti_aliasing ? 10 : 20);
   s.texture_size = 1 + bytes.next() % 4;
@@ -69,7 +70,7 @@ Scene<T> decode(Bytes bytes) {
   s.seed = bytes.next();
 
   const int64_t meshes = packed ? s.batch : 1;
-  int64_t vertex_counts[4] = {0, 0, 0, 0}, face_counts[4] = {0, 0, 0, 0};
+  int64_t vertex_counts[9] = {}, face_counts[9] = {};
   for (int64_t m = 0; m < meshes; ++m) {
     const int counts = bytes.next();
     vertex_counts[m] = counts % 16;

@@ -41,18 +41,34 @@ TEST_REAL(smoothness_of_a_hinge) {
   }
 }
 
+// Eleven meshes: eight that are worked on together, and three.
 TEST(smoothness_gradient_is_the_derivative) {
-  const std::vector<double> vertices = noise_array<double>(1, 3 * 12);  // two meshes of 6
+  const int64_t batch = 11, size = 18;
+  const std::vector<double> vertices = noise_array<double>(1, batch * size), grad_loss = noise_array<double>(2, batch);
   const std::vector<int64_t> edges{0, 1, 2, 3, 1, 2, 0, 4, 3, 4, 5, 1, 2, 5, 0, 4};
-  std::vector<double> grad = unwritten<double>(36);
-  const std::vector<double> grad_loss{1.5, -0.5};
-  smoothness_backward(Smoothness<double>{vertices.data(), edges.data(), 2, 6, 4, nullptr, grad_loss.data(), grad.data(), 2});
-  for (int n = 0; n < 36; ++n) {
+  std::vector<double> grad = unwritten<double>(batch * size);
+  smoothness_backward(Smoothness<double>{vertices.data(), edges.data(), batch, 6, 4, nullptr, grad_loss.data(), grad.data(), 2});
+  for (int64_t n = 0; n < size; ++n) {  // the same coordinate of every mesh at once: they do not depend on each other
     std::vector<double> more = vertices, less = vertices;
-    more[n] += 1e-6;
-    less[n] -= 1e-6;
-    const std::vector<double> up = smoothness(more, edges, 2), down = smoothness(less, edges, 2);
-    CHECK_NEAR(grad[n], (grad_loss[0] * (up[0] - down[0]) + grad_loss[1] * (up[1] - down[1])) / 2e-6, 1e-6);
+    for (int64_t b = 0; b < batch; ++b) {
+      more[b * size + n] += 1e-6;
+      less[b * size + n] -= 1e-6;
+    }
+    const std::vector<double> up = smoothness(more, edges, batch), down = smoothness(less, edges, batch);
+    for (int64_t b = 0; b < batch; ++b) {
+      const double difference = grad_loss[b] * (up[b] - down[b]) / 2e-6;
+      CHECK_NEAR(grad[b * size + n], difference, 1e-6 * (1 + std::abs(difference)));
+    }
+  }
+}
+
+TEST_REAL(smoothness_does_not_depend_on_the_company) {
+  const std::vector<T> vertices = noise_array<T>(1, 11 * 18);
+  const std::vector<int64_t> edges{0, 1, 2, 3, 1, 2, 0, 4, 3, 4, 5, 1, 2, 5, 0, 4, 0, 5, 1, 2, 3, 2, 4, 5};
+  const std::vector<T> together = smoothness(vertices, edges, 11);
+  for (int b = 0; b < 11; ++b) {
+    const std::vector<T> alone(vertices.begin() + 18 * b, vertices.begin() + 18 * (b + 1));
+    CHECK_EQUAL(smoothness(alone, edges, 1)[0], together[b]);
   }
 }
 
