@@ -86,14 +86,32 @@ def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor,
     return values if values.ndim == ndim + 1 else values.unsqueeze(0)
 
 
-def as_floats(value: object, name: str, wanted: str) -> Tensor:
-    """Numbers, nested sequences of numbers or tensors, or a tensor, as a float tensor; tensors keep their gradient."""
+def as_numbers(value: object, name: str, wanted: str) -> Tensor:
+    """A number, nested sequences of numbers or tensors, an array or a tensor, as a tensor; numbers become float64.
+
+    Tensors keep their gradient, those in sequences, too.
+    """
     try:
-        if isinstance(value, Sequence) and any(isinstance(part, Tensor) for part in value):
-            value = torch.stack([torch.as_tensor(part) for part in value])
-        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+        tensor = _joined(value)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"{name} must be {wanted}, got {describe(value)}: {error}") from error
+    if tensor.is_complex():
+        raise TypeError(f"{name} must be {wanted} of real numbers, got {describe(tensor)}")
+    return tensor
+
+
+def _joined(value: object) -> Tensor:
+    if isinstance(value, Tensor):
+        return value
+    # torch.as_tensor would cut the tensors in a sequence from their graph.
+    if isinstance(value, list | tuple) and any(isinstance(part, Tensor | list | tuple) for part in value):
+        return torch.stack([_joined(part) for part in value])
+    return torch.as_tensor(value, dtype=torch.float64)
+
+
+def as_floats(value: object, name: str, wanted: str) -> Tensor:
+    """As :func:`as_numbers`, but a tensor must be of floats already."""
+    tensor = as_numbers(value, name, wanted)
     if not tensor.is_floating_point():
         raise TypeError(f"{name} must be {wanted} of floats, got {describe(tensor)}; call .float()")
     return tensor
