@@ -44,7 +44,7 @@ def ribbons(size: int = 256) -> Tensor:
     return palette[((u * 4 + v * 24) % 4).long()]
 
 
-def main(output: Path = Path("output"), views: int = 4, image_size: int = 192) -> Path:
+def main(output: Path = Path("output"), views: int = 4, image_size: int = 180) -> Path:
     """Writes OUTPUT/views.png: a column for each view; colours, depth and normals in rows."""
     vertices, faces, uv, uv_faces = trefoil()
     camera = nmr.LookAt.from_angles(3.0, 25.0, [20 + 180 / views * k for k in range(views)], half_fov_deg=17.0)

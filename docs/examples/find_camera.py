@@ -18,7 +18,7 @@ from learn3d.data.shapes import make_shape
 def main(output: Path = Path("output"), steps: int = 120, image_size: int = 160, seed: int = 2) -> tuple[float, float]:
     """Writes OUTPUT/find_camera.gif and .png: what each guess sees, in front of the silhouette (orange) to be matched.
 
-    Returns how far the guess that ends best is from the true camera, before and after, in units of the chair's longest side.
+    Returns how far the guess that ends best is from the true camera, before and after; the chair has length 1.
     """
     chair = make_shape("chair", np.random.default_rng(seed))
     # Mesh files are right-handed; the world of LookAt is left-handed, as the published renderer's.
@@ -50,7 +50,7 @@ def main(output: Path = Path("output"), steps: int = 120, image_size: int = 160,
     for step in range(steps + 1):
         images = silhouettes(eyes)
         errors = (images - target).square().mean((1, 2))
-        if step % max(steps // 40, 1) == 0:
+        if step % (1 + (steps - 1) // 40) == 0:
             frames.append(draw(eyes.detach()))
         optimizer.zero_grad()
         errors.sum().backward()

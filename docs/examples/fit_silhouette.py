@@ -40,8 +40,8 @@ def main(output: Path = Path("output"), steps: int = 200, image_size: int = 96, 
 
     sphere, faces = nmr.icosphere(3)
     edges = nmr.edge_table(faces)
-    # What is optimised is (1 + 10 L) vertices, L the Laplacian: a pull on one vertex moves the region around it, and the
-    # surface stays smooth (Nicolet et al. 2021, Large Steps in Inverse Rendering of Geometry).
+    # What is optimised is (1 + 10 L) vertices, L the Laplacian: a pull on one vertex moves the region around it, and
+    # the surface stays smooth (Nicolet et al. 2021, Large Steps in Inverse Rendering of Geometry).
     neighbours = torch.zeros(len(sphere), len(sphere))
     neighbours[edges[:, :2], edges[:, :2].flip(1)] = 1
     stiffness = torch.eye(len(sphere)) + 10 * (torch.diag(neighbours.sum(1)) - neighbours)
@@ -54,7 +54,7 @@ def main(output: Path = Path("output"), steps: int = 200, image_size: int = 96, 
         vertices = softness @ shape
         images = nmr.render_silhouette(vertices, faces, camera, image_size=image_size)
         losses.append(nmr.losses.soft_iou_loss(images, target))
-        if step % max(steps // 40, 1) == 0:
+        if step % (1 + (steps - 1) // 40) == 0:
             side = [-60 + 120 * step / steps]
             pair = draw(goal, goal_faces, side, gray), draw(vertices.detach(), faces, side, blue)
             frames.append(torch.cat(pair, dim=1))

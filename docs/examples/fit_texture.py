@@ -27,7 +27,7 @@ def vase(rows: int = 32, columns: int = 48) -> tuple[Tensor, Tensor, Tensor]:
     return vertices, faces, torch.stack([u, v], dim=-1).view(-1, 2)
 
 
-def painting(height: int = 96, width: int = 256) -> Tensor:
+def painting(height: int, width: int) -> Tensor:
     """The texture to be found, [H, W, 3]; row 0 is its top."""
     image = Image.new("RGB", (width, height), "#f3e9d2")
     draw = ImageDraw.Draw(image)
@@ -39,7 +39,7 @@ def painting(height: int = 96, width: int = 256) -> Tensor:
     return torch.from_numpy(np.array(image)).float() / 255
 
 
-def main(output: Path = Path("output"), steps: int = 60, views: int = 12, image_size: int = 128) -> tuple[float, float]:
+def main(output: Path = Path("output"), steps: int = 60, views: int = 12, size: int = 128) -> tuple[float, float]:
     """Writes OUTPUT/fit_texture.png: views that were not used, of the vase and of the one found; then both textures.
 
     Returns the mean error of the colours in these views before and after.
@@ -50,11 +50,10 @@ def main(output: Path = Path("output"), steps: int = 60, views: int = 12, image_
     def photograph(texture: Tensor, elevation_deg: list[float], azimuth_deg: list[float]) -> Tensor:
         camera = nmr.LookAt.from_angles(3.0, elevation_deg, azimuth_deg, half_fov_deg=14.2)
         colors = nmr.UVTexture(texture, uv, wrap="clamp")
-        style = {"colors": colors, "lights": lights, "background": 1.0, "image_size": image_size}
-        return nmr.render_rgb(vertices, faces, camera, **style)
+        return nmr.render_rgb(vertices, faces, camera, colors=colors, lights=lights, background=1.0, image_size=size)
 
-    truth = painting()
     azimuths, elevations = [360 / views * k for k in range(views)], [(5.0, 40.0)[k % 2] for k in range(views)]
+    truth = painting(3 * size // 4, 2 * size)
     pictures = photograph(truth, elevations, azimuths)
     unseen = [20.0] * 4, [60.0, 150.0, 240.0, 330.0]
     wanted = photograph(truth, *unseen)
@@ -69,12 +68,11 @@ def main(output: Path = Path("output"), steps: int = 60, views: int = 12, image_
         (images - pictures[some]).square().sum().backward()
         optimizer.step()
     found = photograph(texture.detach(), *unseen)
-    after = (found - wanted).abs().mean().item()
 
-    rows = [torch.cat(list(row), dim=1) for row in (wanted, found, (truth, texture.detach()))]
     output.mkdir(parents=True, exist_ok=True)
+    rows = [torch.cat(list(row), dim=1) for row in (wanted, found, (truth, texture.detach()))]
     imageio.imwrite(output / "fit_texture.png", (torch.cat(rows).clamp(0, 1) * 255).round().byte().numpy())
-    return before, after
+    return before, (found - wanted).abs().mean().item()
 
 
 if __name__ == "__main__":
