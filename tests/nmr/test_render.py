@@ -85,7 +85,7 @@ def published_camera(v, setting):
     names = [key.removeprefix("param_") for key in v if key.startswith("param_") and v[key].dtype == np.float32]
     leaves = {name: torch.from_numpy(np.atleast_1d(v[f"param_{name}"])).requires_grad_() for name in names}
     if str(v["camera_mode"]) == "projection":
-        size = float(leaves.pop("orig_size"))
+        size = leaves.pop("orig_size").item()
         return nmr.Pinhole(*(leaves[name] for name in ("K", "R", "t", "dist_coeffs")), orig_size=size), leaves, -1
     angle = float(setting["viewing_angle"])
     if str(v["camera_mode"]) == "look":
