@@ -13,7 +13,8 @@
     python tools/bench.py scaling       w1, w2, w3 at 1, 2, 4, 8, 16 threads, as far as there are cores
     python tools/bench.py count         the work in w1 (faces, pixels, sweeps, divisions, bytes) and the floor it sets
 
-Medians over repeats that alternate between the programs, and the fastest. `pip install deodr` for the comparison.
+Medians over repeats that alternate between the programs, and the fastest. Freed memory is kept for all of them, as in
+training (learn3d/memory.py). `pip install deodr` for the comparison.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from bench_work import (
 )
 
 import nmr
+from learn3d.memory import keep_freed_memory
 
 
 class Target(NamedTuple):
@@ -275,6 +277,7 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     if options.workload == "memory":
         return bench_memory(threads=(1, 2))
+    keep_freed_memory()
     if options.workload == "count":
         return bench_count(options)
     if options.workload == "all":

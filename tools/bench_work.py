@@ -126,13 +126,16 @@ class Result:
 
 
 def measure(programs: dict[str, Program], repeats: int) -> list[Row]:
-    """Median and fastest milliseconds of each program; repeats alternate between them; one more is not timed."""
+    """Median and fastest milliseconds of each program.
+
+    Repeats alternate between them; the first call of each turn finds the caches full of another program's data and is
+    not timed.
+    """
     times: dict[str, list[Timing]] = {name: [] for name in programs}
-    for repeat in range(repeats + 1):
+    for _ in range(repeats):
         for name, program in programs.items():
-            seconds = program()
-            if repeat:
-                times[name].append(seconds)
+            program()
+            times[name].append(program())
     return [milliseconds(name, seconds) for name, seconds in times.items()]
 
 
