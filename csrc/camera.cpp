@@ -316,6 +316,8 @@ void project_backward(const Project<T>& args) {
       args.grad_matrix || args.grad_intrinsics || args.grad_distortion || args.grad_origin || args.grad_extent;
   double* totals = sum_camera ? reserve(scratch.totals, num_runs * kTotals) : nullptr;
 
+  if (args.batch == 0 && args.grad_vertices) std::fill_n(args.grad_vertices, 3 * args.vertex_batch * args.num_vertices, T(0));
+
   // Vertices that all images share are owned by the task of their chunk, which visits the images in order.
   const bool shared = !args.starts && args.vertex_batch == 1 && args.batch > 1;
   const int64_t images = shared ? args.batch : 1, tasks = num_runs / images;

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+import nmr
 from learn3d import checkpoint
 from learn3d.data.kato import KatoDataset
 from learn3d.losses import mmd_from_distances
@@ -32,17 +33,6 @@ class Evaluation:
     mmd_paper: float | None
     images: int
     undefined: int  # images whose prediction and truth are both empty; excluded from the mean
-
-
-def voxel_iou(prediction: Tensor, target: Tensor) -> Tensor:
-    """Intersection over union of bool grids [B,s,s,s] and [B,s,s,s] -> float64 [B]; NaN where both are empty."""
-    if prediction.shape != target.shape or prediction.dtype != torch.bool or target.dtype != torch.bool:
-        raise ValueError(
-            "prediction and target must be bool grids of the same shape, got "
-            f"{prediction.dtype} {list(prediction.shape)} and {target.dtype} {list(target.shape)}"
-        )
-    prediction, target = prediction.flatten(1), target.flatten(1)
-    return (prediction & target).sum(1).double() / (prediction | target).sum(1).double()
 
 
 @torch.no_grad()
@@ -70,7 +60,7 @@ def evaluate(
             code = networks.encoder(network_input(batch.images, networks.device))
             vertices = networks.generator(code)
         predicted = dataset.voxelize(vertices.cpu(), networks.generator.faces.cpu())
-        ious.append(voxel_iou(predicted, batch.voxels))
+        ious.append(nmr.metrics.voxel_iou(predicted, batch.voxels))
         codes.append(code.float().cpu())
         views.append(batch.view_ids)
     iou = torch.cat(ious)

@@ -71,7 +71,8 @@ class MeshBatch(NamedTuple):
         if self.starts is None:
             values = torch.stack(self._one_size(values, name)) if isinstance(values, tuple) else values
             if values.shape[0] not in (1, self.batch):
-                raise ValueError(f"{name} must have batch size 1 or {self.batch} as the images, got {describe(values)}")
+                sizes = "1" if self.batch == 1 else f"1 or {self.batch}"
+                raise ValueError(f"{name} must have batch size {sizes} as the images, got {describe(values)}")
             wanted = {"vertex": self.vertices.shape[1], "face": self.faces.shape[-2], None: values.shape[1]}[per]
             if values.shape[1] != wanted:
                 raise ValueError(f"{name} must have one row per {per}, {wanted} of them, got {describe(values)}")
@@ -124,6 +125,10 @@ def pack_meshes(vertices: object, faces: object) -> MeshBatch:
     """Meshes given as lists, checked and laid end to end; a list of one becomes the batch ``[1, V, 3]``."""
     if is_list(vertices):
         for part in vertices:
+            if not isinstance(part, Tensor):
+                raise TypeError(
+                    f"a list of vertices must hold tensors [V_b, 3], it holds {describe(part)}; use torch.as_tensor()"
+                )
             check_vertices(part)
             if part.ndim != 2:
                 raise ValueError(f"a list of vertices must hold tensors [V_b, 3], it holds {describe(part)}")
@@ -137,9 +142,10 @@ def pack_meshes(vertices: object, faces: object) -> MeshBatch:
     if isinstance(faces, Tensor):
         faces = faces.unbind(0) if faces.ndim == 3 else [faces] * len(vertices)
     if not is_list(faces) or len(faces) != len(vertices) or not len(vertices):
-        got = f"{len(faces)}" if is_list(faces) else describe(faces)
+        got = f"of {len(faces)}" if is_list(faces) else describe(faces)
         raise ValueError(
-            f"a list of meshes needs faces for each, and at least one; got {len(vertices)} vertices and {got} faces"
+            "a list of meshes needs faces for each, and at least one mesh; "
+            f"got vertices of {len(vertices)} meshes and faces {got}"
         )
     faces = [check_faces(part, 1, vertices[0].device) for part in faces]
     if any(part.ndim != 2 for part in faces):

@@ -18,6 +18,7 @@ from ._validate import (
     check_eps,
     check_faces,
     check_size,
+    check_transformed,
     check_vertices,
     describe,
 )
@@ -69,18 +70,18 @@ def make_scene(
     size = check_size(image_size, "image_size", _LARGEST_IMAGE)
     check_depth_range(near, far)
     packed = is_list(vertices) or is_list(faces)
-    mesh = pack_meshes(vertices, faces) if packed else MeshBatch(check_vertices(vertices), faces)
+    if packed:
+        mesh = pack_meshes(vertices, faces)
+    else:
+        mesh = MeshBatch(check_vertices(vertices, ", or a list of [V_b, 3]"), faces)
     world = mesh.vertices
     if camera is not None:
         check_camera(camera, mesh.starts is not None)
         if mesh.starts is None:
-            mesh = mesh._replace(vertices=check_vertices(camera.transform(world)))
+            mesh = mesh._replace(vertices=camera.transform(world))
         else:
             mesh = mesh._replace(vertices=camera.transform(world, starts=mesh.starts))
-            if not isinstance(mesh.vertices, Tensor) or mesh.vertices.shape != world.shape:
-                raise ValueError(
-                    f"camera.transform must return packed vertices {list(world.shape)}, got {describe(mesh.vertices)}"
-                )
+        check_transformed(mesh.vertices, world, mesh.starts is not None)
     mesh = mesh._replace(faces=check_faces(mesh.faces, mesh.batch, mesh.vertices.device))
     check_eps(eps, mesh.vertices.dtype)
     return Scene(world, mesh, camera, size * 2 if anti_aliasing else size)

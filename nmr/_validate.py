@@ -6,6 +6,7 @@ import inspect
 import operator
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,12 +21,12 @@ def describe(value: object) -> str:
     return type(value).__name__
 
 
-def check_vertices(vertices: object) -> Tensor:
-    """``vertices`` as ``[B, V, 3]`` float32 or float64."""
+def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
+    """``vertices`` as ``[B, V, 3]`` float32 or float64; ``otherwise`` tells in the error what else is taken."""
     if not isinstance(vertices, Tensor):
         raise TypeError(
-            "vertices must be a float tensor [B, V, 3] or [V, 3], or a list of [V_b, 3], "
-            f"got {describe(vertices)}; use torch.as_tensor()"
+            f"vertices must be a float tensor [B, V, 3] or [V, 3]{otherwise}, got {describe(vertices)}; "
+            "use torch.as_tensor()"
         )
     if vertices.ndim not in (2, 3) or vertices.shape[-1] != 3:
         raise ValueError(f"vertices must have shape [B, V, 3] or [V, 3], got {describe(vertices)}")
@@ -56,12 +57,27 @@ def check_faces(faces: object, batch: int, device: torch.device, name: str = "fa
 
 def check_camera(camera: object, packed: bool) -> None:
     """Something with ``transform(vertices)``; for lists of meshes with ``transform(vertices, starts)``."""
+    if isinstance(camera, type):
+        raise TypeError(f"camera must be a camera, got the class {camera.__name__}; make one: {camera.__name__}(...)")
     if not callable(getattr(camera, "transform", None)):
         raise TypeError(f"camera must have a method transform(vertices), as nmr.LookAt does, got {describe(camera)}")
     if packed and "starts" not in inspect.signature(camera.transform).parameters:
         raise TypeError(
             f"for a list of meshes, {type(camera).__name__}.transform must take (vertices [N, 3], starts [B + 1, 2]), "
             "as that of nmr.LookAt; it takes vertices alone"
+        )
+
+
+def check_transformed(vertices: object, world: Tensor, packed: bool) -> None:
+    """What a camera made of the vertices ``world``: of their shape (one mesh may have become B) and type."""
+    like = isinstance(vertices, Tensor) and (vertices.dtype, vertices.device) == (world.dtype, world.device)
+    grown = not packed and world.shape[0] == 1
+    if not like or vertices.ndim != world.ndim or vertices.shape[int(grown) :] != world.shape[int(grown) :]:
+        shape = ["B", *world.shape[1:]] if grown else list(world.shape)
+        wanted = f"{str(world.dtype).removeprefix('torch.')} [{', '.join(map(str, shape))}]"
+        raise ValueError(
+            f"camera.transform must return {'packed ' if packed else ''}vertices {wanted}, as it gets them, "
+            f"got {describe(vertices)}"
         )
 
 
@@ -86,14 +102,32 @@ def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor,
     return values if values.ndim == ndim + 1 else values.unsqueeze(0)
 
 
-def as_floats(value: object, name: str, wanted: str) -> Tensor:
-    """Numbers, nested sequences of numbers or tensors, or a tensor, as a float tensor; tensors keep their gradient."""
+def as_numbers(value: object, name: str, wanted: str) -> Tensor:
+    """A number, nested sequences of numbers or tensors, an array or a tensor, as a tensor; numbers become float64.
+
+    Tensors keep their gradient, those in sequences, too.
+    """
     try:
-        if isinstance(value, Sequence) and any(isinstance(part, Tensor) for part in value):
-            value = torch.stack([torch.as_tensor(part) for part in value])
-        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+        tensor = _joined(value)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"{name} must be {wanted}, got {describe(value)}: {error}") from error
+    if tensor.is_complex():
+        raise TypeError(f"{name} must be {wanted} of real numbers, got {describe(tensor)}")
+    return tensor
+
+
+def _joined(value: object) -> Tensor:
+    if isinstance(value, Tensor):
+        return value
+    # torch.as_tensor would cut the tensors in a sequence from their graph.
+    if isinstance(value, list | tuple) and any(isinstance(part, Tensor | np.ndarray | list | tuple) for part in value):
+        return torch.stack([_joined(part) for part in value])
+    return torch.as_tensor(value, dtype=torch.float64)
+
+
+def as_floats(value: object, name: str, wanted: str) -> Tensor:
+    """As :func:`as_numbers`, but a tensor must be of floats already."""
+    tensor = as_numbers(value, name, wanted)
     if not tensor.is_floating_point():
         raise TypeError(f"{name} must be {wanted} of floats, got {describe(tensor)}; call .float()")
     return tensor
@@ -110,13 +144,23 @@ def check_size(value: object, name: str, largest: int) -> int:
     return value
 
 
+def check_number(value: object, name: str) -> float:
+    """A number, also of NumPy or in a tensor of one element."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name} must be a number, got {describe(value)}") from error
+
+
 def check_depth_range(near: float, far: float) -> None:
     """0 <= near < far, both finite."""
+    near, far = check_number(near, "near"), check_number(far, "far")
     if not (0 <= near < far < float("inf")):
         raise ValueError(f"near and far must be finite with 0 <= near < far, got near={near}, far={far}")
 
 
 def check_eps(eps: float, dtype: torch.dtype) -> None:
     """Positive in the dtype, and finite."""
+    eps = check_number(eps, "eps")
     if not torch.finfo(dtype).tiny <= eps < float("inf"):
         raise ValueError(f"eps must be positive in {dtype} and finite, got {eps}")

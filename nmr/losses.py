@@ -12,8 +12,17 @@ import torch
 from torch import Tensor
 
 from . import ops
-from ._validate import check_vertices, describe
+from ._validate import check_number, check_vertices, describe
 from .mesh import _check_indices, face_normals, face_vertices
+
+__all__ = [
+    "edge_length_loss",
+    "inflation_loss",
+    "laplacian_loss",
+    "normal_consistency_loss",
+    "smoothness_loss",
+    "soft_iou_loss",
+]
 
 
 def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
@@ -21,7 +30,8 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
     Parameters
     ----------
-    prediction, target : Tensor [B, ...], in [0, 1], of one shape
+    prediction : float Tensor [B, ...], in [0, 1]
+    target : Tensor of the same shape, in [0, 1] (not 0..255), of any type
 
     Returns
     -------
@@ -34,8 +44,11 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     TypeError, ValueError
         If the shapes differ, or there is nothing to compare.
     """
-    if not isinstance(prediction, Tensor) or not isinstance(target, Tensor):
-        raise TypeError(f"prediction and target must be tensors, got {describe(prediction)} and {describe(target)}")
+    if not isinstance(prediction, Tensor) or not isinstance(target, Tensor) or not prediction.is_floating_point():
+        raise TypeError(
+            "prediction and target must be tensors, and prediction one of floats, "
+            f"got {describe(prediction)} and {describe(target)}"
+        )
     if prediction.shape != target.shape or prediction.ndim < 2 or prediction.shape[0] == 0:
         raise ValueError(
             "prediction and target must have one shape [B, ...] with B >= 1, "
@@ -146,7 +159,7 @@ def edge_length_loss(vertices: Tensor, edges: Tensor, target: float | None = Non
     """
     vertices = _check_meshes(vertices)
     v0, v1 = _check_edges(edges, vertices)
-    if target is not None and not (0 <= target < math.inf):
+    if target is not None and not (0 <= check_number(target, "target") < math.inf):
         raise ValueError(f"target must be a finite length >= 0, got {target}; leave it out for the mean length")
     rows = _batch_last(vertices)
     length = _length(rows.index_select(0, v1) - rows.index_select(0, v0))

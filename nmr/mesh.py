@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ._validate import check_faces, check_vertices
+from ._validate import check_faces, check_vertices, describe
 
 
 def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
@@ -18,9 +18,11 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
 
     Raises
     ------
-    ValueError
-        If subdivisions is not in 0..7.
+    TypeError, ValueError
+        If subdivisions is not an integer in 0..7.
     """
+    if not hasattr(subdivisions, "__index__"):
+        raise TypeError(f"subdivisions must be an integer, got {describe(subdivisions)}")
     if not 0 <= subdivisions <= 7:
         raise ValueError(f"subdivisions must lie in 0..7, got {subdivisions}")
     t = (1 + 5**0.5) / 2

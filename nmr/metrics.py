@@ -12,8 +12,10 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from ._validate import check_size, check_vertices, describe
+from ._validate import check_number, check_size, check_vertices, describe
 from .mesh import _face_cross, _gather, _unit, face_vertices
+
+__all__ = ["SurfacePoints", "chamfer_distance", "f_score", "sample_surface", "voxel_iou"]
 
 try:
     from scipy.spatial import cKDTree
@@ -158,7 +160,7 @@ def f_score(points_a: Tensor, points_b: Tensor, threshold: float) -> Tensor:
     >>> b = nmr.metrics.sample_surface(*nmr.icosphere(2), 10000).points
     >>> nmr.metrics.f_score(a, b, 0.02)
     """
-    if not threshold > 0:
+    if not check_number(threshold, "threshold") > 0:
         raise ValueError(f"threshold must be a distance above 0, got {threshold}")
     a, b = _check_points(points_a, points_b)
     precision = (_length(_to_nearest(a, b)) < threshold).to(a.dtype).mean(1)

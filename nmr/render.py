@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
+from ._packing import is_list
 from ._scene import Meshes, average, make_scene, shade
 from ._validate import describe
 from .cameras import Camera
@@ -111,8 +112,8 @@ def render(
     >>> camera = nmr.LookAt.from_angles(2.732, 30.0, [0.0, 90.0])
     >>> rgb, depth = nmr.render(vertices, faces, camera, outputs=("rgb", "depth"), lights=nmr.Lights(), image_size=64)
     """
-    unknown = [name for name in outputs if name not in _OUTPUTS] if not isinstance(outputs, str) else [outputs]
-    if unknown or not len(outputs) or len(set(outputs)) != len(outputs):
+    listed = is_list(outputs) and all(name in _OUTPUTS for name in outputs)
+    if not listed or not outputs or len(set(outputs)) != len(outputs):
         raise ValueError(
             f"outputs must be different names out of {_OUTPUTS}, at least one, in a tuple; got {outputs!r}"
         )

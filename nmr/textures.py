@@ -184,7 +184,8 @@ class UVTexture:
                 raise ValueError(f"uv must have shape [T, 2] or [B, T, 2], got {describe(uv)}")
         if self.uv_faces is not None:
             for faces in _each(self.uv_faces):
-                check_faces(faces, len(faces), torch.device("cpu"), "uv_faces")
+                batch = len(faces) if isinstance(faces, Tensor) and faces.ndim else 0
+                check_faces(faces, batch, torch.device("cpu"), "uv_faces")
         if self.wrap not in ("repeat", "clamp", "mirror"):
             raise ValueError(f'wrap must be "repeat", "clamp" or "mirror", got {self.wrap!r}')
 

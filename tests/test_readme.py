@@ -1,21 +1,75 @@
-"""The README's code runs, and its commands name files that exist."""
+"""The code of the README and of the pages in docs runs, and what they name exists.
+
+Our own code is in blocks marked ``python``; code of other libraries, which is not run, in blocks marked ``py``.
+"""
 
 import re
 from pathlib import Path
 
+import pytest
+import torch
+
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def test_the_python_example_runs_and_fits_the_target():
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+def run(page):
+    """Executes the blocks of a page, in order, in one namespace, which is returned."""
     names = {}
-    exec(code, names)
+    for block in re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL):
+        exec(block, names)
+    return names
+
+
+def test_readme_renders_and_fits_the_target():
+    names = run(README)
+    renderings = names["renderings"]
+    assert renderings.rgb.shape == renderings.normals.shape == (3, 256, 256, 3)
+    assert renderings.alpha.shape == renderings.depth.shape == (3, 256, 256)
+    assert 0.2 < renderings.alpha.mean() < 0.8 and renderings.rgb[renderings.alpha == 1].std() > 0.1
     assert names["images"].shape == (2, 64, 64)
     assert names["nmr"].losses.soft_iou_loss(names["images"], names["target"]) < 0.1
 
 
-def test_what_it_names_exists():
-    named = set(re.findall(r"(?:tools|docs|csrc|nmr|learn3d)/[\w./-]*\w\.(?:py|sh|md|png|cpp)", README))
-    assert len(named) > 5
-    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+def test_from_pytorch3d_draws_the_same_picture_both_ways():
+    names = run(ROOT / "docs" / "from-pytorch3d.md")
+    rgb, alpha, same = names["rgb"], names["alpha"], names["same"]
+    assert rgb.shape == (1, 256, 256, 3) and alpha.shape == (1, 256, 256)
+    assert 0.2 < alpha.mean() < 0.8
+    assert (rgb - same).abs().max(-1).values.gt(1e-3).float().mean() < 1e-3  # but for edges that round differently
+    # The sphere's colours are its coordinates: in both worlds x grows to the right, y to the top.
+    assert rgb[0, 128, 180, 0] > rgb[0, 128, 70, 0] and rgb[0, 70, 128, 1] > rgb[0, 180, 128, 1]
+    # Nearest to the eye, which is at z = 2.7, is the greatest z.
+    assert rgb[0, 128, 128, 2] > 0.9
+
+
+def test_from_pytorch3d_texture_coordinates():
+    """A texel centre of align_corners=True is one of ours."""
+    names = run(ROOT / "docs" / "from-pytorch3d.md")
+    names["uv"] = torch.tensor([[0.0, 0.0], [1.0, 1.0], [3 / 127, 5 / 63]])
+    page = (ROOT / "docs" / "from-pytorch3d.md").read_text()
+    exec(re.findall(r"^uv = \(.*$", page, flags=re.MULTILINE)[0], names)
+    texels = names["uv"] * torch.tensor([128, 64]) - 0.5
+    torch.testing.assert_close(texels, torch.tensor([[0.0, 0.0], [127.0, 63.0], [3.0, 5.0]]), atol=1e-4, rtol=0)
+
+
+def test_from_nvdiffrast_draws_the_same_picture_three_ways():
+    names = run(ROOT / "docs" / "from-nvdiffrast.md")
+    image = names["image"]
+    assert image.shape == (1, 256, 256, 3) and 0.1 < (image != 1).any(-1).float().mean() < 0.9
+    torch.testing.assert_close(names["same"], image, atol=0, rtol=0)
+    assert (names["also"] - image).abs().max(-1).values.gt(1e-3).float().mean() < 1e-3
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pages_run_and_what_they_name_exists(page):
+    if page not in (README, ROOT / "docs" / "from-pytorch3d.md", ROOT / "docs" / "from-nvdiffrast.md"):  # run above
+        run(page)
+    text = page.read_text()
+    named = re.findall(r"(?:tools|docs|csrc|nmr|learn3d|tests)/[\w./-]*\w\.(?:py|sh|md|png|cpp|ipynb)", text)
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)", text)
+    missing = [name for name in {*named} if not (ROOT / name).exists()]
+    missing += [link for link in {*links} if "://" not in link and not (page.parent / link).exists()]
+    assert missing == []
+    assert page != README or len(named) > 5

@@ -12,8 +12,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .._validate import as_numbers, describe
 from .pinhole import Pinhole
-from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched
+from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched, common_batch, height_and_width
 
 # Camera axes here: x right, y down, z away (OpenCV). OpenGL: right, up, towards the viewer; PyTorch3D: left, up, away.
 _OPENGL_AXES = torch.tensor([[1.0], [-1.0], [-1.0]], dtype=torch.float64)
@@ -26,14 +27,20 @@ def _row(*entries: Tensor | float) -> Tensor:
     return torch.stack([torch.as_tensor(x, dtype=torch.float64).expand(batch) for x in entries], dim=-1)
 
 
-def _size(height: float, width: float) -> tuple[float, float]:
-    if not (0 < height < float("inf") and 0 < width < float("inf")):
-        raise ValueError(f"height and width must be positive, got {height} and {width}")
-    return float(height), float(width)
+def _image_size(image_size: tuple[float, float] | None, in_ndc: bool) -> tuple[float, float]:
+    if image_size is None and not in_ndc:
+        raise ValueError("image_size=(height, width) is needed with in_ndc=False")
+    return height_and_width((1, 1) if image_size is None else image_size, "image_size")
+
+
+def _plain(camera: ProjectingCamera) -> Projection:
+    if not isinstance(camera, ProjectingCamera):
+        raise TypeError(f"camera must be one of nmr's (nmr.cameras.ProjectingCamera), got {describe(camera)}")
+    return camera.projection().plain()
 
 
 def _without_distortion(camera: ProjectingCamera, target: str) -> Projection:
-    projection = camera.projection().plain()
+    projection = _plain(camera)
     if projection.distortion is not None and projection.perspective and projection.distortion.any():
         raise ValueError(f"{target} has no lens distortion; undistort the images and drop dist_coeffs")
     return projection
@@ -77,14 +84,14 @@ def from_opencv(
     ValueError
         For other shapes, also those of OpenCV's longer distortion models.
     """
-    height, width = _size(height, width)
+    height, width = height_and_width((height, width), "height and width")
     K = batched(as_parameter(K, "K", 3, 3), torch.float64, 3, 3)
     shift = torch.zeros(3, 3, dtype=torch.float64)
     shift[:2, 2] = 0.5 - pixel_center
-    t = t if isinstance(t, Tensor) else torch.as_tensor(t, dtype=torch.float64)
+    t = as_numbers(t, "t", "numbers of shape [3], [3, 1], [B, 3] or [B, 3, 1]")
     t = t.squeeze(-1) if t.shape[-1:] == (1,) else t
     if dist_coeffs is not None:
-        d = dist_coeffs if isinstance(dist_coeffs, Tensor) else torch.as_tensor(dist_coeffs, dtype=torch.float64)
+        d = as_numbers(dist_coeffs, "dist_coeffs", "4 or 5 numbers")
         d = d.squeeze(-1) if d.ndim > 1 and d.shape[-1] == 1 else d
         if d.ndim not in (1, 2) or d.shape[-1] not in (4, 5):
             raise ValueError(
@@ -103,8 +110,8 @@ def to_opencv(
     The determinant of R is -1 for the cameras of a left-handed world (see above). An orthographic camera raises a
     ValueError.
     """
-    height, width = _size(height, width)
-    projection = camera.projection().plain()
+    height, width = height_and_width((height, width), "height and width")
+    projection = _plain(camera)
     if not projection.perspective:
         raise ValueError("OpenCV has no orthographic camera; use to_opengl or to_pytorch3d")
     x, y = projection.intrinsics.unbind(1)
@@ -184,7 +191,7 @@ def to_opengl(camera: ProjectingCamera, *, near: float, far: float) -> tuple[Ten
 
 def _pairs(value: Numbers, name: str) -> Tensor:
     """``[B, 2]`` from a number, ``[B]`` or ``[B, 2]``."""
-    value = value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+    value = as_numbers(value, name, "a number, [B] or [B, 2]")
     if value.ndim > 2 or (value.ndim == 2 and value.shape[1] != 2):
         raise ValueError(f"{name} must be a number or have shape [B] or [B, 2], got {list(value.shape)}")
     value = value.to("cpu", torch.float64)
@@ -231,12 +238,10 @@ def from_pytorch3d(
         batched(as_parameter(R, "R", 3, 3), torch.float64, 3, 3),
         batched(as_parameter(T, "T", 3), torch.float64, 3, 1),
     )
-    batch = max(R.shape[0], T.shape[0])
+    batch = common_batch(R=R, T=T)
     matrix = torch.cat([R.transpose(1, 2).expand(batch, 3, 3), T.expand(batch, 3, 1)], dim=-1)
     focal, centre = _pairs(focal_length, "focal_length"), _pairs(principal_point, "principal_point")
-    if image_size is None and not in_ndc:
-        raise ValueError("image_size=(height, width) is needed with in_ndc=False")
-    height, width = _size(*(image_size or (1, 1)))
+    height, width = _image_size(image_size, in_ndc)
     shorter, size = min(height, width), torch.tensor([width, height], dtype=torch.float64)
     if not in_ndc:
         focal, centre = focal * (2 / shorter), -(centre - size / 2) * (2 / shorter)
@@ -280,9 +285,7 @@ def to_pytorch3d(
         For a camera with distortion or skew, or a missing or impossible image_size.
     """
     camera = _without_distortion(camera, "PyTorch3D")
-    if image_size is None and not in_ndc:
-        raise ValueError("image_size=(height, width) is needed with in_ndc=False")
-    height, width = _size(*(image_size or (1, 1)))
+    height, width = _image_size(image_size, in_ndc)
     shorter, size = min(height, width), torch.tensor([width, height], dtype=torch.float64)
     intrinsics, matrix = camera.intrinsics, _PYTORCH3D_AXES * camera.matrix
     if intrinsics[:, 0, 1].any() or intrinsics[:, 1, 0].any():

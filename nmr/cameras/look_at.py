@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
+from .._validate import as_numbers
 from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched, common_batch
 
 Scalars = float | Sequence[float] | Tensor
@@ -26,8 +27,12 @@ def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: S
     elevation 0 the point is ``(0, 0, -d)``.
     """
     d, e, a = (
-        x if isinstance(x, Tensor) and x.is_floating_point() else torch.as_tensor(x, dtype=torch.float64)
-        for x in (distance, elevation_deg, azimuth_deg)
+        x if x.is_floating_point() else x.double()
+        for x in (
+            as_numbers(distance, "distance", "a number or [B]"),
+            as_numbers(elevation_deg, "elevation_deg", "a number or [B]"),
+            as_numbers(azimuth_deg, "azimuth_deg", "a number or [B]"),
+        )
     )
     if len({x.shape for x in (d, e, a) if x.ndim}) > 1:
         raise ValueError(
@@ -69,7 +74,7 @@ def _between(eye: Tensor, at: Tensor) -> Tensor:
 def _posed(eye: Tensor, forward: Tensor, up: Tensor, dtype: torch.dtype, **rest: Tensor | bool | None) -> Projection:
     """The projection of a camera at ``eye`` with the axes of :class:`LookAt`; NaN where they are not finite."""
     eye, forward, up = (batched(x, dtype, 3) for x in (eye, forward, up))
-    batch = max(forward.shape[0], up.shape[0])
+    batch = common_batch(forward=forward, up=up)
     return Projection(ops.pose(forward.expand(batch, 3), up.expand(batch, 3)), origin=eye, **rest)
 
 

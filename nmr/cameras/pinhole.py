@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import KW_ONLY, dataclass
 
 import torch
-from torch import Tensor
 
-from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched, common_batch
+from .._validate import as_numbers
+from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched, common_batch, height_and_width
 
 # From pixels (u right, v down) to [-1, 1]: x = 2 u / width - 1, y = 1 - 2 v / height.
 _CENTRE = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -58,22 +58,18 @@ class Pinhole(ProjectingCamera):
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", as_parameter(self.K, "K", 3, 3))
         object.__setattr__(self, "R", as_parameter(self.R, "R", 3, 3))
-        t = self.t if isinstance(self.t, Tensor) else torch.as_tensor(self.t, dtype=torch.float64)
+        t = as_numbers(self.t, "t", "numbers of shape [3], [B, 3] or [B, 1, 3]")
         t = t.squeeze(1) if t.ndim == 3 and t.shape[1] == 1 else t
         object.__setattr__(self, "t", as_parameter(t, "t", 3))
         if self.dist_coeffs is not None:
             object.__setattr__(self, "dist_coeffs", as_parameter(self.dist_coeffs, "dist_coeffs", 5))
-        size = self.orig_size
-        height, width = (float(x) for x in (size if isinstance(size, (tuple, list)) else (size, size)))
-        if not (0 < height < float("inf") and 0 < width < float("inf")):
-            raise ValueError(f"orig_size must be positive numbers (height, width), or one number, got {size}")
-        object.__setattr__(self, "orig_size", (height, width))
+        object.__setattr__(self, "orig_size", height_and_width(self.orig_size, "orig_size"))
         named = {"K": (self.K, 3), "R": (self.R, 3), "t": (self.t, 2), "dist_coeffs": (self.dist_coeffs, 2)}
         common_batch(**{name: x for name, (x, ndim) in named.items() if x is not None and x.ndim == ndim})
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         K, R, t = batched(self.K, torch.float64, 3, 3), batched(self.R, dtype, 3, 3), batched(self.t, dtype, 3, 1)
-        batch = max(R.shape[0], t.shape[0])
+        batch = common_batch(R=R, t=t)
         matrix = torch.cat([R.expand(batch, 3, 3), t.expand(batch, 3, 1)], dim=-1)
         height, width = self.orig_size
         intrinsics = K[:, :2] * torch.tensor([[2 / width], [-2 / height]], dtype=K.dtype) + _CENTRE

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._validate import check_vertices, describe
+from .._validate import as_numbers, check_vertices, describe
 
 Numbers = float | Sequence | np.ndarray | Tensor
 
@@ -178,9 +178,9 @@ def common_batch(**parameters: Tensor | None) -> int:
 
 def as_parameter(value: Numbers, name: str, *shape: int) -> Tensor:
     """``value`` as a float tensor ``[*shape]`` or ``[B, *shape]``; numbers that are not tensors become float64."""
-    tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+    one, many = (", ".join([*first, *map(str, shape)]) for first in ([], ["B"]))
+    tensor = as_numbers(value, name, f"numbers of shape [{one}] or [{many}]")
     if tensor.ndim not in (len(shape), len(shape) + 1) or tensor.shape[tensor.ndim - len(shape) :] != shape:
-        one, many = (", ".join([*first, *map(str, shape)]) for first in ([], ["B"]))
         raise ValueError(f"{name} must have shape [{one}] or [{many}], got {list(tensor.shape)}")
     return tensor
 
@@ -188,3 +188,16 @@ def as_parameter(value: Numbers, name: str, *shape: int) -> Tensor:
 def batched(tensor: Tensor, dtype: torch.dtype, *shape: int) -> Tensor:
     """A parameter as ``[B, *shape]`` in host memory, where the few numbers of a camera are dealt with."""
     return tensor.to("cpu", dtype).reshape(-1, *shape)
+
+
+def height_and_width(value: object, name: str) -> tuple[float, float]:
+    """(height, width) of an image, given so or by one number for both."""
+    pair = value.tolist() if isinstance(value, (Tensor, np.ndarray)) else value
+    pair = pair if isinstance(pair, (tuple, list)) else (pair, pair)
+    try:
+        size = tuple(float(x) for x in pair)
+    except (TypeError, ValueError):
+        size = ()
+    if len(size) != 2 or not all(0 < x < float("inf") for x in size):
+        raise ValueError(f"{name} must be positive numbers (height, width), or one number, got {value}")
+    return size

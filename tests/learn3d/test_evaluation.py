@@ -20,28 +20,9 @@ from learn3d.evaluation import (
     mean_mmd,
     spread_samples,
     versions,
-    voxel_iou,
 )
 from learn3d.losses import mmd
 from learn3d.networks import create_networks
-
-
-def test_voxel_iou_of_boxes() -> None:
-    a = torch.zeros(3, 8, 8, 8, dtype=torch.bool)
-    b = a.clone()
-    a[0, :4], b[0, :4] = True, True  # equal
-    a[1, :4], b[1, 2:6] = True, True  # overlap 2 of 6 layers
-    result = voxel_iou(a, b)
-    assert result[:2].tolist() == pytest.approx([1, 1 / 3])
-    assert result[2].isnan()
-
-
-def test_voxel_iou_refuses_other_grids() -> None:
-    grid = torch.zeros(1, 4, 4, 4, dtype=torch.bool)
-    with pytest.raises(ValueError, match="bool grids of the same shape"):
-        voxel_iou(grid, grid[:, :2])
-    with pytest.raises(ValueError, match="bool grids of the same shape"):
-        voxel_iou(grid.float(), grid)
 
 
 @pytest.fixture(scope="module")

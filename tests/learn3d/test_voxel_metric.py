@@ -5,7 +5,7 @@ import torch
 from vectors import load_vector
 
 from learn3d.data.kato import to_kato_axes
-from learn3d.evaluation import voxel_iou
+from nmr.metrics import voxel_iou
 
 
 def test_iou_after_the_axis_rule_is_the_published_one():

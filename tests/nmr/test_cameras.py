@@ -391,6 +391,43 @@ POINTS, STARTS = torch.rand(7, 3), torch.tensor([[0, 0], [3, 0], [7, 0]])
 EYE, K = [0.0, 0.0, -2.0], torch.eye(3)
 
 
+def test_tensors_in_lists_keep_their_gradient():
+    """torch.as_tensor([tensor, 0.0]) would cut them off without a word."""
+    points = torch.rand(2, 3, 3, dtype=torch.float64)
+    x, z = torch.tensor(0.3, requires_grad=True), torch.tensor(-2.0, dtype=torch.float64, requires_grad=True)
+    eye = torch.tensor([[0.3, 0.0, -2.0], [0.0, 1.0, -2.0]], dtype=torch.float64, requires_grad=True)
+    (expected,) = torch.autograd.grad(nmr.LookAt(eye).transform(points).sum(), eye)
+    nested = nmr.LookAt([[x, 0.0, z], torch.tensor([0.0, 1.0, -2.0])])
+    grad_x, grad_z = torch.autograd.grad(nested.transform(points).sum(), (x, z))
+    torch.testing.assert_close(torch.stack([grad_x.double(), grad_z]), expected[0, [0, 2]], atol=1e-6, rtol=1e-6)
+    distance = torch.tensor(2.0, requires_grad=True)
+    points_from_angles([distance, 1.0], 0.0, 0.0).sum().backward()
+    assert distance.grad == -1
+    t = torch.tensor(2.0, requires_grad=True)
+    nmr.Pinhole(K, K, [0.0, 0.0, t], orig_size=2).transform(POINTS)[..., 2].sum().backward()
+    assert t.grad == len(POINTS)
+
+
+def test_no_pose_is_an_empty_batch():
+    points = torch.rand(4, 3, requires_grad=True)
+    for camera in (
+        nmr.LookAt(torch.rand(0, 3)),
+        nmr.Orthographic(EYE, scale=torch.rand(0)),
+        nmr.Pinhole(K, K, torch.rand(0, 3), orig_size=2),
+        nmr.cameras.from_pytorch3d(K, torch.rand(0, 3)),
+    ):
+        out = camera.transform(points)
+        assert out.shape == (0, 4, 3)
+        (grad,) = torch.autograd.grad(out.sum(), points)
+        assert not grad.any()
+
+
+@pytest.mark.parametrize("size", [(480, 640), [480, 640], torch.tensor([480, 640]), np.array([480.0, 640.0])])
+def test_the_size_of_an_image_may_come_in_any_form(size):
+    camera = nmr.Pinhole(K, K, EYE, orig_size=size)
+    assert camera.orig_size == (480.0, 640.0)
+
+
 @pytest.mark.parametrize(
     "error, make, words",
     [
@@ -428,6 +465,26 @@ EYE, K = [0.0, 0.0, -2.0], torch.eye(3)
         (ValueError, lambda: nmr.Pinhole(K, K, EYE, [0.0] * 4, orig_size=2), r"dist_coeffs must have shape \[5\]"),
         (ValueError, lambda: nmr.Pinhole(K, K, EYE, orig_size=(0, 5)), r"positive numbers \(height, width\)"),
         (ValueError, lambda: nmr.Pinhole(K.expand(2, 3, 3), K, torch.rand(3, 3), orig_size=2), r"K \[2, 3, 3\], t"),
+        (TypeError, lambda: nmr.LookAt("front"), r"eye must be numbers of shape \[3\] or \[B, 3\], got str: "),
+        (TypeError, lambda: nmr.LookAt(None), "eye must be numbers .* got NoneType"),
+        (TypeError, lambda: nmr.LookAt([[0.0, 0.0, 1.0], [0.0, 1.0]]), "eye must be numbers .* got list: "),
+        (TypeError, lambda: nmr.LookAt(torch.zeros(3, dtype=torch.cfloat)), "of real numbers, got complex64"),
+        (
+            TypeError,
+            lambda: nmr.LookAt(EYE, half_fov_deg="wide"),
+            r"half_fov_deg must be numbers of shape \[\] or \[B\]",
+        ),
+        (TypeError, lambda: nmr.Orthographic(EYE, scale=None), "scale must be numbers .* got NoneType"),
+        (
+            TypeError,
+            lambda: nmr.LookAt.from_angles(2.0, "up", 0.0),
+            r"elevation_deg must be a number or \[B\], got str",
+        ),
+        (TypeError, lambda: nmr.Pinhole(None, K, EYE, orig_size=2), "K must be numbers .* got NoneType"),
+        (TypeError, lambda: nmr.Pinhole(K, K, "t", orig_size=2), "t must be numbers .* got str"),
+        (ValueError, lambda: nmr.Pinhole(K, K, EYE, orig_size="large"), "orig_size must be positive .* got large"),
+        (ValueError, lambda: nmr.Pinhole(K, K, EYE, orig_size=(2, 3, 4)), r"orig_size .* got \(2, 3, 4\)"),
+        (ValueError, lambda: nmr.Pinhole(K, K, EYE, orig_size=None), "orig_size must be positive .* got None"),
         (ValueError, lambda: Projection(K, K), r"matrix must be a tensor of shape \[B, 3, 4\], got float32 \[3, 3\]"),
         (ValueError, lambda: Projection(torch.rand(2, 3, 4), torch.rand(3, 2, 3)), r"intrinsics \[3, 2, 3\]"),
     ],

@@ -140,6 +140,9 @@ def test_soft_iou_error():
     for a, b in (((1, 4, 4), (1, 5, 4)), ((0, 4, 4), (0, 4, 4)), ((4,), (4,))):
         with pytest.raises(ValueError, match=r"one shape \[B, \.\.\.\] with B >= 1, got float32"):
             soft_iou_loss(torch.zeros(a), torch.zeros(b))
+    for prediction in (torch.ones(2, 3, dtype=torch.bool), torch.ones(2, 3, dtype=torch.uint8)):
+        with pytest.raises(TypeError, match=r"prediction one of floats, got (bool|uint8)"):
+            soft_iou_loss(prediction, prediction)
     with pytest.raises(TypeError, match="must be tensors"):
         soft_iou_loss([0.0], torch.zeros(1, 1))
 
@@ -282,6 +285,8 @@ def test_edges_errors():
         normal_consistency_loss(vertices, torch.zeros(1, 2, dtype=torch.long))
     with pytest.raises(ValueError, match="at least one edge"):
         normal_consistency_loss(vertices, torch.zeros(0, 4, dtype=torch.long))
+    with pytest.raises(TypeError, match="target must be a number, got str"):
+        edge_length_loss(vertices, torch.zeros(1, 2, dtype=torch.long), "short")
     for target in (-1, float("nan"), float("inf")):
         with pytest.raises(ValueError, match=r"finite length >= 0, got .*leave it out"):
             edge_length_loss(vertices, torch.zeros(1, 2, dtype=torch.long), target)

@@ -20,6 +20,8 @@ def test_icosphere_is_a_closed_unit_sphere(n):
 
 
 def test_icosphere_refuses_huge_levels():
+    with pytest.raises(TypeError, match="subdivisions must be an integer, got float"):
+        nmr.icosphere(2.5)
     with pytest.raises(ValueError, match=r"0\.\.7"):
         nmr.icosphere(12)
 
@@ -144,7 +146,7 @@ def test_normals_errors():
             function(vertices, faces + 1)
         with pytest.raises(ValueError, match="faces refer to vertex -1"):
             function(vertices, faces - 1)
-        with pytest.raises(TypeError, match="vertices must be a float tensor"):
-            function([[0.0]], faces)
+        with pytest.raises(TypeError, match=r"vertices must be a float tensor \[B, V, 3\] or \[V, 3\], got list"):
+            function([vertices], faces)
         with pytest.raises(ValueError, match="batch size of the vertices, 1"):
             function(vertices, faces.expand(2, -1, -1))

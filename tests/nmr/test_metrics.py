@@ -153,6 +153,8 @@ def test_distance_errors():
     for bad in (math.nan, math.inf):
         with pytest.raises(ValueError, match="must be finite"):
             f_score(a, a + bad, 0.1)
+    with pytest.raises(TypeError, match="threshold must be a number, got str"):
+        f_score(a, a, "near")
     for threshold in (0, -1, math.nan):
         with pytest.raises(ValueError, match="threshold must be a distance above 0"):
             f_score(a, a, threshold)

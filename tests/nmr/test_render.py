@@ -85,7 +85,7 @@ def published_camera(v, setting):
     names = [key.removeprefix("param_") for key in v if key.startswith("param_") and v[key].dtype == np.float32]
     leaves = {name: torch.from_numpy(np.atleast_1d(v[f"param_{name}"])).requires_grad_() for name in names}
     if str(v["camera_mode"]) == "projection":
-        size = float(leaves.pop("orig_size"))
+        size = leaves.pop("orig_size").item()
         return nmr.Pinhole(*(leaves[name] for name in ("K", "R", "t", "dist_coeffs")), orig_size=size), leaves, -1
     angle = float(setting["viewing_angle"])
     if str(v["camera_mode"]) == "look":
@@ -493,9 +493,22 @@ class Constant:
         ),
         (dict(background=[0.0, 1.0]), ValueError, r"background must be a number, \[3\] or \[1, 3\], got .*\[2\]"),
         (dict(background=torch.zeros(2, 3)), ValueError, r"got float64 \[2, 3\]"),
-        (dict(camera=Constant("x")), TypeError, "vertices must be a float tensor"),
+        (dict(outputs=None), ValueError, "in a tuple; got None"),
+        (dict(outputs={"rgb", "alpha"}), ValueError, "in a tuple; got {"),
+        (dict(camera=Constant("x")), ValueError, r"transform must return vertices float64 \[B, 4, 3\], .* got str"),
+        (
+            dict(camera=Constant(torch.rand(1, 3, 3).double())),
+            ValueError,
+            r"transform must .*, got float64 \[1, 3, 3\]",
+        ),
+        (dict(camera=Constant(torch.rand(1, 4, 3))), ValueError, r"vertices float64 .*, got float32 \[1, 4, 3\]"),
+        (dict(camera=nmr.LookAt), TypeError, r"got the class LookAt; make one: LookAt\(\.\.\.\)"),
         (dict(image_size=0), ValueError, "image_size must lie in 1"),
         (dict(near=2.0, far=1.0), ValueError, "near < far"),
+        (dict(near="close"), TypeError, "near must be a number, got str"),
+        (dict(far=None), TypeError, "far must be a number, got NoneType"),
+        (dict(far=torch.ones(2)), TypeError, r"far must be a number, got float32 \[2\]"),
+        (dict(eps=None), TypeError, "eps must be a number, got NoneType"),
         (dict(eps=0.0), ValueError, "eps must be positive"),
     ],
 )
@@ -511,7 +524,7 @@ def test_errors_say_what_was_wanted(change, error, words):
         (lambda f: f.resolve(torch.zeros(1, 8, 8).double()), ValueError, r"image must have shape \[1, 8, 8, 'C'\]"),
         (lambda f: f.interpolate(torch.rand(4, 3).long()), TypeError, r"attributes must be a float tensor \[V, C\]"),
         (lambda f: f.interpolate(torch.rand(5, 3)), ValueError, "attributes must have one row per vertex, 4"),
-        (lambda f: f.interpolate(torch.rand(3, 4, 3)), ValueError, "attributes must have batch size 1 or 1"),
+        (lambda f: f.interpolate(torch.rand(3, 4, 3)), ValueError, "attributes must have batch size 1 as the images"),
         (lambda f: f.interpolate([torch.rand(4, 3), torch.rand(5, 3)]), ValueError, "attributes has several"),
         (lambda f: f.interpolate([torch.rand(4, 3), 1]), TypeError, "the list holds int"),
         (

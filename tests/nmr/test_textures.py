@@ -234,6 +234,7 @@ def test_colours_take_the_type_of_the_vertices():
         (lambda: nmr.UVTexture(torch.zeros(0, 4, 3), CORNERS), ValueError, "image must have texels"),
         (lambda: nmr.UVTexture(torch.zeros(4, 4, 3), torch.zeros(4, 3)), ValueError, r"uv must have shape \[T, 2\]"),
         (lambda: nmr.UVTexture(torch.zeros(4, 4, 3), CORNERS, wrap="tile"), ValueError, "wrap must be .*got 'tile'"),
+        (lambda: nmr.UVTexture(torch.zeros(4, 4, 3), CORNERS, 3), TypeError, "uv_faces must be .* got int"),
         (lambda: nmr.UVTexture(torch.zeros(4, 4, 3), CORNERS, CORNERS), TypeError, r"call uv_faces.long\(\)"),
         (
             lambda: nmr.UVTexture(torch.zeros(4, 4, 3), CORNERS, torch.zeros(2).long()),
@@ -251,7 +252,7 @@ def test_errors_say_what_was_wanted(make, error, words):
     "colors, words",
     [
         (nmr.VertexColors(uniform(5, 3)), r"colors must have one row per vertex, 4 of them, got float64 \[1, 5, 3\]"),
-        (nmr.VertexColors(uniform(2, 4, 3)), r"colors must have batch size 1 or 1"),
+        (nmr.VertexColors(uniform(2, 4, 3)), r"colors must have batch size 1 as the images"),
         (nmr.FaceColors(uniform(3, 3)), "colors must have one row per face, 2 of them"),
         (nmr.TextureCubes(uniform(3, 2, 2, 2, 3)), "textures must have one row per face, 2 of them"),
         (nmr.UVTexture(uniform(4, 4, 3), uniform(3, 2)), "uv must have one row per vertex, 4 of them"),

@@ -1,0 +1,111 @@
+"""The example scripts and the notebook run, leave pictures that show something, and what they fit gets better.
+
+The notebook's cells are executed in order in one namespace, without a Jupyter kernel: they are plain Python, and a
+kernel would add a dozen dependencies to see the same.
+"""
+
+import ast
+import json
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+import tyro
+from PIL import Image
+
+EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """At sizes as small as these threads wait for each other longer than they work, above all on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def run(name, output, *arguments):
+    """Runs an example as from the command line and returns what it returns."""
+    main = runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"]
+    return tyro.cli(main, args=["--output", str(output), *arguments])
+
+
+def check_picture(pixels, width, height):
+    assert pixels.shape == (height, width, 3) and pixels.dtype == np.uint8
+    # A fifth of the pixels at least is background, and what is drawn has shades.
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 50
+    assert (pixels == 255).all(-1).mean() > 0.2
+    # The object is inside: nothing touches the left and the upper border.
+    assert (pixels[0] == 255).all() and (pixels[:, 0] == 255).all()
+
+
+def check_movie(path, width, height):
+    frames = imageio.imread(path)
+    assert frames.ndim == 4 and len(frames) > 10 and frames.shape[1:3] == (height, width)
+    assert (frames[0] != frames[-1]).any(-1).mean() > 0.02
+
+
+def test_every_example_is_tested_and_short():
+    scripts = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+    assert scripts == ["draw_views", "find_camera", "fit_packed", "fit_silhouette", "fit_texture"]
+    assert all(len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 80 for name in scripts)
+
+
+def test_draw_views_from_the_command_line(tmp_path):
+    command = [sys.executable, str(EXAMPLES / "draw_views.py"), "--output", str(tmp_path / "new"), "--views", "2"]
+    done = subprocess.run([*command, "--image-size", "64"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    check_picture(imageio.imread(tmp_path / "new" / "views.png"), 2 * 64, 3 * 64)
+
+
+def test_fit_silhouette(tmp_path):
+    before, after = run("fit_silhouette", tmp_path, "--steps", "60", "--image-size", "64")
+    assert after < before / 2.5
+    check_picture(imageio.imread(tmp_path / "fit_silhouette.png"), 4 * 192, 2 * 128)
+    check_movie(tmp_path / "fit_silhouette.gif", 2 * 192, 128)
+
+
+def test_fit_texture(tmp_path):
+    before, after = run("fit_texture", tmp_path, "--steps", "16", "--views", "6", "--size", "64")
+    assert after < before / 5
+    pixels = imageio.imread(tmp_path / "fit_texture.png")
+    check_picture(pixels[: 2 * 64], 4 * 64, 2 * 64)
+
+
+def test_find_camera(tmp_path):
+    before, after = run("find_camera", tmp_path, "--steps", "90", "--image-size", "64")
+    assert after < before / 20
+    check_picture(imageio.imread(tmp_path / "find_camera.png"), 4 * 64, 4 * 64)
+    check_movie(tmp_path / "find_camera.gif", 4 * 64, 2 * 64)
+
+
+def test_fit_packed(tmp_path):
+    before, after = run("fit_packed", tmp_path, "--steps", "60", "--image-size", "48")
+    assert after < before / 2
+    check_picture(imageio.imread(tmp_path / "fit_packed.png"), 2 * 192, 2 * 192)
+
+
+def test_notebook():
+    notebook = json.loads((EXAMPLES / "quick_tour.ipynb").read_text())
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
+    names, pictures = {}, []
+    for cell in cells:
+        body = ast.parse("".join(cell["source"])).body
+        last = body.pop() if isinstance(body[-1], ast.Expr) else None
+        exec(compile(ast.Module(body, []), "quick_tour.ipynb", "exec"), names)
+        if last is not None:  # what Jupyter shows below the cell
+            value = eval(compile(ast.Expression(last.value), "quick_tour.ipynb", "eval"), names)
+            if value is not None:
+                pictures.append(value)
+    assert len(pictures) == 6 and all(isinstance(picture, Image.Image) for picture in pictures)
+    for picture in pictures:
+        pixels = np.asarray(picture)
+        assert pixels.shape[1] == 4 * 128 and 20 < pixels.std()
+    assert names["losses"][-1] < names["losses"][0] / 3
