@@ -399,6 +399,12 @@ def render_face_index(
     ------
     TypeError, ValueError
         As :func:`render_silhouette`.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> face_index = nmr.render_face_index(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), image_size=64)
+    >>> seen = torch.unique(face_index[face_index >= 0])
     """
     scene = make_scene(vertices, faces, camera, image_size, False, near, far)
     owner = scene.rasterize(fill_back, near, far)

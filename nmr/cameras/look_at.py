@@ -23,7 +23,8 @@ _NARROWEST_DEG = 1e-9  # there float still holds what is divided by the tangent
 def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: Scalars) -> Tensor:
     """Points on a sphere around the origin: ``(d cos e sin a, d sin e, -d cos e cos a)``, ``[3]`` or ``[B, 3]``.
 
-    Numbers, sequences and tensors of one length broadcast; other lengths raise a ValueError. At azimuth 0 and
+    Numbers, sequences and tensors of one length broadcast; other lengths raise a ValueError, and what are not numbers a
+    TypeError. At azimuth 0 and
     elevation 0 the point is ``(0, 0, -d)``.
     """
     d, e, a = (
@@ -105,8 +106,8 @@ class LookAt(ProjectingCamera):
 
     Raises
     ------
-    ValueError
-        For a shape other than those, batch sizes that differ, or half_fov_deg outside (0, 90).
+    TypeError, ValueError
+        For what are not numbers, a shape other than those, batch sizes that differ, or half_fov_deg outside (0, 90).
 
     Examples
     --------
@@ -142,8 +143,14 @@ class Look(ProjectingCamera):
 
     Raises
     ------
-    ValueError
+    TypeError, ValueError
         As :class:`LookAt`.
+
+    Examples
+    --------
+    >>> camera = nmr.Look([0.0, 0.0, -2.0], direction=[0.0, 0.0, 5.0])
+    >>> camera.transform(torch.tensor([[0.0, 0.5, 0.0]]))[0, 0, 2]
+    tensor(2.)
     """
 
     eye: Numbers
@@ -167,8 +174,14 @@ class Orthographic(ProjectingCamera):
 
     Raises
     ------
-    ValueError
-        For a wrong shape, batch sizes that differ, or a scale that is not positive and finite.
+    TypeError, ValueError
+        For what are not numbers, a wrong shape, batch sizes that differ, or a scale that is not positive and finite.
+
+    Examples
+    --------
+    >>> camera = nmr.Orthographic([0.0, 0.0, -2.0], scale=0.5)
+    >>> camera.transform(torch.tensor([[1.0, 0.0, 3.0]]))
+    tensor([[[0.5000, 0.0000, 5.0000]]])
     """
 
     eye: Numbers
