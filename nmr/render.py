@@ -218,7 +218,8 @@ def render_silhouette(
     anti_aliasing : bool
         Raster at 2S x 2S and average 2x2 pixels.
     fill_back : bool
-        Draw faces from behind, too. Without it only faces that are counter-clockwise on the screen are drawn.
+        Draw faces from behind, too. Without it only faces that are counter-clockwise on the screen are drawn; a camera
+        that mirrors the world (LookAt, Look, Orthographic) turns the outside of mesh files clockwise.
     near, far : float
         A pixel is covered only where near < depth < far. Faces are not clipped.
     eps : float
