@@ -46,9 +46,12 @@ def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: S
 
 def _scalar(value: Scalars, name: str, low: float, high: float, wanted: str) -> float | Tensor:
     """A number, or a float tensor [] or [B], strictly between low and high."""
-    if not isinstance(value, (int, float)):
+    if isinstance(value, (int, float)):
+        inside = low < value < high  # torch.compile reads no tensors
+    else:
         value = as_parameter(value, name)
-    if not torch.as_tensor((low < value) & (value < high)).all():
+        inside = ((low < value) & (value < high)).all()
+    if not inside:
         raise ValueError(f"{name} must lie {wanted}, got {value}")
     return value
 
