@@ -43,6 +43,12 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     ------
     TypeError, ValueError
         If the shapes differ, or there is nothing to compare.
+
+    Examples
+    --------
+    >>> target = torch.tensor([[0.0, 1.0, 1.0]])
+    >>> nmr.losses.soft_iou_loss(torch.tensor([[0.5, 1.0, 0.0]]), target)
+    tensor(0.6000)
     """
     if not isinstance(prediction, Tensor) or not isinstance(target, Tensor) or not prediction.is_floating_point():
         raise TypeError(
@@ -85,6 +91,12 @@ def smoothness_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     ------
     TypeError, ValueError
         For wrong types and shapes, and for edges that refer to missing vertices.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> edges = nmr.edge_table(faces)
+    >>> nmr.losses.smoothness_loss(vertices, edges)
     """
     vertices = _check_meshes(vertices)
     return ops.smoothness(vertices, _check_edge_table(edges).to(vertices.device)).mean()

@@ -20,6 +20,12 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
     ------
     TypeError, ValueError
         If subdivisions is not an integer in 0..7.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> vertices.shape, faces.shape
+    (torch.Size([642, 3]), torch.Size([1280, 3]))
     """
     if not hasattr(subdivisions, "__index__"):
         raise TypeError(f"subdivisions must be an integer, got {describe(subdivisions)}")
@@ -95,6 +101,12 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
     TypeError, ValueError
         For a wrong type or shape, and for a mesh with an edge that does not have exactly two faces (a border, unless
         `open_mesh`; a non-manifold edge or a degenerate face): the message says how many edges and names the first.
+
+    Examples
+    --------
+    >>> square = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    >>> nmr.edge_table(square, open_mesh=True)
+    tensor([[0, 2, 1, 3]])
     """
     faces = _one_mesh(faces)
     # Sides 0-1, 1-2 and 2-0 with their opposite corners, grouped by edge; a stable sort keeps the face order.
@@ -191,6 +203,12 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     ------
     TypeError, ValueError
         For wrong types and shapes, and for faces that refer to missing vertices.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> (nmr.vertex_normals(vertices, faces) * vertices).sum(-1).min() > 0.999
+    tensor(True)
     """
     batched = check_vertices(vertices)
     faces = check_faces(faces, batched.shape[0], batched.device)

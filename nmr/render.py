@@ -218,7 +218,8 @@ def render_silhouette(
     anti_aliasing : bool
         Raster at 2S x 2S and average 2x2 pixels.
     fill_back : bool
-        Draw faces from behind, too. Without it only faces that are counter-clockwise on the screen are drawn.
+        Draw faces from behind, too. Without it only faces that are counter-clockwise on the screen are drawn; a camera
+        that mirrors the world (LookAt, Look, Orthographic) turns the outside of mesh files clockwise.
     near, far : float
         A pixel is covered only where near < depth < far. Faces are not clipped.
     eps : float
@@ -399,6 +400,12 @@ def render_face_index(
     ------
     TypeError, ValueError
         As :func:`render_silhouette`.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> face_index = nmr.render_face_index(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), image_size=64)
+    >>> seen = torch.unique(face_index[face_index >= 0])
     """
     scene = make_scene(vertices, faces, camera, image_size, False, near, far)
     owner = scene.rasterize(fill_back, near, far)

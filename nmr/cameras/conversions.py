@@ -81,8 +81,8 @@ def from_opencv(
 
     Raises
     ------
-    ValueError
-        For other shapes, also those of OpenCV's longer distortion models.
+    TypeError, ValueError
+        For what are not numbers, other shapes, also those of OpenCV's longer distortion models.
     """
     height, width = height_and_width((height, width), "height and width")
     K = batched(as_parameter(K, "K", 3, 3), torch.float64, 3, 3)
@@ -143,8 +143,8 @@ def from_opengl(view: Numbers, projection: Numbers) -> Projection:
 
     Raises
     ------
-    ValueError
-        For other shapes, or matrices that no camera of this form has.
+    TypeError, ValueError
+        For what are not numbers, other shapes, or matrices that no camera of this form has.
     """
     view = batched(as_parameter(view, "view", 4, 4), torch.float64, 4, 4)
     clip = batched(as_parameter(projection, "projection", 4, 4), torch.float64, 4, 4)
@@ -231,8 +231,8 @@ def from_pytorch3d(
 
     Raises
     ------
-    ValueError
-        For other shapes, or a missing or impossible image_size.
+    TypeError, ValueError
+        For what are not numbers, other shapes, or a missing or impossible image_size.
     """
     R, T = (
         batched(as_parameter(R, "R", 3, 3), torch.float64, 3, 3),
@@ -281,8 +281,8 @@ def to_pytorch3d(
 
     Raises
     ------
-    ValueError
-        For a camera with distortion or skew, or a missing or impossible image_size.
+    TypeError, ValueError
+        For what is not a camera of nmr, a camera with distortion or skew, or a missing or impossible image_size.
     """
     camera = _without_distortion(camera, "PyTorch3D")
     height, width = _image_size(image_size, in_ndc)

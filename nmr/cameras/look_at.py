@@ -23,7 +23,8 @@ _NARROWEST_DEG = 1e-9  # there float still holds what is divided by the tangent
 def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: Scalars) -> Tensor:
     """Points on a sphere around the origin: ``(d cos e sin a, d sin e, -d cos e cos a)``, ``[3]`` or ``[B, 3]``.
 
-    Numbers, sequences and tensors of one length broadcast; other lengths raise a ValueError. At azimuth 0 and
+    Numbers, sequences and tensors of one length broadcast; other lengths raise a ValueError, and what are not numbers a
+    TypeError. At azimuth 0 and
     elevation 0 the point is ``(0, 0, -d)``.
     """
     d, e, a = (
@@ -45,9 +46,12 @@ def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: S
 
 def _scalar(value: Scalars, name: str, low: float, high: float, wanted: str) -> float | Tensor:
     """A number, or a float tensor [] or [B], strictly between low and high."""
-    if not isinstance(value, (int, float)):
+    if isinstance(value, (int, float)):
+        inside = low < value < high  # torch.compile reads no tensors
+    else:
         value = as_parameter(value, name)
-    if not torch.as_tensor((low < value) & (value < high)).all():
+        inside = ((low < value) & (value < high)).all()
+    if not inside:
         raise ValueError(f"{name} must lie {wanted}, got {value}")
     return value
 
@@ -105,8 +109,8 @@ class LookAt(ProjectingCamera):
 
     Raises
     ------
-    ValueError
-        For a shape other than those, batch sizes that differ, or half_fov_deg outside (0, 90).
+    TypeError, ValueError
+        For what are not numbers, a shape other than those, batch sizes that differ, or half_fov_deg outside (0, 90).
 
     Examples
     --------
@@ -142,8 +146,14 @@ class Look(ProjectingCamera):
 
     Raises
     ------
-    ValueError
+    TypeError, ValueError
         As :class:`LookAt`.
+
+    Examples
+    --------
+    >>> camera = nmr.Look([0.0, 0.0, -2.0], direction=[0.0, 0.0, 5.0])
+    >>> camera.transform(torch.tensor([[0.0, 0.5, 0.0]]))[0, 0, 2]
+    tensor(2.)
     """
 
     eye: Numbers
@@ -167,8 +177,14 @@ class Orthographic(ProjectingCamera):
 
     Raises
     ------
-    ValueError
-        For a wrong shape, batch sizes that differ, or a scale that is not positive and finite.
+    TypeError, ValueError
+        For what are not numbers, a wrong shape, batch sizes that differ, or a scale that is not positive and finite.
+
+    Examples
+    --------
+    >>> camera = nmr.Orthographic([0.0, 0.0, -2.0], scale=0.5)
+    >>> camera.transform(torch.tensor([[1.0, 0.0, 3.0]]))
+    tensor([[[0.5000, 0.0000, 5.0000]]])
     """
 
     eye: Numbers

@@ -37,8 +37,8 @@ class Pinhole(ProjectingCamera):
 
     Raises
     ------
-    ValueError
-        For a shape other than those, batch sizes that differ, or an orig_size that is not positive.
+    TypeError, ValueError
+        For what are not numbers, other shapes, batch sizes that differ, or an orig_size that is not positive.
 
     Examples
     --------

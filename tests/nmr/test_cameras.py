@@ -408,6 +408,24 @@ def test_tensors_in_lists_keep_their_gradient():
     assert t.grad == len(POINTS)
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda t: nmr.LookAt(t, half_fov_deg=20.0),
+        lambda t: nmr.Orthographic([0.0, t[1], -2.0], scale=0.5),
+        lambda t: nmr.Pinhole(K, K, t, orig_size=(2, 3)),
+    ],
+)
+def test_cameras_are_made_in_a_compiled_graph(make):
+    points, t = torch.rand(5, 3), torch.tensor([0.1, 0.2, -2.0], requires_grad=True)
+
+    def transform(points, t):
+        return make(t).transform(points)
+
+    compiled = torch.compile(transform, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(points, t), transform(points, t))
+
+
 def test_no_pose_is_an_empty_batch():
     points = torch.rand(4, 3, requires_grad=True)
     for camera in (

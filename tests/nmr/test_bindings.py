@@ -1,0 +1,116 @@
+"""The last check before the kernels: every array that does not fit is an error and no access outside an array.
+
+Fragments, edges, colours and cameras have theirs beside the tests of their values.
+"""
+
+import mmap
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from nmr import _C, ops
+
+CALLS = {
+    "rasterize": lambda a: _C.rasterize(a["vertices"], a["faces"], a["starts"], a["owner"], True, 0.1, 100.0, 1),
+    "silhouette": lambda a: _C.silhouette_forward(a["owner"], a["alpha"], True, 1),
+    "silhouette_backward": lambda a: _C.silhouette_backward(
+        a["vertices"], a["faces"], a["starts"], a["owner"], a["alpha"], a["grad"], True, 1e-4, 1
+    ),
+    "smoothness": lambda a: _C.smoothness_forward(a["vertices"], a["edges"], a["loss"], 1),
+    "smoothness_backward": lambda a: _C.smoothness_backward(a["vertices"], a["edges"], a["loss"], a["grad"], 1),
+    "voxelize": lambda a: _C.voxelize(a["vertices"].astype(np.float32), a["faces"], a["voxels"], a["size"], 1),
+}
+RASTER, SMOOTHNESS = ("rasterize", "silhouette_backward"), ("smoothness", "smoothness_backward")
+STARTS = np.array([[0, 0], [6, 2], [12, 4]])
+
+
+@pytest.mark.parametrize(
+    "calls, change, words",
+    [
+        (RASTER, dict(vertices=np.zeros((12, 3))), r"vertices must have shape \[B, V, 3\], got \[12, 3\]"),
+        (RASTER, dict(starts=STARTS), r"vertices must have shape \[N, 3\], got \[2, 12, 3\]"),
+        (RASTER, dict(faces=np.zeros((4, 2), int)), r"faces must have shape \[F, 3\], or .* got \[4, 2\]"),
+        (RASTER, dict(faces=np.zeros((3, 4, 3), int)), r"with the B of vertices \[2, 12, 3\], got \[3, 4, 3\]"),
+        (RASTER, dict(faces=np.full((4, 3), -1)), "faces refer to vertex -1, but a mesh has 12 vertices"),
+        (("rasterize",), dict(owner=np.zeros((2, 0, 0), np.int32)), r"R in 1\.\.16384, got \[2, 0, 0\]"),
+        (
+            ("rasterize",),
+            dict(owner=np.zeros((3, 8, 8), np.int32)),
+            r"owner must have shape \[2, 8, 8\], got \[3, 8, 8\]",
+        ),
+        (("silhouette",), dict(alpha=np.zeros((2, 4))), r"alpha must have shape \[B, S, S\], got \[2, 4\]"),
+        (("silhouette",), dict(alpha=np.zeros((2, 4, 5))), r"alpha must have shape \[2, 4, 4\], got \[2, 4, 5\]"),
+        (("silhouette",), dict(owner=np.zeros((2, 4, 4), np.int32)), r"owner must have shape \[2, 8, 8\]"),
+        (RASTER[1:], dict(owner=np.zeros((2, 9, 9), np.int32)), r"has an even size, got \[2, 9, 9\]"),
+        (RASTER[1:], dict(owner=np.full((2, 8, 8), 9, np.int32)), "the owner map does not belong to these faces"),
+        (RASTER[1:], dict(alpha=np.zeros((2, 8, 8))), r"grad_alpha must have shape \[2, 4, 4\], got \[2, 8, 8\]"),
+        (RASTER[1:], dict(grad=np.zeros((1, 12, 3))), r"grad_vertices must have shape \[2, 12, 3\], got \[1, 12, 3\]"),
+        (SMOOTHNESS, dict(vertices=np.zeros((2, 12))), r"vertices must have shape \[B, V, 3\], got \[2, 12\]"),
+        (SMOOTHNESS, dict(edges=np.zeros((1, 3), int)), r"edges must have shape \[E, 4\], got \[1, 3\]"),
+        (SMOOTHNESS, dict(edges=np.full((1, 4), 12)), "edges refer to vertex 12, but a mesh has 12 vertices"),
+        (SMOOTHNESS[:1], dict(loss=np.zeros(3)), r"loss must have shape \[2\], got \[3\]"),
+        (SMOOTHNESS[1:], dict(loss=np.zeros(3)), r"grad_loss must have shape \[2\], got \[3\]"),
+        (SMOOTHNESS[1:], dict(grad=np.zeros((2, 12))), r"grad_vertices must have shape \[2, 12, 3\], got \[2, 12\]"),
+        (("voxelize",), dict(size=0), r"size must lie in 1\.\.1024, got 0"),
+        (("voxelize",), dict(size=5), r"voxels must have shape \[2, 5, 5, 5\], got \[2, 4, 4, 4\]"),
+    ],
+)
+def test_no_call_reads_or_writes_outside_an_array(calls, change, words):
+    arguments = dict(
+        vertices=np.random.default_rng(0).random((2, 12, 3)) + 0.5,
+        faces=np.arange(12).reshape(4, 3),
+        starts=None,
+        owner=np.zeros((2, 8, 8), np.int32),
+        alpha=np.zeros((2, 4, 4)),
+        grad=np.zeros((2, 12, 3)),
+        edges=np.array([[0, 1, 2, 3]]),
+        loss=np.zeros(2),
+        voxels=np.zeros((2, 4, 4, 4), bool),
+        size=4,
+    )
+    for call in calls:
+        CALLS[call](arguments)
+        with pytest.raises(ValueError, match=words):
+            CALLS[call]({**arguments, **change})
+
+
+@pytest.mark.parametrize("points", [(2, 5, 3), (3, 4, 3)])
+def test_projected_points_have_the_shape_of_the_vertices(points):
+    camera = [np.zeros(shape) for shape in ((2, 3, 4), (2, 2, 3))]
+    with pytest.raises(ValueError, match=rf"points must have shape \[2, 4, 3\], got \[{points[0]}, {points[1]}, 3\]"):
+        _C.project_forward(np.zeros((2, 4, 3)), *camera, None, None, None, None, np.zeros(points), True, 1)
+
+
+@pytest.mark.parametrize("change", [np.int32, np.asfortranarray, None])
+def test_nothing_is_converted_silently(change):
+    faces = None if change is None else np.arange(12).reshape(4, 3)
+    faces = faces.astype(change) if change is np.int32 else faces if change is None else change(faces)
+    with pytest.raises(TypeError, match="incompatible function arguments"):
+        _C.rasterize(np.zeros((2, 12, 3)), faces, None, np.zeros((2, 8, 8), np.int32), True, 0.1, 100.0, 1)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory that is promised and never touched")
+def test_more_faces_than_an_owner_map_can_name():
+    no_reserve = getattr(mmap, "MAP_NORESERVE", 0x4000)  # in the module from Python 3.13
+    faces = mmap.mmap(-1, 24 << 30, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | no_reserve)
+    with pytest.raises(ValueError, match=r"at most 2\^30 faces per mesh"):
+        _C.rasterize(
+            np.zeros((1, 3, 3)), np.frombuffer(faces, np.int64).reshape(-1, 3), None, np.zeros((1, 8, 8), np.int32),
+            *(True, 0.1, 100.0, 1),
+        )  # fmt: skip
+
+
+def test_gradients_of_gradients_are_refused():
+    """Those of the public functions are in their own tests; this one no public function reaches."""
+    grad = torch.rand(1, 4, 4, 1, requires_grad=True)
+    with pytest.raises(RuntimeError, match=r"render has no second derivative.*without create_graph=True"):
+        ops.edges.resolve_backward(grad, True).sum().backward()
+
+
+def test_without_its_compiled_part_the_package_says_so():
+    code = "import sys; sys.modules['nmr._C'] = None; import nmr"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "ImportError: the compiled part of nmr is missing" in result.stderr
