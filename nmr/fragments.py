@@ -12,6 +12,7 @@ from torch import Tensor
 from . import ops
 from ._packing import MeshBatch
 from ._validate import check_values, describe
+from .mesh import _unit
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -130,12 +131,17 @@ class Fragments:
         sums = torch.zeros_like(world.vertices).view(-1, 3)
         sums = sums.scatter_add(0, rows.reshape(-1, 1).expand(-1, 3), across.repeat_interleave(3, dim=0))
         at_vertices = _unit(sums).view(world.vertices.shape)
-        normals = _unit(ops.interpolate(at_vertices, self.faces, self.owner, self.weights, self.mesh.starts))
+        normals = ops.interpolate(at_vertices, self.faces, self.owner, self.weights, self.mesh.starts)
+        normals = F.normalize(normals, dim=-1, eps=1e-5)  # opposite ones that cancel stay short, and so do gradients
         turned = self.is_back != self._mirrored()
         return torch.where(turned.unsqueeze(-1), -normals, normals)
 
     def _face_normals(self) -> Tensor:
-        """``(v0 - v1) x (v2 - v1)`` in world space, of unit length: ``[B | 1, F, 3]``, packed ``[M, 3]``."""
+        """``(v0 - v1) x (v2 - v1)`` in world space, of unit length: ``[B | 1, F, 3]``, packed ``[M, 3]``.
+
+        However small the face: in the published renderer normals of products below 1e-5 stay short, and small meshes
+        dark. A face without area has none (0).
+        """
         world, across, _ = self._across()
         return _unit(across).view(*world.vertices.shape[:-2], self.faces.shape[-2], 3)
 
@@ -191,11 +197,6 @@ class Fragments:
         if image.ndim != 4 or image.shape[:3] != self.owner.shape:
             raise ValueError(f"image must have shape {[*self.owner.shape, 'C']}, got {describe(image)}")
         return ops.resolve(image, *self.mesh[:3], self.owner, self.anti_aliasing, self.eps)
-
-
-def _unit(vectors: Tensor) -> Tensor:
-    # As in the published renderer: a vector shorter than 1e-5 stays short, and is no error.
-    return F.normalize(vectors, dim=-1, eps=1e-5)
 
 
 def _usable(points: Tensor) -> Tensor:

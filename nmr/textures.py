@@ -150,7 +150,7 @@ class UVTexture:
         Row 0 is the top; any number of channels. Differentiable.
     uv : float Tensor [T, 2] or [B, T, 2]; for a list of meshes a list of [T_b, 2]
         (0, 0) is the bottom left corner of the image, (1, 1) its top right one; texel centres are at half texels.
-        Differentiable where texels differ.
+        Differentiable where texels differ. What is not finite or beyond 1e6 counts as 0.
     uv_faces : integer Tensor [F, 3] or [B, F, 3], or a list; optional
         Rows of uv at the corners of each face. Without it there is one uv per vertex. A seam is where faces that
         share a vertex have different rows.

@@ -426,6 +426,19 @@ def test_empty_batches_and_meshes(batch, num_vertices, num_faces):
     assert images.fragments.face_index.shape == (batch, 16, 16) and not vertices.grad.any()
 
 
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("size", [1e-4, 1e4])
+def test_normals_and_light_do_not_depend_on_the_unit_of_length(size, smooth):
+    """The published renderer's normals are shorter where the cross product of a face's sides is below 1e-5."""
+    vertices, faces = nmr.icosphere(2)
+    setting = dict(image_size=16, near=1e-6, far=1e6, outputs=("normals", "rgb"), smooth_normals=smooth)
+    setting["lights"] = nmr.Lights(0.2, 0.8, [0.3, 0.5, -0.8], smooth=smooth)
+    expected = nmr.render(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), **setting)
+    images = nmr.render(vertices * size, faces, nmr.LookAt([0.0, 0.0, -3.0 * size]), **setting)
+    for image, wanted in zip(images, expected, strict=True):
+        torch.testing.assert_close(image, wanted, atol=1e-4, rtol=1e-4)
+
+
 # --- torch
 
 
