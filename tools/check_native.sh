@@ -5,6 +5,7 @@
 #   tsan          the same under ThreadSanitizer, with a small OpenMP of our own that it can see through (g++)
 #   tsan-clang    the same with LLVM's OpenMP, which tells the sanitizer what it does (clang++)
 #   fuzz SECONDS  libFuzzer (clang++); findings: build/native/fuzz/finding-*; inputs: build/native/corpus
+#   keep          adds to tests/csrc/corpus.hex what reaches code that nothing in it reaches
 #   count         instructions of workload W1 under callgrind, against tests/csrc/instructions.json
 #   variants      the same bits from every compiler and instruction set at hand
 #   coverage      lines and branches of csrc/ and nmr/ that the C++ and Python tests reach
@@ -28,7 +29,7 @@ want() { # program, what for
     command -v "$1" >/dev/null || skip "no $1 on this machine, which $2 needs"
 }
 
-build() { # name, compiler, flags, targets ("" for all), further cmake arguments
+build() { # name, compiler, flags, targets, further cmake arguments
     local name=$1 compiler=$2 flags=$3 targets=$4
     shift 4
     local generator=()
@@ -36,7 +37,7 @@ build() { # name, compiler, flags, targets ("" for all), further cmake arguments
     # shellcheck disable=SC2086
     cmake -S tests/csrc -B "build/native/$name" "${generator[@]}" -DCMAKE_CXX_COMPILER="$compiler" -DCMAKE_CXX_FLAGS="$flags" \
         -DCMAKE_BUILD_TYPE=None -DPython_EXECUTABLE="$python" "$@" >"build/native/$name.log" 2>&1 &&
-        cmake --build "build/native/$name" --parallel "${JOBS:-2}" ${targets:+--target $targets} >>"build/native/$name.log" 2>&1 ||
+        cmake --build "build/native/$name" --parallel "${JOBS:-2}" --target $targets >>"build/native/$name.log" 2>&1 ||
         { grep -E -A8 "error|Error|FAILED" "build/native/$name.log" | head -60; echo "the whole log: build/native/$name.log"; exit 1; }
 }
 
@@ -46,25 +47,25 @@ run_tests() { # name of the build
 }
 
 check_tests() {
-    build plain "${CXX:-c++}" -O3 "" -DNMR_MULTIVERSION=ON # as it is shipped
+    build plain "${CXX:-c++}" -O3 "tests fuzz" -DNMR_MULTIVERSION=ON # as it is shipped
     run_tests plain
 }
 
 check_asan() {
-    build asan "${CXX:-c++}" "$address" ""
+    build asan "${CXX:-c++}" "$address" "tests fuzz"
     export UBSAN_OPTIONS=print_stacktrace=1
     run_tests asan
 }
 
 check_tsan() {
     want g++ "the ThreadSanitizer check"
-    build tsan g++ "$sanitize -fsanitize=thread" "" -DNMR_OWN_GOMP=ON
+    build tsan g++ "$sanitize -fsanitize=thread" "tests fuzz" -DNMR_OWN_GOMP=ON
     run_tests tsan
 }
 
 check_tsan_clang() {
     want clang++ "the ThreadSanitizer check with LLVM's OpenMP"
-    build tsan-clang clang++ "$sanitize -fsanitize=thread" ""
+    build tsan-clang clang++ "$sanitize -fsanitize=thread" "tests fuzz"
     # The OpenMP library itself is not instrumented; archer reports its synchronisation instead, or there is no check.
     local archer
     archer=$(clang++ -print-resource-dir)/../../libarcher.so
@@ -80,6 +81,14 @@ check_fuzz() {
     nice -n 19 build/native/fuzz/fuzz -max_total_time="$1" -max_len=512 -print_final_stats=1 -timeout=10 -rss_limit_mb=2048 \
         -artifact_prefix=build/native/fuzz/finding- build/native/corpus 2>&1 | tee build/native/fuzz.txt |
         grep -v -E "	(NEW|REDUCE|pulse) |NEW_FUNC"
+}
+
+check_keep() {
+    [ -x build/native/fuzz/fuzz ] || skip "nothing was fuzzed yet"
+    rm -rf build/native/kept
+    mkdir build/native/kept
+    build/native/fuzz/fuzz -set_cover_merge=1 -use_counters=0 build/native/kept build/native/corpus 2>&1 | tail -1
+    "$python" tests/csrc/corpus.py pack build/native/kept
 }
 
 check_count() {
@@ -124,7 +133,7 @@ VARIANTS
 
 check_coverage() {
     "$python" -c 'import gcovr' 2>/dev/null || skip "no gcovr in $python (it comes with the test extra)"
-    build coverage g++ "-O0 -g --coverage" ""
+    build coverage g++ "-O0 -g --coverage" "tests fuzz"
     find build/native/coverage -name '*.gcda' -delete
     run_tests coverage
     # The package beside the build: Python tests run with the instrumented kernels and their bindings.
@@ -154,12 +163,12 @@ check_coverage() {
     "${gcovr[@]}" --txt /dev/null --print-summary
 }
 
-[ $# -gt 0 ] || { sed -n '2,14s/^# \{0,1\}//p' "$0"; exit 2; }
+[ $# -gt 0 ] || { sed -n '2,15s/^# \{0,1\}//p' "$0"; exit 2; }
 mkdir -p build/native
 check=$1
 shift
 case $check in
-tests | asan | tsan | count | variants | coverage | fuzz) "check_$check" "$@" ;;
+tests | asan | tsan | count | variants | coverage | fuzz | keep) "check_$check" "$@" ;;
 tsan-clang) check_tsan_clang ;;
 *) echo "no check of that name: $check"; exit 2 ;;
 esac

@@ -1,7 +1,7 @@
 """The corpus of the fuzz target (fuzz.cpp): corpus.hex, an input per line. libFuzzer wants a file for each.
 
 python tests/csrc/corpus.py unpack FOLDER      writes the corpus into a folder
-python tests/csrc/corpus.py pack FOLDER        makes the folder's files and the seeds of this script the corpus
+python tests/csrc/corpus.py pack FOLDER        adds the folder's files, and the seeds of this script, to the corpus
 """
 
 import hashlib
@@ -81,7 +81,8 @@ def unpack(folder: Path) -> None:
 
 def pack(folder: Path) -> None:
     found = {path.read_bytes() for path in folder.glob("*")} if folder.exists() else set()
-    lines = sorted({data.hex() for data in {*found, *seeds()}}, key=lambda line: (len(line), line))
+    present = CORPUS.read_text().split() if CORPUS.exists() else []
+    lines = sorted({*present, *(data.hex() for data in {*found, *seeds()})}, key=lambda line: (len(line), line))
     CORPUS.write_text("".join(f"{line}\n" for line in lines))
     print(f"{len(lines)} inputs, {CORPUS.stat().st_size} bytes")
 
