@@ -114,3 +114,16 @@ def test_without_its_compiled_part_the_package_says_so():
     code = "import sys; sys.modules['nmr._C'] = None; import nmr"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "ImportError: the compiled part of nmr is missing" in result.stderr
+
+
+@pytest.mark.parametrize("name", ["vertices", "matrix", "intrinsics", "distortion", "origin", "extent"])
+def test_project_backward_checks_the_shape_of_every_output(name):
+    shapes = dict(
+        vertices=(2, 4, 3), matrix=(2, 3, 4), intrinsics=(2, 2, 3), distortion=(2, 5), origin=(2, 3), extent=(2,)
+    )
+    inputs = [np.ones(shape) for shape in shapes.values()]
+    grads = {key: np.ones(shape) for key, shape in shapes.items()}
+    grads[name] = np.ones((7, *shapes[name]))
+    order = ("vertices", "matrix", "intrinsics", "distortion", "origin", "extent")
+    with pytest.raises(ValueError, match=f"grad_{name} must have shape"):
+        _C.project_backward(*inputs, None, np.ones((2, 4, 3)), *(grads[key] for key in order), True, 1)
