@@ -29,10 +29,10 @@ import torch as _torch  # noqa: F401  torch first: the extension then shares tor
 from . import cameras, losses, metrics
 from .cameras import Camera, Look, LookAt, Orthographic, Pinhole
 from .fragments import Fragments
+from .images import Images
 from .lights import Lights
 from .mesh import edge_table, face_normals, icosphere, unique_edges, vertex_normals
 from .render import (
-    Images,
     render,
     render_depth,
     render_face_index,

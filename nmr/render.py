@@ -2,51 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from ._packing import is_list
 from ._scene import Meshes, average, make_scene, shade
-from ._validate import describe
 from .cameras import Camera
 from .fragments import Fragments
+from .images import OUTPUTS, Images
 from .lights import Lights
 from .textures import Colors
-
-_OUTPUTS = ("rgb", "alpha", "depth", "normals", "fragments")
-
-
-class Images:
-    """What :func:`render` returns: the outputs asked for, as attributes and, in the order asked, by unpacking.
-
-    ``rgb [B, S, S, C]``, ``alpha [B, S, S]``, ``depth [B, S, S]``, ``normals [B, S, S, 3]``, ``fragments``
-    (:class:`Fragments`). Others raise an AttributeError.
-    """
-
-    rgb: Tensor
-    alpha: Tensor
-    depth: Tensor
-    normals: Tensor
-    fragments: Fragments
-
-    def __init__(self, outputs: dict[str, Tensor | Fragments]) -> None:
-        self.__dict__.update(outputs)
-
-    def __getattr__(self, name: str) -> Tensor | Fragments:
-        if name in _OUTPUTS:
-            raise AttributeError(f"{name} was not rendered; ask for it: outputs={(*self.__dict__, name)}")
-        raise AttributeError(f"Images has no attribute {name!r}; it has {', '.join(self.__dict__)}")
-
-    def __setattr__(self, name: str, value: object) -> None:
-        raise AttributeError(f"Images cannot be changed, so {name} cannot be set")
-
-    def __iter__(self) -> Iterator[Tensor | Fragments]:
-        return iter(self.__dict__.values())
-
-    def __repr__(self) -> str:
-        return f"Images({', '.join(f'{name}: {describe(value)}' for name, value in self.__dict__.items())})"
 
 
 def render(
@@ -112,11 +79,9 @@ def render(
     >>> camera = nmr.LookAt.from_angles(2.732, 30.0, [0.0, 90.0])
     >>> rgb, depth = nmr.render(vertices, faces, camera, outputs=("rgb", "depth"), lights=nmr.Lights(), image_size=64)
     """
-    listed = is_list(outputs) and all(name in _OUTPUTS for name in outputs)
+    listed = is_list(outputs) and all(name in OUTPUTS for name in outputs)
     if not listed or not outputs or len(set(outputs)) != len(outputs):
-        raise ValueError(
-            f"outputs must be different names out of {_OUTPUTS}, at least one, in a tuple; got {outputs!r}"
-        )
+        raise ValueError(f"outputs must be different names out of {OUTPUTS}, at least one, in a tuple; got {outputs!r}")
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, eps)
     images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the order asked
     if "alpha" in images and "rgb" not in images:

@@ -1,0 +1,43 @@
+"""What a rendering of several outputs holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from torch import Tensor
+
+from ._validate import describe
+from .fragments import Fragments
+
+OUTPUTS = ("rgb", "alpha", "depth", "normals", "fragments")
+
+
+class Images:
+    """What :func:`render` returns: the outputs asked for, as attributes and, in the order asked, by unpacking.
+
+    ``rgb [B, S, S, C]``, ``alpha [B, S, S]``, ``depth [B, S, S]``, ``normals [B, S, S, 3]``, ``fragments``
+    (:class:`Fragments`). Others raise an AttributeError.
+    """
+
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor
+    normals: Tensor
+    fragments: Fragments
+
+    def __init__(self, outputs: dict[str, Tensor | Fragments]) -> None:
+        self.__dict__.update(outputs)
+
+    def __getattr__(self, name: str) -> Tensor | Fragments:
+        if name in OUTPUTS:
+            raise AttributeError(f"{name} was not rendered; ask for it: outputs={(*self.__dict__, name)}")
+        raise AttributeError(f"Images has no attribute {name!r}; it has {', '.join(self.__dict__)}")
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError(f"Images cannot be changed, so {name} cannot be set")
+
+    def __iter__(self) -> Iterator[Tensor | Fragments]:
+        return iter(self.__dict__.values())
+
+    def __repr__(self) -> str:
+        return f"Images({', '.join(f'{name}: {describe(value)}' for name, value in self.__dict__.items())})"
