@@ -49,12 +49,6 @@ NMR_INLINE bool is_drawable(const Triangle<T>& t) {
   return finite && ((t.x[1] - x0) * (t.y[2] - y0) != (t.y[1] - y0) * (t.x[2] - x0));
 }
 
-// Counter-clockwise (y up), or of exactly zero area. In floating point a sliver can pass in both vertex orders, or in neither.
-template <class T>
-NMR_INLINE bool faces_camera(const Triangle<T>& t) {
-  return !((t.y[2] - t.y[0]) * (t.x[1] - t.x[0]) < (t.y[1] - t.y[0]) * (t.x[2] - t.x[0]));
-}
-
 // Rows of the matrix M with barycentric weight w_k = M[k][0] X + M[k][1] Y + M[k][2] at pixel coordinates (X, Y): the inverse
 // of the matrix with columns (X_k, Y_k, 1).
 template <class T>

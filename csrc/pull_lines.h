@@ -17,7 +17,7 @@ struct PullLines {
   std::vector<T> position, weight;        // [R, R + lanes] background pixels with gradient < 0, ascending, and -gradient; 0 after
   std::vector<int32_t> count;             // [R] how many
   std::vector<T> first, last;             // [R + lanes] the first and last of them; +-infinity if there is none
-  std::vector<T> gain_first, gain_last;   // [R + lanes] first and last covered pixel with gradient > 0
+  std::vector<T> gain_first, gain_last;   // [R + lanes] bounds of the covered pixels with gradient > 0
 
   void reserve_lines(int64_t R) {
     for (std::vector<T>* v : {&position, &weight}) reserve(*v, R * (R + kLanes));

@@ -62,6 +62,7 @@ NMR_INLINE T travel(T factor, T offset, T eps) {
   const T h = factor * offset;
   return h > 0 ? h + eps : h - eps;
 }
+
 // One pixel's pull, for pixels inside the face and for levers of extreme size. An end whose lever is not finite stays.
 template <class T>
 NMR_INLINE void pull(T weight, T offset, const Lever<T>& lever, T& grad_p, T& grad_q) {

@@ -82,13 +82,16 @@ MeshBatch<T> mesh_batch(const Array<T>& vertices, const Indices& faces, const st
   MeshBatch<T> mesh{vertices.data(), faces.data(), 0, vertices.shape(packed ? 0 : 1), faces.shape(per_image ? 1 : 0), per_image,
                     packed ? starts->data() : nullptr};
   require(mesh.num_faces < (int64_t(1) << 30), "at most 2^30 faces per mesh");
+  const auto require_vertices = [](int64_t count) { require(count < (int64_t(1) << 29), "at most 2^29 vertices per mesh"); };
   if (packed) {
     require_starts(*starts, mesh.num_vertices, mesh.num_faces);
     mesh.batch = starts->shape(0) - 1;
+    for (int64_t b = 0; b < mesh.batch; ++b) require_vertices(mesh.vertex_count(b));
     for (int64_t b = 0; b < mesh.batch; ++b)
       require_indices(mesh.image_faces(b), 3 * mesh.face_count(b), mesh.vertex_count(b), "faces", "vertex", "vertices");
   } else {
     mesh.batch = vertices.shape(0);
+    require_vertices(mesh.num_vertices);
     require_indices(faces.data(), faces.size(), mesh.num_vertices, "faces", "vertex", "vertices");
   }
   return mesh;

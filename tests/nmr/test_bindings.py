@@ -92,15 +92,28 @@ def test_nothing_is_converted_silently(change):
         _C.rasterize(np.zeros((2, 12, 3)), faces, None, np.zeros((2, 8, 8), np.int32), True, 0.1, 100.0, 1)
 
 
+def promised(gigabytes, dtype):
+    """An array of memory that is promised and never touched."""
+    no_reserve = getattr(mmap, "MAP_NORESERVE", 0x4000)  # in the module from Python 3.13
+    block = mmap.mmap(-1, gigabytes << 30, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | no_reserve)
+    return np.frombuffer(block, dtype)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="memory that is promised and never touched")
 def test_more_faces_than_an_owner_map_can_name():
-    no_reserve = getattr(mmap, "MAP_NORESERVE", 0x4000)  # in the module from Python 3.13
-    faces = mmap.mmap(-1, 24 << 30, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | no_reserve)
+    faces, owner = promised(24, np.int64).reshape(-1, 3), np.zeros((1, 8, 8), np.int32)
     with pytest.raises(ValueError, match=r"at most 2\^30 faces per mesh"):
-        _C.rasterize(
-            np.zeros((1, 3, 3)), np.frombuffer(faces, np.int64).reshape(-1, 3), None, np.zeros((1, 8, 8), np.int32),
-            *(True, 0.1, 100.0, 1),
-        )  # fmt: skip
+        _C.rasterize(np.zeros((1, 3, 3)), faces, None, owner, True, 0.1, 100.0, 1)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory that is promised and never touched")
+@pytest.mark.parametrize("packed", [False, True])
+def test_more_vertices_than_the_set_up_of_faces_can_name(packed):
+    vertices, faces = promised(6, np.float32).reshape(-1, 3), np.array([[0, 1, 2]])
+    starts = np.array([[0, 0], [len(vertices), 1]]) if packed else None
+    owner = np.zeros((1, 8, 8), np.int32)
+    with pytest.raises(ValueError, match=r"at most 2\^29 vertices per mesh"):
+        _C.rasterize(vertices if packed else vertices[None], faces, starts, owner, True, 0.1, 100.0, 1)
 
 
 def test_gradients_of_gradients_are_refused():
