@@ -9,15 +9,25 @@ import torch
 
 if TYPE_CHECKING:
     import nmr
+    from learn3d.data.poses import Poses
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
     """B views with what training and evaluation need to know about each of them."""
 
-    images: torch.Tensor  # uint8 [B, 4, 64, 64]: R, G, B and the mask, as stored by the data set
-    masks: torch.Tensor  # float32 [B, 64, 64] in [0, 1]: anti-aliased silhouettes, row 0 = top
-    cameras: nmr.LookAt  # the B cameras that saw the images
+    images: torch.Tensor  # uint8 [B, 4, S, S]: R, G, B and the mask, in the form that the encoder takes
+    masks: torch.Tensor  # float32 [B, 64, 64] in [0, 1]: silhouettes to be matched, row 0 = top
+    poses: Poses  # where the B cameras stood
     view_ids: torch.Tensor  # int64 [B] in 0 .. K-1: the pose class of each view
     object_ids: torch.Tensor  # int64 [B]: which object of the split each view shows
+    class_ids: torch.Tensor  # int64 [B]: which category each object belongs to (0 where there is one only)
     voxels: torch.Tensor | None  # bool [B, 32, 32, 32] ground truth in the data set's axes, None where there is none
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def cameras(self) -> nmr.cameras.Camera:
+        """The B cameras that saw the images."""
+        return self.poses.cameras()

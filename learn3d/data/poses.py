@@ -1,0 +1,115 @@
+"""Camera tables: the pose of every sample of a data set, ready to become cameras or features for a discriminator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import nmr
+
+
+def wrap_deg(angle_deg: Tensor) -> Tensor:
+    """Angles in degrees, brought into -180 (included) .. 180 (excluded)."""
+    return torch.remainder(angle_deg + 180.0, 360.0) - 180.0
+
+
+@dataclass(frozen=True, eq=False)
+class LookAtPoses:
+    """M perspective cameras that look at the origin from (distance, elevation, azimuth) in the object frame.
+
+    Conventions of `nmr.points_from_angles`: the eye is at d (cos e sin a, sin e, -cos e cos a).
+    """
+
+    azimuth_deg: Tensor  # float32 [M]
+    elevation_deg: Tensor | float  # float32 [M], or one value for all
+    distance: Tensor | float  # float32 [M], or one value for all; units of the object frame
+    half_fov_deg: Tensor | float  # float32 [M], or one value for all: half of the field of view
+
+    def __post_init__(self) -> None:
+        for name in ("azimuth_deg", "elevation_deg", "distance", "half_fov_deg"):
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, name, torch.from_numpy(np.ascontiguousarray(value, np.float32)))
+            value = getattr(self, name)
+            if isinstance(value, Tensor) and value.shape != (len(self.azimuth_deg),):
+                raise ValueError(f"{name} must be [{len(self.azimuth_deg)}] or one number, got {list(value.shape)}")
+
+    def __len__(self) -> int:
+        return len(self.azimuth_deg)
+
+    def __getitem__(self, indices: Tensor) -> LookAtPoses:
+        """The poses of the samples `indices`, int64 [B]."""
+        return LookAtPoses(*(value[indices] if isinstance(value, Tensor) else value for value in self._values()))
+
+    def cameras(self) -> nmr.LookAt:
+        """The M cameras as one batch."""
+        return nmr.LookAt.from_angles(
+            self.distance, self.elevation_deg, self.azimuth_deg, half_fov_deg=self.half_fov_deg
+        )
+
+    def features(self) -> Tensor:
+        """What tells a discriminator the view: the eye's position, float32 [M, 3]."""
+        return nmr.points_from_angles(self.distance, self.elevation_deg, self.azimuth_deg).to(torch.float32)
+
+    def mirrored(self, chosen: Tensor) -> LookAtPoses:
+        """The same poses, where `chosen` (bool [M]) seen in a mirror: the image flipped left-right, the azimuth negated."""
+        return replace(self, azimuth_deg=torch.where(chosen, -self.azimuth_deg, self.azimuth_deg))
+
+    @property
+    def elevations_deg(self) -> Tensor:
+        """The elevation of every sample, float32 [M]."""
+        return torch.as_tensor(self.elevation_deg, dtype=torch.float32).expand(len(self))
+
+    def _values(self) -> tuple[Tensor | float, ...]:
+        return self.azimuth_deg, self.elevation_deg, self.distance, self.half_fov_deg
+
+
+@dataclass(frozen=True, eq=False)
+class RotationPoses:
+    """M orthographic cameras given by a rotation each (Pascal3D+): v' = R v, and x', y' in [-1, 1] span the image.
+
+    The depth is moved in front of the camera (z' + `depth_offset`), which changes no pixel of a silhouette.
+    """
+
+    rotation: Tensor  # float32 [M, 3, 3]
+    depth_offset: float = 2.0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.rotation, np.ndarray):
+            rotation = torch.from_numpy(np.ascontiguousarray(self.rotation, np.float32))
+            object.__setattr__(self, "rotation", rotation)
+        if self.rotation.ndim != 3 or self.rotation.shape[1:] != (3, 3):
+            raise ValueError(f"rotation must be [M, 3, 3], got {list(self.rotation.shape)}")
+
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    def __getitem__(self, indices: Tensor) -> RotationPoses:
+        return RotationPoses(self.rotation[indices], self.depth_offset)
+
+    def cameras(self) -> nmr.cameras.Projection:
+        """The M cameras as one batch."""
+        offset = torch.tensor([0.0, 0.0, self.depth_offset]).expand(len(self), 3)[:, :, None]
+        intrinsics = torch.eye(2, 3).expand(len(self), 2, 3)
+        return nmr.cameras.Projection(torch.cat([self.rotation, offset], dim=2), intrinsics, perspective=False)
+
+    def features(self) -> Tensor:
+        """What tells a discriminator the view: the nine entries of the rotation, float32 [M, 9]."""
+        return self.rotation.reshape(len(self), 9)
+
+    def mirrored(self, chosen: Tensor) -> RotationPoses:
+        """The same poses, where `chosen` (bool [M]) for the image flipped left-right of an object with x' -> -x'.
+
+        For an object that is symmetric about z = 0 the flipped image is seen under D R D', D = diag(-1, 1, 1),
+        D' = diag(1, 1, -1).
+        """
+        image, body = torch.tensor([-1.0, 1.0, 1.0]), torch.tensor([1.0, 1.0, -1.0])
+        return replace(
+            self, rotation=torch.where(chosen[:, None, None], image[:, None] * self.rotation * body, self.rotation)
+        )
+
+
+Poses = LookAtPoses | RotationPoses

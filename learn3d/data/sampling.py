@@ -1,0 +1,69 @@
+"""Which samples a training step sees: functions of (data set, seed, step) alone, so that resuming needs no memory."""
+
+from __future__ import annotations
+
+import functools
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from learn3d.data.views import ViewDataset
+
+Sampling = Literal["views", "pairs", "classes"]
+
+
+def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, seed: int, step: int) -> Tensor:
+    """Samples of step `step` (from 1), int64 [batch_size].
+
+    "views": every view on its own, epochs of shuffled samples. "pairs": two different views of each of batch_size / 2
+    objects drawn at random, [a_1 .. a_n, b_1 .. b_n] (Kato et al. 2018). "classes": categories drawn uniformly, then a
+    view of each (Kato and Harada 2019).
+    """
+    if sampling == "views":
+        return shuffled_epochs(len(dataset), batch_size, seed, step)
+    rng = np.random.default_rng([seed, step])
+    if sampling == "pairs":
+        if batch_size % 2:
+            raise ValueError(f"pairs of views need an even batch_size, got {batch_size}")
+        starts, order = _views_by_object(dataset)
+        sizes = np.diff(starts)
+        able = np.flatnonzero(sizes >= 2)
+        if len(able) == 0:
+            raise ValueError("no object has two views; a multi-view method needs at least two views of an object")
+        objects = able[rng.integers(len(able), size=batch_size // 2)]
+        first = rng.integers(sizes[objects])
+        second = (first + rng.integers(1, sizes[objects])) % sizes[objects]
+        return torch.from_numpy(np.concatenate([order[starts[objects] + first], order[starts[objects] + second]]))
+    if sampling == "classes":
+        classes = np.zeros(dataset.num_objects, np.int64) if dataset.class_ids is None else dataset.class_ids
+        of_sample = classes[dataset.object_ids]
+        members = [np.flatnonzero(of_sample == c) for c in range(dataset.num_classes)]
+        drawn = rng.integers(dataset.num_classes, size=batch_size)
+        return torch.from_numpy(np.array([members[c][rng.integers(len(members[c]))] for c in drawn]))
+    raise ValueError(f"sampling must be views, pairs or classes, got {sampling!r}")
+
+
+def shuffled_epochs(num_samples: int, batch_size: int, seed: int, step: int) -> Tensor:
+    """The next ones of an endless row of shuffled epochs."""
+    positions = range((step - 1) * batch_size, step * batch_size)
+    pieces = []
+    for epoch in range(positions.start // num_samples, (positions.stop - 1) // num_samples + 1):
+        first = max(positions.start - epoch * num_samples, 0)
+        end = min(positions.stop - epoch * num_samples, num_samples)
+        pieces.append(_epoch_order(num_samples, seed, epoch)[first:end])
+    return torch.cat(pieces)
+
+
+@functools.lru_cache(maxsize=2)
+def _epoch_order(num_samples: int, seed: int, epoch: int) -> Tensor:
+    generator = torch.Generator().manual_seed((seed * 1_000_003 + epoch) % 2**63)
+    return torch.randperm(num_samples, generator=generator)
+
+
+@functools.lru_cache(maxsize=2)
+def _views_by_object(dataset: ViewDataset) -> tuple[np.ndarray, np.ndarray]:
+    """(starts [N+1], samples ordered by object [M])."""
+    order = np.argsort(dataset.object_ids, kind="stable")
+    return np.searchsorted(dataset.object_ids[order], np.arange(dataset.num_objects + 1)), order

@@ -1,0 +1,172 @@
+"""A data set in memory: a flat list of views of objects, whatever layout it was read from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from learn3d.data.batch import Batch
+from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
+from learn3d.data.poses import LookAtPoses, Poses
+from learn3d.data.view_bins import AngleBins
+
+MASK_SIZE = 64
+SPLITS = ("train", "val", "test")
+
+
+@dataclass(frozen=True, eq=False)
+class ViewDataset:
+    """One split of one category, or of several: M views (samples) of N objects. What every reader returns.
+
+    Raises ValueError where the parts do not fit each other.
+    """
+
+    category: str  # what the user called it; several names are joined by commas
+    split: str
+    images: np.ndarray  # uint8 [M, 4, S, S]: R, G, B and the mask
+    poses: Poses  # M camera poses
+    view_ids: np.ndarray  # int64 [M] in 0 .. K-1: pose classes
+    view_names: tuple[str, ...]  # K names of the pose classes
+    object_ids: np.ndarray  # int64 [M] in 0 .. N-1
+    object_names: tuple[str, ...]  # N names, as in the files
+    voxels: np.ndarray | None  # bool [N, 32, 32, 32] in the data set's own axes; None where there is no ground truth
+    convention: VoxelConvention  # how predictions are brought into those axes
+    masks: np.ndarray | None = None  # uint8 [M, 64, 64] silhouettes to be matched; None: the images' fourth channel
+    class_ids: np.ndarray | None = None  # int64 [N]: category of each object, None for a single category
+    class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
+    inverted: bool = True  # colours stored as 255 - colour over black (Kato's form), or as they are
+
+    def __post_init__(self) -> None:
+        m, n = len(self.images), len(self.object_names)
+        if self.images.ndim != 4 or self.images.shape[1] != 4 or self.images.dtype != np.uint8:
+            raise ValueError(f"images must be uint8 [M, 4, S, S], got {self.images.dtype} {list(self.images.shape)}")
+        if self.masks is None and self.images.shape[2:] != (MASK_SIZE, MASK_SIZE):
+            raise ValueError(f"images of {self.images.shape[2:]} pixels need masks [M, {MASK_SIZE}, {MASK_SIZE}]")
+        wanted = {"poses": m, "view_ids": m, "object_ids": m} | ({"masks": m} if self.masks is not None else {})
+        wanted |= {"voxels": n} if self.voxels is not None else {}
+        wanted |= {"class_ids": n} if self.class_ids is not None else {}
+        if wrong := {k: len(getattr(self, k)) for k, size in wanted.items() if len(getattr(self, k)) != size}:
+            raise ValueError(f"{m} images of {n} objects do not go with {wrong}")
+        if self.voxels is not None and self.voxels.shape[1:] != (VOXEL_SIZE,) * 3:
+            raise ValueError(f"voxels must be [N, {VOXEL_SIZE}, {VOXEL_SIZE}, {VOXEL_SIZE}]")
+        for name, values, end in (("view_ids", self.view_ids, self.num_views), ("object_ids", self.object_ids, n)):
+            if m and not (values.min() >= 0 and values.max() < end):
+                raise ValueError(f"{name} must lie in 0 .. {end - 1}, got {values.min()} .. {values.max()}")
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def num_objects(self) -> int:
+        """N."""
+        return len(self.object_names)
+
+    @property
+    def num_views(self) -> int:
+        """K, the number of pose classes."""
+        return len(self.view_names)
+
+    @property
+    def num_classes(self) -> int:
+        """Number of categories in the set, at least 1."""
+        return max(1, len(self.class_names))
+
+    @property
+    def image_size(self) -> int:
+        """S: side of the images in pixels."""
+        return self.images.shape[2]
+
+    def batch(self, indices: Tensor) -> Batch:
+        """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU."""
+        indices = torch.as_tensor(indices)
+        if indices.ndim != 1 or indices.is_floating_point() or indices.dtype == torch.bool:
+            raise TypeError(f"indices must be an integer tensor [B], got {indices.dtype} {list(indices.shape)}")
+        indices = indices.to(torch.int64)
+        if len(indices) and (indices.min() < 0 or indices.max() >= len(self)):
+            raise ValueError(
+                f"indices must lie in 0 .. {len(self) - 1} ({len(self)} views of {self.num_objects} objects), "
+                f"got {int(indices.min())} .. {int(indices.max())}"
+            )
+        rows = indices.numpy()
+        images = torch.from_numpy(self.images[rows])
+        masks = images[:, 3] if self.masks is None else torch.from_numpy(self.masks[rows])
+        objects = self.object_ids[rows]
+        classes = np.zeros(len(rows), np.int64) if self.class_ids is None else self.class_ids[objects]
+        return Batch(
+            images=images,
+            masks=masks.to(torch.float32) / 255,
+            poses=self.poses[indices],
+            view_ids=torch.from_numpy(self.view_ids[rows]),
+            object_ids=torch.from_numpy(objects),
+            class_ids=torch.from_numpy(classes),
+            voxels=None if self.voxels is None else torch.from_numpy(self.voxels[objects]),
+        )
+
+    def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
+        """Occupancy bool [B, 32, 32, 32] of predictions in the data set's voxel axes; see `VoxelConvention`."""
+        return self.convention.voxelize(vertices, faces, definition)
+
+    def with_bins(self, bins: AngleBins) -> ViewDataset:
+        """The same views with pose classes from cells of azimuth and elevation."""
+        if not isinstance(self.poses, LookAtPoses):
+            raise ValueError("cells of azimuth and elevation need look-at cameras; this data set has rotations")
+        return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), view_names=tuple(bins.names()))
+
+    def select(self, samples: np.ndarray) -> ViewDataset:
+        """Only the samples `samples`, int64; all objects stay."""
+        return dataclasses.replace(
+            self,
+            images=self.images[samples],
+            masks=None if self.masks is None else self.masks[samples],
+            poses=self.poses[torch.from_numpy(samples)],
+            view_ids=self.view_ids[samples],
+            object_ids=self.object_ids[samples],
+        )
+
+
+def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
+    """Several categories of one layout and split as one set with class ids; their view classes must be the same."""
+    first = datasets[0]
+    if len(datasets) == 1:
+        return first
+    for other in datasets[1:]:
+        if other.view_names != first.view_names or other.images.shape[1:] != first.images.shape[1:]:
+            raise ValueError(f"{other.category} and {first.category} differ in view classes or image size")
+        if (other.voxels is None) != (first.voxels is None) or (other.masks is None) != (first.masks is None):
+            raise ValueError(f"only one of {other.category} and {first.category} has voxels (or masks)")
+    starts = np.cumsum([0] + [d.num_objects for d in datasets])[:-1]
+    return dataclasses.replace(
+        first,
+        category=",".join(d.category for d in datasets),
+        images=np.concatenate([d.images for d in datasets]),
+        masks=None if first.masks is None else np.concatenate([d.masks for d in datasets]),
+        poses=_join_poses([d.poses for d in datasets]),
+        view_ids=np.concatenate([d.view_ids for d in datasets]),
+        object_ids=np.concatenate([d.object_ids + start for d, start in zip(datasets, starts, strict=True)]),
+        object_names=tuple(name for d in datasets for name in d.object_names),
+        voxels=None if first.voxels is None else np.concatenate([d.voxels for d in datasets]),
+        class_ids=np.repeat(np.arange(len(datasets)), [d.num_objects for d in datasets]),
+        class_names=tuple(d.category for d in datasets),
+    )
+
+
+def _join_poses(poses: list[Poses]) -> Poses:
+    kind = type(poses[0])
+    if any(type(p) is not kind for p in poses):
+        raise ValueError("the categories have cameras of different kinds")
+    joined = {}
+    for field in dataclasses.fields(kind):
+        values = [getattr(p, field.name) for p in poses]
+        if not any(isinstance(v, Tensor) for v in values) and len(set(values)) == 1:
+            joined[field.name] = values[0]
+            continue
+        columns = [
+            v if isinstance(v, Tensor) else torch.full((len(p),), float(v)) for v, p in zip(values, poses, strict=True)
+        ]
+        joined[field.name] = torch.cat(columns)
+    return kind(**joined)

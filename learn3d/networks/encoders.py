@@ -1,0 +1,51 @@
+"""Image encoders: stored images -> shape codes."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+CODE_SIZE = 512
+
+
+class ConvEncoder(nn.Module):
+    """Image [B,4,64,64] (RGB and mask, float in [0,1]) -> shape code [B,512], unbounded (no ReLU at the end)."""
+
+    image_size = 64
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(4, 64, 5, stride=2, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 128, 5, stride=2, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(128, 256, 5, stride=2, padding=2),
+            nn.ReLU(),
+        )
+        self.layers = nn.Sequential(
+            nn.Linear(256 * (self.image_size // 8) ** 2, 1024),
+            nn.ReLU(),
+            nn.Linear(1024, 1024),
+            nn.ReLU(),
+            nn.Linear(1024, CODE_SIZE),
+        )
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.layers(self.convolutions(images).flatten(1))
+
+
+EncoderName = Literal["conv"]
+ENCODERS: dict[str, type[nn.Module]] = {"conv": ConvEncoder}
+
+
+def network_input(images: Tensor, device: torch.device | str, size: int = 64) -> Tensor:
+    """Stored images uint8 [B,4,size,size] -> float32 in [0,1] on `device`, channels last."""
+    if images.dtype != torch.uint8 or images.ndim != 4 or images.shape[1:] != (4, size, size):
+        raise ValueError(
+            f"images must be uint8 [B, 4, {size}, {size}] (RGB and mask), got {images.dtype} {list(images.shape)}"
+        )
+    images = images.to(device).to(memory_format=torch.channels_last)
+    return images.to(torch.float32).div_(255)

@@ -1,0 +1,54 @@
+"""Mesh generators: shape codes -> vertices of a surface of fixed topology."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from torch import Tensor, nn
+
+import nmr
+from learn3d.networks.encoders import CODE_SIZE
+
+OBJECT_SCALE = 0.5
+
+
+def deform_sphere(sphere: Tensor, displacement: Tensor) -> Tensor:
+    """Vertices 0.5 * (sphere + displacement): [V,3] and [B,V,3] -> [B,V,3].
+
+    The paper's text adds the displacement to the unit sphere itself. At the data set's camera a unit sphere covers the
+    whole image, so no silhouette edge would be seen and nothing would be learnt; the published code has the factor 0.5.
+    """
+    return OBJECT_SCALE * (sphere + displacement)
+
+
+class SphereGenerator(nn.Module):
+    """Shape code [B,512] -> vertices float32 [B,642,3] of a deformed icosphere, in the object frame (y up).
+
+    `faces` int64 [1280,3] and `edges` int64 [1920,4] (the table of `nmr.edge_table`) describe the fixed topology.
+    """
+
+    sphere: Tensor
+    faces: Tensor
+    edges: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        sphere, faces = nmr.icosphere(3)
+        self.register_buffer("sphere", sphere.float(), persistent=False)
+        self.register_buffer("faces", faces, persistent=False)
+        self.register_buffer("edges", nmr.edge_table(faces), persistent=False)
+        self.layers = nn.Sequential(
+            nn.Linear(CODE_SIZE, 1024),
+            nn.ReLU(),
+            nn.Linear(1024, 2048),
+            nn.ReLU(),
+            nn.Linear(2048, sphere.shape[0] * 3),
+        )
+
+    def forward(self, codes: Tensor) -> Tensor:
+        displacement = self.layers(codes).float().reshape(codes.shape[0], -1, 3)
+        return deform_sphere(self.sphere, displacement)
+
+
+GeneratorName = Literal["sphere"]
+GENERATORS: dict[str, type[nn.Module]] = {"sphere": SphereGenerator}
