@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from learn3d.data.augment import Augmentation
 from learn3d.data.sampling import Sampling
 from learn3d.methods.multi_view import MultiViewSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
@@ -27,6 +28,7 @@ class Preset:
     batch_size: int
     source: str  # where the figures come from
     sampling: Sampling = "views"
+    augment: tuple[Augmentation, ...] = ()  # what is done to every training batch
     view_bins: str | None = None  # cells of azimuth and elevation, None: the data set's own view classes
 
 

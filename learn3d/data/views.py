@@ -39,6 +39,7 @@ class ViewDataset:
     masks: np.ndarray | None = None  # uint8 [M, 64, 64] silhouettes to be matched; None: the images' fourth channel
     class_ids: np.ndarray | None = None  # int64 [N]: category of each object, None for a single category
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
+    points: np.ndarray | None = None  # float32 [N, P, 3]: points on the true surfaces in the object frame, where known
     inverted: bool = True  # colours stored as 255 - colour over black (Kato's form), or as they are
 
     def __post_init__(self) -> None:
@@ -49,6 +50,7 @@ class ViewDataset:
             raise ValueError(f"images of {self.images.shape[2:]} pixels need masks [M, {MASK_SIZE}, {MASK_SIZE}]")
         wanted = {"poses": m, "view_ids": m, "object_ids": m} | ({"masks": m} if self.masks is not None else {})
         wanted |= {"voxels": n} if self.voxels is not None else {}
+        wanted |= {"points": n} if self.points is not None else {}
         wanted |= {"class_ids": n} if self.class_ids is not None else {}
         if wrong := {k: len(getattr(self, k)) for k, size in wanted.items() if len(getattr(self, k)) != size}:
             raise ValueError(f"{m} images of {n} objects do not go with {wrong}")
@@ -150,6 +152,7 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
         object_ids=np.concatenate([d.object_ids + start for d, start in zip(datasets, starts, strict=True)]),
         object_names=tuple(name for d in datasets for name in d.object_names),
         voxels=None if first.voxels is None else np.concatenate([d.voxels for d in datasets]),
+        points=None if any(d.points is None for d in datasets) else np.concatenate([d.points for d in datasets]),
         class_ids=np.repeat(np.arange(len(datasets)), [d.num_objects for d in datasets]),
         class_names=tuple(d.category for d in datasets),
     )

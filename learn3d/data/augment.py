@@ -1,0 +1,45 @@
+"""Random changes of a training batch: functions of (batch, seed, step) alone, so that resuming needs no memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+
+from learn3d.data.batch import Batch
+
+Augmentation = Literal["flip", "flip-image", "channels", "crop"]
+
+
+def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -> Batch:
+    """The batch with the named changes, each drawn for every sample on its own, in the order of the names.
+
+    "flip": image, mask and pose mirrored left-right with probability 1/2 (Kato and Harada 2019). "flip-image": the input
+    image alone (published code of Peng et al. 2020 on Pascal3D+; it works because the mesh is symmetric). "channels": a
+    random permutation of the three colours.
+    """
+    rng = np.random.default_rng([seed, step, 1])
+    for name in names:
+        if name == "flip":
+            chosen = torch.from_numpy(rng.random(len(batch)) < 0.5)
+            batch = dataclasses.replace(
+                batch,
+                images=torch.where(chosen[:, None, None, None], batch.images.flip(3), batch.images),
+                masks=torch.where(chosen[:, None, None], batch.masks.flip(2), batch.masks),
+                poses=batch.poses.mirrored(chosen),
+            )
+        elif name == "flip-image":
+            chosen = torch.from_numpy(rng.random(len(batch)) < 0.5)
+            images = torch.where(chosen[:, None, None, None], batch.images.flip(3), batch.images)
+            batch = dataclasses.replace(batch, images=images)
+        elif name == "channels":
+            order = np.argsort(rng.random((len(batch), 3)), axis=1)
+            order = torch.from_numpy(np.concatenate([order, np.full((len(batch), 1), 3)], axis=1))
+            images = torch.gather(batch.images, 1, order[:, :, None, None].expand_as(batch.images))
+            batch = dataclasses.replace(batch, images=images)
+        else:
+            raise ValueError(f"augmentation must be flip, flip-image, channels or crop, got {name!r}")
+    return batch
