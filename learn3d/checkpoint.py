@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from learn3d import files
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict
-from learn3d.networks import Networks, create_networks
+from learn3d.methods import DataShape, Method, create_method
+from learn3d.networks import resolve_precision
 
 FORMAT = 1
 
@@ -55,18 +57,18 @@ def load(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, metadata
 
 
-def network_tensors(networks: Networks) -> dict[str, Tensor]:
-    """Parameters of all networks, named network.<encoder|generator|discriminator>.<parameter>."""
+def network_tensors(method: Method) -> dict[str, Tensor]:
+    """Parameters and buffers of all networks, named network.<encoder|generator|...>.<parameter>."""
     return {
         f"network.{name}.{key}": tensor
-        for name, network in networks.items()
+        for name, network in method.networks.items()
         for key, tensor in network.state_dict().items()
     }
 
 
-def restore_networks(networks: Networks, tensors: dict[str, Tensor], source: Path) -> None:
-    """Copy the parameters of a checkpoint into networks of the same shape, or raise a ValueError."""
-    for name, network in networks.items():
+def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path) -> None:
+    """Copy the parameters of a checkpoint into the networks of a method of the same shape, or raise a ValueError."""
+    for name, network in method.networks.items():
         prefix = f"network.{name}."
         state = {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
         try:
@@ -109,26 +111,32 @@ def find(path: Path, which: str = "last") -> Path:
     return path / f"{which}.safetensors" if path.is_dir() else path
 
 
-def load_networks(path: Path, *, device: str = "cpu") -> tuple[Networks, TrainConfig, dict[str, Any]]:
-    """Trained networks for evaluation, from a checkpoint file: (networks in eval mode, configuration, metadata)."""
+def load_method(
+    path: Path, *, device: str = "cpu", precision: str = "fp32"
+) -> tuple[Method, TrainConfig, dict[str, Any]]:
+    """A trained method ready for use, from a checkpoint file: (method in evaluation mode, configuration, metadata)."""
     tensors, metadata = load(path)
     config = config_from_dict(metadata["config"], source=str(path))
     with torch.random.fork_rng(devices=[]):
-        networks = create_networks(
-            metadata["num_views"], discriminator=metadata["has_discriminator"], device=device, seed=0
+        method = create_method(
+            config.settings,
+            data_shape(metadata),
+            device=device,
+            precision=resolve_precision(precision, device),
+            seed=0,
         )
-    restore_networks(networks, tensors, path)
-    for _, network in networks.items():
-        network.eval().requires_grad_(False)
-    return networks, config, metadata
+    restore_networks(method, tensors, path)
+    method.set_training(False)
+    for network in method.networks.values():
+        network.requires_grad_(False)
+    return method, config, metadata
 
 
-def networks_metadata(networks: Networks, config: TrainConfig) -> dict[str, Any]:
-    """What `load_networks` needs to know besides the tensors."""
-    discriminator = networks.discriminator
-    last = [module for module in (discriminator.layers if discriminator else []) if isinstance(module, nn.Linear)]
-    return {
-        "config": config_to_dict(config),
-        "has_discriminator": discriminator is not None,
-        "num_views": last[-1].out_features if last else 0,
-    }
+def method_metadata(shape: DataShape, config: TrainConfig) -> dict[str, Any]:
+    """What `load_method` needs to know besides the tensors."""
+    return {"config": config_to_dict(config), "shape": dataclasses.asdict(shape)}
+
+
+def data_shape(metadata: dict[str, Any]) -> DataShape:
+    """The data's shape in a checkpoint's metadata; version 0.1 had the number of views alone."""
+    return DataShape(**metadata["shape"]) if "shape" in metadata else DataShape(num_views=metadata["num_views"])

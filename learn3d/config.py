@@ -1,75 +1,53 @@
-"""What a training run is: one frozen dataclass, the two presets of the method, and their checks."""
+"""What a training run is: one frozen dataclass, filled in from a preset, with its checks and its JSON form."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
+import typing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-Method = Literal["proposed", "vanilla"]
-Preset = Literal["released", "paper"]
+from learn3d.data.augment import Augmentation
+from learn3d.data.layouts import Layout
+from learn3d.data.sampling import Sampling
+from learn3d.data.view_bins import AngleBins
+from learn3d.presets import PRESETS, Settings
+
+DEFAULT_PRESET = next(iter(PRESETS))
 
 
-@dataclass(frozen=True)
-class LossForms:
-    """The places where the published code and the printed equations disagree."""
-
-    adversarial: Literal["log", "probability"]  # squares of log-probability or of probability differences (eq. 4)
-    prior: Literal["squared", "norm"]  # squared length of the codes, or their length (eq. 5)
-
-
-#: "released" is what the published code computes (and what the paper's tables were made with); "paper" is every
-#: equation as printed, with the sign slip of the projection loss corrected (1 - IoU is minimised, not IoU). Both place
-#: the vertices at 0.5 * (unit sphere + displacement), as the published code does: the text's unit sphere is larger than
-#: the image at the data set's camera, so that no edge is visible and the silhouette gives no gradient.
-PRESETS: dict[str, LossForms] = {
-    "released": LossForms(adversarial="log", prior="squared"),
-    "paper": LossForms(adversarial="probability", prior="norm"),
-}
-
-
-@dataclass(frozen=True)
-class LossSettings:
-    """Forms and weights of the terms of L_tot; a weight of 0 means that the term is not computed."""
-
-    forms: LossForms
-    smoothness: float  # lambda_1
-    classification: float  # lambda_2
-    adversarial: float  # lambda_3
-    prior: float  # lambda_4
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """One training run. It is saved with the run (config.json and in every checkpoint)."""
 
     data: Path
     """Folder with the data set's files, such as 02691156_train_images.npz (what tools/make_dataset.py writes)."""
     category: str
-    """Object class to train on: a name such as airplane or chair, a synset id, or the file prefix of your own set."""
+    """Object class to train on: a name such as airplane or chair, a synset id, or the file prefix of your own set.
+    Several, separated by commas, are trained on together."""
     output: Path
     """Folder of this run: checkpoints, metrics, pictures. It must be new or empty unless you resume or overwrite."""
-    method: Method = "proposed"
-    """proposed: with pose confusion and the Gaussian prior. vanilla: Vanilla-AE, the same with both at zero."""
-    preset: Preset = "released"
-    """released: the published code's losses. paper: equations as printed, but the generator keeps the factor 0.5."""
-    iterations: int = 20_000
-    """Number of training steps."""
-    batch_size: int = 128
-    """Images per step."""
-    learning_rate: float = 1e-4
-    """Adam's step size, the same for the three networks and constant."""
-    lambda_smooth: float = 0.001
-    """Weight of the smoothness loss (lambda_1)."""
-    lambda_classification: float | None = None
-    """Weight of the discriminator's own loss (lambda_2). None: 1 for proposed, 0 for vanilla."""
-    lambda_adversarial: float | None = None
-    """Weight of the pose confusion loss (lambda_3). None: 1 for proposed, 0 for vanilla."""
-    lambda_prior: float | None = None
-    """Weight of the Gaussian prior on the codes (lambda_4). None: 1 for proposed, 0 for vanilla."""
+    preset: str = DEFAULT_PRESET
+    """Published experiment whose settings apply where nothing else is said."""
+    settings: Settings | None = None
+    """Settings of the method. None: the preset's."""
+    layout: Layout | None = None
+    """Layout of the data set. None: the preset's."""
+    view_bins: str | None = None
+    """Pose classes as cells of azimuth and elevation in degrees, such as 15x20. None: the preset's, which for data sets
+    of fixed views are these views."""
+    sampling: Sampling | None = None
+    """What a batch is made of: views (each on its own), pairs (two views of an object) or classes (drawn uniformly).
+    None: the preset's."""
+    augment: tuple[Augmentation, ...] | None = None
+    """Random changes of the training images. None: the preset's."""
+    iterations: int | None = None
+    """Number of training steps. None: the preset's."""
+    batch_size: int | None = None
+    """Images per step. None: the preset's."""
     seed: int = 0
     """Seed of the initial weights and of the order of the images."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -94,11 +72,26 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for name in ("data", "output"):
             object.__setattr__(self, name, Path(getattr(self, name)))
-        _check_choice("method", self.method, ("proposed", "vanilla"))
         _check_choice("preset", self.preset, tuple(PRESETS))
+        preset = PRESETS[self.preset]
+        for name in ("settings", "layout", "view_bins", "sampling", "augment", "iterations", "batch_size"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, getattr(preset, name))
+        if type(self.settings) is not type(preset.settings):
+            raise ValueError(
+                f"preset {self.preset!r} takes {type(preset.settings).__name__}, got {type(self.settings).__name__}"
+            )
+        check_fields(self.settings)
+        object.__setattr__(self, "augment", tuple(self.augment))
+        _check_choice("layout", self.layout, typing.get_args(Layout))
+        _check_choice("sampling", self.sampling, typing.get_args(Sampling))
+        for name in self.augment:
+            _check_choice("augment", name, typing.get_args(Augmentation))
         _check_choice("device", self.device, ("cpu", "cuda"))
         _check_choice("precision", self.precision, ("auto", "bf16", "fp32"))
         _check_choice("val_split", self.val_split, ("val", "test"))
+        if self.view_bins is not None:
+            AngleBins.parse(self.view_bins)
         if not self.category:
             raise ValueError("category must be a class name such as 'airplane', got an empty string")
         for name in ("iterations", "batch_size", "validate_every", "pictures_every", "checkpoint_every", "log_every"):
@@ -108,26 +101,29 @@ class TrainConfig:
                 _check_positive_int(name, getattr(self, name))
         if not isinstance(self.seed, int) or self.seed < 0:
             raise ValueError(f"seed must be a whole number >= 0, got {self.seed!r}")
-        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):
-            raise ValueError(f"learning_rate must be a positive number, got {self.learning_rate!r}")
-        for name in ("lambda_smooth", "lambda_classification", "lambda_adversarial", "lambda_prior"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} must be a number >= 0, got {value!r}")
-            if self.method == "vanilla" and name != "lambda_smooth" and value not in (None, 0):
-                raise ValueError(
-                    f"{name}={value} conflicts with method 'vanilla', which is defined by having that term at 0; "
-                    f"leave {name} out or choose method 'proposed'"
-                )
 
-    def loss_settings(self) -> LossSettings:
-        """Forms from the preset, weights from the options, with 1 (proposed) or 0 (vanilla) where none was given."""
-        default = 1.0 if self.method == "proposed" else 0.0
-        classification, adversarial, prior = (
-            default if value is None else float(value)
-            for value in (self.lambda_classification, self.lambda_adversarial, self.lambda_prior)
-        )
-        return LossSettings(PRESETS[self.preset], float(self.lambda_smooth), classification, adversarial, prior)
+
+def check_fields(settings: Settings) -> None:
+    """Raise a ValueError naming the setting that is no choice of its kind, negative, or not finite.
+
+    Rates (learning_rate...) must be positive; whole numbers at least 1; all other numbers, such as weights, at least 0.
+    """
+    types = typing.get_type_hints(type(settings))
+    for field in dataclasses.fields(settings):
+        value, kind = getattr(settings, field.name), types[field.name]
+        if typing.get_origin(kind) is Literal:
+            _check_choice(field.name, value, typing.get_args(kind))
+        elif kind is bool:
+            _check_choice(field.name, value, (False, True))
+        elif kind is int:
+            _check_positive_int(field.name, value)
+        elif kind is float:
+            positive = field.name.startswith("learning_rate")
+            fits = isinstance(value, (int, float)) and math.isfinite(value) and (value > 0 if positive else value >= 0)
+            if not fits:
+                raise ValueError(
+                    f"{field.name} must be a {'positive number' if positive else 'number >= 0'}, got {value!r}"
+                )
 
 
 #: Options that a resumed run may change: they say where and how long to compute and what to report, not what to learn.
@@ -138,18 +134,31 @@ RESUME_MAY_CHANGE = frozenset(
 
 
 def config_to_dict(config: TrainConfig) -> dict[str, Any]:
-    """The configuration as plain JSON values."""
-    return {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(config).items()}
+    """The configuration as plain JSON values; the method's settings are a dictionary under "settings"."""
+    return json.loads(json.dumps(dataclasses.asdict(config), default=str))
 
 
 def config_from_dict(values: dict[str, Any], source: str = "config") -> TrainConfig:
-    """Build a TrainConfig from plain values; an unknown or missing option is a ValueError that names it."""
+    """Build a TrainConfig from plain values; an unknown or missing option is a ValueError that names it.
+
+    Configurations of version 0.1, with a method beside the preset, are understood too.
+    """
+    values = dict(values)
+    if "method" in values:
+        values = _from_first_version(values)
     known = {f.name: f for f in dataclasses.fields(TrainConfig)}
-    if unknown := sorted(set(values) - set(known)):
-        raise ValueError(f"{source} has unknown options {unknown}; known ones are {sorted(known)}")
+    _check_names(values, known, source)
     required = [name for name, f in known.items() if f.default is dataclasses.MISSING]
     if missing := [name for name in required if name not in values]:
         raise ValueError(f"{source} lacks the options {missing}")
+    if isinstance(values.get("settings"), dict):
+        _check_choice("preset", values.get("preset", DEFAULT_PRESET), tuple(PRESETS))
+        kind = type(PRESETS[values.get("preset", DEFAULT_PRESET)].settings)
+        _check_names(values["settings"], {f.name for f in dataclasses.fields(kind)}, f"{source}: settings")
+        given = {k: tuple(v) if isinstance(v, list) else v for k, v in values["settings"].items()}
+        values["settings"] = kind(**given)
+    if values.get("augment") is not None:
+        values["augment"] = tuple(values["augment"])
     return TrainConfig(**values)
 
 
@@ -164,20 +173,55 @@ def load_config(path: Path) -> TrainConfig:
     return config_from_dict(values, source=str(path))
 
 
+def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
+    """What makes `config` another run than `saved`: one line per option that a resumed run may not change."""
+    old, new = (_flat(c) for c in (saved, config))
+    return [
+        f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"
+        for name in dict.fromkeys([*old, *new])
+        if name not in RESUME_MAY_CHANGE and old.get(name) != new.get(name)
+    ]
+
+
 def check_resume(config: TrainConfig, saved: TrainConfig) -> None:
     """Raise a ValueError naming every option whose change would make the resumed run a different one."""
-    changed = [
-        f"{f.name}: {getattr(saved, f.name)!r} in the run, {getattr(config, f.name)!r} asked for"
-        for f in dataclasses.fields(TrainConfig)
-        if f.name not in RESUME_MAY_CHANGE and getattr(config, f.name) != getattr(saved, f.name)
-    ]
-    if changed:
+    if changed := differences(config, saved):
         raise ValueError("cannot resume with different options (" + "; ".join(changed) + "); start a new run for that")
 
 
-def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+def _flat(config: TrainConfig) -> dict[str, Any]:
+    """Options by name, the method's settings among them. The preset is only where they came from."""
+    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(TrainConfig)}
+    settings = values.pop("settings")
+    del values["preset"]
+    return {"method": type(settings).__name__.removesuffix("Settings")} | values | dataclasses.asdict(settings)
+
+
+def _from_first_version(values: dict[str, Any]) -> dict[str, Any]:
+    """A configuration of version 0.1: method proposed or vanilla, preset released or paper, weights beside them."""
+    method, forms = values.pop("method"), values.pop("preset", "released")
+    names = {
+        ("proposed", "released"): "peng2020-kato",
+        ("proposed", "paper"): "peng2020-kato-printed",
+        ("vanilla", "released"): "peng2020-kato-vanilla",
+        ("vanilla", "paper"): "peng2020-kato-vanilla",
+    }
+    if (method, forms) not in names:
+        raise ValueError(f"unknown method and preset {method!r}, {forms!r} in a configuration of version 0.1")
+    name = names[method, forms]
+    weights = ("lambda_smooth", "lambda_classification", "lambda_adversarial", "lambda_prior", "learning_rate")
+    given = {key: value for key in weights if (value := values.pop(key, None)) is not None}
+    return values | {"preset": name, "settings": dataclasses.asdict(PRESETS[name].settings) | given}
+
+
+def _check_names(values: dict[str, Any], known: Any, source: str) -> None:
+    if unknown := sorted(set(values) - set(known)):
+        raise ValueError(f"{source} has unknown options {unknown}; known ones are {sorted(known)}")
+
+
+def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
     if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+        raise ValueError(f"{name} must be one of {', '.join(map(str, choices))}, got {value!r}")
 
 
 def _check_positive_int(name: str, value: Any) -> None:

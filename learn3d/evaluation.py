@@ -1,93 +1,158 @@
-"""Voxel IoU and pose invariance (MMD) of trained networks on one split of a data set."""
+"""Voxel IoU, distance between surfaces and pose invariance (MMD) of a trained method on one split of a data set."""
 
 from __future__ import annotations
 
-import dataclasses
-import importlib.metadata
 import itertools
 import math
-import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 import nmr
-from learn3d import checkpoint
-from learn3d.data.kato import KatoDataset
+from learn3d.data.conventions import Definition
+from learn3d.data.views import ViewDataset
 from learn3d.losses import mmd_from_distances
-from learn3d.networks import Networks, autocast, network_input
+from learn3d.methods import Grids, Meshes, Method
+from learn3d.surfaces import grid_surface
 
 CODES_PER_VIEW = 512
+SURFACE_POINTS = 2000
+F_SCORE_DISTANCE = 0.05  # share of the object's longest side
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Result for one class. `mmd` and `mmd_paper` are None when fewer than two views have codes."""
+    """Result for one class: a value per image, and the MMDs (None when fewer than two views have codes)."""
 
-    voxel_iou: float | None  # None when it is defined for no image
+    object_ids: Tensor  # int64 [M]
+    view_ids: Tensor  # int64 [M]
+    ious: dict[
+        Definition, Tensor
+    ]  # float [M] per voxeliser; NaN where prediction and truth are empty; {} without truth
+    chamfer_l1: Tensor | None  # float [M], None when not asked for or without truth
+    f_score: Tensor | None  # float [M], likewise
     mmd: float | None
     mmd_paper: float | None
-    images: int
-    undefined: int  # images whose prediction and truth are both empty; excluded from the mean
+
+    @property
+    def images(self) -> int:
+        """Number of images."""
+        return len(self.object_ids)
+
+    @property
+    def undefined(self) -> int:
+        """Images whose prediction and truth are both empty; they are left out of the mean."""
+        return int(next(iter(self.ious.values())).isnan().sum()) if self.ious else 0
+
+    @property
+    def voxel_iou(self) -> float | None:
+        """Mean IoU over the images by the first voxeliser; None when it is defined for no image."""
+        return _mean(next(iter(self.ious.values()))) if self.ious else None
+
+    def summary(self) -> dict[str, Any]:
+        """Means as plain values; what was not computed is None."""
+        return {
+            "voxel_iou": self.voxel_iou,
+            **{f"voxel_iou_{name}": _mean(values) for name, values in self.ious.items()},
+            "chamfer_l1": _mean(self.chamfer_l1),
+            "f_score": _mean(self.f_score),
+            "mmd": self.mmd,
+            "mmd_paper": self.mmd_paper,
+            "images": self.images,
+            "undefined": self.undefined,
+        }
 
 
 @torch.no_grad()
 def evaluate(
-    networks: Networks,
-    dataset: KatoDataset,
+    method: Method,
+    dataset: ViewDataset,
     *,
-    precision: Literal["bf16", "fp32"] = "fp32",
+    definitions: Sequence[Definition] = ("kato18",),
     max_images: int | None = None,
     paper_mmd: bool = False,
+    surfaces: bool = False,
     batch_size: int = 256,
 ) -> Evaluation:
-    """Mean voxel IoU over the images of a split, and the mean MMD over all pairs of views.
+    """Voxel IoU of every image of a split, and the mean MMD over all pairs of view classes.
 
-    Every image (object x view) is encoded, its mesh voxelised in the data set's convention and compared with the
-    object's voxels. With `max_images` only that many images are used, always the same ones: see `spread_samples`.
-    `paper_mmd` also computes the MMD as the paper prints it.
+    Every image is encoded, its shape voxelised in the data set's convention and compared with the object's voxels, by
+    each voxeliser of `definitions`. With `max_images` only that many images are used, always the same ones: see
+    `spread_samples`. `paper_mmd` also computes the MMD as the paper prints it. `surfaces` also compares points on the
+    surfaces, in units of the object frame: Chamfer-L1 and F-score at 5 % of the longest side, 2,000 points of each;
+    where the data set has no points, the truth is the surface of its voxels, which limits them to about 1/32.
     """
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
-    indices = spread_samples(dataset.num_objects, dataset.num_views, count)
-    ious, codes, views = [], [], []
-    for chosen in indices.split(batch_size):
-        batch = dataset.batch(chosen)
-        with autocast(networks.device, precision):
-            code = networks.encoder(network_input(batch.images, networks.device))
-            vertices = networks.generator(code)
-        predicted = dataset.voxelize(vertices.cpu(), networks.generator.faces.cpu())
-        ious.append(nmr.metrics.voxel_iou(predicted, batch.voxels))
-        codes.append(code.float().cpu())
-        views.append(batch.view_ids)
-    iou = torch.cat(ious)
-    undefined = int(iou.isnan().sum())
+    generator = torch.Generator().manual_seed(0)
+    truth = _true_surfaces(dataset, generator) if surfaces else None
+    ious: dict[Definition, list[Tensor]] = {name: [] for name in definitions if dataset.voxels is not None}
+    codes, views, objects, distances = [], [], [], []
+    was_training = method.training
+    method.set_training(False)
+    try:
+        for chosen in spread_samples(dataset.object_ids, dataset.view_ids, count).split(batch_size):
+            batch = dataset.batch(chosen)
+            code = method.encode(batch.images)
+            shapes = method.decode(code)
+            for name in ious:
+                ious[name].append(nmr.metrics.voxel_iou(occupancy(shapes, dataset, name), batch.voxels))
+            if truth is not None:
+                points = _surface_points(shapes, generator)
+                distances += [_compare(a, truth[b]) for a, b in zip(points, batch.object_ids.tolist(), strict=True)]
+            codes.append(code.float().cpu())
+            views.append(batch.view_ids)
+            objects.append(batch.object_ids)
+    finally:
+        method.set_training(was_training)
     forms = ("released", "paper") if paper_mmd else ("released",)
     means = mean_mmd(torch.cat(codes), torch.cat(views), forms=forms)
+    chamfer, f_score = torch.tensor(distances).T if distances else (None, None)
     return Evaluation(
-        voxel_iou=float(iou.nanmean()) if undefined < count else None,
+        object_ids=torch.cat(objects),
+        view_ids=torch.cat(views),
+        ious={name: torch.cat(values) for name, values in ious.items()},
+        chamfer_l1=chamfer,
+        f_score=f_score,
         mmd=means.get("released"),
         mmd_paper=means.get("paper"),
-        images=count,
-        undefined=undefined,
     )
 
 
-def spread_samples(num_objects: int, num_views: int, count: int) -> Tensor:
-    """`count` different samples object * num_views + view, int64 [count], ascending; a function of its arguments alone.
+def occupancy(shapes: Meshes | Grids, dataset: ViewDataset, definition: Definition) -> Tensor:
+    """Predictions as bool [B, 32, 32, 32] in the data set's voxel axes. A voxeliser makes no difference to grids."""
+    if isinstance(shapes, Meshes):
+        return dataset.voxelize(shapes.vertices, shapes.faces, definition)
+    if dataset.convention.box != 1.0:
+        raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {dataset.convention.name} voxels")
+    return dataset.convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))
 
-    Every view is among them as often as any other, give or take one, and so is every object. Going through the views
-    and through the objects side by side meets each pair once in lcm(objects, views) steps; then the objects shift by
-    one. Both orders are shuffled, so that it is not always the same view that goes with an object.
+
+def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> Tensor:
+    """`count` different samples, int64 [count], ascending; a function of its arguments alone.
+
+    Every view is among them about as often as any other, and so is every object: samples are taken one after the other
+    in a shuffled order, each time from those whose view and object have been taken least.
     """
-    generator = torch.Generator().manual_seed(0)
-    objects, views = (torch.randperm(n, generator=generator) for n in (num_objects, num_views))
-    k = torch.arange(count)
-    turn = k // math.lcm(num_objects, num_views)
-    return (objects[(k + turn) % num_objects] * num_views + views[k % num_views]).sort().values
+    total = len(object_ids)
+    if count >= total:
+        return torch.arange(total)
+    order = np.random.default_rng(0).permutation(total)
+    views_taken, objects_taken = np.zeros(view_ids.max() + 1, int), np.zeros(object_ids.max() + 1, int)
+    left = np.ones(total, bool)
+    chosen = np.empty(count, np.int64)
+    views, objects = view_ids[order], object_ids[order]
+    for i in range(count):
+        load = views_taken[views] + objects_taken[objects] + np.where(left, 0, 2 * total)
+        best = int(load.argmin())
+        left[best] = False
+        views_taken[views[best]] += 1
+        objects_taken[objects[best]] += 1
+        chosen[i] = order[best]
+    return torch.from_numpy(np.sort(chosen))
 
 
 def mean_mmd(
@@ -123,114 +188,37 @@ def mean_mmd(
     return {form: value / len(pairs) for form, value in sums.items()}
 
 
-def evaluate_runs(
-    paths: Sequence[Path],
-    *,
-    data: Path | None = None,
-    category: str | None = None,
-    split: str = "test",
-    which: Literal["last", "best"] = "last",
-    precision: Literal["bf16", "fp32"] = "fp32",
-    device: str = "cpu",
-    report_progress: Callable[[str], None] = lambda text: None,
-) -> dict[str, Any]:
-    """Evaluate run folders or checkpoint files on a split; a report ready for JSON, see `format_table`.
-
-    `data` and `category` default to those each run was trained with. The mean over classes is taken per method; several
-    runs of one class and method (seeds) count as one class.
-    """
-    if not paths:
-        raise ValueError("give at least one run folder or checkpoint to evaluate")
-    results = []
-    for path in paths:
-        file = checkpoint.find(path, which)
-        networks, config, metadata = checkpoint.load_networks(file, device=device)
-        name, folder = category or config.category, data or config.data
-        report_progress(f"{file}: {config.method} on {name}, {split}")
-        result = evaluate(networks, KatoDataset.load(folder, name, split), precision=precision, paper_mmd=True)
-        if result.undefined:
-            report_progress(f"warning: {result.undefined} images have no IoU (prediction and truth empty); left out")
-        about = {
-            "checkpoint": str(file),
-            "category": name,
-            "data": str(folder),
-            "method": config.method,
-            "preset": config.preset,
-            "iterations": metadata["step"],
-            "seed": config.seed,
-        }
-        results.append(about | dataclasses.asdict(result))
-    protocol = {
-        "split": split,
-        "checkpoint": which,
-        "precision": precision,
-        "views": "all views of all objects, each image on its own",
-        "voxels": "32^3, filled surface voxels (kato18), mean over images, then over classes",
-        "mmd": f"mean over all pairs of views, up to {CODES_PER_VIEW} codes each; five kernels, no root",
-        "mmd_paper": "the same with the paper's printed formula: one kernel, square root",
-    }
-    return {"protocol": protocol, "versions": versions(), "results": results, "means": _class_means(results)}
-
-
-def format_table(report: dict[str, Any]) -> str:
-    """The report of `evaluate_runs` as a text table: a line per run, then a mean over classes per method."""
-    header = ("class", "method", "seed", "iterations", "images", "voxel IoU", "MMD", "MMD (printed formula)")
-    rows = [header]
-    for r in report["results"]:
-        label = f"{r['method']} ({r['preset']})"
-        counts = (str(r["seed"]), str(r["iterations"]), str(r["images"]))
-        rows.append((r["category"], label, *counts, *(_number(r[k]) for k in ("voxel_iou", "mmd", "mmd_paper"))))
-    for m in report["means"]:
-        label, classes = f"{m['method']} ({m['preset']})", f"{m['classes']} classes" if m["classes"] > 1 else "1 class"
-        rows.append(("mean", label, "", "", classes, *(_number(m[k]) for k in ("voxel_iou", "mmd", "mmd_paper"))))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join(lines)
-
-
-def versions() -> dict[str, str | None]:
-    """Versions of the package and of torch, and the git commit when the code runs from a checkout."""
-    try:
-        package = importlib.metadata.version("nmr-learn3d")
-    except importlib.metadata.PackageNotFoundError:
-        package = None
-    return {"nmr-learn3d": package, "torch": torch.__version__, "commit": _git_commit()}
-
-
-def _class_means(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mean over classes of each method's figures; runs of the same class are averaged first."""
-    methods = dict.fromkeys((r["method"], r["preset"]) for r in results)
-    means = []
-    for method, preset in methods:
-        mine = [r for r in results if (r["method"], r["preset"]) == (method, preset)]
-        classes = sorted({r["category"] for r in mine})
-        row: dict[str, Any] = {"method": method, "preset": preset, "classes": len(classes)}
-        for key in ("voxel_iou", "mmd", "mmd_paper"):
-            per_class = [_mean([r[key] for r in mine if r["category"] == name]) for name in classes]
-            row[key] = _mean(per_class)
-        means.append(row)
-    return means
-
-
-def _mean(values: list[float | None]) -> float | None:
-    """Plain mean, or None when a value is missing."""
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known and len(known) == len(values) else None
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}"
-
-
-def _git_commit() -> str | None:
-    """Commit of the checkout that holds this file (with "-dirty" after changes), None for an installed copy."""
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(Path(__file__).parent), *arguments]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)
-        return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.CalledProcessError):
+def _mean(values: Tensor | None) -> float | None:
+    """Mean of what is defined."""
+    if values is None or bool(values.isnan().all()):
         return None
+    return float(values.nanmean())
+
+
+def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Tensor] | None:
+    """Points [P, 3] on the true surface of every object, in the object frame; None where nothing is known."""
+    if dataset.points is not None:
+        return list(torch.from_numpy(dataset.points).float())
+    if dataset.voxels is None:
+        return None
+    grids = dataset.convention.to_object(torch.from_numpy(dataset.voxels))
+    return [_sample(*grid_surface(grid.float(), box=dataset.convention.box), generator) for grid in grids]
+
+
+def _surface_points(shapes: Meshes | Grids, generator: torch.Generator) -> list[Tensor]:
+    if isinstance(shapes, Meshes):
+        return [_sample(vertices, shapes.faces, generator) for vertices in shapes.vertices]
+    return [_sample(*grid_surface(grid, level=shapes.threshold), generator) for grid in shapes.occupancy]
+
+
+def _sample(vertices: Tensor, faces: Tensor, generator: torch.Generator) -> Tensor:
+    if len(faces) == 0:
+        return torch.empty(0, 3)
+    return nmr.metrics.sample_surface(vertices, faces, SURFACE_POINTS, generator=generator).points
+
+
+def _compare(a: Tensor, b: Tensor) -> tuple[float, float]:
+    """(Chamfer-L1, F-score) of two sets of points; NaN where one is empty."""
+    if not (len(a) and len(b)):
+        return math.nan, math.nan
+    return float(nmr.metrics.chamfer_distance(a, b, form="l1")), float(nmr.metrics.f_score(a, b, F_SCORE_DISTANCE))

@@ -14,15 +14,38 @@ from torch import Tensor
 
 import nmr
 from learn3d import files
-from learn3d.data.kato import DISTANCE, ELEVATION_DEG, HALF_FOV_DEG, KatoDataset
-from learn3d.networks import IMAGE_SIZE, Networks, network_input
+from learn3d.data.kato import DISTANCE, HALF_FOV_DEG
+from learn3d.data.poses import LookAtPoses, Poses
+from learn3d.data.views import MASK_SIZE, ViewDataset
+from learn3d.methods import Grids, Meshes, Method
 from learn3d.shading import shade_mesh
+from learn3d.surfaces import grid_surface
 
 CLAY = (0.62, 0.68, 0.78)
 GRID_COLUMNS = ("input", "target", "rendering", "same view", "+60°", "+120°", "+180°", "+240°", "+300°")
 TILE = 96
 MARGIN = 4
 HEADER = 18
+
+
+def as_meshes(shapes: Meshes | Grids) -> list[tuple[Tensor, Tensor]]:
+    """Predictions as a mesh each: (vertices [V,3], faces [F,3]); grids by marching cubes."""
+    if isinstance(shapes, Meshes):
+        return [(vertices, shapes.faces) for vertices in shapes.vertices]
+    return [grid_surface(grid, level=shapes.threshold) for grid in shapes.occupancy]
+
+
+def view_angles(pose: Poses) -> tuple[float, float]:
+    """(azimuth, elevation) in degrees of a single pose in the object frame; where it is a rotation, from it."""
+    if isinstance(pose, LookAtPoses):
+        return float(pose.azimuth_deg[0]), float(pose.elevations_deg[0])
+    eye = -pose.rotation[0, 2]  # the camera looks along its third axis
+    return float(torch.rad2deg(torch.atan2(eye[0], -eye[2]))), float(torch.rad2deg(eye[1].clamp(-1, 1).asin()))
+
+
+def display_colors(images: np.ndarray, dataset: ViewDataset) -> np.ndarray:
+    """Stored images uint8 [B,4,S,S] as pictures uint8 [B,S,S,3]."""
+    return natural_colors(images) if dataset.inverted else np.moveaxis(images[:, :3], 1, -1)
 
 
 def natural_colors(images: np.ndarray) -> np.ndarray:
@@ -64,24 +87,28 @@ def draw_mesh(
 
 
 @torch.no_grad()
-def picture_grid(networks: Networks, dataset: KatoDataset, indices: Tensor) -> np.ndarray:
-    """What the networks make of some images: uint8 [H,W,3].
+def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.ndarray:
+    """What a method makes of some images: uint8 [H,W,3].
 
     A row per image: the input, the target silhouette, the rendered silhouette and the shaded mesh at the input's view,
     and the mesh from five new views around it.
     """
     batch = dataset.batch(indices)
-    vertices = networks.generator(networks.encoder(network_input(batch.images, networks.device))).cpu()
-    faces = networks.generator.faces.cpu()
-    silhouettes = nmr.render_silhouette(vertices, faces, batch.cameras, image_size=IMAGE_SIZE)
-    inputs = natural_colors(batch.images.numpy())
+    training = method.training
+    method.set_training(False)
+    meshes = as_meshes(method.decode(method.encode(batch.images)))
+    method.set_training(training)
+    inputs = display_colors(batch.images.numpy(), dataset)
     rows = []
     for i in range(len(indices)):
-        azimuth = _azimuth_deg(batch.cameras.eye[i])
+        vertices, faces = meshes[i]
+        pose = batch.poses[torch.tensor([i])]
+        silhouette = nmr.render_silhouette(vertices[None], faces, pose.cameras(), image_size=MASK_SIZE)[0]
+        azimuth, elevation = view_angles(pose)
         views = draw_mesh(
-            vertices[i], faces, [azimuth + 60 * k for k in range(6)], elevation_deg=ELEVATION_DEG, image_size=TILE
+            vertices, faces, [azimuth + 60 * k for k in range(6)], elevation_deg=elevation, image_size=TILE
         )
-        flat = [inputs[i], to_uint8(batch.masks[i]), to_uint8(silhouettes[i])]
+        flat = [inputs[i], to_uint8(batch.masks[i]), to_uint8(silhouette)]
         rows.append([*flat, *views])
     return tile(rows, GRID_COLUMNS)
 
@@ -141,8 +168,3 @@ def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0)
         optimize=True,
     )
     files.write_bytes(path, buffer.getvalue())
-
-
-def _azimuth_deg(eye: Tensor) -> float:
-    """Azimuth of a camera position (d cos e sin a, d sin e, -d cos e cos a)."""
-    return float(torch.rad2deg(torch.atan2(eye[0], -eye[2])))

@@ -6,14 +6,13 @@ A preset fills in what the command line leaves out; every setting can be given o
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from learn3d.data.augment import Augmentation
+from learn3d.data.layouts import Layout
 from learn3d.data.sampling import Sampling
 from learn3d.methods.multi_view import MultiViewSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 
-Layout = Literal["kato", "dvr", "kar", "r2n2", "pascal3d", "photos"]
 Settings = PoseInvariantSettings | MultiViewSettings
 
 

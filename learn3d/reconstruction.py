@@ -14,8 +14,9 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from learn3d import checkpoint, figures, files
-from learn3d.data.kato import KatoDataset, mesh_to_object
-from learn3d.networks import IMAGE_SIZE, Networks, network_input
+from learn3d.data.kato import mesh_to_object
+from learn3d.data.layouts import load_dataset
+from learn3d.methods import Method
 
 OBJECT_SHARE = 0.65  # side of the object's bounding square as a share of the picture's side, when the run does not say
 STRIP_SIZE = 160
@@ -43,9 +44,14 @@ def read_image(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, n
 
 
 def prepare_image(
-    colors: np.ndarray, mask: np.ndarray, *, crop: bool = True, object_share: float = OBJECT_SHARE
+    colors: np.ndarray,
+    mask: np.ndarray,
+    *,
+    crop: bool = True,
+    object_share: float = OBJECT_SHARE,
+    size: int = 64,
 ) -> np.ndarray:
-    """Bring an image of any size into the data set's form: uint8 [4,64,64], inverted colours on black, and the mask.
+    """Bring an image of any size into the data set's form, uint8 [4,size,size]: inverted colours on black, the mask.
 
     The object is laid over white and, with `crop`, centred in a square so that its larger side takes `object_share` of
     it, as in the data set; without, the image must be framed like that already and is only made square and scaled.
@@ -65,15 +71,14 @@ def prepare_image(
     else:
         centre_y, centre_x = mask.shape[0] / 2, mask.shape[1] / 2
         side = float(max(mask.shape))
-    resized = _resample(stored, centre_x - side / 2, centre_y - side / 2, side)
+    resized = _resample(stored, centre_x - side / 2, centre_y - side / 2, side, size)
     return np.rint(resized.transpose(2, 0, 1)).clip(0, 255).astype(np.uint8)
 
 
 @torch.no_grad()
-def reconstruct(networks: Networks, images: np.ndarray) -> Tensor:
-    """Meshes float32 [B,642,3] in the object frame, from images uint8 [B,4,64,64] in the data set's form."""
-    codes = networks.encoder(network_input(torch.from_numpy(images), networks.device))
-    return networks.generator(codes).cpu()
+def reconstruct(method: Method, images: np.ndarray) -> list[tuple[Tensor, Tensor]]:
+    """Meshes (vertices float32 [V,3] in the object frame, faces [F,3]) of images uint8 [B,4,S,S] as stored."""
+    return figures.as_meshes(method.decode(method.encode(torch.from_numpy(images))))
 
 
 def export_mesh(path: Path, vertices: Tensor, faces: Tensor) -> None:
@@ -134,13 +139,16 @@ def reconstruct_files(
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
     pairs = zip(images, masks or [None] * len(images), strict=True)
-    networks, _, metadata = checkpoint.load_networks(checkpoint.find(run, which))
+    method, _, metadata = checkpoint.load_method(checkpoint.find(run, which))
     share = metadata.get("object_share") or OBJECT_SHARE
-    prepared = [prepare_image(*read_image(image, mask), crop=crop, object_share=share) for image, mask in pairs]
+    prepared = [
+        prepare_image(*read_image(image, mask), crop=crop, object_share=share, size=method.image_size)
+        for image, mask in pairs
+    ]
     names = [Path(image).stem for image in images]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]
-    return _save_all(networks, folder, names, np.stack(prepared), options)
+    return _save_all(method, folder, names, np.stack(prepared), options)
 
 
 def reconstruct_dataset(
@@ -155,28 +163,28 @@ def reconstruct_dataset(
     **options: Any,
 ) -> list[Path]:
     """Reconstruct images of a data set (indices object * views + view) and save the results in `folder`."""
-    networks, config, _ = checkpoint.load_networks(checkpoint.find(run, which))
-    dataset = KatoDataset.load(data, category or config.category, split)
+    method, config, _ = checkpoint.load_method(checkpoint.find(run, which))
+    name = category or config.category
+    dataset = load_dataset(config.layout, data, name, split, image_size=method.image_size)
     batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
     numbers = zip(batch.object_ids.tolist(), batch.view_ids.tolist(), strict=True)
     names = [f"{dataset.category}_{split}_object{number:04}_view{view:02}" for number, view in numbers]
-    return _save_all(networks, folder, names, batch.images.numpy(), options)
+    return _save_all(method, folder, names, batch.images.numpy(), options)
 
 
-def _save_all(networks: Networks, folder: Path, names: list[str], images: np.ndarray, options: dict) -> list[Path]:
-    meshes, faces = reconstruct(networks, images), networks.generator.faces
+def _save_all(method: Method, folder: Path, names: list[str], images: np.ndarray, options: dict) -> list[Path]:
     written = []
-    for name, image, vertices in zip(names, images, meshes, strict=True):
+    for name, image, (vertices, faces) in zip(names, images, reconstruct(method, images), strict=True):
         written += save_reconstruction(folder, name, image, vertices, faces, **options)
     return written
 
 
-def _resample(stored: np.ndarray, left: float, top: float, side: float) -> np.ndarray:
-    """The square [H,W,C] with that corner and side (whole pixels), scaled to 64x64, anti-aliased; zero outside."""
+def _resample(stored: np.ndarray, left: float, top: float, side: float, size: int) -> np.ndarray:
+    """The square [H,W,C] with that corner and side (whole pixels), scaled to [size,size,C], anti-aliased; zero outside."""
     left, top, side = round(left), round(top), max(1, round(side))
     pad = max(0, -left, -top, left + side - stored.shape[1], top + side - stored.shape[0])
     square = np.pad(stored, ((pad, pad), (pad, pad), (0, 0)))[top + pad :, left + pad :][:side, :side]
-    return skimage.transform.resize(square, (IMAGE_SIZE, IMAGE_SIZE), order=1, anti_aliasing=side > IMAGE_SIZE)
+    return skimage.transform.resize(square, (size, size), order=1, anti_aliasing=side > size)
 
 
 def _open(path: Path) -> Image.Image:

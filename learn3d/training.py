@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import shlex
 import shutil
 import signal
@@ -20,12 +19,17 @@ from torch import Tensor
 
 from learn3d import checkpoint, figures, files
 from learn3d.config import TrainConfig, check_resume, config_from_dict, config_to_dict
-from learn3d.data.kato import KatoDataset
+from learn3d.data.augment import augment
+from learn3d.data.layouts import load_dataset
+from learn3d.data.sampling import sample_indices
+from learn3d.data.views import ViewDataset
 from learn3d.evaluation import evaluate
 from learn3d.memory import keep_freed_memory
-from learn3d.methods.pose_invariant import Optimizers, create_optimizers, train_step, uses_discriminator
-from learn3d.networks import Networks, create_networks, resolve_precision
+from learn3d.methods import DataShape, Method, create_method
+from learn3d.networks import resolve_precision
+from learn3d.presets import PRESETS
 from learn3d.runlog import RunLog
+from learn3d.versions import versions
 
 CONFIG_FILE = "config.json"
 PICTURE_ROWS = 8
@@ -38,6 +42,7 @@ class Progress:
     step: int = 0  # steps taken
     best_iou: float = -1.0  # best validation voxel IoU so far; -1 before the first validation
     best_step: int = 0
+    seconds: float = 0.0  # spent in training, over all resumptions
     object_share: float = 0.0  # side of the objects' bounding squares over that of the pictures, training mean
 
 
@@ -78,20 +83,15 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     keep_freed_memory()
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    train_set = KatoDataset.load(config.data, config.category, "train")
-    val_set = KatoDataset.load(config.data, config.category, config.val_split)
-    settings = config.loss_settings()
+    train_set, val_set = load_splits(config)
     precision = resolve_precision(config.precision, config.device)
-
-    networks = create_networks(
-        train_set.num_views, discriminator=uses_discriminator(settings), device=config.device, seed=config.seed
-    )
-    optimizers = create_optimizers(networks, config.learning_rate)
+    shape = DataShape(train_set.num_views, train_set.num_classes, train_set.poses.num_features)
+    method = create_method(config.settings, shape, device=config.device, precision=precision, seed=config.seed)
     progress = Progress(object_share=object_share(train_set))
     conditions = Conditions(len(train_set), f"{zlib.crc32(np.ascontiguousarray(train_set.images)):08x}", precision)
     folder = config.output
     if resume:
-        restore(folder / "last.safetensors", config, conditions, networks, optimizers, progress)
+        restore(folder / "last.safetensors", config, conditions, method, progress)
     else:
         _claim_folder(folder, overwrite)
     if progress.step >= config.iterations:
@@ -100,27 +100,30 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
             "to continue ask for more iterations"
         )
     files.write_json(folder / CONFIG_FILE, config_to_dict(config))
+    before = progress.seconds
 
     with _stop_on_signal() as stop, RunLog(folder, start=progress.step, total=config.iterations) as log:
         log.say(_describe(config, precision, train_set, val_set, progress))
         for step in range(progress.step + 1, config.iterations + 1):
-            indices = batch_indices(len(train_set), config.batch_size, config.seed, step)
+            indices = sample_indices(train_set, config.sampling, config.batch_size, config.seed, step)
+            batch = augment(train_set.batch(indices), config.augment, config.seed, step)
             try:
-                losses = train_step(networks, optimizers, train_set.batch(indices), step, settings, precision)
+                losses = method.train_step(batch, step)
             except FloatingPointError as error:
                 raise FloatingPointError(f"{error}; {_last_good(folder)}") from None
             progress.step = step
+            progress.seconds = before + time.monotonic() - started
             log.step(step, losses)
 
             last = step == config.iterations
             if last or step % config.log_every == 0:
                 log.metrics(step, "train", losses)
             if last or step % config.validate_every == 0:
-                _validate(config, networks, val_set, precision, progress, log)
+                _validate(config, method, shape, val_set, progress, log)
             if last or step % config.pictures_every == 0:
-                _draw(config, networks, val_set, step, log)
+                _draw(config, method, val_set, step, log)
             if last or stop.requested or step % config.checkpoint_every == 0:
-                save_last(folder, config, conditions, networks, optimizers, progress)
+                save_last(folder, config, conditions, method, shape, progress)
             if stop.requested and not last:
                 log.say(f"stopped by {stop.name} after step {step}; continue with: {resume_command(folder)}")
                 break
@@ -130,32 +133,27 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     return Summary(folder, progress.step, finished, progress.best_iou, progress.best_step, seconds)
 
 
-def batch_indices(num_samples: int, batch_size: int, seed: int, step: int) -> Tensor:
-    """Samples of step `step` (from 1), int64 [batch_size]: the next ones of an endless row of shuffled epochs.
-
-    A function of its arguments alone, so that a resumed run needs no memory of the data's position.
-    """
-    positions = range((step - 1) * batch_size, step * batch_size)
-    pieces = []
-    for epoch in range(positions.start // num_samples, (positions.stop - 1) // num_samples + 1):
-        first = max(positions.start - epoch * num_samples, 0)
-        end = min(positions.stop - epoch * num_samples, num_samples)
-        pieces.append(_epoch_order(num_samples, seed, epoch)[first:end])
-    return torch.cat(pieces)
-
-
-@functools.lru_cache(maxsize=2)
-def _epoch_order(num_samples: int, seed: int, epoch: int) -> Tensor:
-    generator = torch.Generator().manual_seed((seed * 1_000_003 + epoch) % 2**63)
-    return torch.randperm(num_samples, generator=generator)
+def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:
+    """The training and the validation split of a run. Both have the same view classes."""
+    return tuple(
+        load_dataset(
+            config.layout,
+            config.data,
+            config.category,
+            split,
+            image_size=config.settings.image_size,
+            view_bins=config.view_bins,
+        )
+        for split in ("train", config.val_split)
+    )
 
 
-def object_share(dataset: KatoDataset) -> float:
+def object_share(dataset: ViewDataset) -> float:
     """Mean over the images of the larger side of the mask's bounding box, as a share of the picture's side.
 
     Kept in checkpoints, so that photographs can be framed like the images that the networks know.
     """
-    masks = dataset.images[:, :, 3].reshape(len(dataset), *dataset.images.shape[-2:]) > 127
+    masks = dataset.images[:, 3] > 127
     sides = []
     for axis in (1, 2):
         seen = masks.any(axis=axis)
@@ -167,15 +165,18 @@ def object_share(dataset: KatoDataset) -> float:
 
 def _validate(
     config: TrainConfig,
-    networks: Networks,
-    val_set: KatoDataset,
-    precision: str,
+    method: Method,
+    shape: DataShape,
+    val_set: ViewDataset,
     progress: Progress,
     log: RunLog,
 ) -> None:
-    """Measure voxel IoU and MMD on the validation images; keep the networks when they are the best so far."""
-    result = evaluate(networks, val_set, precision=precision, max_images=config.max_val_images)
-    log.metrics(progress.step, config.val_split, {k: v for k, v in dataclasses.asdict(result).items() if v is not None})
+    """Measure voxel IoU and MMD on the validation images; keep the networks when they are the best so far.
+
+    A data set without true shapes has no best: its MMD alone says nothing about the shapes.
+    """
+    result = evaluate(method, val_set, max_images=config.max_val_images)
+    log.metrics(progress.step, config.val_split, {k: v for k, v in result.summary().items() if v is not None})
     mmd = "" if result.mmd is None else f", MMD {result.mmd:.3f}"
     iou = -1.0 if result.voxel_iou is None else result.voxel_iou
     better = iou > progress.best_iou
@@ -186,40 +187,48 @@ def _validate(
         log.say(f"warning: {result.undefined} images have no IoU (prediction and truth are both empty); left out")
     if better:
         progress.best_iou, progress.best_step = iou, progress.step
-        metadata = checkpoint.networks_metadata(networks, config) | dataclasses.asdict(progress)
-        _check_networks(networks, config.output)
-        checkpoint.save(config.output / "best.safetensors", checkpoint.network_tensors(networks), metadata)
+        metadata = checkpoint.method_metadata(shape, config) | dataclasses.asdict(progress)
+        _check_networks(method, config.output)
+        checkpoint.save(config.output / "best.safetensors", checkpoint.network_tensors(method), metadata)
 
 
-def _draw(config: TrainConfig, networks: Networks, val_set: KatoDataset, step: int, log: RunLog) -> None:
+def _draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
     """Write pictures/<step>.png: the same few validation images every time, of different objects and views."""
-    rows = min(PICTURE_ROWS, len(val_set))
-    objects = torch.linspace(0, val_set.num_objects - 1, rows).round().long()
-    views = (torch.arange(rows) * 7 + 3) % val_set.num_views
-    grid = figures.picture_grid(networks, val_set, objects * val_set.num_views + views)
+    grid = figures.picture_grid(method, val_set, picture_samples(val_set, PICTURE_ROWS))
     folder = config.output / "pictures"
     folder.mkdir(exist_ok=True)
     figures.save_png(folder / f"{step:06}.png", grid)
     log.picture(step, config.val_split, grid)
 
 
+def picture_samples(dataset: ViewDataset, count: int) -> Tensor:
+    """Samples for pictures, int64 [count] or fewer: of objects spread over the set, each seen from another side."""
+    rows = min(count, len(dataset))
+    chosen = []
+    for row, number in enumerate(np.linspace(0, dataset.num_objects - 1, rows).round().astype(int)):
+        samples = np.flatnonzero(dataset.object_ids == number)
+        if len(samples):
+            chosen.append(samples[(row * 7 + 3) % len(samples)])
+    return torch.from_numpy(np.array(chosen))
+
+
 def save_last(
     folder: Path,
     config: TrainConfig,
     conditions: Conditions,
-    networks: Networks,
-    optimizers: Optimizers,
+    method: Method,
+    shape: DataShape,
     progress: Progress,
 ) -> None:
-    """Write last.safetensors: networks, optimizers, random state, progress, configuration and conditions."""
-    _check_networks(networks, folder)
-    tensors = checkpoint.network_tensors(networks) | {"random.cpu": torch.get_rng_state()}
+    """Write last.safetensors: networks, optimizers, random state, progress, configuration, conditions and versions."""
+    _check_networks(method, folder)
+    tensors = checkpoint.network_tensors(method) | {"random.cpu": torch.get_rng_state()}
     if config.device == "cuda":
         tensors["random.cuda"] = torch.cuda.get_rng_state()
-    for name, optimizer in optimizers.items():
+    for name, optimizer in method.optimizers.items():
         tensors |= checkpoint.optimizer_tensors(name, optimizer)
-    metadata = checkpoint.networks_metadata(networks, config) | dataclasses.asdict(progress)
-    metadata["conditions"] = dataclasses.asdict(conditions)
+    metadata = checkpoint.method_metadata(shape, config) | dataclasses.asdict(progress)
+    metadata |= {"conditions": dataclasses.asdict(conditions), "versions": versions()}
     checkpoint.save(folder / "last.safetensors", tensors, metadata)
 
 
@@ -227,8 +236,7 @@ def restore(
     path: Path,
     config: TrainConfig,
     conditions: Conditions,
-    networks: Networks,
-    optimizers: Optimizers,
+    method: Method,
     progress: Progress,
 ) -> None:
     """Bring everything back to the state that `save_last` wrote.
@@ -242,8 +250,8 @@ def restore(
         saved = dataclasses.replace(saved, precision=config.precision)
     check_resume(config, saved)
     _check_conditions(conditions, recorded, config.data)
-    checkpoint.restore_networks(networks, tensors, path)
-    for name, optimizer in optimizers.items():
+    checkpoint.restore_networks(method, tensors, path)
+    for name, optimizer in method.optimizers.items():
         checkpoint.restore_optimizer(name, optimizer, tensors)
     for field in dataclasses.fields(Progress):
         setattr(progress, field.name, metadata.get(field.name, getattr(progress, field.name)))
@@ -321,9 +329,9 @@ def _claim_folder(folder: Path, overwrite: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
 
 
-def _check_networks(networks: Networks, folder: Path) -> None:
+def _check_networks(method: Method, folder: Path) -> None:
     """Refuse to save networks that are no longer finite: the checkpoint on disk is better than they are."""
-    for name, network in networks.items():
+    for name, network in method.networks.items():
         if not all(bool(parameter.isfinite().all()) for parameter in network.parameters()):
             raise FloatingPointError(f"the {name} has weights that are not finite; {_last_good(folder)}")
 
@@ -335,8 +343,9 @@ def _last_good(folder: Path) -> str:
     return f"the last good checkpoint is {path}; try a lower learning_rate or precision fp32"
 
 
-def _describe(config: TrainConfig, precision: str, train_set: KatoDataset, val_set: KatoDataset, at: Progress) -> str:
+def _describe(config: TrainConfig, precision: str, train_set: ViewDataset, val_set: ViewDataset, at: Progress) -> str:
     where = f"{config.device}, {precision}, {torch.get_num_threads()} threads"
     data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
     verb = f"resuming at step {at.step}" if at.step else "training"
-    return f"{verb}: {config.method} ({config.preset}) on {config.category}, {data}; {where}; output {config.output}"
+    name = f"{PRESETS[config.preset].label} ({config.preset})"
+    return f"{verb}: {name} on {config.category}, {data}; {where}; output {config.output}"

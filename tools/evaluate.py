@@ -13,7 +13,7 @@ from typing import Literal
 
 import tyro
 
-from learn3d.evaluation import evaluate_runs, format_table
+from learn3d.evaluation_report import evaluate_runs, format_table
 from learn3d.files import write_json
 
 

@@ -1,6 +1,6 @@
 """Where each data set's voxels lie: one named transform per data set, from the object frame to its grid.
 
-A prediction is voxelised in the object frame's axes (x, y, z) and then brought into the axes of the stored ground truth,
+A prediction is voxelised in the object frame's axes (x, y, z) and then brought into those of the stored ground truth,
 which is never touched. Sources: the published evaluation code, see docs/methods/README.md.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from torch import Tensor
 
 import nmr

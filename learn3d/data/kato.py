@@ -15,23 +15,22 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
 import nmr
-from learn3d.data.batch import Batch
+from learn3d.data.conventions import KATO, VOXEL_SIZE
+from learn3d.data.poses import LookAtPoses
+from learn3d.data.views import SPLITS, ViewDataset
 
 NUM_VIEWS = 24
 IMAGE_SIZE = 64
-VOXEL_SIZE = 32
 DISTANCE = 2.732
 ELEVATION_DEG = 30.0
 AZIMUTH_STEP_DEG = -15.0
 HALF_FOV_DEG = 15.0
-SPLITS = ("train", "val", "test")
 
 SYNSETS = {
     "airplane": "02691156",
@@ -82,10 +81,15 @@ def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:
     return np.stack([np.cross(axes[up], axes[front]), axes[up], -axes[front]]) + 0.0
 
 
+def view_poses(view_ids: torch.Tensor) -> LookAtPoses:
+    """Poses of Kato's views, one per entry of `view_ids` (int64 [B] in 0 .. 23)."""
+    azimuth_deg = AZIMUTH_STEP_DEG * torch.as_tensor(view_ids).to(torch.float32)
+    return LookAtPoses(azimuth_deg, ELEVATION_DEG, DISTANCE, HALF_FOV_DEG)
+
+
 def view_cameras(view_ids: torch.Tensor) -> nmr.LookAt:
     """Cameras of Kato's views, one per entry of `view_ids` (int64 [B] in 0 .. 23)."""
-    azimuth_deg = AZIMUTH_STEP_DEG * torch.as_tensor(view_ids).to(torch.float32)
-    return nmr.LookAt.from_angles(DISTANCE, ELEVATION_DEG, azimuth_deg, half_fov_deg=HALF_FOV_DEG)
+    return view_poses(view_ids).cameras()
 
 
 def voxelize(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
@@ -93,89 +97,51 @@ def voxelize(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
 
     vertices float [B, V, 3] or [V, 3] within [-0.5, 0.5]; faces integer [F, 3] or [B, F, 3].
     """
-    scale = (VOXEL_SIZE - 1) / VOXEL_SIZE
-    return to_kato_axes(nmr.voxelize(vertices * scale + 0.5, faces, size=VOXEL_SIZE))
+    return KATO.voxelize(vertices, faces)
 
 
-def to_kato_axes(grid: torch.Tensor) -> torch.Tensor:
-    """Grids [B, s, s, s] with axes (x, y, z) of the object frame, in the axes (y, x, -z) of the stored voxels."""
-    return grid.transpose(1, 2).flip(3)
+def load(folder: Path | str, category: str, split: str) -> ViewDataset:
+    """Read and check one category (name or synset id) and split ("train", "val" or "test") of a folder.
 
-
-@dataclass(frozen=True, eq=False)
-class KatoDataset:
-    """One category and split of Kato's data, in memory. Sample `object * 24 + view` is one view of one object."""
-
-    images: np.ndarray  # uint8 [N, 24, 4, 64, 64], as stored
-    voxels: np.ndarray  # bool [N, 32, 32, 32], as stored
-    category: str
-    split: str
-
-    @classmethod
-    def load(cls, folder: Path | str, category: str, split: str) -> KatoDataset:
-        """Read and check one category (name or synset id) and split ("train", "val" or "test") of a folder.
-
-        Raises FileNotFoundError where a file is missing (the message lists what the folder holds) and ValueError where
-        a file is no such npz, or its array has another shape or dtype, or the two files disagree on the object count.
-        """
-        if split not in SPLITS:
-            raise ValueError(f"split must be one of {', '.join(SPLITS)}; got {split!r}")
-        folder = Path(folder)
-        paths = split_paths(folder, category, split)
-        for path in paths:
-            if not path.is_file():
-                raise FileNotFoundError(_what_is_there(folder, category, split, path))
-        images = _read_array(paths[0], np.uint8, (NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE), "images")
-        voxels = _read_array(paths[1], np.bool_, (VOXEL_SIZE,) * 3, "voxels")
-        if len(images) != len(voxels):
-            raise ValueError(
-                f"{paths[0].name} holds {len(images)} objects but {paths[1].name} holds {len(voxels)}; "
-                "the two files must come from the same data set: fetch or make both again"
-            )
-        if len(images) == 0:
-            raise ValueError(f"{paths[0]} holds no object; make the data set with more meshes or another split")
-        return cls(images, voxels, category, split)
-
-    @property
-    def num_objects(self) -> int:
-        return len(self.images)
-
-    @property
-    def num_views(self) -> int:
-        return NUM_VIEWS
-
-    def __len__(self) -> int:
-        return self.num_objects * self.num_views
-
-    def batch(self, indices: torch.Tensor) -> Batch:
-        """The samples `indices` (integer [B], each object * 24 + view) as one Batch on the CPU."""
-        indices = torch.as_tensor(indices)
-        if indices.ndim != 1 or indices.is_floating_point() or indices.dtype == torch.bool:
-            raise TypeError(f"indices must be an integer tensor [B], got {indices.dtype} {list(indices.shape)}")
-        indices = indices.to(torch.int64)
-        if len(indices) and (indices.min() < 0 or indices.max() >= len(self)):
-            raise ValueError(
-                f"indices must lie in 0 .. {len(self) - 1} ({self.num_objects} objects x {self.num_views} views), "
-                f"got {int(indices.min())} .. {int(indices.max())}"
-            )
-        object_ids, view_ids = indices // self.num_views, indices % self.num_views
-        images = torch.from_numpy(self.images[object_ids.numpy(), view_ids.numpy()])
-        return Batch(
-            images=images,
-            masks=images[:, 3].to(torch.float32) / 255,
-            cameras=self.cameras(view_ids),
-            view_ids=view_ids,
-            object_ids=object_ids,
-            voxels=torch.from_numpy(self.voxels[object_ids.numpy()]),
+    Sample `object * 24 + view` is one view of one object; the pose classes are the 24 views.
+    Raises FileNotFoundError where a file is missing (the message lists what the folder holds) and ValueError where
+    a file is no such npz, or its array has another shape or dtype, or the two files disagree on the object count.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"split must be one of {', '.join(SPLITS)}; got {split!r}")
+    folder = Path(folder)
+    paths = split_paths(folder, category, split)
+    for path in paths:
+        if not path.is_file():
+            raise FileNotFoundError(_what_is_there(folder, category, split, path))
+    images = _read_array(paths[0], np.uint8, (NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE), "images")
+    voxels = _read_array(paths[1], np.bool_, (VOXEL_SIZE,) * 3, "voxels")
+    if len(images) != len(voxels):
+        raise ValueError(
+            f"{paths[0].name} holds {len(images)} objects but {paths[1].name} holds {len(voxels)}; "
+            "the two files must come from the same data set: fetch or make both again"
         )
+    if len(images) == 0:
+        raise ValueError(f"{paths[0]} holds no object; make the data set with more meshes or another split")
+    return from_arrays(images, voxels, category, split)
 
-    def cameras(self, view_ids: torch.Tensor) -> nmr.LookAt:
-        """Cameras of the views `view_ids` (int64 [B]); see `view_cameras`."""
-        return view_cameras(view_ids)
 
-    def voxelize(self, vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
-        """Occupancy bool [B, 32, 32, 32] of predictions in the data set's voxel convention; see `voxelize`."""
-        return voxelize(vertices, faces)
+def from_arrays(images: np.ndarray, voxels: np.ndarray, category: str, split: str) -> ViewDataset:
+    """The data set of images uint8 [N, 24, 4, 64, 64] and voxels bool [N, 32, 32, 32], as the files hold them."""
+    count = len(images)
+    view_ids = np.tile(np.arange(NUM_VIEWS), count)
+    return ViewDataset(
+        category=category,
+        split=split,
+        images=images.reshape(count * NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE),
+        poses=view_poses(torch.from_numpy(view_ids)),
+        view_ids=view_ids,
+        view_names=tuple(f"azimuth {AZIMUTH_STEP_DEG * view:g}°" for view in range(NUM_VIEWS)),
+        object_ids=np.repeat(np.arange(count), NUM_VIEWS),
+        object_names=tuple(f"{i:04d}" for i in range(count)),
+        voxels=voxels,
+        convention=KATO,
+    )
 
 
 def _read_array(path: Path, dtype: type, shape: tuple[int, ...], what: str) -> np.ndarray:

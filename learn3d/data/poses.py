@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -20,13 +21,14 @@ def wrap_deg(angle_deg: Tensor) -> Tensor:
 class LookAtPoses:
     """M perspective cameras that look at the origin from (distance, elevation, azimuth) in the object frame.
 
-    Conventions of `nmr.points_from_angles`: the eye is at d (cos e sin a, sin e, -cos e cos a).
+    Conventions of `nmr.cameras.points_from_angles`: the eye is at d (cos e sin a, sin e, -cos e cos a).
     """
 
     azimuth_deg: Tensor  # float32 [M]
     elevation_deg: Tensor | float  # float32 [M], or one value for all
     distance: Tensor | float  # float32 [M], or one value for all; units of the object frame
     half_fov_deg: Tensor | float  # float32 [M], or one value for all: half of the field of view
+    num_features: ClassVar[int] = 3
 
     def __post_init__(self) -> None:
         for name in ("azimuth_deg", "elevation_deg", "distance", "half_fov_deg"):
@@ -52,10 +54,10 @@ class LookAtPoses:
 
     def features(self) -> Tensor:
         """What tells a discriminator the view: the eye's position, float32 [M, 3]."""
-        return nmr.points_from_angles(self.distance, self.elevation_deg, self.azimuth_deg).to(torch.float32)
+        return nmr.cameras.points_from_angles(self.distance, self.elevation_deg, self.azimuth_deg).to(torch.float32)
 
     def mirrored(self, chosen: Tensor) -> LookAtPoses:
-        """The same poses, where `chosen` (bool [M]) seen in a mirror: the image flipped left-right, the azimuth negated."""
+        """The same poses, where `chosen` (bool [M]) seen in a mirror: image flipped left-right, azimuth negated."""
         return replace(self, azimuth_deg=torch.where(chosen, -self.azimuth_deg, self.azimuth_deg))
 
     @property
@@ -76,6 +78,7 @@ class RotationPoses:
 
     rotation: Tensor  # float32 [M, 3, 3]
     depth_offset: float = 2.0
+    num_features: ClassVar[int] = 9
 
     def __post_init__(self) -> None:
         if isinstance(self.rotation, np.ndarray):

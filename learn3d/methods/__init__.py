@@ -1,1 +1,27 @@
-"""Training steps, one file per method."""
+"""Methods, one file each with its own training step; `create_method` builds the one that settings belong to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import torch
+
+from learn3d.methods.method import DataShape, Grids, Meshes, Method
+from learn3d.networks import check_device
+
+if TYPE_CHECKING:
+    from learn3d.presets import Settings
+
+__all__ = ["DataShape", "Grids", "Meshes", "Method", "create_method"]
+
+
+def create_method(
+    settings: Settings, shape: DataShape, *, device: str, precision: Literal["bf16", "fp32"], seed: int
+) -> Method:
+    """The method of `settings`, with PyTorch's default initialisation of its networks from `seed`."""
+    from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
+
+    methods: dict[type, type[Method]] = {PoseInvariantSettings: PoseInvariant}
+    check_device(device)
+    torch.manual_seed(seed)
+    return methods[type(settings)](settings, shape, device, precision)

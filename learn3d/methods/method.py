@@ -1,4 +1,4 @@
-"""What the training loop, evaluation and figures expect of a method: networks, a training step, and a way to a shape."""
+"""What the training loop, evaluation and figures expect of a method: networks, a training step, a way to shapes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.data.batch import Batch
@@ -38,6 +39,13 @@ class Grids:
     occupancy: Tensor  # float32 [B, s, s, s] in [0, 1]; axes (x, y, z) of the object frame over the box [-0.5, 0.5]
     threshold: float = 0.5  # occupied above it
 
+    def occupied(self, size: int) -> Tensor:
+        """Bool [B, size, size, size]: where the mean over the cell is above the threshold; s is a multiple of size."""
+        factor, rest = divmod(self.occupancy.shape[-1], size)
+        if rest or factor < 1:
+            raise ValueError(f"a grid of {self.occupancy.shape[-1]} cells cannot be pooled to {size}")
+        return F.avg_pool3d(self.occupancy[:, None], factor)[:, 0] > self.threshold
+
 
 class Method(abc.ABC):
     """One method in training or in use. A subclass builds `networks` and `optimizers` and has its own training step.
@@ -50,7 +58,7 @@ class Method(abc.ABC):
     optimizers: dict[str, torch.optim.Optimizer]
     device: torch.device
     precision: Literal["bf16", "fp32"]
-    image_size: int = 64  # side of the images that `encode` takes
+    image_size: int  # side of the images that `encode` takes; also a property of the method's settings
 
     @abc.abstractmethod
     def train_step(self, batch: Batch, step: int) -> dict[str, float]:
@@ -70,6 +78,11 @@ class Method(abc.ABC):
     def autocast(self) -> torch.autocast:
         """Context in which the networks run at the method's precision."""
         return autocast(self.device, self.precision)
+
+    @property
+    def training(self) -> bool:
+        """Whether the networks are in training mode."""
+        return any(network.training for network in self.networks.values())
 
     def set_training(self, training: bool) -> None:
         """Batch norms and the like in training or in evaluation mode."""

@@ -40,6 +40,11 @@ class PoseInvariantSettings:
     """Prior on the squared length of the codes (published code) or on their length (eq. 5)."""
 
     @property
+    def image_size(self) -> int:
+        """Side of the images that the encoder takes, in pixels."""
+        return ENCODERS[self.encoder].image_size
+
+    @property
     def uses_discriminator(self) -> bool:
         """Whether the pose discriminator takes part at all (for Vanilla-AE it is not even created)."""
         return self.lambda_classification > 0 or self.lambda_adversarial > 0
@@ -51,7 +56,8 @@ class PoseInvariant(Method):
     def __init__(
         self, settings: PoseInvariantSettings, shape: DataShape, device: str, precision: Literal["bf16", "fp32"]
     ) -> None:
-        self.settings, self.device, self.precision = settings, torch.device(device), precision
+        self.settings, self.image_size = settings, settings.image_size
+        self.device, self.precision = torch.device(device), precision
         self.encoder = ENCODERS[settings.encoder]()
         self.generator = GENERATORS[settings.generator]()
         self.networks = {"encoder": self.encoder, "generator": self.generator}
@@ -60,7 +66,6 @@ class PoseInvariant(Method):
         for network in self.networks.values():
             network.to(device)
         self.encoder.to(memory_format=torch.channels_last)
-        self.image_size = self.encoder.image_size
         self.optimizers = {name: adam(network, settings.learning_rate) for name, network in self.networks.items()}
 
     def encode(self, images: Tensor) -> Tensor:

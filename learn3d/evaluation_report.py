@@ -1,0 +1,118 @@
+"""The report of tools/evaluate.py: trained runs measured on a split, as JSON and as a text table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from learn3d import checkpoint
+from learn3d.data.layouts import load_dataset
+from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS, evaluate
+from learn3d.presets import PRESETS
+from learn3d.versions import versions
+
+COLUMNS = {
+    "voxel_iou_kato18": "voxel IoU",
+    "voxel_iou_kato19": "IoU (kato19)",
+    "chamfer_l1": "Chamfer-L1",
+    "f_score": "F-score",
+    "mmd": "MMD",
+    "mmd_paper": "MMD (printed formula)",
+}
+
+
+def evaluate_runs(
+    paths: Sequence[Path],
+    *,
+    data: Path | None = None,
+    category: str | None = None,
+    split: str = "test",
+    which: Literal["last", "best"] = "last",
+    precision: Literal["bf16", "fp32"] = "fp32",
+    device: str = "cpu",
+    report_progress: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """Evaluate run folders or checkpoint files on a split; a report ready for JSON, see `format_table`.
+
+    `data` and `category` default to those each run was trained with. The mean over classes is taken per method; several
+    runs of one class and method (seeds) count as one class.
+    """
+    if not paths:
+        raise ValueError("give at least one run folder or checkpoint to evaluate")
+    results = []
+    for path in paths:
+        file = checkpoint.find(path, which)
+        method, config, metadata = checkpoint.load_method(file, device=device, precision=precision)
+        name, folder = category or config.category, data or config.data
+        report_progress(f"{file}: {PRESETS[config.preset].label} ({config.preset}) on {name}, {split}")
+        dataset = load_dataset(
+            config.layout, folder, name, split, image_size=method.image_size, view_bins=config.view_bins
+        )
+        result = evaluate(method, dataset, definitions=("kato18", "kato19"), paper_mmd=True, surfaces=True)
+        if result.undefined:
+            report_progress(f"warning: {result.undefined} images have no IoU (prediction and truth empty); left out")
+        about = {
+            "checkpoint": str(file),
+            "category": name,
+            "data": str(folder),
+            "method": PRESETS[config.preset].label,
+            "preset": config.preset,
+            "iterations": metadata["step"],
+            "seed": config.seed,
+            "trained_by": metadata.get("versions"),
+        }
+        results.append(about | result.summary())
+    protocol = {
+        "split": split,
+        "checkpoint": which,
+        "precision": precision,
+        "views": "all views of all objects, each image on its own",
+        "voxels": "32^3, filled surface voxels, mean over images, then over classes; kato18 and kato19 are the two "
+        "published voxelisers of predictions, not comparable with each other",
+        "surfaces": f"{SURFACE_POINTS} points each, object frame; F-score at {F_SCORE_DISTANCE} of the longest side",
+        "mmd": f"mean over all pairs of views, up to {CODES_PER_VIEW} codes each; five kernels, no root",
+        "mmd_paper": "the same with the paper's printed formula: one kernel, square root",
+    }
+    return {"protocol": protocol, "versions": versions(), "results": results, "means": _class_means(results)}
+
+
+def format_table(report: dict[str, Any]) -> str:
+    """The report of `evaluate_runs` as a text table: a line per run, then a mean over classes per method."""
+    header = ("class", "method", "seed", "iterations", "images", *COLUMNS.values())
+    rows = [header]
+    for r in report["results"]:
+        label = f"{r['method']} ({r['preset']})"
+        counts = (str(r["seed"]), str(r["iterations"]), str(r["images"]))
+        rows.append((r["category"], label, *counts, *(_number(r.get(key)) for key in COLUMNS)))
+    for m in report["means"]:
+        label, classes = f"{m['method']} ({m['preset']})", f"{m['classes']} classes" if m["classes"] > 1 else "1 class"
+        rows.append(("mean", label, "", "", classes, *(_number(m[key]) for key in COLUMNS)))
+    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join(lines)
+
+
+def _class_means(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mean over classes of each method's figures; runs of the same class are averaged first."""
+    methods = dict.fromkeys((r["method"], r["preset"]) for r in results)
+    means = []
+    for method, preset in methods:
+        mine = [r for r in results if (r["method"], r["preset"]) == (method, preset)]
+        classes = sorted({r["category"] for r in mine})
+        row: dict[str, Any] = {"method": method, "preset": preset, "classes": len(classes)}
+        for key in COLUMNS:
+            per_class = [_mean([r.get(key) for r in mine if r["category"] == name]) for name in classes]
+            row[key] = _mean(per_class)
+        means.append(row)
+    return means
+
+
+def _mean(values: list[float | None]) -> float | None:
+    """Plain mean, or None when a value is missing."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"

@@ -1,0 +1,32 @@
+"""What code made a result: versions, and the git commit when it runs from a checkout."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import subprocess
+from pathlib import Path
+
+import torch
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of the package and of torch, and the git commit when the code runs from a checkout."""
+    try:
+        package = importlib.metadata.version("nmr-learn3d")
+    except importlib.metadata.PackageNotFoundError:
+        package = None
+    return {"nmr-learn3d": package, "torch": torch.__version__, "commit": _git_commit()}
+
+
+def _git_commit() -> str | None:
+    """Commit of the checkout that holds this file (with "-dirty" after changes), None for an installed copy."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(Path(__file__).parent), *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", Path(__file__).name)
+        return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
