@@ -46,7 +46,7 @@ PRESETS: dict[str, Preset] = {
         "kato",
         20_000,
         128,
-        f"{_PAPER}, eqs. 4 and 5 as printed",
+        f"{_PAPER}, eqs. 4 and 5 as printed; the generator keeps the factor 0.5",
     ),
     "peng2020-kato-vanilla": Preset(
         "Vanilla-AE",

@@ -180,7 +180,7 @@ def _save_all(method: Method, folder: Path, names: list[str], images: np.ndarray
 
 
 def _resample(stored: np.ndarray, left: float, top: float, side: float, size: int) -> np.ndarray:
-    """The square [H,W,C] with that corner and side (whole pixels), scaled to [size,size,C], anti-aliased; zero outside."""
+    """The square with that corner and side (whole pixels), scaled to [size,size,C], anti-aliased; zero outside."""
     left, top, side = round(left), round(top), max(1, round(side))
     pad = max(0, -left, -top, left + side - stored.shape[1], top + side - stored.shape[0])
     square = np.pad(stored, ((pad, pad), (pad, pad), (0, 0)))[top + pad :, left + pad :][:side, :side]

@@ -6,7 +6,6 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 from statistics import median
 from typing import Literal
 from unittest import mock
@@ -17,12 +16,13 @@ from bench_work import Result, Row, deformed_spheres, settings
 from torch import Tensor
 
 import nmr
-from learn3d.config import TrainConfig
 from learn3d.data import kato
+from learn3d.data.sampling import shuffled_epochs
+from learn3d.data.views import ViewDataset
 from learn3d.memory import keep_freed_memory
-from learn3d.methods import pose_invariant
-from learn3d.networks import create_networks, resolve_precision
-from learn3d.training import batch_indices
+from learn3d.methods import DataShape, Method, create_method, pose_invariant
+from learn3d.networks import resolve_precision
+from learn3d.presets import PRESETS
 
 BATCH = 128
 NETWORKS = "networks and optimizers (what is left)"
@@ -75,7 +75,7 @@ class Stopwatch:
         return call
 
     def watch_step(self, stack: ExitStack) -> None:
-        """Until the stack closes, the parts of ``pose_invariant.train_step`` are timed."""
+        """Until the stack closes, the parts of ``PoseInvariant.train_step`` are timed."""
 
         def render(vertices: Tensor, faces: Tensor, camera: nmr.Camera, **options) -> Tensor:
             return draw(transform(camera, vertices), faces, **options)
@@ -94,25 +94,25 @@ class Stopwatch:
             stack.enter_context(mock.patch.object(owner, name, self.timed(part, getattr(owner, name))))
 
 
-def sphere_dataset(num_objects: int = 48) -> kato.KatoDataset:
+def sphere_dataset(num_objects: int = 48) -> ViewDataset:
     """Silhouettes of deformed spheres as images: the cost of a step hardly depends on what is in them."""
     spheres = deformed_spheres(num_objects, 3, 64, True)
     vertices = spheres.vertices.repeat_interleave(kato.NUM_VIEWS, 0)
     cameras = kato.view_cameras(torch.arange(kato.NUM_VIEWS).repeat(num_objects))
     masks = (255 * nmr.render_silhouette(vertices, spheres.faces, cameras, image_size=64)).round().to(torch.uint8)
     images = masks.view(num_objects, kato.NUM_VIEWS, 1, 64, 64).expand(-1, -1, 4, -1, -1).contiguous().numpy()
-    return kato.KatoDataset(images, np.zeros((num_objects, 32, 32, 32), dtype=bool), "spheres", "train")
+    return kato.from_arrays(images, np.zeros((num_objects, 32, 32, 32), dtype=bool), "spheres", "train")
 
 
 WAYS = ("forward", "backward")
 Parts = dict[tuple[str, str], float]  # seconds by (part, "forward" or "backward"), and of ("step", "forward")
 
 
-def run_step(watch: Stopwatch, dataset, networks, optimizers, iteration: int, loss_settings, precision: str) -> Parts:
+def run_step(watch: Stopwatch, dataset: ViewDataset, method: Method, iteration: int) -> Parts:
     watch.seconds.clear()
     start = time.perf_counter()
-    batch = watch.timed("data", lambda: dataset.batch(batch_indices(len(dataset), BATCH, 0, iteration)))()
-    pose_invariant.train_step(networks, optimizers, batch, iteration, loss_settings, precision)
+    batch = watch.timed("data", lambda: dataset.batch(shuffled_epochs(len(dataset), BATCH, 0, iteration)))()
+    method.train_step(batch, iteration)
     return {("step", "forward"): time.perf_counter() - start, **watch.seconds}
 
 
@@ -135,19 +135,18 @@ def bench_step(threads: int, repeats: int) -> Result:
     keep_freed_memory()
     about = settings(threads, repeats, batch=BATCH)
     dataset, watch = sphere_dataset(), Stopwatch()
-    loss_settings = TrainConfig(data=Path(), category="spheres", output=Path()).loss_settings()
     best = resolve_precision("auto", "cpu")
     precisions: list[Literal["bf16", "fp32"]] = ["bf16", "fp32"] if best == "bf16" else ["fp32", "bf16"]
-    programs = {}
-    for precision in precisions:
-        networks = create_networks(kato.NUM_VIEWS, discriminator=True, device="cpu", seed=0)
-        programs[precision] = networks, pose_invariant.create_optimizers(networks, 1e-4)
+    proposed, shape = PRESETS["peng2020-kato"].settings, DataShape(kato.NUM_VIEWS)
+    programs = {
+        precision: create_method(proposed, shape, device="cpu", precision=precision, seed=0) for precision in precisions
+    }
     steps: dict[str, list[Parts]] = {precision: [] for precision in programs}
     with ExitStack() as stack:
         watch.watch_step(stack)
         for iteration in range(1, repeats + 3):  # the first two, one of each kind, are not counted
-            for precision, (networks, optimizers) in programs.items():
-                parts = run_step(watch, dataset, networks, optimizers, iteration, loss_settings, precision)
+            for precision, method in programs.items():
+                parts = run_step(watch, dataset, method, iteration)
                 if iteration > 2:
                     steps[precision].append(parts)
     print(f"\nTraining step of the proposed method\n{', '.join(f'{k} {v}' for k, v in about.items())}")

@@ -20,8 +20,9 @@ step "Making $objects ${category}s, each rendered from 24 views"
 "$python" tools/make_dataset.py --output "$out/data" --category "$category" --procedural "$objects" --overwrite
 
 for method in proposed vanilla; do
-    step "Training the method '$method' for $steps steps"
-    "$python" tools/train.py --data "$out/data" --category "$category" --method "$method" --output "$out/$method" \
+    case $method in proposed) preset=peng2020-kato ;; vanilla) preset=peng2020-kato-vanilla ;; esac
+    step "Training the method '$method' (preset $preset) for $steps steps"
+    "$python" tools/train.py --data "$out/data" --category "$category" --preset "$preset" --output "$out/$method" \
         --overwrite --iterations "$steps" --validate-every 200 --pictures-every 200 --checkpoint-every 200
 done
 

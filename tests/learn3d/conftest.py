@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -12,8 +13,10 @@ import pytest
 import torch
 
 from learn3d import training
-from learn3d.config import TrainConfig
-from learn3d.data.kato import KatoDataset
+from learn3d.config import DEFAULT_PRESET, TrainConfig
+from learn3d.data import kato
+from learn3d.data.views import ViewDataset
+from learn3d.presets import PRESETS
 from learn3d.training import train
 
 
@@ -36,8 +39,8 @@ def tiny_arrays(objects: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="session")
-def tiny_set() -> KatoDataset:
-    return KatoDataset(*tiny_arrays(3, seed=0), category="airplane", split="test")
+def tiny_set() -> ViewDataset:
+    return kato.from_arrays(*tiny_arrays(3, seed=0), category="airplane", split="test")
 
 
 @pytest.fixture(scope="session")
@@ -60,10 +63,13 @@ def run_folder(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def tiny_config(tiny_folder: Path) -> Callable[..., TrainConfig]:
-    """Makes a configuration for a few steps of batch 4 on the tiny data."""
+    """Makes a configuration for a few steps of batch 4 on the tiny data; options may be settings of the method."""
 
     def make(output: Path, **options: object) -> TrainConfig:
         defaults = {"iterations": 4, "batch_size": 4, "precision": "fp32", "log_every": 1, "max_val_images": 4}
+        preset = PRESETS.get(options.get("preset", DEFAULT_PRESET), PRESETS[DEFAULT_PRESET]).settings
+        names = {field.name for field in dataclasses.fields(preset)} & set(options)
+        options["settings"] = dataclasses.replace(preset, **{name: options.pop(name) for name in names})
         return TrainConfig(**({"data": tiny_folder, "category": "airplane", "output": output} | defaults | options))
 
     return make

@@ -7,7 +7,9 @@ import torch
 from safetensors.torch import save_file
 
 from learn3d import checkpoint
-from learn3d.networks import PoseDiscriminator, create_networks
+from learn3d.config import config_from_dict
+from learn3d.methods import DataShape, create_method
+from learn3d.presets import PRESETS
 
 
 def test_round_trip_keeps_bits_names_and_metadata(tmp_path) -> None:
@@ -64,19 +66,55 @@ def test_missing_foreign_and_future_files(tmp_path) -> None:
 
 
 def test_networks_of_another_shape_are_refused(tmp_path) -> None:
-    networks = create_networks(24, discriminator=True, device="cpu", seed=0)
-    tensors = checkpoint.network_tensors(networks)
-    networks.discriminator = PoseDiscriminator(72)
+    of_24_views, of_72_views = (
+        create_method(PRESETS["peng2020-kato"].settings, DataShape(k), device="cpu", precision="fp32", seed=0)
+        for k in (24, 72)
+    )
     with pytest.raises(ValueError, match="does not fit the discriminator"):
-        checkpoint.restore_networks(networks, tensors, tmp_path)
+        checkpoint.restore_networks(of_72_views, checkpoint.network_tensors(of_24_views), tmp_path)
 
 
-def test_load_networks_gives_the_saved_ones_for_use(finished_run) -> None:
+def test_load_method_gives_the_saved_one_for_use(finished_run) -> None:
     random = torch.get_rng_state()
-    networks, config, metadata = checkpoint.load_networks(checkpoint.find(finished_run, "last"))
+    method, config, metadata = checkpoint.load_method(checkpoint.find(finished_run, "last"))
+    networks = method.networks
     assert torch.equal(torch.get_rng_state(), random)
     tensors, _ = checkpoint.load(finished_run / "last.safetensors")
-    assert torch.equal(networks.encoder.layers[0].weight, tensors["network.encoder.layers.0.weight"])
-    assert networks.discriminator.layers[-1].out_features == 24
-    assert not any(p.requires_grad for _, network in networks.items() for p in network.parameters())
+    assert torch.equal(networks["encoder"].layers[0].weight, tensors["network.encoder.layers.0.weight"])
+    assert networks["discriminator"].layers[-1].out_features == 24
+    assert not any(p.requires_grad for network in networks.values() for p in network.parameters())
+    assert not method.training
     assert (config.category, metadata["step"]) == ("airplane", 4)
+    assert metadata["versions"]["torch"] == torch.__version__
+
+
+FIRST_VERSION = {
+    "data": "d",
+    "category": "chair",
+    "output": "o",
+    "iterations": 9,
+    "batch_size": 4,
+    "lambda_smooth": 0.001,
+}
+
+
+@pytest.mark.parametrize(
+    ("method", "preset", "name"),
+    [
+        ("proposed", "released", "peng2020-kato"),
+        ("proposed", "paper", "peng2020-kato-printed"),
+        ("vanilla", "released", "peng2020-kato-vanilla"),
+    ],
+)
+def test_checkpoints_of_the_first_version_are_understood(tmp_path, method: str, preset: str, name: str) -> None:
+    new = create_method(PRESETS[name].settings, DataShape(24), device="cpu", precision="fp32", seed=0)
+    weights = {"lambda_classification": None, "lambda_adversarial": None, "lambda_prior": None, "learning_rate": 1e-4}
+    config = FIRST_VERSION | weights | {"method": method, "preset": preset}
+    has_discriminator = method == "proposed"
+    about = {"config": config, "has_discriminator": has_discriminator, "num_views": 24 * has_discriminator, "step": 9}
+    checkpoint.save(tmp_path / "last.safetensors", checkpoint.network_tensors(new), about)
+    old, config, _ = checkpoint.load_method(tmp_path / "last.safetensors")
+    assert (config.preset, config.settings) == (name, PRESETS[name].settings)
+    assert old.networks.keys() == new.networks.keys()
+    with pytest.raises(ValueError, match="unknown method and preset 'gan', 'released'"):
+        config_from_dict(FIRST_VERSION | {"method": "gan"})

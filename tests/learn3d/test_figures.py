@@ -9,7 +9,13 @@ from PIL import Image
 
 import nmr
 from learn3d import figures
-from learn3d.networks import create_networks
+from learn3d.methods import DataShape, Method, create_method
+from learn3d.presets import PRESETS
+
+
+def create_vanilla() -> Method:
+    settings = PRESETS["peng2020-kato-vanilla"].settings
+    return create_method(settings, DataShape(24), device="cpu", precision="fp32", seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +35,8 @@ def test_natural_colors_undo_the_inversion() -> None:
 
 
 def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set) -> None:
-    networks = create_networks(24, discriminator=False, device="cpu", seed=0)
-    grid = figures.picture_grid(networks, tiny_set, torch.tensor([3, 30]))
+    method = create_vanilla()
+    grid = figures.picture_grid(method, tiny_set, torch.tensor([3, 30]))
     step = figures.TILE + figures.MARGIN
     assert grid.shape == (figures.HEADER + 2 * step + figures.MARGIN, 9 * step + figures.MARGIN, 3)
     assert grid.dtype == np.uint8

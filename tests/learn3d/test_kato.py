@@ -10,8 +10,9 @@ import pytest
 import torch
 
 import nmr
-from learn3d.data import Batch, KatoDataset, synset_of
-from learn3d.data.kato import mesh_to_object, voxelize
+from learn3d.data import kato
+from learn3d.data.batch import Batch
+from learn3d.data.kato import mesh_to_object, synset_of, voxelize
 
 
 @pytest.fixture
@@ -30,16 +31,16 @@ def test_reads_back_what_was_written_by_name_and_by_synset(tmp_path, arrays):
     images, voxels = arrays
     write(tmp_path, images, voxels)
     for category in ("chair", "03001627"):
-        dataset = KatoDataset.load(tmp_path, category, "test")
+        dataset = kato.load(tmp_path, category, "test")
         assert (dataset.num_objects, dataset.num_views, len(dataset)) == (2, 24, 48)
-        np.testing.assert_array_equal(dataset.images, images)
+        np.testing.assert_array_equal(dataset.images, images.reshape(48, 4, 64, 64))
         np.testing.assert_array_equal(dataset.voxels, voxels)
 
 
 def test_batch_takes_object_times_24_plus_view(tmp_path, arrays):
     images, voxels = arrays
     write(tmp_path, images, voxels)
-    batch = KatoDataset.load(tmp_path, "chair", "test").batch(torch.tensor([30, 0, 23]))
+    batch = kato.load(tmp_path, "chair", "test").batch(torch.tensor([30, 0, 23]))
     assert isinstance(batch, Batch)
     assert batch.object_ids.tolist() == [1, 0, 0] and batch.view_ids.tolist() == [6, 0, 23]
     assert batch.images.dtype == torch.uint8 and batch.voxels.dtype == torch.bool
@@ -51,7 +52,7 @@ def test_batch_takes_object_times_24_plus_view(tmp_path, arrays):
 
 def test_view_k_is_seen_from_azimuth_minus_15_k_degrees(tmp_path, arrays):
     write(tmp_path, *arrays)
-    cameras = KatoDataset.load(tmp_path, "chair", "test").cameras(torch.tensor([0, 6, 12, 18]))
+    cameras = kato.load(tmp_path, "chair", "test").batch(torch.tensor([0, 6, 12, 42])).cameras
     flat, height = 2.732 * np.cos(np.radians(30)), 2.732 * np.sin(np.radians(30))
     wanted = [[0, height, -flat], [-flat, height, 0], [0, height, flat], [flat, height, 0]]
     np.testing.assert_allclose(np.asarray(cameras.eye), wanted, atol=1e-5)
@@ -95,17 +96,17 @@ def test_synset_of_known_and_other_names():
 
 def test_missing_files_are_named_with_what_is_there(tmp_path, arrays):
     with pytest.raises(FileNotFoundError, match="no such folder"):
-        KatoDataset.load(tmp_path / "nowhere", "chair", "test")
+        kato.load(tmp_path / "nowhere", "chair", "test")
     with pytest.raises(FileNotFoundError, match="holds no"):
-        KatoDataset.load(tmp_path, "chair", "test")
+        kato.load(tmp_path, "chair", "test")
     write(tmp_path, *arrays)
     with pytest.raises(FileNotFoundError, match=r"03001627_train_images.npz.*the folder holds: chair test"):
-        KatoDataset.load(tmp_path, "chair", "train")
+        kato.load(tmp_path, "chair", "train")
     (tmp_path / "03001627_test_voxels.npz").unlink()
     with pytest.raises(FileNotFoundError, match="03001627_test_voxels"):
-        KatoDataset.load(tmp_path, "chair", "test")
+        kato.load(tmp_path, "chair", "test")
     with pytest.raises(ValueError, match="train, val, test"):
-        KatoDataset.load(tmp_path, "chair", "validation")
+        kato.load(tmp_path, "chair", "validation")
 
 
 def test_wrong_shapes_dtypes_and_counts(tmp_path, arrays):
@@ -122,7 +123,7 @@ def test_wrong_shapes_dtypes_and_counts(tmp_path, arrays):
     for bad_images, bad_voxels, message in cases:
         write(tmp_path, bad_images, bad_voxels)
         with pytest.raises(ValueError, match=message):
-            KatoDataset.load(tmp_path, "chair", "test")
+            kato.load(tmp_path, "chair", "test")
 
 
 def test_foreign_truncated_and_pickled_files(tmp_path, arrays):
@@ -153,7 +154,7 @@ def test_foreign_truncated_and_pickled_files(tmp_path, arrays):
     for content, message in cases:
         path.write_bytes(content)
         with pytest.raises(ValueError, match=message):
-            KatoDataset.load(tmp_path, "chair", "test")
+            kato.load(tmp_path, "chair", "test")
 
 
 def test_too_little_memory_is_not_called_a_damaged_file(tmp_path, arrays, monkeypatch):
@@ -163,12 +164,12 @@ def test_too_little_memory_is_not_called_a_damaged_file(tmp_path, arrays, monkey
     write(tmp_path, *arrays)
     monkeypatch.setattr(np, "load", fail)
     with pytest.raises(MemoryError):
-        KatoDataset.load(tmp_path, "chair", "test")
+        kato.load(tmp_path, "chair", "test")
 
 
 def test_bad_indices(tmp_path, arrays):
     write(tmp_path, *arrays)
-    dataset = KatoDataset.load(tmp_path, "chair", "test")
+    dataset = kato.load(tmp_path, "chair", "test")
     for bad in ([48], [-1]):
         with pytest.raises(ValueError, match=r"0 \.\. 47"):
             dataset.batch(torch.tensor(bad))

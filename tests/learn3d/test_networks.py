@@ -8,17 +8,21 @@ import torch
 from torch import nn
 from vectors import load_vector
 
-from learn3d import networks as networks_module
+from learn3d.methods import DataShape, Method, create_method
 from learn3d.networks import (
-    Encoder,
-    MeshGenerator,
     PoseDiscriminator,
     autocast,
-    create_networks,
-    deform_sphere,
     network_input,
     resolve_precision,
 )
+from learn3d.networks import precision as precision_module
+from learn3d.networks.encoders import ConvEncoder
+from learn3d.networks.generators import SphereGenerator, deform_sphere
+from learn3d.presets import PRESETS
+
+
+def create(preset: str, seed: int = 0, device: str = "cpu") -> Method:
+    return create_method(PRESETS[preset].settings, DataShape(24), device=device, precision="fp32", seed=seed)
 
 
 def layer_sizes(network: nn.Module) -> list[tuple[int, int]]:
@@ -26,7 +30,7 @@ def layer_sizes(network: nn.Module) -> list[tuple[int, int]]:
 
 
 def test_encoder_is_the_papers() -> None:
-    encoder = Encoder()
+    encoder = ConvEncoder()
     convolutions = [m for m in encoder.modules() if isinstance(m, nn.Conv2d)]
     shapes = [(c.in_channels, c.out_channels, c.kernel_size, c.stride, c.padding) for c in convolutions]
     assert shapes == [
@@ -42,7 +46,7 @@ def test_encoder_is_the_papers() -> None:
 
 
 def test_generator_and_discriminator_are_the_papers() -> None:
-    generator = MeshGenerator()
+    generator = SphereGenerator()
     assert layer_sizes(generator) == [(512, 1024), (1024, 2048), (2048, 1926)]
     assert layer_sizes(PoseDiscriminator(24)) == [(512, 256), (256, 128), (128, 24)]
     assert generator.faces.shape == (1280, 3)
@@ -54,8 +58,8 @@ def test_generator_and_discriminator_are_the_papers() -> None:
 
 
 def test_networks_have_26_million_parameters() -> None:
-    networks = create_networks(24, discriminator=True, device="cpu", seed=0)
-    assert sum(p.numel() for _, network in networks.items() for p in network.parameters()) == 26_121_694
+    networks = create("peng2020-kato").networks
+    assert sum(p.numel() for network in networks.values() for p in network.parameters()) == 26_121_694
 
 
 def test_generator_rule_vectors() -> None:
@@ -64,20 +68,20 @@ def test_generator_rule_vectors() -> None:
 
 
 def test_untrained_mesh_is_near_a_sphere_of_radius_one_half() -> None:
-    generator = MeshGenerator()
+    generator = SphereGenerator()
     radius = generator(torch.zeros(1, 512)).norm(dim=2)
     assert torch.allclose(radius, torch.full_like(radius, 0.5), atol=0.05)
 
 
 def test_initial_weights_follow_the_seed_and_not_the_discriminator() -> None:
-    with_d = create_networks(24, discriminator=True, device="cpu", seed=3)
-    without = create_networks(24, discriminator=False, device="cpu", seed=3)
-    other = create_networks(24, discriminator=False, device="cpu", seed=4)
-    assert without.discriminator is None
+    with_d = create("peng2020-kato", seed=3).networks
+    without = create("peng2020-kato-vanilla", seed=3).networks
+    other = create("peng2020-kato-vanilla", seed=4).networks
+    assert "discriminator" not in without
     for name in ("encoder", "generator"):
-        ours, theirs = getattr(with_d, name).state_dict(), getattr(without, name).state_dict()
+        ours, theirs = with_d[name].state_dict(), without[name].state_dict()
         assert all(torch.equal(ours[key], theirs[key]) for key in ours)
-    assert not torch.equal(other.encoder.layers[0].weight, without.encoder.layers[0].weight)
+    assert not torch.equal(other["encoder"].layers[0].weight, without["encoder"].layers[0].weight)
 
 
 def test_network_input_scales_bytes_to_the_unit_interval() -> None:
@@ -100,20 +104,20 @@ def test_network_input_refuses_other_images(images: torch.Tensor) -> None:
 def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, flags: str, wanted: str) -> None:
     cpuinfo = tmp_path / "cpuinfo"
     cpuinfo.write_text(f"model name : x\nflags\t\t: {flags}\n")
-    monkeypatch.setattr(networks_module, "CPUINFO", str(cpuinfo))
+    monkeypatch.setattr(precision_module, "CPUINFO", str(cpuinfo))
     assert resolve_precision("auto", "cpu") == wanted
     assert resolve_precision("fp32", "cpu") == "fp32"
-    monkeypatch.setattr(networks_module, "CPUINFO", str(tmp_path / "missing"))
+    monkeypatch.setattr(precision_module, "CPUINFO", str(tmp_path / "missing"))
     assert resolve_precision("auto", "cpu") == "fp32"
 
 
 def test_bf16_changes_results_little() -> None:
-    networks = create_networks(24, discriminator=False, device="cpu", seed=0)
+    networks = create("peng2020-kato-vanilla").networks
     images = network_input(torch.from_numpy(np.random.default_rng(0).integers(0, 256, (1, 4, 64, 64), np.uint8)), "cpu")
     with torch.no_grad():
-        exact = networks.generator(networks.encoder(images))
+        exact = networks["generator"](networks["encoder"](images))
         with autocast("cpu", "bf16"):
-            rough = networks.generator(networks.encoder(images))
+            rough = networks["generator"](networks["encoder"](images))
     assert rough.dtype == torch.float32
     assert 0 < (rough - exact).abs().max() < 0.005
 
@@ -121,4 +125,4 @@ def test_bf16_changes_results_little() -> None:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
 def test_missing_cuda_is_said() -> None:
     with pytest.raises(ValueError, match="sees no CUDA device"):
-        create_networks(24, discriminator=False, device="cuda", seed=0)
+        create("peng2020-kato", device="cuda")

@@ -34,7 +34,7 @@ def test_stored_form_is_inverted_on_black() -> None:
 
 
 def test_data_set_image_survives_the_way_out_and_back(tiny_set) -> None:
-    stored = tiny_set.images[0, 3]
+    stored = tiny_set.images[3]
     again = prepare_image(255 - stored[:3].transpose(1, 2, 0), stored[3], crop=False)
     assert np.array_equal(again, stored)
 

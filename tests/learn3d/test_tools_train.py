@@ -35,11 +35,14 @@ def call(module: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: object
 
 def test_options_reach_the_configuration(tmp_path) -> None:
     arguments = (
-        f"--data d --category chair --output {tmp_path} --method vanilla --preset paper --batch-size 7 --overwrite"
+        f"--data d --category chair --output {tmp_path} --preset peng2020-kato-printed --lambda-prior 0.5 "
+        "--batch-size 7 --augment flip channels --overwrite"
     )
     command = tool("train").parse(arguments.split())
     config = command.config
-    assert (config.category, config.method, config.preset, config.batch_size) == ("chair", "vanilla", "paper", 7)
+    assert (config.category, config.preset, config.batch_size) == ("chair", "peng2020-kato-printed", 7)
+    assert (config.settings.lambda_prior, config.settings.prior_form) == (0.5, "norm")
+    assert config.augment == ("flip", "channels")
     assert (command.overwrite, command.resume) == (True, False)
     assert config.iterations == 20_000
 
@@ -73,6 +76,7 @@ def test_help_explains_every_option(name: str, monkeypatch, capsys) -> None:
     [
         ("train", ["--data", "{}", "--category", "airplane", "--output", "{}/run"], "02691156_train_images.npz"),
         ("train", ["--output", "{}", "--resume"], "folder of a training run"),
+        ("train", ["--output", "{}", "--preset", "kato"], "there is no preset 'kato'; choose one of peng2020-kato,"),
         ("train", ["--data", "x", "--category", "chair", "--output", "{}", "--resume", "--overwrite"], "folder of a"),
         ("evaluate", ["{}"], "there is no checkpoint"),
         ("reconstruct", ["--run", "{}", "--output", "{}/out"], "give either image files or --dataset"),
@@ -141,7 +145,16 @@ def test_reconstruct_lists_its_files(finished_run, tiny_folder, tmp_path, monkey
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT to another process")
 def test_interrupting_the_command_saves_and_ends_well(tiny_folder, run_folder) -> None:
     command = [sys.executable, str(TOOLS / "train.py"), "--data", str(tiny_folder), "--category", "airplane"]
-    command += ["--output", str(run_folder), "--batch-size", "2", "--method", "vanilla", "--log-every", "1"]
+    command += [
+        "--output",
+        str(run_folder),
+        "--batch-size",
+        "2",
+        "--preset",
+        "peng2020-kato-vanilla",
+        "--log-every",
+        "1",
+    ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 120
         metrics = run_folder / "metrics.jsonl"

@@ -11,20 +11,25 @@ import numpy as np
 import pytest
 import torch
 
+import nmr
 from learn3d import checkpoint, training
 from learn3d.config import (
-    PRESETS,
     TrainConfig,
     check_resume,
     config_from_dict,
     config_to_dict,
     load_config,
 )
-from learn3d.data.kato import KatoDataset
-from learn3d.methods import pose_invariant
-from learn3d.methods.pose_invariant import create_optimizers, train_step, uses_discriminator
-from learn3d.networks import create_networks
-from learn3d.training import batch_indices, object_share, train
+from learn3d.data import kato
+from learn3d.data.sampling import shuffled_epochs
+from learn3d.data.views import ViewDataset
+from learn3d.methods import DataShape, create_method
+from learn3d.methods.multi_view import MultiViewSettings
+from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
+from learn3d.presets import PRESETS
+from learn3d.training import object_share, train
+
+VANILLA = "peng2020-kato-vanilla"
 
 
 def snapshot(network: torch.nn.Module) -> list[torch.Tensor]:
@@ -35,13 +40,11 @@ def changed(network: torch.nn.Module, before: list[torch.Tensor]) -> bool:
     return any(not torch.equal(p, q) for p, q in zip(network.parameters(), before, strict=True))
 
 
-def make_step(config: TrainConfig, data: KatoDataset):
-    """Networks, and a function that takes one step with them."""
-    settings = config.loss_settings()
-    networks = create_networks(24, discriminator=uses_discriminator(settings), device="cpu", seed=0)
-    optimizers = create_optimizers(networks, config.learning_rate)
+def make_step(config: TrainConfig, data: ViewDataset):
+    """Networks by name, and a function that takes one step with them."""
+    method = create_method(config.settings, DataShape(24), device="cpu", precision="fp32", seed=0)
     batch = data.batch(torch.tensor([0, 25, 50, 7]))
-    return networks, lambda iteration: train_step(networks, optimizers, batch, iteration, settings, "fp32")
+    return method.networks, lambda iteration: method.train_step(batch, iteration)
 
 
 def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
@@ -49,13 +52,13 @@ def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
     for iteration in (1, 2, 3):
         before = {name: snapshot(network) for name, network in networks.items()}
         losses = step(iteration)
-        assert changed(networks.encoder, before["encoder"])
-        assert changed(networks.generator, before["generator"])
+        assert changed(networks["encoder"], before["encoder"])
+        assert changed(networks["generator"], before["generator"])
         odd = iteration % 2 == 1
-        assert changed(networks.discriminator, before["discriminator"]) == odd
+        assert changed(networks["discriminator"], before["discriminator"]) == odd
         assert ("classification" in losses, "confusion" in losses) == (odd, not odd)
         if not odd:
-            assert all(p.grad is None for p in networks.discriminator.parameters())
+            assert all(p.grad is None for p in networks["discriminator"].parameters())
 
 
 def test_total_is_the_weighted_sum(tiny_config, tiny_set, tmp_path) -> None:
@@ -67,7 +70,7 @@ def test_total_is_the_weighted_sum(tiny_config, tiny_set, tmp_path) -> None:
     assert even["total"] == pytest.approx(shape[1] + 0.5 * even["confusion"], rel=1e-5)
 
 
-def gradients(config: TrainConfig, data: KatoDataset, iteration: int) -> dict[str, list[torch.Tensor]]:
+def gradients(config: TrainConfig, data: ViewDataset, iteration: int) -> dict[str, list[torch.Tensor]]:
     networks, step = make_step(config, data)
     step(iteration)
     return {
@@ -93,23 +96,24 @@ def test_confusion_reaches_the_encoder_only(tiny_config, tiny_set, tmp_path) -> 
 
 
 def test_vanilla_has_no_discriminator_and_no_code_losses(tiny_config, tiny_set, tmp_path) -> None:
-    networks, step = make_step(tiny_config(tmp_path, method="vanilla"), tiny_set)
-    assert networks.discriminator is None
+    networks, step = make_step(tiny_config(tmp_path, preset=VANILLA), tiny_set)
+    assert "discriminator" not in networks
     for iteration in (1, 2):
         assert set(step(iteration)) == {"projection", "smoothness", "total"}
 
 
 def test_projection_loss_falls(tiny_config, tiny_set, tmp_path) -> None:
-    _, step = make_step(tiny_config(tmp_path, method="vanilla", learning_rate=3e-4), tiny_set)
+    _, step = make_step(tiny_config(tmp_path, preset=VANILLA, learning_rate=3e-4), tiny_set)
     values = [step(iteration)["projection"] for iteration in range(1, 7)]
     assert values[-1] < values[0] - 0.03
 
 
 def test_presets_differ_as_stated(tiny_config, tiny_set, tmp_path) -> None:
-    assert (PRESETS["released"].adversarial, PRESETS["released"].prior) == ("log", "squared")
-    assert (PRESETS["paper"].adversarial, PRESETS["paper"].prior) == ("probability", "norm")
+    code, printed = PRESETS["peng2020-kato"].settings, PRESETS["peng2020-kato-printed"].settings
+    assert (code.adversarial_form, code.prior_form) == ("log", "squared")
+    assert (printed.adversarial_form, printed.prior_form) == ("probability", "norm")
     _, released = make_step(tiny_config(tmp_path), tiny_set)
-    _, paper = make_step(tiny_config(tmp_path, preset="paper"), tiny_set)
+    _, paper = make_step(tiny_config(tmp_path, preset="peng2020-kato-printed"), tiny_set)
     a, b = released(2), paper(2)
     assert a["projection"] == b["projection"]
     assert a["smoothness"] == b["smoothness"]
@@ -117,21 +121,31 @@ def test_presets_differ_as_stated(tiny_config, tiny_set, tmp_path) -> None:
     assert a["prior"] != b["prior"]
 
 
-def test_method_sets_the_default_weights(tmp_path) -> None:
-    config = TrainConfig(tmp_path, "airplane", tmp_path)
-    settings = config.loss_settings()
-    assert (settings.smoothness, settings.classification, settings.adversarial, settings.prior) == (0.001, 1, 1, 1)
-    settings = TrainConfig(tmp_path, "airplane", tmp_path, method="vanilla").loss_settings()
-    assert (settings.smoothness, settings.classification, settings.adversarial, settings.prior) == (0.001, 0, 0, 0)
-    assert (config.iterations, config.batch_size, config.learning_rate) == (20_000, 128, 1e-4)
+def weights(config: TrainConfig) -> tuple[float, ...]:
+    names = ("lambda_smooth", "lambda_classification", "lambda_adversarial", "lambda_prior")
+    return tuple(getattr(config.settings, name) for name in names)
+
+
+def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
+    config = TrainConfig(data=tmp_path, category="airplane", output=tmp_path)
+    assert weights(config) == (0.001, 1, 1, 1)
+    assert weights(TrainConfig(data=tmp_path, category="airplane", output=tmp_path, preset=VANILLA)) == (0.001, 0, 0, 0)
+    assert (config.iterations, config.batch_size, config.settings.learning_rate) == (20_000, 128, 1e-4)
+    assert (config.layout, config.sampling, config.augment, config.view_bins) == ("kato", "views", (), None)
+    given = TrainConfig(data=tmp_path, category="airplane", output=tmp_path, iterations=7, view_bins="15x20")
+    assert (given.iterations, given.batch_size, given.view_bins) == (7, 128, "15x20")
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "vae"}, "method must be one of proposed, vanilla"),
-        ({"preset": "kato"}, "preset must be one of released, paper"),
-        ({"method": "vanilla", "lambda_prior": 1.0}, "lambda_prior=1.0 conflicts with method 'vanilla'"),
+        ({"preset": "kato"}, "preset must be one of peng2020-kato, "),
+        ({"settings": MultiViewSettings()}, "'peng2020-kato' takes PoseInvariantSettings, got MultiViewSettings"),
+        ({"layout": "shapenet"}, "layout must be one of kato, "),
+        ({"sampling": "all"}, "sampling must be one of views, pairs, classes"),
+        ({"augment": ("zoom",)}, "augment must be one of flip, "),
+        ({"view_bins": "15"}, "view bins are written as AZIMUTHxELEVATION"),
+        ({"prior_form": "cube"}, "prior_form must be one of squared, norm"),
         ({"iterations": 0}, "iterations must be a whole number >= 1"),
         ({"batch_size": 2.5}, "batch_size must be a whole number >= 1"),
         ({"learning_rate": float("nan")}, "learning_rate must be a positive number"),
@@ -141,17 +155,28 @@ def test_method_sets_the_default_weights(tmp_path) -> None:
         ({"threads": 0}, "threads must be a whole number >= 1"),
     ],
 )
-def test_wrong_options_are_named(tmp_path, options: dict, message: str) -> None:
+def test_wrong_options_are_named(tiny_config, tmp_path, options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        TrainConfig(**({"data": tmp_path, "category": "airplane", "output": tmp_path} | options))
+        if "settings" in options:
+            TrainConfig(data=tmp_path, category="airplane", output=tmp_path, **options)
+        tiny_config(tmp_path, **options)
 
 
 def test_config_survives_json_and_names_unknown_options(tmp_path) -> None:
-    config = TrainConfig(tmp_path, "chair", tmp_path / "run", lambda_prior=0.5, threads=2)
+    config = TrainConfig(
+        data=tmp_path,
+        category="chair",
+        output=tmp_path / "run",
+        settings=PoseInvariantSettings(lambda_prior=0.5),
+        threads=2,
+        augment=("flip",),
+    )
     values = json.loads(json.dumps(config_to_dict(config)))
     assert config_from_dict(values) == config
     with pytest.raises(ValueError, match=r"unknown options \['latent'\]"):
         config_from_dict(values | {"latent": 3})
+    with pytest.raises(ValueError, match=r"settings has unknown options \['latent'\]"):
+        config_from_dict(values | {"settings": {"latent": 3}})
     with pytest.raises(ValueError, match=r"lacks the options \['output'\]"):
         config_from_dict({"data": "a", "category": "b"})
     with pytest.raises(ValueError, match="folder of a training run"):
@@ -171,20 +196,20 @@ def test_resume_may_change_only_what_does_not_matter(tiny_config, tmp_path) -> N
 @pytest.mark.parametrize(("samples", "batch"), [(24, 5), (24, 24), (7, 20)])
 def test_batches_go_through_every_epoch_completely(samples: int, batch: int) -> None:
     steps = 3 * samples
-    drawn = torch.cat([batch_indices(samples, batch, seed=0, step=step) for step in range(1, steps + 1)])
+    drawn = torch.cat([shuffled_epochs(samples, batch, seed=0, step=step) for step in range(1, steps + 1)])
     assert len(drawn) == steps * batch
     epochs = drawn[: len(drawn) // samples * samples].reshape(-1, samples)
     assert torch.equal(epochs.sort(dim=1).values, torch.arange(samples).expand_as(epochs))
     assert not torch.equal(epochs[0], epochs[1])
-    assert torch.equal(batch_indices(samples, batch, seed=0, step=3), batch_indices(samples, batch, seed=0, step=3))
-    other = torch.cat([batch_indices(samples, batch, seed=1, step=step) for step in range(1, steps + 1)])
+    assert torch.equal(shuffled_epochs(samples, batch, seed=0, step=3), shuffled_epochs(samples, batch, seed=0, step=3))
+    other = torch.cat([shuffled_epochs(samples, batch, seed=1, step=step) for step in range(1, steps + 1)])
     assert not torch.equal(drawn, other)
 
 
 def test_object_share() -> None:
     images = np.zeros((1, 24, 4, 64, 64), np.uint8)
     images[:, :12, 3, 10:26, 5:37] = 255  # 16 x 32: half of the picture
-    data = KatoDataset(images, np.zeros((1, 32, 32, 32), bool), "airplane", "train")
+    data = kato.from_arrays(images, np.zeros((1, 32, 32, 32), bool), "airplane", "train")
     assert object_share(data) == pytest.approx(0.25)  # the other twelve are empty
 
 
@@ -207,12 +232,15 @@ def test_a_finished_run_leaves_everything(finished_run, read_metrics) -> None:
     assert list((finished_run / "tensorboard").iterdir())
 
 
+TRAIN_STEP = PoseInvariant.train_step
+
+
 def signal_after(number: int, step: int):
     """The training step, with a signal to this process at the end of one of them."""
 
-    def step_and_signal(*arguments):
-        losses = train_step(*arguments)
-        if arguments[3] == step:
+    def step_and_signal(self, batch, now: int):
+        losses = TRAIN_STEP(self, batch, now)
+        if now == step:
             signal.raise_signal(number)
         return losses
 
@@ -221,8 +249,8 @@ def signal_after(number: int, step: int):
 
 def test_sigterm_saves_and_says_how_to_resume(tiny_config, run_folder, monkeypatch, capsys) -> None:
     handler = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(training, "train_step", signal_after(signal.SIGTERM, 1))
-    summary = train(tiny_config(run_folder, method="vanilla"))
+    monkeypatch.setattr(PoseInvariant, "train_step", signal_after(signal.SIGTERM, 1))
+    summary = train(tiny_config(run_folder, preset=VANILLA))
     assert (summary.step, summary.finished) == (1, False)
     assert signal.getsignal(signal.SIGTERM) is handler
     assert "stopped by SIGTERM after step 1" in capsys.readouterr().err
@@ -234,21 +262,21 @@ def test_a_second_interrupt_does_not_wait(tiny_config, run_folder, monkeypatch) 
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(training, "train_step", twice)
+    monkeypatch.setattr(PoseInvariant, "train_step", twice)
     with pytest.raises(KeyboardInterrupt):
-        train(tiny_config(run_folder, method="vanilla"))
+        train(tiny_config(run_folder, preset=VANILLA))
 
 
 def test_interrupted_run_resumes_bit_for_bit(
     tiny_config, finished_run, run_folder, monkeypatch, capsys, read_metrics
 ) -> None:
-    monkeypatch.setattr(training, "train_step", signal_after(signal.SIGINT, 2))
+    monkeypatch.setattr(PoseInvariant, "train_step", signal_after(signal.SIGINT, 2))
     summary = train(tiny_config(run_folder))
     assert (summary.step, summary.finished) == (2, False)
     assert f"--output {run_folder} --resume" in capsys.readouterr().err
 
     torch.manual_seed(99)  # whatever the new process does before
-    monkeypatch.setattr(training, "train_step", train_step)
+    monkeypatch.setattr(PoseInvariant, "train_step", TRAIN_STEP)
     with open(run_folder / "metrics.jsonl", "a") as file:
         file.write('{"step": 3, "split": "train"}\n{"step": 4, "spl')  # as a crash after the checkpoint would leave it
     summary = train(tiny_config(run_folder), resume=True)
@@ -259,9 +287,10 @@ def test_interrupted_run_resumes_bit_for_bit(
         theirs, about_theirs = checkpoint.load(finished_run / f"{name}.safetensors")
         assert ours.keys() == theirs.keys()
         assert all(torch.equal(ours[key], theirs[key]) for key in ours)
-        assert {k: v for k, v in about.items() if k != "config"} == {
-            k: v for k, v in about_theirs.items() if k != "config"
+        assert {k: v for k, v in about.items() if k not in ("config", "seconds")} == {
+            k: v for k, v in about_theirs.items() if k not in ("config", "seconds")
         }
+        assert about["seconds"] > 0
 
 
 def test_resume_refuses_conflicts_and_finished_runs(tiny_config, finished_run) -> None:
@@ -355,7 +384,7 @@ def test_used_folder_is_refused_and_overwrite_keeps_foreign_files(
     with pytest.raises(ValueError, match="is not empty; continue that run"):
         train(tiny_config(run_folder))
     monkeypatch.setattr(training, "_draw", lambda *arguments: None)
-    train(tiny_config(run_folder, iterations=1, method="vanilla"), overwrite=True)
+    train(tiny_config(run_folder, iterations=1, preset=VANILLA), overwrite=True)
     assert (run_folder / "notes.txt").read_text() == "mine"
     assert read_metrics(run_folder)[0]["step"] == 1
 
@@ -373,8 +402,8 @@ def test_nan_loss_stops_before_the_step_and_names_the_last_checkpoint(tiny_confi
         calls.append(0)
         return prediction.mean() * (float("nan") if len(calls) == 3 else 1)
 
-    monkeypatch.setattr(pose_invariant.nmr.losses, "soft_iou_loss", loss)
-    config = tiny_config(run_folder, method="vanilla", checkpoint_every=2)
+    monkeypatch.setattr(nmr.losses, "soft_iou_loss", loss)
+    config = tiny_config(run_folder, preset=VANILLA, checkpoint_every=2)
     with pytest.raises(FloatingPointError, match=r"not finite at iteration 3 \(projection nan.*last good checkpoint"):
         train(config)
     tensors, metadata = checkpoint.load(run_folder / "last.safetensors")
@@ -383,14 +412,11 @@ def test_nan_loss_stops_before_the_step_and_names_the_last_checkpoint(tiny_confi
 
 
 def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> None:
-    networks, _ = make_step(tiny_config(run_folder), KatoDataset(*np_empty(), "airplane", "train"))
+    config = tiny_config(run_folder)
+    method = create_method(config.settings, DataShape(24), device="cpu", precision="fp32", seed=0)
     with torch.no_grad():
-        networks.generator.layers[0].bias[3] = float("inf")
+        method.generator.layers[0].bias[3] = float("inf")
     run_folder.mkdir()
     with pytest.raises(FloatingPointError, match="generator has weights that are not finite; there is no checkpoint"):
-        training.save_last(run_folder, tiny_config(run_folder), None, networks, None, training.Progress())
+        training.save_last(run_folder, config, None, method, DataShape(24), training.Progress())
     assert not list(run_folder.iterdir())
-
-
-def np_empty() -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros((3, 24, 4, 64, 64), np.uint8), np.zeros((3, 32, 32, 32), bool)
