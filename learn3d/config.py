@@ -39,6 +39,8 @@ class TrainConfig:
     view_bins: str | None = None
     """Pose classes as cells of azimuth and elevation in degrees, such as 15x20. None: the preset's, which for data sets
     of fixed views are these views."""
+    views_per_object: int | None = None
+    """Train on so many views of every object. None: what the layout's protocol uses, one for Kar's, else all."""
     sampling: Sampling | None = None
     """What a batch is made of: views (each on its own), pairs (two views of an object) or classes (drawn uniformly).
     None: the preset's."""
@@ -96,7 +98,7 @@ class TrainConfig:
             raise ValueError("category must be a class name such as 'airplane', got an empty string")
         for name in ("iterations", "batch_size", "validate_every", "pictures_every", "checkpoint_every", "log_every"):
             _check_positive_int(name, getattr(self, name))
-        for name in ("threads", "max_val_images"):
+        for name in ("threads", "max_val_images", "views_per_object"):
             if getattr(self, name) is not None:
                 _check_positive_int(name, getattr(self, name))
         if not isinstance(self.seed, int) or self.seed < 0:

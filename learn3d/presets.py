@@ -56,6 +56,24 @@ PRESETS: dict[str, Preset] = {
         128,
         f"{_PAPER}: the baseline trained on single views",
     ),
+    "peng2020-kar": Preset(
+        "Proposed",
+        PoseInvariantSettings(),
+        "kar",
+        20_000,
+        128,
+        f"{_PAPER}: one image per object, K = 72; losses: {_CODE}",
+        view_bins="15x20",
+    ),
+    "peng2020-kar-vanilla": Preset(
+        "Vanilla-AE",
+        PoseInvariantSettings(lambda_classification=0.0, lambda_adversarial=0.0, lambda_prior=0.0),
+        "kar",
+        20_000,
+        128,
+        f"{_PAPER}: the baseline on the same images",
+        view_bins="15x20",
+    ),
 }
 
 

@@ -135,17 +135,10 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
 
 def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:
     """The training and the validation split of a run. Both have the same view classes."""
-    return tuple(
-        load_dataset(
-            config.layout,
-            config.data,
-            config.category,
-            split,
-            image_size=config.settings.image_size,
-            view_bins=config.view_bins,
-        )
-        for split in ("train", config.val_split)
-    )
+    options = {"image_size": config.settings.image_size, "view_bins": config.view_bins}
+    where = (config.layout, config.data, config.category)
+    train_set = load_dataset(*where, "train", views_per_object=config.views_per_object, **options)
+    return train_set, load_dataset(*where, config.val_split, **options)
 
 
 def object_share(dataset: ViewDataset) -> float:

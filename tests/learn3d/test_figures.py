@@ -59,9 +59,9 @@ def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set) -> None:
 
 def test_shaded_view_agrees_with_the_rendering_at_the_input_view(tiny_set, egg) -> None:
     vertices, faces = egg[0] + torch.tensor([0.15, 0.1, 0.05]), egg[1]
-    camera = tiny_set.cameras(torch.tensor([5]))
+    camera = tiny_set.poses[torch.tensor([5])].cameras()
     silhouette = nmr.render_silhouette(vertices[None], faces, camera, image_size=64)[0] > 0.5
-    azimuth = figures._azimuth_deg(camera.eye[0])
+    azimuth = figures.view_angles(tiny_set.poses[torch.tensor([5])])[0]
     assert azimuth == pytest.approx(-75, abs=1e-3)
     shaded = figures.draw_mesh(vertices, faces, [azimuth, -azimuth], elevation_deg=30, image_size=64)
     agreement = [((picture < 220).any(axis=2) == silhouette.numpy()).mean() for picture in shaded]
