@@ -131,7 +131,7 @@ def check_fields(settings: Settings) -> None:
 #: Options that a resumed run may change: they say where and how long to compute and what to report, not what to learn.
 RESUME_MAY_CHANGE = frozenset(
     {"data", "output", "iterations", "device", "threads"}
-    | {"validate_every", "max_val_images", "pictures_every", "checkpoint_every", "log_every"}
+    | {"val_split", "validate_every", "max_val_images", "pictures_every", "checkpoint_every", "log_every"}
 )
 
 
