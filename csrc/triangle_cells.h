@@ -1,8 +1,6 @@
-// Which unit cells a triangle touches: the separating axis test of a triangle and a box, both closed, so that a triangle in the
-// plane between two cells touches both. Of the 13 axes, the box's three are the bounds of the search; the others are below.
-//
-// All is in double, and exact for coordinates that are multiples of 1/64 within +-512, so that touching is; otherwise the last bits
-// of a double decide it.
+// Which unit cells a triangle touches: the separating axis test of a triangle and a box. Both are closed, so that a triangle in the
+// plane between two cells touches both; to be sure of that whatever rounding does, the cells are larger by kSlack on each side. Of the
+// 13 axes the box's three are the bounds of the search; the others are below. All in double.
 #pragma once
 
 #include <algorithm>
@@ -17,6 +15,8 @@ class TriangleCells {
  public:
   // A face with a corner that is not finite, or farther than this from the first cell on some axis, touches nothing.
   static constexpr double kFarthest = 1048576;
+  // More than rounding can do to coordinates within kFarthest, less than float coordinates of a grid's size can be apart.
+  static constexpr double kSlack = 1e-9;
 
   // Corners in cells. Their order does not matter, to the last bit: it is made one of size first.
   TriangleCells(const Eigen::Vector3f (&corners)[3], int64_t size) {
@@ -31,8 +31,8 @@ class TriangleCells {
     });
     for (int a = 0; a < 3; ++a) {
       const double low = std::min({v[0][a], v[1][a], v[2][a]}), high = std::max({v[0][a], v[1][a], v[2][a]});
-      first_[a] = std::max<int64_t>(static_cast<int64_t>(std::ceil(low)) - 1, 0);  // cell i spans [i, i + 1]
-      last_[a] = std::min<int64_t>(static_cast<int64_t>(std::floor(high)), size - 1);
+      first_[a] = std::max<int64_t>(static_cast<int64_t>(std::ceil(low - kSlack)) - 1, 0);  // cell i spans [i, i + 1]
+      last_[a] = std::min<int64_t>(static_cast<int64_t>(std::floor(high + kSlack)), size - 1);
     }
     for (int a = 0; a < 3; ++a)
       for (int k = 0; k < 3; ++k) edges_[a][k] = EdgeTest(v[k], v[(k + 1) % 3], v[(k + 2) % 3], a);
@@ -41,7 +41,11 @@ class TriangleCells {
     normal_ = Eigen::Vector3d(e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0]);
     // Thinner than this, and rounding may have turned it: such a face is a segment, for which the other axes suffice.
     if (normal_.cwiseAbs().maxCoeff() <= 1e-10 * e.cwiseAbs().maxCoeff() * f.cwiseAbs().maxCoeff()) normal_.setZero();
-    for (double n : normal_) (n > 0 ? plane_low_ : plane_high_) -= n;
+    for (double n : normal_) {
+      (n > 0 ? plane_low_ : plane_high_) -= n;
+      plane_low_ -= kSlack * std::abs(n);
+      plane_high_ += kSlack * std::abs(n);
+    }
     for (int a = 0; a < 3; ++a)
       if (std::abs(normal_[a]) > std::abs(normal_[inner_])) inner_ = a;
   }
@@ -77,8 +81,9 @@ class TriangleCells {
       along_p = s[q] - t[q];
       along_q = t[p] - s[p];
       const double d = along_p * (opposite[p] - s_p) + along_q * (opposite[q] - s_q);  // the triangle spans 0 and d
-      low = std::min(d, 0.0) - std::max(along_p, 0.0) - std::max(along_q, 0.0);
-      high = std::max(d, 0.0) - std::min(along_p, 0.0) - std::min(along_q, 0.0);
+      const double slack = kSlack * (std::abs(along_p) + std::abs(along_q));
+      low = std::min(d, 0.0) - std::max(along_p, 0.0) - std::max(along_q, 0.0) - slack;
+      high = std::max(d, 0.0) - std::min(along_p, 0.0) - std::min(along_q, 0.0) + slack;
     }
 
     bool passes(int64_t c_p, int64_t c_q) const {

@@ -21,7 +21,8 @@ def voxelize(
     - "kato18" (Kato et al. 2018): a cell in which a ray along an axis through one of its four corner lines (integer
       coordinates) meets a face, or which holds a vertex;
     - "kato19" (Kato and Harada 2019): every cell that a face touches, both closed, so that a face in the plane between
-      two cells touches both. By a separating axis test of triangle and cube.
+      two cells touches both. By a separating axis test of triangle and cube, in which cells are larger by 1e-9 on each
+      side, lest rounding decide what touches.
 
     The second contains the first and is thicker: their IoU figures do not compare.
 

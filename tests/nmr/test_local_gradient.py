@@ -144,17 +144,18 @@ def test_descent_moves_a_square_onto_another():
     vertices, faces = square(-0.5, -0.4, 0.3, 0.4)
     target = nmr.render_silhouette(vertices + vertices.new_tensor([0.2, 0.12, 0.0]), faces, image_size=32)
     offset = torch.zeros(1, 1, 3, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.SGD([offset], lr=0.02)
+    optimizer = torch.optim.SGD([offset], lr=0.01)
     losses = []
-    for _ in range(60):
+    for _ in range(40):
         optimizer.zero_grad()
         alpha = nmr.render_silhouette(vertices + offset, faces, image_size=32, gradient="local")
         loss = nmr.losses.soft_iou_loss(alpha, target)
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
-    assert losses[0] > 0.4 and losses[-1] < 0.08
-    torch.testing.assert_close(offset.detach().flatten(), vertices.new_tensor([0.2, 0.12, 0.0]), rtol=0, atol=0.04)
+    assert losses[0] > 0.5 and losses[-1] < 0.1
+    # It comes to rest less than a pixel of the raster away.
+    torch.testing.assert_close(offset.detach().flatten(), vertices.new_tensor([0.2, 0.12, 0.0]), rtol=0, atol=2 / 64)
 
 
 def test_descent_through_a_camera_deforms_a_sphere():
