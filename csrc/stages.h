@@ -90,7 +90,7 @@ struct Rasterize {
   int num_threads;
 };
 
-// Coverage of an owner map, and NMR's gradient of it (silhouette.cpp).
+// Coverage of an owner map, and NMR's gradient of it (silhouette.cpp) or that of Kato and Harada 2019 (local_gradient.cpp).
 template <class T>
 struct SilhouetteForward {
   const int32_t* owner;  // [B, R, R]
@@ -106,7 +106,7 @@ struct SilhouetteBackward {
   MeshBatch<T> mesh;
   int64_t image_size;
   bool anti_aliasing;
-  T eps;                // keeps the distance to an edge away from zero
+  T eps;                // NMR's: keeps the distance to an edge away from zero; local: directions that differ by less tie
   const int32_t* owner; // [B, R, R]
   const T* grad_alpha;  // [B, S, S]
   T* grad_vertices;     // out, like mesh.vertices; z gets 0
@@ -214,6 +214,7 @@ struct EdgesBackward {
 struct Voxelize {
   MeshBatch<float> mesh;  // vertices in [0, 1]^3
   int64_t size;           // s
+  bool touched;           // the surface is every cell that a face touches (kato19); else that of rays and vertices (kato18)
   bool* voxels;           // out [B, s, s, s]
   int num_threads;
 };
@@ -237,6 +238,7 @@ template <class T> void project_backward(const Project<T>& args);
 template <class T> void rasterize(const Rasterize<T>& args);
 template <class T> void silhouette_forward(const SilhouetteForward<T>& args);
 template <class T> void silhouette_backward(const SilhouetteBackward<T>& args);
+template <class T> void local_gradient(const SilhouetteBackward<T>& args);
 template <class T> void fragments_forward(const Fragments<T>& args);
 template <class T> void fragments_backward(const Fragments<T>& args);
 template <class T> void depth_forward(const DepthImage<T>& args);

@@ -3,7 +3,7 @@
 Public names
 ------------
 render              meshes -> several of the images below in one pass
-render_silhouette   meshes -> anti-aliased silhouettes, differentiable with NMR's gradient
+render_silhouette   meshes -> anti-aliased silhouettes, differentiable with NMR's gradient or a local one
 render_rgb          meshes -> colour images, with the same gradient
 render_depth        meshes -> depth images, with their true derivative
 render_normals      meshes -> normals in world space
@@ -12,7 +12,7 @@ render_face_index   meshes -> which face is nearest at each pixel
 VertexColors, FaceColors, TextureCubes, UVTexture   colours of meshes; any object with sample(fragments) is, too: Colors
 Lights              ambient and directional lights, flat or smooth
 LookAt, Look, Pinhole, Orthographic, Camera   cameras: world space -> renderer space; ``nmr.cameras`` converts them
-voxelize            meshes -> filled occupancy grids (kato18, the published voxel IoU)
+voxelize            meshes -> filled occupancy grids (kato18 or kato19, the published voxel IoU)
 icosphere, edge_table, unique_edges, losses   meshes to deform, and what to minimise
 metrics             points on surfaces, Chamfer distance, F-score, IoU of grids
 face_normals, vertex_normals    unit normals, differentiable

@@ -43,10 +43,12 @@ class Scene(NamedTuple):
     def rasterize(self, fill_back: bool, near: float, far: float) -> Tensor:
         return ops.rasterize(*self.mesh[:3], self.raster_size, bool(fill_back), float(near), float(far))
 
-    def silhouette(self, anti_aliasing: bool, fill_back: bool, near: float, far: float, eps: float):
+    def silhouette(
+        self, anti_aliasing: bool, fill_back: bool, near: float, far: float, eps: float, local: bool = False
+    ):
         size = self.raster_size // 2 if anti_aliasing else self.raster_size
         return ops.silhouette(
-            *self.mesh[:3], size, bool(anti_aliasing), bool(fill_back), float(near), float(far), float(eps)
+            *self.mesh[:3], size, bool(anti_aliasing), bool(fill_back), float(near), float(far), float(eps), local
         )
 
     def depth(self, owner: Tensor, anti_aliasing: bool, far: float) -> Tensor:

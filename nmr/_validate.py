@@ -144,6 +144,12 @@ def check_size(value: object, name: str, largest: int) -> int:
     return value
 
 
+def check_choice(value: object, name: str, choices: tuple[str, ...]) -> None:
+    """One of the words."""
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(f"{name} must be {' or '.join(map(repr, choices))}, got {value!r}")
+
+
 def check_number(value: object, name: str) -> float:
     """A number, also of NumPy or in a tensor of one element."""
     try:

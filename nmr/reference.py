@@ -67,18 +67,25 @@ def silhouette(index: Tensor, anti_aliasing: bool, dtype: torch.dtype = torch.fl
     return alpha.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2)) if anti_aliasing else alpha
 
 
-def fragments(vertices: Tensor, faces: Tensor, index: Tensor, far: float = 100.0) -> tuple[Tensor, Tensor]:
-    """Perspective-correct weights ``[R, R, 3]`` and depth ``[R, R]`` of an index map; autograd differentiates both."""
-    R, drawn = index.shape[0], index >= 0
-    x, y, z = vertices[with_back_faces(faces, True)[index.clamp_min(0)]].unbind(-1)
+def _screen_weights(corners: Tensor) -> Tensor:
+    """Clamped, normalised weights ``[R, R, 3]`` at the pixel centres of corners ``[R, R, 3, 3]``; row 0 = bottom."""
+    R = corners.shape[0]
+    x, y, _ = corners.unbind(-1)
     X, Y = (x * R + R - 1) / 2, (y * R + R - 1) / 2
-    column = torch.arange(R).to(vertices)
+    column = torch.arange(R).to(corners)
     x_pixel, y_pixel = torch.meshgrid(column, column, indexing="xy")
     a, b = [1, 2, 0], [2, 0, 1]
     dx, dy = X[..., b] - X[..., a], Y[..., a] - Y[..., b]
     linear = dy * x_pixel[..., None] + dx * y_pixel[..., None] + X[..., a] * Y[..., b] - X[..., b] * Y[..., a]
     screen = (linear / (X * dy).sum(-1, keepdim=True)).clamp(0, 1)
-    screen = screen / screen.sum(-1, keepdim=True)
+    return screen / screen.sum(-1, keepdim=True)
+
+
+def fragments(vertices: Tensor, faces: Tensor, index: Tensor, far: float = 100.0) -> tuple[Tensor, Tensor]:
+    """Perspective-correct weights ``[R, R, 3]`` and depth ``[R, R]`` of an index map; autograd differentiates both."""
+    drawn = index >= 0
+    corners = vertices[with_back_faces(faces, True)[index.clamp_min(0)]]
+    screen, z = _screen_weights(corners), corners[..., 2]
     depth = 1 / (screen / z).sum(-1)
     weights = screen / z * depth[..., None]
     weights = torch.where((index >= len(faces))[..., None], weights.flip(-1), weights)
@@ -107,6 +114,13 @@ def texture_color(texture: Tensor, weights: Tensor, eps: float) -> Tensor:
             share = share * (t[k] - below if upper else 1 - (t[k] - below))
         color = color + share * texture[tuple(cell)]
     return color
+
+
+def _raster_gradient(grad_resolved: Tensor, anti_aliasing: bool) -> Tensor:
+    """The gradient ``[R, R, ...]``, row 0 = bottom, of raster pixels by that ``[S, S, ...]`` of the resolved image."""
+    if anti_aliasing:
+        grad_resolved = (grad_resolved / 4).repeat_interleave(2, 0).repeat_interleave(2, 1)
+    return grad_resolved.flip(0)
 
 
 def silhouette_gradient(
@@ -138,10 +152,7 @@ def edge_gradient(
     Index map and image have row 0 = bottom, the gradient has row 0 = top.
     """
     R = index.shape[0]
-    grad = grad_resolved
-    if anti_aliasing:
-        grad = (grad / 4).repeat_interleave(2, 0).repeat_interleave(2, 1)
-    grad = grad.flip(0)
+    grad = _raster_gradient(grad_resolved, anti_aliasing)
     result = torch.zeros_like(vertices)
     for f, face in enumerate(with_back_faces(faces, fill_back)):
         if not (index == f).any():
@@ -208,3 +219,34 @@ def _sweep_edge(
 
 def _height(a: Tensor, b: Tensor, n: int) -> float:
     return float((b[1] - a[1]) / (b[0] - a[0]) * (n - a[0]) + a[1])
+
+
+def local_gradient(
+    vertices: Tensor, faces: Tensor, index: Tensor, grad_alpha: Tensor, anti_aliasing: bool, eps: float = 1e-4
+) -> Tensor:
+    """The silhouette's local gradient ``[V, 3]`` of one image, of Kato and Harada 2019 (:func:`nmr.render_silhouette`).
+
+    From the index map ``[R, R]``, row 0 = bottom, and the gradient ``[S, S]`` of alpha, row 0 = top.
+    """
+    coverage = (index >= 0).to(vertices)
+    grad = _raster_gradient(grad_alpha, anti_aliasing)
+    at_pixels = torch.zeros(*index.shape, 3, dtype=vertices.dtype)
+    at_pixels[..., 0] = _one_pixel_moves(coverage, grad, eps)
+    at_pixels[..., 1] = _one_pixel_moves(coverage.T, grad.T, eps).T
+    drawn = index >= 0
+    corners = with_back_faces(faces, True)[index[drawn]]
+    weights = _screen_weights(vertices[with_back_faces(faces, True)[index.clamp_min(0)]])[drawn]
+    shares = weights[:, :, None] * at_pixels[drawn][:, None, :]
+    return torch.zeros_like(vertices).index_add(0, corners.flatten(), shares.flatten(0, 1))
+
+
+def _one_pixel_moves(image: Tensor, grad: Tensor, eps: float) -> Tensor:
+    """d loss / d coordinate along the rows of each pixel's point, ``[R, R]``."""
+    per_pixel = image.shape[1] / 2
+    step = image[:, 1:] - image[:, :-1]
+    right, left = step * grad[:, 1:] * per_pixel, -step * grad[:, :-1] * per_pixel  # the image moves by a pixel
+    none = torch.zeros_like(image[:, :1])
+    right, left = (torch.cat([none, x], 1) + torch.cat([x, none], 1) for x in (right, left))  # of both pairs
+    moves = torch.where(right > left, -right, left)
+    still = (torch.maximum(right, left) <= 0) | ((right - left).abs() < eps)
+    return torch.where(still, torch.zeros_like(moves), moves)

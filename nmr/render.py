@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ._packing import is_list
 from ._scene import Meshes, average, make_scene, shade
+from ._validate import check_choice
 from .cameras import Camera
 from .fragments import Fragments
 from .images import OUTPUTS, Images
@@ -165,8 +166,9 @@ def render_silhouette(
     near: float = 0.1,
     far: float = 100.0,
     eps: float = 1e-4,
+    gradient: str = "nmr",
 ) -> Tensor:
-    """Silhouettes of meshes, with the gradient of the Neural Mesh Renderer.
+    """Silhouettes of meshes, with the gradient of the Neural Mesh Renderer, or a local one.
 
     Parameters
     ----------
@@ -188,7 +190,10 @@ def render_silhouette(
     near, far : float
         A pixel is covered only where near < depth < far. Faces are not clipped.
     eps : float
-        In the gradient, added to the distance between an edge and a pixel (in units of [-1, 1]).
+        In NMR's gradient, added to the distance between an edge and a pixel (in units of [-1, 1]). In the local one,
+        directions that lower the loss at rates less than this apart tie. Both are absolute, and as published.
+    gradient : "nmr" or "local"
+        Which gradient; the images are the same.
 
     Returns
     -------
@@ -203,13 +208,27 @@ def render_silhouette(
     edge to m). The values equal those of the published kernels in float32; ``docs/conventions.md`` lists the
     departures. Results do not depend on the number of threads or on the batch size. There are no second derivatives.
 
+    The local gradient is that of Kato and Harada 2019 (view prior learning), described anew here. With I the coverage
+    of raster pixels (0 or 1), g the gradient of the loss by it (with anti-aliasing a quarter of that by the image
+    pixel: raster and R = 2S, else R = S), and i, j neighbours, j to the right::
+
+        right(i, j) = -(I_i - I_j) g_j R / 2    the rate at which the loss falls if what i shows moves onto j
+        left(i, j)  = -(I_j - I_i) g_i R / 2    ... if what j shows moves onto i
+
+    A covered pixel sums each over its pairs with the left and the right neighbour; a pair within an object (or beyond
+    the border of the image) gives nothing. With ``right`` and ``left`` these sums, d loss / d x of the point seen in
+    the pixel is 0 if neither is positive or they differ by less than ``eps``, -right if right > left, else +left. The
+    corners of the pixel's face receive it in the shares of their weights on the screen at the pixel's centre (clamped
+    to [0, 1], normalised, taken as constant). The same upwards for y. So only pixels at the rim of an object pull, and
+    only by what is wrong at the rim: a target out of a pixel's reach moves nothing.
+
     No mesh gives a NaN: faces with a non-finite corner draw nothing and get no gradient. (A loss whose own gradient is
     not finite passes that on.)
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, and for faces that refer to missing vertices.
+        For wrong types, shapes and ranges, for faces that refer to missing vertices, and for an unknown gradient.
 
     Examples
     --------
@@ -218,8 +237,9 @@ def render_silhouette(
     >>> nmr.render_silhouette(0.4 * vertices, faces, camera, image_size=64).shape
     torch.Size([2, 64, 64])
     """
+    check_choice(gradient, "gradient", ("nmr", "local"))
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, eps)
-    alpha, _ = scene.silhouette(anti_aliasing, fill_back, near, far, eps)
+    alpha, _ = scene.silhouette(anti_aliasing, fill_back, near, far, eps, gradient == "local")
     return alpha
 
 

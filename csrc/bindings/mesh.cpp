@@ -35,11 +35,12 @@ void smoothness_backward_py(const Array<T>& vertices, const Array<int64_t>& edge
   smoothness_backward(args);
 }
 
-void voxelize_py(const Array<float>& vertices, const Indices& faces, Array<bool>& voxels, int64_t size, int num_threads) {
+void voxelize_py(const Array<float>& vertices, const Indices& faces, Array<bool>& voxels, int64_t size, bool touched,
+                 int num_threads) {
   const MeshBatch<float> mesh = mesh_batch(vertices, faces, std::nullopt);
   require(size >= 1 && size <= 1024, "size must lie in 1..1024, got " + std::to_string(size));
   require_shape(voxels, "voxels", {mesh.batch, size, size, size});
-  const Voxelize args{mesh, size, voxels.mutable_data(), num_threads};
+  const Voxelize args{mesh, size, touched, voxels.mutable_data(), num_threads};
   py::gil_scoped_release release;
   voxelize(args);
 }
@@ -58,7 +59,7 @@ void bind_mesh(py::module_& m) {
   define_smoothness<float>(m);
   define_smoothness<double>(m);
   m.def("voxelize", &voxelize_py, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("voxels").noconvert(), py::arg("size"), py::arg("num_threads"));
+        py::arg("voxels").noconvert(), py::arg("size"), py::arg("touched"), py::arg("num_threads"));
 }
 
 }  // namespace nmr

@@ -1,4 +1,4 @@
-// The rasterizer and the silhouette.
+// The rasterizer and the silhouette, with its two gradients.
 #include "arrays.h"
 
 namespace nmr {
@@ -28,7 +28,7 @@ void silhouette_forward_py(const Array<int32_t>& owner, Array<T>& alpha, bool an
   silhouette_forward(args);
 }
 
-template <class T>
+template <class T, void backward(const SilhouetteBackward<T>&)>
 void silhouette_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
                             const Array<int32_t>& owner, const Array<T>& grad_alpha, Array<T>& grad_vertices, bool anti_aliasing,
                             double eps, int num_threads) {
@@ -40,7 +40,7 @@ void silhouette_backward_py(const Array<T>& vertices, const Indices& faces, cons
   const SilhouetteBackward<T> args{mesh, image_size, anti_aliasing, static_cast<T>(eps), owner.data(), grad_alpha.data(),
                                    grad_vertices.mutable_data(), num_threads};
   py::gil_scoped_release release;
-  silhouette_backward(args);
+  backward(args);
 }
 
 template <class T>
@@ -50,9 +50,13 @@ void define_raster(py::module_& m) {
         py::arg("num_threads"));
   m.def("silhouette_forward", &silhouette_forward_py<T>, py::arg("owner").noconvert(), py::arg("alpha").noconvert(),
         py::arg("anti_aliasing"), py::arg("num_threads"));
-  m.def("silhouette_backward", &silhouette_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("grad_alpha").noconvert(),
-        py::arg("grad_vertices").noconvert(), py::arg("anti_aliasing"), py::arg("eps"), py::arg("num_threads"));
+  const auto define_backward = [&m](const char* name, auto* function) {
+    m.def(name, function, py::arg("vertices").noconvert(), py::arg("faces").noconvert(), py::arg("starts").noconvert(),
+          py::arg("owner").noconvert(), py::arg("grad_alpha").noconvert(), py::arg("grad_vertices").noconvert(),
+          py::arg("anti_aliasing"), py::arg("eps"), py::arg("num_threads"));
+  };
+  define_backward("silhouette_backward", &silhouette_backward_py<T, silhouette_backward<T>>);
+  define_backward("local_gradient", &silhouette_backward_py<T, local_gradient<T>>);
 }
 
 }  // namespace

@@ -15,7 +15,7 @@ from .camera import pose, pose_backward, project, project_backward
 from .edges import edges_backward, resolve, resolve_backward
 from .fragments import depth_backward, depth_image, fragments, fragments_backward
 from .mesh import smoothness, smoothness_backward, voxels
-from .raster import rasterize, silhouette, silhouette_backward
+from .raster import local_gradient, rasterize, silhouette, silhouette_backward
 from .shade import interpolate, interpolate_backward, sample_texture_cubes, texture_cubes_backward
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "fragments_backward",
     "interpolate",
     "interpolate_backward",
+    "local_gradient",
     "pose",
     "pose_backward",
     "project",

@@ -1,4 +1,4 @@
-"""Operators: which face is nearest at each pixel, and silhouettes with NMR's gradient."""
+"""Operators: which face is nearest at each pixel, and silhouettes with NMR's gradient or the local one."""
 
 # No `from __future__ import annotations` here: torch 2.4 reads the operators' types from the annotations themselves.
 from typing import Optional
@@ -52,8 +52,12 @@ def silhouette(
     near: float,
     far: float,
     eps: float,
+    local: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Silhouettes ``alpha [B, S, S]`` and the owner map ``[B, R, R]`` of meshes in renderer space."""
+    """Silhouettes ``alpha [B, S, S]`` and the owner map ``[B, R, R]`` of meshes in renderer space.
+
+    The gradient is :func:`silhouette_backward`, or if ``local`` :func:`local_gradient`.
+    """
     raster_size = image_size * (2 if anti_aliasing else 1)
     owner = _owner_map(vertices, faces, starts, raster_size, fill_back, near, far)
     alpha = torch.empty((owner.shape[0], image_size, image_size), dtype=vertices.dtype)
@@ -62,27 +66,27 @@ def silhouette(
 
 
 @silhouette.register_fake
-def _(vertices, faces, starts, image_size, anti_aliasing, fill_back, near, far, eps):
+def _(vertices, faces, starts, image_size, anti_aliasing, fill_back, near, far, eps, local=False):
     batch, raster_size = batch_size(vertices, starts), image_size * (2 if anti_aliasing else 1)
     alpha = vertices.new_empty((batch, image_size, image_size))
     return alpha, vertices.new_empty((batch, raster_size, raster_size), dtype=torch.int32)
 
 
 def _silhouette_setup(ctx, inputs, output):
-    vertices, faces, starts, _, anti_aliasing, _, _, _, eps = inputs
+    vertices, faces, starts, _, anti_aliasing, _, _, _, eps, local = inputs
     owner = output[1]
     ctx.mark_non_differentiable(owner)
     ctx.set_materialize_grads(False)  # no zeros in the shape of the owner map
     ctx.save_for_backward(vertices, faces, starts, owner)
     ctx.settings = anti_aliasing, eps
+    ctx.local = local
 
 
 def _silhouette_backward(ctx, grad_alpha, _grad_owner):
     if grad_alpha is None:
-        return (None,) * 9
-    vertices, faces, starts, owner = ctx.saved_tensors
-    grad_vertices = silhouette_backward(vertices, faces, starts, owner, grad_alpha, *ctx.settings)
-    return grad_vertices, None, None, None, None, None, None, None, None
+        return (None,) * 10
+    gradient = local_gradient if ctx.local else silhouette_backward
+    return gradient(*ctx.saved_tensors, grad_alpha, *ctx.settings), *(None,) * 9
 
 
 silhouette.register_autograd(_silhouette_backward, setup_context=_silhouette_setup)
@@ -99,18 +103,13 @@ def silhouette_backward(
     eps: float,
 ) -> Tensor:
     """NMR's silhouette gradient, per vertex, of the shape of ``vertices``; zero in z."""
+    return _gradient(_C.silhouette_backward, vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps)
+
+
+def _gradient(kernel, vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps) -> Tensor:
     grad_vertices = torch.empty(vertices.shape, dtype=vertices.dtype)
-    _C.silhouette_backward(
-        host_array(vertices),
-        host_array(faces),
-        host_array(starts),
-        host_array(owner),
-        host_array(grad_alpha),
-        grad_vertices.numpy(),
-        anti_aliasing,
-        eps,
-        num_threads(),
-    )
+    arrays = map(host_array, (vertices, faces, starts, owner, grad_alpha))
+    kernel(*arrays, grad_vertices.numpy(), anti_aliasing, eps, num_threads())
     return grad_vertices.to(vertices.device)
 
 
@@ -120,3 +119,25 @@ def _(vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps):
 
 
 silhouette_backward.register_autograd(no_second_derivative("render_silhouette"))
+
+
+@torch.library.custom_op("nmr::local_gradient", mutates_args=())
+def local_gradient(
+    vertices: Tensor,
+    faces: Tensor,
+    starts: Optional[Tensor],  # noqa: UP045
+    owner: Tensor,
+    grad_alpha: Tensor,
+    anti_aliasing: bool,
+    eps: float,
+) -> Tensor:
+    """Kato and Harada's silhouette gradient, of one pixel's reach, of the shape of ``vertices``; zero in z."""
+    return _gradient(_C.local_gradient, vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps)
+
+
+@local_gradient.register_fake
+def _(vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps):
+    return vertices.new_empty(vertices.shape)
+
+
+local_gradient.register_autograd(no_second_derivative("render_silhouette"))

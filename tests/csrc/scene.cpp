@@ -37,8 +37,12 @@ void run_silhouette(const Scene<T>& s, Results<T>& r, int num_threads) {
   silhouette_forward(SilhouetteForward<T>{r.owner.data(), s.batch, s.image_size, s.anti_aliasing, r.alpha.data(), num_threads});
   const std::vector<T> grad_alpha = input(s, kGradAlpha, size);
   r.grad_silhouette = unwritten<T>(3 * s.rows());
-  silhouette_backward(SilhouetteBackward<T>{s.mesh(), s.image_size, s.anti_aliasing, s.eps, r.owner.data(), grad_alpha.data(),
-                                            r.grad_silhouette.data(), num_threads});
+  r.grad_local = unwritten<T>(3 * s.rows());
+  SilhouetteBackward<T> args{s.mesh(), s.image_size, s.anti_aliasing, s.eps, r.owner.data(), grad_alpha.data(),
+                             r.grad_silhouette.data(), num_threads};
+  silhouette_backward(args);
+  args.grad_vertices = r.grad_local.data();
+  local_gradient(args);
 }
 
 template <class T>
@@ -174,9 +178,11 @@ void run_voxels(const Scene<T>& s, Results<T>& r, int num_threads) {
   const std::vector<float> vertices(s.vertices.begin(), s.vertices.end());
   const int64_t cells = s.grid_size * s.grid_size * s.grid_size;
   r.voxels.assign(s.batch * cells, 2);
+  r.touched_voxels.assign(s.batch * cells, 2);
   const MeshBatch<float> mesh{vertices.data(), s.faces.data(), s.batch, s.num_vertices, s.num_faces, s.faces_per_image,
                               s.packed() ? s.starts.data() : nullptr};
-  voxelize(Voxelize{mesh, s.grid_size, reinterpret_cast<bool*>(r.voxels.data()), num_threads});
+  voxelize(Voxelize{mesh, s.grid_size, false, reinterpret_cast<bool*>(r.voxels.data()), num_threads});
+  voxelize(Voxelize{mesh, s.grid_size, true, reinterpret_cast<bool*>(r.touched_voxels.data()), num_threads});
 }
 
 template <class T>
@@ -268,10 +274,14 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   }
   for (size_t n = 2; n < r.grad_silhouette.size(); n += 3)
     if (r.grad_silhouette[n] != 0) return "the silhouette's gradient has no z";
+  for (size_t n = 2; n < r.grad_local.size(); n += 3)
+    if (r.grad_local[n] != 0) return "the silhouette's local gradient has no z";
+  if (!all_finite(r.grad_local)) return "the silhouette's local gradient is finite";
   for (size_t n = 2; n < r.grad_edges.size(); n += 3)
     if (r.grad_edges[n] != 0) return "the edges' gradient has no z";
-  for (unsigned char cell : r.voxels)
-    if (cell > 1) return "a cell is filled or empty";
+  for (const std::vector<unsigned char>* voxels : {&r.voxels, &r.touched_voxels})
+    for (unsigned char cell : *voxels)
+      if (cell > 1) return "a cell is filled or empty";
   if (!scene.foreign_owner) {
     if (!all_finite(r.grad_silhouette)) return "the silhouette's gradient is finite";
     if (!all_finite(r.grad_edges)) return "the edges' gradient is finite";

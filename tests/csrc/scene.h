@@ -65,7 +65,7 @@ struct Scene {
 template <class T>
 struct Results {
   std::vector<int32_t> owner;
-  std::vector<T> alpha, grad_silhouette;
+  std::vector<T> alpha, grad_silhouette, grad_local;
   std::vector<T> weights, depth, grad_fragments;
   std::vector<T> depth_image, grad_depth;
   std::vector<T> colors, grad_textures;
@@ -75,13 +75,14 @@ struct Results {
   std::vector<T> points, grad_world, grad_matrix, grad_intrinsics, grad_distortion, grad_origin, grad_extent;
   std::vector<T> pose, grad_forward, grad_up;
   std::vector<T> loss, grad_loss;
-  std::vector<unsigned char> voxels;
+  std::vector<unsigned char> voxels, touched_voxels;
 
   template <class Visit>
   void for_each(const Visit& visit) const {
     visit("owner", owner);
     visit("alpha", alpha);
     visit("grad_silhouette", grad_silhouette);
+    visit("grad_local", grad_local);
     visit("weights", weights);
     visit("depth", depth);
     visit("grad_fragments", grad_fragments);
@@ -108,6 +109,7 @@ struct Results {
     visit("loss", loss);
     visit("grad_loss", grad_loss);
     visit("voxels", voxels);
+    visit("touched_voxels", touched_voxels);
   }
 };
 

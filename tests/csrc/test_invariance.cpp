@@ -63,8 +63,10 @@ TEST_REAL(an_image_does_not_depend_on_its_company) {
     CHECK(alone.values == share(together.values, b, kMeshes));
     CHECK(alone.loss == share(together.loss, b, kMeshes));
     CHECK(alone.voxels == share(together.voxels, b, kMeshes));
+    CHECK(alone.touched_voxels == share(together.touched_voxels, b, kMeshes));
     if (b > 0) continue;
     CHECK(alone.grad_silhouette == share(together.grad_silhouette, b, kMeshes));
+    CHECK(alone.grad_local == share(together.grad_local, b, kMeshes));
     CHECK(alone.grad_fragments == share(together.grad_fragments, b, kMeshes));
     CHECK(alone.grad_depth == share(together.grad_depth, b, kMeshes));
     CHECK(alone.grad_weights == share(together.grad_weights, b, kMeshes));
@@ -82,6 +84,7 @@ TEST_REAL(packed_meshes_give_what_stacked_ones_give) {
   CHECK(a.owner == b.owner);
   CHECK(a.alpha == b.alpha);
   CHECK(a.grad_silhouette == b.grad_silhouette);
+  CHECK(a.grad_local == b.grad_local);
   CHECK(a.weights == b.weights);
   CHECK(a.depth == b.depth);
   CHECK(a.grad_fragments == b.grad_fragments);
@@ -97,6 +100,7 @@ TEST_REAL(packed_meshes_give_what_stacked_ones_give) {
   CHECK(a.grad_world == b.grad_world);
   CHECK(a.grad_matrix == b.grad_matrix);
   CHECK(a.voxels == b.voxels);
+  CHECK(a.touched_voxels == b.touched_voxels);
 }
 
 }  // namespace nmr::test

@@ -15,10 +15,10 @@ std::vector<T> smoothness(const std::vector<T>& vertices, const std::vector<int6
   return loss;
 }
 
-std::vector<unsigned char> voxels_of(const std::vector<Mesh>& meshes, int64_t size) {
+std::vector<unsigned char> voxels_of(const std::vector<Mesh>& meshes, int64_t size, bool touched) {
   const Scene<float> scene = stack<float>(meshes, false);
   std::vector<unsigned char> voxels(scene.batch * size * size * size, 2);
-  voxelize(Voxelize{scene.mesh(), size, reinterpret_cast<bool*>(voxels.data()), 2});
+  voxelize(Voxelize{scene.mesh(), size, touched, reinterpret_cast<bool*>(voxels.data()), 2});
   return voxels;
 }
 
@@ -74,31 +74,59 @@ TEST_REAL(smoothness_does_not_depend_on_the_company) {
 
 TEST(voxels_of_a_box) {
   const int64_t s = 16;
-  const std::vector<unsigned char> voxels = voxels_of({box(0.3, 0.7)}, s);
-  for (int64_t n = 0; n < s * s * s; ++n) {
-    const int64_t c[3] = {n / (s * s), n / s % s, n % s};
-    bool within = true, near_surface = false;
-    for (int64_t x : c) {
-      within = within && x + 1 > 0.3 * s && x < 0.7 * s;  // the cell meets the box
-      near_surface = near_surface || std::abs(x + 0.5 - 0.3 * s) < 1.5 || std::abs(x + 0.5 - 0.7 * s) < 1.5;
+  for (bool touched : {false, true}) {
+    const std::vector<unsigned char> voxels = voxels_of({box(0.3, 0.7)}, s, touched);
+    for (int64_t n = 0; n < s * s * s; ++n) {
+      const int64_t c[3] = {n / (s * s), n / s % s, n % s};
+      bool within = true, near_surface = false;
+      for (int64_t x : c) {
+        within = within && x + 1 > 0.3 * s && x < 0.7 * s;  // the cell meets the box
+        near_surface = near_surface || std::abs(x + 0.5 - 0.3 * s) < 1.5 || std::abs(x + 0.5 - 0.7 * s) < 1.5;
+      }
+      if (touched || !near_surface) CHECK_EQUAL(bool(voxels[n]), within);
+      if (voxels[n]) CHECK(near_surface || within);
     }
-    if (!near_surface) CHECK_EQUAL(bool(voxels[n]), within);
-    if (voxels[n]) CHECK(near_surface || within);
   }
 }
 
 TEST(voxels_fill_what_is_closed_and_nothing_else) {
   Mesh ball = icosphere(3);
   for (double& x : ball.vertices) x = 0.5 + 0.4 * x;
-  const std::vector<unsigned char> closed = voxels_of({ball}, 32);
-  const auto count = std::count(closed.begin(), closed.end(), 1);
-  CHECK_NEAR(static_cast<double>(count), 4.0 / 3 * 3.14159 * std::pow(0.4 * 32 + 0.5, 3), 0.05 * static_cast<double>(count));
   Mesh open = ball;
   open.faces.resize(3 * 900);
-  const std::vector<unsigned char> hollow = voxels_of({open}, 32);
-  CHECK(std::count(hollow.begin(), hollow.end(), 1) < count / 2);
-  CHECK_EQUAL(int(hollow[(16 * 32 + 16) * 32 + 16]), 0);
-  for (unsigned char cell : voxels_of({Mesh{}}, 5)) CHECK_EQUAL(int(cell), 0);
+  for (bool touched : {false, true}) {
+    const std::vector<unsigned char> closed = voxels_of({ball}, 32, touched);
+    const auto count = std::count(closed.begin(), closed.end(), 1);
+    // A sphere touches cells whose centres lie up to 3/4 of a cell away from it, on average over its directions.
+    const double radius = 0.4 * 32 + (touched ? 0.75 : 0.5);
+    CHECK_NEAR(static_cast<double>(count), 4.0 / 3 * 3.14159 * std::pow(radius, 3), 0.05 * static_cast<double>(count));
+    const std::vector<unsigned char> hollow = voxels_of({open}, 32, touched);
+    CHECK(std::count(hollow.begin(), hollow.end(), 1) < 0.6 * static_cast<double>(count));
+    CHECK_EQUAL(int(hollow[(16 * 32 + 16) * 32 + 16]), 0);
+    for (unsigned char cell : voxels_of({Mesh{}}, 5, touched)) CHECK_EQUAL(int(cell), 0);
+  }
+}
+
+// A plane through the grid, far larger than it: the cells between x + y + 2 z = 2 in grid widths and no others.
+TEST(voxels_of_a_plane) {
+  const int64_t s = 8;
+  const std::vector<unsigned char> voxels = voxels_of({triangle({-40, -40, 41, 40, -40, 1, -40, 42, 0})}, s, true);
+  for (int64_t n = 0; n < s * s * s; ++n) {
+    const int64_t low = n / (s * s) + n / s % s + 2 * (n % s);  // of x + y + 2 z over the cell, times s; it spans 4
+    CHECK_EQUAL(bool(voxels[n]), low <= 2 * s && low + 4 >= 2 * s);
+  }
+}
+
+// The grids of corners on whole cells, in every order, against each other and against the plane between two layers of cells.
+TEST(voxels_touch_on_both_sides) {
+  const std::vector<double> corners{0.25, 0.25, 0.5, 0.75, 0.25, 0.5, 0.25, 0.75, 0.5};
+  for (const std::vector<int64_t>& order : {std::vector<int64_t>{0, 1, 2}, {1, 2, 0}, {2, 1, 0}, {0, 2, 1}}) {
+    const std::vector<unsigned char> voxels = voxels_of({Mesh{corners, order}}, 8, true);
+    for (int64_t n = 0; n < 512; ++n) {
+      const int64_t x = n / 64, y = n / 8 % 8, z = n % 8;
+      CHECK_EQUAL(bool(voxels[n]), (z == 3 || z == 4) && x >= 1 && y >= 1 && x <= 6 && y <= 6 && x + y <= 8);
+    }
+  }
 }
 
 }  // namespace nmr::test

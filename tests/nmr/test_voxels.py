@@ -1,4 +1,6 @@
-"""voxelize: published grids, geometry, invariance, bad input."""
+"""voxelize: published grids, the slow definition of kato19, geometry, invariance, bad input."""
+
+import itertools
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
@@ -6,11 +8,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import for_threads
 from vectors import load_vector, vector_names
 
 import nmr
 
 VOXELS = vector_names("vox_*")
+DEFINITIONS = ("kato18", "kato19")
 
 
 def test_the_vectors_are_there():
@@ -37,26 +41,198 @@ def test_a_box_fills_its_cells_and_axes_keep_their_order():
     assert inside.all()
 
 
-def test_a_shape_that_leaves_the_grid_is_hollow():
+@pytest.mark.parametrize("definition", DEFINITIONS)
+def test_a_shape_that_leaves_the_grid_is_hollow(definition):
     vertices, faces = nmr.icosphere(3)
-    closed = nmr.voxelize(0.4 * vertices + 0.5, faces)[0]
-    opened = nmr.voxelize(0.4 * vertices + torch.tensor([0.2, 0.5, 0.5]), faces)[0]
+    closed = nmr.voxelize(0.4 * vertices + 0.5, faces, definition=definition)[0]
+    opened = nmr.voxelize(0.4 * vertices + torch.tensor([0.2, 0.5, 0.5]), faces, definition=definition)[0]
     assert closed[16, 16, 16] and not opened[6, 16, 16]
 
 
-def test_same_grid_for_any_number_of_threads_and_batch():
+@pytest.mark.parametrize("definition", DEFINITIONS)
+def test_same_grid_for_any_number_of_threads_and_batch(definition):
     vertices, faces = nmr.icosphere(2)
     batch = torch.stack([s * vertices + 0.5 for s in (0.1, 0.2, 0.3, 0.4, 0.45)])
-    before = torch.get_num_threads()
-    try:
-        grids = []
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            grids.append(nmr.voxelize(batch, faces))
-    finally:
-        torch.set_num_threads(before)
+    grids = for_threads((1, 2, 5), lambda: nmr.voxelize(batch, faces, definition=definition))
     assert torch.equal(grids[0], grids[1]) and torch.equal(grids[0], grids[2])
-    assert torch.equal(nmr.voxelize(batch[3], faces)[0], grids[0][3])
+    assert torch.equal(nmr.voxelize(batch[3], faces, definition=definition)[0], grids[0][3])
+
+
+# --- kato19
+
+
+def touched_cells(corners, size):
+    """Cells that triangles touch, bool [s, s, s]: 13 axes, every cell, in whatever numbers the corners [F, 3, 3] are.
+
+    With integers it is exact: corners are in units of 1/64 cell. Also the least of how far each cell is from the other
+    side of its answer, relative to the length of the axis.
+    """
+    unit = 64 if np.issubdtype(corners.dtype, np.integer) else 1
+    grid = np.arange(size + 1) * unit
+    boxes = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), -1)
+    offsets = list(itertools.product((0, 1), repeat=3))
+    eight = np.stack([boxes[x : size + x, y : size + y, z : size + z] for x, y, z in offsets], 3)
+    touched, margin = np.zeros((size,) * 3, bool), np.full((size,) * 3, np.inf)
+    for a, b, c in corners:
+        sides = (b - a, c - b, a - c)
+        axes = [*np.eye(3, dtype=corners.dtype), np.cross(sides[0], sides[1])]
+        axes += [np.cross(axis, side) for axis in axes[:3] for side in sides]
+        gap = np.full((size,) * 3, -np.inf)  # > 0: separated
+        for axis in axes:
+            of_box, of_face = eight @ axis, np.stack([a, b, c]) @ axis
+            between = np.maximum(of_box.min(-1) - of_face.max(), of_face.min() - of_box.max(-1))
+            gap = np.maximum(gap, between / max(np.linalg.norm(axis.astype(float)), 1e-30))
+        touched |= gap <= 0
+        margin = np.minimum(margin, np.abs(gap))
+    return touched, margin
+
+
+def fill(surface):
+    """All that is not reached from the border through faces of cells off the surface."""
+    outside = np.zeros_like(surface)
+    border = np.pad(
+        np.zeros([max(n - 2, 0) for n in surface.shape], bool),
+        [(1, min(n - 1, 1)) for n in surface.shape],
+        constant_values=True,
+    )
+    outside[border & ~surface] = True
+    while True:
+        grown = np.pad(outside, 1)
+        reached = np.any([np.roll(grown, step, axis) for axis in range(3) for step in (1, -1)], 0)[1:-1, 1:-1, 1:-1]
+        more = reached & ~surface & ~outside
+        if not more.any():
+            return ~outside
+        outside |= more
+
+
+def kato19(vertices, faces, size):
+    return nmr.voxelize(torch.as_tensor(vertices), torch.as_tensor(faces), size, definition="kato19")[0].numpy()
+
+
+# Coordinates in 1/64 of a cell, on whole cells more often than not, some outside of the grid.
+whole = st.integers(-1, 9).map(lambda n: 64 * n)
+corners = hnp.arrays(np.int64, (6, 3), elements=whole | st.integers(-64, 9 * 64))
+triples = hnp.arrays(np.int64, st.tuples(st.integers(0, 5), st.just(3)), elements=st.integers(0, 5))
+sizes = st.sampled_from([1, 2, 4, 8])  # powers of two: coordinates in [0, 1] times s are exact
+
+
+@settings(max_examples=120, deadline=None)
+@given(corners, triples, sizes)
+def test_kato19_is_its_slow_definition_where_touching_is_exact(corners, faces, size):
+    surface, _ = touched_cells(corners[faces], size)
+    assert np.array_equal(kato19(corners / (64.0 * size), faces, size), fill(surface))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_kato19_is_its_slow_definition_elsewhere(seed):
+    rng = np.random.default_rng(seed)
+    size, faces = 7, np.arange(3).reshape(1, 3)
+    for scale in (0.05, 0.3, 2.0):
+        vertices = (rng.random((1, 3)) + scale * rng.standard_normal((3, 3))).astype(np.float32)
+        surface, margin = touched_cells((vertices * np.float32(size)).astype(np.float64)[faces], size)
+        assert margin.min() > 1e-9  # no cell is a matter of rounding
+        assert np.array_equal(kato19(vertices, faces, size), fill(surface))
+
+
+@settings(max_examples=100, deadline=None)
+@given(corners, triples, sizes)
+def test_kato19_contains_kato18(corners, faces, size):
+    corners = corners // 8 * 8  # so that float32 cannot round a ray of kato18 over a face's edge
+    vertices = torch.from_numpy(corners).clamp(0, 64 * size) / (64.0 * size)
+    thick, thin = (nmr.voxelize(vertices, torch.from_numpy(faces), size, definition=d) for d in ("kato19", "kato18"))
+    assert (thick | ~thin).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    hnp.arrays(np.float32, (6, 3), elements=st.floats(-0.5, 1.5, width=32)),
+    triples,
+    st.integers(1, 9),
+    st.integers(0, 2**32 - 1),
+)
+def test_kato19_holds_every_point_of_every_face(vertices, faces, size, seed):
+    weights = np.random.default_rng(seed).dirichlet((0.5, 0.5, 0.5), (len(faces), 200))
+    corners = (vertices * np.float32(size)).astype(np.float64)[faces]
+    points = np.einsum("fnk,fkc->fnc", weights, corners).reshape(-1, 3)
+    clear = (np.abs(points - points.round()) > 1e-6).all(1)  # of the rounding of the points themselves
+    cells = np.floor(points[clear]).astype(int)
+    cells = cells[((cells >= 0) & (cells < size)).all(1)]
+    assert kato19(vertices, faces, size)[tuple(cells.T)].all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    hnp.arrays(np.float32, (6, 3), elements=st.floats(-0.5, 1.5, width=32)), triples, st.integers(1, 9), st.randoms()
+)
+def test_kato19_knows_no_order_and_no_winding(vertices, faces, size, random):
+    shuffled = [random.sample(list(face), 3) for face in random.sample(list(faces), len(faces))]
+    shuffled = np.array(shuffled, np.int64).reshape(-1, 3)
+    assert np.array_equal(kato19(vertices, shuffled, size), kato19(vertices, faces, size))
+
+
+@settings(max_examples=60, deadline=None)
+@given(corners, triples, sizes, st.permutations(range(3)), st.integers(0, 2))
+def test_kato19_knows_no_axis(corners, faces, size, order, mirrored):
+    grid = kato19(corners / (64.0 * size), faces, size)
+    assert np.array_equal(kato19(corners[:, order] / (64.0 * size), faces, size), grid.transpose(order))
+    corners = corners.copy()
+    corners[:, mirrored] = 64 * size - corners[:, mirrored]
+    assert np.array_equal(kato19(corners / (64.0 * size), faces, size), np.flip(grid, mirrored))
+
+
+def test_kato19_of_a_face_between_cells_is_on_both_sides():
+    square = torch.tensor([[0.25, 0.25, 0.5], [0.75, 0.25, 0.5], [0.75, 0.75, 0.5], [0.25, 0.75, 0.5]])
+    grid = nmr.voxelize(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), 8, definition="kato19")[0]
+    expected = torch.zeros(8, 8, 8, dtype=torch.bool)
+    expected[1:7, 1:7, 3:5] = True  # [2, 6] touches the cells 1 to 6
+    assert torch.equal(grid, expected)
+    thin = nmr.voxelize(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), 8)[0]
+    assert thin.sum() < grid.sum() and (grid | ~thin).all()
+
+
+def test_kato19_of_points_and_segments():
+    faces = torch.tensor([[0, 0, 0]])
+    assert nmr.voxelize(torch.full((1, 3), 0.3), faces, 8, definition="kato19").sum() == 1
+    assert nmr.voxelize(torch.full((1, 3), 0.5), faces, 8, definition="kato19").sum() == 8
+    diagonal = torch.tensor([[0.01, 0.01, 0.01], [0.49, 0.49, 0.49], [0.99, 0.99, 0.99]])
+    grid = nmr.voxelize(diagonal, torch.tensor([[0, 1, 2]]), 8, definition="kato19")[0]
+    assert grid[range(8), range(8), range(8)].all() and grid.sum() == 8 + 7 * 6  # through seven corners of cells
+
+
+NOT_NUMBERS = [float("nan"), float("inf"), -float("inf"), 3e38, -1e30, 1e10]
+
+
+@pytest.mark.parametrize("value", NOT_NUMBERS)
+@pytest.mark.parametrize("place", range(9))
+def test_kato19_of_a_face_that_is_not_there(value, place):
+    vertices = torch.tensor([[0.1, 0.2, 0.3], [0.9, 0.3, 0.4], [0.4, 0.8, 0.9]])
+    good = nmr.voxelize(vertices, torch.tensor([[0, 1, 2]]), 16, definition="kato19")
+    bad = vertices.clone()
+    bad.view(-1)[place] = value
+    assert not nmr.voxelize(bad, torch.tensor([[0, 1, 2]]), 16, definition="kato19").any()
+    both = torch.cat([bad, vertices])
+    grid = nmr.voxelize(both, torch.tensor([[0, 1, 2], [3, 4, 5]]), 16, definition="kato19")
+    assert torch.equal(grid, good) and good.any()
+
+
+def test_kato19_of_a_face_far_larger_than_the_grid():
+    """Many grids wide and through its middle: a slab of cells, found without looking at every cell."""
+    vertices = torch.tensor([[-900.0, -900.0, 0.3], [900.0, -900.0, 0.3], [0.0, 900.0, 0.3]])
+    grid = nmr.voxelize(vertices, torch.tensor([[0, 1, 2]]), 256, definition="kato19")[0]
+    assert grid[:, :, 76].all() and grid.sum() == 256 * 256
+    tilted = vertices + torch.tensor([0.0, 0.0, 0.2]) + torch.tensor([0.0, 0.0, 1.0]) * vertices[:, :1]
+    grid = nmr.voxelize(tilted, torch.tensor([[0, 1, 2]]), 256, definition="kato19")[0]
+    assert 256 * 250 > grid.sum(0).bool().sum() > 128 * 250
+
+
+def test_opcheck():
+    vertices, faces = nmr.icosphere(1)
+    batch = torch.stack([0.3 * vertices + 0.5, 0.4 * vertices + 0.5])
+    for arguments in ((batch, faces, 6), (batch, faces, 6, True)):
+        torch.library.opcheck(nmr.ops.voxels, arguments)
+
+
+# --- bad input
 
 
 @settings(max_examples=150, deadline=None)
@@ -69,9 +245,10 @@ def test_same_grid_for_any_number_of_threads_and_batch():
     hnp.arrays(np.int64, st.tuples(st.integers(0, 5), st.just(3)), elements=st.integers(0, 5)),
     st.integers(1, 9),
     st.booleans(),
+    st.sampled_from(DEFINITIONS),
 )
-def test_any_mesh_is_voxelized(vertices, faces, size, normalize):
-    voxels = nmr.voxelize(torch.from_numpy(vertices), torch.from_numpy(faces), size, normalize)
+def test_any_mesh_is_voxelized(vertices, faces, size, normalize, definition):
+    voxels = nmr.voxelize(torch.from_numpy(vertices), torch.from_numpy(faces), size, normalize, definition)
     assert voxels.dtype == torch.bool and voxels.shape == (len(vertices), size, size, size)
     if len(faces) == 0:
         assert not voxels.any()
@@ -84,6 +261,8 @@ def test_any_mesh_is_voxelized(vertices, faces, size, normalize):
         (dict(size=2.5), TypeError, "size must be an integer"),
         (dict(vertices=torch.zeros(3)), ValueError, "vertices must have shape"),
         (dict(faces=torch.full((1, 3), 7)), ValueError, "vertex 7"),
+        (dict(definition="kato20"), ValueError, "definition must be 'kato18' or 'kato19', got 'kato20'"),
+        (dict(definition=None), ValueError, "got None"),
     ],
 )
 def test_errors(change, error, words):

@@ -1,0 +1,125 @@
+// The silhouette's gradient of Kato and Harada 2019, which reaches one pixel: where the object ends between two pixels, the loss
+// tells whether the end should move, and the point that is seen in the covered one of the two moves.
+//
+// With I the coverage (0 or 1) and g the gradient of the loss by it, both at raster resolution, and i, j neighbours in a row, j to
+// the right: if what is seen moves right by a pixel (2 / R), I_j becomes I_i, and the loss falls at the rate
+//     right = -(I_i - I_j) g_j R / 2;      if it moves left, I_i becomes I_j:      left = -(I_j - I_i) g_i R / 2.
+// A covered pixel sums both rates over its two pairs, goes the better way or none, and hands that to the corners of its face by
+// their weights at its centre, which are taken as constant. Rows upwards likewise, for y. z gets nothing.
+#include <algorithm>
+#include <cmath>
+
+#include "geometry.h"
+#include "parallel.h"
+#include "stages.h"
+
+namespace nmr {
+namespace {
+
+// One image at raster resolution; row 0 = top.
+template <class T>
+struct LocalImage {
+  const T* vertices;
+  const int64_t* faces;
+  int64_t num_faces;
+  int64_t R, S;
+  bool anti_aliasing;
+  T eps;
+  const int32_t* owner;
+  const T* grad_alpha;
+
+  bool covered(int64_t row, int64_t column) const { return owner[row * R + column] >= 0; }
+
+  // A 2x2 mean shares its gradient in quarters.
+  T grad(int64_t row, int64_t column) const {
+    return anti_aliasing ? grad_alpha[row / 2 * S + column / 2] / 4 : grad_alpha[row * S + column];
+  }
+};
+
+// Rates at which the loss falls if the point of a pixel moves up or down an axis.
+template <class T>
+struct Rates {
+  T up = 0, down = 0;
+
+  // The end of the object towards the upper (lower) neighbour, which is background: `own` and `other` are the gradients of the two.
+  void add_upper_end(T own, T other) {
+    up -= other;
+    down += own;
+  }
+  void add_lower_end(T own, T other) {
+    up += own;
+    down -= other;
+  }
+
+  // d loss / d coordinate: that of the better direction, if it is any good and clearly better. A NaN stays one.
+  T gradient(T per_pixel, T eps) const {
+    const T u = up * per_pixel, d = down * per_pixel;
+    if (!(u - d == u - d)) return u - d;
+    if (std::max(u, d) <= 0 || std::abs(u - d) < eps) return 0;
+    return u > d ? -u : d;
+  }
+};
+
+// Screen weights of a face's corners at the centre of a pixel, in the order in which it is drawn; as in the rasterizer. False if it
+// has none: no rasterizer makes such a face an owner.
+template <class T>
+bool screen_weights(const Triangle<T>& t, int64_t row, int64_t column, int64_t R, T (&w)[3]) {
+  const BarycentricMatrix<T> matrix = barycentric_matrix(t, static_cast<T>(R));
+  const T x = static_cast<T>(column), y = static_cast<T>(R - 1 - row);
+  for (int k = 0; k < 3; ++k) w[k] = clamp_weight(matrix.m[k][0] * x + matrix.m[k][1] * y + matrix.m[k][2]);
+  const T sum = w[0] + w[1] + w[2];
+  for (T& weight : w) weight /= sum;
+  return sum > 0;
+}
+
+template <class T>
+void pull_pixel(const LocalImage<T>& image, int64_t row, int64_t column, T* grad_vertices) {
+  const int64_t end = image.R - 1;
+  const T own = image.grad(row, column), per_pixel = static_cast<T>(image.R) / 2;
+  Rates<T> x, y;
+  bool at_end = false;
+  const auto neighbour = [&](int64_t r, int64_t c, auto add) {
+    if (r < 0 || r > end || c < 0 || c > end || image.covered(r, c)) return;  // beyond the border nothing is known
+    at_end = true;
+    add(image.grad(r, c));
+  };
+  neighbour(row, column + 1, [&](T other) { x.add_upper_end(own, other); });
+  neighbour(row, column - 1, [&](T other) { x.add_lower_end(own, other); });
+  neighbour(row - 1, column, [&](T other) { y.add_upper_end(own, other); });
+  neighbour(row + 1, column, [&](T other) { y.add_lower_end(own, other); });
+  if (!at_end) return;
+  const T grad_x = x.gradient(per_pixel, image.eps), grad_y = y.gradient(per_pixel, image.eps);
+  if (grad_x == 0 && grad_y == 0) return;
+  const int32_t id = image.owner[row * image.R + column];
+  const bool reversed = id >= image.num_faces;
+  const int64_t* face = image.faces + 3 * (reversed ? id - image.num_faces : id);
+  T w[3];
+  if (!screen_weights(load_triangle(image.vertices, face, reversed), row, column, image.R, w)) return;
+  for (int k = 0; k < 3; ++k) {
+    T* grad = grad_vertices + 3 * face[reversed ? 2 - k : k];
+    grad[0] += w[k] * grad_x;
+    grad[1] += w[k] * grad_y;
+  }
+}
+
+}  // namespace
+
+// Images in parallel; the pixels of one in a fixed order, because they share vertices.
+template <class T>
+void local_gradient(const SilhouetteBackward<T>& args) {
+  const int64_t S = args.image_size, R = args.anti_aliasing ? 2 * S : S;
+  parallel_for(args.mesh.batch, args.num_threads, [&](int64_t b) {
+    const LocalImage<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b), R, S,
+                              args.anti_aliasing, args.eps, args.owner + b * R * R, args.grad_alpha + b * S * S};
+    T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
+    std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));
+    for (int64_t row = 0; row < R; ++row)
+      for (int64_t column = 0; column < R; ++column)
+        if (image.covered(row, column)) pull_pixel(image, row, column, grad_vertices);
+  });
+}
+
+template void local_gradient(const SilhouetteBackward<float>&);
+template void local_gradient(const SilhouetteBackward<double>&);
+
+}  // namespace nmr
