@@ -47,7 +47,7 @@ class VoxelConvention:
         lower IoU, not the same metric.
         """
         scale = (self.kato18_scale if definition == "kato18" else 1.0) / self.box
-        grid = nmr.voxelize(vertices * scale + 0.5, faces, size=VOXEL_SIZE)  # TODO definition
+        grid = nmr.voxelize(vertices * scale + 0.5, faces, size=VOXEL_SIZE, definition=definition)
         return self.to_axes(grid)
 
 
