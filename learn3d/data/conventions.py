@@ -61,3 +61,7 @@ KAR = VoxelConvention("kar", swap=(1, 3), flip=(1,), kato18_scale=_INNER)
 KAR_VPL = VoxelConvention("kar-vpl", swap=None, flip=(3,))
 #: Pascal3D+ as packed by Kato and Harada 2019: the grid spans [-1, 1]. Axes (-x, -z, -y).
 PASCAL3D = VoxelConvention("pascal3d", swap=(2, 3), flip=(1, 2, 3), box=2.0)
+#: 3D-R2N2's binvox grids. binvox keeps the axes (x, y, z) of ShapeNet's mesh files (y up, right-handed), and the object
+#: frame of the renderings is (-z, y, -x) of the mesh (the same as Kato's, see `kato.mesh_to_object`). Read backwards,
+#: the grid's axes are (-z, y, -x) of the object frame. The grid spans the cube that binvox fits around the object.
+R2N2 = VoxelConvention("r2n2", swap=(1, 3), flip=(1, 3), kato18_scale=_INNER)

@@ -13,8 +13,10 @@ The oddities that this module hides (Kato et al. 2018):
 
 from __future__ import annotations
 
+import contextlib
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ import torch
 
 import nmr
 from learn3d.data.conventions import KATO, VOXEL_SIZE
+from learn3d.data.findings import Problem
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.views import SPLITS, ViewDataset
 
@@ -31,6 +34,9 @@ DISTANCE = 2.732
 ELEVATION_DEG = 30.0
 AZIMUTH_STEP_DEG = -15.0
 HALF_FOV_DEG = 15.0
+VIEW_NAMES = tuple(f"azimuth {AZIMUTH_STEP_DEG * view:g}°" for view in range(NUM_VIEWS))
+
+_KINDS = ("images", "voxels")
 
 SYNSETS = {
     "airplane": "02691156",
@@ -109,20 +115,10 @@ def load(folder: Path | str, category: str, split: str) -> ViewDataset:
     """
     if split not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}; got {split!r}")
-    folder = Path(folder)
-    paths = split_paths(folder, category, split)
-    for path in paths:
-        if not path.is_file():
-            raise FileNotFoundError(_what_is_there(folder, category, split, path))
-    images = _read_array(paths[0], np.uint8, (NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE), "images")
-    voxels = _read_array(paths[1], np.bool_, (VOXEL_SIZE,) * 3, "voxels")
-    if len(images) != len(voxels):
-        raise ValueError(
-            f"{paths[0].name} holds {len(images)} objects but {paths[1].name} holds {len(voxels)}; "
-            "the two files must come from the same data set: fetch or make both again"
-        )
-    if len(images) == 0:
-        raise ValueError(f"{paths[0]} holds no object; make the data set with more meshes or another split")
+    for path in split_paths(folder, category, split):
+        _check_there(path, category, split)
+    images, voxels = (_read(folder, category, split, kind) for kind in _KINDS)
+    _check_counts(folder, category, split, len(images), len(voxels))
     return from_arrays(images, voxels, category, split)
 
 
@@ -136,12 +132,79 @@ def from_arrays(images: np.ndarray, voxels: np.ndarray, category: str, split: st
         images=images.reshape(count * NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE),
         poses=view_poses(torch.from_numpy(view_ids)),
         view_ids=view_ids,
-        view_names=tuple(f"azimuth {AZIMUTH_STEP_DEG * view:g}°" for view in range(NUM_VIEWS)),
+        view_names=VIEW_NAMES,
         object_ids=np.repeat(np.arange(count), NUM_VIEWS),
         object_names=tuple(f"{i:04d}" for i in range(count)),
         voxels=voxels,
         convention=KATO,
     )
+
+
+def problems(folder: Path | str, category: str, split: str, *, progress: bool = False) -> Iterator[Problem]:
+    """Everything that is wrong with the two files of one category and split."""
+    arrays = {}
+    for kind, path in zip(_KINDS, split_paths(folder, category, split), strict=True):
+        try:
+            arrays[kind] = _read(folder, category, split, kind)
+        except (ValueError, FileNotFoundError) as error:
+            yield Problem(str(path), str(error))
+            continue
+        whole = arrays[kind][:, :, 3].max((2, 3)) < 128 if kind == "images" else ~arrays[kind].any((1, 2, 3))
+        for index in np.argwhere(whole).tolist():
+            what = "the mask of object {}, view {}," if kind == "images" else "the grid of object {}"
+            yield Problem(str(path), f"{what.format(*index)} is empty", "warning")
+    if len(arrays) == len(_KINDS):
+        try:
+            _check_counts(folder, category, split, *map(len, arrays.values()))
+        except ValueError as error:
+            yield Problem(str(split_paths(folder, category, split)[0]), str(error))
+
+
+def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
+    """The categories (synset ids or prefixes) of a folder and the splits of each, by the names of its files."""
+    found: dict[str, set[str]] = {}
+    for kind in _KINDS:
+        for path in Path(folder).glob(f"*_{kind}.npz"):
+            prefix, _, split = path.name.removesuffix(f"_{kind}.npz").rpartition("_")
+            if prefix and split in SPLITS:
+                found.setdefault(prefix, set()).add(split)
+    return {prefix: tuple(s for s in SPLITS if s in splits) for prefix, splits in sorted(found.items())}
+
+
+def count(folder: Path | str, category: str, split: str) -> int:
+    """How many objects a split holds, from the header of its voxels (or images) file alone; 0 where it has none."""
+    for path in reversed(split_paths(folder, category, split)):
+        with contextlib.suppress(OSError, KeyError, ValueError, zipfile.BadZipFile):
+            with zipfile.ZipFile(path) as archive, archive.open("arr_0.npy") as file:
+                version = np.lib.format.read_magic(file)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                return int((read(file)[0] or (0,))[0])
+    return 0
+
+
+def _read(folder: Path | str, category: str, split: str, kind: str) -> np.ndarray:
+    """The array of the images or of the voxels file."""
+    path = split_paths(folder, category, split)[_KINDS.index(kind)]
+    _check_there(path, category, split)
+    if kind == "images":
+        return _read_array(path, np.uint8, (NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE), kind)
+    return _read_array(path, np.bool_, (VOXEL_SIZE,) * 3, kind)
+
+
+def _check_there(path: Path, category: str, split: str) -> None:
+    if not path.is_file():
+        raise FileNotFoundError(_what_is_there(path.parent, category, split, path))
+
+
+def _check_counts(folder: Path | str, category: str, split: str, images: int, voxels: int) -> None:
+    paths = split_paths(folder, category, split)
+    if images != voxels:
+        raise ValueError(
+            f"{paths[0].name} holds {images} objects but {paths[1].name} holds {voxels}; "
+            "the two files must come from the same data set: fetch or make both again"
+        )
+    if images == 0:
+        raise ValueError(f"{paths[0]} holds no object; make the data set with more meshes or another split")
 
 
 def _read_array(path: Path, dtype: type, shape: tuple[int, ...], what: str) -> np.ndarray:

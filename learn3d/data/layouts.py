@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -39,9 +40,33 @@ def load_dataset(
     names = [name.strip() for name in category.split(",")]
     if len(set(names)) != len(names) or not all(names):
         raise ValueError(f"category must be one name, or different names joined by commas, got {category!r}")
-    if layout != "kato":
+    bins = None if view_bins is None else AngleBins.parse(view_bins)
+    random_views = {"image_size": image_size, "view_bins": bins, "views_per_object": views_per_object}
+    # Readers are imported when they are asked for: each needs other packages.
+    if layout == "kato":
+        _check_fixed_views(layout, image_size, views_per_object)
+        load = kato.load
+    elif layout == "dvr":
+        from learn3d.data import dvr
+
+        _check_fixed_views(layout, image_size, views_per_object)
+        load = partial(dvr.load, progress=progress)
+    elif layout == "kar":
+        from learn3d.data import kar
+
+        load = partial(kar.load, **random_views, progress=progress)
+    elif layout == "r2n2":
+        from learn3d.data import r2n2
+
+        load = partial(r2n2.load, **random_views, progress=progress)
+    else:
         raise NotImplementedError(f"the reader of the layout {layout!r} is not written yet")
+    dataset = concatenate([load(folder, name, split) for name in names])
+    return dataset.with_bins(bins) if bins is not None and layout in ("kato", "dvr") else dataset
+
+
+def _check_fixed_views(layout: str, image_size: int, views_per_object: int | None) -> None:
     if image_size != kato.IMAGE_SIZE or views_per_object is not None:
-        raise ValueError("image_size and views_per_object cannot be chosen with the layout 'kato': 24 views of 64x64")
-    dataset = concatenate([kato.load(folder, name, split) for name in names])
-    return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
+        raise ValueError(
+            f"image_size and views_per_object cannot be chosen with the layout {layout!r}: 24 views, 64x64"
+        )

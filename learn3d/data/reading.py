@@ -1,0 +1,176 @@
+"""What the readers of folders share: images, arrays and tables with errors that name the file, many objects at once."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from learn3d.data.findings import AGAIN, DamagedFile, Findings, MissingFile
+from learn3d.data.kato import synset_of
+from learn3d.data.views import MASK_SIZE, SPLITS
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def map_objects(function: Callable[[T], R], items: Sequence[T], what: str, progress: bool) -> Iterator[R]:
+    """function of every item, in order, computed in parallel threads; nothing more is started after an exception."""
+    executor = ThreadPoolExecutor(min(16, 2 * (os.cpu_count() or 1)))
+    try:
+        yield from tqdm(executor.map(function, items), what, len(items), disable=not progress, unit="object")
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+def check_split(split: str, splits: Sequence[str] = SPLITS) -> None:
+    """Raise a ValueError for a split that the layout does not have."""
+    if split not in splits:
+        raise ValueError(f"split must be one of {', '.join(splits)}; got {split!r}")
+
+
+def category_folder(folder: Path, category: str) -> Path:
+    """The folder of a category (name or synset id) below `folder`; a MissingFile says which there are."""
+    path = folder / synset_of(category)
+    if not folder.is_dir():
+        raise MissingFile(folder, "there is no such folder")
+    if not path.is_dir():
+        found = sorted(p.name for p in folder.iterdir() if p.is_dir())
+        raise MissingFile(path, f"there is no folder of {category!r}; those here are: {', '.join(found) or 'none'}")
+    return path
+
+
+def warn_of_repeats(
+    findings: Findings, path: Path, what: str, ids: Sequence[str], others: dict[str, Iterable[str]]
+) -> None:
+    """Note ids that the list of a split (`what`) holds twice, and those that it shares with the lists of others."""
+    if repeated := sorted(name for name, times in Counter(ids).items() if times > 1):
+        findings.warn(path, f"{what} lists {', '.join(repeated)} more than once")
+    for split, other in others.items():
+        if shared := sorted(set(ids) & set(other)):
+            findings.warn(path, f"{what} shares {len(shared)} objects with {split}, such as {shared[0]}")
+
+
+def warn_if_empty(findings: Findings, path: Path, mask: np.ndarray) -> None:
+    """Note a mask, uint8 [H, W], in which nothing is inside."""
+    if mask.max() < 128:
+        findings.warn(path, f"its mask is empty: the brightest of its values 0 .. 255 is {mask.max()}")
+
+
+def read_image(path: Path) -> Image.Image:
+    """A decoded image file in its own mode; DamagedFile or MissingFile."""
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except FileNotFoundError:
+        raise MissingFile(path, "is missing; expected an image") from None
+    except (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError) as error:
+        raise DamagedFile(path, f"cannot be decoded as an image ({error}). {AGAIN}") from error
+
+
+def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
+    """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None where there is none."""
+    if image.mode == "P":
+        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+    if image.mode not in ("RGBA", "LA", "PA"):
+        return np.asarray(image.convert("RGB")), None
+    image = image.convert("RGBA")
+    alpha = image.getchannel("A")
+    white = Image.new("RGB", image.size, (255, 255, 255))
+    white.paste(image, mask=alpha)
+    return np.asarray(white), np.asarray(alpha)
+
+
+def check_square(path: Path, image: Image.Image, least: int) -> None:
+    """Raise DamagedFile for an image that is not square, smaller than `least`, or has more than 8 bits a channel."""
+    if image.width != image.height or image.width < least:
+        raise DamagedFile(
+            path, f"is {image.width}x{image.height} pixels; expected a square image of at least {least}x{least}"
+        )
+    if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
+        raise DamagedFile(path, f"has the pixel format {image.mode}; expected 8-bit grey, RGB or RGBA")
+
+
+def shrink(color: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """An image uint8 [4, size, size] and a mask uint8 [64, 64]: colours [S, S, 3] and mask [S, S], averaged by area."""
+    image, small = _shrink(np.dstack([color, mask]), size), _shrink(mask, MASK_SIZE)
+    return np.ascontiguousarray(image.transpose(2, 0, 1)), small
+
+
+def _shrink(pixels: np.ndarray, size: int) -> np.ndarray:
+    if pixels.shape[0] == size:
+        return pixels
+    if pixels.ndim == 2:
+        return np.asarray(Image.fromarray(pixels).resize((size, size), Image.Resampling.BOX))
+    # One channel at a time: PIL would weight the colours of an RGBA image by its fourth channel.
+    return np.dstack([_shrink(np.ascontiguousarray(channel), size) for channel in pixels.transpose(2, 0, 1)])
+
+
+def read_npz(path: Path, wanted: str) -> dict[str, np.ndarray]:
+    """All arrays of an npz file without pickled objects; `wanted` says what it should hold."""
+    try:
+        archive = np.load(path, allow_pickle=False)
+        if isinstance(archive, np.ndarray):
+            raise ValueError("it is a single npy array")
+        with archive:
+            return {name: archive[name] for name in archive.files}
+    except FileNotFoundError:
+        raise MissingFile(path, f"is missing; expected {wanted}") from None
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        raise DamagedFile(path, f"cannot be read ({error}); expected an npz file with {wanted}. {AGAIN}") from error
+
+
+def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
+    """The first `rows` rows of a table of numbers in a text file, float64 [rows, C] with C >= `columns`, all finite."""
+    try:
+        text = path.read_text()
+    except FileNotFoundError:
+        raise MissingFile(path, f"is missing; expected {wanted}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise DamagedFile(path, f"cannot be read ({error}); expected {wanted}. {AGAIN}") from error
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    if len(lines) < rows:
+        raise DamagedFile(path, f"has {len(lines)} rows, {rows} are needed; expected {wanted}. {AGAIN}")
+    table = np.empty((rows, columns))
+    for k, line in enumerate(lines[:rows]):
+        try:
+            table[k] = [float(word) for word in line[:columns]]
+        except ValueError:
+            raise DamagedFile(path, f"row {k} is {' '.join(line)!r}; expected {wanted}") from None
+        if not np.isfinite(table[k]).all():
+            raise DamagedFile(path, f"row {k} has numbers that are not finite; expected {wanted}")
+    return table
+
+
+def assemble(
+    objects: Iterable[tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray, np.ndarray]],
+    count: int,
+    views: int,
+    size: int,
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]:
+    """The arrays of a data set from `count` objects: `views` results of `shrink`, a pose table and voxels each.
+
+    Returns images uint8 [M, 4, size, size]; masks uint8 [M, 64, 64], or None where they are the images' fourth channel;
+    the rows of the tables float64 [M, C]; voxels bool [N, 32, 32, 32].
+    """
+    images = np.empty((count * views, 4, size, size), np.uint8)
+    masks = None if size == MASK_SIZE else np.empty((count * views, MASK_SIZE, MASK_SIZE), np.uint8)
+    tables, grids = [], []
+    for i, (pairs, table, grid) in enumerate(objects):
+        for row, (image, mask) in enumerate(pairs, i * views):
+            images[row] = image
+            if masks is not None:
+                masks[row] = mask
+        tables.append(table)
+        grids.append(grid)
+    return images, masks, np.concatenate(tables), np.stack(grids)
