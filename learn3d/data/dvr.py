@@ -94,9 +94,7 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
 
     def examine(name: str) -> list[Problem]:
         findings = Findings()
-        item = _read(root / name, POINTS, findings)
-        if item.points is None and not (root / name / "pointcloud.npz").exists():
-            findings.warn(root / name / "pointcloud.npz", "is missing: without it the set has no ground-truth shape")
+        _read(root / name, POINTS, findings)
         return findings.problems
 
     for found in map_objects(examine, ids, f"{category} {split}", progress):
@@ -148,7 +146,9 @@ def _read(root: Path, points: int, findings: Findings) -> _Object:
     views = [_read_view(root, k, findings) for k in range(kato.NUM_VIEWS)]
     to_object = findings.attempt(_fit_world, root / "cameras.npz")
     cloud, path = None, root / "pointcloud.npz"
-    if points and to_object is not None and path.exists():
+    if not path.exists():
+        findings.warn(path, "is missing: without it the set has no ground-truth shape")
+    elif points and to_object is not None:
         cloud = findings.attempt(_read_points, path, points, to_object)
     return _Object(np.stack(views) if all(view is not None for view in views) else None, cloud)
 

@@ -23,6 +23,7 @@ What is done with them follows the published code of Peng et al. 2020, except wh
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Iterator
@@ -245,7 +246,7 @@ def _grey(path: Path, depth: Image.Image) -> np.ndarray:
 def _read_voxels(path: Path) -> np.ndarray:
     wanted = "a MATLAB file with the array 'Volume' [32, 32, 32]"
     try:
-        volume = scipy.io.loadmat(path, variable_names=["Volume"]).get("Volume")
+        volume = scipy.io.loadmat(io.BytesIO(path.read_bytes()), variable_names=["Volume"]).get("Volume")
     except FileNotFoundError:
         raise MissingFile(path, f"is missing; expected {wanted}") from None
     except Exception as error:  # scipy's parser raises whatever a damaged file leads it to
