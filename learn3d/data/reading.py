@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import zipfile
 import zlib
@@ -102,18 +103,29 @@ def check_square(path: Path, image: Image.Image, least: int) -> None:
 
 
 def shrink(color: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """An image uint8 [4, size, size] and a mask uint8 [64, 64]: colours [S, S, 3] and mask [S, S], averaged by area."""
-    image, small = _shrink(np.dstack([color, mask]), size), _shrink(mask, MASK_SIZE)
-    return np.ascontiguousarray(image.transpose(2, 0, 1)), small
+    """An image uint8 [4, size, size] and a mask uint8 [64, 64] of colours uint8 [S, S, 3] and a mask uint8 [S, S].
+
+    Each pixel becomes the mean over its area of the original; fractions of original pixels count as such.
+    """
+    planes = np.concatenate([color.transpose(2, 0, 1), mask[None]])
+    image = _shrink(planes, size)
+    return image, image[3] if size == MASK_SIZE else _shrink(planes[3], MASK_SIZE)
 
 
-def _shrink(pixels: np.ndarray, size: int) -> np.ndarray:
-    if pixels.shape[0] == size:
-        return pixels
-    if pixels.ndim == 2:
-        return np.asarray(Image.fromarray(pixels).resize((size, size), Image.Resampling.BOX))
-    # One channel at a time: PIL would weight the colours of an RGBA image by its fourth channel.
-    return np.dstack([_shrink(np.ascontiguousarray(channel), size) for channel in pixels.transpose(2, 0, 1)])
+def _shrink(planes: np.ndarray, size: int) -> np.ndarray:
+    if planes.shape[-1] == size:
+        return planes
+    weights = _area_weights(planes.shape[-1], size)
+    return np.rint(weights @ planes.astype(np.float32) @ weights.T).astype(np.uint8)
+
+
+@functools.cache
+def _area_weights(source: int, size: int) -> np.ndarray:
+    """Share of each of `source` pixels in each of `size` larger ones, float32 [size, source]; rows sum to 1."""
+    edges = np.arange(size + 1) * (source / size)
+    pixels = np.arange(source)
+    overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
+    return (overlap.clip(0) * (size / source)).astype(np.float32)
 
 
 def read_npz(path: Path, wanted: str) -> dict[str, np.ndarray]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -131,7 +130,7 @@ def test_command_prints_problems_and_a_table_and_says_by_its_exit_code(tmp_path,
     assert "error: " in (text := capsys.readouterr().err) and "nothing of the layout 'r2n2'" in text
 
 
-def test_command_runs_as_a_script(tmp_path):
+def test_a_set_without_objects_is_an_error(tmp_path):
     write_kato(tmp_path, "train", 0, 0)
-    result = subprocess.run([sys.executable, TOOL, tmp_path], capture_output=True, text=True)
-    assert result.returncode == 1 and "holds no object" in result.stdout, result.stderr
+    (problem,) = check_folder("kato", tmp_path).splits[0].problems
+    assert problem.severity == "error" and "holds no object" in problem.message
