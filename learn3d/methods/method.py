@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.data.batch import Batch
@@ -38,25 +37,6 @@ class Grids:
 
     occupancy: Tensor  # float32 [B, s, s, s] in [0, 1]; axes (x, y, z) of the object frame over the box [-0.5, 0.5]
     threshold: float = 0.5  # occupied above it
-
-
-def occupancy_grid(grids: Grids, size: int = 32, scale: float = 1.0) -> Tensor:
-    """Occupied cells bool [B, size, size, size], axes (x, y, z): the mean of the finer cells is above the threshold.
-
-    `scale` shrinks the shapes about the middle of the grid first (trilinear), as `VoxelConvention.voxelize` shrinks
-    meshes: kato18_scale / box makes the cells those of the data set's grids. Where the published PrGAN thresholds is
-    not said; the mean of 2^3 cells above one half is the least partial choice. Raises ValueError where `size` does not
-    divide the grid's.
-    """
-    occupancy = grids.occupancy[:, None].float()
-    cells = occupancy.shape[-1]
-    if size < 1 or cells % size:
-        raise ValueError(f"size must divide the {cells} cells per side of the predicted grids, got {size}")
-    if scale != 1:
-        shrink = torch.eye(3, 4) / scale
-        where = F.affine_grid(shrink.expand(len(occupancy), 3, 4), list(occupancy.shape), align_corners=False)
-        occupancy = F.grid_sample(occupancy, where, align_corners=False)
-    return F.avg_pool3d(occupancy, cells // size)[:, 0] > grids.threshold
 
 
 class Method(abc.ABC):

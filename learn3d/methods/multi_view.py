@@ -36,6 +36,11 @@ class MultiViewSettings:
     lambda_smooth: float = 0.001
     """Weight of the smoothness loss (published: 0.001 for one category, 0 for all together)."""
 
+    @property
+    def image_size(self) -> int:
+        """Side of the images that the encoder takes, in pixels."""
+        return ENCODERS[self.encoder].image_size
+
 
 class MultiView(Method):
     """Encoder and mesh generator, trained on pairs of views: batches [a_1 .. a_n, b_1 .. b_n], sampling "pairs"."""
@@ -43,14 +48,14 @@ class MultiView(Method):
     def __init__(
         self, settings: MultiViewSettings, shape: DataShape, device: str, precision: Literal["bf16", "fp32"]
     ) -> None:
-        self.settings, self.device, self.precision = settings, torch.device(device), precision
+        self.settings, self.image_size = settings, settings.image_size
+        self.device, self.precision = torch.device(device), precision
         self.encoder = ENCODERS[settings.encoder]()
         self.generator = GENERATORS[settings.generator]()
         self.networks = {"encoder": self.encoder, "generator": self.generator}
         for network in self.networks.values():
             network.to(device)
         self.encoder.to(memory_format=torch.channels_last)
-        self.image_size = self.encoder.image_size
         slow = {id(parameter) for n, parameter in self.generator.named_parameters() if n.startswith("centroid.")}
         parameters = list(self.generator.parameters())
         self.optimizers = {

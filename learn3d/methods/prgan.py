@@ -17,6 +17,7 @@ from learn3d.networks.projection import ViewCircle, project
 from learn3d.networks.voxel_gan import (
     DISCRIMINATOR_CHANNELS,
     GENERATOR_CHANNELS,
+    IMAGE_SIZE,
     SHAPE_CODE,
     TAU,
     InverseEncoder,
@@ -56,6 +57,11 @@ class PrGANSettings:
     perspective: bool = False
     """Rays of the projection that meet in the eye, as the data set's do, instead of PrGAN's parallel ones."""
 
+    @property
+    def image_size(self) -> int:
+        """Side of the images that the encoder takes, in pixels."""
+        return IMAGE_SIZE
+
     def __post_init__(self) -> None:
         if self.encoder_from_step < 1:
             raise ValueError(f"encoder_from_step must be a step, from 1, got {self.encoder_from_step}")
@@ -73,7 +79,8 @@ class PrGAN(Method):
     def __init__(
         self, settings: PrGANSettings, shape: DataShape, device: str, precision: Literal["bf16", "fp32"]
     ) -> None:
-        self.settings, self.device, self.precision = settings, torch.device(device), precision
+        self.settings, self.image_size = settings, settings.image_size
+        self.device, self.precision = torch.device(device), precision
         self.views = ViewCircle(
             shape.num_views, settings.elevation_deg, settings.distance, settings.half_fov_deg, settings.perspective
         )
