@@ -87,7 +87,7 @@ def test_thickness_is_measured_in_voxels() -> None:
     views = ViewCircle()
     image = project(density, torch.tensor([0, 3]), views, TAU)
     thickness = -torch.log1p(-image.double()) / TAU  # times the area of a pixel, in voxels, it is what the box holds
-    assert thickness.sum((1, 2)) * (2 * views.half_width) ** 2 == pytest.approx(density.sum((1, 2, 3)), rel=0.01)
+    assert thickness.sum((1, 2)) * (2 * views.half_width) ** 2 == pytest.approx(density.sum((1, 2, 3)), rel=0.03)
 
 
 BOXES = (  # low and high corners; no two views of the three together are alike, and no mirror image is
