@@ -19,9 +19,15 @@ def create_method(
     settings: Settings, shape: DataShape, *, device: str, precision: Literal["bf16", "fp32"], seed: int
 ) -> Method:
     """The method of `settings`, with PyTorch's default initialisation of its networks from `seed`."""
+    from learn3d.methods.multi_view import MultiView, MultiViewSettings
     from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
+    from learn3d.methods.prgan import PrGAN, PrGANSettings
 
-    methods: dict[type, type[Method]] = {PoseInvariantSettings: PoseInvariant}
+    methods: dict[type, type[Method]] = {
+        PoseInvariantSettings: PoseInvariant,
+        MultiViewSettings: MultiView,
+        PrGANSettings: PrGAN,
+    }
     check_device(device)
     torch.manual_seed(seed)
     return methods[type(settings)](settings, shape, device, precision)

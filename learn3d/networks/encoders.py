@@ -37,8 +37,15 @@ class ConvEncoder(nn.Module):
         return self.layers(self.convolutions(images).flatten(1))
 
 
-EncoderName = Literal["conv"]
-ENCODERS: dict[str, type[nn.Module]] = {"conv": ConvEncoder}
+class ReluConvEncoder(ConvEncoder):
+    """The same with a ReLU at the end, as in Kato et al. 2018: codes have no negative entries."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        return torch.relu(super().forward(images))
+
+
+EncoderName = Literal["conv", "conv-relu"]
+ENCODERS: dict[str, type[nn.Module]] = {"conv": ConvEncoder, "conv-relu": ReluConvEncoder}
 
 
 def network_input(images: Tensor, device: torch.device | str, size: int = 64) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import torch
 from torch import Tensor, nn
 
 import nmr
@@ -50,5 +51,44 @@ class SphereGenerator(nn.Module):
         return deform_sphere(self.sphere, displacement)
 
 
-GeneratorName = Literal["sphere"]
-GENERATORS: dict[str, type[nn.Module]] = {"sphere": SphereGenerator}
+def deform_bounded_sphere(sphere: Tensor, bias: Tensor, centroid: Tensor) -> Tensor:
+    """Vertices of Kato et al. 2018 (published code): [V,3], [B,V,3] and [B,3] -> [B,V,3] within [-0.5, 0.5].
+
+    With b = 0.5 sphere and c = tanh(centroid): s = sign(b) sigmoid(logit(|b|) + bias) lies in (-1, 1), is stretched to
+    (-1, c) and (c, 1) on its two sides, and halved: 0.5 (c + s (1 - sign(s) c)). So every vertex stays in its octant
+    about c / 2. One on a coordinate plane of the sphere (b = 0) stays on it: logit(0) = -inf, and its gradient is 0.
+    """
+    base, center = OBJECT_SCALE * sphere, torch.tanh(centroid)[:, None]
+    stretch = base.sign() * torch.sigmoid(torch.logit(base.abs()) + bias)
+    return 0.5 * (center + stretch * (1 - base.sign() * center))
+
+
+class BoundedGenerator(nn.Module):
+    """Shape code [B,512] -> vertices float32 [B,642,3] in [-0.5, 0.5], each in its octant about a learnt centroid.
+
+    Kato et al. 2018: 512-1024-2048, and from there the bias of every vertex and, times 0.1, the centroid.
+    `faces` and `edges` as in `SphereGenerator`.
+    """
+
+    sphere: Tensor
+    faces: Tensor
+    edges: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        sphere, faces = nmr.icosphere(3)
+        self.register_buffer("sphere", sphere.float(), persistent=False)
+        self.register_buffer("faces", faces, persistent=False)
+        self.register_buffer("edges", nmr.edge_table(faces), persistent=False)
+        self.layers = nn.Sequential(nn.Linear(CODE_SIZE, 1024), nn.ReLU(), nn.Linear(1024, 2048), nn.ReLU())
+        self.bias = nn.Linear(2048, sphere.shape[0] * 3)
+        self.centroid = nn.Linear(2048, 3)
+
+    def forward(self, codes: Tensor) -> Tensor:
+        features = self.layers(codes)
+        bias = self.bias(features).float().reshape(codes.shape[0], -1, 3)
+        return deform_bounded_sphere(self.sphere, bias, 0.1 * self.centroid(features).float())
+
+
+GeneratorName = Literal["sphere", "bounded"]
+GENERATORS: dict[str, type[nn.Module]] = {"sphere": SphereGenerator, "bounded": BoundedGenerator}

@@ -1,0 +1,226 @@
+"""PrGAN (Gadelha et al. 2017): a GAN of voxel grids that sees only silhouettes, and an encoder learnt afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from learn3d.data.batch import Batch
+from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
+from learn3d.methods.method import DataShape, Grids, Method, adam, check_finite, frozen
+from learn3d.networks import network_input
+from learn3d.networks.projection import ViewCircle, project
+from learn3d.networks.voxel_gan import (
+    DISCRIMINATOR_CHANNELS,
+    GENERATOR_CHANNELS,
+    IMAGE_SIZE,
+    SHAPE_CODE,
+    TAU,
+    InverseEncoder,
+    SilhouetteDiscriminator,
+    VoxelGenerator,
+)
+
+BETAS = (0.5, 0.999)  # of Adam, for the two networks of the GAN
+
+
+@dataclass(frozen=True)
+class PrGANSettings:
+    """Schedule, step sizes and widths; the defaults are the published code's, the schedule is that for airplanes."""
+
+    encoder_from_step: int = 53_051
+    """First step that trains the encoder instead of the GAN (published: after 50 epochs)."""
+    generator_learning_rate: float = 2.5e-3
+    """Adam's step size for the generator, in both of its steps."""
+    discriminator_learning_rate: float = 1e-4
+    """Adam's step size for the discriminator."""
+    encoder_learning_rate: float = 1e-5
+    """Adam's step size for the inverse encoder."""
+    accuracy_margin: float = 0.8
+    """The discriminator rests in steps that begin with a higher accuracy."""
+    generator_channels: tuple[int, int, int, int] = GENERATOR_CHANNELS
+    """Channels at 4^3, 8^3, 16^3 and 32^3; fewer on a small machine."""
+    discriminator_channels: tuple[int, int, int, int] = DISCRIMINATOR_CHANNELS
+    """Channels at 32^2, 16^2, 8^2 and 4^2; fewer on a small machine."""
+    occupancy_threshold: float = 0.5
+    """A predicted voxel is full where the sigmoid is higher (unpublished)."""
+    elevation_deg: float = 30.0
+    """Elevation of the K views, which stand at equal steps of azimuth."""
+    distance: float = 2.732
+    """Distance of the data set's cameras; with the field of view it gives the size of objects in the images."""
+    half_fov_deg: float = 15.0
+    """Half of the field of view of the data set's cameras."""
+    perspective: bool = False
+    """Rays of the projection that meet in the eye, as the data set's do, instead of PrGAN's parallel ones."""
+
+    @property
+    def image_size(self) -> int:
+        """Side of the images that the encoder takes, in pixels."""
+        return IMAGE_SIZE
+
+    def __post_init__(self) -> None:
+        if self.encoder_from_step < 1:
+            raise ValueError(f"encoder_from_step must be a step, from 1, got {self.encoder_from_step}")
+        if not 0 < self.occupancy_threshold < 1:
+            raise ValueError(f"occupancy_threshold must lie between 0 and 1, got {self.occupancy_threshold}")
+
+
+class PrGAN(Method):
+    """Generator of voxels from z ~ U(-1, 1)^201, discriminator of silhouettes, inverse encoder.
+
+    The first 200 entries of z decide the shape, the last one v the view: floor((v + 1) K / 2). Which view a training
+    image was taken from is never used, only that views come from the circle, each as often as any other.
+    """
+
+    def __init__(
+        self, settings: PrGANSettings, shape: DataShape, device: str, precision: Literal["bf16", "fp32"]
+    ) -> None:
+        self.settings, self.image_size = settings, settings.image_size
+        self.device, self.precision = torch.device(device), precision
+        self.views = ViewCircle(
+            shape.num_views, settings.elevation_deg, settings.distance, settings.half_fov_deg, settings.perspective
+        )
+        self.generator = VoxelGenerator(settings.generator_channels)
+        self.discriminator = SilhouetteDiscriminator(settings.discriminator_channels)
+        self.encoder = InverseEncoder()
+        self.networks = {"generator": self.generator, "discriminator": self.discriminator, "encoder": self.encoder}
+        for network in self.networks.values():
+            network.to(device)
+        self.optimizers = {
+            "generator": adam(self.generator, settings.generator_learning_rate, BETAS),
+            "generator_statistics": adam(self.generator, settings.generator_learning_rate, BETAS),
+            "discriminator": adam(self.discriminator, settings.discriminator_learning_rate, BETAS),
+            "encoder": adam(self.encoder, settings.encoder_learning_rate),
+        }
+
+    def encode(self, images: Tensor) -> Tensor:
+        """Shape codes [B, 200] of the mask channel alone; the view that the encoder also estimates is left out."""
+        masks = network_input(images, self.device, self.image_size)[:, 3]
+        with self.autocast():
+            return self.encoder(masks)[:, :SHAPE_CODE].float()
+
+    def decode(self, codes: Tensor) -> Grids:
+        return Grids((self.generator(codes) * TAU).cpu(), self.settings.occupancy_threshold)
+
+    def sample_z(self, count: int) -> Tensor:
+        """z ~ U(-1, 1), float32 [count, 201], from torch's global random state on the CPU, whatever the device."""
+        return (2 * torch.rand(count, SHAPE_CODE + 1) - 1).to(self.device)
+
+    def view_ids(self, z: Tensor) -> Tensor:
+        """The view that the last entry of z asks for: floor((v + 1) K / 2), int64 [B] in 0 .. K-1."""
+        return ((z[:, -1] + 1) * (self.views.count / 2)).long().clamp(0, self.views.count - 1)
+
+    def generate(self, z: Tensor) -> Tensor:
+        """Silhouettes [B, 64, 64] of what z [B, 201] stands for. In float32: bf16 makes these layers slow on CPUs."""
+        return project(self.generator(z[:, :SHAPE_CODE]), self.view_ids(z), self.views, TAU)
+
+    def train_step(self, batch: Batch, step: int) -> dict[str, float]:
+        """A step of the GAN before `encoder_from_step`, of the encoder from there on.
+
+        Raises ValueError where the batch's cameras are not those of the K views.
+        """
+        check_views(batch.poses, batch.view_ids, self.views)
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad(set_to_none=True)
+        if step >= self.settings.encoder_from_step:
+            return self._encoder_step(len(batch), step)
+        return self._gan_step(batch.masks.to(self.device), step)
+
+    def _gan_step(self, real: Tensor, step: int) -> dict[str, float]:
+        """Discriminator (where its accuracy at the start is at most 0.8), then generator, then generator once more: on
+        the statistics of the discriminator's first layer. One z serves all three, as in the published code.
+        """
+        z = self.sample_z(len(real))
+        losses = {"accuracy": self.accuracy(real, z)}
+        self.set_training(True)
+
+        fake = self.generate(z)
+        if losses["accuracy"] <= self.settings.accuracy_margin:
+            with self.autocast():
+                of_real, of_fake = self.discriminator(real).float(), self.discriminator(fake.detach()).float()
+            self._take_step("discriminator", _bce(of_real, 1.0) + _bce(of_fake, 0.0), losses, step)
+
+        with self.autocast():
+            generation = _bce(frozen(self.discriminator, fake).float(), 1.0)
+        self._take_step("generator", generation, losses, step)
+
+        with self.autocast():
+            first = self.discriminator.first
+            of_real, of_fake = (frozen(first, images[:, None]).float() for images in (real, self.generate(z)))
+        self._take_step("generator_statistics", statistics_loss(of_real, of_fake), losses, step)
+        losses["total"] = sum(losses.get(name, 0.0) for name in self.optimizers)
+        return losses
+
+    def _encoder_step(self, count: int, step: int) -> dict[str, float]:
+        """The encoder learns z of fresh samples of the generator, which stays as it is (evaluation mode)."""
+        self.set_training(False)
+        z = self.sample_z(count)
+        with torch.no_grad():
+            images = self.generate(z)
+        with self.autocast():
+            estimate = self.encoder(images)
+        losses: dict[str, float] = {}
+        self._take_step("encoder", (estimate.float() - z).square().sum(), losses, step)
+        losses["total"] = losses["encoder"]
+        return losses
+
+    @torch.no_grad()
+    def accuracy(self, real: Tensor, z: Tensor) -> float:
+        """Mean of D on real silhouettes and of 1 - D on generated ones: probabilities, in evaluation mode."""
+        self.set_training(False)
+        with self.autocast():
+            of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
+        return float((of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2)
+
+    def _take_step(self, name: str, loss: Tensor, losses: dict[str, float], step: int) -> None:
+        losses[name] = float(loss.detach())
+        check_finite(losses, step)
+        loss.backward()
+        self.optimizers[name].step()
+        self.optimizers[name].zero_grad(set_to_none=True)
+
+
+def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
+    """Squared distance of the batch means of features [B, ...] and of their variances, summed over all features."""
+    variances = (features.var(dim=0, unbiased=False) for features in (of_real, of_fake))
+    return (of_real.mean(0) - of_fake.mean(0)).square().sum() + torch.sub(*variances).square().sum()
+
+
+def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
+    """Raise a ValueError unless every camera is that of its view class, to half a degree and half a percent.
+
+    PrGAN needs a table of views to draw from. Data with continuous viewpoints have none; the means of their classes
+    would be one, but then no image would be seen from where its class says.
+    """
+    wanted = (
+        f"PrGAN needs images from {views.count} fixed views, view k at azimuth {-360 / views.count:g} k and elevation "
+        f"{views.elevation_deg:g}, distance {views.distance:g}, half field of view {views.half_fov_deg:g}"
+    )
+    if not isinstance(poses, LookAtPoses):
+        raise ValueError(f"{wanted}; this data set gives rotations. Take data in Kato's layout")
+    checks = (
+        ("azimuth", wrap_deg(poses.azimuth_deg - views.azimuth_deg(view_ids)).abs(), 0.5, poses.azimuth_deg),
+        ("elevation", _off(poses.elevation_deg, views.elevation_deg), 0.5, poses.elevation_deg),
+        ("distance", _off(poses.distance, views.distance), 0.005 * views.distance, poses.distance),
+        ("half field of view", _off(poses.half_fov_deg, views.half_fov_deg), 0.1, poses.half_fov_deg),
+    )
+    for name, off, allowed, values in checks:
+        if bool((off > allowed).any()):
+            worst = int(off.argmax())
+            value = float(values[worst]) if isinstance(values, Tensor) else values
+            raise ValueError(
+                f"{wanted}; a camera of view {int(view_ids[worst])} has {name} {value:g}. Take data in Kato's layout, "
+                "or give the data set's own elevation_deg, distance and half_fov_deg"
+            )
+
+
+def _off(values: Tensor | float, wanted: float) -> Tensor:
+    return (torch.as_tensor(values, dtype=torch.float32) - wanted).abs()
+
+
+def _bce(logits: Tensor, target: float) -> Tensor:
+    return F.binary_cross_entropy_with_logits(logits, torch.full_like(logits, target))

@@ -1,0 +1,106 @@
+"""PrGAN's networks (Gadelha et al. 2017): voxel generator, silhouette discriminator, inverse encoder.
+
+Layers, sizes and initial weights are those of the published TensorFlow code: weights of fully connected layers from
+N(0, 0.1), of convolutions from N(0, 0.02), biases 0. Normalisations average with momentum 0.9 in TensorFlow's sense,
+which is 0.1 in torch's.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+SHAPE_CODE = 200  # entries of z that decide the shape; one more decides the view
+VOLUME_SIZE = 64
+IMAGE_SIZE = 64
+TAU = 0.5  # density of a full voxel is 1 / TAU; in the projection it cancels, so that a full voxel lets exp(-1) through
+GENERATOR_CHANNELS = (128, 64, 32, 1)
+DISCRIMINATOR_CHANNELS = (128, 256, 512, 1024)
+
+
+class VoxelGenerator(nn.Module):
+    """Shape code [B, 200] -> density float32 [B, 64, 64, 64] in [0, 1 / TAU], axes (x, y, z) of the object frame.
+
+    A linear layer to `channels[0]` features on 4^3 cells, then transposed convolutions (4^3, stride 2) to the other
+    channels at 8^3, 16^3 and 32^3 and to one at 64^3; batch norm and ReLU after all but the last, which has a sigmoid.
+    The published layer list narrows to ONE channel already at 32^3. Its normalisation there is declared for 16
+    channels, so that this may have been a slip; it is kept as the default, since it is what was run.
+    """
+
+    def __init__(self, channels: Sequence[int] = GENERATOR_CHANNELS) -> None:
+        super().__init__()
+        if len(channels) != 4 or min(channels) < 1:
+            raise ValueError(f"generator_channels must be 4 positive numbers (at 4^3, 8^3, 16^3, 32^3), got {channels}")
+        self.first = nn.Linear(SHAPE_CODE, channels[0] * 4**3)
+        layers: list[nn.Module] = [nn.BatchNorm3d(channels[0]), nn.ReLU()]
+        for before, after in itertools.pairwise(channels):
+            layers += [nn.ConvTranspose3d(before, after, 4, stride=2, padding=1), nn.BatchNorm3d(after), nn.ReLU()]
+        layers.append(nn.ConvTranspose3d(channels[-1], 1, 4, stride=2, padding=1))
+        self.layers = nn.Sequential(*layers)
+        self.apply(_initialise)
+        self.to(memory_format=torch.channels_last_3d)  # half the time on a CPU
+
+    def forward(self, codes: Tensor) -> Tensor:
+        features = self.first(codes).reshape(len(codes), -1, 4, 4, 4)
+        return torch.sigmoid(self.layers(features.to(memory_format=torch.channels_last_3d)))[:, 0] / TAU
+
+
+class SilhouetteDiscriminator(nn.Module):
+    """Grey silhouettes [B, 64, 64] in [0, 1] -> logits [B]: positive where they look like those of the data.
+
+    Convolutions 5x5 with stride 2 to `channels`, batch norm and LeakyReLU(0.2) after each, then a linear layer.
+    """
+
+    def __init__(self, channels: Sequence[int] = DISCRIMINATOR_CHANNELS) -> None:
+        super().__init__()
+        if len(channels) != 4 or min(channels) < 1:
+            raise ValueError(
+                f"discriminator_channels must be 4 positive numbers (at 32^2, 16^2, 8^2, 4^2), got {channels}"
+            )
+        layers = [
+            nn.Sequential(nn.Conv2d(before, after, 5, stride=2, padding=2), nn.BatchNorm2d(after), nn.LeakyReLU(0.2))
+            for before, after in itertools.pairwise((1, *channels))
+        ]
+        self.first, self.others = layers[0], nn.Sequential(*layers[1:])
+        self.last = nn.Linear(channels[-1] * (IMAGE_SIZE // 16) ** 2, 1)
+        self.apply(_initialise)
+        self.to(memory_format=torch.channels_last)
+
+    def forward(self, silhouettes: Tensor) -> Tensor:
+        return self.last(self.others(self.features(silhouettes)).flatten(1))[:, 0]
+
+    def features(self, silhouettes: Tensor) -> Tensor:
+        """What the first layer makes of them, [B, channels[0], 32, 32], normalised and rectified."""
+        return self.first(silhouettes[:, None])
+
+
+class InverseEncoder(nn.Module):
+    """Silhouettes [B, 64, 64] in [0, 1] -> z [B, 201]: the shape code, then the view's coordinate.
+
+    4096-512-512-201 with a LeakyReLU(0.2) after the first layer only, and the output divided by 201, as published.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(IMAGE_SIZE**2, 512), nn.LeakyReLU(0.2), nn.Linear(512, 512), nn.Linear(512, SHAPE_CODE + 1)
+        )
+        self.apply(_initialise)
+
+    def forward(self, silhouettes: Tensor) -> Tensor:
+        return self.layers(silhouettes.flatten(1)) / (SHAPE_CODE + 1)
+
+
+def _initialise(module: nn.Module) -> None:
+    if isinstance(module, nn.Linear):
+        nn.init.normal_(module.weight, std=0.1)
+    elif isinstance(module, nn.ConvTranspose3d):
+        nn.init.normal_(module.weight, std=0.02)
+    elif isinstance(module, nn.Conv2d):
+        nn.init.trunc_normal_(module.weight, std=0.02, a=-0.04, b=0.04)
+    else:
+        return
+    nn.init.zeros_(module.bias)

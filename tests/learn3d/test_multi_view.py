@@ -1,0 +1,185 @@
+"""Vanilla-AE on pairs of views: the bounded generator, the four silhouettes, the optimizer."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import nmr
+from learn3d.data.batch import Batch
+from learn3d.data.poses import LookAtPoses
+from learn3d.methods.method import DataShape
+from learn3d.methods.multi_view import MultiView, MultiViewSettings, SparseGradientAdam, check_pairs
+from learn3d.networks import ENCODERS, GENERATORS
+from learn3d.networks.generators import deform_bounded_sphere
+from learn3d.presets import PRESETS, method_name
+
+
+def make_batch(objects: list[int]) -> Batch:
+    count = len(objects)
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(0, 256, (count, 4, 64, 64), dtype=torch.uint8, generator=generator)
+    masks = torch.zeros(count, 64, 64)
+    for i in range(count):
+        masks[i, 16 + 2 * i : 46, 20 : 40 + 2 * i] = 1
+    views = torch.arange(count) * 5 % 24
+    poses = LookAtPoses(-15.0 * views, 30.0, 2.732, 15.0)
+    return Batch(images, masks, poses, views, torch.tensor(objects), torch.zeros(count, dtype=torch.int64), None)
+
+
+@pytest.fixture(scope="module")
+def method() -> MultiView:
+    torch.manual_seed(0)
+    return MultiView(MultiViewSettings(decay_at_step=10), DataShape(24), "cpu", "fp32")
+
+
+def test_bounded_rule() -> None:
+    rng = np.random.default_rng(0)
+    sphere = rng.normal(size=(50, 3))
+    sphere[0], sphere[1, 0] = (0, 0, 1), 0  # on coordinate planes
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    bias, centroid = rng.normal(size=(2, 50, 3)), rng.normal(size=(2, 3))
+    wanted = np.empty((2, 50, 3))
+    for b, i, axis in np.ndindex(2, 50, 3):
+        base, c = 0.5 * sphere[i, axis], np.tanh(centroid[b, axis])
+        size = 0.0 if base == 0 else 1 / (1 + (1 - abs(base)) / abs(base) * np.exp(-bias[b, i, axis]))
+        wanted[b, i, axis] = 0.5 * (c + (1 - c) * size if base > 0 else c - (1 + c) * size)
+    arrays = (torch.tensor(a) for a in (sphere, bias, centroid))
+    assert np.allclose(deform_bounded_sphere(*arrays), wanted, atol=1e-12)
+
+
+def test_vertices_keep_the_box_and_their_octant() -> None:
+    sphere = nmr.icosphere(3)[0].float()
+    bias = 20 * torch.randn(4, 642, 3, generator=torch.Generator().manual_seed(1))
+    centroid = torch.tensor([[0.0, 0.0, 0.0], [1.0, -2.0, 0.3], [50.0, -50.0, 0.0], [0.1, 0.1, 0.1]])
+    bias.requires_grad_()
+    vertices = deform_bounded_sphere(sphere, bias, centroid)
+    assert vertices.abs().max() <= 0.5
+    offset = vertices - 0.5 * torch.tanh(centroid)[:, None]
+    assert ((offset * sphere) >= -1e-6).all()
+    assert offset[:, sphere == 0].abs().max() < 1e-6
+    vertices.sum().backward()
+    assert bias.grad.isfinite().all()
+    assert (bias.grad[:, sphere == 0] == 0).all()
+
+
+def test_generator_and_encoder_are_katos() -> None:
+    torch.manual_seed(0)
+    generator, encoder = GENERATORS["bounded"](), ENCODERS["conv-relu"]()
+    linear = [(m.in_features, m.out_features) for m in generator.modules() if isinstance(m, nn.Linear)]
+    assert linear == [(512, 1024), (1024, 2048), (2048, 1926), (2048, 3)]
+    vertices = generator(torch.zeros(2, 512))
+    assert vertices.shape == (2, 642, 3)
+    assert torch.allclose(vertices.norm(dim=2), torch.tensor(0.25), atol=0.02)  # 0.5 * 0.5 sphere
+    codes = encoder(torch.rand(2, 4, 64, 64))
+    assert codes.shape == (2, 512)
+    assert codes.min() == 0
+    plain = ENCODERS["conv"]()
+    plain.load_state_dict(encoder.state_dict())
+    images = torch.rand(2, 4, 64, 64)
+    assert torch.equal(encoder(images), plain(images).relu())
+
+
+def test_centroid_moves_the_shape_by_a_tenth() -> None:
+    generator = GENERATORS["bounded"]()
+    with torch.no_grad():
+        for layer in (generator.bias, generator.centroid):
+            layer.weight.zero_()
+            layer.bias.zero_()
+        generator.centroid.bias[0] = 2.0
+    vertices = generator(torch.zeros(1, 512))[0]
+    on_plane = vertices[generator.sphere[:, 0] == 0]
+    assert torch.allclose(on_plane[:, 0], 0.5 * torch.tanh(torch.tensor(0.2)))
+
+
+def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> None:
+    batch = make_batch([4, 7, 4, 7])
+    with torch.no_grad():
+        method.generator.bias.weight *= 100  # shapes that differ
+        vertices, faces = method.decode(method.encode(batch.images)).vertices, method.generator.faces
+        losses = []
+        for shapes, views in (([0, 1], [0, 1]), ([2, 3], [0, 1]), ([0, 1], [2, 3]), ([2, 3], [2, 3])):
+            cameras = nmr.LookAt.from_angles(2.732, 30.0, batch.poses.azimuth_deg[views], half_fov_deg=15.0)
+            silhouettes = nmr.render_silhouette(vertices[shapes], faces, cameras, image_size=64)
+            losses.append(float(nmr.losses.soft_iou_loss(silhouettes, batch.masks[views])))
+        smoothness = float(nmr.losses.smoothness_loss(vertices, method.generator.edges))
+    assert len({round(loss, 4) for loss in losses}) == 4
+    before = {name: [p.detach().clone() for p in n.parameters()] for name, n in method.networks.items()}
+    values = method.train_step(batch, 1)
+    assert values["projection"] == pytest.approx(sum(losses) / 4, abs=1e-6)
+    assert values["smoothness"] == pytest.approx(smoothness, rel=1e-5)
+    assert values["total"] == pytest.approx(values["projection"] + 0.001 * values["smoothness"])
+    for name, network in method.networks.items():
+        assert all((p != q).any() for p, q in zip(network.parameters(), before[name], strict=True)), name
+
+
+def test_step_size_decays_once_and_is_smaller_for_the_centroid(method: MultiView) -> None:
+    rates = {}
+    for step in (10, 11):
+        method.train_step(make_batch([0, 0]), step)
+        rates[step] = {name: optimizer.param_groups[0]["lr"] for name, optimizer in method.optimizers.items()}
+    assert rates[10] == pytest.approx({"encoder": 1e-4, "generator": 1e-4, "centroid": 1e-5})
+    assert rates[11] == pytest.approx({"encoder": 1e-5, "generator": 1e-5, "centroid": 1e-6})
+
+
+@pytest.mark.parametrize("objects", [[0, 1, 1, 0], [0, 1, 0]])
+def test_batches_must_be_pairs(objects: list[int]) -> None:
+    with pytest.raises(ValueError, match="is not made of such pairs; choose sampling 'pairs'"):
+        check_pairs(make_batch(objects))
+
+
+def slow_adam(weight: float, grads: list[float], rate: float, skip: bool) -> float:
+    first = second = 0.0
+    for t, grad in enumerate(grads, start=1):
+        if skip and grad == 0:
+            continue
+        first, second = 0.9 * first + 0.1 * grad, 0.999 * second + 0.001 * grad**2
+        corrected = rate * np.sqrt(1 - 0.999**t) / (1 - 0.9**t)
+        weight -= corrected * first / (np.sqrt(second) + 1e-8)
+    return weight
+
+
+def test_zero_gradients_leave_weights_and_moments_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("learn3d.methods.multi_view.CHUNK", 4)  # several pieces
+    rng = np.random.default_rng(0)
+    grads = rng.normal(size=(6, 5, 3)) * (rng.random((6, 5, 3)) < 0.6)
+    grads[:, 0] = 0
+    ours, theirs = (nn.Parameter(torch.ones(5, 3, dtype=torch.float64)) for _ in range(2))
+    sparse, plain = SparseGradientAdam([ours], lr=0.01), torch.optim.Adam([theirs], lr=0.01)
+    for grad in grads:
+        ours.grad, theirs.grad = torch.tensor(grad), torch.tensor(grad)
+        sparse.step()
+        plain.step()
+    for i, j in np.ndindex(5, 3):
+        assert ours[i, j].item() == pytest.approx(slow_adam(1.0, list(grads[:, i, j]), 0.01, skip=True), abs=1e-9)
+        assert theirs[i, j].item() == pytest.approx(slow_adam(1.0, list(grads[:, i, j]), 0.01, skip=False), abs=1e-7)
+    assert (ours[0] == 1).all()
+    assert (ours - theirs).abs().max() > 1e-3  # it matters
+    assert (sparse.state[ours]["exp_avg_sq"][0] == 0).all()
+
+
+def test_optimizer_goes_on_from_a_saved_state() -> None:
+    straight = nn.Parameter(torch.ones(4, 2))
+    optimizer = SparseGradientAdam([straight], lr=0.01)
+    straight.grad = torch.arange(8.0).reshape(4, 2)
+    optimizer.step()
+    resumed = nn.Parameter(straight.detach().clone())
+    other = SparseGradientAdam([resumed], lr=0.01)
+    other.load_state_dict(copy.deepcopy(optimizer.state_dict()))
+    for parameter, stepping in ((straight, optimizer), (resumed, other)):
+        parameter.grad = -torch.ones(4, 2)
+        stepping.step()
+    assert torch.equal(straight, resumed)
+
+
+def test_preset_is_the_published_schedule() -> None:
+    preset = PRESETS["kato2018-kato"]
+    assert method_name(preset.settings) == "multi_view"
+    assert preset.sampling == "pairs"
+    assert preset.settings.decay_at_step == 0.95 * preset.iterations
+    assert method_name(PRESETS["gadelha2017-kato"].settings) == "prgan"
+    assert PRESETS["gadelha2017-kato"].settings.encoder_from_step == PRESETS["gadelha2017-kato"].iterations // 2 + 1

@@ -1,0 +1,258 @@
+"""PrGAN: networks, what each of its steps moves, the switch to the encoder, and where its voxels lie."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import nmr
+from learn3d.data.batch import Batch
+from learn3d.data.conventions import KATO
+from learn3d.data.poses import LookAtPoses, RotationPoses
+from learn3d.methods.method import DataShape
+from learn3d.methods.prgan import PrGAN, PrGANSettings, statistics_loss
+from learn3d.networks.voxel_gan import SHAPE_CODE, TAU, InverseEncoder, SilhouetteDiscriminator, VoxelGenerator
+
+VIEWS = 4
+SMALL = {"generator_channels": (4, 4, 2, 1), "discriminator_channels": (4, 4, 4, 8)}
+
+
+def small_prgan(**settings: object) -> PrGAN:
+    torch.manual_seed(0)
+    return PrGAN(PrGANSettings(**SMALL | settings), DataShape(VIEWS), "cpu", "fp32")
+
+
+def make_batch(count: int = 3, poses: LookAtPoses | RotationPoses | None = None) -> Batch:
+    views = torch.arange(count) % VIEWS
+    masks = torch.zeros(count, 64, 64)
+    for i in range(count):
+        masks[i, 20 + 3 * i : 44, 16:48] = 1
+    if poses is None:
+        poses = LookAtPoses(-360.0 / VIEWS * views, 30.0, 2.732, 15.0)
+    images = torch.zeros(count, 4, 64, 64, dtype=torch.uint8)
+    images[:, 3] = (255 * masks).to(torch.uint8)
+    return Batch(images, masks, poses, views, torch.arange(count), torch.zeros(count, dtype=torch.int64), None)
+
+
+def weights(method: PrGAN) -> dict[str, list[Tensor]]:
+    return {name: [p.detach().clone() for p in network.parameters()] for name, network in method.networks.items()}
+
+
+def changed(method: PrGAN, before: dict[str, list[Tensor]]) -> set[str]:
+    after = weights(method)
+    return {n for n in before if any(not torch.equal(a, b) for a, b in zip(before[n], after[n], strict=True))}
+
+
+def test_networks_are_the_published_ones() -> None:
+    generator, discriminator = VoxelGenerator(), SilhouetteDiscriminator()
+    up = [m for m in generator.modules() if isinstance(m, nn.ConvTranspose3d)]
+    down = [m for m in discriminator.modules() if isinstance(m, nn.Conv2d)]
+    assert [(m.in_channels, m.out_channels, m.kernel_size[0], m.stride[0]) for m in up] == [
+        (128, 64, 4, 2),
+        (64, 32, 4, 2),
+        (32, 1, 4, 2),
+        (1, 1, 4, 2),
+    ]
+    assert [(m.in_channels, m.out_channels, m.kernel_size[0], m.stride[0]) for m in down] == [
+        (1, 128, 5, 2),
+        (128, 256, 5, 2),
+        (256, 512, 5, 2),
+        (512, 1024, 5, 2),
+    ]
+    norms = [
+        m for n in (generator, discriminator) for m in n.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)
+    ]
+    assert len(norms) == 8
+    assert all(m.momentum == 0.1 for m in norms)
+    linear = [m for n in (generator, discriminator, InverseEncoder()) for m in n.modules() if isinstance(m, nn.Linear)]
+    sizes = [(200, 8192), (16384, 1), (4096, 512), (512, 512), (512, 201)]
+    assert [(m.in_features, m.out_features) for m in linear] == sizes
+    assert all(abs(float(m.weight.detach().std()) - 0.1) < 0.01 for m in linear)
+
+
+def test_generator_fills_the_volume_within_its_bounds() -> None:
+    density = VoxelGenerator((4, 4, 2, 1))(torch.rand(2, SHAPE_CODE))
+    assert density.shape == (2, 64, 64, 64)
+    assert density.min() >= 0
+    assert density.max() <= 1 / TAU
+    assert SilhouetteDiscriminator((4, 4, 4, 8))(torch.rand(2, 64, 64)).shape == (2,)
+
+
+def test_encoder_divides_by_the_size_of_z() -> None:
+    encoder, images = InverseEncoder(), torch.rand(2, 64, 64)
+    assert torch.allclose(encoder(images) * 201, encoder.layers(images.flatten(1)))
+
+
+def test_every_view_is_drawn_from_an_equal_share_of_v() -> None:
+    method = small_prgan()
+    z = torch.zeros(800, SHAPE_CODE + 1)
+    z[:, -1] = torch.linspace(-1, 1, 801)[:-1]
+    ids = method.view_ids(z)
+    assert torch.equal(ids, ((z[:, -1] + 1) * VIEWS / 2).floor().long())
+    assert ids.bincount().tolist() == [200] * VIEWS
+    assert int(method.view_ids(torch.ones(1, SHAPE_CODE + 1))) == VIEWS - 1
+
+
+@pytest.mark.parametrize(
+    ("name", "network", "step"),
+    [
+        ("generator", "generator", 1),
+        ("generator_statistics", "generator", 1),
+        ("discriminator", "discriminator", 1),
+        ("encoder", "encoder", 2),
+    ],
+)
+def test_each_step_changes_its_network_only(
+    monkeypatch: pytest.MonkeyPatch, name: str, network: str, step: int
+) -> None:
+    method = small_prgan(encoder_from_step=2)
+    for other, optimizer in method.optimizers.items():
+        if other != name:
+            monkeypatch.setattr(optimizer, "step", lambda: None)
+    before = weights(method)
+    losses = method.train_step(make_batch(), step)
+    assert name in losses
+    assert changed(method, before) == {network}
+
+
+def test_discriminator_rests_while_it_is_too_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    method = small_prgan()
+    for accuracy, rests in ((0.81, True), (0.8, False)):
+        monkeypatch.setattr(method, "accuracy", lambda real, z, value=accuracy: value)
+        before = weights(method)
+        losses = method.train_step(make_batch(), 1)
+        assert ("discriminator" in losses) is not rests
+        assert changed(method, before) == ({"generator"} if rests else {"generator", "discriminator"})
+
+
+def test_accuracy_is_the_mean_probability_of_being_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    method, batch = small_prgan(), make_batch(4)
+    monkeypatch.setattr(method, "generate", lambda z: torch.zeros(len(z), 64, 64))
+    monkeypatch.setattr(method, "discriminator", lambda images: 4 * images.amax((1, 2)) - 1)  # 3 and -1
+    probability = torch.tensor([3.0, 1.0]).sigmoid().mean()
+    assert method.accuracy(batch.masks, method.sample_z(4)) == pytest.approx(float(probability))
+
+
+def test_statistics_are_means_and_variances_over_the_batch() -> None:
+    real, fake = torch.tensor([[0.0, 1.0], [2.0, 1.0]]), torch.tensor([[0.0, 0.0], [0.0, 4.0]])
+    assert float(statistics_loss(real, fake)) == (1 - 0) ** 2 + (1 - 2) ** 2 + (1 - 0) ** 2 + (0 - 4) ** 2
+
+
+def test_encoder_learns_to_invert_a_fixed_generator(monkeypatch: pytest.MonkeyPatch) -> None:
+    def bars(z: Tensor) -> Tensor:  # the last eight entries of z as the grey of eight bars
+        return ((z[:, -8:] + 1) / 2).repeat_interleave(8, 1)[:, :, None].expand(-1, 64, 64)
+
+    method = small_prgan(encoder_from_step=1, encoder_learning_rate=1e-3)
+    monkeypatch.setattr(method, "generate", bars)
+    batch = make_batch(32)
+    for step in range(1, 41):
+        losses = method.train_step(batch, step)
+    assert set(losses) == {"encoder", "total"}
+    z = method.sample_z(64)
+    with torch.no_grad():
+        error = (method.encoder(bars(z)) - z).square().mean(0)
+    assert error[-8:].mean() < 0.4 / 3  # chance is the variance of U(-1, 1), 1 / 3
+    assert error[:-8].mean() > 0.9 / 3  # nothing tells these
+
+
+def test_encoder_phase_leaves_generator_and_its_averages_alone() -> None:
+    method = small_prgan(encoder_from_step=2)
+    method.train_step(make_batch(), 1)
+    before = copy.deepcopy(method.generator.state_dict())
+    method.train_step(make_batch(), 2)
+    assert all(torch.equal(before[key], value) for key, value in method.generator.state_dict().items())
+
+
+def test_codes_come_from_the_mask_alone() -> None:
+    method, images = small_prgan(), make_batch().images
+    codes = method.encode(images)
+    assert codes.shape == (3, SHAPE_CODE)
+    colourful = images.clone()
+    colourful[:, :3] = 200
+    assert torch.equal(method.encode(colourful), codes)
+    assert not torch.equal(codes[0], codes[1])
+
+
+def test_voxels_lie_where_the_data_sets_voxels_do() -> None:
+    vertices, faces = nmr.icosphere(3)
+    vertices = vertices * torch.tensor([0.15, 0.2, 0.1]) + torch.tensor([0.3, 0.1, -0.25])
+    truth = KATO.voxelize(vertices, faces)
+    method = small_prgan()
+
+    class Fixed(nn.Module):
+        def forward(self, codes: Tensor) -> Tensor:
+            return nmr.voxelize(vertices + 0.5, faces, size=64).float().expand(len(codes), -1, -1, -1) / TAU
+
+    method.generator = Fixed()
+    grids = method.decode(torch.zeros(1, SHAPE_CODE))
+    assert grids.occupancy.max() == 1
+    assert grids.threshold == 0.5
+    occupied = grids.occupied(32)
+    assert float(nmr.metrics.voxel_iou(KATO.to_axes(occupied), truth)) > 0.7
+    assert float(nmr.metrics.voxel_iou(occupied, truth)) < 0.1
+
+
+def test_training_goes_on_from_weights_averages_optimizers_and_random_state() -> None:
+    straight = small_prgan(encoder_from_step=4)
+    for step in (1, 2):
+        straight.train_step(make_batch(), step)
+    state = copy.deepcopy([part.state_dict() for part in (*straight.networks.values(), *straight.optimizers.values())])
+    random = torch.get_rng_state()
+    wanted = [straight.train_step(make_batch(), step) for step in (3, 4, 5)]
+
+    resumed = small_prgan(encoder_from_step=4)
+    for part, saved in zip((*resumed.networks.values(), *resumed.optimizers.values()), state, strict=True):
+        part.load_state_dict(saved)
+    resumed.set_training(True)
+    torch.set_rng_state(random)
+    assert [resumed.train_step(make_batch(), step) for step in (3, 4, 5)] == wanted
+    assert all(
+        torch.equal(a, b)
+        for name in straight.networks
+        for a, b in zip(weights(straight)[name], weights(resumed)[name], strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [
+        (RotationPoses(torch.eye(3).expand(3, 3, 3)), r"view k at azimuth -90 k .*this data set gives rotations"),
+        (LookAtPoses(torch.tensor([0.0, -90.0, -171.0]), 30.0, 2.732, 15.0), "a camera of view 2 has azimuth -171"),
+        (LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), torch.tensor([30.0, 31.0, 30.0]), 2.732, 15.0), "elevation 31"),
+        (LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), 30.0, 2.0, 15.0), "has distance 2. Take data in Kato's layout"),
+        (LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), 30.0, 2.732, 25.0), "has half field of view 25"),
+    ],
+)
+def test_other_cameras_are_refused(poses: LookAtPoses | RotationPoses, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        small_prgan().train_step(make_batch(poses=poses), 1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"encoder_from_step": 0}, "encoder_from_step must be a step, from 1, got 0"),
+        ({"occupancy_threshold": 1.0}, "occupancy_threshold must lie between 0 and 1, got 1.0"),
+    ],
+)
+def test_settings_are_checked(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PrGANSettings(**settings)
+
+
+def test_widths_are_checked() -> None:
+    with pytest.raises(ValueError, match="generator_channels must be 4 positive numbers"):
+        VoxelGenerator((8, 4, 2))
+    with pytest.raises(ValueError, match="discriminator_channels must be 4 positive numbers"):
+        SilhouetteDiscriminator((8, 4, 0, 2))
+
+
+def test_a_loss_that_is_not_finite_stops_the_training() -> None:
+    method = small_prgan()
+    with torch.no_grad():
+        method.discriminator.last.bias.fill_(float("nan"))
+    with pytest.raises(FloatingPointError, match="at iteration 7"):
+        method.train_step(make_batch(), 7)

@@ -1,0 +1,144 @@
+"""The projection module of PrGAN: against its definition, and against the renderer's cameras."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+import nmr
+from learn3d.networks.projection import ViewCircle, project
+
+SIZE = 12
+TAU = 0.5
+
+
+def slow_projection(density: np.ndarray, view: int, views: ViewCircle) -> np.ndarray:
+    """One view, pixel by pixel: rays in the frame (right, up, away), trilinear samples, zero outside."""
+    size = len(density)
+    azimuth, elevation = math.radians(-360 / views.count * view), math.radians(views.elevation_deg)
+    away = -np.array(
+        [math.cos(elevation) * math.sin(azimuth), math.sin(elevation), -math.cos(elevation) * math.cos(azimuth)]
+    )
+    right = np.cross([0, 1, 0], away) / math.cos(elevation)
+    up = np.cross(away, right)
+    half = views.distance * math.tan(math.radians(views.half_fov_deg))
+    step = 2 * half / size
+    image = np.zeros((size, size))
+    for row, column in itertools.product(range(size), range(size)):
+        across = ((column + 0.5) / size * 2 - 1) * half * right + (1 - (row + 0.5) / size * 2) * half * up
+        start, direction = across, away
+        if views.perspective:
+            ray = across + views.distance * away
+            direction = ray / np.linalg.norm(ray)
+            start = views.distance * (direction - away)
+        samples = math.ceil(math.sqrt(3) / step)
+        total = 0.0
+        for k in range(samples):
+            position = (start + (k - (samples - 1) / 2) * step * direction + 0.5) * size - 0.5
+            low = np.floor(position).astype(int)
+            for corner in itertools.product((0, 1), repeat=3):
+                cell = low + corner
+                if (cell >= 0).all() and (cell < size).all():
+                    total += np.prod(1 - np.abs(position - cell)) * density[tuple(cell)]
+        image[row, column] = 1 - math.exp(-TAU * total * step * size)
+    return image
+
+
+@pytest.mark.parametrize(
+    ("view", "views"),
+    [
+        (1, ViewCircle()),
+        (17, ViewCircle()),
+        (2, ViewCircle(count=3, elevation_deg=-10)),
+        (8, ViewCircle(perspective=True)),
+    ],
+)
+def test_projection_is_its_definition(view: int, views: ViewCircle) -> None:
+    density = torch.rand(1, SIZE, SIZE, SIZE, generator=torch.Generator().manual_seed(0)) * 0.3
+    image = project(density, torch.tensor([view]), views, TAU)[0]
+    wanted = slow_projection(density[0].double().numpy(), view, views)
+    assert 0.1 < wanted.max() < 1
+    assert np.allclose(image, wanted, atol=2e-5)
+
+
+def test_projection_and_gradient_are_those_of_grid_sample() -> None:
+    views, ids = ViewCircle(), torch.tensor([23, 6, 0, 13, 6])
+    density = (0.3 * torch.rand(5, SIZE, SIZE, SIZE, generator=torch.Generator().manual_seed(1))).requires_grad_()
+    points = torch.stack([views.sample_points(-15.0 * k, SIZE) for k in ids.tolist()])
+    samples = F.grid_sample(density[:, None], 2 * points.flip(-1), align_corners=False)[:, 0]
+    wanted = 1 - torch.exp(-TAU * samples.sum(3) * 2 * views.half_width)
+    image = project(density, ids, views, TAU)
+    assert torch.allclose(image, wanted, atol=1e-5)
+    weights = torch.rand_like(image)
+    (ours,) = torch.autograd.grad((image * weights).sum(), density)
+    (theirs,) = torch.autograd.grad((wanted * weights).sum(), density)
+    assert theirs.abs().max() > 0.01
+    assert torch.allclose(ours, theirs, atol=1e-5)
+
+
+def test_thickness_is_measured_in_voxels() -> None:
+    density = torch.zeros(2, 24, 24, 24)
+    density[:, 6:18, 8:16, 7:17] = 0.1
+    views = ViewCircle()
+    image = project(density, torch.tensor([0, 3]), views, TAU)
+    thickness = -torch.log1p(-image.double()) / TAU  # times the area of a pixel, in voxels, it is what the box holds
+    assert thickness.sum((1, 2)) * (2 * views.half_width) ** 2 == pytest.approx(density.sum((1, 2, 3)), rel=0.03)
+
+
+BOXES = (  # low and high corners; no two views of the three together are alike, and no mirror image is
+    ((-0.5, -0.4, -0.3), (0.1, -0.1, 0.4)),
+    ((-0.5, -0.1, -0.3), (-0.2, 0.4, 0.0)),
+    ((0.1, -0.4, 0.1), (0.5, 0.1, 0.4)),
+)
+
+
+def mesh_of_boxes() -> tuple[torch.Tensor, torch.Tensor]:
+    corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
+    sides = torch.tensor([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    faces = torch.cat([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
+    vertices = [torch.where(corners == 0, torch.tensor(low), torch.tensor(high)) for low, high in BOXES]
+    return torch.cat(vertices), torch.cat([faces + 8 * i for i in range(len(BOXES))])
+
+
+def grid_of_boxes(size: int) -> torch.Tensor:
+    """Cells whose centres lie in a box, float32 [size, size, size], axes (x, y, z)."""
+    centres = (torch.cartesian_prod(*[torch.arange(size)] * 3) + 0.5) / size - 0.5
+    inside = [((centres >= torch.tensor(low)) & (centres <= torch.tensor(high))).all(1) for low, high in BOXES]
+    return torch.stack(inside).any(0).float().reshape(size, size, size)
+
+
+def iou(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    a, b = a > 0.5, b > 0.5
+    return (a & b).sum((1, 2)) / (a | b).sum((1, 2))
+
+
+@pytest.mark.parametrize(("perspective", "bound"), [(False, 0.75), (True, 0.95)])
+def test_views_are_those_of_katos_cameras(perspective: bool, bound: float) -> None:
+    vertices, faces = mesh_of_boxes()
+    ids = torch.tensor([1, 7, 13, 19, 20])
+    cameras = nmr.LookAt.from_angles(2.732, 30.0, -15.0 * ids, half_fov_deg=15.0)
+    masks = nmr.render_silhouette(vertices, faces, cameras, image_size=64)
+    views = ViewCircle(perspective=perspective)
+    density = grid_of_boxes(64).expand(5, -1, -1, -1) / TAU
+    image = project(density, ids, views, TAU)
+    assert iou(image, masks).min() > bound
+    assert iou(project(density, (24 - ids) % 24, views, TAU), masks).max() < 0.72  # azimuths of the other sign
+    assert iou(image.flip(1), masks).max() < 0.6
+    if not perspective:
+        eyes = nmr.cameras.points_from_angles(2.732, 30.0, -15.0 * ids)
+        parallel = nmr.render_silhouette(
+            vertices, faces, nmr.Orthographic(eyes, scale=1 / views.half_width), image_size=64
+        )
+        assert iou(image, parallel).min() > 0.95
+
+
+def test_shapes_are_checked() -> None:
+    with pytest.raises(ValueError, match=r"density must be \[B, S, S, S\] and view_ids \[B\], got \[2, 4, 4, 5\]"):
+        project(torch.zeros(2, 4, 4, 5), torch.zeros(2, dtype=torch.int64), ViewCircle(), TAU)
+    with pytest.raises(ValueError, match=r"and \[3\]"):
+        project(torch.zeros(2, 4, 4, 4), torch.zeros(3, dtype=torch.int64), ViewCircle(), TAU)
