@@ -20,8 +20,9 @@ def create_method(
 ) -> Method:
     """The method of `settings`, with PyTorch's default initialisation of its networks from `seed`."""
     from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
+    from learn3d.methods.vpl import VPL, VPLSettings
 
-    methods: dict[type, type[Method]] = {PoseInvariantSettings: PoseInvariant}
+    methods: dict[type, type[Method]] = {PoseInvariantSettings: PoseInvariant, VPLSettings: VPL}
     check_device(device)
     torch.manual_seed(seed)
     return methods[type(settings)](settings, shape, device, precision)
