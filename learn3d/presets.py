@@ -59,7 +59,7 @@ _KAR_VPL = VPLSettings(
 )
 #: The same authors on Pascal3D+, without its perceptual loss of colours.
 _PASCAL_VPL = VPLSettings(
-    encoder="resnet18",
+    encoder="preact-resnet18",
     image_size=224,
     generator="cube-fc",
     symmetric=True,

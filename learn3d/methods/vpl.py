@@ -128,6 +128,8 @@ class VPL(Method):
         settings = self.settings
         for optimizer in self.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
+        if settings.lambda_discriminator > 0:
+            others = other_views(batch, settings.other_views)
 
         with self.autocast():
             vertices = self.generator(self.encoder(self._encoder_input(batch.images)))
@@ -136,7 +138,6 @@ class VPL(Method):
         vertices = vertices.cpu()
         faces = self.generator.faces.cpu()
         if settings.lambda_discriminator > 0:  # both views of each shape in one call
-            others = other_views(batch, settings.other_views)
             views = batch.poses[torch.cat([torch.arange(len(batch)), others])]
             silhouettes, elsewhere = self._render(torch.cat([vertices, vertices]), faces, views).chunk(2)
         else:
@@ -181,14 +182,13 @@ class VPL(Method):
 
     def _render(self, vertices: Tensor, faces: Tensor, poses: Poses) -> Tensor:
         settings = self.settings
-        size, gradient = settings.silhouette_size, settings.renderer_gradient
         return nmr.render_silhouette(
             vertices,
             faces,
             poses.cameras(),
-            image_size=size,
+            image_size=settings.silhouette_size,
             anti_aliasing=settings.anti_aliasing,
-            **({} if gradient == "nmr" else {"gradient": gradient}),
+            gradient=settings.renderer_gradient,
         )
 
     def _projection_loss(self, silhouettes: Tensor, batch: Batch) -> Tensor:

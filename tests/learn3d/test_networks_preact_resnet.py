@@ -13,13 +13,12 @@ def test_layers_are_the_published_ones() -> None:
     network = PreactResNet18()
     stem = [(7, 2, 3, 64)]
     first = [(3, 1, 64, 64)] * 4
-    later = [
-        [(3, 2, a, 2 * a), (3, 1, 2 * a, 2 * a), (1, 2, a, 2 * a), (3, 1, 2 * a, 2 * a), (3, 1, 2 * a, 2 * a)]
-        for a in (64, 128, 256)
-    ]
+    later = []
+    for a in (64, 128, 256):
+        later += [(3, 2, a, 2 * a), (1, 2, a, 2 * a)] + [(3, 1, 2 * a, 2 * a)] * 3
     convolutions = [m for m in network.modules() if isinstance(m, nn.Conv2d)]
     found = sorted((c.kernel_size[0], c.stride[0], c.in_channels, c.out_channels) for c in convolutions)
-    assert found == sorted(stem + first + sum(later, []))
+    assert found == sorted(stem + first + later)
     assert all(c.bias is None for c in convolutions)
     assert len([m for m in network.modules() if isinstance(m, nn.BatchNorm2d)]) == 17
     assert (network.code.in_features, network.code.out_features) == (512 * 7 * 7, 512)
