@@ -59,7 +59,7 @@ _KAR_VPL = VPLSettings(
 )
 #: The same authors on Pascal3D+, without its perceptual loss of colours.
 _PASCAL_VPL = VPLSettings(
-    encoder="preact-resnet18",
+    encoder="resnet18",
     image_size=224,
     generator="cube-fc",
     symmetric=True,
@@ -69,7 +69,7 @@ _PASCAL_VPL = VPLSettings(
     discriminator_channels=64,
     adversary="reversal",
     other_views="next",
-    silhouette_size=64,
+    silhouette_size=224,
     anti_aliasing=False,
     renderer_gradient="local",
     silhouette_loss="iou",
@@ -90,7 +90,7 @@ def _vpl_on_kar(label: str, iterations: int, detail: str, **changes: float | boo
 def _vpl_on_pascal(label: str, iterations: int, detail: str, **changes: float) -> Preset:
     settings = replace(_PASCAL_VPL, **changes)
     source = f"{_VPL_CODE}: train_pascal.sh, {detail}, without lambda_perceptual"
-    return Preset(label, settings, "pascal3d", iterations, 16, source, "classes", ("flip-image",))
+    return Preset(label, settings, "pascal3d", iterations, 16, source, "classes", ("crop", "flip-image"))
 
 
 _VPL_PRESETS: dict[str, Preset] = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -23,6 +24,7 @@ from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.method import DataShape, Meshes, Method, adam, check_finite, frozen
 from learn3d.networks import ENCODERS, GENERATORS, network_input
 from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
+from learn3d.networks.flat_resnet import FlatResNet18
 from learn3d.networks.gradient_reversal import reverse_gradient
 from learn3d.networks.preact_resnet import PreactResNet18, grey_background
 from learn3d.networks.view_discriminators import (
@@ -41,8 +43,12 @@ class VPLSettings:
     The defaults are the re-implementation that Peng et al. 2020 compared with on Kato's data.
     """
 
-    encoder: Literal["conv", "preact-resnet18"] = "conv"
-    """conv: three convolutions, 64-pixel RGB and mask. preact-resnet18: RGB on grey, any multiple of 32 pixels."""
+    encoder: Literal["conv", "preact-resnet18", "resnet18"] = "conv"
+    """conv: three convolutions, 64-pixel RGB and mask. preact-resnet18: RGB on grey. resnet18: RGB, may be pretrained.
+    The last two take any multiple of 32 pixels."""
+    pretrained: Path | None = None
+    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's; its batch norms
+    stay frozen then. None: random weights."""
     image_size: int = 64
     """Side of the input images in pixels."""
     generator: Literal["sphere", "cube-conv", "cube-fc"] = "sphere"
@@ -84,6 +90,10 @@ class VPLSettings:
     """Weight of the internal pressure."""
     lambda_discriminator: float = 1.0
     """lambda_D: weight of the adversarial loss on the shapes; the discriminator itself always learns with weight 1."""
+
+    def __post_init__(self) -> None:
+        if self.pretrained is not None:
+            object.__setattr__(self, "pretrained", Path(self.pretrained))
 
 
 class VPL(Method):
@@ -245,6 +255,8 @@ def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> 
 def _create_encoder(settings: VPLSettings) -> nn.Module:
     if settings.encoder == "preact-resnet18":
         return PreactResNet18(settings.image_size)
+    if settings.encoder == "resnet18":
+        return FlatResNet18(settings.image_size, settings.pretrained)
     encoder = ENCODERS[settings.encoder]()
     if settings.image_size != encoder.image_size:
         raise ValueError(
@@ -283,6 +295,8 @@ def _check(settings: VPLSettings, shape: DataShape) -> None:
             f"silhouette_size must be {MASK_SIZE}, the size of the data's masks, or image_size "
             f"({settings.image_size}), got {settings.silhouette_size}"
         )
+    if settings.pretrained is not None and settings.encoder != "resnet18":
+        raise ValueError(f"pretrained weights are for the encoder 'resnet18', got encoder {settings.encoder!r}")
     if settings.symmetric and settings.generator == "sphere":
         raise ValueError("symmetric needs a cube generator (cube-conv or cube-fc), got generator 'sphere'")
     if settings.class_conditional and settings.discriminator != "spectral-patch":

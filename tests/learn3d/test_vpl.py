@@ -32,7 +32,6 @@ SMALL = {
     "image_size": 32,
     "silhouette_size": 64,
     "discriminator_channels": 8,
-    "renderer_gradient": "nmr",
     "learning_rate": 2e-3,
 }
 SHAPENET = replace(PRESETS["kato2019-kar"].settings, **SMALL)
@@ -112,7 +111,8 @@ def test_a_few_steps_lower_the_projection_loss(form: str) -> None:
     rotations = form == "pascal"
     method = create(settings, pose_features=9 if rotations else 3)
     batch = make_batch(settings.image_size, rotations=rotations)
-    losses = [method.train_step(batch, step)["projection"] for step in range(1, 15)]
+    steps = 20 if form == "reimplemented" else 14
+    losses = [method.train_step(batch, step)["projection"] for step in range(1, steps + 1)]
     assert losses[-1] < 0.8 * losses[0], losses
     method.set_training(False)
     codes = method.encode(batch.images)
@@ -292,6 +292,7 @@ def test_presets_of_vpl() -> None:
     [
         (VPLSettings(image_size=224), {}, "encoder 'conv' takes images of 64 pixels, got image_size 224"),
         (VPLSettings(silhouette_size=128), {}, r"silhouette_size must be 64, .* or image_size \(64\), got 128"),
+        (VPLSettings(pretrained="weights.pth"), {}, "weights are for the encoder 'resnet18', got encoder 'conv'"),
         (VPLSettings(symmetric=True), {}, "symmetric needs a cube generator"),
         (
             VPLSettings(class_conditional=True),
