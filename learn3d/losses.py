@@ -1,4 +1,4 @@
-"""Losses on shape codes and pose logits, and the MMD between sets of codes. (Projection, smoothness: nmr.losses.)
+"""Losses on shape codes, pose logits and silhouettes, the MMD between sets of codes. (IoU, smoothness: nmr.losses.)
 
 Everything is computed in float32, whatever precision the networks ran in.
 """
@@ -48,6 +48,30 @@ def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tens
     if form == "norm":
         return torch.linalg.vector_norm(codes, dim=1).mean()
     raise ValueError(f"form must be 'squared' or 'norm', got {form!r}")
+
+
+def silhouette_pyramid_loss(prediction: Tensor, target: Tensor, levels: int = 5) -> Tensor:
+    """Distance of silhouettes at several resolutions (published code of Kato and Harada 2019).
+
+    sum over levels l of the batch mean of |p_l / |p_l| - t_l / |t_l||^2, with p_0 = prediction and p_(l+1) = p_l halved
+    by the mean of 2x2 pixels. An empty silhouette has p / |p| = 0. prediction, target float [B,S,S], S >= 2^(levels-1);
+    differentiable in both.
+    """
+    if prediction.ndim != 3 or prediction.shape != target.shape or len(prediction) == 0:
+        raise ValueError(
+            "prediction and target must be [B, S, S] of one shape with B >= 1, "
+            f"got {list(prediction.shape)} and {list(target.shape)}"
+        )
+    if min(prediction.shape[1:]) < 2 ** (levels - 1):
+        raise ValueError(f"{levels} levels need at least {2 ** (levels - 1)} pixels, got {list(prediction.shape[1:])}")
+    pair = torch.stack([prediction.float(), target.float()])
+    total = pair.new_zeros(())
+    for level in range(levels):
+        if level > 0:
+            pair = F.avg_pool2d(pair, 2)
+        p, t = F.normalize(pair.flatten(2), dim=2)
+        total = total + (p - t).square().sum(1).mean()
+    return total
 
 
 def mmd(

@@ -22,10 +22,12 @@ def create_method(
     from learn3d.methods.multi_view import MultiView, MultiViewSettings
     from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
     from learn3d.methods.prgan import PrGAN, PrGANSettings
+    from learn3d.methods.vpl import VPL, VPLSettings
 
     methods: dict[type, type[Method]] = {
         PoseInvariantSettings: PoseInvariant,
         MultiViewSettings: MultiView,
+        VPLSettings: VPL,
         PrGANSettings: PrGAN,
     }
     check_device(device)

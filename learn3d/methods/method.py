@@ -100,9 +100,10 @@ def adam(network: nn.Module, learning_rate: float, betas: tuple[float, float] = 
 
 
 def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
-    """Apply a network so that gradients reach its inputs but not its parameters."""
-    parameters = {name: parameter.detach() for name, parameter in network.named_parameters()}
-    return torch.func.functional_call(network, parameters, inputs)
+    """Apply a network so that gradients reach its inputs but not its parameters, and its buffers stay as they are."""
+    state = {name: parameter.detach() for name, parameter in network.named_parameters()}
+    state |= {name: buffer.clone() for name, buffer in network.named_buffers()}
+    return torch.func.functional_call(network, state, inputs)
 
 
 def check_finite(losses: dict[str, float], step: int) -> None:

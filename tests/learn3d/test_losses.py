@@ -8,7 +8,13 @@ import pytest
 import torch
 from vectors import load_vector
 
-from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, mmd, pose_classification_loss
+from learn3d.losses import (
+    domain_confusion_loss,
+    gaussian_prior_loss,
+    mmd,
+    pose_classification_loss,
+    silhouette_pyramid_loss,
+)
 from learn3d.networks import PoseDiscriminator
 
 
@@ -138,3 +144,55 @@ def test_unknown_form(call) -> None:
 def test_mmd_refuses_unequal_sets() -> None:
     with pytest.raises(ValueError, match=r"must be \[N, C\] of one shape"):
         mmd(torch.zeros(2, 3), torch.zeros(4, 3))
+
+
+def test_silhouette_pyramid_equals_its_sum() -> None:
+    torch.manual_seed(0)
+    prediction, target = torch.rand(3, 48, 48), (torch.rand(3, 48, 48) > 0.6).float()
+    expected = 0.0
+    for p, t in zip(prediction.tolist(), target.tolist(), strict=True):
+        for _ in range(5):
+            norms = [sum(v * v for row in image for v in row) ** 0.5 for image in (p, t)]
+            pixels = zip(itertools.chain(*p), itertools.chain(*t), strict=True)
+            expected += sum((a / norms[0] - b / norms[1]) ** 2 for a, b in pixels) / 3
+            p, t = (
+                [
+                    [
+                        (
+                            image[2 * y][2 * x]
+                            + image[2 * y][2 * x + 1]
+                            + image[2 * y + 1][2 * x]
+                            + image[2 * y + 1][2 * x + 1]
+                        )
+                        / 4
+                        for x in range(len(image) // 2)
+                    ]
+                    for y in range(len(image) // 2)
+                ]
+                for image in (p, t)
+            )
+    assert float(silhouette_pyramid_loss(prediction, target)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_silhouette_pyramid_of_equal_and_of_empty_images() -> None:
+    disc = ((torch.arange(64) - 32)[:, None] ** 2 + (torch.arange(64) - 32) ** 2 < 300).float()[None]
+    empty = torch.zeros(1, 64, 64, requires_grad=True)
+    assert float(silhouette_pyramid_loss(disc, disc)) == 0
+    assert float(silhouette_pyramid_loss(disc / 2, disc)) == pytest.approx(0, abs=1e-10)  # of the shape, not the grey
+    loss = silhouette_pyramid_loss(empty, disc)
+    assert loss.item() == pytest.approx(5)
+    loss.backward()
+    assert torch.isfinite(empty.grad).all()
+
+
+@pytest.mark.parametrize(
+    ("prediction", "target", "message"),
+    [
+        (torch.rand(2, 16, 16), torch.rand(2, 32, 32), r"must be \[B, S, S\] of one shape"),
+        (torch.rand(0, 16, 16), torch.rand(0, 16, 16), "with B >= 1"),
+        (torch.rand(1, 8, 8), torch.rand(1, 8, 8), "5 levels need at least 16 pixels"),
+    ],
+)
+def test_silhouette_pyramid_refuses(prediction, target, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        silhouette_pyramid_loss(prediction, target)

@@ -1,0 +1,305 @@
+"""View prior learning (VPL; Kato and Harada 2019), as re-implemented by Peng et al. 2020 and as published.
+
+A discriminator learns to tell silhouettes of predicted shapes at the view of the input image ("real") from silhouettes
+at other views ("fake"); the shapes learn to make the two alike. docs/methods/vpl.md has the equations.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+import nmr
+from learn3d.data.batch import Batch
+from learn3d.data.poses import Poses
+from learn3d.data.views import MASK_SIZE
+from learn3d.losses import silhouette_pyramid_loss
+from learn3d.methods.method import DataShape, Meshes, Method, adam, check_finite, frozen
+from learn3d.networks import ENCODERS, GENERATORS, network_input
+from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
+from learn3d.networks.flat_resnet import FlatResNet18
+from learn3d.networks.gradient_reversal import reverse_gradient
+from learn3d.networks.preact_resnet import PreactResNet18, grey_background
+from learn3d.networks.view_discriminators import (
+    OneHotViewDiscriminator,
+    PatchDiscriminator,
+    SpectralPatchDiscriminator,
+)
+
+MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object where alpha is at least this
+
+
+@dataclass(frozen=True)
+class VPLSettings:
+    """Networks, losses and their weights; a weight of 0 means that the term is not computed.
+
+    The defaults are the re-implementation that Peng et al. 2020 compared with on Kato's data.
+    """
+
+    encoder: Literal["conv", "preact-resnet18", "resnet18"] = "conv"
+    """conv: three convolutions, 64-pixel RGB and mask. preact-resnet18: RGB on grey. resnet18: RGB, may be pretrained.
+    The last two take any multiple of 32 pixels."""
+    pretrained: Path | None = None
+    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's; its batch norms
+    stay frozen then. None: random weights."""
+    image_size: int = 64
+    """Side of the input images in pixels."""
+    generator: Literal["sphere", "cube-conv", "cube-fc"] = "sphere"
+    """sphere: 642 free vertices. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or not."""
+    symmetric: bool = False
+    """Cube generators only: mirror the shape at z = 0."""
+    vertex_scale: float = 0.01
+    """Cube generators only: s, the factor of the last layer's output."""
+    object_scale: float = 0.5
+    """Cube generators only: factor of the vertices; they start on a sphere of half this radius."""
+    discriminator: Literal["dcgan", "spectral-patch", "patch"] = "dcgan"
+    """dcgan: one-hot view planes. spectral-patch, patch: features of the camera's pose (ShapeNet, Pascal3D+)."""
+    discriminator_channels: int = 128
+    """Channels of the discriminator's first layer; the others follow (published: dcgan 128, spectral-patch 32, patch
+    64). A narrower one costs its square less."""
+    class_conditional: bool = False
+    """Tell the discriminator the object's category (spectral-patch and data of several categories only)."""
+    adversary: Literal["alternating", "reversal"] = "alternating"
+    """alternating: odd steps train the discriminator, even ones the shapes against it. reversal: both in one step
+    through a gradient reversal layer (as published)."""
+    other_views: Literal["random", "reversed", "next"] = "random"
+    """The other view of each sample is that of: a random sample of the batch with another view class; the sample at the
+    same place from the batch's end (published, ShapeNet); the next sample of its category (published, Pascal3D+)."""
+    silhouette_size: int = 64
+    """Side of rendered silhouettes: 64, compared with the data's masks, or image_size, with the input's own mask."""
+    anti_aliasing: bool = True
+    """Render silhouettes with 2x2 samples a pixel."""
+    renderer_gradient: Literal["nmr", "local"] = "nmr"
+    """Gradient of the renderer: Kato et al. 2018's, or the local one of Kato and Harada 2019."""
+    silhouette_loss: Literal["iou", "pyramid"] = "iou"
+    """iou: 1 - soft IoU. pyramid: squared distance of normalised images at five resolutions."""
+    learning_rate: float = 1e-4
+    """Adam's step size, the same for the three networks and constant."""
+    adam_beta1: float = 0.9
+    """Adam's decay of the mean gradient (of its square: 0.999)."""
+    lambda_smooth: float = 0.001
+    """Weight of the smoothness loss."""
+    lambda_inflation: float = 0.0
+    """Weight of the internal pressure."""
+    lambda_discriminator: float = 1.0
+    """lambda_D: weight of the adversarial loss on the shapes; the discriminator itself always learns with weight 1."""
+
+    def __post_init__(self) -> None:
+        if self.pretrained is not None:
+            object.__setattr__(self, "pretrained", Path(self.pretrained))
+
+
+class VPL(Method):
+    """Encoder, mesh generator and, unless it is the baseline, a discriminator of silhouettes and their views."""
+
+    def __init__(
+        self, settings: VPLSettings, shape: DataShape, device: str, precision: Literal["bf16", "fp32"]
+    ) -> None:
+        _check(settings, shape)
+        self.settings, self.device, self.precision = settings, torch.device(device), precision
+        self.image_size = settings.image_size
+        self.encoder = _create_encoder(settings)
+        self.generator = _create_generator(settings)
+        self.networks = {"encoder": self.encoder, "generator": self.generator}
+        if settings.lambda_discriminator > 0:
+            self.networks["discriminator"] = self.discriminator = _create_discriminator(settings, shape)
+        for network in self.networks.values():
+            network.to(device)
+        self.encoder.to(memory_format=torch.channels_last)
+        betas = (settings.adam_beta1, 0.999)
+        self.optimizers = {n: adam(network, settings.learning_rate, betas) for n, network in self.networks.items()}
+
+    def encode(self, images: Tensor) -> Tensor:
+        with self.autocast():
+            return self.encoder(self._encoder_input(images)).float()
+
+    def decode(self, codes: Tensor) -> Meshes:
+        with self.autocast():
+            return Meshes(self.generator(codes).cpu(), self.generator.faces.cpu())
+
+    def train_step(self, batch: Batch, step: int) -> dict[str, float]:
+        """Iterations count from 1. In every one encoder and generator descend projection + smoothness + inflation.
+
+        With a discriminator D each shape is also rendered at another view. Alternating: in odd iterations D descends
+        softplus(-D(input view)) + softplus(D(other view)) on silhouettes that are constants for it; in even ones
+        encoder and generator descend lambda_D softplus(-D(other view)), while D gets neither gradient nor step. (Its
+        batch norms then use the batch's statistics, too, and leave their running means alone.) Reversal: in every
+        iteration D descends that loss, and encoder and generator climb it with lambda_D times its gradient.
+
+        Raises ValueError where the batch is too small to have another view.
+        """
+        settings = self.settings
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad(set_to_none=True)
+        if settings.lambda_discriminator > 0:
+            others = other_views(batch, settings.other_views)
+
+        with self.autocast():
+            vertices = self.generator(self.encoder(self._encoder_input(batch.images)))
+
+        # Rendering runs on the CPU: the vertices move there, and their gradient comes back, explicitly.
+        vertices = vertices.cpu()
+        faces = self.generator.faces.cpu()
+        if settings.lambda_discriminator > 0:  # both views of each shape in one call
+            views = batch.poses[torch.cat([torch.arange(len(batch)), others])]
+            silhouettes, elsewhere = self._render(torch.cat([vertices, vertices]), faces, views).chunk(2)
+        else:
+            silhouettes = self._render(vertices, faces, batch.poses)
+
+        losses = {"projection": self._projection_loss(silhouettes, batch)}
+        total = losses["projection"]
+        if settings.lambda_smooth > 0:
+            losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.generator.edges.cpu())
+            total = total + settings.lambda_smooth * losses["smoothness"]
+        if settings.lambda_inflation > 0:
+            losses["inflation"] = nmr.losses.inflation_loss(vertices, faces)
+            total = total + settings.lambda_inflation * losses["inflation"]
+
+        if settings.lambda_discriminator > 0 and settings.adversary == "reversal":
+            reverse = settings.lambda_discriminator
+            real, fake = reverse_gradient(silhouettes, reverse), reverse_gradient(elsewhere, reverse)
+            losses["discrimination"] = self._discrimination_loss(real, fake, others, batch)
+            total = total + losses["discrimination"]
+        elif settings.lambda_discriminator > 0 and step % 2 == 1:
+            real, fake = silhouettes.detach(), elsewhere.detach()
+            losses["discrimination"] = self._discrimination_loss(real, fake, others, batch)
+            total = total + losses["discrimination"]
+        elif settings.lambda_discriminator > 0:
+            logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, batch)
+            losses["adversarial"] = F.softplus(-logits).mean()
+            total = total + settings.lambda_discriminator * losses["adversarial"]
+
+        losses["total"] = total
+        values = {name: float(loss.detach()) for name, loss in losses.items()}
+        check_finite(values, step)
+        total.backward()
+        self.optimizers["encoder"].step()
+        self.optimizers["generator"].step()
+        if "discrimination" in losses:
+            self.optimizers["discriminator"].step()
+        return values
+
+    def _encoder_input(self, images: Tensor) -> Tensor:
+        prepared = network_input(images, self.device, self.image_size)
+        return grey_background(prepared) if self.settings.encoder == "preact-resnet18" else prepared
+
+    def _render(self, vertices: Tensor, faces: Tensor, poses: Poses) -> Tensor:
+        settings = self.settings
+        return nmr.render_silhouette(
+            vertices,
+            faces,
+            poses.cameras(),
+            image_size=settings.silhouette_size,
+            anti_aliasing=settings.anti_aliasing,
+            gradient=settings.renderer_gradient,
+        )
+
+    def _projection_loss(self, silhouettes: Tensor, batch: Batch) -> Tensor:
+        masks = batch.masks
+        if self.settings.silhouette_size != MASK_SIZE:
+            masks = (batch.images[:, 3] >= MASK_THRESHOLD * 255).to(silhouettes)
+        if self.settings.silhouette_loss == "pyramid":
+            return silhouette_pyramid_loss(silhouettes, masks)
+        return nmr.losses.soft_iou_loss(silhouettes, masks)
+
+    def _discrimination_loss(self, real: Tensor, fake: Tensor, others: Tensor, batch: Batch) -> Tensor:
+        """Binary cross-entropy of logits x: softplus(-x) for the target 1, softplus(x) for 0; scalar on the CPU."""
+        real_logits = self._discriminate(self.discriminator, real, torch.arange(len(batch)), batch)
+        fake_logits = self._discriminate(self.discriminator, fake, others, batch)
+        return F.softplus(-real_logits).mean() + F.softplus(fake_logits).mean()
+
+    def _discriminate(self, network: Callable[..., Tensor], images: Tensor, views: Tensor, batch: Batch) -> Tensor:
+        """Logits, on the CPU, for silhouettes [B,S,S] of a batch's shapes, seen at the views of its samples `views`."""
+        images = images.to(self.device)
+        if self.settings.discriminator == "dcgan":
+            with self.autocast():
+                return network(images, batch.view_ids[views].to(self.device)).float().cpu()
+        # In float32: spectral normalisation mixes types otherwise.
+        conditions = [batch.poses[views].features().to(self.device)]
+        if self.settings.class_conditional:
+            conditions.append(batch.class_ids.to(self.device))
+        return network(images, *conditions).cpu()
+
+
+def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> Tensor:
+    """For each sample of a batch the sample whose view serves as its other one, int64 [B]; see VPLSettings.other_views.
+
+    "random" asks torch's global generator, and takes any sample where all have one view class. Over a data set in which
+    all views are equally frequent it draws uniformly from the other views, as the published code does.
+    "reversed" leaves the middle one of an odd batch its own view, "next" a sample alone in its category (as published).
+    Raises ValueError for a batch of one sample.
+    """
+    count = len(batch)
+    if count < 2:
+        raise ValueError(f"view prior learning needs another view for each image: batches of at least 2, got {count}")
+    if choice == "reversed":
+        return torch.arange(count).flip(0)
+    if choice == "next":
+        others = torch.arange(count)
+        for category in batch.class_ids.unique():
+            members = torch.nonzero(batch.class_ids == category).flatten()
+            others[members] = members.roll(-1)
+        return others
+    different = (batch.view_ids[:, None] != batch.view_ids).float()
+    weights = torch.where(different.any(1, keepdim=True), different, 1.0)
+    return torch.multinomial(weights, 1).squeeze(1)
+
+
+def _create_encoder(settings: VPLSettings) -> nn.Module:
+    if settings.encoder == "preact-resnet18":
+        return PreactResNet18(settings.image_size)
+    if settings.encoder == "resnet18":
+        return FlatResNet18(settings.image_size, settings.pretrained)
+    encoder = ENCODERS[settings.encoder]()
+    if settings.image_size != encoder.image_size:
+        raise ValueError(
+            f"encoder {settings.encoder!r} takes images of {encoder.image_size} pixels, got image_size "
+            f"{settings.image_size}"
+        )
+    return encoder
+
+
+def _create_generator(settings: VPLSettings) -> nn.Module:
+    if settings.generator == "sphere":
+        return GENERATORS["sphere"]()
+    kind = {"cube-conv": ConvCubeGenerator, "cube-fc": LinearCubeGenerator}[settings.generator]
+    return kind(settings.vertex_scale, settings.object_scale, settings.symmetric)
+
+
+def _create_discriminator(settings: VPLSettings, shape: DataShape) -> nn.Module:
+    channels = settings.discriminator_channels
+    if settings.discriminator == "dcgan":
+        if shape.num_views < 2:
+            raise ValueError(
+                f"discriminator 'dcgan' tells views by their class and needs at least 2, got {shape.num_views}"
+            )
+        return OneHotViewDiscriminator(shape.num_views, channels, settings.silhouette_size)
+    if settings.discriminator == "patch":
+        return PatchDiscriminator(shape.pose_features, channels)
+    return SpectralPatchDiscriminator(
+        shape.pose_features, channels, shape.num_classes if settings.class_conditional else None
+    )
+
+
+def _check(settings: VPLSettings, shape: DataShape) -> None:
+    """Raise a ValueError for settings that contradict each other or the data."""
+    if settings.silhouette_size not in (MASK_SIZE, settings.image_size):
+        raise ValueError(
+            f"silhouette_size must be {MASK_SIZE}, the size of the data's masks, or image_size "
+            f"({settings.image_size}), got {settings.silhouette_size}"
+        )
+    if settings.pretrained is not None and settings.encoder != "resnet18":
+        raise ValueError(f"pretrained weights are for the encoder 'resnet18', got encoder {settings.encoder!r}")
+    if settings.symmetric and settings.generator == "sphere":
+        raise ValueError("symmetric needs a cube generator (cube-conv or cube-fc), got generator 'sphere'")
+    if settings.class_conditional and settings.discriminator != "spectral-patch":
+        raise ValueError(f"class_conditional needs discriminator 'spectral-patch', got {settings.discriminator!r}")
+    if settings.class_conditional and shape.num_classes < 2:
+        raise ValueError("class_conditional needs data of several categories, got one")

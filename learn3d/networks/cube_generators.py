@@ -1,0 +1,151 @@
+"""Mesh generators of Kato and Harada 2019: shape codes -> vertices of a cube's surface, blown up to a sphere."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+import nmr
+from learn3d.networks.encoders import CODE_SIZE
+from learn3d.networks.initialization import initialize_he
+
+GRID_SIZE = 16  # vertices along an edge of the cube
+INITIAL_RADIUS = 0.5
+BOUND = 1.2  # coordinates lie between -BOUND and BOUND
+BATCH_NORM_EPS = 2e-5  # published code
+
+
+def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
+    """The surface of a grid of size^3 points: (points int64 [V,3], patches int64 [6,size,size], faces int64 [F,3]).
+
+    patches[f, i, j] is the vertex at (i, j) of side f of the cube; vertices at edges belong to two sides, at corners to
+    three. Faces are counter-clockwise seen from outside. size = 16 gives V = 1352 and F = 2700.
+    """
+    grid = torch.cartesian_prod(*[torch.arange(size)] * 3)
+    outside = ((grid == 0) | (grid == size - 1)).any(1)
+    points = grid[outside]
+    vertex = torch.full((size**3,), -1)
+    vertex[outside] = torch.arange(len(points))
+    vertex = vertex.view(size, size, size)
+    patches = torch.stack([vertex.select(axis, end) for axis in range(3) for end in (0, size - 1)])
+    faces = []
+    for side, patch in enumerate(patches):
+        a, b, c, d = patch[:-1, :-1], patch[1:, :-1], patch[1:, 1:], patch[:-1, 1:]
+        # (first axis) x (second axis) of the patch is the third axis for x and z and its opposite for y.
+        outwards = (side % 2 == 1) != (side // 2 == 1)
+        corners = (a, b, c, a, c, d) if outwards else (a, c, b, a, d, c)
+        faces.append(torch.stack(corners, dim=-1).view(-1, 3))
+    return points, patches, torch.cat(faces)
+
+
+class CubeGenerator(nn.Module):
+    """What both have in common: vertices = object_scale * 1.2 * tanh(base + scale * bias), float32 [B,1352,3].
+
+    `base`, learned, starts as the sphere of radius 0.5 (times object_scale); `bias` is what a subclass computes of the
+    codes. `symmetric` mirrors the shape at z = 0 as published: z becomes |z|, each vertex the mean of itself and its
+    mirror image, and z gets the sign back that the vertex has on the cube. (The vertices are then symmetric exactly;
+    the diagonals that divide the cube's squares into faces are not, as published.)
+
+    `faces` int64 [2700,3] and `edges` int64 [4050,4] (the table of `nmr.edge_table`) describe the fixed topology.
+    """
+
+    faces: Tensor
+    edges: Tensor
+    mirror: Tensor  # int64 [V]: the vertex on the other side of z = 0
+    signs: Tensor  # float32 [V,3]: (1, 1, -1) where z < 0 on the cube, else 1
+
+    def __init__(self, scale: float, object_scale: float, symmetric: bool) -> None:
+        super().__init__()
+        points, self.patches, faces = cube_surface()
+        self.scale, self.object_scale, self.symmetric = scale, object_scale, symmetric
+        centred = 2 * points.double() / (GRID_SIZE - 1) - 1
+        sphere = centred / centred.norm(dim=1, keepdim=True)
+        self.base = nn.Parameter(torch.atanh(INITIAL_RADIUS * sphere / BOUND).float())
+        mirrored = points * torch.tensor([1, 1, -1]) + torch.tensor([0, 0, GRID_SIZE - 1])
+        order = {tuple(point): number for number, point in enumerate(points.tolist())}
+        mirror = torch.tensor([order[tuple(point)] for point in mirrored.tolist()])
+        signs = torch.ones(len(points), 3)
+        signs[points[:, 2] < GRID_SIZE / 2, 2] = -1
+        for name, table in (("faces", faces), ("edges", nmr.edge_table(faces)), ("mirror", mirror), ("signs", signs)):
+            self.register_buffer(name, table, persistent=False)
+
+    def bias(self, codes: Tensor) -> Tensor:
+        """What the codes [B,512] add to the base, [B,V,3]."""
+        raise NotImplementedError
+
+    def forward(self, codes: Tensor) -> Tensor:
+        points = self.base + self.scale * self.bias(codes).float()
+        if self.symmetric:
+            points = torch.cat([points[..., :2], points[..., 2:].abs()], dim=-1)
+            points = (points + points[:, self.mirror]) / 2
+        vertices = self.object_scale * BOUND * torch.tanh(points)
+        return vertices * self.signs if self.symmetric else vertices
+
+
+class ConvCubeGenerator(CubeGenerator):
+    """One stack of transposed convolutions per side of the cube; where sides meet, the mean of theirs (ShapeNet).
+
+    Each: linear to 512@2x2, three 3x3 transposed convolutions of stride 2 to 256, 128, 64 channels, batch norm and ReLU
+    after each of the four; 3x3 convolution to 3@16x16.
+    """
+
+    positions: Tensor  # int64 [V,3]: places of a vertex among the 6 * 16 * 16 outputs (filled up with the first)
+    shares: Tensor  # float32 [V,3,1]: their weights: 1, 1/2 or 1/3, and 0 for the filling
+
+    def __init__(
+        self, scale: float = 0.01, object_scale: float = 0.5, symmetric: bool = False, channels: int = 512
+    ) -> None:
+        super().__init__(scale, object_scale, symmetric)
+        self.sides = nn.ModuleList(_side_decoder(channels) for _ in self.patches)
+        places: list[list[int]] = [[] for _ in self.base]
+        for place, vertex in enumerate(self.patches.flatten().tolist()):
+            places[vertex].append(place)
+        filled = [[*p, *[p[0]] * (3 - len(p))] for p in places]
+        shares = [[1 / len(p)] * len(p) + [0.0] * (3 - len(p)) for p in places]
+        self.register_buffer("positions", torch.tensor(filled), persistent=False)
+        self.register_buffer("shares", torch.tensor(shares)[:, :, None], persistent=False)
+
+    def bias(self, codes: Tensor) -> Tensor:
+        sides = torch.stack([side(codes) for side in self.sides], dim=1)  # [B,6,3,16,16]
+        outputs = sides.float().permute(0, 1, 3, 4, 2).flatten(1, 3)
+        # A gather: its sums have a fixed order on every device, those of a scatter have not.
+        return (outputs[:, self.positions] * self.shares).sum(2)
+
+
+def _side_decoder(channels: int) -> nn.Sequential:
+    layers: list[nn.Module] = [
+        nn.Linear(CODE_SIZE, 4 * channels, bias=False),
+        nn.Unflatten(1, (channels, 2, 2)),
+        nn.BatchNorm2d(channels, eps=BATCH_NORM_EPS),
+        nn.ReLU(),
+    ]
+    for _ in range(3):
+        layers += [
+            nn.ConvTranspose2d(channels, channels // 2, 3, stride=2, padding=1, output_padding=1, bias=False),
+            nn.BatchNorm2d(channels // 2, eps=BATCH_NORM_EPS),
+            nn.ReLU(),
+        ]
+        channels //= 2
+    decoder = nn.Sequential(*layers, nn.Conv2d(channels, 3, 3, padding=1))
+    initialize_he(decoder)
+    return decoder
+
+
+class LinearCubeGenerator(CubeGenerator):
+    """Linear layers 512-4096-4096-1352*3 with ReLU (Pascal3D+)."""
+
+    def __init__(
+        self, scale: float = 0.1, object_scale: float = 1.0, symmetric: bool = True, channels: int = 4096
+    ) -> None:
+        super().__init__(scale, object_scale, symmetric)
+        self.layers = nn.Sequential(
+            nn.Linear(CODE_SIZE, channels),
+            nn.ReLU(),
+            nn.Linear(channels, channels),
+            nn.ReLU(),
+            nn.Linear(channels, self.base.numel()),
+        )
+        initialize_he(self)
+
+    def bias(self, codes: Tensor) -> Tensor:
+        return self.layers(codes).unflatten(1, (-1, 3))

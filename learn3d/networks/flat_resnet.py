@@ -1,0 +1,47 @@
+"""ResNet-18 with a linear layer on all its features (Kato and Harada 2019, Pascal3D+)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from learn3d.networks.encoders import CODE_SIZE
+from learn3d.networks.resnet import ResNet18Encoder, load_pretrained
+
+
+class FlatResNet18(nn.Module):
+    """Images [B,4,S,S] in [0,1], the mask unused -> shape code [B,512], linear in the 512 * (S/32)^2 last features.
+
+    `pretrained`: file of ImageNet weights (torchvision's resnet18). With it the batch norms stay as they are in the
+    file, statistics, gain and offset, as published; the convolutions are trained. Without it everything is trained from
+    scratch: batch norms frozen at their initial values would normalise nothing.
+    """
+
+    def __init__(self, image_size: int = 224, pretrained: Path | None = None) -> None:
+        super().__init__()
+        if image_size < 32 or image_size % 32:
+            raise ValueError(f"image_size must be a multiple of 32 for FlatResNet18, got {image_size}")
+        self.image_size = image_size
+        self.resnet = ResNet18Encoder()
+        self.code = nn.Linear(512 * (image_size // 32) ** 2, CODE_SIZE)
+        self.frozen_norms: list[nn.BatchNorm2d] = []
+        if pretrained is not None:
+            load_pretrained(self.resnet, pretrained)
+            self.frozen_norms = [module for module in self.resnet.modules() if isinstance(module, nn.BatchNorm2d)]
+            for norm in self.frozen_norms:
+                norm.requires_grad_(False)
+            self.train()
+
+    def train(self, mode: bool = True) -> FlatResNet18:
+        super().train(mode)
+        for norm in self.frozen_norms:
+            norm.eval()
+        return self
+
+    def forward(self, images: Tensor) -> Tensor:
+        net = self.resnet
+        x = (images[:, :3] - net.mean) / net.std
+        x = F.max_pool2d(F.relu(net.bn1(net.conv1(x))), 3, 2, padding=1)
+        return self.code(net.layer4(net.layer3(net.layer2(net.layer1(x)))).flatten(1))
