@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal, get_args
 
-from learn3d.data import kato
+from learn3d.data import kato, pascal3d
 from learn3d.data.view_bins import AngleBins
 from learn3d.data.views import ViewDataset, concatenate
 
@@ -39,6 +39,11 @@ def load_dataset(
     names = [name.strip() for name in category.split(",")]
     if len(set(names)) != len(names) or not all(names):
         raise ValueError(f"category must be one name, or different names joined by commas, got {category!r}")
+    if layout == "pascal3d":
+        if views_per_object is not None:
+            raise ValueError("views_per_object cannot be chosen with the layout 'pascal3d': one view of every object")
+        dataset = concatenate([pascal3d.load(folder, name, split, image_size=image_size) for name in names])
+        return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
     if layout != "kato":
         raise NotImplementedError(f"the reader of the layout {layout!r} is not written yet")
     if image_size != kato.IMAGE_SIZE or views_per_object is not None:

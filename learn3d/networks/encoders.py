@@ -7,6 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from learn3d.networks.resnet import ResNet18Encoder
+
 CODE_SIZE = 512
 
 
@@ -37,8 +39,8 @@ class ConvEncoder(nn.Module):
         return self.layers(self.convolutions(images).flatten(1))
 
 
-EncoderName = Literal["conv"]
-ENCODERS: dict[str, type[nn.Module]] = {"conv": ConvEncoder}
+EncoderName = Literal["conv", "resnet18"]
+ENCODERS: dict[str, type[nn.Module]] = {"conv": ConvEncoder, "resnet18": ResNet18Encoder}
 
 
 def network_input(images: Tensor, device: torch.device | str, size: int = 64) -> Tensor:

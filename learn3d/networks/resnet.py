@@ -1,0 +1,102 @@
+"""ResNet-18 (He et al. 2016) as an image encoder, with the parameter names of torchvision's resnet18."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class _Block(nn.Module):
+    """Two 3x3 convolutions beside a shortcut: relu(f(x) + x), where x passes a 1x1 convolution if its size changes."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(outputs)
+        self.downsample = None
+        if stride != 1 or inputs != outputs:
+            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+
+    def forward(self, x: Tensor) -> Tensor:
+        shortcut = x if self.downsample is None else self.downsample(x)
+        x = F.relu(self.bn1(self.conv1(x)))
+        return F.relu(self.bn2(self.conv2(x)) + shortcut)
+
+
+class ResNet18Encoder(nn.Module):
+    """Images [B, 4, 224, 224] in [0, 1] -> shape codes [B, 512]: the average-pooled features, which are not negative.
+
+    The first three channels are normalised by ImageNet's mean and deviation; the mask is not looked at. As in the
+    published code of Peng et al. 2020 on Pascal3D+ the pooled features are the code, without a layer behind them.
+    """
+
+    image_size = 224
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
+        self.conv1 = nn.Conv2d(3, 64, 7, 2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.layer1 = nn.Sequential(_Block(64, 64, 1), _Block(64, 64, 1))
+        self.layer2 = nn.Sequential(_Block(64, 128, 2), _Block(128, 128, 1))
+        self.layer3 = nn.Sequential(_Block(128, 256, 2), _Block(256, 256, 1))
+        self.layer4 = nn.Sequential(_Block(256, 512, 2), _Block(512, 512, 1))
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):  # torchvision's initialisation
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, images: Tensor) -> Tensor:
+        x = (images[:, :3] - self.mean) / self.std
+        x = F.max_pool2d(F.relu(self.bn1(self.conv1(x))), 3, 2, padding=1)
+        x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
+        return x.mean(dim=(2, 3))
+
+
+def load_pretrained(encoder: nn.Module, path: Path | str) -> None:
+    """Copy weights of torchvision's resnet18 (.pth, .pt or .safetensors) into a `ResNet18Encoder`, in place.
+
+    The classification layer "fc" is left out. Nothing in the file is executed (weights_only).
+
+    Raises FileNotFoundError for a missing file, ValueError for an encoder of another kind, a file that cannot be read,
+    and weights of another network (naming the first that is missing, unknown or of another shape).
+    """
+    path = Path(path)
+    if not isinstance(encoder, ResNet18Encoder):
+        raise ValueError(f"pretrained weights are for the encoder resnet18, not for {type(encoder).__name__}")
+    given = {name: value for name, value in _read_weights(path).items() if not name.startswith("fc.")}
+    own = encoder.state_dict()
+    counters = {name for name in own if name.endswith("num_batches_tracked")}  # not in files of older versions
+    hint = "; it must be a state dict of torchvision's resnet18"
+    if missing := sorted(own.keys() - counters - given.keys()):
+        raise ValueError(f"{path} lacks {missing[0]!r} and {len(missing) - 1} more of {len(own)} entries{hint}")
+    if unknown := sorted(given.keys() - own.keys()):
+        raise ValueError(f"{path} has {unknown[0]!r} and {len(unknown) - 1} more entries that ResNet-18 has not{hint}")
+    for name, value in given.items():
+        if value.shape != own[name].shape:
+            raise ValueError(f"{path}: {name} is {list(value.shape)}, ResNet-18 has {list(own[name].shape)}{hint}")
+    encoder.load_state_dict(given, strict=False)
+
+
+def _read_weights(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file of pretrained weights {path}")
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(path)
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # the readers raise half a dozen kinds for a damaged or a hostile file
+        raise ValueError(f"cannot read pretrained weights from {path}: {error}") from error
+    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+        raise ValueError(f"{path} must hold a state dict (names -> tensors), got {type(weights).__name__}")
+    return weights
