@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal, get_args
 
-from learn3d.data import kato, pascal3d
+from learn3d.data import kato, pascal3d, photos
 from learn3d.data.view_bins import AngleBins
 from learn3d.data.views import ViewDataset, concatenate
 
@@ -39,10 +39,14 @@ def load_dataset(
     names = [name.strip() for name in category.split(",")]
     if len(set(names)) != len(names) or not all(names):
         raise ValueError(f"category must be one name, or different names joined by commas, got {category!r}")
-    if layout == "pascal3d":
+    if layout in ("pascal3d", "photos"):
         if views_per_object is not None:
-            raise ValueError("views_per_object cannot be chosen with the layout 'pascal3d': one view of every object")
-        dataset = concatenate([pascal3d.load(folder, name, split, image_size=image_size) for name in names])
+            raise ValueError(f"views_per_object cannot be chosen with the layout {layout!r}: it uses all there are")
+        if layout == "pascal3d":
+            parts = [pascal3d.load(folder, name, split, image_size=image_size) for name in names]
+        else:
+            parts = [photos.load(folder, name, split, image_size=image_size, progress=progress) for name in names]
+        dataset = concatenate(parts)
         return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
     if layout != "kato":
         raise NotImplementedError(f"the reader of the layout {layout!r} is not written yet")

@@ -18,6 +18,9 @@ from learn3d.data.augment import augment
 from learn3d.data.crops import Crops, join
 from learn3d.data.layouts import load_dataset
 from learn3d.data.views import concatenate
+from learn3d.methods.method import DataShape
+from learn3d.methods.pose_invariant import PoseInvariant
+from learn3d.presets import PRESETS
 
 
 def rotation(*angles_deg: float) -> np.ndarray:
@@ -310,3 +313,37 @@ def test_the_scan_reports_everything(folder: Path, contents: dict[str, dict]) ->
     for part in ("there is no", "not an npz", "images_ref[1] has an empty mask", "voxels[2] is empty", "orthonormal"):
         assert part in texts
     assert "bounding_boxes[0] must be" in texts and "bounding_boxes[2] = " in texts
+
+
+@pytest.mark.parametrize("name", ["peng2020-pascal", "peng2020-pascal-vanilla"])
+def test_the_presets_train_and_are_measured(folder: Path, name: str) -> None:
+    preset = PRESETS[name]
+    train = load_dataset(preset.layout, folder, "aeroplane", "train", image_size=224)
+    torch.manual_seed(0)
+    shape = DataShape(train.num_views, pose_features=train.poses.features().shape[1])
+    method = PoseInvariant(preset.settings, shape, "cpu", "fp32")
+    assert method.image_size == train.image_size
+    losses = {}
+    for step in (1, 2):
+        batch = augment(train.batch(torch.arange(3)), preset.augment, 0, step)
+        losses |= method.train_step(batch, step)
+    assert all(np.isfinite(value) for value in losses.values())
+    assert ("confusion" in losses and "prior" in losses) == (name == "peng2020-pascal")
+    method.set_training(False)
+    val = load_dataset(preset.layout, folder, "aeroplane", "val", image_size=224).batch(torch.arange(3))
+    with torch.no_grad():
+        meshes = method.decode(method.encode(val.images))
+    iou = nmr.metrics.voxel_iou(train.voxelize(meshes.vertices, meshes.faces), val.voxels)
+    assert ((0 < iou) & (iou < 1)).all()
+
+
+def test_the_presets_are_the_papers() -> None:
+    settings = PRESETS["peng2020-pascal"].settings
+    weights = [getattr(settings, f"lambda_{n}") for n in ("smooth", "classification", "adversarial", "prior")]
+    assert weights == [0.001, 1, 0.01, 0.01]
+    assert (settings.encoder, settings.generator, PRESETS["peng2020-pascal"].iterations) == (
+        "resnet18",
+        "symmetric",
+        40_000,
+    )
+    assert not PRESETS["peng2020-pascal-vanilla"].settings.uses_discriminator
