@@ -25,10 +25,12 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
 from learn3d.data import conventions, safe_pickle
 from learn3d.data.conventions import VOXEL_SIZE
 from learn3d.data.crops import SMALLEST, Crops, bounds
+from learn3d.data.findings import Problem
 from learn3d.data.poses import RotationPoses
 from learn3d.data.views import MASK_SIZE, SPLITS, ViewDataset
 
@@ -124,16 +126,29 @@ def view_classes(rotations: np.ndarray, training: np.ndarray) -> tuple[np.ndarra
     return np.searchsorted(kept, cells), tuple(f"y {y:g}°, z {z:g}°, x {x:g}°" for y, z, x in middle)
 
 
-def problems(folder: Path | str, category: str) -> Iterator[tuple[Path, str]]:
-    """Everything that is wrong with the three files of a category, for the scan command: (file, what is wrong)."""
-    for path in dict.fromkeys(path for split in ("train", "val") for path in _paths(folder, category, split)):
+def problems(folder: Path | str, category: str, split: str, *, progress: bool = False) -> Iterator[Problem]:
+    """Everything that is wrong with the files of one split."""
+    for path in tqdm(_paths(folder, category, split), desc=f"{category} {split}", disable=not progress):
         try:
             file = _read(path)
         except (ValueError, OSError) as error:
-            yield path, str(error).removeprefix(f"{path}: ")
+            yield Problem(str(path), str(error).removeprefix(f"{path}: "))
             continue
-        for text in (*_severe_problems(file), *_slight_problems(file)):
-            yield path, text
+        yield from (Problem(str(path), text) for text in _severe_problems(file))
+        yield from (Problem(str(path), text, "warning") for text in _slight_problems(file))
+
+
+def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
+    """The categories of a folder and the splits of each ("test" is val)."""
+    found = {
+        name: [s for s in ("train", "val") if any(p.exists() for p in _paths(folder, name, s))] for name in CATEGORIES
+    }
+    return {name: tuple(splits) for name, splits in found.items() if splits}
+
+
+def count(folder: Path | str, category: str, split: str) -> int:
+    """How many photographs a split has, each an object of its own."""
+    return sum(len(_read_rotations(path)) for path in _paths(folder, category, split))
 
 
 def _paths(folder: Path | str, category: str, split: str) -> list[Path]:

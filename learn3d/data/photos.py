@@ -19,11 +19,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 import nmr
 from learn3d.data import conventions
+from learn3d.data.findings import Problem
 from learn3d.data.framing import check_mask, frame, mask_box, read_photo
-from learn3d.data.photo_table import Photo, find_table, read_table, split_objects
+from learn3d.data.photo_table import TABLES, Photo, find_table, read_table, split_objects
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import AngleBins
 from learn3d.data.views import MASK_SIZE, SPLITS, ViewDataset
@@ -80,37 +82,61 @@ def load(
     )
 
 
-def problems(folder: Path | str, category: str) -> Iterator[tuple[Path, str]]:
-    """Everything that is wrong with the photographs, for the scan command: (file, what is wrong)."""
+def problems(folder: Path | str, category: str, split: str, *, progress: bool = False) -> Iterator[Problem]:
+    """Everything that is wrong with one split; where the table has faults, with all photographs that it lists."""
     try:
         table = find_table(folder, category)
         photos, faults = read_table(table)
+        splits = None if faults else split_objects(table, photos)
     except (ValueError, OSError) as error:
-        yield Path(folder), str(error)
+        yield Problem(str(folder), str(error))
         return
-    yield from ((table, fault) for fault in faults)
+    yield from (Problem(str(table), fault) for fault in faults)
     scales = []
-    for photo in photos:
+    chosen = [photo for photo in photos if splits is None or splits[photo.object] == split]
+    for photo in tqdm(chosen, desc=f"{category} {split}", disable=not progress, dynamic_ncols=True):
         try:
             _, mask = _read(photo)
         except (ValueError, OSError) as error:
-            yield photo.file, str(error)
+            yield Problem(str(photo.file), str(error))
             continue
         left, top, right, bottom = mask_box(mask)
         if left == 0 or top == 0 or right == mask.shape[1] or bottom == mask.shape[0]:
-            yield photo.file, "its object touches the border; what lies outside counts as empty"
+            message = "its object touches the border; what lies outside counts as empty"
+            yield Problem(str(photo.file), message, "warning")
         scales.append(_scale(photo, mask))
     try:
-        if not faults:
-            split_objects(table, photos)
         _check_scale(table, scales)
     except ValueError as error:
-        yield table, str(error).removeprefix(f"{table}: ")
-    images = table.parent / "images"
-    listed = {photo.file for photo in photos}
-    for path in sorted(images.iterdir()) if images.is_dir() and not faults else []:
+        yield Problem(str(table), str(error).removeprefix(f"{table}: "))
+    images, listed = table.parent / "images", {photo.file for photo in photos}
+    for path in sorted(images.iterdir()) if split == "train" and images.is_dir() and not faults else []:
         if path.suffix.lower() in _SUFFIXES and path not in listed:
-            yield path, f"it is not in {table.name}"
+            yield Problem(str(path), f"it is not in {table.name}", "warning")
+
+
+def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
+    """The categories of a folder, or of one that is a category itself, and the splits of each."""
+    folder = Path(folder)
+    places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())] if folder.is_dir() else []
+    found = {}
+    for place in places:
+        if any((place / name).is_file() for name in TABLES):
+            try:
+                table = find_table(place, "")
+                photos, faults = read_table(table)
+                splits = set() if faults else set(split_objects(table, photos).values())
+            except (ValueError, OSError):
+                splits = set()
+            found[place.resolve().name] = tuple(name for name in SPLITS if name in splits) or ("train",)
+    return found
+
+
+def count(folder: Path | str, category: str, split: str) -> int:
+    """How many objects a split has."""
+    table = find_table(folder, category)
+    photos, _ = read_table(table)
+    return sum(name == split for name in split_objects(table, photos).values())
 
 
 def choose_bins(poses: LookAtPoses) -> AngleBins:
@@ -149,8 +175,6 @@ def _read_images(
     photos: list[Photo], size: int, progress: bool
 ) -> tuple[np.ndarray, np.ndarray, list[float], list[float]]:
     """Images uint8 [M, 4, size, size], masks uint8 [M, 64, 64], half fields of view, scales (`_scale`)."""
-    from tqdm import tqdm
-
     images = np.empty((len(photos), 4, size, size), np.uint8)
     masks = np.empty((len(photos), MASK_SIZE, MASK_SIZE), np.uint8)
     half_fovs, scales = [], []

@@ -271,8 +271,8 @@ def test_damaged_files_are_named(folder: Path, contents: dict[str, dict], name: 
     write(folder / "aeroplane_val.npz", contents["val"] | change)
     with pytest.raises(ValueError, match=rf"aeroplane_val.npz.*{message}"):
         pascal3d.load(folder, "aeroplane", "val")
-    found = list(pascal3d.problems(folder, "aeroplane"))
-    assert found and all(path == folder / "aeroplane_val.npz" for path, _ in found)
+    found = list(pascal3d.problems(folder, "aeroplane", "val"))
+    assert found and all(p.path == str(folder / "aeroplane_val.npz") and p.severity == "error" for p in found[:1])
 
 
 def test_a_damaged_training_file_is_named_by_val_too(folder: Path, contents: dict[str, dict]) -> None:
@@ -296,7 +296,13 @@ def test_wrong_names_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_scan_reports_everything(folder: Path, contents: dict[str, dict]) -> None:
-    assert list(pascal3d.problems(folder, "aeroplane")) == []
+    def scan() -> list[tuple[str, str]]:
+        splits = pascal3d.contents(folder)["aeroplane"]
+        found = [problem for split in splits for problem in pascal3d.problems(folder, "aeroplane", split)]
+        return [(Path(p.path).name, f"{p.severity}: {p.message}") for p in found]
+
+    assert scan() == [] and pascal3d.contents(folder) == {"aeroplane": ("train", "val")}
+    assert [pascal3d.count(folder, "aeroplane", split) for split in ("train", "val", "test")] == [6, 3, 3]
     (folder / "aeroplane_train.npz").unlink()
     references = contents["val"]["images_ref"].copy()
     references[1, ..., 3] = 0
@@ -307,10 +313,16 @@ def test_the_scan_reports_everything(folder: Path, contents: dict[str, dict]) ->
     change = {"images_ref": references, "voxels": voxels, "rotation_matrices": skewed, "bounding_boxes": boxes}
     write(folder / "aeroplane_val.npz", contents["val"] | change)
     (folder / "aeroplane_imagenet.npz").write_bytes(b"PK")
-    found = [(path.name, text) for path, text in pascal3d.problems(folder, "aeroplane")]
+    found = scan()
     assert [name for name, _ in found].count("aeroplane_val.npz") == 7
     texts = " | ".join(text for _, text in found)
-    for part in ("there is no", "not an npz", "images_ref[1] has an empty mask", "voxels[2] is empty", "orthonormal"):
+    for part in (
+        "error: there is no",
+        "not an npz",
+        "warning: images_ref[1] has an empty mask",
+        "voxels[2] is",
+        "orthonormal",
+    ):
         assert part in texts
     assert "bounding_boxes[0] must be" in texts and "bounding_boxes[2] = " in texts
 

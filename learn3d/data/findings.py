@@ -1,0 +1,64 @@
+"""What is wrong with the files of a data set: errors that name the file, and a list of them.
+
+A reader parses an object in steps, each through `Findings.attempt`. With strict findings (`load`) the first step that
+fails raises; otherwise (`problems`) it is noted and the next one follows, so that both see exactly the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+R = TypeVar("R")
+
+AGAIN = "Perhaps the download or copy was cut short: fetch it again"
+
+
+class DamagedFile(ValueError):
+    """A file that is there, but not as it should be."""
+
+    def __init__(self, path: Path, message: str) -> None:
+        super().__init__(f"{path}: {message}")
+        self.path, self.message = path, message
+
+
+class MissingFile(FileNotFoundError):
+    """A file or folder that should be there."""
+
+    def __init__(self, path: Path, message: str) -> None:
+        super().__init__(f"{path}: {message}")
+        self.path, self.message = path, message
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong with a file: an error stops `load`, a warning does not."""
+
+    path: str
+    message: str  # what is wrong, what was expected
+    severity: Literal["error", "warning"] = "error"
+
+
+@dataclass
+class Findings:
+    """What was found wrong while something was read."""
+
+    strict: bool = False  # raise the first error, drop warnings
+    problems: list[Problem] = field(default_factory=list)
+
+    def attempt(self, function: Callable[..., R], *arguments: Any) -> R | None:
+        """The result of function(*arguments), or None with a note of why there is none."""
+        if self.strict:
+            return function(*arguments)
+        try:
+            return function(*arguments)
+        except (DamagedFile, MissingFile) as error:
+            self.problems.append(Problem(str(error.path), error.message))
+            return None
+
+    def warn(self, path: Path, message: str) -> None:
+        """Note something that is odd, but can be read."""
+        if not self.strict:
+            self.problems.append(Problem(str(path), message, "warning"))
