@@ -16,6 +16,7 @@ from learn3d import files
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict
 from learn3d.methods import DataShape, Method, create_method
 from learn3d.networks import resolve_precision
+from learn3d.presets import Settings
 
 FORMAT = 1
 
@@ -119,7 +120,7 @@ def load_method(
     config = config_from_dict(metadata["config"], source=str(path))
     with torch.random.fork_rng(devices=[]):
         method = create_method(
-            config.settings,
+            without_pretrained(config.settings),
             data_shape(metadata),
             device=device,
             precision=resolve_precision(precision, device),
@@ -130,6 +131,11 @@ def load_method(
     for network in method.networks.values():
         network.requires_grad_(False)
     return method, config, metadata
+
+
+def without_pretrained(settings: Settings) -> Settings:
+    """The settings without the file of weights to start from, which a checkpoint replaces."""
+    return dataclasses.replace(settings, pretrained=None) if hasattr(settings, "pretrained") else settings
 
 
 def method_metadata(shape: DataShape, config: TrainConfig) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def check_movie(path, width, height):
 
 def test_every_example_is_tested_and_short():
     scripts = sorted(path.stem for path in EXAMPLES.glob("*.py"))
-    assert scripts == ["draw_views", "find_camera", "fit_packed", "fit_silhouette", "fit_texture"]
+    assert scripts == ["draw_views", "find_camera", "fit_packed", "fit_silhouette", "fit_texture", "make_photo_folder"]
     assert all(len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 80 for name in scripts)
 
 

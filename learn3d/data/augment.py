@@ -17,13 +17,29 @@ Augmentation = Literal["flip", "flip-image", "channels", "crop"]
 def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -> Batch:
     """The batch with the named changes, each drawn for every sample on its own, in the order of the names.
 
-    "flip": image, mask and pose mirrored left-right with probability 1/2 (Kato and Harada 2019). "flip-image": the input
-    image alone (published code of Peng et al. 2020 on Pascal3D+; it works because the mesh is symmetric). "channels": a
-    random permutation of the three colours.
+    "flip": image, mask and pose mirrored left-right with probability 1/2 (Kato and Harada 2019). "flip-image": the
+    colours of the input image alone, while every mask stays with its pose (published code of both papers on Pascal3D+;
+    it works because the mesh is symmetric). "channels": a random permutation of the three colours. "crop": the colours
+    cut anew from the original image, each side of the padded box moved by up to 15 % of the box, uniformly (Pascal3D+,
+    both papers); it comes first, and masks stay as they are.
+
+    Raises ValueError for an unknown name, for "crop" where the data set has no original images, or not first.
     """
     rng = np.random.default_rng([seed, step, 1])
-    for name in names:
-        if name == "flip":
+    for position, name in enumerate(names):
+        if name == "crop":
+            if position > 0:
+                raise ValueError(
+                    f"crop must be the first augmentation, for it makes new images; got {', '.join(names)}"
+                )
+            if batch.crops is None:
+                raise ValueError(
+                    "the augmentation crop needs the original images and boxes, which only the layout pascal3d has; "
+                    "leave it out"
+                )
+            colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (len(batch), 4))))
+            batch = dataclasses.replace(batch, images=torch.cat([colors, batch.images[:, 3:]], dim=1))
+        elif name == "flip":
             chosen = torch.from_numpy(rng.random(len(batch)) < 0.5)
             batch = dataclasses.replace(
                 batch,
@@ -33,8 +49,9 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -
             )
         elif name == "flip-image":
             chosen = torch.from_numpy(rng.random(len(batch)) < 0.5)
-            images = torch.where(chosen[:, None, None, None], batch.images.flip(3), batch.images)
-            batch = dataclasses.replace(batch, images=images)
+            colors = batch.images[:, :3]
+            colors = torch.where(chosen[:, None, None, None], colors.flip(3), colors)
+            batch = dataclasses.replace(batch, images=torch.cat([colors, batch.images[:, 3:]], dim=1))
         elif name == "channels":
             order = np.argsort(rng.random((len(batch), 3)), axis=1)
             order = torch.from_numpy(np.concatenate([order, np.full((len(batch), 1), 3)], axis=1))

@@ -9,6 +9,7 @@ import torch
 
 if TYPE_CHECKING:
     import nmr
+    from learn3d.data.crops import Crops
     from learn3d.data.poses import Poses
 
 
@@ -23,6 +24,7 @@ class Batch:
     object_ids: torch.Tensor  # int64 [B]: which object of the split each view shows
     class_ids: torch.Tensor  # int64 [B]: which category each object belongs to (0 where there is one only)
     voxels: torch.Tensor | None  # bool [B, 32, 32, 32] ground truth in the data set's axes, None where there is none
+    crops: Crops | None = None  # what the augmentation "crop" cuts the images' colours from, where that is known
 
     def __len__(self) -> int:
         return len(self.images)

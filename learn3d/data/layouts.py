@@ -59,10 +59,18 @@ def load_dataset(
         from learn3d.data import r2n2
 
         load = partial(r2n2.load, **random_views, progress=progress)
+    elif views_per_object is not None:
+        raise ValueError(f"views_per_object cannot be chosen with the layout {layout!r}: it uses all there are")
+    elif layout == "pascal3d":
+        from learn3d.data import pascal3d
+
+        load = partial(pascal3d.load, image_size=image_size)
     else:
-        raise NotImplementedError(f"the reader of the layout {layout!r} is not written yet")
+        from learn3d.data import photos
+
+        load = partial(photos.load, image_size=image_size, progress=progress)
     dataset = concatenate([load(folder, name, split) for name in names])
-    return dataset.with_bins(bins) if bins is not None and layout in ("kato", "dvr") else dataset
+    return dataset.with_bins(bins) if bins is not None and layout not in ("kar", "r2n2") else dataset
 
 
 def _check_fixed_views(layout: str, image_size: int, views_per_object: int | None) -> None:

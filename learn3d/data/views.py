@@ -12,6 +12,7 @@ from torch import Tensor
 
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
+from learn3d.data.crops import Crops, join
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.data.view_bins import AngleBins
 
@@ -41,6 +42,7 @@ class ViewDataset:
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
     points: np.ndarray | None = None  # float32 [N, P, 3]: points on the true surfaces in the object frame, where known
     inverted: bool = True  # colours stored as 255 - colour over black (Kato's form), or as they are
+    crops: Crops | None = None  # M: what the augmentation "crop" cuts the images' colours from; None: it is not known
 
     def __post_init__(self) -> None:
         m, n = len(self.images), len(self.object_names)
@@ -49,6 +51,7 @@ class ViewDataset:
         if self.masks is None and self.images.shape[2:] != (MASK_SIZE, MASK_SIZE):
             raise ValueError(f"images of {self.images.shape[2:]} pixels need masks [M, {MASK_SIZE}, {MASK_SIZE}]")
         wanted = {"poses": m, "view_ids": m, "object_ids": m} | ({"masks": m} if self.masks is not None else {})
+        wanted |= {"crops": m} if self.crops is not None else {}
         wanted |= {"voxels": n} if self.voxels is not None else {}
         wanted |= {"points": n} if self.points is not None else {}
         wanted |= {"class_ids": n} if self.class_ids is not None else {}
@@ -107,6 +110,7 @@ class ViewDataset:
             object_ids=torch.from_numpy(objects),
             class_ids=torch.from_numpy(classes),
             voxels=None if self.voxels is None else torch.from_numpy(self.voxels[objects]),
+            crops=None if self.crops is None else self.crops[rows],
         )
 
     def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
@@ -128,6 +132,7 @@ class ViewDataset:
             poses=self.poses[torch.from_numpy(samples)],
             view_ids=self.view_ids[samples],
             object_ids=self.object_ids[samples],
+            crops=None if self.crops is None else self.crops[samples],
         )
 
 
@@ -153,6 +158,7 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
         object_names=tuple(name for d in datasets for name in d.object_names),
         voxels=None if first.voxels is None else np.concatenate([d.voxels for d in datasets]),
         points=None if any(d.points is None for d in datasets) else np.concatenate([d.points for d in datasets]),
+        crops=None if any(d.crops is None for d in datasets) else join([d.crops for d in datasets]),
         class_ids=np.repeat(np.arange(len(datasets)), [d.num_objects for d in datasets]),
         class_names=tuple(d.category for d in datasets),
     )

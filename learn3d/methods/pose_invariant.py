@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -14,6 +15,7 @@ from learn3d.data.views import MASK_SIZE
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import DataShape, Meshes, Method, adam, check_finite, frozen
 from learn3d.networks import ENCODERS, GENERATORS, EncoderName, GeneratorName, PoseDiscriminator, network_input
+from learn3d.networks.resnet import load_pretrained
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,8 @@ class PoseInvariantSettings:
     """conv: three convolutions, 64-pixel RGB and mask. resnet18: 224-pixel RGB."""
     generator: GeneratorName = "sphere"
     """sphere: 642 free vertices. symmetric: mirrored at z = 0."""
+    pretrained: Path | None = None
+    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's. None: random."""
     learning_rate: float = 1e-4
     """Adam's step size, the same for the three networks and constant."""
     lambda_smooth: float = 0.001
@@ -38,6 +42,10 @@ class PoseInvariantSettings:
     """Confusion loss on squares of log-probability (published code) or of probability differences (eq. 4)."""
     prior_form: Literal["squared", "norm"] = "squared"
     """Prior on the squared length of the codes (published code) or on their length (eq. 5)."""
+
+    def __post_init__(self) -> None:
+        if self.pretrained is not None:
+            object.__setattr__(self, "pretrained", Path(self.pretrained))
 
     @property
     def image_size(self) -> int:
@@ -59,6 +67,8 @@ class PoseInvariant(Method):
         self.settings, self.image_size = settings, settings.image_size
         self.device, self.precision = torch.device(device), precision
         self.encoder = ENCODERS[settings.encoder]()
+        if settings.pretrained is not None:
+            load_pretrained(self.encoder, settings.pretrained)
         self.generator = GENERATORS[settings.generator]()
         self.networks = {"encoder": self.encoder, "generator": self.generator}
         if settings.uses_discriminator:

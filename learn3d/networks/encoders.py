@@ -7,6 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from learn3d.networks.resnet import ResNet18Encoder
+
 CODE_SIZE = 512
 
 
@@ -44,8 +46,12 @@ class ReluConvEncoder(ConvEncoder):
         return torch.relu(super().forward(images))
 
 
-EncoderName = Literal["conv", "conv-relu"]
-ENCODERS: dict[str, type[nn.Module]] = {"conv": ConvEncoder, "conv-relu": ReluConvEncoder}
+EncoderName = Literal["conv", "conv-relu", "resnet18"]
+ENCODERS: dict[str, type[nn.Module]] = {
+    "conv": ConvEncoder,
+    "conv-relu": ReluConvEncoder,
+    "resnet18": ResNet18Encoder,
+}
 
 
 def network_input(images: Tensor, device: torch.device | str, size: int = 64) -> Tensor:

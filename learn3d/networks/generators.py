@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 import nmr
@@ -90,5 +91,55 @@ class BoundedGenerator(nn.Module):
         return deform_bounded_sphere(self.sphere, bias, 0.1 * self.centroid(features).float())
 
 
-GeneratorName = Literal["sphere", "bounded"]
-GENERATORS: dict[str, type[nn.Module]] = {"sphere": SphereGenerator, "bounded": BoundedGenerator}
+class SymmetricSphereGenerator(nn.Module):
+    """Shape code [B,512] -> vertices float32 [B,642,3] that are exactly mirror-symmetric about z = 0.
+
+    Of the 642 vertices 32 lie on z = 0 and stay there (x and y are predicted), 305 have z > 0 (x, y and z are), and 305
+    are their mirror images: 64 + 915 = 979 outputs (published code of Peng et al. 2020 for Pascal3D+).
+    `faces`, `edges` as in `SphereGenerator`.
+    """
+
+    sphere: Tensor
+    faces: Tensor
+    edges: Tensor
+    middle: Tensor  # int64 [32]: vertices with z = 0
+    right: Tensor  # int64 [305]: vertices with z > 0
+    left: Tensor  # int64 [305]: the mirror image of each of them
+    order: Tensor  # int64 [642]: where each vertex stands in [middle, right, left]
+
+    def __init__(self) -> None:
+        super().__init__()
+        sphere, faces = nmr.icosphere(3)
+        middle, right = (torch.nonzero(where)[:, 0] for where in (sphere[:, 2] == 0, sphere[:, 2] > 0))
+        mirrored = sphere[right] * sphere.new_tensor([1.0, 1.0, -1.0])
+        left = torch.cdist(mirrored.double(), sphere.double()).argmin(dim=1)
+        if not torch.equal(sphere[left], mirrored):
+            raise RuntimeError("the icosphere is not symmetric about z = 0")
+        buffers = {"sphere": sphere.float(), "faces": faces, "edges": nmr.edge_table(faces)}
+        buffers |= {"middle": middle, "right": right, "left": left}
+        buffers |= {"order": torch.cat([middle, right, left]).argsort()}
+        for name, value in buffers.items():
+            self.register_buffer(name, value, persistent=False)
+        self.layers = nn.Sequential(
+            nn.Linear(CODE_SIZE, 1024),
+            nn.ReLU(),
+            nn.Linear(1024, 2048),
+            nn.ReLU(),
+            nn.Linear(2048, len(middle) * 2 + len(right) * 3),
+        )
+
+    def forward(self, codes: Tensor) -> Tensor:
+        outputs = self.layers(codes).float()
+        count = len(self.middle)
+        middle = F.pad(outputs[:, : 2 * count].reshape(-1, count, 2), (0, 1))
+        right = outputs[:, 2 * count :].reshape(-1, len(self.right), 3)
+        left = right * right.new_tensor([1.0, 1.0, -1.0])
+        return deform_sphere(self.sphere, torch.cat([middle, right, left], dim=1)[:, self.order])
+
+
+GeneratorName = Literal["sphere", "symmetric", "bounded"]
+GENERATORS: dict[str, type[nn.Module]] = {
+    "sphere": SphereGenerator,
+    "symmetric": SymmetricSphereGenerator,
+    "bounded": BoundedGenerator,
+}
