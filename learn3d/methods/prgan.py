@@ -12,7 +12,7 @@ from torch import Tensor
 from learn3d.data.batch import Batch
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
 from learn3d.methods.method import DataShape, Grids, Method, adam, check_finite, frozen
-from learn3d.networks import network_input
+from learn3d.networks import autocast, network_input
 from learn3d.networks.projection import ViewCircle, project
 from learn3d.networks.voxel_gan import (
     DISCRIMINATOR_CHANNELS,
@@ -116,7 +116,8 @@ class PrGAN(Method):
 
     def generate(self, z: Tensor) -> Tensor:
         """Silhouettes [B, 64, 64] of what z [B, 201] stands for. In float32: bf16 makes these layers slow on CPUs."""
-        return project(self.generator(z[:, :SHAPE_CODE]), self.view_ids(z), self.views, TAU)
+        with autocast(self.device, "fp32"):
+            return project(self.generator(z[:, :SHAPE_CODE]), self.view_ids(z), self.views, TAU)
 
     def train_step(self, batch: Batch, step: int) -> dict[str, float]:
         """A step of the GAN before `encoder_from_step`, of the encoder from there on.
