@@ -98,7 +98,7 @@ def test_other_forms_of_the_mask_give_the_same_images(folder, form):
     path, depth_path = renders(folder) / "render_0.png", renders(folder) / "depth_0.png"
     depth = np.asarray(Image.open(depth_path))
     if form == "16 bits":
-        save(depth_path, depth.astype(np.uint16) * 256 + 77)
+        save(depth_path, np.where(depth < 250, 249 * 256 + 255, 250 * 256).astype(np.uint16))
     elif form == "RGB":
         save(depth_path, np.dstack([depth] * 3))
     else:
