@@ -3,9 +3,6 @@
 A reader takes part with three functions beside `load`: `contents(folder)`, the categories and their splits;
 `count(folder, category, split)`, how many objects a split should have; `problems(folder, category, split)`, what is
 wrong with them. An error is what `load` would raise, a warning is what it would read in spite of being odd.
-
-Readers without `contents` (pascal3d, photos) tell of a whole category at once: `problems(folder, category)` gives pairs
-of a file and what is wrong with it, all of which count as errors.
 """
 
 from __future__ import annotations
@@ -28,7 +25,7 @@ class SplitReport:
 
     category: str
     split: str
-    objects: int  # how many it should have; 0 where that cannot be told
+    objects: int  # how many it should have; 0 where that cannot be read
     problems: tuple[Problem, ...]
 
     @property
@@ -97,12 +94,9 @@ def check_folder(
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder}")
     reader = importlib.import_module(f"learn3d.data.{layout}")
-    whole = not hasattr(reader, "contents")
-    found = dict.fromkeys(_whole_categories(folder), ("all",)) if whole else reader.contents(folder)
+    found = reader.contents(folder)
     if not found and not categories:
         raise FileNotFoundError(f"{folder} holds nothing of the layout {layout!r}; see docs/data-sets.md")
-    if whole:
-        return Report(layout, str(folder), tuple(_check_whole(reader, folder, name) for name in categories or found))
     reports = []
     for category in categories or found:
         there = found.get(category) or found.get(synset_of(category)) or ("train", "val", "test")
@@ -110,21 +104,6 @@ def check_folder(
             problems = tuple(reader.problems(folder, category, split, progress=progress))
             reports.append(SplitReport(category, split, _count(reader, folder, category, split), problems))
     return Report(layout, str(folder), tuple(reports))
-
-
-def _whole_categories(folder: Path) -> list[str]:
-    """Categories of layouts whose reader does not tell: `{category}_{part}.npz`, or folders with a table of poses."""
-    files = {path.name.split("_")[0] for path in folder.glob("*_*.npz")}
-    tables = {path.parent.name for pattern in ("poses.*", "*/poses.*") for path in folder.resolve().glob(pattern)}
-    return sorted(files | tables)
-
-
-def _check_whole(reader: Any, folder: Path, category: str) -> SplitReport:
-    try:
-        found = [Problem(str(path), message) for path, message in reader.problems(folder, category)]
-    except ValueError as error:  # a category that the layout does not have
-        found = [Problem(str(folder), str(error))]
-    return SplitReport(category, "all", 0, tuple(found))
 
 
 def _count(reader: Any, folder: Path, category: str, split: str) -> int:

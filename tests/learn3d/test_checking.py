@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
-import types
 from pathlib import Path
 
 import numpy as np
@@ -98,26 +97,6 @@ def test_what_was_asked_for_and_is_not_there_is_an_error(tmp_path):
         check_folder("dvr", tmp_path)
     with pytest.raises(ValueError, match="layout must be one of kato, dvr"):
         check_folder("lsm", tmp_path)
-
-
-def test_readers_that_tell_of_a_whole_category(tmp_path, monkeypatch):
-    """pascal3d and photos."""
-    reader = types.ModuleType("photos")
-    reader.problems = lambda folder, category: iter([(folder / category / "a.png", "is cut short")])
-    monkeypatch.setitem(sys.modules, "learn3d.data.photos", reader)
-    (tmp_path / "mugs").mkdir()
-    (tmp_path / "mugs" / "poses.csv").write_text("")
-    report = check_folder("photos", tmp_path)
-    assert report.errors == 1 and report.splits[0].category == "mugs"
-    assert check_folder("photos", tmp_path / "mugs").splits[0].category == "mugs"
-    assert report.splits[0].problems[0].path.endswith("mugs/a.png")
-
-    def refuse(folder, category):
-        raise ValueError("there is no such category")
-        yield
-
-    reader.problems = refuse
-    assert check_folder("photos", tmp_path, ["cups"]).splits[0].problems[0].message == "there is no such category"
 
 
 @pytest.fixture
