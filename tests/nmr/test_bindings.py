@@ -19,11 +19,14 @@ CALLS = {
     "silhouette_backward": lambda a: _C.silhouette_backward(
         a["vertices"], a["faces"], a["starts"], a["owner"], a["alpha"], a["grad"], True, 1e-4, 1
     ),
+    "local_gradient": lambda a: _C.local_gradient(
+        a["vertices"], a["faces"], a["starts"], a["owner"], a["alpha"], a["grad"], True, 1e-4, 1
+    ),
     "smoothness": lambda a: _C.smoothness_forward(a["vertices"], a["edges"], a["loss"], 1),
     "smoothness_backward": lambda a: _C.smoothness_backward(a["vertices"], a["edges"], a["loss"], a["grad"], 1),
-    "voxelize": lambda a: _C.voxelize(a["vertices"].astype(np.float32), a["faces"], a["voxels"], a["size"], 1),
+    "voxelize": lambda a: _C.voxelize(a["vertices"].astype(np.float32), a["faces"], a["voxels"], a["size"], True, 1),
 }
-RASTER, SMOOTHNESS = ("rasterize", "silhouette_backward"), ("smoothness", "smoothness_backward")
+RASTER, SMOOTHNESS = ("rasterize", "silhouette_backward", "local_gradient"), ("smoothness", "smoothness_backward")
 STARTS = np.array([[0, 0], [6, 2], [12, 4]])
 
 

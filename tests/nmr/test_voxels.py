@@ -116,7 +116,7 @@ triples = hnp.arrays(np.int64, st.tuples(st.integers(0, 5), st.just(3)), element
 sizes = st.sampled_from([1, 2, 4, 8])  # powers of two: coordinates in [0, 1] times s are exact
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(corners, triples, sizes)
 def test_kato19_is_its_slow_definition_where_touching_is_exact(corners, faces, size):
     surface, _ = touched_cells(corners[faces], size)
@@ -188,6 +188,14 @@ def test_kato19_of_a_face_between_cells_is_on_both_sides():
     assert torch.equal(grid, expected)
     thin = nmr.voxelize(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), 8)[0]
     assert thin.sum() < grid.sum() and (grid | ~thin).all()
+
+
+def test_a_box_that_fills_the_grid_is_open_in_kato18():
+    corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = torch.tensor([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    thick, thin = (nmr.voxelize(corners, faces, 8, definition=d)[0] for d in ("kato19", "kato18"))
+    assert thick.all() and not thin[4, 4, 4]
 
 
 def test_kato19_of_points_and_segments():
