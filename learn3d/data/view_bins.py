@@ -63,12 +63,9 @@ class AngleBins:
     def ids(self, poses: LookAtPoses) -> Tensor:
         """The class of every pose, int64 [M] in 0 .. K-1."""
         azimuths, elevations = self.shape
-        a = (
-            ((wrap_deg(poses.azimuth_deg.double()) + 180) / self.azimuth_width_deg)
-            .floor()
-            .long()
-            .clamp(0, azimuths - 1)
-        )
+        azimuth = poses.azimuth_deg.double()
+        turn = torch.where(azimuth == 180, azimuth, wrap_deg(azimuth)) + 180  # the upper end belongs to the last cell
+        a = (turn / self.azimuth_width_deg).floor().long().clamp(0, azimuths - 1)
         e = (poses.elevations_deg.double() - self.elevation_low_deg) / self.elevation_width_deg
         return a * elevations + e.floor().long().clamp(0, elevations - 1)
 
