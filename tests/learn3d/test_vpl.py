@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 
@@ -150,7 +151,7 @@ def test_training_goes_on_from_its_saved_state(form: str) -> None:
     method.train_step(batch, 1)
     for name, network in method.networks.items():
         other.networks[name].load_state_dict(network.state_dict())
-        other.optimizers[name].load_state_dict(method.optimizers[name].state_dict())
+        other.optimizers[name].load_state_dict(deepcopy(method.optimizers[name].state_dict()))
     runs = []
     for continued in (method, other):
         torch.manual_seed(1)
