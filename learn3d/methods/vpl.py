@@ -232,7 +232,7 @@ def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> 
     """For each sample of a batch the sample whose view serves as its other one, int64 [B]; see VPLSettings.other_views.
 
     "random" asks torch's global generator, and takes any sample where all have one view class. Over a data set in which
-    all views are equally frequent it draws uniformly from the other views, as the published code does.
+    all views are equally frequent it draws uniformly from the other views, as the code of Peng et al. 2020 does.
     "reversed" leaves the middle one of an odd batch its own view, "next" a sample alone in its category (as published).
     Raises ValueError for a batch of one sample.
     """

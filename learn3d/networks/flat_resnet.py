@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.networks.encoders import CODE_SIZE
@@ -41,7 +40,4 @@ class FlatResNet18(nn.Module):
         return self
 
     def forward(self, images: Tensor) -> Tensor:
-        net = self.resnet
-        x = (images[:, :3] - net.mean) / net.std
-        x = F.max_pool2d(F.relu(net.bn1(net.conv1(x))), 3, 2, padding=1)
-        return self.code(net.layer4(net.layer3(net.layer2(net.layer1(x)))).flatten(1))
+        return self.code(self.resnet.features(images).flatten(1))

@@ -54,11 +54,14 @@ class ResNet18Encoder(nn.Module):
             if isinstance(module, nn.Conv2d):  # torchvision's initialisation
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
-    def forward(self, images: Tensor) -> Tensor:
+    def features(self, images: Tensor) -> Tensor:
+        """The last features [B, 512, 7, 7], before they are pooled."""
         x = (images[:, :3] - self.mean) / self.std
         x = F.max_pool2d(F.relu(self.bn1(self.conv1(x))), 3, 2, padding=1)
-        x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
-        return x.mean(dim=(2, 3))
+        return self.layer4(self.layer3(self.layer2(self.layer1(x))))
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.features(images).mean(dim=(2, 3))
 
 
 def load_pretrained(encoder: nn.Module, path: Path | str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 
@@ -140,6 +141,21 @@ def test_training_repeats_itself(form: str) -> None:
     for _ in range(2):
         method = create(FORMS[form])
         runs.append([method.train_step(make_batch(FORMS[form].image_size, 4), step) for step in (1, 2)])
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize("form", ["reimplemented", "class"])
+def test_training_goes_on_from_its_saved_state(form: str) -> None:
+    batch = make_batch(FORMS[form].image_size, 4)
+    method, other = create(FORMS[form]), create(FORMS[form])
+    method.train_step(batch, 1)
+    for name, network in method.networks.items():
+        other.networks[name].load_state_dict(network.state_dict())
+        other.optimizers[name].load_state_dict(deepcopy(method.optimizers[name].state_dict()))
+    runs = []
+    for continued in (method, other):
+        torch.manual_seed(1)
+        runs.append([continued.train_step(batch, step) for step in (2, 3)])
     assert runs[0] == runs[1]
 
 
