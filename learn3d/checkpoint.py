@@ -117,9 +117,12 @@ def load_method(
     """A trained method ready for use, from a checkpoint file: (method in evaluation mode, configuration, metadata)."""
     tensors, metadata = load(path)
     config = config_from_dict(metadata["config"], source=str(path))
+    settings = config.settings
+    if getattr(settings, "pretrained", None) is not None:  # only training starts from that file, which may be gone
+        settings = dataclasses.replace(settings, pretrained=None)
     with torch.random.fork_rng(devices=[]):
         method = create_method(
-            config.settings,
+            settings,
             data_shape(metadata),
             device=device,
             precision=resolve_precision(precision, device),
