@@ -16,7 +16,6 @@ from learn3d import files
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict
 from learn3d.methods import DataShape, Method, create_method
 from learn3d.networks import resolve_precision
-from learn3d.presets import Settings
 
 FORMAT = 1
 
@@ -118,9 +117,12 @@ def load_method(
     """A trained method ready for use, from a checkpoint file: (method in evaluation mode, configuration, metadata)."""
     tensors, metadata = load(path)
     config = config_from_dict(metadata["config"], source=str(path))
+    settings = config.settings
+    if getattr(settings, "pretrained", None) is not None:  # only training starts from that file, which may be gone
+        settings = dataclasses.replace(settings, pretrained=None)
     with torch.random.fork_rng(devices=[]):
         method = create_method(
-            without_pretrained(config.settings),
+            settings,
             data_shape(metadata),
             device=device,
             precision=resolve_precision(precision, device),
@@ -131,11 +133,6 @@ def load_method(
     for network in method.networks.values():
         network.requires_grad_(False)
     return method, config, metadata
-
-
-def without_pretrained(settings: Settings) -> Settings:
-    """The settings without the file of weights to start from, which a checkpoint replaces."""
-    return dataclasses.replace(settings, pretrained=None) if hasattr(settings, "pretrained") else settings
 
 
 def method_metadata(shape: DataShape, config: TrainConfig) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -13,6 +15,8 @@ from python2_pickles import npy, python2_pickle
 from scipy.spatial.transform import Rotation
 
 import nmr
+from learn3d.checkpoint import load_method
+from learn3d.config import TrainConfig
 from learn3d.data import pascal3d
 from learn3d.data.augment import augment
 from learn3d.data.crops import Crops, join
@@ -20,7 +24,9 @@ from learn3d.data.layouts import load_dataset
 from learn3d.data.views import concatenate
 from learn3d.methods.method import DataShape
 from learn3d.methods.pose_invariant import PoseInvariant
+from learn3d.networks.resnet import ResNet18Encoder
 from learn3d.presets import PRESETS
+from learn3d.training import train
 
 
 def rotation(*angles_deg: float) -> np.ndarray:
@@ -347,6 +353,19 @@ def test_the_presets_train_and_are_measured(folder: Path, name: str) -> None:
         meshes = method.decode(method.encode(val.images))
     iou = nmr.metrics.voxel_iou(train.voxelize(meshes.vertices, meshes.faces), val.voxels)
     assert ((0 < iou) & (iou < 1)).all()
+
+
+def test_a_trained_model_does_without_the_pretrained_weights(folder: Path, tmp_path: Path) -> None:
+    weights = tmp_path / "resnet18.pth"
+    torch.save(ResNet18Encoder().state_dict(), weights)
+    settings = dataclasses.replace(PRESETS["peng2020-pascal"].settings, pretrained=weights)
+    options = {"preset": "peng2020-pascal", "settings": settings, "iterations": 1, "batch_size": 2, "precision": "fp32"}
+    config = TrainConfig(data=folder, category="aeroplane", output=tmp_path / "run", **options)
+    assert train(config).finished
+    weights.unlink()
+    method, saved, _ = load_method(tmp_path / "run" / "last.safetensors")
+    assert saved.settings == settings and method.image_size == 224
+    shutil.rmtree(tmp_path / "run")
 
 
 def test_the_presets_are_the_papers() -> None:
