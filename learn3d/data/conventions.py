@@ -43,8 +43,8 @@ class VoxelConvention:
         """Occupancy bool [B, 32, 32, 32] of meshes in the object frame, comparable with the stored voxels.
 
         vertices float [B, V, 3] or [V, 3]; faces integer [F, 3] or [B, F, 3]. "kato18" is the voxeliser of Kato et al.
-        2018 and of the paper, "kato19" the conservative one of Kato and Harada 2019 (VPL): thicker surfaces, higher or
-        lower IoU, not the same metric.
+        2018 and of the paper, "kato19" the conservative one of Kato and Harada 2019 (VPL): every cell that a face
+        touches. Not the same metric.
         """
         scale = (self.kato18_scale if definition == "kato18" else 1.0) / self.box
         grid = nmr.voxelize(vertices * scale + 0.5, faces, size=VOXEL_SIZE, definition=definition)
