@@ -1,8 +1,8 @@
 """PrGAN's projection module: a volume -> its soft silhouettes from K fixed views around it (Gadelha et al. 2017).
 
 The published code turns the 64^3 volume into the view by trilinear resampling and sums along the depth. For a fixed
-view that is a linear map from voxels to pixels, so it is kept as a table: 0.13 s instead of 6 s for a batch of 64,
-forward and backward, on two cores.
+view that is a linear map from voxels to pixels, so it is kept as a table: forward and backward take a fifth of the time
+of `grid_sample` on one core (40 ms for a batch of 16 instead of 200).
 """
 
 from __future__ import annotations
@@ -75,10 +75,10 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
     # Turning an object by a quarter only renumbers its voxels: the tables of a quarter of the circle serve all.
     quarter = views.count // 4 if views.count % 4 == 0 else views.count
     thickness = torch.empty_like(density[:, :, :, 0]).flatten(1)
-    parts, order = [], []
+    volumes, parts, order = density.unbind(), [], []
     for base in (view_ids % quarter).unique().tolist():
         members = (view_ids % quarter == base).nonzero()[:, 0]
-        turned = [density[i].rot90(int(view_ids[i]) // quarter, (0, 2)).reshape(-1) for i in members.tolist()]
+        turned = [volumes[i].rot90(int(view_ids[i]) // quarter, (0, 2)).reshape(-1) for i in members.tolist()]
         forward, backward = ray_table(views, base, size, density.device)
         parts.append(_Integrate.apply(torch.stack(turned, dim=1), *forward, *backward).T)
         order.append(members)
