@@ -104,4 +104,8 @@ def _intensity(
 
 def _pool(images: np.ndarray, size: int, factor: int) -> np.ndarray:
     """Mean over factor x factor blocks: [B, size * factor, size * factor, C] -> [B, size, size, C]."""
-    return images.reshape(len(images), size, factor, size, factor, images.shape[-1]).mean(axis=(2, 4))
+    total = np.zeros((len(images), size, size, images.shape[-1]), dtype=np.float32)
+    for row in range(factor):
+        for column in range(factor):
+            total += images[:, row::factor, column::factor]  # several times faster than one mean over two axes
+    return total / np.float32(factor**2)

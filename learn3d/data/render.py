@@ -35,7 +35,7 @@ SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
 class DatasetConfig:
     """What to make a data set from, and how."""
 
-    output: Path  # folder for the files; other categories may live in it too (photos: one category a folder)
+    output: Path  # folder for the files; other categories may live in it too
     category: str  # name of the category; Kato's 13 names become synset ids in the file names
     layout: Layout = "kato"  # whose files and viewpoints
     views: int | None = (

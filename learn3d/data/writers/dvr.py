@@ -71,14 +71,13 @@ def world_from_object() -> np.ndarray:
 
 
 def _camera_arrays(poses: LookAtPoses) -> dict[str, np.ndarray]:
-    cameras = poses.cameras().projection().plain()
+    focal = 1 / np.tan(np.deg2rad(kato.HALF_FOV_DEG))
+    camera = np.diag([focal, focal, 1.0, 1.0])
     arrays = {}
-    for k, (matrix, intrinsics) in enumerate(zip(cameras.matrix.numpy(), cameras.intrinsics.numpy(), strict=False)):
+    for k, matrix in enumerate(poses.cameras().projection().plain().matrix.numpy()):
         world = np.eye(4)
         world[:3] = matrix
         world[:3, :3] = matrix[:, :3] @ world_from_object().T
-        focal = intrinsics[0, 0]
-        camera = np.diag([focal, focal, 1.0, 1.0])
         arrays |= {f"world_mat_{k}": world, f"world_mat_inv_{k}": np.linalg.inv(world)}
         arrays |= {f"camera_mat_{k}": camera, f"camera_mat_inv_{k}": np.linalg.inv(camera)}
     return arrays

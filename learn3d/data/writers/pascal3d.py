@@ -34,7 +34,7 @@ SHARES = (0.5, 0.9)  # of the picture's shorter side that the cube takes
 
 
 class Pascal3dWriter(Writer):
-    """Pictures are kept in memory until all are made. Every second view of an object to train on is "imagenet"."""
+    """Pictures are kept in memory until all are made. Every second one to train on is "imagenet"."""
 
     image_size = 224
     default_views = 8
@@ -47,6 +47,7 @@ class Pascal3dWriter(Writer):
 
     def __init__(self, folder: Path, category: str) -> None:
         super().__init__(folder, category)
+        self._trained_on = 0
         self._rows: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in FILES}
 
     @classmethod
@@ -60,7 +61,7 @@ class Pascal3dWriter(Writer):
         return RotationPoses(viewpoints.pascal3d_views(count, rng) @ self.turn.T)
 
     def write(self, item: RenderedObject) -> None:
-        for k, (rgba, rotation) in enumerate(zip(item.rgba(), item.poses.rotation.numpy(), strict=True)):
+        for rgba, rotation in zip(item.rgba(), item.poses.rotation.numpy(), strict=True):
             photo, reference, box = _photograph(rgba, item.rng)
             row = {
                 "images": photo,
@@ -69,12 +70,15 @@ class Pascal3dWriter(Writer):
                 "rotation_matrices": rotation * np.float32([[-1], [1], [1]]),
                 "voxels": item.voxels,
             }
-            file = "val" if item.split == "val" else "imagenet" if k % 2 else "train"
+            file = "val" if item.split == "val" else FILES[self._trained_on % 2]
+            self._trained_on += file != "val"
             self._rows[file].append(row)
 
     def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
+        if self._trained_on < 2:
+            raise ValueError("the layout pascal3d needs at least two pictures to train on: more meshes, or more views")
         for name, rows in self._rows.items():
-            if not rows and name == "val":
+            if not rows:
                 continue
             arrays = {key: [row[key] for row in rows] for key in rows[0]}
             images = np.empty(len(rows), dtype=object)

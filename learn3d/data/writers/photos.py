@@ -1,8 +1,10 @@
-"""Writes a folder of photographs: `images/`, `masks/` and `poses.csv`, continuous views through different lenses.
+"""Writes a folder of photographs (see `learn3d.data.photos`): continuous views through different lenses.
 
-`images/{id}_{view}.png` RGB on an out-of-focus background, `masks/{id}_{view}.png` grey, 255 = object; `poses.csv` has
-one row per picture: file, azimuth_deg, elevation_deg, distance, half_fov_deg, object, split. The camera looks at the
-origin from `nmr.points_from_angles(distance, elevation_deg, azimuth_deg)` of the object frame.
+- `{category}/images/{id}_{view}.png`: RGB, the object on an out-of-focus background
+- `{category}/masks/{id}_{view}.png`: grey, 255 where the object is
+- `{category}/poses.csv`, one row per picture: file, azimuth_deg, elevation_deg, distance (in lengths of the object's
+  longest side), fov_deg (the whole field of view), object, split. The camera looks at the middle of the object, from
+  `nmr.points_from_angles(distance, elevation_deg, azimuth_deg)` of the object frame.
 """
 
 from __future__ import annotations
@@ -17,11 +19,11 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.data.writers.pictures import photo_background, write_png
 from learn3d.data.writers.writer import RenderedObject, Writer
 
-COLUMNS = ("file", "azimuth_deg", "elevation_deg", "distance", "half_fov_deg", "object", "split")
+COLUMNS = ("file", "azimuth_deg", "elevation_deg", "distance", "fov_deg", "object", "split")
 
 
 class PhotosWriter(Writer):
-    """Pictures, masks and a table; a folder holds one category, and no voxels."""
+    """Pictures, masks and a table in a folder of the category's name; no voxels."""
 
     image_size = 256
     default_views = 12
@@ -34,7 +36,7 @@ class PhotosWriter(Writer):
 
     @classmethod
     def paths(cls, category: str) -> tuple[str, ...]:
-        return "images", "masks", "poses.csv"
+        return (category,)
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
         return viewpoints.photo_views(count, float(np.linalg.norm(vertices, axis=1).max()), rng)
@@ -43,20 +45,20 @@ class PhotosWriter(Writer):
         size = self.image_size
         pictures = item.over(np.stack([photo_background(size, size, item.rng) for _ in item.rgb]))
         poses = item.poses
-        numbers = np.stack([poses.azimuth_deg, poses.elevation_deg, poses.distance, poses.half_fov_deg], axis=1)
+        numbers = np.stack([poses.azimuth_deg, poses.elevation_deg, poses.distance, 2 * poses.half_fov_deg], axis=1)
         for k, (picture, mask, row) in enumerate(zip(pictures, item.alpha, numbers, strict=True)):
             file = f"{item.name}_{k:02d}.png"
-            write_png(self.folder / "images" / file, picture)
-            write_png(self.folder / "masks" / file, mask)
+            write_png(self.folder / self.category / "images" / file, picture)
+            write_png(self.folder / self.category / "masks" / file, mask)
             self._rows.append((file, *(f"{value:.4f}" for value in row), item.name, item.split))
 
     def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
-        with open(self.folder / "poses.csv", "w", newline="") as file:
+        with open(self.folder / self.category / "poses.csv", "w", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows([COLUMNS, *self._rows])
         return objects
 
     def card(self) -> dict[str, str]:
         return {
             "images": "RGB 256 x 256 with a background; masks: grey, anti-aliased",
-            "views": "poses.csv: azimuth, elevation, distance and half of the field of view of every picture",
+            "views": "poses.csv: azimuth, elevation, distance, field of view, object and split of every picture",
         }

@@ -84,7 +84,9 @@ class R2n2Writer(Writer):
         (volumes / "model.binvox").write_bytes(binvox_bytes(item.voxels, [-side / 2] * 3, side))
 
     def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
-        first = int(TRAIN_SHARE * len(self._written))
+        first = len(self._written) * 8 // 10
+        if first == 0:
+            raise ValueError("the layout r2n2 needs at least two objects, one to train on and one for test")
         return {"train": self._written[:first], "test": self._written[first:]}
 
     def card(self) -> dict[str, str]:
@@ -102,7 +104,8 @@ def binvox_bytes(voxels: np.ndarray, translate: list[float], scale: float) -> by
     runs = bytearray()
     for start, end in zip(np.append(0, ends[:-1]), ends, strict=True):
         full, rest = divmod(int(end - start), 255)
-        runs += bytes([cells[start], 255]) * full + (bytes([cells[start], rest]) if rest else b"")
+        value = int(cells[start])
+        runs += bytes([value, 255]) * full + (bytes([value, rest]) if rest else b"")
     size = " ".join(map(str, voxels.shape))
     corner = " ".join(f"{value:.9g}" for value in translate)
     return f"#binvox 1\ndim {size}\ntranslate {corner}\nscale {scale:.9g}\ndata\n".encode() + bytes(runs)
