@@ -42,9 +42,10 @@ def make(out, source, **settings):
 
 
 def load(folder, category, split):
-    """The arrays as Kato's files hold them, and the metric."""
-    images, voxels = (np.load(path)["arr_0"] for path in kato.split_paths(folder, category, split))
-    return SimpleNamespace(images=images, voxels=voxels, voxelize=kato.voxelize, cameras=kato.view_cameras)
+    """What the reader makes of the files, views sorted by object."""
+    dataset = kato.load(folder, category, split)
+    images = dataset.images.reshape(-1, 24, 4, 64, 64)
+    return SimpleNamespace(images=images, voxels=dataset.voxels, voxelize=dataset.voxelize, cameras=kato.view_cameras)
 
 
 def placed(mesh, up="y", front="x"):
