@@ -22,13 +22,13 @@ import numpy as np
 from PIL import Image
 
 from learn3d.data import conventions, viewpoints
+from learn3d.data.pascal3d import class_name
 from learn3d.data.poses import RotationPoses
 from learn3d.data.writers.dvr import world_from_object
 from learn3d.data.writers.pictures import photo_background
 from learn3d.data.writers.writer import RenderedObject, Writer
 
 FILES = ("train", "imagenet", "val")
-NAMES = {"airplane": "aeroplane"}  # Pascal's name
 HEIGHTS, WIDTHS = (160, 300), (200, 400)  # of the pictures, in pixels
 SHARES = (0.5, 0.9)  # of the picture's shorter side that the cube takes
 
@@ -52,7 +52,7 @@ class Pascal3dWriter(Writer):
 
     @classmethod
     def paths(cls, category: str) -> tuple[str, ...]:
-        return tuple(f"{NAMES.get(category, category)}_{name}.npz" for name in FILES)
+        return tuple(f"{class_name(category)}_{name}.npz" for name in FILES)
 
     def place(self, vertices: np.ndarray) -> np.ndarray:
         return super().place(vertices) * (2 / np.linalg.norm(np.ptp(vertices, axis=0)))

@@ -20,15 +20,13 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from learn3d.data import viewpoints
-from learn3d.data.conventions import VOXEL_SIZE, VoxelConvention
+from learn3d.data import conventions, viewpoints
 from learn3d.data.kato import synset_of
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.writers.pictures import write_png
 from learn3d.data.writers.writer import RenderedObject, Writer
 
 TRAIN_SHARE = 0.8
-AXES = VoxelConvention("r2n2", swap=(1, 3), flip=(1, 3), kato18_scale=(VOXEL_SIZE - 1) / VOXEL_SIZE)
 
 
 class R2n2Writer(Writer):
@@ -39,7 +37,7 @@ class R2n2Writer(Writer):
     default_test = 1 - TRAIN_SHARE
     default_val = 0.0
     bytes_per_view = 4 * 137**2
-    convention = AXES
+    convention = conventions.R2N2
     objects_fill = "box centred at the origin, its diagonal 1"
 
     def __init__(self, folder: Path, category: str) -> None:
