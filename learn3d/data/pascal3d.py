@@ -152,10 +152,15 @@ def count(folder: Path | str, category: str, split: str) -> int:
 
 
 def _paths(folder: Path | str, category: str, split: str) -> list[Path]:
+    return [Path(folder) / f"{class_name(category)}_{part}.npz" for part in FILES[split]]
+
+
+def class_name(category: str) -> str:
+    """What Pascal3D+ calls a category, which may also be one of Kato's names or a synset id; ValueError for others."""
     name = _OTHER_NAMES.get(category, category)
     if name not in CATEGORIES:
         raise ValueError(f"Pascal3D+ has the categories {', '.join(CATEGORIES)}; got {category!r}")
-    return [Path(folder) / f"{name}_{part}.npz" for part in FILES[split]]
+    return name
 
 
 def _read(path: Path) -> _File:

@@ -1,26 +1,34 @@
-"""Meshes -> a data set in Kato's layout: 24 shaded views and 32^3 voxels of every object, by our own renderer."""
+"""Meshes -> a data set in any layout: shaded views, masks, cameras and voxels of every object, by our renderer.
+
+Here meshes are chosen, split, scaled and coloured. From where they are looked at is in `learn3d.data.viewpoints`, how
+it is written in `learn3d.data.writers`.
+"""
 
 from __future__ import annotations
 
-import os
-import shutil
+import dataclasses
+import re
 import tempfile
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
+from PIL import Image
 
-import nmr
 from learn3d.data import kato, meshes
+from learn3d.data.contact_sheet import Row, draw_rows, make_row
+from learn3d.data.folders import check_room, existing, publish
+from learn3d.data.layouts import Layout
+from learn3d.data.poses import Poses
+from learn3d.data.writers import RenderedObject, Writer, writer_of
 from learn3d.files import write_json
-from learn3d.shading import shade_mesh
+from learn3d.shading import KEY_LIGHT, shade_mesh
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
-BYTES_PER_OBJECT = kato.NUM_VIEWS * 4 * kato.IMAGE_SIZE**2 + kato.VOXEL_SIZE**3
 
 
 @dataclass(frozen=True)
@@ -29,16 +37,21 @@ class DatasetConfig:
 
     output: Path  # folder for the files; other categories may live in it too
     category: str  # name of the category; Kato's 13 names become synset ids in the file names
+    layout: Layout = "kato"  # whose files and viewpoints
+    views: int | None = (
+        None  # views per object; default kar 20, r2n2 24, pascal3d 8, photos 12; kato and dvr: always 24
+    )
     source: Path | None = None  # folder of meshes (searched recursively) or a mesh pack (.npz); not with --procedural
     procedural: int = 0  # make this many shapes with the procedural generator instead of reading meshes
-    test: float = 0.2  # part of the meshes for the test split: a share below 1 (then at least 4 of them), or a count
-    val: float = 0.1  # the same for the validation split; 0 for none
+    test: float | None = None  # part of the meshes for the test split: a share below 1 (then at least 4 of them), or a
+    # count; default 0.2, and 0 for pascal3d, which is tested on val
+    val: float | None = None  # the same for the validation split, 0 for none; default 0.1; pascal3d 0.2, r2n2 0
     augment: int = 0  # copies of each training mesh, besides itself, with every axis scaled by a random 0.75 .. 1.25
     up: Axis = "y"  # mesh axis that points up
     front: Axis | None = None  # mesh axis that faces the camera of view 0; default x (y where up is x), procedural z
     color: Literal["random", "mesh"] = "random"  # a random light colour per object, or the mesh's own where it has one
     max_faces: int = 1_000_000  # skip meshes with more faces
-    seed: int = 0  # of the split, the scales, the colours and the procedural shapes; same seed, same bytes
+    seed: int = 0  # of the split, the scales, the colours, the views and the procedural shapes; same seed, same bytes
     overwrite: bool = False  # replace files of this category that are already in the folder
 
 
@@ -47,7 +60,7 @@ class DatasetReport:
     """What `make_dataset` did."""
 
     category: str
-    files: list[str]  # names of the files written, in the folder
+    files: list[str]  # files and folders written, relative to the output folder
     objects: dict[str, int]  # objects per split, augmented copies included
     used: list[dict]  # per mesh: name, split, vertices, faces, watertight
     skipped: list[dict]  # per mesh: name, split, reason
@@ -96,140 +109,167 @@ def random_color(rng: np.random.Generator) -> np.ndarray:
     return np.clip(rng.uniform(0.55, 0.9) + rng.uniform(-0.2, 0.2, size=3), 0.35, 1.0).astype(np.float32)
 
 
-def render_object(vertices: np.ndarray, faces: np.ndarray, face_colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Kato's record of one object: images uint8 [24, 4, 64, 64] (inverted RGB, alpha) and voxels bool [32, 32, 32].
+def render_object(
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    face_colors: np.ndarray,
+    poses: Poses,
+    image_size: int,
+    turn: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """All views of one object: rgb uint8 [n, S, S, 3] over white and alpha uint8 [n, S, S].
 
-    vertices float [V, 3] in the object frame, box centred, longest side 1; faces integer [F, 3]; face_colors float [3]
-    or [F, 3]. The alpha is exactly that of `nmr.render_silhouette`. Raises ValueError where no view shows anything.
+    vertices float32 [V, 3] in the object frame of the poses; faces int64 [F, 3]; face_colors float [3] or [F, 3]; turn
+    [3, 3] from the frame of `kato.mesh_to_object`, in which the light stays where it is. The alpha is exactly that of
+    `nmr.render_silhouette`. Raises ValueError where no view shows anything.
     """
-    vertices = torch.as_tensor(np.ascontiguousarray(vertices, dtype=np.float32))
-    faces = torch.as_tensor(np.ascontiguousarray(faces, dtype=np.int64))
-    cameras = kato.view_cameras(torch.arange(kato.NUM_VIEWS))
-    rgb, _ = shade_mesh(vertices, faces, face_colors, cameras, image_size=kato.IMAGE_SIZE)
-    alpha = nmr.render_silhouette(vertices, faces, cameras, image_size=kato.IMAGE_SIZE, anti_aliasing=True)
+    light = tuple((turn @ KEY_LIGHT).tolist())
+    rgb, alpha = shade_mesh(vertices, faces, face_colors, poses.cameras(), image_size=image_size, light=light)
     if not alpha.any():
         raise ValueError("no view shows any of it (all faces have no area, or are smaller than a pixel)")
-    images = np.empty((kato.NUM_VIEWS, 4, kato.IMAGE_SIZE, kato.IMAGE_SIZE), dtype=np.uint8)
-    images[:, :3] = 255 - rgb.transpose(0, 3, 1, 2)
-    images[:, 3] = np.rint(255 * alpha.numpy())
-    return images, kato.voxelize(vertices, faces)[0].numpy()
+    return rgb, alpha
+
+
+def object_names(sources: list[meshes.MeshSource]) -> list[str]:
+    """A name for each mesh that can be part of a file name, all different: letters, digits and underscores."""
+    names, taken = [], set()
+    for source in sources:
+        plain = re.sub(r"\W+", "_", str(Path(source.name).with_suffix(""))).strip("_")[-80:] or "mesh"
+        name = next(n for i in range(len(sources)) if (n := f"{plain}_{i + 1}" if i else plain).lower() not in taken)
+        taken.add(name.lower())
+        names.append(name)
+    return names
 
 
 def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
     """Make the data set that `config` describes and return what was done; meshes that cannot be used are skipped.
 
-    Writes `{synset}_{split}_images.npz`, `{synset}_{split}_voxels.npz` for every split that is not empty and
+    Writes the files of the layout (see its module in `learn3d.data.writers`) for every split that is not empty and
     `{synset}_card.json` (settings, splits), `{synset}_report.json`, `{synset}_report.txt`, `{synset}_contact.png`
-    (rows: objects of each split; columns: views 0, 3, ... 21, the mask of view 0, the voxels seen from the front).
+    (rows: objects of each split; columns: 8 views, the mask of the first one, the voxels seen from the front).
     Files appear under their names only when all of them are complete.
 
     Raises ValueError (settings that do not fit, no usable mesh), FileNotFoundError (no such source), FileExistsError
     (files of the category are there and `overwrite` is off), OSError (folder not writable, disk too full).
     """
-    _check(config)
-    prefix = kato.synset_of(config.category)
+    config = _complete(config)
+    writer_class, prefix = writer_of(config.layout), kato.synset_of(config.category)
     sources, ignored = _list_sources(config)
     splits = split_objects(len(sources), config.test, config.val, config.seed)
     copies = {split: 1 + (config.augment if split == "train" else 0) for split in splits}
-    _prepare_folder(config, prefix, sum(len(splits[s]) * copies[s] for s in splits))
+    total = sum(len(splits[s]) * copies[s] for s in splits)
+    _prepare_folder(config, writer_class, total)
 
-    used, skipped, objects, sheet = [], [], {}, []
+    done = _Done()
     with tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=config.output) as temporary:
-        bar = _progress_bar(sum(len(splits[s]) * copies[s] for s in splits), config.category, progress)
+        folder, trash = Path(temporary) / "new", Path(temporary) / "old"
+        folder.mkdir()
+        writer = writer_class(folder, config.category)
+        names = object_names(sources)
+        sheet = []
+        bar = _progress_bar(total, config.category, progress)
         for split in ("train", "val", "test"):
-            numbers = splits[split]
-            images, voxels = _render_split(config, sources, numbers, split, copies[split], used, skipped, bar)
-            if not len(images):
-                continue
-            objects[split] = len(images)
-            np.savez_compressed(Path(temporary) / f"{prefix}_{split}_images.npz", images)
-            np.savez_compressed(Path(temporary) / f"{prefix}_{split}_voxels.npz", voxels)
-            chosen = np.unique(np.linspace(0, len(images) - 1, 6).astype(int))
-            sheet.append(contact_sheet(images[chosen], voxels[chosen]))
+            chosen = [(int(number), sources[number], names[number]) for number in splits[split]]
+            rows = _render_split(config, writer, chosen, split, copies[split], done, bar)
+            if rows:
+                sheet.append(draw_rows(rows))
         bar.close()
-        if "train" not in objects:
-            bad = [mesh for mesh in skipped if mesh["split"] == "train"]
+        objects = writer.finish(config.output, done.objects) if done.objects.get("train") else {}
+        if not objects.get("train"):
+            bad = [mesh for mesh in done.skipped if mesh["split"] == "train"]
             raise ValueError(
                 f"none of the {len(bad)} meshes to train on can be used; the first reasons: "
                 + "; ".join(f"{mesh['name']}: {mesh['reason']}" for mesh in bad[:3])
             )
-        _write_png(Path(temporary) / f"{prefix}_contact.png", np.concatenate(sheet))
-        files = sorted([p.name for p in Path(temporary).iterdir()] + [f"{prefix}_{n}" for n in _TEXT_FILES])
-        report = DatasetReport(config.category, files, objects, used, skipped, dict(sorted(ignored.items())))
-        write_json(Path(temporary) / f"{prefix}_card.json", _card(config, objects, used))
-        write_json(Path(temporary) / f"{prefix}_report.json", asdict(report))
-        (Path(temporary) / f"{prefix}_report.txt").write_text(report.text() + "\n")
-        for name in files:
-            os.replace(Path(temporary) / name, config.output / name)
-        for stale in _existing(config.output, prefix):  # of an earlier data set with more splits
-            if stale.name not in files:
-                stale.unlink()
+        for split, written in objects.items():  # some layouts decide on the splits at the end
+            for name in written:
+                done.mesh_of[name]["split"] = split
+        Image.fromarray(np.concatenate(sheet)).save(folder / f"{prefix}_contact.png")
+        own = [path for path in (*writer.paths(config.category), *writer.shared) if (folder / path).exists()]
+        files = sorted([*own, *_extra_files(prefix)])
+        counts = {split: len(written) for split, written in objects.items() if written}
+        report = DatasetReport(config.category, files, counts, done.used, done.skipped, dict(sorted(ignored.items())))
+        write_json(folder / f"{prefix}_card.json", _card(config, writer, counts, done.used))
+        write_json(folder / f"{prefix}_report.json", asdict(report))
+        (folder / f"{prefix}_report.txt").write_text(report.text() + "\n")
+        stale = set(existing(config.output, _own_paths(writer_class, config.category))) - set(files)
+        publish(folder, config.output, files, sorted(stale), trash)
     return report
 
 
-_TEXT_FILES = ("card.json", "report.json", "report.txt")
+@dataclass
+class _Done:
+    """What became of the meshes so far."""
 
-
-def contact_sheet(images: np.ndarray, voxels: np.ndarray) -> np.ndarray:
-    """A picture to look at, uint8 [64 N, 64 * 10, 3]: per object 8 views over white, the mask of view 0, its voxels.
-
-    The last column is the occupancy seen along the axis of view 0 (darker = thicker), the same way round as view 0.
-    """
-    views = 255 - images[:, ::3, :3].transpose(0, 3, 1, 4, 2)  # [N, 64, 8, 64, 3]
-    mask = np.repeat(255 - images[:, 0, 3][:, :, None, :, None], 3, axis=4)
-    depth = voxels.sum(axis=3)[:, ::-1]  # axes (y, x, -z): rows from the top, columns to the right
-    depth = depth / max(1, depth.max()) * 215 + 40 * (depth > 0)
-    front = np.repeat(np.repeat(255 - depth.astype(np.uint8), 2, axis=1), 2, axis=2)[:, :, None, :, None]
-    sheet = np.concatenate([views, mask, np.repeat(front, 3, axis=4)], axis=2)
-    return sheet.reshape(-1, sheet.shape[2] * sheet.shape[3], 3)
+    used: list[dict] = field(default_factory=list)
+    skipped: list[dict] = field(default_factory=list)
+    objects: dict[str, list[str]] = field(default_factory=dict)  # names per split
+    mesh_of: dict[str, dict] = field(default_factory=dict)  # entry of `used` per object name
 
 
 def _render_split(
     config: DatasetConfig,
-    sources: list[meshes.MeshSource],
-    numbers: np.ndarray,
+    writer: Writer,
+    chosen: list[tuple[int, meshes.MeshSource, str]],
     split: str,
     copies: int,
-    used: list[dict],
-    skipped: list[dict],
+    done: _Done,
     bar,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Render the meshes `numbers` of one split, `copies` objects each; appends to `used` and `skipped`."""
-    total = len(numbers) * copies
-    images = np.empty((total, kato.NUM_VIEWS, 4, kato.IMAGE_SIZE, kato.IMAGE_SIZE), dtype=np.uint8)
-    voxels = np.empty((total, *(kato.VOXEL_SIZE,) * 3), dtype=bool)
-    done = 0
-    for number in numbers.tolist():
-        source, rendered = sources[number], 0
+) -> list[Row]:
+    """Render and write the chosen meshes (number, mesh, name) of one split, `copies` objects each."""
+    writer.start(split, len(chosen) * copies)
+    rows = []
+    for number, source, name in chosen:
+        items = []
         try:
             mesh = meshes.checked(source.read(), config.max_faces)
-            vertices = mesh.vertices @ kato.mesh_to_object(config.up, _front(config)).T
             for copy in range(copies):
-                rng = np.random.default_rng([config.seed, 1, number, copy])
-                scale = rng.uniform(*SCALE_RANGE, size=3)
-                color = random_color(rng)
-                if config.color == "mesh" and mesh.face_colors is not None:
-                    color = np.where(np.isnan(mesh.face_colors), color, mesh.face_colors)
-                placed = meshes.fit_to_box(meshes.fit_to_box(vertices) * (scale if copy else 1.0))
-                images[done + copy], voxels[done + copy] = render_object(placed, mesh.faces, color)
-                rendered += 1
+                items.append(_render(config, writer, mesh, number, copy, f"{name}-{copy}" if copy else name, split))
                 bar.update()
         except ValueError as error:  # it cannot be read, rendered or seen: the others go on
-            skipped.append({"name": source.name, "split": split, "reason": str(error)})
-            bar.update(copies - rendered)
+            done.skipped.append({"name": source.name, "split": split, "reason": str(error)})
+            bar.update(copies - len(items))
             continue
-        done += copies
         size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
         watertight = meshes.is_watertight(mesh.vertices, mesh.faces)
-        used.append({"name": source.name, "split": split, **size, "watertight": watertight})
-    return images[:done], voxels[:done]
+        entry = {"name": source.name, "split": split, **size, "watertight": watertight}
+        done.used.append(entry)
+        for item in items:
+            writer.write(item)
+            grid = writer.convention.to_object(torch.from_numpy(item.voxels)[None])[0].numpy()
+            rows.append(make_row(item.rgb, item.alpha, grid))
+            done.objects.setdefault(split, []).append(item.name)
+            done.mesh_of[item.name] = entry
+    return rows
+
+
+def _render(
+    config: DatasetConfig, writer: Writer, mesh: meshes.RawMesh, number: int, copy: int, name: str, split: str
+) -> RenderedObject:
+    """Object `copy` of mesh `number`: scaled, coloured, placed, looked at."""
+    rng = np.random.default_rng([config.seed, 1, number, copy])
+    scale = rng.uniform(*SCALE_RANGE, size=3)
+    color = random_color(rng)
+    if config.color == "mesh" and mesh.face_colors is not None:
+        color = np.where(np.isnan(mesh.face_colors), color, mesh.face_colors)
+    vertices = mesh.vertices @ kato.mesh_to_object(config.up, _front(config)).T
+    fitted = meshes.fit_to_box(meshes.fit_to_box(vertices) * (scale if copy else 1.0))
+    placed = writer.place(fitted)
+    rng = np.random.default_rng([config.seed, 2, number, copy])
+    poses = writer.views(placed, config.views, rng)
+    vertices = torch.as_tensor(np.ascontiguousarray(placed, dtype=np.float32))
+    faces = torch.as_tensor(np.ascontiguousarray(mesh.faces, dtype=np.int64))
+    rgb, alpha = render_object(vertices, faces, color, poses, writer.image_size, writer.turn)
+    voxels = writer.voxelize(vertices, faces)
+    return RenderedObject(name, split, vertices, faces, poses, rgb, alpha, voxels, rng)
 
 
 def _front(config: DatasetConfig) -> str:
     return config.front or ("z" if config.procedural else "y" if config.up.endswith("x") else "x")
 
 
-def _check(config: DatasetConfig) -> None:
+def _complete(config: DatasetConfig) -> DatasetConfig:
+    """The settings with the layout's own where none were given; ValueError where they do not fit."""
     if (config.source is None) == (config.procedural == 0):
         raise ValueError("give either a source (a folder of meshes or a mesh pack .npz) or procedural > 0, not both")
     if config.procedural < 0 or config.augment < 0 or config.max_faces < 1 or config.seed < 0:
@@ -241,6 +281,17 @@ def _check(config: DatasetConfig) -> None:
         raise ValueError(f"color must be random or mesh, got {config.color!r}")
     kato.mesh_to_object(config.up, _front(config))
     kato.synset_of(config.category)
+    writer = writer_of(config.layout)
+    defaults = {"views": writer.default_views, "test": writer.default_test, "val": writer.default_val}
+    config = dataclasses.replace(config, **{k: v for k, v in defaults.items() if getattr(config, k) is None})
+    if config.views < 1 or (writer.fixed_views and config.views != writer.default_views):
+        allowed = f"exactly {writer.default_views}" if writer.fixed_views else "at least 1"
+        raise ValueError(f"the layout {config.layout} has {allowed} views per object, got {config.views}")
+    for split, default in (("test", writer.default_test), ("val", writer.default_val)):
+        if default == 0 and getattr(config, split) != 0:
+            raise ValueError(f"the layout {config.layout} has no {split} split; leave {split} at 0")
+    writer.check(config.output, config.category, config.test, config.augment)
+    return config
 
 
 def _list_sources(config: DatasetConfig) -> tuple[list[meshes.MeshSource], Counter[str]]:
@@ -256,48 +307,37 @@ def _list_sources(config: DatasetConfig) -> tuple[list[meshes.MeshSource], Count
     raise FileNotFoundError(f"there is no folder or mesh pack {source}")
 
 
-def _existing(out: Path, prefix: str) -> list[Path]:
-    """Files of this category that are in the folder now."""
-    names = [f"{prefix}_{split}_{kind}.npz" for split in kato.SPLITS for kind in ("images", "voxels")]
-    names += [f"{prefix}_{name}" for name in ("contact.png", *_TEXT_FILES)]
-    return [out / name for name in names if (out / name).exists()]
+def _extra_files(prefix: str) -> list[str]:
+    """What lies beside the files of every layout."""
+    return [f"{prefix}_{name}" for name in ("card.json", "contact.png", "report.json", "report.txt")]
 
 
-def _prepare_folder(config: DatasetConfig, prefix: str, objects: int) -> None:
+def _own_paths(writer: type[Writer], category: str) -> list[str]:
+    return [*writer.paths(category), *_extra_files(kato.synset_of(category))]
+
+
+def _prepare_folder(config: DatasetConfig, writer: type[Writer], objects: int) -> None:
     """Create the folder and check that it can take the files: nothing in the way, writable, room on the disk."""
-    existing = _existing(config.output, prefix)
-    if existing and not config.overwrite:
+    there = existing(config.output, _own_paths(writer, config.category))
+    if there and not config.overwrite:
         raise FileExistsError(
-            f"{config.output} already holds {existing[0].name} and {len(existing) - 1} more file(s) of "
+            f"{config.output} already holds {there[0]} and {len(there) - 1} more file(s) or folder(s) of "
             f"{config.category}; give another folder, or --overwrite to replace them"
         )
-    try:
-        config.output.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=config.output):
-            pass
-    except OSError as error:
-        raise OSError(
-            f"cannot write into the folder {config.output}: {error}; give another one with --output"
-        ) from error
-    needed = objects * BYTES_PER_OBJECT // 2 + 2**24  # compressed renderings take a tenth of it
-    free = shutil.disk_usage(config.output).free
-    if free < needed:
-        raise OSError(
-            f"{objects} objects may need {needed / 2**20:.0f} MiB but the disk of {config.output} has "
-            f"{free / 2**20:.0f} MiB free; free some, give another folder, or use fewer meshes or augmented copies"
-        )
+    needed = objects * (config.views * writer.bytes_per_view + 32**3) // 2 + 2**24  # renderings shrink to a tenth
+    check_room(config.output, needed, f"{objects} objects")
 
 
-def _card(config: DatasetConfig, objects: dict[str, int], used: list[dict]) -> dict:
+def _card(config: DatasetConfig, writer: Writer, objects: dict[str, int], used: list[dict]) -> dict:
     """The data set's card: everything needed to make it again, and which mesh went where."""
-    settings = {k: v for k, v in asdict(config).items() if k not in ("output", "overwrite")}
+    left_out = {"output", "overwrite", "layout"} | ({"views"} if writer.fixed_views else set())
+    settings = {k: v for k, v in asdict(config).items() if k not in left_out}
     settings["source"] = None if config.source is None else Path(config.source).name
     return {
-        "images": "uint8 [N, 24, 4, 64, 64]: RGB = 255 - composite over white, alpha",
-        "voxels": "bool [N, 32, 32, 32], axes (y, x, -z) of the object frame",
-        "views": "azimuth -15 k, elevation 30, distance 2.732, half field of view 15 degrees",
-        "objects_fill": "box centred at the origin, longest side 1",
-        "object_from_mesh": kato.mesh_to_object(config.up, _front(config)).tolist(),
+        **({} if config.layout == "kato" else {"layout": config.layout}),
+        **writer.card(),
+        "objects_fill": writer.objects_fill,
+        "object_from_mesh": (writer.turn @ kato.mesh_to_object(config.up, _front(config))).tolist(),
         "settings": settings,
         "objects": objects,
         "augmented": f"in train, each mesh is followed by its {config.augment} scaled copies",
@@ -309,9 +349,3 @@ def _progress_bar(total: int, name: str, show: bool):
     from tqdm import tqdm
 
     return tqdm(total=total, desc=name, unit="object", disable=not show, dynamic_ncols=True)
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    import imageio.v3 as imageio
-
-    imageio.imwrite(path, image)
