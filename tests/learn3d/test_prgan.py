@@ -189,7 +189,7 @@ def test_voxels_lie_where_the_data_sets_voxels_do() -> None:
     method.generator = Fixed()
     grids = method.decode(torch.zeros(1, SHAPE_CODE))
     assert grids.occupancy.max() == 1
-    assert grids.threshold == 0.5
+    assert grids.threshold == 0.1
     occupied = grids.occupied(32)
     assert float(nmr.metrics.voxel_iou(KATO.to_axes(occupied), truth)) > 0.7
     assert float(nmr.metrics.voxel_iou(occupied, truth)) < 0.1
