@@ -64,8 +64,9 @@ def load(
         )
     images, masks, half_fovs, scales = _read_images(chosen, image_size, progress)
     _check_scale(table, scales)
-    poses, training = _poses(chosen, half_fovs), _poses([p for p in photos if splits[p.object] == "train"])
-    view_ids, view_names = _view_classes(poses, training)
+    poses = _poses(chosen, half_fovs)
+    training = [photo for photo in photos if splits[photo.object] == "train"]
+    view_ids, view_names = _view_classes(poses, _poses(training, [photo.fov_deg / 2 for photo in training]))
     names = sorted({photo.object for photo in chosen})
     return ViewDataset(
         category=category,
@@ -165,10 +166,9 @@ def _view_classes(poses: LookAtPoses, training: LookAtPoses) -> tuple[np.ndarray
     return np.searchsorted(kept, cells), tuple(names[k] for k in kept)
 
 
-def _poses(photos: list[Photo], half_fovs: list[float] | None = None) -> LookAtPoses:
+def _poses(photos: list[Photo], half_fovs_deg: list[float]) -> LookAtPoses:
     columns = ([getattr(photo, name) for photo in photos] for name in ("azimuth_deg", "elevation_deg", "distance"))
-    half_fovs = [photo.fov_deg / 2 for photo in photos] if half_fovs is None else half_fovs
-    return LookAtPoses(*(torch.tensor(column, dtype=torch.float32) for column in (*columns, half_fovs)))
+    return LookAtPoses(*(torch.tensor(column, dtype=torch.float32) for column in (*columns, half_fovs_deg)))
 
 
 def _read_images(

@@ -158,6 +158,9 @@ def test_mirrored_poses_show_a_symmetric_object_mirrored(folder: Path) -> None:
     wanted = torch.where(chosen[:, None, None], straight.flip(2), straight)
     torch.testing.assert_close(mirrored, wanted, atol=1e-6, rtol=0)
     assert (straight != straight.flip(2)).any()
+    # A mirrored pose is one that a camera can have: no rotation becomes a reflection, nor the reverse.
+    determinants = torch.linalg.det(dataset.poses.mirrored(chosen).rotation)
+    torch.testing.assert_close(determinants, torch.linalg.det(dataset.poses.rotation), atol=1e-5, rtol=0)
 
 
 def test_voxels_of_the_object_overlap_with_the_convention(folder: Path) -> None:

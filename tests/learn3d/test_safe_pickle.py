@@ -152,6 +152,10 @@ DAMAGED = {
     "a negative shape": (python2(IMAGES, (SHAPE, b"\x8a\x01\xff\x8a\x01\xffK\x12")), "whose shape or dtype is none"),
     "many dimensions": (python2(IMAGES, (SHAPE, b"K\x01" * 30)), "whose shape or dtype is none"),
     "a huge object array": (python2(IMAGES, (b"(\x8a\x02\x02\x00t", b"(\x8a\x05\xff\xff\xff\xff\x7ft")), "not fit its"),
+    "more shape than items": (
+        python2(IMAGES, (b"(\x8a\x02\x02\x00t", b"(\x8a\x02\x03\x00t")),
+        "that does not fit its items",
+    ),
     "a huge string": (python2(IMAGES, (b"T\x12\x00\x00\x00", b"T\xff\xff\xff\xff")), "asks for 4294967295 bytes where"),
     "a short string": (python2(IMAGES, (b"T\x12\x00\x00\x00", b"T\x11\x00\x00\x00")), "instruction"),
     "an unknown order": (python2(IMAGES, (b"u1K\x00K\x01", b"u3K\x00K\x01")), "dtype 'u3'"),
