@@ -127,13 +127,41 @@ def read_state(run: Run) -> State:
     return State("done" if result.is_file() and is_current(run, load_json(result)) else "trained", step)
 
 
+def read_results(runs: Sequence[Run]) -> dict[Path, dict[str, Any]]:
+    """The stored results of those runs that have one that is theirs, by folder."""
+    found = {run.folder: load_json(path) for run in runs if (path := run.folder / RESULT_FILE).is_file()}
+    return {run.folder: found[run.folder] for run in runs if run.folder in found and is_current(run, found[run.folder])}
+
+
+def found_runs(table: Table, options: Options) -> list[Run]:
+    """The runs of a table whose results are in the output folder, whatever their options; no preset is needed.
+
+    Only the categories, methods and number of seeds among the options count. Raises ValueError where there is none.
+    """
+    runs = []
+    for row in selected_rows(table, options.methods):
+        pattern = f"*/{row.variant.name}-seed*/{RESULT_FILE}" if row.variant else ""
+        for path in sorted((options.output / "runs").glob(pattern)) if pattern else []:
+            category, seed = path.parts[-3], int(path.parts[-2].rpartition("seed")[2])
+            if category not in (options.categories or [category]) or seed >= (options.seeds or seed + 1):
+                continue
+            result = load_json(path)
+            config = config_from_dict(result["config"], source=str(path))
+            config = dataclasses.replace(config, output=path.parent, iterations=result["iterations"])
+            runs.append(Run(row.variant, category, seed, config, result["split"]))
+    if not runs:
+        raise ValueError(f"there is no result for the table {table.name} in {options.output / 'runs'}; train first")
+    order = [*(options.categories or table.categories), *sorted({run.category for run in runs})]
+    return sorted(runs, key=lambda run: order.index(run.category))
+
+
 def is_current(run: Run, result: dict[str, Any]) -> bool:
     """Whether a stored result is of these networks on this data."""
     return (
         result.get("iterations") == run.config.iterations
         and result.get("checkpoint") == run.variant.checkpoint
         and result.get("split") == run.split
-        and Path(result.get("data", "")) == run.config.data.resolve()
+        and result.get("data") == str(run.config.data.resolve())
     )
 
 
@@ -191,7 +219,7 @@ def _configure(
 
 
 def _changes_by_variant(variants: Sequence[Variant], table: Table, texts: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """What "name=value" and "method:name=value" change in each variant. Without a method: wherever there is the name."""
+    """What "name=value" and "method:name=value" change in each variant; without a method, wherever the name exists."""
     labels = {row.label.lower(): row.variant.name for row in table.rows if row.variant}
     changes: dict[str, dict[str, Any]] = {variant.name: {} for variant in variants}
     options = {f.name: f.type for f in dataclasses.fields(TrainConfig) if f.name not in _OWN_OPTIONS}
@@ -208,7 +236,9 @@ def _changes_by_variant(variants: Sequence[Variant], table: Table, texts: Sequen
         if not separator or not name:
             raise ValueError(f"a change is written as name=value or method:name=value, got {text!r}")
         if name in _OWN_OPTIONS:
-            raise ValueError(f"{name} has an option of its own, or belongs to the table; it cannot be changed by {text!r}")
+            raise ValueError(
+                f"{name} has an option of its own, or belongs to the table; it cannot be changed by {text!r}"
+            )
         meant = [v for v in variants if not colon or v.name == method]
         if not meant:
             raise ValueError(f"{text!r} names the method {method!r}; there are {', '.join(v.name for v in variants)}")

@@ -1,7 +1,7 @@
 """Every figure of the paper's tables, as printed (Peng et al. 2020), by table, row and category.
 
-Categories have the names of this package: the paper's "Dresser" is ShapeNet's cabinet. A row with a mean only is one that
-the paper prints only so.
+Categories have the names of this package: the paper's "Dresser" is ShapeNet's cabinet. A row without values is one of
+which the paper gives the mean alone.
 """
 
 from __future__ import annotations

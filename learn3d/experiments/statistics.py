@@ -31,7 +31,8 @@ def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray], *,
     sums[c], counts[c] float [N_c]: sum of a measure over the images of each object of category c, and their number. The
     images of an object are not independent of each other, so objects are drawn, with replacement, within each category;
     the mean over the images of each category is taken, then that over categories. The draws depend on the seed and the
-    numbers of objects alone: two results of the same objects get the same ones and can be subtracted (paired bootstrap).
+    numbers of objects alone: two results of the same objects have the same ones and can be subtracted, which makes the
+    bootstrap of their difference a paired one.
     """
     rng = np.random.default_rng(seed)
     total = np.zeros(RESAMPLES)
