@@ -163,6 +163,10 @@ def _notes(report: dict[str, Any]) -> list[str]:
         notes.append(f"{labels}, paper's figures: {note}.")
     if any(_only_printed(row["cells"][MEAN]) for row in report["rows"]):
         notes.append("A mean in parentheses is the paper's over its own categories, which are not the ones here.")
+    lengths = sorted({(run["iterations"], run["batch_size"]) for run in report["runs"]})
+    if len(lengths) > 1:
+        alike = ", ".join(f"{iterations} iterations of batch {batch}" for iterations, batch in lengths)
+        notes.append(f"The runs were not all trained alike: {alike}.")
     if report["missing"]:
         notes.append(f"Not there yet: {', '.join(report['missing'])}.")
     return notes

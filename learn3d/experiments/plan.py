@@ -116,6 +116,10 @@ def read_state(run: Run) -> State:
     if precision == resolve_precision(run.config.precision, run.config.device):  # by name or by "auto", it is the same
         saved = dataclasses.replace(saved, precision=run.config.precision)
     changed = differences(run.config, saved)
+    if run.variant.checkpoint == "best" and run.config.val_split != saved.val_split:
+        changed.append(
+            f"val_split: {saved.val_split!r} chose the run's best networks, {run.config.val_split!r} asked for"
+        )
     if step > run.config.iterations:
         changed.append(f"iterations: {step} taken by the run, {run.config.iterations} asked for")
     if changed:

@@ -74,8 +74,15 @@ def object_sums(record: dict[str, Any], definition: str) -> tuple[np.ndarray, np
 
 def _load(run: Run, split: str) -> ViewDataset:
     config = run.config
-    size = config.settings.image_size
-    return load_dataset(config.layout, config.data, config.category, split, image_size=size, view_bins=config.view_bins)
+    return load_dataset(
+        config.layout,
+        config.data,
+        config.category,
+        split,
+        image_size=config.settings.image_size,
+        view_bins=config.view_bins,
+        views_per_object=config.views_per_object if split == "train" else None,
+    )
 
 
 def _check_data(run: Run, recorded: dict[str, Any]) -> None:
