@@ -58,6 +58,8 @@ class Command:
     """Start runs anew that are there with other options."""
     report_only: bool = False
     """Train nothing: report what is there."""
+    beside_code: bool = False
+    """Put the published code's figures on the meshes of docs/results.md beside ours, for the same iterations."""
     page: Path | None = None
     """Also put the table into this Markdown page, between its marks."""
 
@@ -69,7 +71,8 @@ def main() -> int:
     command = tyro.cli(Command, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
     shared = ("data", "output", "categories", "methods", "iterations", "batch_size", "seeds", "layout", "device")
     options = Options(**{name: getattr(command, name) for name in shared}, threads=command.threads, changes=command.set)
-    call = Call(command.table, options, command.jobs, command.overwrite, command.report_only, command.page)
+    named = ("table", "jobs", "overwrite", "report_only", "page", "beside_code")
+    call = Call(options=options, **{name: getattr(command, name) for name in named})
     try:
         return run_experiment(call)
     except (ValueError, OSError) as error:

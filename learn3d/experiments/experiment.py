@@ -28,6 +28,7 @@ class Call:
     overwrite: bool = False
     report_only: bool = False
     page: Path | None = None
+    beside_code: bool = False
 
 
 def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
@@ -49,7 +50,7 @@ def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
         threads = call.options.threads or share_of_cores(call.jobs)
         runs = plan_runs(table, dataclasses.replace(call.options, threads=threads))
         outcomes = _complete(runs, table.name, call, threads, worker)
-    report = make_report(table, call.options, runs, read_results(runs))
+    report = make_report(table, call.options, runs, read_results(runs), beside_code=call.beside_code)
     paths = write_report(call.options.output, report)
     if call.page is not None:
         embed(call.page, report)

@@ -113,6 +113,9 @@ def main_table(report: dict[str, Any]) -> Cells:
             for metric in metrics:
                 table.append([label, f"here ({metric})", *(_ours_text(cell, metric) for cell in cells)])
                 label = ""
+        if any("code" in cell for cell in cells):
+            texts = (_number(cell.get("code"), digits=3) for cell in cells)
+            table.append(["", "published code, same meshes", *texts])
         if any("difference" in cell for cell in cells):
             table.append(["", "difference", *(_signed(cell.get("difference")) for cell in cells)])
     return table

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS
+from learn3d.experiments import published
 from learn3d.experiments.plan import Options, Run, command_line, selected_rows
 from learn3d.experiments.published import CATEGORIES, PublishedRow
 from learn3d.experiments.results import object_sums
@@ -42,13 +43,25 @@ PROTOCOL = {
 
 
 def make_report(
-    table: Table, options: Options, runs: Sequence[Run], records: Mapping[Path, dict[str, Any]]
+    table: Table,
+    options: Options,
+    runs: Sequence[Run],
+    records: Mapping[Path, dict[str, Any]],
+    *,
+    beside_code: bool = False,
 ) -> dict[str, Any]:
-    """The table's report from the stored results of runs, by folder; runs without one are named under "missing"."""
+    """The table's report from the stored results of runs, by folder; runs without one are named under "missing".
+
+    With `beside_code` the figures that the published code reaches on the meshes of docs/results.md stand beside ours,
+    where there are some for the same number of iterations.
+    """
     categories = list(dict.fromkeys(run.category for run in runs))
     rows = selected_rows(table, options.methods)
     done = {row.label: _records_of(row, categories, runs, records) for row in rows}
-    baseline = done.get(table.baseline)
+    made = [_row(table, row, categories, done[row.label], done.get(table.baseline)) for row in rows]
+    if beside_code:
+        for row in made:
+            _add_code(table, row, categories)
     return {
         "table": table.name,
         "title": table.title,
@@ -60,7 +73,7 @@ def make_report(
         "output": str(options.output),
         "categories": categories,
         "protocol": PROTOCOL,
-        "rows": [_row(table, row, categories, done[row.label], baseline) for row in rows],
+        "rows": made,
         "runs": [_run(run, records[run.folder]) for run in runs if run.folder in records],
         "missing": [run.name for run in runs if run.folder not in records],
     }
@@ -106,6 +119,19 @@ def _row(
     }
 
 
+def _add_code(table: Table, row: dict[str, Any], categories: list[str]) -> None:
+    """Put the published code's figures into the cells of a row."""
+    figures = (published.CODE_MMD if table.metric == "mmd" else published.CODE_IOU).get(row["label"], {})
+    cells, found = row["cells"], []
+    for name in categories:
+        taken = cells[name].get("iterations", [])
+        if len(taken) == 1 and taken[0] in figures.get(name, {}):
+            cells[name]["code"] = figures[name][taken[0]]
+            found.append(cells[name]["code"])
+    if found and len(found) == len(categories):
+        cells[MEAN]["code"] = float(np.mean(found))
+
+
 def _cell(ours: list[dict[int, dict]]) -> dict[str, Any]:
     """Our figures for one category, or their means over several, from results by seed."""
     seeds = sorted(set.intersection(*(set(by_seed) for by_seed in ours)))
@@ -123,6 +149,7 @@ def _cell(ours: list[dict[int, dict]]) -> dict[str, Any]:
         "by_seed": by_seed,
         "interval_seeds": {name: interval for name, found in by_seed.items() if (interval := t_interval(found))},
         "interval_objects": {name: percentile_interval(_resampled(name, ours)) for name in IOUS},
+        "iterations": sorted({record["iterations"] for results in ours for record in results.values()}),
         "objects": sum(len(record["objects"]["names"]) for record in first),
         "images": sum(record["images"] for record in first),
     }

@@ -346,6 +346,15 @@ def test_report_files_tell_the_same(report, tmp_path) -> None:
     assert not {"http://", "https://", "src="} & set(page.split("=")), "nothing is loaded from elsewhere"
 
 
+def test_the_published_codes_figures_stand_beside_ours(tmp_path, stub) -> None:
+    given = options(tmp_path, categories=("airplane", "chair"), iterations=3000)
+    assert run_experiment(Call("kato", given, beside_code=True), worker=stub) == 0
+    text = (tmp_path / "out" / "kato.md").read_text()
+    assert "|  | published code, same meshes | 0.579 | 0.361 | 0.470 |" in text
+    assert run_experiment(Call("mmd", given, report_only=True, beside_code=True), worker=stub) == 0
+    assert "same meshes" not in (tmp_path / "out" / "mmd.md").read_text(), "no MMD is known at 3,000"
+
+
 def test_mmd_is_compared_by_ratio(tmp_path, stub) -> None:
     run_experiment(Call("mmd", options(tmp_path)), worker=stub)
     proposed = json.loads((tmp_path / "out" / "mmd.json").read_text())["rows"][1]
@@ -481,3 +490,11 @@ def test_two_processes_never_share_a_run(tmp_path) -> None:
         pass
     with sole_use(tmp_path):
         pass
+
+
+def test_the_page_of_results_has_a_place_for_every_table(report, tmp_path) -> None:
+    page = tmp_path / "results.md"
+    shutil.copy(Path(__file__).parents[2] / "docs" / "results.md", page)
+    for name in TABLES:
+        formats.embed(page, report | {"table": name})
+    assert page.read_text().count("| Proposed | paper (kato18) | 0.565 |") == len(TABLES)
