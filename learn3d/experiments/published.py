@@ -136,8 +136,8 @@ PASCAL = {
 }  # fmt: skip
 
 #: What the published code itself reaches on the meshes of docs/results.md (airplanes of FlightGear, chairs and tables
-#: of Sweet Home 3D; their splits and scalings), seed 0, batch 128: voxel IoU (kato18) and MMD on the test split, by row,
-#: category and iterations. Over three seeds the IoUs at 3,000 iterations spread by about 0.012.
+#: of Sweet Home 3D; their splits and scalings), seed 0, batch 128: voxel IoU (kato18) and MMD on the test split, by
+#: row, category and iterations. Over three seeds the IoUs at 3,000 iterations spread by about 0.012.
 CODE_IOU = {
     "Proposed": {
         "airplane": {1000: 0.541, 2000: 0.564, 3000: 0.579, 4000: 0.590, 5000: 0.597},
