@@ -159,7 +159,7 @@ def _notes(report: dict[str, Any]) -> list[str]:
     about = "Brackets: 95 % intervals, over test objects (bootstrap; objects, not images, are drawn again)"
     if len(seeds) > 1:
         about += f"; ±: over {len(seeds)} seeds (Student's t)"
-    about = f"Measured on the {report['split']} split. {about}." if report["runs"] else ""
+    about = f"Measured on the test split. {about}." if report["runs"] else ""
     notes += [about] if about else []
     for note in dict.fromkeys(row["published_note"] for row in report["rows"] if row["published_note"]):
         labels = ", ".join(row["label"] for row in report["rows"] if row["published_note"] == note)

@@ -19,6 +19,8 @@ from learn3d.presets import PRESETS
 
 RESULT_FILE = "test.json"
 LOG_FILE = "log.txt"
+#: Settings that are steps of the schedule, as the presets have them, for any number of iterations.
+_SCHEDULES = {"encoder_from_step": lambda n: n // 2 + 1, "decay_at_step": lambda n: n * 95 // 100}
 _OWN_OPTIONS = ("data", "category", "output", "preset", "settings", "layout", "iterations", "batch_size", "seed")
 
 
@@ -47,7 +49,6 @@ class Run:
     category: str
     seed: int
     config: TrainConfig
-    split: Literal["test", "val"]
 
     @property
     def folder(self) -> Path:
@@ -96,8 +97,7 @@ def plan_runs(table: Table, options: Options) -> list[Run]:
     if len(set(categories)) != len(categories):
         raise ValueError(f"categories must be different ones, got {', '.join(categories)}")
     return [
-        Run(variant, category, seed, _configure(table, options, variant, changes[variant.name], category, seed), split)
-        for split in [table.split]
+        Run(variant, category, seed, _configure(table, options, variant, changes[variant.name], category, seed))
         for category in categories
         for variant in variants
         for seed in range(seeds)
@@ -152,7 +152,7 @@ def found_runs(table: Table, options: Options) -> list[Run]:
             result = load_json(path)
             config = config_from_dict(result["config"], source=str(path))
             config = dataclasses.replace(config, output=path.parent, iterations=result["iterations"])
-            runs.append(Run(row.variant, category, seed, config, result["split"]))
+            runs.append(Run(row.variant, category, seed, config))
     if not runs:
         raise ValueError(f"there is no result for the table {table.name} in {options.output / 'runs'}; train first")
     order = [*(options.categories or table.categories), *sorted({run.category for run in runs})]
@@ -164,7 +164,6 @@ def is_current(run: Run, result: dict[str, Any]) -> bool:
     return (
         result.get("iterations") == run.config.iterations
         and result.get("checkpoint") == run.variant.checkpoint
-        and result.get("split") == run.split
         and result.get("data") == str(run.config.data.resolve())
     )
 
@@ -205,7 +204,9 @@ def _configure(
     preset = PRESETS[variant.preset]
     changes = dict(variant.changes) | given
     setting_names = {field.name for field in dataclasses.fields(preset.settings)}
-    settings = {name: value for name, value in changes.items() if name in setting_names}
+    iterations = options.iterations or preset.iterations
+    settings = {name: step_of(iterations) for name, step_of in _SCHEDULES.items() if name in setting_names}
+    settings |= {name: value for name, value in changes.items() if name in setting_names}
     return TrainConfig(
         data=options.data,
         category=category,

@@ -68,7 +68,6 @@ def make_report(
         "note": table.note,
         "metric": table.metric,
         "baseline": table.baseline,
-        "split": table.split,
         "data": str(options.data),
         "output": str(options.output),
         "categories": categories,
@@ -202,7 +201,7 @@ def _paper(row: PublishedRow | None, column: str, categories: list[str]) -> dict
 def _run(run: Run, record: dict[str, Any]) -> dict[str, Any]:
     """One line about a run, with all that repeats it."""
     config = run.config
-    kept = ("iterations", "step", "checkpoint", "split", "seed", "seconds", "images", "undefined")
+    kept = ("iterations", "step", "checkpoint", "seed", "seconds", "images", "undefined")
     about = {"run": run.name, "variant": run.variant.name, "category": run.category}
     about |= {name: record.get(name) for name in kept} | {"batch_size": config.batch_size}
     about |= {"objects": len(record["objects"]["names"])}

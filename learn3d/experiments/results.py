@@ -17,11 +17,12 @@ from learn3d.experiments.plan import RESULT_FILE, Run, command_line
 from learn3d.versions import versions
 
 DEFINITIONS = ("kato18", "kato19")
+SPLIT = "test"
 DIGITS = 5  # of stored values
 
 
 def measure(run: Run, *, check_data: bool) -> dict[str, Any]:
-    """Evaluate a trained run in fp32 on all images of its split and write <run>/test.json; returns what it holds.
+    """Evaluate a trained run in fp32 on all images of the test split and write <run>/test.json; returns what it holds.
 
     Keys: the configuration and the command that repeats it; iterations, step of the networks tested, seconds of
     training, versions at training and at testing; voxel IoU by both voxelisers, Chamfer-L1, F-score, both MMDs; and
@@ -37,15 +38,14 @@ def measure(run: Run, *, check_data: bool) -> dict[str, Any]:
     method, saved, metadata = checkpoint.load_method(
         run.folder / f"{run.variant.checkpoint}.safetensors", device=config.device, precision="fp32"
     )
-    dataset = _load(run, run.split)
+    dataset = _load(run, SPLIT)
     if dataset.voxels is None:
-        raise ValueError(f"{config.data} has no voxels for {run.category}, {run.split}: IoU cannot be measured")
+        raise ValueError(f"{config.data} has no voxels for {run.category}, {SPLIT}: IoU cannot be measured")
     result = evaluate(method, dataset, definitions=DEFINITIONS, paper_mmd=True, surfaces=True)
     record = {
         "config": config_to_dict(saved),
         "command": command_line(config),
         "data": str(config.data.resolve()),
-        "split": run.split,
         "checkpoint": run.variant.checkpoint,
         "iterations": last["step"],
         "step": metadata["step"],

@@ -27,14 +27,14 @@ STOPPED = 75  # exit status of a run that was stopped and can go on (sysexits' E
 def request_of(run: Run, *, fresh: bool = False) -> str:
     """The line that asks a worker for a run; `fresh` replaces whatever the folder holds."""
     variant = {"name": run.variant.name, "preset": run.variant.preset, "checkpoint": run.variant.checkpoint}
-    values = {"variant": variant, "category": run.category, "seed": run.seed, "split": run.split, "fresh": fresh}
+    values = {"variant": variant, "category": run.category, "seed": run.seed, "fresh": fresh}
     return json.dumps(values | {"config": config_to_dict(run.config)})
 
 
 def run_of(request: dict[str, Any]) -> Run:
     """The run that a request asks for."""
     config = config_from_dict(request["config"], source="the request")
-    return Run(Variant(**request["variant"]), request["category"], request["seed"], config, request["split"])
+    return Run(Variant(**request["variant"]), request["category"], request["seed"], config)
 
 
 def carry_out(run: Run, *, fresh: bool) -> bool:

@@ -51,7 +51,7 @@ means = [round(base + 0.02 * k, 5) for k in range(5)]
 table = {"names": list("abcde"), "images": [24] * 5, "defined": [24] * 5, "kato18": means, "kato19": means}
 iou = sum(means) / 5
 result = {"config": config, "command": "python tools/train.py ...", "data": os.path.realpath(config["data"])}
-result |= {"split": request["split"], "checkpoint": request["variant"]["checkpoint"], "seed": request["seed"]}
+result |= {"checkpoint": request["variant"]["checkpoint"], "seed": request["seed"]}
 result |= {"iterations": config["iterations"], "step": config["iterations"], "seconds": 60.0, "conditions": {}}
 result |= {"trained_by": {"commit": "0123456789ab"}, "tested_by": {"commit": "ba9876543210"}}
 result |= {"voxel_iou_kato18": iou, "voxel_iou_kato19": iou - 0.05, "mmd": 1 - base, "mmd_paper": 0.5, "images": 120}
@@ -84,7 +84,7 @@ def test_printed_means_agree_with_the_printed_rows(name: str) -> None:
 
 
 def test_tables_take_rows_of_the_paper_and_share_runs() -> None:
-    assert set(TABLES) == {"kato", "prgan", "kar", "ablation", "bins", "mmd", "pascal"}
+    assert set(TABLES) == {"kato", "prgan", "kar", "ablation", "bins", "mmd", "multi-view", "pascal"}
     variants: dict[str, object] = {}
     for table in TABLES.values():
         assert table.baseline in [row.label for row in table.rows]
@@ -113,6 +113,20 @@ def test_bins_are_a_training_option(tmp_path) -> None:
     runs = plan_runs(TABLES["bins"], Options(tmp_path, tmp_path, categories=("chair",)))
     assert [run.config.view_bins for run in runs] == list(published.BINS)
     assert {run.config.layout for run in runs} == {"kar"}
+
+
+def test_schedules_follow_the_number_of_iterations(tmp_path) -> None:
+    settings = [
+        plan_runs(TABLES[table], options(tmp_path, methods=(name,), iterations=2000))[0].config.settings
+        for table, name in (("prgan", "prgan"), ("multi-view", "multi-view"))
+    ]
+    assert (settings[0].encoder_from_step, settings[1].decay_at_step) == (1001, 1900)
+    for table in TABLES.values():
+        for run in plan_runs(table, Options(tmp_path, tmp_path, ("chair",), seeds=1)):
+            usual = PRESETS[run.variant.preset].settings
+            assert run.config.settings == dataclasses.replace(
+                usual, **{name: value for name, value in run.variant.changes.items() if hasattr(usual, name)}
+            ), "what is not changed is as published"
 
 
 def test_changes_reach_the_methods_that_they_name(tmp_path) -> None:
