@@ -20,6 +20,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; display: 
 th, td { padding: .2rem .6rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap }
 th:first-child, td:first-child, th:nth-child(2), td:nth-child(2) { text-align: left }
 th { border-bottom: 2px solid #888 } tr.first td { border-top: 2px solid #bbb } td.ours { font-weight: 600 }
+td .small { font-weight: 400 } td { vertical-align: top }
 code { font-size: .85em; overflow-wrap: anywhere } .small { color: #555; font-size: .9em }
 """
 
@@ -108,16 +109,17 @@ def main_table(report: dict[str, Any]) -> Cells:
         if any("paper" in cell or "paper_printed" in cell for cell in cells):
             table.append([label, f"paper{quoted} ({row['metric']})", *map(_paper_text, cells)])
             label = ""
+        if any("code" in cell for cell in cells):
+            texts = (_number(cell.get("code"), digits=3) for cell in cells)
+            table.append([label, "published code, same meshes", *texts])
+            label = ""
         if row["variant"] is not None:
             metrics = [row["metric"]] if report["metric"] == "mmd" else ["kato18", "kato19"]
             for metric in metrics:
                 table.append([label, f"here ({metric})", *(_ours_text(cell, metric) for cell in cells)])
                 label = ""
-        if any("code" in cell for cell in cells):
-            texts = (_number(cell.get("code"), digits=3) for cell in cells)
-            table.append(["", "published code, same meshes", *texts])
         if any("difference" in cell for cell in cells):
-            table.append(["", "difference", *(_signed(cell.get("difference")) for cell in cells)])
+            table.append(["", "here - paper", *(_signed(cell.get("difference")) for cell in cells)])
     return table
 
 
@@ -230,9 +232,18 @@ def _markdown_table(table: Cells) -> str:
 
 def _html_table(table: Cells) -> str:
     header, *rows = table
+    grouped = any(not row[0] for row in rows)  # several lines belong to one label
     lines = ["<table><thead><tr>" + "".join(f"<th>{html.escape(c)}</th>" for c in header) + "</tr></thead><tbody>"]
     for row in rows:
-        ours = " class='ours'" if row[1].startswith("here") else ""
-        cells = "".join(f"<td{ours if i > 1 else ''}>{html.escape(cell)}</td>" for i, cell in enumerate(row))
-        lines.append(f"<tr{' class=first' if row[0] else ''}>{cells}</tr>")
-    return re.sub(r"\n+", "\n", "\n".join(lines)) + "</tbody></table>"
+        ours = " class=ours" if row[1].startswith("here (") else ""
+        cells = "".join(f"<td{ours if i > 1 else ''}>{_html_cell(cell)}</td>" for i, cell in enumerate(row))
+        lines.append(f"<tr{' class=first' if grouped and row[0] else ''}>{cells}</tr>")
+    return "\n".join(lines) + "</tbody></table>"
+
+
+def _html_cell(text: str) -> str:
+    """A value, its intervals small in a line below."""
+    value, _, intervals = text.partition(" ")
+    if not re.match(r"[±\[]", intervals):
+        return html.escape(text)
+    return f"{html.escape(value)}<br><span class=small>{html.escape(intervals)}</span>"
