@@ -37,13 +37,22 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> No
 
 def load(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what `save` wrote, on the CPU. A missing, truncated or foreign file is a ValueError that says so."""
+    return _read(path, tensors=True)
+
+
+def load_metadata(path: Path) -> dict[str, Any]:
+    """The metadata of a checkpoint alone, without reading its tensors; raises as `load` does."""
+    return _read(path, tensors=False)[1]
+
+
+def _read(path: Path, *, tensors: bool) -> tuple[dict[str, Tensor], dict[str, Any]]:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"there is no checkpoint {path}; a run folder holds last.safetensors and best.safetensors")
     try:
         with safe_open(path, framework="pt") as file:
             header = (file.metadata() or {}).get("learn3d")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
+            contents = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}
     except (SafetensorError, OSError) as error:
         raise ValueError(
             f"{path} cannot be read as a checkpoint ({error}); it is damaged or was cut short: "
@@ -54,7 +63,7 @@ def load(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     metadata = json.loads(header)
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} has checkpoint format {metadata.get('format')}, this version reads format {FORMAT}")
-    return tensors, metadata
+    return contents, metadata
 
 
 def network_tensors(method: Method) -> dict[str, Tensor]:

@@ -1,0 +1,122 @@
+"""One table from beginning to end: plan, train and measure what is missing, report."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from learn3d.experiments.formats import embed, main_table, write_report
+from learn3d.experiments.plan import Options, Run, State, found_runs, plan_runs, read_results, read_state
+from learn3d.experiments.pool import WORKER, Outcome, carry_out_all, share_of_cores
+from learn3d.experiments.report import make_report
+from learn3d.experiments.tables import TABLES
+from learn3d.presets import PRESETS
+
+INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
+
+
+@dataclass(frozen=True)
+class Call:
+    """What is asked for."""
+
+    table: str
+    options: Options
+    jobs: int = 1
+    overwrite: bool = False
+    report_only: bool = False
+    page: Path | None = None
+    beside_code: bool = False
+
+
+def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
+    """Carry out a table's missing runs and write its report; the exit status: 0, 1 where a run failed, 130 if stopped.
+
+    The report is written in any case, with what there is. Raises ValueError for a table, method or option that does not
+    exist, for runs with other options in the output folder (unless `overwrite`), and for damaged files.
+    """
+    if call.table not in TABLES:
+        raise ValueError(f"there is no table {call.table!r}; choose one of {', '.join(TABLES)} (see --list)")
+    if call.jobs < 1:
+        raise ValueError(f"jobs must be a number of processes, at least 1, got {call.jobs}")
+    if call.report_only and call.overwrite:
+        raise ValueError("--report-only trains nothing and --overwrite trains anew; give one of them")
+    table, outcomes = TABLES[call.table], []
+    if call.report_only:
+        runs = found_runs(table, call.options)
+    else:
+        threads = call.options.threads or share_of_cores(call.jobs)
+        runs = plan_runs(table, dataclasses.replace(call.options, threads=threads))
+        outcomes = _complete(runs, table.name, call, threads, worker)
+    report = make_report(table, call.options, runs, read_results(runs), beside_code=call.beside_code)
+    paths = write_report(call.options.output, report)
+    if call.page is not None:
+        embed(call.page, report)
+    for line in main_table(report):
+        print("  ".join(cell.ljust(8) for cell in line).rstrip())
+    _say("report: " + ", ".join(map(str, paths)))
+    return _conclude(outcomes, [] if call.report_only else report["missing"])
+
+
+def _complete(runs: Sequence[Run], table: str, call: Call, threads: int, worker: Sequence[str]) -> list[Outcome]:
+    """Train and measure what is not done yet; runs with other options are an error, or replaced."""
+    states, conflicts = _read_states(runs)
+    if conflicts and not call.overwrite:
+        advice = "ask for the same options, choose another --output, or give --overwrite"
+        raise ValueError("\n  ".join([*map(str, conflicts.values()), advice]))
+    missing = [run for run, state in zip(runs, states, strict=True) if state.stage != "done"]
+    _say(f"{table}: {len(runs)} runs, of which {_count(states)}; {call.jobs} at a time, {threads} threads each")
+    fresh = [run for run in runs if run.folder in conflicts]
+    return carry_out_all(missing, jobs=call.jobs, threads=threads, fresh=fresh, worker=worker)
+
+
+def describe_tables() -> str:
+    """What --list prints: every table with its methods, and whether their presets are there."""
+    lines = []
+    for table in TABLES.values():
+        lines.append(f"{table.name}: {table.title}")
+        lines.append(f"  layout {table.layout}, {len(table.categories)} categories, seeds {table.seeds}")
+        for row in table.rows:
+            if row.variant is None:
+                lines.append(f"  {row.label}: quoted")
+                continue
+            changes = "".join(f", {name}={value}" for name, value in row.variant.changes.items())
+            absent = "" if row.variant.preset in PRESETS else " (not in this version)"
+            lines.append(f"  {row.label}: {row.variant.name}, preset {row.variant.preset}{changes}{absent}")
+    return "\n".join(lines)
+
+
+def _read_states(runs: Sequence[Run]) -> tuple[list[State], dict[Path, ValueError]]:
+    """How far every run has come, and the conflicts by folder; a run in conflict counts as new."""
+    states, conflicts = [], {}
+    for run in runs:
+        try:
+            states.append(read_state(run))
+        except ValueError as error:
+            conflicts[run.folder] = error
+            states.append(State("new"))
+    return states, conflicts
+
+
+def _count(states: Sequence[State]) -> str:
+    names = {"done": "are done", "trained": "only need testing", "unfinished": "go on", "new": "are new"}
+    return ", ".join(f"{n} {text}" for s, text in names.items() if (n := sum(state.stage == s for state in states)))
+
+
+def _conclude(outcomes: Sequence[Outcome], missing: Sequence[str]) -> int:
+    failed = [outcome for outcome in outcomes if outcome.status == "failed"]
+    for outcome in failed:
+        _say(f"\nFAILED {outcome.run.name}; the end of its log:\n{outcome.tail}")
+    if failed:
+        _say(f"\n{len(failed)} of {len(outcomes)} runs failed; the same command tries them again")
+        return 1
+    if missing:
+        _say("stopped; the same command goes on")
+        return INTERRUPTED
+    return 0
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,249 @@
+"""Reports as files: JSON as they are, CSV with a line per run, Markdown, and one HTML page that needs nothing else."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from learn3d import files
+from learn3d.experiments.report import MEAN
+
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 75rem; margin: 2rem auto; padding: 0 1rem }
+h1 { font-size: 1.4rem } h2 { font-size: 1.1rem; margin-top: 2rem }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; display: block; overflow-x: auto }
+th, td { padding: .2rem .6rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap }
+th:first-child, td:first-child, th:nth-child(2), td:nth-child(2) { text-align: left }
+th { border-bottom: 2px solid #888 } tr.first td { border-top: 2px solid #bbb } td.ours { font-weight: 600 }
+td .small { font-weight: 400 } td { vertical-align: top }
+code { font-size: .85em; overflow-wrap: anywhere } .small { color: #555; font-size: .9em }
+"""
+
+Cells = list[list[str]]
+
+
+def write_report(folder: Path, report: dict[str, Any]) -> list[Path]:
+    """Write <table>.json, .csv, .md and .html into `folder`; returns their paths."""
+    name = report["table"]
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.{suffix}" for suffix in ("json", "csv", "md", "html")]
+    files.write_json(paths[0], report)
+    for path, text in zip(paths[1:], (to_csv(report), to_markdown(report), to_html(report)), strict=True):
+        files.write_bytes(path, text.encode())
+    return paths
+
+
+def embed(page: Path, report: dict[str, Any]) -> None:
+    """Put the Markdown report into `page`, in place of what is between <!-- table: NAME --> and <!-- end: NAME -->.
+
+    Raises ValueError where the page does not have the two lines.
+    """
+    name, text = report["table"], page.read_text()
+    start, end = f"<!-- table: {name} -->", f"<!-- end: {name} -->"
+    if text.count(start) != 1 or text.count(end) != 1 or text.index(end) < text.index(start):
+        raise ValueError(f"{page} must have the lines {start!r} and {end!r}, once each, where the table belongs")
+    before, rest = text.split(start)
+    after = rest.split(end)[1]
+    files.write_bytes(page, f"{before}{start}\n{to_markdown(report, heading=False)}{end}{after}".encode())
+
+
+def to_csv(report: dict[str, Any]) -> str:
+    """One line per run."""
+    out = io.StringIO()
+    names = list(report["runs"][0]) if report["runs"] else ["run"]
+    writer = csv.DictWriter(out, [name for name in names if name != "general_command"], extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows(report["runs"])
+    return out.getvalue()
+
+
+def to_markdown(report: dict[str, Any], *, heading: bool = True) -> str:
+    """Tables and text for a page. Commands have DATA and OUTPUT in place of folders, so that no path gets in."""
+    parts = [f"## {report['title']}"] if heading else []
+    parts += [_markdown_table(main_table(report))]
+    parts += _notes(report)
+    if len(versus := baseline_table(report)) > 1:
+        parts += [f"Against {report['baseline']}:", _markdown_table(versus)]
+    if report["runs"]:
+        parts += [
+            "What was run:",
+            _markdown_table(run_table(report)),
+            "```sh\n" + "\n".join(commands(report)) + "\n```",
+        ]
+    return "\n\n".join(parts) + "\n"
+
+
+def to_html(report: dict[str, Any]) -> str:
+    """A page of its own, with the style in it."""
+    body = [f"<h1>{html.escape(report['title'])}</h1>", _html_table(main_table(report))]
+    body += [f"<p class='small'>{html.escape(note)}</p>" for note in _notes(report)]
+    if len(versus := baseline_table(report)) > 1:
+        body += [f"<h2>Against {html.escape(report['baseline'])}</h2>", _html_table(versus)]
+    if report["runs"]:
+        body += ["<h2>What was run</h2>", _html_table(run_table(report))]
+        body += ["<h2>Commands</h2>", *(f"<p><code>{html.escape(command)}</code></p>" for command in commands(report))]
+    body += ["<h2>Measures</h2><dl>"]
+    body += [f"<dt>{name}</dt><dd class='small'>{html.escape(text)}</dd>" for name, text in report["protocol"].items()]
+    title = html.escape(report["title"])
+    return (
+        f"<!doctype html>\n<html lang='en'><head><meta charset='utf-8'><title>{title}</title>"
+        f"<meta name='viewport' content='width=device-width'><style>{_STYLE}</style></head>\n<body>\n"
+        + "\n".join(body)
+        + "</dl>\n</body></html>\n"
+    )
+
+
+def main_table(report: dict[str, Any]) -> Cells:
+    """Per method a line with the paper's figures, one with ours and one with the differences; first the header."""
+    columns = [*report["categories"], MEAN]
+    table = [["method", "", *columns]]
+    for row in report["rows"]:
+        cells = [row["cells"][column] for column in columns]
+        quoted = f", quoted from {row['quoted_from']}" if row["quoted_from"] else ""
+        label = row["label"]
+        if any("paper" in cell or "paper_printed" in cell for cell in cells):
+            table.append([label, f"paper{quoted} ({row['metric']})", *map(_paper_text, cells)])
+            label = ""
+        if any("code" in cell for cell in cells):
+            texts = (_number(cell.get("code"), digits=3) for cell in cells)
+            table.append([label, "published code, same meshes", *texts])
+            label = ""
+        if row["variant"] is not None:
+            metrics = [row["metric"]] if report["metric"] == "mmd" else ["kato18", "kato19"]
+            for metric in metrics:
+                table.append([label, f"here ({metric})", *(_ours_text(cell, metric) for cell in cells)])
+                label = ""
+        if any("difference" in cell for cell in cells):
+            table.append(["", "here - paper", *(_signed(cell.get("difference")) for cell in cells)])
+    return table
+
+
+def baseline_table(report: dict[str, Any]) -> Cells:
+    """Per method its difference to the baseline with the interval over objects, or for the MMD the ratio."""
+    columns = [*report["categories"], MEAN]
+    table = [["method", "", *columns]]
+    for row in report["rows"]:
+        differences = [row["cells"][column].get("to_baseline") for column in columns]
+        if any(differences):
+            table.append([row["label"], "difference", *map(_difference_text, differences)])
+    return table
+
+
+def run_table(report: dict[str, Any]) -> Cells:
+    """A line per run: what was trained, on how much, and everything that was measured."""
+    header = ["run", "networks", "iterations", "batch", "objects", "images", "kato18", "kato19", "MMD", "printed MMD"]
+    table = [[*header, "Chamfer-L1", "F-score", "minutes", "commit"]]
+    for run in report["runs"]:
+        network = run["checkpoint"] + (f" (step {run['step']})" if run["step"] != run["iterations"] else "")
+        counts = [str(run[key]) for key in ("iterations", "batch_size", "objects", "images")]
+        measures = [_number(run[key]) for key in ("kato18", "kato19", "mmd", "mmd_paper", "chamfer_l1", "f_score")]
+        minutes = "-" if run["seconds"] is None else f"{run['seconds'] / 60:.1f}"
+        commit = (
+            run["commit"][:9] if run["commit"] else f"tested at {run['tested_at'][:9]}" if run["tested_at"] else "-"
+        )
+        table.append([run["run"], network, *counts, *measures, minutes, commit])
+    return table
+
+
+def commands(report: dict[str, Any]) -> list[str]:
+    """The commands that repeat the runs, with CATEGORY and SEED for what they differ in."""
+    return list(dict.fromkeys(run["general_command"] for run in report["runs"]))
+
+
+def _notes(report: dict[str, Any]) -> list[str]:
+    notes = [report["note"]] if report["note"] else []
+    seeds = sorted({seed for row in report["rows"] for seed in row["cells"].get(MEAN, {}).get("seeds", [])})
+    about = "Brackets: 95 % intervals, over test objects (bootstrap; objects, not images, are drawn again)"
+    if len(seeds) > 1:
+        about += f"; ±: over {len(seeds)} seeds (Student's t)"
+    about = f"Measured on the test split. {about}." if report["runs"] else ""
+    notes += [about] if about else []
+    for note in dict.fromkeys(row["published_note"] for row in report["rows"] if row["published_note"]):
+        labels = ", ".join(row["label"] for row in report["rows"] if row["published_note"] == note)
+        notes.append(f"{labels}, paper's figures: {note}.")
+    if any(_only_printed(row["cells"][MEAN]) for row in report["rows"]):
+        notes.append("A mean in parentheses is the paper's over its own categories, which are not the ones here.")
+    lengths = sorted({(run["iterations"], run["batch_size"]) for run in report["runs"]})
+    if len(lengths) > 1:
+        alike = ", ".join(f"{iterations} iterations of batch {batch}" for iterations, batch in lengths)
+        notes.append(f"The runs were not all trained alike: {alike}.")
+    if report["missing"]:
+        notes.append(f"Not there yet: {', '.join(report['missing'])}.")
+    return notes
+
+
+def _only_printed(cell: dict[str, Any]) -> bool:
+    return "paper_printed" in cell and "paper" not in cell
+
+
+def _paper_text(cell: dict[str, Any]) -> str:
+    return f"({cell['paper_printed']:.3f})" if _only_printed(cell) else _number(cell.get("paper"), digits=3)
+
+
+def _ours_text(cell: dict[str, Any], metric: str) -> str:
+    """Value, half width of the interval over seeds, interval over objects."""
+    if metric not in cell.get("values", {}):
+        return "-"
+    text = _number(cell["values"][metric], digits=3)
+    if over_seeds := cell["interval_seeds"].get(metric):
+        text += f" ±{_number((over_seeds[1] - over_seeds[0]) / 2, digits=3)}"
+    return text + _interval_text(cell["interval_objects"].get(metric))
+
+
+def _difference_text(difference: dict[str, Any] | None) -> str:
+    if difference is None:
+        return "-"
+    if "ratio" in difference:
+        return f"{_signed(difference['value'])} (x {difference['ratio']:.2f})"
+    return _signed(difference["value"]) + _interval_text(difference.get("interval_objects"), signed=True)
+
+
+def _interval_text(interval: Sequence[float] | None, signed: bool = False) -> str:
+    if interval is None:
+        return ""
+    return " [" + ", ".join(_signed(end) if signed else _number(end, digits=3) for end in interval) + "]"
+
+
+def _signed(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.3f}"
+
+
+def _commit_text(run: dict[str, Any]) -> str:
+    """The commit that trained a run, or where that was not recorded the one that tested it."""
+    if run["commit"]:
+        return run["commit"][:9] + ("-dirty" if run["commit"].endswith("-dirty") else "")
+    return f"tested at {run['tested_at'][:9]}" if run["tested_at"] else "-"
+
+
+def _number(value: float | None, digits: int = 4) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _markdown_table(table: Cells) -> str:
+    header, *rows = [[cell.replace("|", "\\|") for cell in row] for row in table]
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def _html_table(table: Cells) -> str:
+    header, *rows = table
+    grouped = any(not row[0] for row in rows)  # several lines belong to one label
+    lines = ["<table><thead><tr>" + "".join(f"<th>{html.escape(c)}</th>" for c in header) + "</tr></thead><tbody>"]
+    for row in rows:
+        ours = " class=ours" if row[1].startswith("here (") else ""
+        cells = "".join(f"<td{ours if i > 1 else ''}>{_html_cell(cell)}</td>" for i, cell in enumerate(row))
+        lines.append(f"<tr{' class=first' if grouped and row[0] else ''}>{cells}</tr>")
+    return "\n".join(lines) + "</tbody></table>"
+
+
+def _html_cell(text: str) -> str:
+    """A value, its intervals small in a line below."""
+    value, _, intervals = text.partition(" ")
+    if not re.match(r"[±\[]", intervals):
+        return html.escape(text)
+    return f"{html.escape(value)}<br><span class=small>{html.escape(intervals)}</span>"

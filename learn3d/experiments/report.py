@@ -1,0 +1,218 @@
+"""A table from stored results: the paper's figures beside ours, differences, confidence intervals; plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS
+from learn3d.experiments import published
+from learn3d.experiments.plan import Options, Run, command_line, selected_rows
+from learn3d.experiments.published import CATEGORIES, PublishedRow
+from learn3d.experiments.results import object_sums
+from learn3d.experiments.statistics import LEVEL, RESAMPLES, percentile_interval, resampled_means, t_interval
+from learn3d.experiments.tables import Row, Table
+
+MEAN = "mean"  # the column after the categories
+MEASURES = {
+    "kato18": "voxel_iou_kato18",
+    "kato19": "voxel_iou_kato19",
+    "mmd": "mmd",
+    "mmd_paper": "mmd_paper",
+    "chamfer_l1": "chamfer_l1",
+    "f_score": "f_score",
+}
+IOUS = ("kato18", "kato19")
+
+PROTOCOL = {
+    "kato18": "voxel IoU of 32^3 grids, mean over images, then over categories; by the voxeliser of Kato et al. 2018, "
+    "with which the paper's own figures were measured",
+    "kato19": "the same by the voxeliser of Kato and Harada 2019, with thicker surfaces; not comparable with kato18",
+    "mmd": f"mean over all pairs of view classes, up to {CODES_PER_VIEW} codes each; five kernels, no root (the "
+    "published code, and the paper's table)",
+    "mmd_paper": "the same by the printed formula: one kernel, square root",
+    "chamfer_l1": f"between {SURFACE_POINTS} points of each surface, units of the object frame",
+    "f_score": f"of the same points at {F_SCORE_DISTANCE} of the longest side",
+    "interval_seeds": f"{LEVEL:.0%} interval of the mean over seeds (Student's t)",
+    "interval_objects": f"{LEVEL:.0%} interval over test objects: {RESAMPLES} resamples of objects, not images; the "
+    "differences to the baseline are paired",
+}
+
+
+def make_report(
+    table: Table,
+    options: Options,
+    runs: Sequence[Run],
+    records: Mapping[Path, dict[str, Any]],
+    *,
+    beside_code: bool = False,
+) -> dict[str, Any]:
+    """The table's report from the stored results of runs, by folder; runs without one are named under "missing".
+
+    With `beside_code` the figures that the published code reaches on the meshes of docs/results.md stand beside ours,
+    where there are some for the same number of iterations.
+    """
+    categories = list(dict.fromkeys(run.category for run in runs))
+    rows = selected_rows(table, options.methods)
+    done = {row.label: _records_of(row, categories, runs, records) for row in rows}
+    made = [_row(table, row, categories, done[row.label], done.get(table.baseline)) for row in rows]
+    if beside_code:
+        for row in made:
+            _add_code(table, row, categories)
+    return {
+        "table": table.name,
+        "title": table.title,
+        "note": table.note,
+        "metric": table.metric,
+        "baseline": table.baseline,
+        "data": str(options.data),
+        "output": str(options.output),
+        "categories": categories,
+        "protocol": PROTOCOL,
+        "rows": made,
+        "runs": [_run(run, records[run.folder]) for run in runs if run.folder in records],
+        "missing": [run.name for run in runs if run.folder not in records],
+    }
+
+
+def _records_of(
+    row: Row, categories: list[str], runs: Sequence[Run], records: Mapping[Path, dict]
+) -> dict[str, dict[int, dict]]:
+    """Results of a row by category and seed."""
+    mine = [run for run in runs if row.variant and run.variant.name == row.variant.name and run.folder in records]
+    return {c: {run.seed: records[run.folder] for run in mine if run.category == c} for c in categories}
+
+
+def _row(
+    table: Table,
+    row: Row,
+    categories: list[str],
+    results: dict[str, dict[int, dict]],
+    baseline: dict[str, dict[int, dict]] | None,
+) -> dict[str, Any]:
+    metric = "mmd" if table.metric == "mmd" else row.published.metric if row.published else "kato18"
+    is_baseline = row.label == table.baseline
+    cells = {}
+    for column, names in [*((c, [c]) for c in categories), (MEAN, categories)]:
+        ours = [results[name] for name in names]
+        cell = _cell(ours) if all(ours) else {}
+        if cell and baseline and not is_baseline and all(baseline[name] for name in names):
+            main = "mmd" if table.metric == "mmd" else "kato18"
+            cell["to_baseline"] = _difference(main, ours, [baseline[name] for name in names])
+        cell |= _paper(row.published, column, categories)
+        if "paper" in cell and metric in cell.get("values", {}):
+            cell["difference"] = cell["values"][metric] - cell["paper"]
+        cells[column] = cell
+    return {
+        "label": row.label,
+        "variant": row.variant.name if row.variant else None,
+        "preset": row.variant.preset if row.variant else None,
+        "checkpoint": row.variant.checkpoint if row.variant else None,
+        "metric": metric,
+        "quoted_from": row.published.quoted_from if row.published else None,
+        "published_note": row.published.note if row.published else None,
+        "cells": cells,
+    }
+
+
+def _add_code(table: Table, row: dict[str, Any], categories: list[str]) -> None:
+    """Put the published code's figures into the cells of a row."""
+    figures = (published.CODE_MMD if table.metric == "mmd" else published.CODE_IOU).get(row["label"], {})
+    cells, found = row["cells"], []
+    for name in categories:
+        taken = cells[name].get("iterations", [])
+        if len(taken) == 1 and taken[0] in figures.get(name, {}):
+            cells[name]["code"] = figures[name][taken[0]]
+            found.append(cells[name]["code"])
+    if found and len(found) == len(categories):
+        cells[MEAN]["code"] = float(np.mean(found))
+
+
+def _cell(ours: list[dict[int, dict]]) -> dict[str, Any]:
+    """Our figures for one category, or their means over several, from results by seed."""
+    seeds = sorted(set.intersection(*(set(by_seed) for by_seed in ours)))
+    values, by_seed = {}, {}
+    for name, key in MEASURES.items():
+        per_category = [[record.get(key) for record in results.values()] for results in ours]
+        if any(value is None for found in per_category for value in found):
+            continue
+        values[name] = float(np.mean([np.mean(found) for found in per_category]))
+        by_seed[name] = [float(np.mean([results[seed][key] for results in ours])) for seed in seeds]
+    first = [next(iter(results.values())) for results in ours]
+    return {
+        "values": values,
+        "seeds": seeds,
+        "by_seed": by_seed,
+        "interval_seeds": {name: interval for name, found in by_seed.items() if (interval := t_interval(found))},
+        "interval_objects": {name: percentile_interval(_resampled(name, ours)) for name in IOUS},
+        "iterations": sorted({record["iterations"] for results in ours for record in results.values()}),
+        "objects": sum(len(record["objects"]["names"]) for record in first),
+        "images": sum(record["images"] for record in first),
+    }
+
+
+def _difference(metric: str, ours: list[dict[int, dict]], theirs: list[dict[int, dict]]) -> dict[str, Any]:
+    """Ours minus the baseline's; for IoU with the interval of a paired bootstrap over the same objects."""
+    key = MEASURES[metric]
+    a, b = (
+        float(np.mean([np.mean([r[key] for r in results.values()]) for results in side])) for side in (ours, theirs)
+    )
+    difference: dict[str, Any] = {"metric": metric, "value": a - b}
+    if metric == "mmd":
+        return difference | ({"ratio": a / b} if b else {})
+    if [_names(results) for results in ours] == [_names(results) for results in theirs]:
+        difference["interval_objects"] = percentile_interval(_resampled(metric, ours) - _resampled(metric, theirs))
+    return difference
+
+
+def _resampled(metric: str, ours: list[dict[int, dict]]) -> np.ndarray:
+    """Means over resampled objects [2000]; the IoUs of an object are those of all seeds together."""
+    sums, counts = [], []
+    for results in ours:
+        found = [object_sums(record, metric) for record in results.values()]
+        sums.append(sum(s for s, _ in found))
+        counts.append(sum(n for _, n in found))
+    return resampled_means(sums, counts)
+
+
+def _names(results: dict[int, dict]) -> list[str]:
+    return next(iter(results.values()))["objects"]["names"]
+
+
+def _paper(row: PublishedRow | None, column: str, categories: list[str]) -> dict[str, Any]:
+    """The paper's figure for a column. The mean is taken over the same categories as ours wherever the paper has them;
+    its printed mean stands beside it. A mean over other categories than ours is given, but not compared."""
+    if row is None:
+        return {}
+    if column != MEAN:
+        return {"paper": row.values[column]} if column in row.values else {}
+    printed = {} if row.mean is None else {"paper_printed": row.mean}
+    same = set(categories) == (set(row.values) or set(CATEGORIES))
+    if same and row.mean is not None:
+        return printed | {"paper": row.mean}
+    if categories and all(name in row.values for name in categories):
+        return printed | {"paper": float(np.mean([row.values[name] for name in categories]))}
+    return printed
+
+
+def _run(run: Run, record: dict[str, Any]) -> dict[str, Any]:
+    """One line about a run, with all that repeats it."""
+    config = run.config
+    kept = ("iterations", "step", "checkpoint", "seed", "seconds", "images", "undefined")
+    about = {"run": run.name, "variant": run.variant.name, "category": run.category}
+    about |= {name: record.get(name) for name in kept} | {"batch_size": config.batch_size}
+    about |= {"objects": len(record["objects"]["names"])}
+    about |= {name: record.get(key) for name, key in MEASURES.items()}
+    trained, tested = record.get("trained_by") or {}, record.get("tested_by") or {}
+    about |= {"commit": trained.get("commit"), "tested_at": tested.get("commit"), "torch": trained.get("torch")}
+    general = command_line(
+        config,
+        data="DATA",
+        category="CATEGORY",
+        seed="SEED",
+        output=f"OUTPUT/runs/CATEGORY/{run.variant.name}-seedSEED",
+    )
+    return about | {"command": record["command"], "general_command": general}

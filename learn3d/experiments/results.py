@@ -1,0 +1,116 @@
+"""The measurement of one finished run on its test split, kept in a file that reports need no network to read."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import numpy as np
+import torch
+
+from learn3d import checkpoint, files
+from learn3d.config import config_to_dict
+from learn3d.data.layouts import load_dataset
+from learn3d.data.views import ViewDataset
+from learn3d.evaluation import evaluate
+from learn3d.experiments.plan import RESULT_FILE, Run, command_line
+from learn3d.versions import versions
+
+DEFINITIONS = ("kato18", "kato19")
+SPLIT = "test"
+DIGITS = 5  # of stored values
+
+
+def measure(run: Run, *, check_data: bool) -> dict[str, Any]:
+    """Evaluate a trained run in fp32 on all images of the test split and write <run>/test.json; returns what it holds.
+
+    Keys: the configuration and the command that repeats it; iterations, step of the networks tested, seconds of
+    training, versions at training and at testing; voxel IoU by both voxelisers, Chamfer-L1, F-score, both MMDs; and
+    "objects" and "views": for each of them the number of its images, the number with a defined IoU and the mean IoU.
+
+    With `check_data` the training images of `run.config.data` are compared with those the run was trained on.
+    Raises ValueError where there is no checkpoint or the data are not the run's.
+    """
+    config = run.config
+    last = checkpoint.load_metadata(run.folder / "last.safetensors")
+    if check_data:
+        _check_data(run, last.get("conditions", {}))
+    method, saved, metadata = checkpoint.load_method(
+        run.folder / f"{run.variant.checkpoint}.safetensors", device=config.device, precision="fp32"
+    )
+    dataset = _load(run, SPLIT)
+    if dataset.voxels is None:
+        raise ValueError(f"{config.data} has no voxels for {run.category}, {SPLIT}: IoU cannot be measured")
+    result = evaluate(method, dataset, definitions=DEFINITIONS, paper_mmd=True, surfaces=True)
+    record = {
+        "config": config_to_dict(saved),
+        "command": command_line(config),
+        "data": str(config.data.resolve()),
+        "checkpoint": run.variant.checkpoint,
+        "iterations": last["step"],
+        "step": metadata["step"],
+        "seed": config.seed,
+        "seconds": last.get("seconds"),
+        "conditions": last.get("conditions", {}),
+        "trained_by": last.get("versions"),
+        "tested_by": versions(),
+    }
+    summary = {key: value for key, value in result.summary().items() if key != "voxel_iou"}
+    tables = {
+        "objects": _means_by(result.object_ids, result.ious, dataset.object_names),
+        "views": _means_by(result.view_ids, result.ious, dataset.view_names),
+    }
+    record |= summary | tables
+    files.write_json(run.folder / RESULT_FILE, record)
+    return record
+
+
+def object_sums(record: dict[str, Any], definition: str) -> tuple[np.ndarray, np.ndarray]:
+    """(sum of the IoUs, number of IoUs), both float64 [N], of the objects of a stored result."""
+    defined = np.array(record["objects"]["defined"], np.float64)
+    means = np.array([0.0 if mean is None else mean for mean in record["objects"][definition]])
+    return means * defined, defined
+
+
+def _load(run: Run, split: str) -> ViewDataset:
+    config = run.config
+    return load_dataset(
+        config.layout,
+        config.data,
+        config.category,
+        split,
+        image_size=config.settings.image_size,
+        view_bins=config.view_bins,
+        views_per_object=config.views_per_object if split == "train" else None,
+    )
+
+
+def _check_data(run: Run, recorded: dict[str, Any]) -> None:
+    """Refuse to put a run's name to data that it was not trained on. Runs that did not record theirs pass."""
+    images = _load(run, "train").images
+    found = f"{zlib.crc32(np.ascontiguousarray(images)):08x}"
+    if recorded.get("images", found) != found:
+        raise ValueError(
+            f"{run.folder} was trained on other data: the CRC-32 of its {recorded.get('samples')} training images is "
+            f"{recorded['images']}, that of the {len(images)} in {run.config.data} is {found}; give the run's own data "
+            "with --data, or another --output"
+        )
+
+
+def _means_by(ids: torch.Tensor, ious: dict[str, torch.Tensor], names: tuple[str, ...]) -> dict[str, Any]:
+    """Names, numbers of images and mean IoUs (None where undefined) of the groups that occur in `ids`, int64 [M]."""
+    ids = ids.numpy()
+    values = {name: value.numpy() for name, value in ious.items()}
+    known = ~np.isnan(next(iter(values.values())))
+    groups = np.unique(ids)
+    images = np.bincount(ids, minlength=len(names))[groups]
+    defined = np.bincount(ids[known], minlength=len(names))[groups]
+    table: dict[str, Any] = {
+        "names": [names[g] for g in groups],
+        "images": images.tolist(),
+        "defined": defined.tolist(),
+    }
+    for name, value in values.items():
+        sums = np.bincount(ids[known], weights=value[known], minlength=len(names))[groups]
+        table[name] = [round(s / n, DIGITS) if n else None for s, n in zip(sums, defined, strict=True)]
+    return table

@@ -1,0 +1,53 @@
+"""Confidence intervals over seeds (t) and over objects (bootstrap)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import stats
+
+LEVEL = 0.95
+RESAMPLES = 2000
+
+Interval = tuple[float, float]
+
+
+def t_interval(values: Sequence[float]) -> Interval | None:
+    """95 % confidence interval of the mean of independent values, by Student's t; None for fewer than two."""
+    n = len(values)
+    if n < 2:
+        return None
+    mean = sum(values) / n
+    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / (n - 1))
+    half = float(stats.t.ppf((1 + LEVEL) / 2, n - 1)) * deviation / math.sqrt(n)
+    return mean - half, mean + half
+
+
+def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray], *, seed: int = 0) -> np.ndarray:
+    """Means of 2,000 resampled test sets, float64 [2000].
+
+    sums[c], counts[c] float [N_c]: sum of a measure over the images of each object of category c, and their number. The
+    images of an object are not independent of each other, so objects are drawn, with replacement, within each category;
+    the mean over the images of each category is taken, then that over categories. The draws depend on the seed and the
+    numbers of objects alone: two results of the same objects have the same ones and can be subtracted, which makes the
+    bootstrap of their difference a paired one.
+    """
+    rng = np.random.default_rng(seed)
+    total = np.zeros(RESAMPLES)
+    for part, number in zip(sums, counts, strict=True):
+        for start in range(0, RESAMPLES, 250):
+            drawn = rng.integers(len(part), size=(250, len(part)))
+            with np.errstate(invalid="ignore", divide="ignore"):
+                total[start : start + 250] += part[drawn].sum(1) / number[drawn].sum(1)
+    return total / len(sums)
+
+
+def percentile_interval(resampled: np.ndarray) -> Interval | None:
+    """The middle 95 % of resampled values, None where none is defined."""
+    known = resampled[np.isfinite(resampled)]
+    if len(known) == 0:
+        return None
+    low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return float(low), float(high)

@@ -1,0 +1,102 @@
+"""One run in a process of its own: train as far as it needs, measure, write the result.
+
+The request comes as one line of JSON on the standard input. The parent keeps its end open: when it is gone, for
+whatever reason, the worker sees the end of the file and stops as at Ctrl-C, its state saved.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from learn3d.config import config_from_dict, config_to_dict
+from learn3d.experiments import plan
+from learn3d.experiments.plan import Run
+from learn3d.experiments.tables import Variant
+
+STOPPED = 75  # exit status of a run that was stopped and can go on (sysexits' EX_TEMPFAIL)
+
+
+def request_of(run: Run, *, fresh: bool = False) -> str:
+    """The line that asks a worker for a run; `fresh` replaces whatever the folder holds."""
+    variant = {"name": run.variant.name, "preset": run.variant.preset, "checkpoint": run.variant.checkpoint}
+    values = {"variant": variant, "category": run.category, "seed": run.seed, "fresh": fresh}
+    return json.dumps(values | {"config": config_to_dict(run.config)})
+
+
+def run_of(request: dict[str, Any]) -> Run:
+    """The run that a request asks for."""
+    config = config_from_dict(request["config"], source="the request")
+    return Run(Variant(**request["variant"]), request["category"], request["seed"], config)
+
+
+def carry_out(run: Run, *, fresh: bool) -> bool:
+    """Train and measure; False when a signal stopped the training. Raises what `train` and `measure` raise."""
+    from learn3d.experiments.results import measure
+    from learn3d.training import train
+
+    state = plan.State("new") if fresh else plan.read_state(run)
+    if state.stage in ("new", "unfinished"):
+        (run.folder / plan.RESULT_FILE).unlink(missing_ok=True)
+        resume = state.stage == "unfinished"
+        if not train(run.config, resume=resume, overwrite=not resume).finished:
+            return False
+    if state.stage != "done":
+        record = measure(run, check_data=state.stage == "trained")
+        print(f"tested: voxel IoU {record['voxel_iou_kato18']:.4f} (kato18)", flush=True)
+    return True
+
+
+@contextlib.contextmanager
+def sole_use(folder: Path) -> Iterator[None]:
+    """Keep other processes from working in the same run folder. Raises OSError where one does; where the system has no
+    file locks (Windows), nothing is kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with open(folder / ".lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise OSError(f"another process works in {folder}; wait for it, or stop it") from None
+        yield
+
+
+def _stop_with_parent() -> None:
+    """Interrupt this process when the standard input ends."""
+
+    def watch() -> None:
+        while os.read(0, 4096):  # not sys.stdin, whose lock a thread must not hold when the interpreter ends
+            pass
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def main() -> int:
+    request = json.loads(sys.stdin.readline())
+    _stop_with_parent()
+    run = run_of(request)
+    try:
+        with sole_use(run.folder):
+            finished = carry_out(run, fresh=request["fresh"])
+    except (ValueError, OSError, FloatingPointError) as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        return 1
+    except KeyboardInterrupt:  # before or after the training, which saves by itself
+        return STOPPED
+    return 0 if finished else STOPPED
+
+
+if __name__ == "__main__":
+    sys.exit(main())
