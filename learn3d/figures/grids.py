@@ -1,0 +1,110 @@
+"""Inputs beside what methods make of them: the grid shown during training, and the comparison of several runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import nmr
+from learn3d.data.views import MASK_SIZE, ViewDataset
+from learn3d.figures.drawing import (
+    TILE,
+    Surface,
+    azimuths_deg,
+    beside,
+    draw_surface,
+    natural_colors,
+    orbit,
+    surfaces,
+    tile,
+    to_uint8,
+)
+from learn3d.methods.method import Method
+
+TURNS_DEG = (0, 60, 120, 180, 240, 300)
+GRID_COLUMNS = ("input", "target", "rendering", "same view", *(f"+{turn}°" for turn in TURNS_DEG[1:]))
+_SPREAD_DEG = 137.508  # the golden angle: any number of directions, none near another
+
+
+@torch.no_grad()
+def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.ndarray:
+    """What a method makes of some images: uint8 [H,W,3].
+
+    A row per image: the input, the target silhouette, the rendered silhouette and the shaded shape at the input's view,
+    and the shape from five new views around it.
+    """
+    batch = dataset.batch(indices)
+    shapes = surfaces(method.decode(method.encode(batch.images)))
+    inputs = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
+    rows = []
+    for i, surface in enumerate(shapes):
+        pose = dataset.poses[torch.as_tensor(indices)[i : i + 1]]
+        flat = [inputs[i], to_uint8(batch.masks[i]), to_uint8(_silhouette(surface, pose.cameras()))]
+        rows.append([*flat, *draw_surface(surface, orbit(pose, TURNS_DEG), image_size=TILE)])
+    return tile(rows, GRID_COLUMNS)
+
+
+@torch.no_grad()
+def comparison_grid(
+    methods: Sequence[tuple[str, Method]], dataset: ViewDataset, samples: Tensor, *, tile_size: int = TILE
+) -> np.ndarray:
+    """The same images through several methods, each a (label, method): uint8 [H,W,3].
+
+    Up to two methods stand side by side as in the paper's figure, a row per image: the input, then for each method its
+    shape from the input's view and from five more around the object. More stand below each other, a group of rows per
+    image.
+    """
+    if not methods:
+        raise ValueError("give at least one method to compare")
+    batch = dataset.batch(samples)
+    inputs = list(natural_colors(batch.images.numpy(), inverted=dataset.inverted))
+    cameras = [orbit(dataset.poses[samples[i : i + 1]], TURNS_DEG) for i in range(len(samples))]
+    drawn = {}  # label -> pictures [6, S, S, 3] of each image
+    for label, method in methods:
+        shapes = surfaces(method.decode(method.encode(batch.images)))
+        drawn[label] = [draw_surface(s, c, image_size=tile_size) for s, c in zip(shapes, cameras, strict=True)]
+    titles = ("input view", *(f"+{turn}°" for turn in TURNS_DEG[1:]))
+    if len(methods) <= 2:
+        blocks = [tile([[picture] for picture in inputs], ["input"], tile_size=tile_size)]
+        blocks += [tile(rows, titles, tile_size=tile_size) for rows in drawn.values()]
+        return beside(blocks, ["", *drawn])
+    rows = [
+        [inputs[i] if k == 0 else None, *pictures[i]]
+        for i in range(len(samples))
+        for k, pictures in enumerate(drawn.values())
+    ]
+    labels = list(drawn) * len(samples)
+    return tile(
+        rows, ["input", *titles], tile_size=tile_size, row_titles=labels, rows_per_group=len(methods)
+    )
+
+
+def spread_views(dataset: ViewDataset, count: int) -> Tensor:
+    """`count` different samples for a figure, int64 [count]: objects spread evenly, each from another side.
+
+    A function of the data set alone. Raises ValueError where there are not so many samples.
+    """
+    if not 1 <= count <= len(dataset):
+        raise ValueError(f"the data set has {len(dataset)} images, {count} were asked for")
+    azimuths = azimuths_deg(dataset.poses).numpy()
+    present = np.unique(dataset.object_ids)
+    objects = present[(np.arange(count) * len(present) // count) if count <= len(present) else np.arange(count) % len(present)]
+    taken = np.zeros(len(dataset), bool)
+    for k, number in enumerate(objects):
+        free = np.flatnonzero((dataset.object_ids == number) & ~taken)
+        if len(free) == 0:  # an object with few views was asked for more
+            free = np.flatnonzero(~taken)
+        off = np.abs((azimuths[free] - 30 - k * _SPREAD_DEG + 180) % 360 - 180)
+        taken[free[off.argmin()]] = True
+        objects[k] = free[off.argmin()]
+    return torch.from_numpy(objects)
+
+
+def _silhouette(surface: Surface, camera: nmr.cameras.Camera) -> Tensor:
+    """Coverage of the pixels, float32 [64, 64]."""
+    if len(surface.faces) == 0:
+        return torch.zeros(MASK_SIZE, MASK_SIZE)
+    return nmr.render_silhouette(surface.vertices[None], surface.faces, camera, image_size=MASK_SIZE)[0]

@@ -1,0 +1,143 @@
+"""Voxel IoU by the azimuth of the input view, and how far the shapes from different views of one object agree.
+
+A model whose codes carry the pose reconstructs some views worse than others, and other shapes from other views of the
+same object; a pose-invariant one draws two nearly round lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from learn3d.figures import plots
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MOST_DIRECTIONS = 36  # azimuths that are drawn one by one; more are gathered in sectors
+SECTORS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class ViewProfile:
+    """The figures of one run by azimuth. NaN where a direction has no image with a defined value."""
+
+    label: str
+    azimuths_deg: np.ndarray  # float64 [D], ascending in 0 .. 360
+    iou: np.ndarray  # float64 [D]: mean voxel IoU with the truth over the images of each direction
+    agreement: np.ndarray  # float64 [D]: mean voxel IoU with the shapes from the object's other views
+    mean_iou: float  # over all images
+    consistency: float  # mean over objects of the mean voxel IoU over all pairs of their views; NaN: single views
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; NaN becomes None."""
+        rows = {name: [_plain(x) for x in getattr(self, name)] for name in ("azimuths_deg", "iou", "agreement")}
+        return {"label": self.label, **rows, "mean_iou": _plain(self.mean_iou), "consistency": _plain(self.consistency)}
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any], source: str = "the file") -> ViewProfile:
+        """The inverse of `to_json`. Raises ValueError, naming what is missing."""
+        try:
+            rows = {name: np.array(values[name], np.float64) for name in ("azimuths_deg", "iou", "agreement")}
+            single = {name: float("nan" if values[name] is None else values[name]) for name in ("mean_iou", "consistency")}
+            profile = cls(label=str(values["label"]), **rows, **single)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{source} holds no profile over views ({type(error).__name__}: {error})") from None
+        if not profile.azimuths_deg.shape == profile.iou.shape == profile.agreement.shape:
+            raise ValueError(f"{source} holds a profile whose azimuths and values differ in number")
+        return profile
+
+
+def directions(azimuths_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which direction each image counts to: (int64 [M] in 0 .. D-1, the directions' azimuths float64 [D]).
+
+    Up to 36 different azimuths (to 0.01 degrees) are directions of their own; more are gathered in 24 sectors of 15
+    degrees, centred at 0, 15, 30 ...
+    """
+    rounded = np.round(np.asarray(azimuths_deg, np.float64) % 360.0, 2) % 360.0
+    distinct, ids = np.unique(rounded, return_inverse=True)
+    if len(distinct) <= MOST_DIRECTIONS:
+        return ids.astype(np.int64), distinct
+    width = 360.0 / SECTORS
+    return (np.round(rounded / width) % SECTORS).astype(np.int64), np.arange(SECTORS) * width
+
+
+def agreements(voxels: np.ndarray) -> np.ndarray:
+    """Voxel IoU between all pairs of V predicted shapes, bool [V, s, s, s]: float64 [V, V], NaN on the diagonal.
+
+    NaN, too, where both shapes are empty.
+    """
+    flat = voxels.reshape(len(voxels), -1).astype(np.float32)
+    both = (flat @ flat.T).astype(np.float64)  # counts below 2^24 are exact
+    sizes = flat.sum(axis=1, dtype=np.float64)
+    union = sizes[:, None] + sizes[None] - both
+    with np.errstate(invalid="ignore"):
+        iou = both / np.where(union > 0, union, np.nan)
+    np.fill_diagonal(iou, np.nan)
+    return iou
+
+
+def profile(
+    label: str, azimuths_deg: np.ndarray, ious: np.ndarray, agreement: np.ndarray, object_ids: np.ndarray
+) -> ViewProfile:
+    """Gather per-image figures by direction.
+
+    azimuths_deg, ious, agreement float [M]: of every image the IoU of its shape with the truth, and the mean IoU with
+    the shapes from the object's other views (NaN: none). The mean of the latter over the views of an object is the
+    mean over all its pairs, so `consistency` is the mean over objects of these means.
+    """
+    ids, azimuths = directions(azimuths_deg)
+    per_object = [_mean(agreement[object_ids == k]) for k in np.unique(object_ids)]
+    return ViewProfile(
+        label,
+        azimuths,
+        np.array([_mean(ious[ids == d]) for d in range(len(azimuths))]),
+        np.array([_mean(agreement[ids == d]) for d in range(len(azimuths))]),
+        _mean(ious),
+        _mean(np.array(per_object)),
+    )
+
+
+def plot_profiles(profiles: Sequence[ViewProfile]) -> Figure:
+    """Two plots seen from above: IoU with the truth, and agreement among the views, by where the camera stood."""
+    plots.load_matplotlib()
+    import matplotlib.pyplot as plt
+
+    if not profiles:
+        raise ValueError("give at least one run to draw")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8.4, 4.2), subplot_kw={"projection": "polar"})
+    for axes, name, mean, title in (
+        (left, "iou", "mean_iou", "voxel IoU with the truth"),
+        (right, "agreement", "consistency", "voxel IoU among the shapes\nfrom different views of one object"),
+    ):
+        for index, p in enumerate(profiles):
+            theta = np.deg2rad(np.append(p.azimuths_deg, p.azimuths_deg[:1]))
+            radius = np.append(getattr(p, name), getattr(p, name)[:1])
+            axes.plot(theta, radius, marker="o", markersize=2.5, label=f"{p.label}: {getattr(p, mean):.3f}", **plots.line_style(index))
+        axes.set_theta_zero_location("S")  # as seen from above: camera 0 stands below, azimuth 90 to the right
+        axes.set_thetagrids(range(0, 360, 45), [f"{a}°" for a in range(0, 360, 45)], fontsize=8)
+        axes.set_ylim(0, _round_up(max(np.nanmax(getattr(p, name), initial=0.0) for p in profiles)))
+        axes.set_yticks(np.arange(0.2, axes.get_ylim()[1] + 1e-6, 0.2))
+        axes.set_rlabel_position(22.5)
+        axes.tick_params(axis="y", labelsize=7, colors="#666666")
+        axes.set_title(title, pad=14)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), title="mean", title_fontsize=8, fontsize=8.5)
+    figure.text(0.5, -0.02, "seen from above; angle: azimuth of the input view, distance from the centre: IoU", ha="center", fontsize=8)
+    figure.tight_layout()
+    return figure
+
+
+def _round_up(value: float) -> float:
+    return float(np.clip(np.ceil(value * 10 + 0.2) / 10, 0.1, 1.0))
+
+
+def _mean(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else float("nan")
+
+
+def _plain(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
