@@ -1,0 +1,48 @@
+"""Pictures for people: what a run shows during training, and the paper's figures from saved checkpoints.
+
+`drawing` draws shapes and writes files, `grids` and `interpolation` put them together; `codes`, `curves` and `polar` are
+plots (extra `figures`, loaded when used); `runs` opens checkpoints with their data, `paper` makes each figure of them.
+"""
+
+from learn3d.figures.drawing import (
+    CLAY,
+    HEADER,
+    MARGIN,
+    TILE,
+    Surface,
+    as_meshes,
+    draw_mesh,
+    draw_surface,
+    natural_colors,
+    orbit,
+    save_gif,
+    save_png,
+    tile,
+    to_uint8,
+    turntable,
+)
+from learn3d.figures.grids import GRID_COLUMNS, comparison_grid, picture_grid
+from learn3d.figures.interpolation import interpolation_strip, morph
+
+__all__ = [
+    "CLAY",
+    "GRID_COLUMNS",
+    "HEADER",
+    "MARGIN",
+    "TILE",
+    "Surface",
+    "as_meshes",
+    "comparison_grid",
+    "draw_mesh",
+    "draw_surface",
+    "interpolation_strip",
+    "morph",
+    "natural_colors",
+    "orbit",
+    "picture_grid",
+    "save_gif",
+    "save_png",
+    "tile",
+    "to_uint8",
+    "turntable",
+]

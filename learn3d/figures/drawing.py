@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import skimage.measure
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
@@ -19,8 +18,9 @@ import nmr
 from learn3d import files
 from learn3d.data.kato import DISTANCE, HALF_FOV_DEG
 from learn3d.data.poses import LookAtPoses, Poses
-from learn3d.methods.method import Grids, Meshes
+from learn3d.methods import Grids, Meshes
 from learn3d.shading import shade_mesh
+from learn3d.surfaces import grid_surface
 
 CLAY = (0.62, 0.68, 0.78)
 TILE = 96
@@ -28,6 +28,7 @@ MARGIN = 4
 HEADER = 18
 _TEXT = (60, 60, 60)
 _RULE = (205, 205, 205)
+_LIGHT = (-0.45, 0.65, -0.65)  # towards the light: left of, above and behind the camera, in its own axes
 _FAR = 5.0  # where orthographic cameras stand: outside of any object, so that faces turn to the right side
 
 
@@ -38,30 +39,18 @@ class Surface(NamedTuple):
     faces: Tensor  # int64 [F, 3]; F = 0 is an empty shape, of which nothing is drawn
 
 
-def surfaces(shapes: Meshes | Grids) -> list[Surface]:
-    """The predicted shapes one by one as triangles; grids by marching cubes at their threshold.
-
-    A grid's cell i spans [i, i + 1] / s - 0.5 along its axis and its value belongs to the cell's centre. The outside of
-    the box is empty, so that surfaces are closed; a grid without an occupied cell is an empty surface.
-    """
+def as_meshes(shapes: Meshes | Grids) -> list[Surface]:
+    """The predicted shapes one by one as triangles; grids by marching cubes at their threshold."""
     if isinstance(shapes, Meshes):
         return [Surface(vertices, shapes.faces) for vertices in shapes.vertices]
-    return [_march(grid, shapes.threshold) for grid in shapes.occupancy.numpy()]
+    return [Surface(*grid_surface(grid, level=shapes.threshold)) for grid in shapes.occupancy]
 
 
-def _march(grid: np.ndarray, threshold: float) -> Surface:
-    if not (grid > threshold).any():
-        return Surface(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64))
-    padded = np.pad(grid.astype(np.float32), 1)
-    corners, faces, _, _ = skimage.measure.marching_cubes(padded, level=threshold)
-    vertices = (corners - 0.5) / len(grid) - 0.5  # the padding moves indices by 1, the centre by half a cell
-    return Surface(torch.from_numpy(vertices.astype(np.float32)), torch.from_numpy(faces.astype(np.int64)))
-
-
-def orbit(poses: Poses, turns_deg: Sequence[float]) -> nmr.LookAt | nmr.Orthographic:
+def orbit(poses: Poses, turns_deg: Sequence[float], *, zoom: float = 1.0) -> nmr.LookAt | nmr.Orthographic:
     """The camera of a single pose, carried around the object's vertical axis by these angles: one camera each.
 
     It keeps its elevation, distance, field of view and roll; 0 is the pose itself, a positive turn adds to the azimuth.
+    `zoom` magnifies the picture about its centre.
     """
     if len(poses) != 1:
         raise ValueError(f"orbit turns one camera, got {len(poses)} poses; pick one as poses[torch.tensor([i])]")
@@ -71,10 +60,11 @@ def orbit(poses: Poses, turns_deg: Sequence[float]) -> nmr.LookAt | nmr.Orthogra
             float(torch.as_tensor(value).reshape(-1)[0])
             for value in (poses.elevation_deg, poses.distance, poses.half_fov_deg)
         )
+        half_fov = math.degrees(math.atan(math.tan(math.radians(half_fov)) / zoom))
         azimuths = float(poses.azimuth_deg[0]) + turns
         return nmr.LookAt.from_angles(distance, elevation, azimuths, half_fov_deg=half_fov)
     _, up, forward = poses.rotation[0].double()
-    return nmr.Orthographic(_turn(-_FAR * forward, turns), up=_turn(up, turns))
+    return nmr.Orthographic(_turn(-_FAR * forward, turns), up=_turn(up, turns), scale=zoom)
 
 
 def _turn(point: Tensor, turns_deg: Tensor) -> Tensor:
@@ -93,23 +83,53 @@ def azimuths_deg(poses: Poses) -> Tensor:
     return torch.rad2deg(torch.atan2(eye[:, 0].double(), -eye[:, 2].double()))
 
 
+def reach(surface: Surface, cameras: nmr.LookAt | nmr.Orthographic) -> float:
+    """How far the shape goes from the picture's centre in any camera, 1 being the border; 0 for an empty shape."""
+    if len(surface.faces) == 0:
+        return 0.0
+    seen = cameras.transform(surface.vertices[surface.faces.unique()][None])
+    return float(seen[..., :2].abs().max())
+
+
+def common_zoom(shapes: Sequence[tuple[Surface, nmr.LookAt | nmr.Orthographic]], masks: Tensor) -> float:
+    """The largest magnification, at least 1, at which shapes stay inside their cameras' pictures, and objects in theirs.
+
+    masks: float [B, S, S] of the input images; one that touches its border allows no magnification.
+    """
+    farthest = max([reach(surface, cameras) for surface, cameras in shapes], default=0.0)
+    inside = torch.nonzero(masks > 0.5)[:, 1:]
+    if len(inside):
+        farthest = max(farthest, float(((2 * inside + 1) / masks.shape[-1] - 1).abs().max()))
+    return max(1.0, 0.95 / max(farthest, 0.05))
+
+
 def draw_surface(surface: Surface, cameras: nmr.LookAt | nmr.Orthographic, *, image_size: int) -> np.ndarray:
-    """One shape as plain clay on white, as each of N cameras sees it: uint8 [N,S,S,3]."""
-    eyes = torch.as_tensor(cameras.eye).reshape(-1, 3)
+    """One shape as plain clay on white, as each of N cameras sees it: uint8 [N,S,S,3].
+
+    The light goes with the camera (from above its left shoulder), so that no side of the shape lies in the dark.
+    """
+    eyes, ups = (torch.as_tensor(v, dtype=torch.float64).reshape(-1, 3) for v in (cameras.eye, cameras.up))
     if len(surface.faces) == 0:
         return np.full((len(eyes), image_size, image_size, 3), 255, np.uint8)
     pictures = []
-    for i in range(len(eyes)):  # one at a time: the fine images that are averaged take memory
-        up = torch.as_tensor(cameras.up).reshape(-1, 3)
-        pose = {"eye": eyes[i : i + 1], "at": cameras.at, "up": up[min(i, len(up) - 1)]}
+    for eye, up in zip(eyes, ups.expand_as(eyes), strict=True):  # one at a time: the fine images take memory
         if isinstance(cameras, nmr.LookAt):
-            camera = nmr.LookAt(**pose, half_fov_deg=cameras.half_fov_deg)
+            camera = nmr.LookAt(eye[None], up=up, half_fov_deg=cameras.half_fov_deg)
         else:
-            camera = nmr.Orthographic(**pose, scale=cameras.scale)
+            camera = nmr.Orthographic(eye[None], up=up, scale=cameras.scale)
+        light = tuple(_camera_axes(eye, up).T @ torch.tensor(_LIGHT, dtype=torch.float64))
         clay = np.asarray(CLAY)
-        rgb, _ = shade_mesh(*surface, clay, camera, image_size=image_size, supersample=4, ambient=0.35)
+        rgb, _ = shade_mesh(*surface, clay, camera, image_size=image_size, supersample=4, ambient=0.35, light=light)
         pictures.append(rgb)
     return np.concatenate(pictures)
+
+
+def _camera_axes(eye: Tensor, up: Tensor) -> Tensor:
+    """Rows x (right), y (up), z (away) of a camera that looks at the origin, float64 [3, 3]."""
+    z = -eye / eye.norm()
+    x = torch.linalg.cross(up, z)
+    x = x / x.norm()
+    return torch.stack([x, torch.linalg.cross(z, x), z])
 
 
 def draw_mesh(
@@ -215,6 +235,13 @@ def stacked(blocks: Sequence[np.ndarray], *, gap: int = 0) -> np.ndarray:
     width = max(block.shape[1] for block in blocks)
     padding = [((0, gap if i < len(blocks) - 1 else 0), (0, width - b.shape[1]), (0, 0)) for i, b in enumerate(blocks)]
     return np.concatenate([np.pad(b, p, constant_values=255) for b, p in zip(blocks, padding, strict=True)])
+
+
+def magnified(pictures: np.ndarray, zoom: float) -> np.ndarray:
+    """The central part of pictures uint8 [N,h,w,3], a share 1 / zoom of each side; they become smaller by it."""
+    height, width = pictures.shape[1:3]
+    top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
+    return pictures[:, top : height - top, left : width - left]
 
 
 def text_width(text: str) -> int:

@@ -13,16 +13,18 @@ from learn3d.data.views import MASK_SIZE, ViewDataset
 from learn3d.figures.drawing import (
     TILE,
     Surface,
+    as_meshes,
     azimuths_deg,
     beside,
+    common_zoom,
     draw_surface,
+    magnified,
     natural_colors,
     orbit,
-    surfaces,
     tile,
     to_uint8,
 )
-from learn3d.methods.method import Method
+from learn3d.methods import Method
 
 TURNS_DEG = (0, 60, 120, 180, 240, 300)
 GRID_COLUMNS = ("input", "target", "rendering", "same view", *(f"+{turn}°" for turn in TURNS_DEG[1:]))
@@ -37,11 +39,14 @@ def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.nd
     and the shape from five new views around it.
     """
     batch = dataset.batch(indices)
-    shapes = surfaces(method.decode(method.encode(batch.images)))
+    training = method.training
+    method.set_training(False)
+    shapes = as_meshes(method.decode(method.encode(batch.images)))
+    method.set_training(training)
     inputs = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
     rows = []
     for i, surface in enumerate(shapes):
-        pose = dataset.poses[torch.as_tensor(indices)[i : i + 1]]
+        pose = batch.poses[torch.tensor([i])]
         flat = [inputs[i], to_uint8(batch.masks[i]), to_uint8(_silhouette(surface, pose.cameras()))]
         rows.append([*flat, *draw_surface(surface, orbit(pose, TURNS_DEG), image_size=TILE)])
     return tile(rows, GRID_COLUMNS)
@@ -49,28 +54,39 @@ def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.nd
 
 @torch.no_grad()
 def comparison_grid(
-    methods: Sequence[tuple[str, Method]], dataset: ViewDataset, samples: Tensor, *, tile_size: int = TILE
+    methods: Sequence[tuple[str, Method]],
+    dataset: ViewDataset,
+    samples: Tensor,
+    *,
+    title: str = "",
+    tile_size: int = TILE,
 ) -> np.ndarray:
     """The same images through several methods, each a (label, method): uint8 [H,W,3].
 
     Up to two methods stand side by side as in the paper's figure, a row per image: the input, then for each method its
     shape from the input's view and from five more around the object. More stand below each other, a group of rows per
-    image.
+    image. `title` stands above the inputs. All pictures are magnified alike, as far as the shapes allow.
     """
     if not methods:
         raise ValueError("give at least one method to compare")
     batch = dataset.batch(samples)
-    inputs = list(natural_colors(batch.images.numpy(), inverted=dataset.inverted))
-    cameras = [orbit(dataset.poses[samples[i : i + 1]], TURNS_DEG) for i in range(len(samples))]
-    drawn = {}  # label -> pictures [6, S, S, 3] of each image
-    for label, method in methods:
-        shapes = surfaces(method.decode(method.encode(batch.images)))
-        drawn[label] = [draw_surface(s, c, image_size=tile_size) for s, c in zip(shapes, cameras, strict=True)]
+    poses = [batch.poses[torch.tensor([i])] for i in range(len(samples))]
+    shapes = {label: as_meshes(method.decode(method.encode(batch.images))) for label, method in methods}
+    if len(shapes) < len(methods):
+        raise ValueError(f"the methods need different labels, got {[label for label, _ in methods]}")
+    cameras = [orbit(pose, TURNS_DEG) for pose in poses]
+    zoom = common_zoom([pair for of_one in shapes.values() for pair in zip(of_one, cameras, strict=True)], batch.masks)
+    cameras = [orbit(pose, TURNS_DEG, zoom=zoom) for pose in poses]
+    inputs = list(magnified(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom))
+    drawn = {  # label -> pictures [6, S, S, 3] of each image
+        label: [draw_surface(s, c, image_size=tile_size) for s, c in zip(of_one, cameras, strict=True)]
+        for label, of_one in shapes.items()
+    }
     titles = ("input view", *(f"+{turn}°" for turn in TURNS_DEG[1:]))
     if len(methods) <= 2:
         blocks = [tile([[picture] for picture in inputs], ["input"], tile_size=tile_size)]
         blocks += [tile(rows, titles, tile_size=tile_size) for rows in drawn.values()]
-        return beside(blocks, ["", *drawn])
+        return beside(blocks, [title, *drawn])
     rows = [
         [inputs[i] if k == 0 else None, *pictures[i]]
         for i in range(len(samples))
@@ -78,7 +94,7 @@ def comparison_grid(
     ]
     labels = list(drawn) * len(samples)
     return tile(
-        rows, ["input", *titles], tile_size=tile_size, row_titles=labels, rows_per_group=len(methods)
+        rows, [title or "input", *titles], tile_size=tile_size, row_titles=labels, rows_per_group=len(methods)
     )
 
 

@@ -8,11 +8,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from learn3d.data.poses import Poses
 from learn3d.data.views import ViewDataset
-from learn3d.figures.drawing import TILE, azimuths_deg, draw_surface, natural_colors, orbit, surfaces, tile
-from learn3d.methods.method import Method
+from learn3d.figures.drawing import (
+    TILE,
+    Surface,
+    as_meshes,
+    azimuths_deg,
+    common_zoom,
+    draw_surface,
+    magnified,
+    natural_colors,
+    orbit,
+    tile,
+)
+from learn3d.figures.runs import encode
+from learn3d.methods import Method
 
-AZIMUTHS_DEG = (-30.0, 60.0)  # the two viewpoints: obliquely from the front, obliquely from the side
+AZIMUTHS_DEG = (-135.0, -45.0)  # the two viewpoints, oblique for whichever axis the object faces
 
 
 def walk(codes: Tensor, steps: int, *, closed: bool = False) -> Tensor:
@@ -32,20 +45,6 @@ def walk(codes: Tensor, steps: int, *, closed: bool = False) -> Tensor:
 
 
 @torch.no_grad()
-def draw_walk(
-    method: Method, dataset: ViewDataset, samples: Tensor, codes: Tensor, azimuths: Sequence[float], image_size: int
-) -> np.ndarray:
-    """The shapes of some codes [n, C] from some azimuths in degrees: uint8 [n, len(azimuths), S, S, 3].
-
-    Elevation, distance and field of view are those of the first of the `samples`.
-    """
-    pose = dataset.poses[samples[:1]]
-    cameras = orbit(pose, [azimuth - float(azimuths_deg(pose)[0]) for azimuth in azimuths])
-    shapes = surfaces(method.decode(codes))
-    return np.stack([draw_surface(surface, cameras, image_size=image_size) for surface in shapes])
-
-
-@torch.no_grad()
 def interpolation_strip(
     method: Method,
     dataset: ViewDataset,
@@ -57,16 +56,16 @@ def interpolation_strip(
 ) -> np.ndarray:
     """The way from the shape of one image to that of the next, and on: uint8 [H,W,3].
 
-    Above, the images `samples` int64 [n], each over its own reconstruction; below, a row per viewpoint with
-    (n - 1) * steps + 1 shapes.
+    Above, the images `samples` int64 [n], each over its own reconstruction; below, a row per viewpoint (azimuth in
+    degrees; elevation and distance of the first image's camera) with (n - 1) * steps + 1 shapes.
     """
     batch = dataset.batch(samples)
-    codes = walk(method.encode(batch.images), steps)
-    pictures = draw_walk(method, dataset, samples, codes, azimuths, tile_size)
-    inputs: list[np.ndarray | None] = [None] * len(codes)
-    inputs[::steps] = list(natural_colors(batch.images.numpy(), inverted=dataset.inverted))
+    shapes = as_meshes(method.decode(walk(method.encode(batch.images), steps)))
+    pictures, zoom = _draw(shapes, batch.poses, batch.masks, azimuths, tile_size)
+    inputs: list[np.ndarray | None] = [None] * len(shapes)
+    inputs[::steps] = list(magnified(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom))
     titles = [f"azimuth {azimuth:g}°" for azimuth in azimuths]
-    return tile([inputs, *pictures.swapaxes(0, 1)], tile_size=tile_size, row_titles=["input", *titles])
+    return tile([inputs, *pictures], tile_size=tile_size, row_titles=["input", *titles])
 
 
 @torch.no_grad()
@@ -83,6 +82,48 @@ def morph(
 
     uint8 [n * steps, S, len(azimuths) * S, 3].
     """
-    codes = walk(method.encode(dataset.batch(samples).images), steps, closed=True)
-    pictures = draw_walk(method, dataset, samples, codes, azimuths, image_size)
-    return np.concatenate(list(pictures.swapaxes(0, 1)), axis=2)
+    batch = dataset.batch(samples)
+    shapes = as_meshes(method.decode(walk(method.encode(batch.images), steps, closed=True)))
+    pictures, _ = _draw(shapes, batch.poses, batch.masks, azimuths, image_size)
+    return np.concatenate(list(pictures), axis=2)
+
+
+def _draw(
+    shapes: Sequence[Surface], poses: Poses, masks: Tensor, azimuths: Sequence[float], image_size: int
+) -> tuple[np.ndarray, float]:
+    """(pictures uint8 [len(azimuths), n, S, S, 3] of n shapes, as much magnified as shapes and masks allow; by what)."""
+    pose = poses[torch.tensor([0])]
+    turns = [azimuth - float(azimuths_deg(pose)[0]) for azimuth in azimuths]
+    cameras = orbit(pose, turns)
+    zoom = common_zoom([(surface, cameras) for surface in shapes], masks)
+    cameras = orbit(pose, turns, zoom=zoom)
+    pictures = np.stack([draw_surface(surface, cameras, image_size=image_size) for surface in shapes])
+    return pictures.swapaxes(0, 1), zoom
+
+
+@torch.no_grad()
+def typical_views(method: Method, dataset: ViewDataset, count: int, *, azimuth_deg: float = AZIMUTHS_DEG[0]) -> Tensor:
+    """Samples of `count` objects whose shapes differ but are no oddities, int64 [count].
+
+    Every object counts as the code of its view nearest to `azimuth_deg`; chosen are those nearest to the centres of
+    `count` clusters of these codes (k-means, started with the farthest points), which are in the order of their size.
+    """
+    off = (azimuths_deg(dataset.poses).numpy() - azimuth_deg + 180) % 360 - 180
+    order = np.argsort(np.abs(off), kind="stable")
+    _, first = np.unique(dataset.object_ids[order], return_index=True)
+    samples = torch.from_numpy(order[first])
+    if not 2 <= count <= len(samples):
+        raise ValueError(f"an interpolation takes 2 to {len(samples)} images here (one an object), got {count}")
+    codes = encode(method, dataset, samples)
+    centres = codes[(codes - codes.mean(dim=0)).norm(dim=1).argmin()][None]
+    while len(centres) < count:
+        centres = torch.cat([centres, codes[torch.cdist(codes, centres).amin(dim=1).argmax()][None]])
+    for _ in range(20):
+        nearest = torch.cdist(codes, centres).argmin(dim=1)
+        members = [codes[nearest == k] for k in range(count)]
+        centres = torch.stack([m.mean(dim=0) if len(m) else c for m, c in zip(members, centres, strict=True)])
+    distances = torch.cdist(centres, codes)
+    chosen: list[int] = []
+    for k in sorted(range(count), key=lambda k: -len(members[k])):
+        chosen.append(next(i for i in distances[k].argsort().tolist() if i not in chosen))
+    return samples[chosen]

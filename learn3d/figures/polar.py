@@ -11,8 +11,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
+import nmr
+from learn3d.data.conventions import Definition
+from learn3d.data.views import ViewDataset
+from learn3d.evaluation import occupancy
 from learn3d.figures import plots
+from learn3d.figures.drawing import azimuths_deg
+from learn3d.methods import Method
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,13 +59,13 @@ class ViewProfile:
         return profile
 
 
-def directions(azimuths_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def directions(azimuths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which direction each image counts to: (int64 [M] in 0 .. D-1, the directions' azimuths float64 [D]).
 
     Up to 36 different azimuths (to 0.01 degrees) are directions of their own; more are gathered in 24 sectors of 15
     degrees, centred at 0, 15, 30 ...
     """
-    rounded = np.round(np.asarray(azimuths_deg, np.float64) % 360.0, 2) % 360.0
+    rounded = np.round(np.asarray(azimuths, np.float64) % 360.0, 2) % 360.0
     distinct, ids = np.unique(rounded, return_inverse=True)
     if len(distinct) <= MOST_DIRECTIONS:
         return ids.astype(np.int64), distinct
@@ -81,24 +89,58 @@ def agreements(voxels: np.ndarray) -> np.ndarray:
 
 
 def profile(
-    label: str, azimuths_deg: np.ndarray, ious: np.ndarray, agreement: np.ndarray, object_ids: np.ndarray
+    label: str, azimuths: np.ndarray, ious: np.ndarray, agreement: np.ndarray, object_ids: np.ndarray
 ) -> ViewProfile:
     """Gather per-image figures by direction.
 
-    azimuths_deg, ious, agreement float [M]: of every image the IoU of its shape with the truth, and the mean IoU with
+    azimuths (degrees), ious, agreement float [M]: of every image the IoU of its shape with the truth, and the mean IoU with
     the shapes from the object's other views (NaN: none). The mean of the latter over the views of an object is the
     mean over all its pairs, so `consistency` is the mean over objects of these means.
     """
-    ids, azimuths = directions(azimuths_deg)
+    ids, middles = directions(azimuths)
     per_object = [_mean(agreement[object_ids == k]) for k in np.unique(object_ids)]
     return ViewProfile(
         label,
-        azimuths,
-        np.array([_mean(ious[ids == d]) for d in range(len(azimuths))]),
-        np.array([_mean(agreement[ids == d]) for d in range(len(azimuths))]),
+        middles,
+        np.array([_mean(ious[ids == d]) for d in range(len(middles))]),
+        np.array([_mean(agreement[ids == d]) for d in range(len(middles))]),
         _mean(ious),
         _mean(np.array(per_object)),
     )
+
+
+@torch.no_grad()
+def measure(
+    label: str, method: Method, dataset: ViewDataset, definition: Definition = "kato18", *, batch_size: int = 256
+) -> ViewProfile:
+    """Reconstruct every image of a data set and compare the shapes with the truth and with each other.
+
+    Raises ValueError where the data set has no true voxels.
+    """
+    if dataset.voxels is None:
+        raise ValueError(f"{dataset.category}, {dataset.split} has no true voxels to compare shapes with")
+    ious, agreement = np.full(len(dataset), np.nan), np.full(len(dataset), np.nan)
+    for samples in _whole_objects(dataset.object_ids, batch_size):
+        shapes = [method.decode(method.encode(dataset.batch(part).images)) for part in samples.split(batch_size)]
+        predicted = torch.cat([occupancy(shape, dataset, definition) for shape in shapes])
+        rows, objects = samples.numpy(), dataset.object_ids[samples.numpy()]
+        ious[rows] = nmr.metrics.voxel_iou(predicted, torch.from_numpy(dataset.voxels[objects])).numpy()
+        for number in np.unique(objects):
+            views = objects == number
+            agreement[rows[views]] = _row_means(agreements(predicted[torch.from_numpy(views)].numpy()))
+    return profile(label, azimuths_deg(dataset.poses).numpy(), ious, agreement, dataset.object_ids)
+
+
+def _whole_objects(object_ids: np.ndarray, size: int) -> list[Tensor]:
+    """All samples, int64, in parts of about `size` that do not cut an object."""
+    order = np.argsort(object_ids, kind="stable")
+    starts = np.flatnonzero(np.diff(object_ids[order], prepend=-1))
+    cuts = [start for k, start in enumerate(starts[1:]) if start // size != starts[k] // size]
+    return [torch.from_numpy(part) for part in np.split(order, cuts)]
+
+
+def _row_means(pairs: np.ndarray) -> np.ndarray:
+    return np.array([_mean(row) for row in pairs])
 
 
 def plot_profiles(profiles: Sequence[ViewProfile]) -> Figure:
