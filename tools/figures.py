@@ -12,7 +12,6 @@ Examples:
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -22,6 +21,11 @@ import tyro
 from learn3d.figures import paper
 from learn3d.figures.interpolation import AZIMUTHS_DEG
 from learn3d.figures.runs import Run, open_runs
+
+
+def report(text: str) -> None:
+    """Say something about the progress, apart from the results."""
+    print(text, file=sys.stderr, flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +64,7 @@ class Measured(Drawn):
             split=self.split,
             which=self.checkpoint,
             device=self.device,
-            report_progress=lambda text: print(text, file=sys.stderr, flush=True),
+            report_progress=report,
         )
 
 
@@ -137,29 +141,15 @@ class Polar(Measured):
 
 @dataclass(frozen=True, kw_only=True)
 class All(Measured):
-    """Every figure with its defaults; --output is a folder."""
+    """Every figure with its defaults, as far as data and runs allow; --output is a folder."""
 
     def draw(self) -> list[Path]:
-        runs = self.open()
-        figures: dict[str, Callable[[Path], list[Path]]] = {
-            "grid": lambda path: [paper.save_grid(runs, path)],
-            "tsne": lambda path: paper.save_tsne(runs, path),
-            "interpolation": lambda path: paper.save_interpolation(runs, path),
-            "curves": lambda path: paper.save_curves(self.runs, path, labels=self.labels),
-            "polar": lambda path: paper.save_polar(runs, path),
-        }
-        written, failed = [], []
-        for name, draw in figures.items():
-            print(f"drawing {name}", file=sys.stderr, flush=True)
-            try:
-                written += draw(self.output / name)
-            except (ValueError, OSError) as error:
-                failed.append(f"{name}: {error}")
-        for path in written:
-            print(path)
-        if failed:
-            raise ValueError("not drawn: " + "; ".join(failed))
-        return []
+        written, failed = paper.save_all(
+            self.open(), self.runs, self.output, labels=self.labels, report_progress=report
+        )
+        for text in failed:
+            report(f"not drawn: {text}")
+        return written
 
 
 Command = (

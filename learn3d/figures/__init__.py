@@ -1,7 +1,7 @@
 """Pictures for people: what a run shows during training, and the paper's figures from saved checkpoints.
 
-`drawing` draws shapes and writes files, `grids` and `interpolation` put them together; `codes`, `curves` and `polar` are
-plots (extra `figures`, loaded when used); `runs` opens checkpoints with their data, `paper` makes each figure of them.
+`drawing` draws shapes and writes files, `grids` and `interpolation` put them together; `codes`, `curves` and `polar`
+are plots (extra `figures`, loaded when used); `runs` opens checkpoints with their data, `paper` draws each figure.
 """
 
 from learn3d.figures.drawing import (
@@ -11,6 +11,7 @@ from learn3d.figures.drawing import (
     TILE,
     Surface,
     as_meshes,
+    azimuths_deg,
     draw_mesh,
     draw_surface,
     natural_colors,
@@ -32,6 +33,7 @@ __all__ = [
     "TILE",
     "Surface",
     "as_meshes",
+    "azimuths_deg",
     "comparison_grid",
     "draw_mesh",
     "draw_surface",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,16 +81,16 @@ def map_codes(
     return CodeMap(label, embed(codes, seed=seed), azimuths_deg, accuracy, chance)
 
 
+@plots.styled
 def plot_maps(maps: Sequence[CodeMap]) -> Figure:
     """Code maps side by side (four in a row at most) with one wheel that says which colour is which azimuth."""
-    plots.load_matplotlib()
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     if not maps:
         raise ValueError("give at least one map of codes to draw")
     side, columns = 3.2, min(4, len(maps))
     rows = -(-len(maps) // columns)
-    figure = plt.figure(figsize=(side * columns + 1.6, (side + 0.5) * rows))
+    figure = Figure(figsize=(side * columns + 1.6, (side + 0.5) * rows))
     grid = figure.add_gridspec(rows, columns + 1, width_ratios=[side] * columns + [1.3], wspace=0.1, hspace=0.28)
     for index, code_map in enumerate(maps):
         _scatter(figure.add_subplot(grid[index // columns, index % columns]), code_map)
@@ -106,7 +108,7 @@ def accuracy_text(code_map: CodeMap) -> str:
 def _scatter(axes: Axes, code_map: CodeMap) -> None:
     color = plots.cyclic_map()((code_map.azimuths_deg / 360.0) % 1.0)
     order = np.random.default_rng(0).permutation(len(color))  # else the last views would cover the others
-    size = float(np.clip(9000 / len(color), 4, 22))
+    size = float(np.clip(7000 / len(color), 4, 16))
     axes.scatter(*code_map.points[order].T, c=color[order], s=size, linewidths=0, rasterized=len(color) > 3000)
     axes.set(xticks=[], yticks=[])
     axes.set_title(code_map.label, fontsize=11, pad=18)
@@ -130,9 +132,7 @@ def _draw_wheel(axes: Axes) -> None:
     axes.text(0, 0, "azimuth\nof the view", ha="center", va="center", fontsize=7.5)
 
 
-def _sklearn(name: str):  # noqa: ANN202
-    import importlib
-
+def _sklearn(name: str) -> ModuleType:
     try:
         return importlib.import_module(f"sklearn.{name}")
     except ImportError:

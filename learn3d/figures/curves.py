@@ -84,18 +84,19 @@ def band(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     return steps, rows.mean(axis=0), rows.min(axis=0), rows.max(axis=0)
 
 
+@plots.styled
 def plot_curves(runs: Mapping[str, Sequence[Mapping[Key, Curve]]]) -> Figure:
     """A panel for every logged number; in it a line per label, the mean over its runs, with their range as a band.
 
     runs: for each label the curves (`read_metrics`) of one run or of several that differ in their seed.
     """
-    plots.load_matplotlib()
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     keys = _panels(runs)
     columns = min(3, len(keys))
     rows = math.ceil(len(keys) / columns)
-    figure, grid = plt.subplots(rows, columns, figsize=(3.5 * columns, 2.5 * rows + 0.4), squeeze=False)
+    figure = Figure(figsize=(3.5 * columns, 2.5 * rows + 0.4))
+    grid = figure.subplots(rows, columns, squeeze=False)
     for axes, key in zip(grid.flat, keys, strict=False):
         _draw_panel(axes, key, runs)
     for axes in grid.flat[len(keys) :]:
@@ -136,9 +137,7 @@ def _draw_panel(axes: Axes, key: Key, runs: Mapping[str, Sequence[Mapping[Key, C
         if len(known) > 1:
             axes.fill_between(steps, low, high, color=plots.line_style(index)["color"], alpha=0.2, linewidth=0)
     axes.set_title(f"{TITLES.get(name, name)}, {split}", loc="left")
-    if split == "train" and all(
-        curve[key].values.min() > 0 for run in runs.values() for curve in run if key in curve
-    ):
+    if split == "train" and all(curve[key].values.min() > 0 for run in runs.values() for curve in run if key in curve):
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")

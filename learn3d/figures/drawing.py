@@ -92,7 +92,7 @@ def reach(surface: Surface, cameras: nmr.LookAt | nmr.Orthographic) -> float:
 
 
 def common_zoom(shapes: Sequence[tuple[Surface, nmr.LookAt | nmr.Orthographic]], masks: Tensor) -> float:
-    """The largest magnification, at least 1, at which shapes stay inside their cameras' pictures, and objects in theirs.
+    """The largest magnification, at least 1, at which shapes and photographed objects stay inside their pictures.
 
     masks: float [B, S, S] of the input images; one that touches its border allows no magnification.
     """
@@ -252,6 +252,12 @@ def text_width(text: str) -> int:
 @functools.cache
 def _font(size: int = 12) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
+
+
+def with_ending(path: Path, suffix: str) -> Path:
+    """The path with the ending of another kind of picture, such as ".svg"; a name without one gets it added."""
+    path = Path(path)
+    return path.with_suffix(suffix) if path.suffix in (".png", ".svg", ".gif", ".json") else Path(f"{path}{suffix}")
 
 
 def save_png(path: Path, rgb: np.ndarray) -> None:

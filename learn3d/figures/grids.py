@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import nmr
+from learn3d.data.poses import wrap_deg
 from learn3d.data.views import MASK_SIZE, ViewDataset
 from learn3d.figures.drawing import (
     TILE,
@@ -93,9 +94,7 @@ def comparison_grid(
         for k, pictures in enumerate(drawn.values())
     ]
     labels = list(drawn) * len(samples)
-    return tile(
-        rows, [title or "input", *titles], tile_size=tile_size, row_titles=labels, rows_per_group=len(methods)
-    )
+    return tile(rows, [title or "input", *titles], tile_size=tile_size, row_titles=labels, rows_per_group=len(methods))
 
 
 def spread_views(dataset: ViewDataset, count: int) -> Tensor:
@@ -107,16 +106,16 @@ def spread_views(dataset: ViewDataset, count: int) -> Tensor:
         raise ValueError(f"the data set has {len(dataset)} images, {count} were asked for")
     azimuths = azimuths_deg(dataset.poses).numpy()
     present = np.unique(dataset.object_ids)
-    objects = present[(np.arange(count) * len(present) // count) if count <= len(present) else np.arange(count) % len(present)]
-    taken = np.zeros(len(dataset), bool)
+    places = np.arange(count)
+    objects = present[places * len(present) // count if count <= len(present) else places % len(present)]
+    chosen: list[int] = []
     for k, number in enumerate(objects):
-        free = np.flatnonzero((dataset.object_ids == number) & ~taken)
-        if len(free) == 0:  # an object with few views was asked for more
-            free = np.flatnonzero(~taken)
-        off = np.abs((azimuths[free] - 30 - k * _SPREAD_DEG + 180) % 360 - 180)
-        taken[free[off.argmin()]] = True
-        objects[k] = free[off.argmin()]
-    return torch.from_numpy(objects)
+        left = np.setdiff1d(np.flatnonzero(dataset.object_ids == number), chosen)
+        if len(left) == 0:  # an object with few views was asked for more
+            left = np.setdiff1d(np.arange(len(dataset)), chosen)
+        off = wrap_deg(torch.from_numpy(azimuths[left] - 30 - k * _SPREAD_DEG)).abs()
+        chosen.append(int(left[int(off.argmin())]))
+    return torch.tensor(chosen)
 
 
 def _silhouette(surface: Surface, camera: nmr.cameras.Camera) -> Tensor:

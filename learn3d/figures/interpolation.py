@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from learn3d.data.poses import Poses
+from learn3d.data.poses import Poses, wrap_deg
 from learn3d.data.views import ViewDataset
 from learn3d.figures.drawing import (
     TILE,
@@ -40,7 +41,7 @@ def walk(codes: Tensor, steps: int, *, closed: bool = False) -> Tensor:
         raise ValueError(f"steps from one code to the next must be at least 1, got {steps}")
     ends = torch.cat([codes, codes[:1]]) if closed else codes
     share = torch.arange(steps, dtype=codes.dtype, device=codes.device)[:, None] / steps
-    legs = [(1 - share) * start + share * end for start, end in zip(ends[:-1], ends[1:], strict=True)]
+    legs = [(1 - share) * start + share * end for start, end in itertools.pairwise(ends)]
     return torch.cat(legs if closed else [*legs, codes[-1:]])
 
 
@@ -91,7 +92,9 @@ def morph(
 def _draw(
     shapes: Sequence[Surface], poses: Poses, masks: Tensor, azimuths: Sequence[float], image_size: int
 ) -> tuple[np.ndarray, float]:
-    """(pictures uint8 [len(azimuths), n, S, S, 3] of n shapes, as much magnified as shapes and masks allow; by what)."""
+    """(Pictures uint8 [len(azimuths), n, S, S, 3] of n shapes, magnified as far as shapes and masks allow; by what)."""
+    if not azimuths:
+        raise ValueError("an interpolation is seen from at least one azimuth, none was given")
     pose = poses[torch.tensor([0])]
     turns = [azimuth - float(azimuths_deg(pose)[0]) for azimuth in azimuths]
     cameras = orbit(pose, turns)
@@ -108,8 +111,8 @@ def typical_views(method: Method, dataset: ViewDataset, count: int, *, azimuth_d
     Every object counts as the code of its view nearest to `azimuth_deg`; chosen are those nearest to the centres of
     `count` clusters of these codes (k-means, started with the farthest points), which are in the order of their size.
     """
-    off = (azimuths_deg(dataset.poses).numpy() - azimuth_deg + 180) % 360 - 180
-    order = np.argsort(np.abs(off), kind="stable")
+    off = wrap_deg(azimuths_deg(dataset.poses) - azimuth_deg).abs()
+    order = np.argsort(off.numpy(), kind="stable")
     _, first = np.unique(dataset.object_ids[order], return_index=True)
     samples = torch.from_numpy(order[first])
     if not 2 <= count <= len(samples):

@@ -14,7 +14,7 @@ from learn3d.config import load_config
 from learn3d.data.conventions import Definition
 from learn3d.evaluation import spread_samples
 from learn3d.figures import codes, curves, plots, polar
-from learn3d.figures.drawing import azimuths_deg, beside, save_gif, save_png, stacked
+from learn3d.figures.drawing import azimuths_deg, beside, save_gif, save_png, stacked, with_ending
 from learn3d.figures.grids import comparison_grid, spread_views
 from learn3d.figures.interpolation import AZIMUTHS_DEG, interpolation_strip, morph, typical_views
 from learn3d.figures.runs import Run, by_dataset, encode, name_runs, title_of
@@ -31,7 +31,7 @@ def save_grid(runs: Sequence[Run], output: Path, *, images: int | None = None, i
     samples to show instead, of every category.
     """
     groups, blocks = by_dataset(runs), []
-    count = images or (IMAGES if len(groups) == 1 else IMAGES_PER_CATEGORY)
+    count = images if images is not None else IMAGES if len(groups) == 1 else IMAGES_PER_CATEGORY
     for group in groups:
         dataset = group[0].dataset
         samples = torch.tensor(indices) if indices else spread_views(dataset, min(count, len(dataset)))
@@ -91,7 +91,7 @@ def save_interpolation(
 
 
 def save_curves(paths: Sequence[Path], output: Path, *, labels: Sequence[str] = ()) -> list[Path]:
-    """Learning curves of run folders as PNG and SVG; runs that differ in their seed alone become one line and a band."""
+    """Learning curves of run folders as PNG and SVG; runs that differ in their seed alone are one line with a band."""
     if not paths:
         raise ValueError("give at least one run folder to draw")
     logs = [curves.read_metrics(path) for path in paths]
@@ -108,7 +108,7 @@ def save_curves(paths: Sequence[Path], output: Path, *, labels: Sequence[str] = 
 def save_polar(runs: Sequence[Run], output: Path, *, definition: Definition = "kato18") -> list[Path]:
     """IoU by the azimuth of the input view as PNG and SVG, and the figures in it as JSON."""
     profiles = [polar.measure(title_of(run, runs), run.method, run.dataset, definition) for run in runs]
-    path = _in_folder(output).with_suffix(".json")
+    path = with_ending(_in_folder(output), ".json")
     files.write_json(path, {"voxels": definition, "profiles": [p.to_json() for p in profiles]})
     return [*plots.save_figure(polar.plot_profiles(profiles), output), path]
 
@@ -125,6 +125,35 @@ def redraw_polar(values: Path, output: Path) -> list[Path]:
     return plots.save_figure(polar.plot_profiles(profiles), _in_folder(output))
 
 
+def save_all(
+    runs: Sequence[Run],
+    paths: Sequence[Path],
+    folder: Path,
+    *,
+    labels: Sequence[str] = (),
+    report_progress: Callable[[str], None] = lambda text: None,
+) -> tuple[list[Path], list[str]]:
+    """Every figure with its defaults: (files written, for each figure that could not be drawn its name and why).
+
+    runs: `paths`, opened. A data set without true voxels has no polar plot, a single object no interpolation.
+    """
+    figures: dict[str, Callable[[Path], list[Path]]] = {
+        "grid": lambda path: [save_grid(runs, path)],
+        "tsne": lambda path: save_tsne(runs, path),
+        "interpolation": lambda path: save_interpolation(runs, path),
+        "curves": lambda path: save_curves(paths, path, labels=labels),
+        "polar": lambda path: save_polar(runs, path),
+    }
+    written, failed = [], []
+    for name, draw in figures.items():
+        report_progress(f"drawing {name}")
+        try:
+            written += draw(Path(folder) / name)
+        except (ValueError, OSError) as error:
+            failed.append(f"{name}: {error}")
+    return written, failed
+
+
 def _in_folder(output: Path) -> Path:
     """The path, its folder made."""
     output = Path(output)
@@ -133,6 +162,6 @@ def _in_folder(output: Path) -> Path:
 
 
 def _written(save: Callable[[Path, np.ndarray], None], output: Path, suffix: str, picture: np.ndarray) -> Path:
-    path = _in_folder(output).with_suffix(suffix)
+    path = with_ending(_in_folder(output), suffix)
     save(path, picture)
     return path

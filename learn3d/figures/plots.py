@@ -1,20 +1,25 @@
-"""What the plots with axes have in common: matplotlib without a display, one style, colours for everyone, files."""
+"""What the plots with axes have in common: one style, colours that everyone can tell apart, files."""
 
 from __future__ import annotations
 
+import functools
 import io
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import numpy as np
 import skimage.color
 
 from learn3d import files
+from learn3d.figures.drawing import with_ending
 
 if TYPE_CHECKING:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 #: Okabe and Ito's colours, told apart with any kind of colour vision, darker ones first: yellow is too faint for lines.
 COLORS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
@@ -35,15 +40,22 @@ _STYLE = {
 }
 
 
-def load_matplotlib() -> ModuleType:
-    """matplotlib in this module's style, drawing into memory only. Raises ValueError where it is not installed."""
-    try:
-        import matplotlib
-    except ImportError:
-        raise ValueError(missing("matplotlib")) from None
-    matplotlib.use("Agg")
-    matplotlib.rcParams.update(_STYLE)
-    return matplotlib
+def styled(draw: Callable[P, R]) -> Callable[P, R]:
+    """Decorator: run a function that uses matplotlib in this module's style, leaving the caller's settings alone.
+
+    It raises ValueError where matplotlib is not installed. Figures are made without pyplot, so no window opens.
+    """
+
+    @functools.wraps(draw)
+    def wrapper(*args: P.args, **options: P.kwargs) -> R:
+        try:
+            import matplotlib
+        except ImportError:
+            raise ValueError(missing("matplotlib")) from None
+        with matplotlib.rc_context(_STYLE):
+            return draw(*args, **options)
+
+    return wrapper
 
 
 def missing(package: str) -> str:
@@ -69,21 +81,18 @@ def cyclic_colors(count: int = 256) -> np.ndarray:
 
 def cyclic_map() -> ListedColormap:
     """`cyclic_colors` as a colour map."""
-    load_matplotlib()
     from matplotlib.colors import ListedColormap
 
     return ListedColormap(cyclic_colors(), name="turn")
 
 
+@styled
 def save_figure(figure: Figure, path: Path, *, dpi: int = 160) -> list[Path]:
-    """Write a figure as .png and as .svg, whichever ending `path` has; returns both paths. Closes the figure."""
-    import matplotlib.pyplot as plt
-
+    """Write a figure as .png and as .svg, whichever ending `path` has; returns both paths."""
     written = []
     for suffix, options in ((".png", {"dpi": dpi}), (".svg", {"metadata": {"Date": None}})):
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix[1:], bbox_inches="tight", **options)
-        written.append(Path(path).with_suffix(suffix))
+        written.append(with_ending(path, suffix))
         files.write_bytes(written[-1], buffer.getvalue())
-    plt.close(figure)
     return written

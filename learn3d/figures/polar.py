@@ -50,7 +50,9 @@ class ViewProfile:
         """The inverse of `to_json`. Raises ValueError, naming what is missing."""
         try:
             rows = {name: np.array(values[name], np.float64) for name in ("azimuths_deg", "iou", "agreement")}
-            single = {name: float("nan" if values[name] is None else values[name]) for name in ("mean_iou", "consistency")}
+            single = {
+                name: float("nan" if values[name] is None else values[name]) for name in ("mean_iou", "consistency")
+            }
             profile = cls(label=str(values["label"]), **rows, **single)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{source} holds no profile over views ({type(error).__name__}: {error})") from None
@@ -93,9 +95,9 @@ def profile(
 ) -> ViewProfile:
     """Gather per-image figures by direction.
 
-    azimuths (degrees), ious, agreement float [M]: of every image the IoU of its shape with the truth, and the mean IoU with
-    the shapes from the object's other views (NaN: none). The mean of the latter over the views of an object is the
-    mean over all its pairs, so `consistency` is the mean over objects of these means.
+    azimuths (degrees), ious, agreement float [M]: of every image where it was seen from, the IoU of its shape with the
+    truth, and the mean IoU with the shapes from the object's other views (NaN: none). The mean of the latter over the
+    views of an object is the mean over all its pairs, so `consistency` is the mean over objects of these means.
     """
     ids, middles = directions(azimuths)
     per_object = [_mean(agreement[object_ids == k]) for k in np.unique(object_ids)]
@@ -143,33 +145,44 @@ def _row_means(pairs: np.ndarray) -> np.ndarray:
     return np.array([_mean(row) for row in pairs])
 
 
+@plots.styled
 def plot_profiles(profiles: Sequence[ViewProfile]) -> Figure:
-    """Two plots seen from above: IoU with the truth, and agreement among the views, by where the camera stood."""
-    plots.load_matplotlib()
-    import matplotlib.pyplot as plt
+    """IoU with the truth and agreement among the views by where the camera stood, seen from above.
+
+    The second plot is left out where no object was seen from two sides.
+    """
+    from matplotlib.figure import Figure
 
     if not profiles:
         raise ValueError("give at least one run to draw")
-    figure, (left, right) = plt.subplots(1, 2, figsize=(8.4, 4.2), subplot_kw={"projection": "polar"})
-    for axes, name, mean, title in (
-        (left, "iou", "mean_iou", "voxel IoU with the truth"),
-        (right, "agreement", "consistency", "voxel IoU among the shapes\nfrom different views of one object"),
-    ):
+    panels = [("iou", "mean_iou", "voxel IoU with the truth")]
+    if any(not np.isnan(p.consistency) for p in profiles):
+        panels.append(("agreement", "consistency", "voxel IoU among the shapes\nfrom different views of one object"))
+    figure = Figure(figsize=(4.2 * len(panels), 4.2))
+    for k, (name, mean, title) in enumerate(panels, start=1):
+        axes = figure.add_subplot(1, len(panels), k, projection="polar")
         for index, p in enumerate(profiles):
             theta = np.deg2rad(np.append(p.azimuths_deg, p.azimuths_deg[:1]))
             radius = np.append(getattr(p, name), getattr(p, name)[:1])
-            axes.plot(theta, radius, marker="o", markersize=2.5, label=f"{p.label}: {getattr(p, mean):.3f}", **plots.line_style(index))
-        axes.set_theta_zero_location("S")  # as seen from above: camera 0 stands below, azimuth 90 to the right
-        axes.set_thetagrids(range(0, 360, 45), [f"{a}°" for a in range(0, 360, 45)], fontsize=8)
-        axes.set_ylim(0, _round_up(max(np.nanmax(getattr(p, name), initial=0.0) for p in profiles)))
+            label = f"{p.label}: {getattr(p, mean):.3f}"
+            axes.plot(theta, radius, marker="o", markersize=2.5, label=label, **plots.line_style(index))
+        axes.set_ylim(0, _round_up(max(_largest(getattr(p, name)) for p in profiles)))
         axes.set_yticks(np.arange(0.2, axes.get_ylim()[1] + 1e-6, 0.2))
+        axes.set_theta_zero_location("S")  # camera 0 stands below, azimuth 90 to the right
+        axes.set_thetagrids(range(0, 360, 45), [f"{a}°" for a in range(0, 360, 45)], fontsize=8)
         axes.set_rlabel_position(22.5)
         axes.tick_params(axis="y", labelsize=7, colors="#666666")
         axes.set_title(title, pad=14)
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), title="mean", title_fontsize=8, fontsize=8.5)
-    figure.text(0.5, -0.02, "seen from above; angle: azimuth of the input view, distance from the centre: IoU", ha="center", fontsize=8)
+    text = "seen from above; angle: azimuth of the input view, distance from the centre: IoU"
     figure.tight_layout()
+    figure.text(0.5, 0.07 - 0.045 * len(profiles), text, ha="center", fontsize=8, wrap=True)
     return figure
+
+
+def _largest(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.max()) if len(known) else 0.0
 
 
 def _round_up(value: float) -> float:

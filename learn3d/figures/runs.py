@@ -65,8 +65,8 @@ def name_runs(
 ) -> list[str]:
     """What to call each run in a figure: the given label, else the preset's.
 
-    Runs of one preset and category whose options differ are called after their folders. With `seeds_apart` the seed is
-    said where runs differ by it alone; without, such runs have one name.
+    Runs of one preset and category that differ in more than their seed are called after their folders. With
+    `seeds_apart` the seed is said where runs differ by it alone; without, such runs have one name.
     """
     if labels:
         if len(labels) != len(paths):
@@ -78,7 +78,8 @@ def name_runs(
         if any(differences(dataclasses.replace(config, seed=c.seed), c) for c in alike):
             names[i] = _folder_name(paths[i])
         elif seeds_apart and len(alike) > 1:
-            names[i] += f", seed {config.seed}"
+            same_seed = sum(c.seed == config.seed for c in alike) > 1
+            names[i] = _folder_name(paths[i]) if same_seed else f"{names[i]}, seed {config.seed}"
     return names
 
 
@@ -105,4 +106,4 @@ def encode(method: Method, dataset: ViewDataset, samples: Tensor, *, batch_size:
 
 def _folder_name(path: Path) -> str:
     path = Path(path).resolve()
-    return path.parent.name if path.is_file() else path.name
+    return f"{path.parent.name}/{path.stem}" if path.is_file() else path.name
