@@ -104,7 +104,7 @@ class Interpolation(Measured):
     """Samples of the data set to use instead."""
     steps: int = 4
     """Steps from one image to the next in the strip."""
-    frames: int = 16
+    frames: int = paper.FRAMES
     """The same in the morph."""
     azimuths: tuple[float, ...] = AZIMUTHS_DEG
     """Viewpoints: azimuths in degrees."""

@@ -4,6 +4,7 @@
 are plots (extra `figures`, loaded when used); `runs` opens checkpoints with their data, `paper` draws each figure.
 """
 
+from learn3d.figures import drawing
 from learn3d.figures.drawing import (
     CLAY,
     HEADER,
@@ -12,6 +13,7 @@ from learn3d.figures.drawing import (
     Surface,
     as_meshes,
     azimuths_deg,
+    common_zoom,
     draw_mesh,
     draw_surface,
     natural_colors,
@@ -34,9 +36,11 @@ __all__ = [
     "Surface",
     "as_meshes",
     "azimuths_deg",
+    "common_zoom",
     "comparison_grid",
     "draw_mesh",
     "draw_surface",
+    "drawing",
     "interpolation_strip",
     "morph",
     "natural_colors",

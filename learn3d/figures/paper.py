@@ -21,7 +21,8 @@ from learn3d.figures.runs import Run, by_dataset, encode, name_runs, title_of
 
 IMAGES = 6  # rows of a grid of one category
 IMAGES_PER_CATEGORY = 2  # rows of each of several categories
-TILE_SIZE = 128
+TILE_SIZE = 128  # pixels
+FRAMES = 16  # of the morph from one image to the next
 
 
 def save_grid(runs: Sequence[Run], output: Path, *, images: int | None = None, indices: Sequence[int] = ()) -> Path:
@@ -68,7 +69,7 @@ def save_interpolation(
     images: int = 3,
     indices: Sequence[int] = (),
     steps: int = 4,
-    frames: int = 16,
+    frames: int = FRAMES,
     azimuths: Sequence[float] = AZIMUTHS_DEG,
 ) -> list[Path]:
     """Shapes between those of some test images: a strip per run as PNG, and an endless morph as GIF.
@@ -140,7 +141,7 @@ def save_all(
     figures: dict[str, Callable[[Path], list[Path]]] = {
         "grid": lambda path: [save_grid(runs, path)],
         "tsne": lambda path: save_tsne(runs, path),
-        "interpolation": lambda path: save_interpolation(runs, path),
+        "interpolation": lambda path: save_interpolation(runs, path, frames=FRAMES),
         "curves": lambda path: save_curves(paths, path, labels=labels),
         "polar": lambda path: save_polar(runs, path),
     }
