@@ -76,9 +76,11 @@ class Grid(Measured):
     """How many images, spread over objects and views. None: 6, or 2 of each of several classes."""
     indices: tuple[int, ...] = ()
     """Samples of the data set to show instead."""
+    truth: bool = False
+    """Show the true voxels, too."""
 
     def draw(self) -> list[Path]:
-        return [paper.save_grid(self.open(), self.output, images=self.images, indices=self.indices)]
+        return [paper.save_grid(self.open(), self.output, images=self.images, indices=self.indices, truth=self.truth)]
 
 
 @dataclass(frozen=True, kw_only=True)

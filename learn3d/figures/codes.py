@@ -129,7 +129,7 @@ def _draw_wheel(axes: Axes) -> None:
     axes.tick_params(pad=-1)
     axes.grid(False)
     axes.spines["polar"].set_visible(False)
-    axes.text(0, 0, "azimuth\nof the view", ha="center", va="center", fontsize=7.5)
+    axes.text(0, 0, "azimuth\nof the view", ha="center", va="center", fontsize=6.5)
 
 
 def _sklearn(name: str) -> ModuleType:

@@ -28,7 +28,7 @@ MARGIN = 4
 HEADER = 18
 _TEXT = (60, 60, 60)
 _RULE = (205, 205, 205)
-_LIGHT = (-0.45, 0.65, -0.65)  # towards the light: left of, above and behind the camera, in its own axes
+_LIGHT = (-0.5, 0.45, -0.75)  # towards the light: left of, above and behind the camera, in its own axes
 _FAR = 5.0  # where orthographic cameras stand: outside of any object, so that faces turn to the right side
 
 
@@ -119,7 +119,7 @@ def draw_surface(surface: Surface, cameras: nmr.LookAt | nmr.Orthographic, *, im
             camera = nmr.Orthographic(eye[None], up=up, scale=cameras.scale)
         light = tuple(_camera_axes(eye, up).T @ torch.tensor(_LIGHT, dtype=torch.float64))
         clay = np.asarray(CLAY)
-        rgb, _ = shade_mesh(*surface, clay, camera, image_size=image_size, supersample=4, ambient=0.35, light=light)
+        rgb, _ = shade_mesh(*surface, clay, camera, image_size=image_size, supersample=4, ambient=0.4, light=light)
         pictures.append(rgb)
     return np.concatenate(pictures)
 

@@ -26,6 +26,7 @@ from learn3d.figures.drawing import (
     to_uint8,
 )
 from learn3d.methods import Method
+from learn3d.surfaces import grid_surface
 
 TURNS_DEG = (0, 60, 120, 180, 240, 300)
 GRID_COLUMNS = ("input", "target", "rendering", "same view", *(f"+{turn}°" for turn in TURNS_DEG[1:]))
@@ -59,6 +60,7 @@ def comparison_grid(
     dataset: ViewDataset,
     samples: Tensor,
     *,
+    truth: bool = False,
     title: str = "",
     tile_size: int = TILE,
 ) -> np.ndarray:
@@ -67,13 +69,20 @@ def comparison_grid(
     Up to two methods stand side by side as in the paper's figure, a row per image: the input, then for each method its
     shape from the input's view and from five more around the object. More stand below each other, a group of rows per
     image. `title` stands above the inputs. All pictures are magnified alike, as far as the shapes allow.
+    With `truth` the objects' voxels come first, like a method of that name.
     """
     if not methods:
         raise ValueError("give at least one method to compare")
+    if truth and dataset.voxels is None:
+        raise ValueError(f"{dataset.category}, {dataset.split} has no true voxels to show")
     batch = dataset.batch(samples)
     poses = [batch.poses[torch.tensor([i])] for i in range(len(samples))]
     shapes = {label: as_meshes(method.decode(method.encode(batch.images))) for label, method in methods}
-    if len(shapes) < len(methods):
+    if truth:
+        grids = dataset.convention.to_object(batch.voxels.float())
+        true_shapes = [Surface(*grid_surface(grid, box=dataset.convention.box)) for grid in grids]
+        shapes = {"truth": true_shapes, **shapes}
+    if len(shapes) < len(methods) + truth:
         raise ValueError(f"the methods need different labels, got {[label for label, _ in methods]}")
     cameras = [orbit(pose, TURNS_DEG) for pose in poses]
     zoom = common_zoom([pair for of_one in shapes.values() for pair in zip(of_one, cameras, strict=True)], batch.masks)
@@ -84,7 +93,7 @@ def comparison_grid(
         for label, of_one in shapes.items()
     }
     titles = ("input view", *(f"+{turn}°" for turn in TURNS_DEG[1:]))
-    if len(methods) <= 2:
+    if len(shapes) <= 2:
         blocks = [tile([[picture] for picture in inputs], ["input"], tile_size=tile_size)]
         blocks += [tile(rows, titles, tile_size=tile_size) for rows in drawn.values()]
         return beside(blocks, [title, *drawn])
@@ -94,7 +103,7 @@ def comparison_grid(
         for k, pictures in enumerate(drawn.values())
     ]
     labels = list(drawn) * len(samples)
-    return tile(rows, [title or "input", *titles], tile_size=tile_size, row_titles=labels, rows_per_group=len(methods))
+    return tile(rows, [title or "input", *titles], tile_size=tile_size, row_titles=labels, rows_per_group=len(shapes))
 
 
 def spread_views(dataset: ViewDataset, count: int) -> Tensor:

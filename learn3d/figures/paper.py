@@ -25,11 +25,18 @@ TILE_SIZE = 128  # pixels
 FRAMES = 16  # of the morph from one image to the next
 
 
-def save_grid(runs: Sequence[Run], output: Path, *, images: int | None = None, indices: Sequence[int] = ()) -> Path:
+def save_grid(
+    runs: Sequence[Run],
+    output: Path,
+    *,
+    images: int | None = None,
+    indices: Sequence[int] = (),
+    truth: bool = False,
+) -> Path:
     """Reconstructions of test images, runs beside each other, categories below each other, as a PNG.
 
     images: how many of each category, chosen by `spread_views`; None: 6, or 2 of each of several categories. indices:
-    samples to show instead, of every category.
+    samples to show instead, of every category. truth: show the true voxels, too.
     """
     groups, blocks = by_dataset(runs), []
     count = images if images is not None else IMAGES if len(groups) == 1 else IMAGES_PER_CATEGORY
@@ -38,7 +45,7 @@ def save_grid(runs: Sequence[Run], output: Path, *, images: int | None = None, i
         samples = torch.tensor(indices) if indices else spread_views(dataset, min(count, len(dataset)))
         title = dataset.category if len(groups) > 1 else ""
         methods = [(run.label, run.method) for run in group]
-        blocks.append(comparison_grid(methods, dataset, samples, title=title, tile_size=TILE_SIZE))
+        blocks.append(comparison_grid(methods, dataset, samples, truth=truth, title=title, tile_size=TILE_SIZE))
     return _written(save_png, output, ".png", stacked(blocks, gap=10))
 
 

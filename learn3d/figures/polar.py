@@ -155,10 +155,10 @@ def plot_profiles(profiles: Sequence[ViewProfile]) -> Figure:
 
     if not profiles:
         raise ValueError("give at least one run to draw")
-    panels = [("iou", "mean_iou", "voxel IoU with the truth")]
+    panels = [("iou", "mean_iou", "with the truth")]
     if any(not np.isnan(p.consistency) for p in profiles):
-        panels.append(("agreement", "consistency", "voxel IoU among the shapes\nfrom different views of one object"))
-    figure = Figure(figsize=(4.2 * len(panels), 4.2))
+        panels.append(("agreement", "consistency", "among the shapes from different views of an object"))
+    figure = Figure(figsize=(4.2 * len(panels), 4.6 + 0.2 * len(profiles)))
     for k, (name, mean, title) in enumerate(panels, start=1):
         axes = figure.add_subplot(1, len(panels), k, projection="polar")
         for index, p in enumerate(profiles):
@@ -173,10 +173,9 @@ def plot_profiles(profiles: Sequence[ViewProfile]) -> Figure:
         axes.set_rlabel_position(22.5)
         axes.tick_params(axis="y", labelsize=7, colors="#666666")
         axes.set_title(title, pad=14)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), title="mean", title_fontsize=8, fontsize=8.5)
-    text = "seen from above; angle: azimuth of the input view, distance from the centre: IoU"
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), title="mean", title_fontsize=8.5, fontsize=8.5)
+    figure.suptitle("voxel IoU by the azimuth of the input view, seen from above", fontsize=10, y=1.02)
     figure.tight_layout()
-    figure.text(0.5, 0.07 - 0.045 * len(profiles), text, ha="center", fontsize=8, wrap=True)
     return figure
 
 

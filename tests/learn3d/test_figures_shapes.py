@@ -97,6 +97,28 @@ def test_more_methods_stand_below_each_other(tiny_set) -> None:
     assert (ink[[2, 5], 1:] < 0.005).all()
 
 
+def test_the_truth_is_shown_as_it_was_seen(tiny_set) -> None:
+    grid = figures.comparison_grid([("a", Ellipsoids())], tiny_set, torch.tensor([3, 30]), truth=True)
+    voxels = tiny_set.convention.to_object(torch.from_numpy(tiny_set.voxels[[0, 1]]).float())
+    pose, true = tiny_set.poses[torch.tensor([30])], figures.as_meshes(Grids(voxels))
+    cameras = [figures.orbit(tiny_set.poses[torch.tensor([i])], [0, 60, 120, 180, 240, 300]) for i in (3, 30)]
+    own = shapes(Ellipsoids(), tiny_set, torch.tensor([3, 30]))
+    masks = tiny_set.batch(torch.tensor([3, 30])).masks
+    zoom = figures.common_zoom([*zip(true, cameras, strict=True), *zip(own, cameras, strict=True)], masks)
+    views = figures.draw_surface(true[1], figures.orbit(pose, [0, 60], zoom=zoom), image_size=figures.TILE)
+    top, left = grid.shape[0] - 2 * STEP - figures.MARGIN, STEP + figures.MARGIN + 14
+    for column in (0, 1):
+        assert np.array_equal(cell(grid, 1, column, top=top, left=left), views[column])
+    three = figures.comparison_grid([("a", Ellipsoids()), ("b", Ellipsoids())], tiny_set, torch.tensor([3]), truth=True)
+    assert three.shape[0] == figures.HEADER + 3 * STEP + figures.MARGIN
+    with pytest.raises(ValueError, match="different labels"):
+        figures.comparison_grid([("truth", Ellipsoids())], tiny_set, torch.tensor([3]), truth=True)
+    with pytest.raises(ValueError, match="airplane, test has no true voxels to show"):
+        figures.comparison_grid(
+            [("a", Ellipsoids())], dataclasses.replace(tiny_set, voxels=None), torch.tensor([3]), truth=True
+        )
+
+
 def test_comparisons_need_methods_of_different_names(tiny_set) -> None:
     with pytest.raises(ValueError, match="at least one method"):
         figures.comparison_grid([], tiny_set, torch.tensor([0]))
