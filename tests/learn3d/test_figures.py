@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +12,8 @@ from PIL import Image
 
 import nmr
 from learn3d import figures
-from learn3d.methods import DataShape, Method, create_method
+from learn3d.data.poses import LookAtPoses, RotationPoses
+from learn3d.methods import DataShape, Grids, Method, create_method
 from learn3d.presets import PRESETS
 
 
@@ -32,6 +36,7 @@ def test_natural_colors_undo_the_inversion() -> None:
     assert colors.shape == (2, 3, 5, 3)
     assert (colors[0] == 255).all()
     assert colors[1, 2, 4].tolist() == [0, 255, 255]
+    assert figures.natural_colors(stored, inverted=False)[1, 2, 4].tolist() == [255, 0, 0]
 
 
 def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set) -> None:
@@ -57,15 +62,130 @@ def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set) -> None:
         assert ((cell(0, column) < 250).any(axis=2) == rendered).mean() > 0.95
 
 
-def test_shaded_view_agrees_with_the_rendering_at_the_input_view(tiny_set, egg) -> None:
+@pytest.mark.parametrize("kind", ["look-at", "rotation"])
+def test_shaded_views_agree_with_the_renderings_at_the_poses(egg, kind) -> None:
     vertices, faces = egg[0] + torch.tensor([0.15, 0.1, 0.05]), egg[1]
-    camera = tiny_set.poses[torch.tensor([5])].cameras()
-    silhouette = nmr.render_silhouette(vertices[None], faces, camera, image_size=64)[0] > 0.5
-    azimuth = figures.view_angles(tiny_set.poses[torch.tensor([5])])[0]
-    assert azimuth == pytest.approx(-75, abs=1e-3)
-    shaded = figures.draw_mesh(vertices, faces, [azimuth, -azimuth], elevation_deg=30, image_size=64)
-    agreement = [((picture < 220).any(axis=2) == silhouette.numpy()).mean() for picture in shaded]
-    assert agreement[0] > 0.99 > 0.95 > agreement[1]
+    poses = LookAtPoses(torch.tensor([-75.0, -40.0, 100.0]), torch.tensor([30.0, 30.0, -10.0]), 2.732, 15.0)
+    if kind == "rotation":  # the same cameras without perspective, the last one rolled by 25 degrees
+        poses = RotationPoses(torch.stack([rotation(-75, 30), rotation(-40, 30), rotation(100, -10, roll_deg=25)]))
+    silhouettes = nmr.render_silhouette(vertices[None].expand(3, -1, -1), faces, poses.cameras(), image_size=64) > 0.5
+    first = figures.orbit(poses[torch.tensor([0])], [0, 35, -35])  # the second pose is 35 degrees on
+    last = figures.orbit(poses[torch.tensor([2])], [0])
+    surface = figures.Surface(vertices, faces)
+    shaded = [(figures.draw_surface(surface, c, image_size=64) < 220).any(axis=3) for c in (first, last)]
+
+    def agreement(a: np.ndarray, b: torch.Tensor) -> float:
+        return float((a == b.numpy()).mean())
+
+    assert agreement(shaded[0][0], silhouettes[0]) > 0.99
+    assert agreement(shaded[0][1], silhouettes[1]) > 0.99
+    assert agreement(shaded[0][2], silhouettes[1]) < 0.97
+    assert agreement(shaded[1][0], silhouettes[2]) > 0.99
+
+
+def rotation(azimuth_deg: float, elevation_deg: float, *, roll_deg: float = 0.0) -> torch.Tensor:
+    """Rows right, up, away of a camera that looks at the origin."""
+    away = -nmr.cameras.points_from_angles(1.0, elevation_deg, azimuth_deg).float()
+    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), away)
+    right = right / right.norm()
+    up = torch.linalg.cross(away, right)
+    cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
+    return torch.stack([cos * right + sin * up, cos * up - sin * right, away])
+
+
+def test_azimuths_are_read_from_poses_of_either_kind() -> None:
+    look_at = LookAtPoses(torch.tensor([-75.0, 190.0]), 30.0, 2.732, 15.0)
+    rotations = RotationPoses(torch.stack([rotation(-75, 30), rotation(190, -20, roll_deg=40)]))
+    for poses in (look_at, rotations):
+        assert figures.azimuths_deg(poses).tolist() == pytest.approx([-75, -170], abs=1e-4)
+
+
+def test_an_orbit_needs_one_pose() -> None:
+    with pytest.raises(ValueError, match="one camera, got 2 poses"):
+        figures.orbit(LookAtPoses(torch.zeros(2), 30.0, 2.732, 15.0), [0])
+
+
+def test_the_light_goes_with_the_camera() -> None:
+    sphere = figures.Surface(*nmr.icosphere(4))
+    cameras = figures.orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 25.0), [0, 60, 180, 300])
+    pictures = figures.draw_surface(sphere, cameras, image_size=32).astype(int)
+    brightness = [picture[10:22, 10:22].mean() for picture in pictures]
+    assert max(brightness) - min(brightness) < 4
+    assert pictures[0][10:16].mean() > pictures[0][16:22].mean() + 8  # and it comes from above
+
+
+def test_grids_are_drawn_where_their_cells_are() -> None:
+    occupancy = torch.zeros(2, 16, 16, 16)
+    occupancy[0, 2:6, 8:14, 15:] = 1.0  # touches the far end of z
+    full, empty = figures.as_meshes(Grids(occupancy))
+    low, high = full.vertices.amin(dim=0), full.vertices.amax(dim=0)
+    half = 0.5 / 16  # the surface runs half way between the centres of neighbouring cells: through their border
+    assert low.tolist() == pytest.approx([2 / 16 - 0.5, 8 / 16 - 0.5, 15 / 16 - 0.5], abs=half / 8)
+    assert high.tolist() == pytest.approx([6 / 16 - 0.5, 14 / 16 - 0.5, 0.5], abs=half / 8)
+    assert len(empty.faces) == 0
+    cameras = figures.orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 15.0), [0, 90])
+    pictures = figures.draw_surface(empty, cameras, image_size=8)
+    assert pictures.shape == (2, 8, 8, 3)
+    assert (pictures == 255).all()
+    assert (figures.draw_surface(full, cameras, image_size=32) < 250).any()
+
+
+def test_common_zoom_fills_the_picture_with_the_largest_shape_or_mask(egg) -> None:
+    pose, turns = LookAtPoses(torch.zeros(1), 0.0, 2.732, 15.0), [0, 90]
+    surface, small = figures.Surface(*egg), figures.Surface(egg[0] * 0.3, egg[1])
+    cameras, no_masks = figures.orbit(pose, turns), torch.zeros(1, 64, 64)
+    zoom = figures.common_zoom([(surface, cameras), (small, cameras)], no_masks)
+    picture = figures.draw_surface(surface, figures.orbit(pose, turns, zoom=zoom), image_size=100)[0]
+    columns = np.flatnonzero((picture < 250).any(axis=(0, 2)))
+    assert 1 <= columns[0] <= 4  # 5 % of the half side are left free
+    assert columns[-1] == 99 - columns[0]
+    masks = no_masks.clone()
+    masks[0, 16:48, 20:56] = 1.0  # reaches 24 / 32 of the half side
+    assert figures.common_zoom([(small, cameras)], masks) == pytest.approx(0.95 / (23.5 / 32), rel=1e-6)
+    assert figures.common_zoom([(small, cameras)], torch.ones(1, 64, 64)) == 1.0
+
+
+def test_magnified_keeps_the_middle() -> None:
+    pictures = np.zeros((1, 40, 40, 3), np.uint8)
+    pictures[:, 10:30, 10:30] = 255
+    assert figures.drawing.magnified(pictures, 2.0).shape == (1, 20, 20, 3)
+    assert (figures.drawing.magnified(pictures, 2.0) == 255).all()
+    assert np.array_equal(figures.drawing.magnified(pictures, 1.0), pictures)
+
+
+def test_a_sheet_has_titles_free_places_and_rules() -> None:
+    black = np.zeros((8, 8, 3), np.uint8)
+    plain = figures.tile([[black, None], [black, black]], tile_size=20)
+    step = 20 + figures.MARGIN
+    assert plain.shape == (2 * step + figures.MARGIN, 2 * step + figures.MARGIN, 3)
+    assert plain[figures.MARGIN + 5, figures.MARGIN + 5].tolist() == [0, 0, 0]
+    assert (plain[: step - 1, step + figures.MARGIN :] == 255).all()  # the free place
+    titled = figures.tile(
+        [[black, None], [black, black]], ["a", "b"], tile_size=20, row_titles=["one", "two"], rows_per_group=1
+    )
+    left = titled.shape[1] - plain.shape[1]
+    assert left > 10 and titled.shape[0] == plain.shape[0] + figures.HEADER
+    assert (titled[: figures.HEADER] < 128).any() and (titled[figures.HEADER :, :left] < 128).any()
+    rule = titled[figures.HEADER + step + figures.MARGIN // 2]
+    assert len(np.unique(rule, axis=0)) == 1 and rule[0, 0] not in (0, 255)
+
+
+def test_blocks_are_put_together_with_labels() -> None:
+    low, high = np.zeros((10, 30, 3), np.uint8), np.zeros((20, 40, 3), np.uint8)
+    sheet = figures.drawing.beside([low, high], ["one", "two"], gap=6)
+    assert sheet.shape[1] == 30 + 6 + 40
+    assert (sheet[-10:, :30] == 0).all() and (sheet[-20:, 36:] == 0).all() and (sheet[-20:-10, :30] == 255).all()
+    assert (sheet[:-20] < 100).any()  # the labels
+    assert figures.drawing.beside([low], [""]).shape == low.shape
+    with pytest.raises(ValueError, match="2 pictures need as many labels, got 1"):
+        figures.drawing.beside([low, high], ["one"])
+    both = figures.drawing.stacked([low, high], gap=4)
+    assert both.shape == (34, 40, 3) and (both[10:14] == 255).all() and (both[14:] == 0).all()
+
+
+def test_endings_are_replaced_only_where_they_are_those_of_pictures() -> None:
+    assert figures.drawing.with_ending(Path("a/b.png"), ".svg") == Path("a/b.svg")
+    assert figures.drawing.with_ending(Path("a/lambda-0.5"), ".svg") == Path("a/lambda-0.5.svg")
 
 
 def test_turntable_turns(egg) -> None:

@@ -1,0 +1,175 @@
+"""The paper's figures, each from opened runs into files; what `tools/figures.py` calls."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from learn3d import files
+from learn3d.config import load_config
+from learn3d.data.conventions import Definition
+from learn3d.evaluation import spread_samples
+from learn3d.figures import codes, curves, plots, polar
+from learn3d.figures.drawing import azimuths_deg, beside, save_gif, save_png, stacked, with_ending
+from learn3d.figures.grids import comparison_grid, spread_views
+from learn3d.figures.interpolation import AZIMUTHS_DEG, interpolation_strip, morph, typical_views
+from learn3d.figures.runs import Run, by_dataset, encode, name_runs, title_of
+
+IMAGES = 6  # rows of a grid of one category
+IMAGES_PER_CATEGORY = 2  # rows of each of several categories
+TILE_SIZE = 128  # pixels
+FRAMES = 16  # of the morph from one image to the next
+
+
+def save_grid(
+    runs: Sequence[Run],
+    output: Path,
+    *,
+    images: int | None = None,
+    indices: Sequence[int] = (),
+    truth: bool = False,
+) -> Path:
+    """Reconstructions of test images, runs beside each other, categories below each other, as a PNG.
+
+    images: how many of each category, chosen by `spread_views`; None: 6, or 2 of each of several categories. indices:
+    samples to show instead, of every category. truth: show the true voxels, too.
+    """
+    groups, blocks = by_dataset(runs), []
+    count = images if images is not None else IMAGES if len(groups) == 1 else IMAGES_PER_CATEGORY
+    for group in groups:
+        dataset = group[0].dataset
+        samples = torch.tensor(indices) if indices else spread_views(dataset, min(count, len(dataset)))
+        title = dataset.category if len(groups) > 1 else ""
+        methods = [(run.label, run.method) for run in group]
+        blocks.append(comparison_grid(methods, dataset, samples, truth=truth, title=title, tile_size=TILE_SIZE))
+    return _written(save_png, output, ".png", stacked(blocks, gap=10))
+
+
+def save_tsne(runs: Sequence[Run], output: Path, *, max_images: int = 2000, seed: int = 0) -> list[Path]:
+    """Shape codes of test images in the plane, coloured by the view, a map per run, as PNG and SVG."""
+    maps = []
+    for run in runs:
+        dataset = run.dataset
+        samples = spread_samples(dataset.object_ids, dataset.view_ids, min(max_images, len(dataset)))
+        rows = samples.numpy()
+        maps.append(
+            codes.map_codes(
+                title_of(run, runs),
+                encode(run.method, dataset, samples).numpy(),
+                azimuths_deg(dataset.poses[samples]).numpy(),
+                dataset.view_ids[rows],
+                dataset.object_ids[rows],
+                seed=seed,
+            )
+        )
+    return plots.save_figure(codes.plot_maps(maps), _in_folder(output))
+
+
+def save_interpolation(
+    runs: Sequence[Run],
+    output: Path,
+    *,
+    images: int = 3,
+    indices: Sequence[int] = (),
+    steps: int = 4,
+    frames: int = FRAMES,
+    azimuths: Sequence[float] = AZIMUTHS_DEG,
+) -> list[Path]:
+    """Shapes between those of some test images: a strip per run as PNG, and an endless morph as GIF.
+
+    images: how many, chosen by `typical_views` with the first run of each category; indices: samples to use instead.
+    steps: shapes from one image to the next in the strip, frames: the same in the animation.
+    """
+    strips, morphs, titles = [], [], []
+    for group in by_dataset(runs):
+        first = group[0]
+        samples = torch.tensor(indices) if indices else typical_views(first.method, first.dataset, images)
+        for run in group:
+            parts = (run.method, run.dataset, samples)
+            strips.append(interpolation_strip(*parts, steps=steps, azimuths=azimuths))
+            morphs.append(morph(*parts, steps=frames, azimuths=azimuths))
+            titles.append(title_of(run, runs) if len(runs) > 1 else "")
+    strip = stacked([beside([s], [title]) for s, title in zip(strips, titles, strict=True)], gap=10)
+    animation = np.stack([beside(list(pictures), titles) for pictures in zip(*morphs, strict=True)])
+    return [_written(save_png, output, ".png", strip), _written(save_gif, output, ".gif", animation)]
+
+
+def save_curves(paths: Sequence[Path], output: Path, *, labels: Sequence[str] = ()) -> list[Path]:
+    """Learning curves of run folders as PNG and SVG; runs that differ in their seed alone are one line with a band."""
+    if not paths:
+        raise ValueError("give at least one run folder to draw")
+    logs = [curves.read_metrics(path) for path in paths]
+    configs = [load_config(Path(path) / "config.json") for path in paths] if not labels else []
+    names = name_runs(configs, paths, labels, seeds_apart=False)
+    if len({config.category for config in configs}) > 1:
+        names = [f"{config.category}: {name}" for config, name in zip(configs, names, strict=True)]
+    lines: dict[str, list[dict[curves.Key, curves.Curve]]] = {}
+    for name, log in zip(names, logs, strict=True):
+        lines.setdefault(name, []).append(log)
+    return plots.save_figure(curves.plot_curves(lines), _in_folder(output))
+
+
+def save_polar(runs: Sequence[Run], output: Path, *, definition: Definition = "kato18") -> list[Path]:
+    """IoU by the azimuth of the input view as PNG and SVG, and the figures in it as JSON."""
+    profiles = [polar.measure(title_of(run, runs), run.method, run.dataset, definition) for run in runs]
+    path = with_ending(_in_folder(output), ".json")
+    files.write_json(path, {"voxels": definition, "profiles": [p.to_json() for p in profiles]})
+    return [*plots.save_figure(polar.plot_profiles(profiles), output), path]
+
+
+def redraw_polar(values: Path, output: Path) -> list[Path]:
+    """The plot of `save_polar` from the JSON that it wrote."""
+    try:
+        stored = json.loads(Path(values).read_text())["profiles"]
+    except FileNotFoundError:
+        raise FileNotFoundError(f"there is no {values}; give the .json that 'polar' wrote beside its picture") from None
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
+        raise ValueError(f"{values} holds no profiles; give the .json that 'polar' wrote beside its picture") from None
+    profiles = [polar.ViewProfile.from_json(value, source=str(values)) for value in stored]
+    return plots.save_figure(polar.plot_profiles(profiles), _in_folder(output))
+
+
+def save_all(
+    runs: Sequence[Run],
+    paths: Sequence[Path],
+    folder: Path,
+    *,
+    labels: Sequence[str] = (),
+    report_progress: Callable[[str], None] = lambda text: None,
+) -> tuple[list[Path], list[str]]:
+    """Every figure with its defaults: (files written, for each figure that could not be drawn its name and why).
+
+    runs: `paths`, opened. A data set without true voxels has no polar plot, a single object no interpolation.
+    """
+    figures: dict[str, Callable[[Path], list[Path]]] = {
+        "grid": lambda path: [save_grid(runs, path)],
+        "tsne": lambda path: save_tsne(runs, path),
+        "interpolation": lambda path: save_interpolation(runs, path, frames=FRAMES),
+        "curves": lambda path: save_curves(paths, path, labels=labels),
+        "polar": lambda path: save_polar(runs, path),
+    }
+    written, failed = [], []
+    for name, draw in figures.items():
+        report_progress(f"drawing {name}")
+        try:
+            written += draw(Path(folder) / name)
+        except (ValueError, OSError) as error:
+            failed.append(f"{name}: {error}")
+    return written, failed
+
+
+def _in_folder(output: Path) -> Path:
+    """The path, its folder made."""
+    output = Path(output)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    return output
+
+
+def _written(save: Callable[[Path, np.ndarray], None], output: Path, suffix: str, picture: np.ndarray) -> Path:
+    path = with_ending(_in_folder(output), suffix)
+    save(path, picture)
+    return path
