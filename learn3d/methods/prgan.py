@@ -47,7 +47,7 @@ class PrGANSettings:
     discriminator_channels: tuple[int, int, int, int] = DISCRIMINATOR_CHANNELS
     """Channels at 32^2, 16^2, 8^2 and 4^2; fewer on a small machine."""
     occupancy_threshold: float = 0.1
-    """A predicted voxel is full where the mean over it is higher. Unpublished; Kato's grids hold every cell that a shape
+    """A predicted voxel is full where its mean is higher. Unpublished; Kato's grids hold every cell that a shape
     touches, so that even true shapes reach an IoU of .35 at 0.5, but .74 at 0.1."""
     elevation_deg: float = 30.0
     """Elevation of the K views, which stand at equal steps of azimuth."""
