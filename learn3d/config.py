@@ -119,6 +119,11 @@ def check_fields(settings: Settings) -> None:
             _check_choice(field.name, value, (False, True))
         elif kind is int:
             _check_positive_int(field.name, value)
+        elif typing.get_origin(kind) is tuple:
+            if not isinstance(value, tuple) or len(value) != len(typing.get_args(kind)):
+                raise ValueError(f"{field.name} must be {len(typing.get_args(kind))} whole numbers, got {value!r}")
+            for item in value:
+                _check_positive_int(field.name, item)
         elif kind is float:
             positive = field.name.startswith("learning_rate")
             fits = isinstance(value, (int, float)) and math.isfinite(value) and (value > 0 if positive else value >= 0)

@@ -261,13 +261,13 @@ def _setting_types(variant: Variant) -> dict[str, Any]:
 
 
 def _parse(text: str, kind: str) -> Any:
-    """A value as JSON has it (0.5, true, null, [1, 2]), else the text itself; "a,b" where several names are wanted."""
+    """A value as JSON has it (0.5, true, null, [1, 2]), else the text itself; "a,b" where several values are wanted."""
     try:
         value = json.loads(text)
     except json.JSONDecodeError:
         value = text
     if "tuple" in kind and isinstance(value, str):
-        value = tuple(part for part in value.split(",") if part)
+        return tuple(_parse(part, "") for part in value.split(",") if part)
     return tuple(value) if isinstance(value, list) else value
 
 

@@ -138,6 +138,16 @@ def test_changes_reach_the_methods_that_they_name(tmp_path) -> None:
         assert (run.config.precision, run.config.augment) == ("fp32", ("flip", "channels"))
 
 
+def test_several_whole_numbers_are_numbers(tmp_path) -> None:
+    for text in ("prgan:discriminator_channels=8,16,32,64", "discriminator-channels=[8,16,32,64]"):
+        (run,) = plan_runs(TABLES["prgan"], options(tmp_path, methods=("prgan",), changes=(text,)))
+        assert run.config.settings.discriminator_channels == (8, 16, 32, 64)
+    with pytest.raises(ValueError, match="discriminator_channels must be a whole number >= 1, got 'a'"):
+        plan_runs(TABLES["prgan"], options(tmp_path, methods=("prgan",), changes=("discriminator_channels=8,16,32,a",)))
+    with pytest.raises(ValueError, match=r"discriminator_channels must be 4 whole numbers, got \(8,\)"):
+        plan_runs(TABLES["prgan"], options(tmp_path, methods=("prgan",), changes=("discriminator_channels=[8]",)))
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
