@@ -1,8 +1,10 @@
-"""Make a data set in Kato's layout from a folder of meshes, a mesh pack or the procedural generator.
+"""Make a data set from a folder of meshes, a mesh pack or the procedural generator, in the layout of any that we read.
 
 Examples:
   python tools/make_dataset.py --output data --category chair --source my_chairs --augment 5
   python tools/make_dataset.py --output data --category airplane --procedural 300
+  python tools/make_dataset.py --output kar --category chair --source my_chairs --layout kar --views 20
+  python tools/make_dataset.py --output pascal --category car --procedural 100 --layout pascal3d
 """
 
 import sys

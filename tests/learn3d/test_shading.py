@@ -8,6 +8,7 @@ import torch
 
 import nmr
 from learn3d.data.kato import view_cameras
+from learn3d.data.poses import RotationPoses
 from learn3d.shading import BACK_LIGHT, shade_mesh
 
 WHITE = np.ones(3, dtype=np.float32)
@@ -59,6 +60,18 @@ def test_each_face_keeps_its_own_colour(square):
     np.testing.assert_array_equal(rgb[0, 10, 8], [0, 0, 255])
 
 
+def test_parallel_rays_light_the_side_that_they_meet(square):
+    vertices, faces = square
+    rotation = torch.diag(torch.tensor([1.0, 1, -1]))  # from behind: +z is towards the camera
+    color = np.array([0.8, 0.4, 0.2], dtype=np.float32)
+    cameras = RotationPoses(torch.stack([torch.eye(3), rotation])).cameras()
+    rgb, alpha = shade_mesh(vertices, faces, color, cameras, image_size=32, light=(0.0, 3.0, -4.0))
+    np.testing.assert_array_equal(rgb[0, 16, 16], np.rint(255 * color * (0.5 + 0.5 * 0.8)))
+    np.testing.assert_array_equal(rgb[1, 16, 16], np.rint(255 * color * (0.5 + 0.5 * 0.8 * BACK_LIGHT)))
+    wanted = nmr.render_silhouette(vertices, faces, cameras, image_size=32)
+    np.testing.assert_array_equal(alpha, np.rint(255 * wanted.numpy()))
+
+
 def test_faces_without_area_give_no_nan(square):
     vertices, faces = square
     faces = torch.cat([faces, torch.tensor([[0, 0, 0], [0, 1, 1]])])
@@ -76,6 +89,7 @@ def test_faces_without_area_give_no_nan(square):
         ({"light": (0.0, float("nan"), 0.0)}, "finite"),
         ({"ambient": 1.5}, "ambient"),
         ({"supersample": 0}, "at least 1"),
+        ({"cameras": view_cameras([0]).projection()}, "as nmr.LookAt only"),
     ],
 )
 def test_errors(square, change, message):

@@ -23,7 +23,7 @@ import nmr
 from learn3d.data import conventions
 from learn3d.data.kato import mesh_to_object
 from learn3d.data.render import DatasetConfig, make_dataset
-from learn3d.data.writers import writer_of
+from learn3d.data.writers import RenderedObject, writer_of
 from learn3d.data.writers.r2n2 import binvox_bytes
 
 SYNSET = "03001627"
@@ -139,7 +139,9 @@ def test_kar(tmp_path, folder):
         assert_oriented(volume, torch.stack([-z, y, x], dim=1), faces, span=1)
         root = tmp_path / "renders" / SYNSET / name
         rows = [[float(word) for word in line.split()] for line in (root / "view.txt").read_text().splitlines()]
-        assert len(rows) == 3 and all(len(row) == 4 and -180 <= row[0] < 180 and -20 <= row[1] < 40 for row in rows)
+        assert len(rows) == 3 and all(
+            len(row) == 4 and row[2] == 0 and -180 <= row[0] < 180 and -20 <= row[1] < 40 for row in rows
+        )
         elevations += [row[1] for row in rows]
         for i, (azimuth, elevation, _, distance) in enumerate(rows):
             camera = nmr.LookAt.from_angles([distance], [elevation], [azimuth], half_fov_deg=14.9314)
@@ -211,6 +213,21 @@ def test_r2n2(tmp_path, folder):
             rgba = np.asarray(Image.open(root / f"{k:02d}.png")).astype(float)
             assert rgba.shape == (137, 137, 4)
             assert_same_mask(rgba[..., 3], silhouette(vertices * side, faces, opencv, 137))
+
+
+def test_colours_are_unmixed_from_white_and_mixed_with_backgrounds():
+    rng = np.random.default_rng(0)
+    color, alpha = rng.integers(0, 256, (2, 8, 8, 3)), rng.choice([0, 64, 128, 191, 255], (2, 8, 8)).astype(np.uint8)
+    share = alpha[..., None] / 255
+    rgb = np.rint(color * share + 255 * (1 - share)).astype(np.uint8)
+    item = RenderedObject("a", "train", None, None, None, rgb, alpha, None, rng)
+    rgba = item.rgba()
+    assert rgba.dtype == np.uint8 and (rgba[..., 3] == alpha).all() and (rgba[alpha == 0] == 0).all()
+    assert np.abs(rgba[..., :3].astype(int) - color)[alpha >= 128].max() <= 2
+    background = rng.integers(0, 256, rgb.shape).astype(np.uint8)
+    wanted = color * share + background * (1 - share)
+    assert np.abs(item.over(background) - wanted).max() <= 1.01
+    np.testing.assert_array_equal(item.over(np.full_like(rgb, 255)), rgb)
 
 
 def test_binvox_runs_are_at_most_255_long():
