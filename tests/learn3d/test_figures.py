@@ -68,19 +68,19 @@ def test_shaded_views_agree_with_the_renderings_at_the_poses(egg, kind) -> None:
     poses = LookAtPoses(torch.tensor([-75.0, -40.0, 100.0]), torch.tensor([30.0, 30.0, -10.0]), 2.732, 15.0)
     if kind == "rotation":  # the same cameras without perspective, the last one rolled by 25 degrees
         poses = RotationPoses(torch.stack([rotation(-75, 30), rotation(-40, 30), rotation(100, -10, roll_deg=25)]))
-    silhouettes = nmr.render_silhouette(vertices[None].expand(3, -1, -1), faces, poses.cameras(), image_size=64) > 0.5
+    silhouettes = nmr.render_silhouette(vertices[None].expand(3, -1, -1), faces, poses.cameras(), image_size=256) > 0.5
     first = figures.orbit(poses[torch.tensor([0])], [0, 35, -35])  # the second pose is 35 degrees on
     last = figures.orbit(poses[torch.tensor([2])], [0])
     surface = figures.Surface(vertices, faces)
-    shaded = [(figures.draw_surface(surface, c, image_size=64) < 220).any(axis=3) for c in (first, last)]
+    shaded = [(figures.draw_surface(surface, c, image_size=256) < 205).any(axis=3) for c in (first, last)]
 
-    def agreement(a: np.ndarray, b: torch.Tensor) -> float:
-        return float((a == b.numpy()).mean())
+    def overlap(a: np.ndarray, b: torch.Tensor) -> float:
+        return float((a & b.numpy()).sum() / (a | b.numpy()).sum())
 
-    assert agreement(shaded[0][0], silhouettes[0]) > 0.99
-    assert agreement(shaded[0][1], silhouettes[1]) > 0.99
-    assert agreement(shaded[0][2], silhouettes[1]) < 0.97
-    assert agreement(shaded[1][0], silhouettes[2]) > 0.99
+    assert overlap(shaded[0][0], silhouettes[0]) > 0.97
+    assert overlap(shaded[0][1], silhouettes[1]) > 0.97
+    assert overlap(shaded[0][2], silhouettes[1]) < 0.8
+    assert overlap(shaded[1][0], silhouettes[2]) > 0.97
 
 
 def rotation(azimuth_deg: float, elevation_deg: float, *, roll_deg: float = 0.0) -> torch.Tensor:
