@@ -6,6 +6,7 @@ ValueError where the file cannot be read, and `checked` where a mesh cannot be u
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -87,6 +88,17 @@ def procedural_sources(category: str, count: int, seed: int) -> list[MeshSource]
         return RawMesh(shape.vertices, shape.faces)
 
     return [MeshSource(f"{category}_{i:05d}", lambda i=i: read(i)) for i in range(count)]
+
+
+def object_names(sources: list[MeshSource]) -> list[str]:
+    """A name for each mesh that can be part of a file name, all different: letters, digits and underscores."""
+    names, taken = [], set()
+    for source in sources:
+        plain = re.sub(r"\W+", "_", str(Path(source.name).with_suffix(""))).strip("_")[-80:] or "mesh"
+        name = next(n for i in range(len(sources)) if (n := f"{plain}_{i + 1}" if i else plain).lower() not in taken)
+        taken.add(name.lower())
+        names.append(name)
+    return names
 
 
 def read_mesh(path: Path) -> RawMesh:

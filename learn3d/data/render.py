@@ -7,7 +7,6 @@ it is written in `learn3d.data.writers`.
 from __future__ import annotations
 
 import dataclasses
-import re
 import tempfile
 from collections import Counter
 from dataclasses import asdict, dataclass, field
@@ -38,14 +37,13 @@ class DatasetConfig:
     output: Path  # folder for the files; other categories may live in it too
     category: str  # name of the category; Kato's 13 names become synset ids in the file names
     layout: Layout = "kato"  # whose files and viewpoints
-    views: int | None = (
-        None  # views per object; default kar 20, r2n2 24, pascal3d 8, photos 12; kato and dvr: always 24
-    )
+    views: int | None = None  # per object; default kar 20, r2n2 24, pascal3d 8, photos 12; kato and dvr have 24
     source: Path | None = None  # folder of meshes (searched recursively) or a mesh pack (.npz); not with --procedural
     procedural: int = 0  # make this many shapes with the procedural generator instead of reading meshes
-    test: float | None = None  # part of the meshes for the test split: a share below 1 (then at least 4 of them), or a
-    # count; default 0.2, and 0 for pascal3d, which is tested on val
-    val: float | None = None  # the same for the validation split, 0 for none; default 0.1; pascal3d 0.2, r2n2 0
+    # part of the meshes for the test split: a share below 1 (then at least 4 of them), or a count; default 0.2;
+    # pascal3d is tested on val and has none
+    test: float | None = None
+    val: float | None = None  # the same for the validation split, 0 for none; default 0.1; pascal3d 0.2, r2n2 none
     augment: int = 0  # copies of each training mesh, besides itself, with every axis scaled by a random 0.75 .. 1.25
     up: Axis = "y"  # mesh axis that points up
     front: Axis | None = None  # mesh axis that faces the camera of view 0; default x (y where up is x), procedural z
@@ -130,17 +128,6 @@ def render_object(
     return rgb, alpha
 
 
-def object_names(sources: list[meshes.MeshSource]) -> list[str]:
-    """A name for each mesh that can be part of a file name, all different: letters, digits and underscores."""
-    names, taken = [], set()
-    for source in sources:
-        plain = re.sub(r"\W+", "_", str(Path(source.name).with_suffix(""))).strip("_")[-80:] or "mesh"
-        name = next(n for i in range(len(sources)) if (n := f"{plain}_{i + 1}" if i else plain).lower() not in taken)
-        taken.add(name.lower())
-        names.append(name)
-    return names
-
-
 def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
     """Make the data set that `config` describes and return what was done; meshes that cannot be used are skipped.
 
@@ -165,7 +152,7 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
         folder, trash = Path(temporary) / "new", Path(temporary) / "old"
         folder.mkdir()
         writer = writer_class(folder, config.category)
-        names = object_names(sources)
+        names = meshes.object_names(sources)
         sheet = []
         bar = _progress_bar(total, config.category, progress)
         for split in ("train", "val", "test"):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from lopsided_meshes import write_meshes
 
 import nmr
 from learn3d.data.kato import mesh_to_object
@@ -27,14 +28,7 @@ SETTINGS = {
 
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory):
-    """Five slabs with a post in one corner and a block in another."""
-    folder = tmp_path_factory.mktemp("meshes")
-    for i in range(5):
-        parts = [trimesh.creation.box(size) for size in ((1, 0.15, 0.5 + 0.08 * i), (0.2, 0.7, 0.2), (0.3, 0.25, 0.3))]
-        parts[1].apply_translation((0.35, 0.4, 0.15))
-        parts[2].apply_translation((-0.3, 0.15, -0.1))
-        trimesh.util.concatenate(parts).export(folder / f"shape{i}.ply")
-    return folder
+    return write_meshes(tmp_path_factory.mktemp("meshes"))
 
 
 @pytest.fixture(scope="module", params=LAYOUTS)
@@ -56,7 +50,7 @@ def mesh_of(made, split, number, name, count):
     elif made.layout == "pascal3d":  # pictures of every object in chair_train, then others of them in chair_imagenet
         file = files[number % (count // 2) * len(files) // (count // 2)]
     else:
-        (file,) = (f for f in files if f.removesuffix(".ply") in name)
+        (file,) = (f for f in files if f.removesuffix(".ply").replace(" ", "_") in name)
     mesh = trimesh.load(made.sources / file, force="mesh", process=False)
     vertices = (mesh.vertices - mesh.bounds.mean(axis=0)) / mesh.extents.max()
     if made.layout == "pascal3d":  # the frame of mesh files, half the diagonal 1

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from lopsided_meshes import make, write_meshes
 from PIL import Image
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
@@ -22,36 +23,15 @@ from scipy.spatial.transform import Rotation
 import nmr
 from learn3d.data import conventions
 from learn3d.data.kato import mesh_to_object
-from learn3d.data.render import DatasetConfig, make_dataset
-from learn3d.data.writers import RenderedObject, writer_of
+from learn3d.data.writers import RenderedObject
 from learn3d.data.writers.r2n2 import binvox_bytes
 
 SYNSET = "03001627"
 
 
-def asymmetric_mesh(depth: float) -> trimesh.Trimesh:
-    """A slab with a post and a block: no rotation or reflection takes it to itself. x to the front, y up."""
-    parts = [trimesh.creation.box((1, 0.15, depth)), trimesh.creation.box((0.2, 0.7, 0.2))]
-    parts.append(trimesh.creation.box((0.3, 0.25, 0.3)))
-    parts[1].apply_translation((0.35, 0.4, depth / 2 - 0.1))
-    parts[2].apply_translation((-0.3, 0.15, 0.1 - depth / 2))
-    mesh = trimesh.util.concatenate(parts)
-    mesh.apply_translation((7, -2, 3))
-    return mesh
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Five of them, as mesh files."""
-    path = tmp_path_factory.mktemp("meshes")
-    for i in range(5):
-        asymmetric_mesh(0.5 + 0.08 * i).export(path / f"my chair {i}.ply")
-    return path
-
-
-def make(out: Path, source: Path, layout: str, **settings):
-    config = {"category": "chair", "val": 0, "test": 0, **settings}
-    return make_dataset(DatasetConfig(output=out, source=source, layout=layout, **config), progress=False)
+    return write_meshes(tmp_path_factory.mktemp("meshes"))
 
 
 def true_mesh(folder: Path, name: str) -> tuple[torch.Tensor, torch.Tensor]:
@@ -304,101 +284,3 @@ def test_photos(tmp_path, folder):
         assert_same_mask(mask, silhouette(vertices, faces, opencv, 256))
         image = np.asarray(Image.open(tmp_path / "chair" / "images" / row["file"]))
         assert image.shape == (256, 256, 3) and image[mask == 0].std() > 5
-
-
-@pytest.mark.parametrize("layout", ["dvr", "kar", "r2n2", "pascal3d", "photos"])
-def test_same_seed_same_bytes_and_nothing_else_in_the_folder(tmp_path, folder, layout):
-    views = {} if layout == "dvr" else {"views": 2}
-    settings = {"test": None, "val": None, **views}
-    report = make(tmp_path / "a", folder, layout, **settings)
-    make(tmp_path / "b", folder, layout, **settings)
-    a, b = ({p.relative_to(tmp_path / n): p for p in (tmp_path / n).rglob("*") if p.is_file()} for n in "ab")
-    assert a.keys() == b.keys() and all(a[key].read_bytes() == b[key].read_bytes() for key in a)
-    make(tmp_path / "c", folder, layout, **settings, seed=1)
-    c = {p.relative_to(tmp_path / "c"): p.read_bytes() for p in (tmp_path / "c").rglob("*") if p.is_file()}
-    assert any(c.get(key) != path.read_bytes() for key, path in a.items())
-    tops = {Path(name).parts[0] for name in report.files}
-    assert tops == {path.name for path in (tmp_path / "a").iterdir()}
-    sheet = np.asarray(Image.open(tmp_path / "a" / f"{SYNSET}_contact.png"))
-    assert sheet.shape == (5 * 64, 640, 3) and sheet[:, :64].std() > 10 and sheet[:, 9 * 64 :].std() > 10
-
-
-def test_categories_share_a_folder_and_are_replaced_one_by_one(tmp_path, folder):
-    make(tmp_path, folder, "kar", views=1)
-    make(tmp_path, folder, "kar", views=1, category="table")
-    with pytest.raises(FileExistsError, match="--overwrite"):
-        make(tmp_path, folder, "kar", views=1)
-    old = (tmp_path / "renders" / SYNSET / "my_chair_0" / "render_0.png").read_bytes()
-    make(tmp_path, folder, "kar", views=2, test=2, overwrite=True, seed=5)
-    assert (tmp_path / "renders" / SYNSET / "my_chair_0" / "render_0.png").read_bytes() != old
-    splits = json.loads((tmp_path / "splits.json").read_text())
-    assert {key: len(value["test"]) for key, value in splits.items()} == {SYNSET: 2, "04379243": 0}
-    assert not list(tmp_path.glob(".make_dataset_*"))
-
-
-def test_copies_of_training_objects_have_names_of_their_own(tmp_path, folder):
-    report = make(tmp_path, folder, "dvr", augment=1, test=1)
-    assert report.objects == {"train": 8, "test": 1}
-    names = (tmp_path / SYNSET / "softras_train.lst").read_text().split()
-    assert len(set(names)) == 8 and sorted(n.endswith("-1") for n in names) == [False] * 4 + [True] * 4
-    clouds = [np.load(tmp_path / SYNSET / name / "pointcloud.npz")["points"] for name in sorted(names)[:2]]
-    assert np.abs(np.ptp(clouds[0], axis=0) - np.ptp(clouds[1], axis=0)).max() > 0.02
-
-
-def test_names_are_fit_for_files_and_differ(tmp_path):
-    source = tmp_path / "in"
-    (source / "a").mkdir(parents=True)
-    for name in ("a/b.ply", "a b.ply", "a_B.stl", "..ply.ply"):
-        asymmetric_mesh(0.5).export(source / name)
-    make(tmp_path / "out", source, "photos", views=1)
-    with open(tmp_path / "out" / "chair" / "poses.csv", newline="") as file:
-        names = {row["object"].lower() for row in csv.DictReader(file)}
-    assert len(names) == 4 and all(name.replace("_", "").isalnum() for name in names)
-
-
-def test_r2n2_moves_objects_between_splits_where_meshes_are_skipped(tmp_path, folder):
-    source = tmp_path / "in"
-    source.mkdir()
-    for i in range(12):
-        asymmetric_mesh(0.5).export(source / f"{i}.ply")
-    for i in (1, 4):
-        (source / f"{i}.ply").write_text("damaged")
-    report = make(tmp_path / "out", source, "r2n2", views=1, test=None, val=None)
-    assert report.objects == {"train": 8, "test": 2} and len(report.skipped) == 2
-    names = sorted(path.name for path in (tmp_path / "out" / "ShapeNetRendering" / SYNSET).iterdir())
-    tested = {mesh["name"] for mesh in report.used if mesh["split"] == "test"}
-    assert tested == {name[6:] + ".ply" for name in names[8:]}
-
-
-def test_errors_of_settings(tmp_path, folder):
-    cases = [
-        ({"layout": "coco"}, "layout must be one of kato, dvr"),
-        ({"layout": "kato", "views": 12}, "exactly 24 views"),
-        ({"layout": "kar", "views": 0}, "at least 1 views"),
-        ({"layout": "r2n2", "val": 1, "test": None}, "no val split"),
-        ({"layout": "r2n2", "augment": 2, "test": None}, "first 80 %"),
-        ({"layout": "r2n2", "test": 0.5}, "first 80 %"),
-        ({"layout": "pascal3d", "test": 0.2}, "no test split"),
-    ]
-    for settings, message in cases:
-        with pytest.raises(ValueError, match=message):
-            make(tmp_path / "out", folder, **settings)
-    (tmp_path / "kar").mkdir()
-    for content in ("{", "[]"):
-        (tmp_path / "kar" / "splits.json").write_text(content)
-        with pytest.raises(ValueError, match=r"splits\.json.*repair or remove"):
-            make(tmp_path / "kar", folder, "kar")
-    single = tmp_path / "single"
-    single.mkdir()
-    asymmetric_mesh(0.5).export(single / "one.ply")
-    with pytest.raises(ValueError, match="two pictures"):
-        make(tmp_path / "out", single, "pascal3d", views=1, test=None)
-    with pytest.raises(ValueError, match="two objects"):
-        make(tmp_path / "out", single, "r2n2", test=None, views=1)
-    assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
-
-
-def test_every_layout_has_a_writer():
-    from learn3d.data.layouts import LAYOUTS
-
-    assert len({writer_of(layout) for layout in LAYOUTS}) == len(LAYOUTS)
