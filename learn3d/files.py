@@ -15,9 +15,12 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
     """Gives a temporary path in the folder of `path`; what was written there takes the name `path` when the block ends.
 
     After an exception nothing is left of it. With `sync` the content is on the disk before it takes the name, so that
-    not even a power cut leaves half a file.
+    not even a power cut leaves half a file. Raises OSError where `path` is there and no plain file: a folder, or a
+    device such as /dev/null, which must not be replaced.
     """
     path = Path(path)
+    if path.exists() and not path.is_file():
+        raise OSError(f"{path} is no plain file and is not replaced; give another name")
     temporary = path.with_name(f".{path.name}.partial")
     try:
         yield temporary

@@ -17,7 +17,8 @@ What is done with them follows the published code of Peng et al. 2020, except wh
 - 224 -> 64 pixels by the mean over each pixel's area, for colours and mask alike, so that the mask has soft borders.
   The published code's skimage.transform.resize(anti_aliasing=True) blurs with a Gaussian of 1.25 pixels and samples
   bilinearly: a little softer.
-- Training uses render 0 of each object alone (single view), validation and test use all 20; `views_per_object`.
+- Training uses render 0 of each object alone (single view), validation and test use all 20 (a data set of your own may
+  have fewer: as many as its first object has); `views_per_object`.
 - Three objects whose renders are broken are left out, as by Kato and Harada 2019; the published code keeps them.
 """
 
@@ -81,13 +82,14 @@ def load(
 
     image_size: side of the images in pixels, 64 or up to 224. The masks to be matched have 64 pixels in any case.
     view_bins: cells of azimuth and elevation, by default 15 x 20 degrees over elevations -20 .. 40 (K = 72).
-    views_per_object: use the first 1 .. 20 renders of each object; None: 1 for training, 20 for the other splits.
+    views_per_object: use the first 1 .. 20 renders of each object; None: 1 for training, all for the other splits.
     Raises FileNotFoundError or ValueError naming the first file that is missing or not as described above.
     """
-    views = (1 if split == "train" else NUM_RENDERS) if views_per_object is None else views_per_object
-    if not 1 <= views <= NUM_RENDERS:
-        raise ValueError(f"views_per_object must lie in 1 .. {NUM_RENDERS}, got {views}")
+    if views_per_object is not None and not 1 <= views_per_object <= NUM_RENDERS:
+        raise ValueError(f"views_per_object must lie in 1 .. {NUM_RENDERS}, got {views_per_object}")
     folder, ids = Path(folder), object_ids(folder, category, split)
+    there = 1 if split == "train" else renders_of(folder / "renders" / synset_of(category) / ids[0])
+    views = there if views_per_object is None else views_per_object
     findings = Findings(strict=True)
     read = map_objects(
         lambda name: _read(folder, synset_of(category), name, views, image_size, findings), ids, category, progress
@@ -112,7 +114,7 @@ def load(
 
 
 def problems(folder: Path | str, category: str, split: str, *, progress: bool = False) -> Iterator[Problem]:
-    """Everything that is wrong with one category and split, all 20 renders of every object included."""
+    """Everything that is wrong with one category and split, all renders of every object included."""
     folder, findings = Path(folder), Findings()
     ids = findings.attempt(object_ids, folder, category, split)
     if ids is not None:
@@ -121,9 +123,11 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
         warn_of_repeats(findings, folder / "splits.json", f"{category} {split}", ids, others)
     yield from findings.problems
 
+    views = renders_of(folder / "renders" / synset_of(category) / ids[0]) if ids else NUM_RENDERS
+
     def examine(name: str) -> list[Problem]:
         findings = Findings()
-        _read(folder, synset_of(category), name, NUM_RENDERS, 64, findings)
+        _read(folder, synset_of(category), name, views, 64, findings)
         return findings.problems
 
     for found in map_objects(examine, ids or [], f"{category} {split}", progress):
@@ -156,6 +160,17 @@ def object_ids(folder: Path | str, category: str, split: str) -> list[str]:
     if not ids:
         raise DamagedFile(path, f"names no object for {synset} ({category}), {split}")
     return ids
+
+
+def renders_of(folder: Path) -> int:
+    """How many renders an object has, by the files or by the rows of view.txt, whichever are more; 20 where none."""
+    numbers = [path.stem.removeprefix("render_") for path in folder.glob("render_*.png")]
+    files = max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)
+    try:
+        rows = sum(bool(line.strip()) for line in (folder / "view.txt").read_text().splitlines())
+    except (OSError, UnicodeDecodeError):  # reading the object will tell
+        rows = 0
+    return min(max(files, rows), NUM_RENDERS) or NUM_RENDERS
 
 
 def _read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:

@@ -41,3 +41,11 @@ def test_sync_comes_before_the_new_name(tmp_path, monkeypatch) -> None:
     with files.replacing(tmp_path / "a", sync=True) as temporary:
         Path(temporary).write_bytes(b"x")
     assert calls == ["fsync", "replace"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs /dev/null")
+def test_devices_and_folders_are_not_replaced(tmp_path) -> None:
+    for path in (Path("/dev/null"), tmp_path):
+        with pytest.raises(OSError, match="is no plain file and is not replaced"):
+            files.write_json(path, {})
+    assert Path("/dev/null").is_char_device()
