@@ -193,8 +193,12 @@ def command_line(config: TrainConfig, **placeholders: str) -> str:
             values[field.name] = value
     words = ["python", "tools/train.py"]
     for name, value in (values | placeholders).items():
+        option = name.replace("_", "-")
+        if isinstance(value, bool):  # a flag: train.py takes no word after it
+            words.append(f"--{option}" if value else f"--no-{option}")
+            continue
         flat = [str(item) for item in value] if isinstance(value, tuple) else [str(value)]
-        words += ["--" + name.replace("_", "-"), *flat]
+        words += ["--" + option, *flat]
     return " ".join(word if word in placeholders.values() else shlex.quote(word) for word in words)
 
 
