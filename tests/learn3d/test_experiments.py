@@ -160,6 +160,7 @@ def test_several_whole_numbers_are_numbers(tmp_path) -> None:
         ({"categories": ("chair", "chair")}, "categories must be different"),
         ({"seeds": 0}, "seeds must be"),
         ({"iterations": -1}, "iterations must be"),
+        ({"layout": "dvr"}, "the layout 'dvr' has no true voxels"),
     ],
 )
 def test_wrong_requests_are_named(tmp_path, given, message) -> None:
@@ -182,7 +183,7 @@ def test_the_command_of_a_run_gives_its_configuration(tmp_path, table: str) -> N
     changes = ("precision=fp32", "augment=flip,channels", "max_val_images=4")
     changes += {"kato": ("vpl:anti_aliasing=false",), "prgan": ("perspective=true",)}.get(table, ("lambda_prior=0.25",))
     methods = [row.variant.name for row in TABLES[table].rows if row.variant and row.variant.preset in PRESETS]
-    given = Options(tmp_path / "a b", tmp_path, ("chair",), tuple(methods), 7, layout="dvr", changes=changes)
+    given = Options(tmp_path / "a b", tmp_path, ("chair",), tuple(methods), 7, layout="r2n2", changes=changes)
     for run in plan_runs(TABLES[table], given):
         assert train.parse(shlex.split(command_line(run.config))[2:]).config == run.config
 
