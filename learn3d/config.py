@@ -108,7 +108,7 @@ class TrainConfig:
 def check_fields(settings: Settings) -> None:
     """Raise a ValueError naming the setting that is no choice of its kind, negative, or not finite.
 
-    Rates (learning_rate...) must be positive; whole numbers at least 1; all other numbers, such as weights, at least 0.
+    Rates (...learning_rate) must be positive; whole numbers at least 1; all other numbers, such as weights, at least 0.
     """
     types = typing.get_type_hints(type(settings))
     for field in dataclasses.fields(settings):
@@ -125,7 +125,7 @@ def check_fields(settings: Settings) -> None:
             for item in value:
                 _check_positive_int(field.name, item)
         elif kind is float:
-            positive = field.name.startswith("learning_rate")
+            positive = "learning_rate" in field.name
             fits = isinstance(value, (int, float)) and math.isfinite(value) and (value > 0 if positive else value >= 0)
             if not fits:
                 raise ValueError(

@@ -164,10 +164,11 @@ def mean_mmd(
 ) -> dict[str, float]:
     """Mean MMD over all pairs of views (276 for 24) between the codes [N,C] of their images; {} for a single view.
 
-    Of each view the first `per_view` codes count; all views use as many as the poorest one has. Distances within a view
-    are computed once, not once per pair.
+    Of each view the first `per_view` codes count; all views use as many as the poorest one has. Views with one code are
+    left out: between two single codes the MMD is a constant (6.19), whatever they are. Distances within a view are
+    computed once, not once per pair.
     """
-    groups = [codes[view_ids == view] for view in view_ids.unique()]
+    groups = [group for view in view_ids.unique() if len(group := codes[view_ids == view]) > 1]
     if len(groups) < 2:
         return {}
     size = min(per_view, *(len(group) for group in groups))

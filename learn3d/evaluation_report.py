@@ -35,7 +35,8 @@ def evaluate_runs(
 ) -> dict[str, Any]:
     """Evaluate run folders or checkpoint files on a split; a report ready for JSON, see `format_table`.
 
-    `data` and `category` default to those each run was trained with. The mean over classes is taken per method; several
+    `data` and `category` default to those each run was trained with; a run on several categories is measured on each of
+    them by itself. The mean over classes is taken per method; several
     runs of one class and method (seeds) count as one class.
     """
     if not paths:
@@ -44,25 +45,26 @@ def evaluate_runs(
     for path in paths:
         file = checkpoint.find(path, which)
         method, config, metadata = checkpoint.load_method(file, device=device, precision=precision)
-        name, folder = category or config.category, data or config.data
-        report_progress(f"{file}: {PRESETS[config.preset].label} ({config.preset}) on {name}, {split}")
-        dataset = load_dataset(
-            config.layout, folder, name, split, image_size=method.image_size, view_bins=config.view_bins
-        )
-        result = evaluate(method, dataset, definitions=("kato18", "kato19"), paper_mmd=True, surfaces=True)
-        if result.undefined:
-            report_progress(f"warning: {result.undefined} images have no IoU (prediction and truth empty); left out")
-        about = {
-            "checkpoint": str(file),
-            "category": name,
-            "data": str(folder),
-            "method": PRESETS[config.preset].label,
-            "preset": config.preset,
-            "iterations": metadata["step"],
-            "seed": config.seed,
-            "trained_by": metadata.get("versions"),
-        }
-        results.append(about | result.summary())
+        folder = data or config.data
+        for name in (part.strip() for part in (category or config.category).split(",")):
+            report_progress(f"{file}: {PRESETS[config.preset].label} ({config.preset}) on {name}, {split}")
+            dataset = load_dataset(
+                config.layout, folder, name, split, image_size=method.image_size, view_bins=config.view_bins
+            )
+            result = evaluate(method, dataset, definitions=("kato18", "kato19"), paper_mmd=True, surfaces=True)
+            if result.undefined:
+                report_progress(f"warning: {result.undefined} images have no IoU (both shapes empty); left out")
+            about = {
+                "checkpoint": str(file),
+                "category": name,
+                "data": str(folder),
+                "method": PRESETS[config.preset].label,
+                "preset": config.preset,
+                "iterations": metadata["step"],
+                "seed": config.seed,
+                "trained_by": metadata.get("versions"),
+            }
+            results.append(about | result.summary())
     protocol = {
         "split": split,
         "checkpoint": which,

@@ -14,8 +14,10 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from learn3d import checkpoint, figures, files
+from learn3d.data.crops import Crops
+from learn3d.data.framing import mask_box
 from learn3d.data.kato import mesh_to_object
-from learn3d.data.layouts import load_dataset
+from learn3d.data.layouts import NATURAL_COLORS, Layout, load_dataset
 from learn3d.methods import Method
 
 OBJECT_SHARE = 0.65  # side of the object's bounding square as a share of the picture's side, when the run does not say
@@ -50,14 +52,19 @@ def prepare_image(
     crop: bool = True,
     object_share: float = OBJECT_SHARE,
     size: int = 64,
+    layout: Layout = "kato",
 ) -> np.ndarray:
-    """Bring an image of any size into the data set's form, uint8 [4,size,size]: inverted colours on black, the mask.
+    """Bring an image of any size into the form that a data set of the layout has, uint8 [4,size,size]: colours, mask.
 
     The object is laid over white and, with `crop`, centred in a square so that its larger side takes `object_share` of
     it, as in the data set; without, the image must be framed like that already and is only made square and scaled.
+    Colours are inverted where the layout inverts them. For "pascal3d" the background stays, and `crop` takes the mask's
+    box, padded and stretched as the reader does it (`learn3d.data.crops`).
     """
     if colors.ndim != 3 or colors.shape[2] != 3 or mask.shape != colors.shape[:2]:
         raise ValueError(f"colors must be [H, W, 3] and mask [H, W], got {list(colors.shape)} and {list(mask.shape)}")
+    if layout == "pascal3d":
+        return _stretched(colors, mask, crop, size)
     alpha = mask.astype(np.float32)[..., None] / 255
     composite = colors * alpha + 255 * (1 - alpha)
     stored = np.concatenate([255 - composite, 255 * alpha], axis=2)  # zero outside the object, so padding is plain
@@ -72,6 +79,8 @@ def prepare_image(
         centre_y, centre_x = mask.shape[0] / 2, mask.shape[1] / 2
         side = float(max(mask.shape))
     resized = _resample(stored, centre_x - side / 2, centre_y - side / 2, side, size)
+    if layout in NATURAL_COLORS:
+        resized[..., :3] = 255 - resized[..., :3]
     return np.rint(resized.transpose(2, 0, 1)).clip(0, 255).astype(np.uint8)
 
 
@@ -105,8 +114,12 @@ def save_reconstruction(
     mesh_format: Literal["obj", "glb", "ply"] = "obj",
     frames: int = 36,
     image_size: int = 256,
+    inverted: bool = True,
 ) -> list[Path]:
-    """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input and six views); returns the three paths."""
+    """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input and six views); returns the three paths.
+
+    inverted: the image's colours are stored as 255 - colour, see `ViewDataset.inverted`.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png")]
@@ -116,7 +129,7 @@ def save_reconstruction(
     views = figures.draw_mesh(
         vertices, faces, [-60.0 * k - 15 for k in range(6)], elevation_deg=20, image_size=STRIP_SIZE, fit=True
     )
-    strip = figures.tile([[figures.natural_colors(image), *views]], tile_size=STRIP_SIZE)
+    strip = figures.tile([[figures.natural_colors(image, inverted=inverted), *views]], tile_size=STRIP_SIZE)
     figures.save_png(paths[2], strip)
     return paths
 
@@ -139,15 +152,14 @@ def reconstruct_files(
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
     pairs = zip(images, masks or [None] * len(images), strict=True)
-    method, _, metadata = checkpoint.load_method(checkpoint.find(run, which))
+    method, config, metadata = checkpoint.load_method(checkpoint.find(run, which))
     share = metadata.get("object_share") or OBJECT_SHARE
-    prepared = [
-        prepare_image(*read_image(image, mask), crop=crop, object_share=share, size=method.image_size)
-        for image, mask in pairs
-    ]
+    form = {"object_share": share, "size": method.image_size, "layout": config.layout}
+    prepared = [prepare_image(*read_image(image, mask), crop=crop, **form) for image, mask in pairs]
     names = [Path(image).stem for image in images]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]
+    options["inverted"] = config.layout not in NATURAL_COLORS
     return _save_all(method, folder, names, np.stack(prepared), options)
 
 
@@ -162,13 +174,19 @@ def reconstruct_dataset(
     which: str = "last",
     **options: Any,
 ) -> list[Path]:
-    """Reconstruct images of a data set (indices object * views + view) and save the results in `folder`."""
+    """Reconstruct images of a data set (indices object * views + view) and save the results in `folder`.
+
+    Files are named after the object and its view class; where several of the images agree in both, after their index.
+    """
     method, config, _ = checkpoint.load_method(checkpoint.find(run, which))
     name = category or config.category
     dataset = load_dataset(config.layout, data, name, split, image_size=method.image_size)
     batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
     numbers = zip(batch.object_ids.tolist(), batch.view_ids.tolist(), strict=True)
     names = [f"{dataset.category}_{split}_object{number:04}_view{view:02}" for number, view in numbers]
+    if len(set(names)) < len(names):
+        names = [f"{dataset.category}_{split}_image{index:06}" for index in indices]
+    options["inverted"] = dataset.inverted
     return _save_all(method, folder, names, batch.images.numpy(), options)
 
 
@@ -177,6 +195,18 @@ def _save_all(method: Method, folder: Path, names: list[str], images: np.ndarray
     for name, image, (vertices, faces) in zip(names, images, reconstruct(method, images), strict=True):
         written += save_reconstruction(folder, name, image, vertices, faces, **options)
     return written
+
+
+def _stretched(colors: np.ndarray, mask: np.ndarray, crop: bool, size: int) -> np.ndarray:
+    """The padded box of the mask (or all of the image), as Pascal3D+'s reader gives it to the networks."""
+    if not (mask > 127).any():
+        raise ValueError("the mask has no pixel above half strength; is it the right mask?")
+    height, width = mask.shape
+    left, top, right, bottom = mask_box(mask) if crop else (0, 0, width, height)
+    box = np.array([[left, top, right - left, bottom - top]])
+    planes = (colors, np.repeat(mask[..., None], 3, axis=2))
+    cut, cut_mask = (Crops.from_images([np.ascontiguousarray(p)], box, size).cut()[0] for p in planes)
+    return np.concatenate([cut, cut_mask[:1]])
 
 
 def _resample(stored: np.ndarray, left: float, top: float, side: float, size: int) -> np.ndarray:

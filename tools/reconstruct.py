@@ -37,7 +37,7 @@ class Command:
     split: Literal["train", "val", "test"] = "test"
     """Part of the data set."""
     indices: tuple[int, ...] = (0,)
-    """Which images of the data set: object * 24 + view."""
+    """Which images of the data set: object * V + view, of V views of each object (Kato's: 24, Kar's: 20)."""
     format: Literal["obj", "glb", "ply"] = "obj"
     """Format of the mesh files."""
     checkpoint: Literal["last", "best"] = "last"

@@ -12,6 +12,8 @@ from learn3d.data.views import ViewDataset, concatenate
 
 Layout = Literal["kato", "dvr", "kar", "r2n2", "pascal3d", "photos"]
 LAYOUTS: tuple[str, ...] = get_args(Layout)
+#: Layouts whose images keep their colours as they are (`ViewDataset.inverted` is False).
+NATURAL_COLORS = frozenset({"kar", "r2n2", "pascal3d"})
 
 
 def load_dataset(

@@ -75,9 +75,3 @@ class AngleBins:
         middle_a = [-180 + (k + 0.5) * self.azimuth_width_deg for k in range(azimuths)]
         middle_e = [self.elevation_low_deg + (k + 0.5) * self.elevation_width_deg for k in range(elevations)]
         return [f"azimuth {a:g}°, elevation {e:g}°" for a in middle_a for e in middle_e]
-
-
-def occupied(ids: Tensor) -> tuple[Tensor, Tensor]:
-    """Renumber classes so that only those that occur remain: (ids int64 [M] in 0 .. K-1, the kept classes [K])."""
-    kept, renumbered = torch.unique(ids, return_inverse=True)
-    return renumbered, kept

@@ -143,10 +143,7 @@ def run_table(report: dict[str, Any]) -> Cells:
         counts = [str(run[key]) for key in ("iterations", "batch_size", "objects", "images")]
         measures = [_number(run[key]) for key in ("kato18", "kato19", "mmd", "mmd_paper", "chamfer_l1", "f_score")]
         minutes = "-" if run["seconds"] is None else f"{run['seconds'] / 60:.1f}"
-        commit = (
-            run["commit"][:9] if run["commit"] else f"tested at {run['tested_at'][:9]}" if run["tested_at"] else "-"
-        )
-        table.append([run["run"], network, *counts, *measures, minutes, commit])
+        table.append([run["run"], network, *counts, *measures, minutes, _commit_text(run)])
     return table
 
 

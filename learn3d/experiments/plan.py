@@ -21,6 +21,7 @@ RESULT_FILE = "test.json"
 LOG_FILE = "log.txt"
 #: Settings that are steps of the schedule, as the presets have them, for any number of iterations.
 _SCHEDULES = {"encoder_from_step": lambda n: n // 2 + 1, "decay_at_step": lambda n: n * 95 // 100}
+_WITHOUT_VOXELS = ("dvr", "photos")
 _OWN_OPTIONS = ("data", "category", "output", "preset", "settings", "layout", "iterations", "batch_size", "seed")
 
 
@@ -86,8 +87,11 @@ def selected_rows(table: Table, methods: Sequence[str]) -> tuple[Row, ...]:
 def plan_runs(table: Table, options: Options) -> list[Run]:
     """The runs that the rows of a table need, by category, then row, then seed.
 
-    Raises ValueError for an unknown method or preset and for options that do not fit (see `TrainConfig`).
+    Raises ValueError for an unknown method or preset, for a layout without true voxels, and for options that do not fit
+    (see `TrainConfig`).
     """
+    if (layout := options.layout or table.layout) in _WITHOUT_VOXELS:
+        raise ValueError(f"the layout {layout!r} has no true voxels, so that no run of the table could be measured")
     variants = [row.variant for row in selected_rows(table, options.methods) if row.variant]
     changes = _changes_by_variant(variants, table, options.changes)
     seeds = table.seeds if options.seeds is None else options.seeds
@@ -193,8 +197,12 @@ def command_line(config: TrainConfig, **placeholders: str) -> str:
             values[field.name] = value
     words = ["python", "tools/train.py"]
     for name, value in (values | placeholders).items():
+        option = name.replace("_", "-")
+        if isinstance(value, bool):  # a flag: train.py takes no word after it
+            words.append(f"--{option}" if value else f"--no-{option}")
+            continue
         flat = [str(item) for item in value] if isinstance(value, tuple) else [str(value)]
-        words += ["--" + name.replace("_", "-"), *flat]
+        words += ["--" + option, *flat]
     return " ".join(word if word in placeholders.values() else shlex.quote(word) for word in words)
 
 

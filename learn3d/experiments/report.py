@@ -100,8 +100,9 @@ def _row(
         ours = [results[name] for name in names]
         cell = _cell(ours) if all(ours) else {}
         if cell and baseline and not is_baseline and all(baseline[name] for name in names):
-            main = "mmd" if table.metric == "mmd" else "kato18"
-            cell["to_baseline"] = _difference(main, ours, [baseline[name] for name in names])
+            main, theirs = "mmd" if table.metric == "mmd" else "kato18", [baseline[name] for name in names]
+            if main in cell["values"] and main in _cell(theirs)["values"]:
+                cell["to_baseline"] = _difference(main, ours, theirs)
         cell |= _paper(row.published, column, categories)
         if "paper" in cell and metric in cell.get("values", {}):
             cell["difference"] = cell["values"][metric] - cell["paper"]

@@ -167,6 +167,13 @@ def test_mean_mmd_of_one_view_is_nothing() -> None:
     assert mean_mmd(torch.zeros(3, 2), torch.zeros(3, dtype=torch.int64)) == {}
 
 
+def test_views_with_a_single_code_do_not_count() -> None:
+    codes = torch.randn(9, 4, generator=torch.Generator().manual_seed(0))
+    views = torch.tensor([0, 0, 0, 0, 5, 5, 5, 5, 7])
+    assert mean_mmd(codes, views) == mean_mmd(codes[:8], views[:8])
+    assert mean_mmd(codes, torch.arange(9)) == {}
+
+
 def test_evaluate_runs_reports_and_tabulates(finished_run) -> None:
     said: list[str] = []
     report = evaluate_runs([finished_run], split="test", report_progress=said.append)
@@ -185,6 +192,16 @@ def test_evaluate_runs_reports_and_tabulates(finished_run) -> None:
     assert f"{result['voxel_iou']:.4f}" in lines[1]
     with pytest.raises(ValueError, match="at least one run"):
         evaluate_runs([])
+
+
+def test_a_run_on_several_categories_is_measured_on_each(finished_run, monkeypatch, tiny_set) -> None:
+    monkeypatch.setattr(
+        "learn3d.evaluation_report.load_dataset",
+        lambda *where, **options: dataclasses.replace(tiny_set, category=where[2]),
+    )
+    report = evaluate_runs([finished_run], category="airplane, chair")
+    assert [result["category"] for result in report["results"]] == ["airplane", "chair"]
+    assert report["means"][0]["classes"] == 2
 
 
 def test_mean_is_over_classes_not_over_runs() -> None:

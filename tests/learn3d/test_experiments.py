@@ -160,6 +160,7 @@ def test_several_whole_numbers_are_numbers(tmp_path) -> None:
         ({"categories": ("chair", "chair")}, "categories must be different"),
         ({"seeds": 0}, "seeds must be"),
         ({"iterations": -1}, "iterations must be"),
+        ({"layout": "dvr"}, "the layout 'dvr' has no true voxels"),
     ],
 )
 def test_wrong_requests_are_named(tmp_path, given, message) -> None:
@@ -173,15 +174,16 @@ def test_a_method_whose_preset_is_absent_is_named(tmp_path, monkeypatch) -> None
         plan_runs(TABLES["kato"], options(tmp_path))
 
 
-@pytest.mark.parametrize("table", ["kato", "ablation", "bins"])
+@pytest.mark.parametrize("table", ["kato", "ablation", "bins", "prgan"])
 def test_the_command_of_a_run_gives_its_configuration(tmp_path, table: str) -> None:
     spec = importlib.util.spec_from_file_location("tool_train_commands", TOOLS / "train.py")
     train = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = train
     spec.loader.exec_module(train)
-    changes = ("precision=fp32", "lambda_prior=0.25", "augment=flip,channels", "max_val_images=4")
+    changes = ("precision=fp32", "augment=flip,channels", "max_val_images=4")
+    changes += {"kato": ("vpl:anti_aliasing=false",), "prgan": ("perspective=true",)}.get(table, ("lambda_prior=0.25",))
     methods = [row.variant.name for row in TABLES[table].rows if row.variant and row.variant.preset in PRESETS]
-    given = Options(tmp_path / "a b", tmp_path, ("chair",), tuple(methods), 7, layout="dvr", changes=changes)
+    given = Options(tmp_path / "a b", tmp_path, ("chair",), tuple(methods), 7, layout="r2n2", changes=changes)
     for run in plan_runs(TABLES[table], given):
         assert train.parse(shlex.split(command_line(run.config))[2:]).config == run.config
 
@@ -364,6 +366,8 @@ def test_report_files_tell_the_same(report, tmp_path) -> None:
     assert "| difference | +0.100 [+0.100, +0.100] |" in text
     assert "python tools/train.py --preset peng2020-kato --data DATA --category CATEGORY" in text
     assert str(tmp_path) not in text, "no path of this machine gets into a page"
+    changed = report | {"runs": [report["runs"][0] | {"commit": "0123456789ab-dirty"}]}
+    assert formats.run_table(changed)[1][-1] == "012345678-dirty"
     page = (out / "kato.html").read_text()
     assert page.startswith("<!doctype html>")
     assert "0.565" in page

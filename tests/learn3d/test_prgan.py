@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import nmr
+from learn3d.config import check_fields
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import KATO
 from learn3d.data.poses import LookAtPoses, RotationPoses
@@ -241,6 +242,11 @@ def test_other_cameras_are_refused(poses: LookAtPoses | RotationPoses, message: 
 def test_settings_are_checked(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         PrGANSettings(**settings)
+
+
+def test_step_sizes_are_checked() -> None:
+    with pytest.raises(ValueError, match="generator_learning_rate must be a positive number, got 0"):
+        check_fields(PrGANSettings(generator_learning_rate=0.0))
 
 
 def test_widths_are_checked() -> None:

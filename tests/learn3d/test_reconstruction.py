@@ -9,6 +9,7 @@ import trimesh
 from PIL import Image
 
 import nmr
+from learn3d.data.crops import Crops
 from learn3d.data.kato import mesh_to_object
 from learn3d.reconstruction import (
     export_mesh,
@@ -49,6 +50,30 @@ def test_crop_centres_and_scales_the_object(corner: tuple[int, int]) -> None:
     assert (columns[0], columns[-1]) == (8, 55)
     assert (rows[0], rows[-1]) == (20, 43)
     assert np.array_equal(stored[0], stored[3])
+
+
+@pytest.mark.parametrize("layout", ["kar", "r2n2"])
+def test_natural_colours_on_white_where_the_layout_has_them(layout: str) -> None:
+    colors = np.full((64, 64, 3), (255, 0, 10), np.uint8)
+    mask = np.zeros((64, 64), np.uint8)
+    mask[10:20, 30:40] = 255
+    for crop in (False, True):
+        stored = prepare_image(colors, mask, crop=crop, size=32, layout=layout)
+        assert stored[:3, 0, 0].tolist() == [255, 255, 255], "beside the image, too"
+        assert [255, 0, 10, 255] in stored.reshape(4, -1).T.tolist()
+
+
+def test_photographs_are_cut_as_pascals_reader_does() -> None:
+    rng = np.random.default_rng(0)
+    colors = rng.integers(0, 256, (120, 200, 3), np.uint8)
+    mask = np.zeros((120, 200), np.uint8)
+    mask[30:70, 50:130] = 255
+    stored = prepare_image(colors, mask, size=64, layout="pascal3d")
+    wanted = Crops.from_images([colors], np.array([[50, 30, 80, 40]]), 64).cut()[0]
+    assert np.array_equal(stored[:3], wanted), "natural colours, background and all"
+    assert stored[3].mean() == pytest.approx(255 / 1.3**2, rel=0.05)
+    with pytest.raises(ValueError, match="no pixel above half strength"):
+        prepare_image(colors, mask // 4, layout="pascal3d")
 
 
 def test_small_images_are_enlarged() -> None:

@@ -227,7 +227,7 @@ def test_a_finished_run_leaves_everything(finished_run, read_metrics) -> None:
     assert [(m["step"], m["split"]) for m in metrics] == [(s, "train") for s in (1, 2, 3, 4)] + [(4, "val")]
     assert "confusion" in metrics[1]
     assert 0 <= metrics[-1]["voxel_iou"] <= 1
-    assert metrics[-1]["mmd"] > 0
+    assert "mmd" not in metrics[-1], "four images of one object: a code per view, which is none to compare"
     assert (finished_run / "pictures" / "000004.png").stat().st_size > 1000
     assert list((finished_run / "tensorboard").iterdir())
 

@@ -12,7 +12,7 @@ import nmr
 from learn3d.data.conventions import KATO
 from learn3d.data.poses import LookAtPoses, RotationPoses, wrap_deg
 from learn3d.data.sampling import sample_indices
-from learn3d.data.view_bins import AngleBins, occupied
+from learn3d.data.view_bins import AngleBins
 from learn3d.data.views import ViewDataset, concatenate
 
 
@@ -182,11 +182,6 @@ def test_rebinning_changes_the_classes_alone() -> None:
     turned = dataclasses.replace(data, poses=RotationPoses(torch.eye(3).expand(12, 3, 3)))
     with pytest.raises(ValueError, match="need look-at cameras"):
         turned.with_bins(AngleBins.parse("60x60"))
-
-
-def test_occupied_classes_are_renumbered() -> None:
-    ids, kept = occupied(torch.tensor([7, 3, 7, 11]))
-    assert (ids.tolist(), kept.tolist()) == ([1, 0, 1, 2], [3, 7, 11])
 
 
 def test_angles_wrap() -> None:
