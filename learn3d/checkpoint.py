@@ -48,7 +48,10 @@ def load_metadata(path: Path) -> dict[str, Any]:
 def _read(path: Path, *, tensors: bool) -> tuple[dict[str, Tensor], dict[str, Any]]:
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"there is no checkpoint {path}; a run folder holds last.safetensors and best.safetensors")
+        raise ValueError(
+            f"there is no checkpoint {path}; a run folder holds last.safetensors and, where the validation images have "
+            "voxels, best.safetensors"
+        )
     try:
         with safe_open(path, framework="pt") as file:
             header = (file.metadata() or {}).get("learn3d")

@@ -89,15 +89,27 @@ class TrainConfig:
         _check_choice("sampling", self.sampling, typing.get_args(Sampling))
         for name in self.augment:
             _check_choice("augment", name, typing.get_args(Augmentation))
+        if "flip" in self.augment and getattr(self.settings, "reads_view_ids", False):
+            raise ValueError(
+                "augment 'flip' moves the camera into another view class, but the discriminator of "
+                f"{self.preset!r} is told the class of the original; leave 'flip' out"
+            )
         _check_choice("device", self.device, ("cpu", "cuda"))
         _check_choice("precision", self.precision, ("auto", "bf16", "fp32"))
         _check_choice("val_split", self.val_split, ("val", "test"))
+        if self.layout == "r2n2" and self.val_split == "val":
+            raise ValueError("3D-R2N2's data have no val split; validate on test (val_split test)")
         if self.view_bins is not None:
             AngleBins.parse(self.view_bins)
         if not self.category:
             raise ValueError("category must be a class name such as 'airplane', got an empty string")
         for name in ("iterations", "batch_size", "validate_every", "pictures_every", "checkpoint_every", "log_every"):
             _check_positive_int(name, getattr(self, name))
+        if getattr(self.settings, "encoder_from_step", 0) > self.iterations:
+            raise ValueError(
+                f"encoder_from_step={self.settings.encoder_from_step} lies beyond the {self.iterations} iterations: "
+                f"the encoder would never be trained; give a step such as {self.iterations // 2 + 1}"
+            )
         for name in ("threads", "max_val_images", "views_per_object"):
             if getattr(self, name) is not None:
                 _check_positive_int(name, getattr(self, name))

@@ -21,7 +21,7 @@ from learn3d.surfaces import grid_surface
 
 CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
-F_SCORE_DISTANCE = 0.05  # share of the object's longest side
+F_SCORE_DISTANCE = 0.05  # units of the object frame, where the longest side is 1 (Pascal3D+: up to 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +44,11 @@ class Evaluation:
         return len(self.object_ids)
 
     @property
+    def mmd_codes(self) -> int:
+        """Codes of each view that the MMDs compare; the fewer, the larger the MMDs come out (bias of 1 / codes)."""
+        return codes_per_view(self.view_ids)
+
+    @property
     def undefined(self) -> int:
         """Images whose prediction and truth are both empty; they are left out of the mean."""
         return int(next(iter(self.ious.values())).isnan().sum()) if self.ious else 0
@@ -62,6 +67,7 @@ class Evaluation:
             "f_score": _mean(self.f_score),
             "mmd": self.mmd,
             "mmd_paper": self.mmd_paper,
+            "mmd_codes": self.mmd_codes,
             "images": self.images,
             "undefined": self.undefined,
         }
@@ -83,7 +89,7 @@ def evaluate(
     Every image is encoded, its shape voxelised in the data set's convention and compared with the object's voxels, by
     each voxeliser of `definitions`. With `max_images` only that many images are used, always the same ones: see
     `spread_samples`. `paper_mmd` also computes the MMD as the paper prints it. `surfaces` also compares points on the
-    surfaces, in units of the object frame: Chamfer-L1 and F-score at 5 % of the longest side, 2,000 points of each;
+    surfaces, in units of the object frame: Chamfer-L1 and F-score at a distance of 0.05, 2,000 points of each;
     where the data set has no points, the truth is the surface of its voxels, which limits them to about 1/32.
     """
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
@@ -169,9 +175,9 @@ def mean_mmd(
     computed once, not once per pair.
     """
     groups = [group for view in view_ids.unique() if len(group := codes[view_ids == view]) > 1]
-    if len(groups) < 2:
+    size = codes_per_view(view_ids, per_view=per_view)
+    if size == 0:
         return {}
-    size = min(per_view, *(len(group) for group in groups))
     groups = [group[:size].double() for group in groups]
     norms = [group.square().sum(1) for group in groups]
 
@@ -187,6 +193,13 @@ def mean_mmd(
         for form in forms:
             sums[form] += float(mmd_from_distances(within[i], within[j], between, form))
     return {form: value / len(pairs) for form, value in sums.items()}
+
+
+def codes_per_view(view_ids: Tensor, *, per_view: int = CODES_PER_VIEW) -> int:
+    """How many codes of each view `mean_mmd` uses: as many as the poorest view of several codes has; 0 for no MMD."""
+    counts = view_ids.unique(return_counts=True)[1]
+    counts = counts[counts > 1]
+    return min(per_view, int(counts.min())) if len(counts) > 1 else 0
 
 
 def _mean(values: Tensor | None) -> float | None:

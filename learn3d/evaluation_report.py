@@ -72,7 +72,7 @@ def evaluate_runs(
         "views": "all views of all objects, each image on its own",
         "voxels": "32^3, filled surface voxels, mean over images, then over classes; kato18 and kato19 are the two "
         "published voxelisers of predictions, not comparable with each other",
-        "surfaces": f"{SURFACE_POINTS} points each, object frame; F-score at {F_SCORE_DISTANCE} of the longest side",
+        "surfaces": f"{SURFACE_POINTS} points each, object frame; F-score at a distance of {F_SCORE_DISTANCE}",
         "mmd": f"mean over all pairs of views, up to {CODES_PER_VIEW} codes each; five kernels, no root",
         "mmd_paper": "the same with the paper's printed formula: one kernel, square root",
     }

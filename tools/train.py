@@ -41,12 +41,14 @@ def parse(arguments: list[str]) -> Command:
     finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     finder.add_argument("--resume", action="store_true")
     finder.add_argument("--output", type=Path)
-    finder.add_argument("--preset", default=DEFAULT_PRESET)
+    finder.add_argument("--preset")
     known, _ = finder.parse_known_args(arguments)
     if known.resume and known.output is not None:
         default = load_config(known.output / "config.json")
+        if known.preset not in (None, default.preset):
+            raise ValueError(f"{known.output} was started with the preset {default.preset}, got {known.preset}")
     else:
-        default = _options_of(known.preset)
+        default = _options_of(known.preset or DEFAULT_PRESET)
     style = (tyro.conf.FlagCreatePairsOff,)
     return tyro.cli(Command, args=arguments, description=_description(), default=Command(default), config=style)
 

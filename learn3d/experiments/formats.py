@@ -107,7 +107,7 @@ def main_table(report: dict[str, Any]) -> Cells:
         quoted = f", quoted from {row['quoted_from']}" if row["quoted_from"] else ""
         label = row["label"]
         if any("paper" in cell or "paper_printed" in cell for cell in cells):
-            table.append([label, f"paper{quoted} ({row['metric']})", *map(_paper_text, cells)])
+            table.append([label, f"paper{quoted} ({_voxeliser(row['metric'])})", *map(_paper_text, cells)])
             label = ""
         if any("code" in cell for cell in cells):
             texts = (_number(cell.get("code"), digits=3) for cell in cells)
@@ -180,6 +180,10 @@ def _only_printed(cell: dict[str, Any]) -> bool:
 
 def _paper_text(cell: dict[str, Any]) -> str:
     return f"({cell['paper_printed']:.3f})" if _only_printed(cell) else _number(cell.get("paper"), digits=3)
+
+
+def _voxeliser(metric: str) -> str:
+    return "voxeliser not stated" if metric == "unknown" else metric
 
 
 def _ours_text(cell: dict[str, Any], metric: str) -> str:

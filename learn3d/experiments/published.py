@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-Metric = Literal["kato18", "kato19", "mmd"]
+Metric = Literal["kato18", "kato19", "unknown", "mmd"]
 
 #: The 13 categories, in the order of the paper's columns.
 CATEGORIES = (
@@ -129,10 +129,10 @@ MMD = {
 #: voxeliser CSDM's and CMR's belong to is not known.
 PASCAL = {
     "CSDM": PublishedRow(
-        0.429, {"airplane": 0.398, "car": 0.600, "chair": 0.291}, quoted_from="Kar et al. 2015", metric="kato19"
+        0.429, {"airplane": 0.398, "car": 0.600, "chair": 0.291}, quoted_from="Kar et al. 2015", metric="unknown"
     ),
     "CMR": PublishedRow(
-        None, {"airplane": 0.46, "car": 0.64}, quoted_from="Kanazawa et al. 2018", metric="kato19"
+        None, {"airplane": 0.46, "car": 0.64}, quoted_from="Kanazawa et al. 2018", metric="unknown"
     ),
     "VPL": PublishedRow(
         0.488, {"airplane": 0.472, "car": 0.689, "chair": 0.303}, quoted_from=_VPL_PAPER, metric="kato19",

@@ -53,6 +53,11 @@ class PoseInvariantSettings:
         return ENCODERS[self.encoder].image_size
 
     @property
+    def reads_view_ids(self) -> bool:
+        """Whether training depends on the view classes."""
+        return self.uses_discriminator
+
+    @property
     def uses_discriminator(self) -> bool:
         """Whether the pose discriminator takes part at all (for Vanilla-AE it is not even created)."""
         return self.lambda_classification > 0 or self.lambda_adversarial > 0

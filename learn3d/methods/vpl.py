@@ -91,6 +91,11 @@ class VPLSettings:
     lambda_discriminator: float = 1.0
     """lambda_D: weight of the adversarial loss on the shapes; the discriminator itself always learns with weight 1."""
 
+    @property
+    def reads_view_ids(self) -> bool:
+        """Whether training depends on the view classes."""
+        return self.lambda_discriminator > 0 and (self.discriminator == "dcgan" or self.other_views == "random")
+
     def __post_init__(self) -> None:
         if self.pretrained is not None:
             object.__setattr__(self, "pretrained", Path(self.pretrained))

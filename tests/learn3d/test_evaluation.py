@@ -12,7 +12,7 @@ import torch
 
 import nmr
 from learn3d.data.conventions import PASCAL3D
-from learn3d.evaluation import evaluate, mean_mmd, spread_samples
+from learn3d.evaluation import codes_per_view, evaluate, mean_mmd, spread_samples
 from learn3d.evaluation_report import COLUMNS, _class_means, evaluate_runs, format_table
 from learn3d.losses import mmd
 from learn3d.methods import Grids, Meshes, Method
@@ -161,6 +161,13 @@ def test_mean_mmd_uses_equally_many_codes_of_each_view() -> None:
     expected = float(mmd(codes[:3], codes[5:8]))
     assert mean_mmd(codes, views, per_view=3)["released"] == pytest.approx(expected, rel=1e-5)
     assert mean_mmd(codes, views)["released"] == pytest.approx(float(mmd(codes[:4], codes[5:])), rel=1e-5)
+
+
+def test_number_of_codes_behind_an_mmd(tiny_set) -> None:
+    assert evaluate(Constant(egg()), tiny_set).summary()["mmd_codes"] == 3
+    assert codes_per_view(torch.tensor([0, 0, 1, 1, 1, 2])) == 2  # the single code is left out
+    assert codes_per_view(torch.tensor([0, 0, 1, 2])) == 0
+    assert codes_per_view(torch.zeros(1000, dtype=torch.int64).index_fill(0, torch.arange(500), 1), per_view=9) == 9
 
 
 def test_mean_mmd_of_one_view_is_nothing() -> None:

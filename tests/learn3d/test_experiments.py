@@ -130,12 +130,12 @@ def test_schedules_follow_the_number_of_iterations(tmp_path) -> None:
 
 
 def test_changes_reach_the_methods_that_they_name(tmp_path) -> None:
-    changes = ("precision=fp32", "Vanilla-AE:learning-rate=3e-4", "lambda_smooth=0.5", "augment=flip,channels")
+    changes = ("precision=fp32", "Vanilla-AE:learning-rate=3e-4", "lambda_smooth=0.5", "augment=flip-image,channels")
     vanilla, proposed = plan_runs(TABLES["kato"], options(tmp_path, changes=changes))
     assert (vanilla.config.settings.learning_rate, proposed.config.settings.learning_rate) == (3e-4, 1e-4)
     for run in (vanilla, proposed):
         assert run.config.settings.lambda_smooth == 0.5
-        assert (run.config.precision, run.config.augment) == ("fp32", ("flip", "channels"))
+        assert (run.config.precision, run.config.augment) == ("fp32", ("flip-image", "channels"))
 
 
 def test_several_whole_numbers_are_numbers(tmp_path) -> None:
@@ -180,10 +180,10 @@ def test_the_command_of_a_run_gives_its_configuration(tmp_path, table: str) -> N
     train = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = train
     spec.loader.exec_module(train)
-    changes = ("precision=fp32", "augment=flip,channels", "max_val_images=4")
+    changes = ("precision=fp32", "augment=flip-image,channels", "max_val_images=4")
     changes += {"kato": ("vpl:anti_aliasing=false",), "prgan": ("perspective=true",)}.get(table, ("lambda_prior=0.25",))
     methods = [row.variant.name for row in TABLES[table].rows if row.variant and row.variant.preset in PRESETS]
-    given = Options(tmp_path / "a b", tmp_path, ("chair",), tuple(methods), 7, layout="r2n2", changes=changes)
+    given = Options(tmp_path / "a b", tmp_path, ("chair",), tuple(methods), 7, layout="kar", changes=changes)
     for run in plan_runs(TABLES[table], given):
         assert train.parse(shlex.split(command_line(run.config))[2:]).config == run.config
 

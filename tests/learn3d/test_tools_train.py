@@ -36,13 +36,13 @@ def call(module: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: object
 def test_options_reach_the_configuration(tmp_path) -> None:
     arguments = (
         f"--data d --category chair --output {tmp_path} --preset peng2020-kato-printed --lambda-prior 0.5 "
-        "--batch-size 7 --augment flip channels --overwrite"
+        "--batch-size 7 --augment flip-image channels --overwrite"
     )
     command = tool("train").parse(arguments.split())
     config = command.config
     assert (config.category, config.preset, config.batch_size) == ("chair", "peng2020-kato-printed", 7)
     assert (config.settings.lambda_prior, config.settings.prior_form) == (0.5, "norm")
-    assert config.augment == ("flip", "channels")
+    assert config.augment == ("flip-image", "channels")
     assert (command.overwrite, command.resume) == (True, False)
     assert config.iterations == 20_000
 
@@ -120,6 +120,12 @@ def test_best_iou_is_said_where_there_is_one(best_step: int, shown: bool, tmp_pa
     assert out.startswith("stopped at step 700 after 1.0 min; ")
     assert ("best validation voxel IoU 0.2500 at step 500" in out, "IoU" in out) == (shown, shown)
     assert out.endswith(f"everything is in {tmp_path}\n")
+
+
+def test_resume_with_another_preset_is_refused(finished_run, monkeypatch, capsys) -> None:
+    preset = ["--preset", "peng2020-kato-vanilla"]
+    assert call(tool("train"), monkeypatch, "--output", finished_run, "--resume", *preset) == 1
+    assert "was started with the preset peng2020-kato, got peng2020-kato-vanilla" in capsys.readouterr().err
 
 
 def test_resume_and_overwrite_exclude_each_other(finished_run, monkeypatch, capsys) -> None:

@@ -144,6 +144,9 @@ def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
         ({"layout": "shapenet"}, "layout must be one of kato, "),
         ({"sampling": "all"}, "sampling must be one of views, pairs, classes"),
         ({"augment": ("zoom",)}, "augment must be one of flip, "),
+        ({"augment": ("channels", "flip")}, "the discriminator of 'peng2020-kato' is told the class of the original"),
+        ({"layout": "r2n2"}, r"3D-R2N2's data have no val split; validate on test"),
+        ({"preset": "gadelha2017-kato"}, "encoder_from_step=53051 lies beyond the 4 iterations: .* such as 3"),
         ({"view_bins": "15"}, "view bins are written as AZIMUTHxELEVATION"),
         ({"prior_form": "cube"}, "prior_form must be one of squared, norm"),
         ({"iterations": 0}, "iterations must be a whole number >= 1"),
@@ -169,7 +172,7 @@ def test_config_survives_json_and_names_unknown_options(tmp_path) -> None:
         output=tmp_path / "run",
         settings=PoseInvariantSettings(lambda_prior=0.5),
         threads=2,
-        augment=("flip",),
+        augment=("channels",),
     )
     values = json.loads(json.dumps(config_to_dict(config)))
     assert config_from_dict(values) == config
