@@ -396,8 +396,8 @@ def test_quoted_rows_are_marked_and_never_trained(tmp_path, stub, monkeypatch, c
     monkeypatch.setitem(TABLES, "kato", dataclasses.replace(table, rows=(*quoted, *table.rows)))
     assert run_experiment(Call("kato", options(tmp_path)), worker=stub) == 0
     text = (tmp_path / "out" / "kato.md").read_text()
-    assert "| CSDM | paper, quoted from Kar et al. 2015 (kato19) | 0.398 | 0.398 |" in text
-    assert "| CMR | paper, quoted from Kanazawa et al. 2018 (kato19) | 0.460 | 0.460 |" in text
+    assert "| CSDM | paper, quoted from Kar et al. 2015 (voxeliser not stated) | 0.398 | 0.398 |" in text
+    assert "| CMR | paper, quoted from Kanazawa et al. 2018 (voxeliser not stated) | 0.460 | 0.460 |" in text
     assert {run["variant"] for run in json.loads((tmp_path / "out" / "kato.json").read_text())["runs"]} == {
         "vanilla",
         "proposed",
