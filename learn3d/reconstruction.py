@@ -10,39 +10,16 @@ import numpy as np
 import skimage.transform
 import torch
 import trimesh
-from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from learn3d import checkpoint, figures, files
 from learn3d.data.crops import Crops
-from learn3d.data.framing import mask_box
+from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo
 from learn3d.data.kato import mesh_to_object
 from learn3d.data.layouts import NATURAL_COLORS, Layout, load_dataset
 from learn3d.methods import Method
 
-OBJECT_SHARE = 0.65  # side of the object's bounding square as a share of the picture's side, when the run does not say
 STRIP_SIZE = 160
-
-
-def read_image(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Read colours uint8 [H,W,3] and mask uint8 [H,W]: of an image with transparency, or of an image and a mask file.
-
-    A mask file is read as grey values (white = object) and must have the image's size.
-    Raises ValueError for an unreadable file, an image with no transparency and no mask, a wrong size, an empty mask.
-    """
-    image = _open(path)
-    if mask_path is not None:
-        grey = _open(mask_path).convert("L")
-        if grey.size != image.size:
-            raise ValueError(f"mask {mask_path} is {grey.size[0]}x{grey.size[1]}, image {path} is {_size(image)}")
-        mask = np.asarray(grey)
-    else:
-        mask = np.asarray(image.convert("RGBA"))[..., 3]
-        if mask.min() == 255:
-            raise ValueError(f"{path} has no transparency to tell the object from its background; give a mask image")
-    if mask.max() == 0:
-        raise ValueError(f"the mask of {path} is empty: no pixel belongs to the object")
-    return np.asarray(image.convert("RGBA"))[..., :3], mask
 
 
 def prepare_image(
@@ -82,6 +59,14 @@ def prepare_image(
     if layout in NATURAL_COLORS:
         resized[..., :3] = 255 - resized[..., :3]
     return np.rint(resized.transpose(2, 0, 1)).clip(0, 255).astype(np.uint8)
+
+
+def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
+    """Colours uint8 [H,W,3] and a mask uint8 [H,W] that shows something; see `read_photo`."""
+    colors, mask = read_photo(path, mask_path)
+    if not mask.any():
+        raise ValueError(f"the mask of {path} is empty: no pixel belongs to the object")
+    return colors, mask
 
 
 @torch.no_grad()
@@ -155,7 +140,7 @@ def reconstruct_files(
     method, config, metadata = checkpoint.load_method(checkpoint.find(run, which))
     share = metadata.get("object_share") or OBJECT_SHARE
     form = {"object_share": share, "size": method.image_size, "layout": config.layout}
-    prepared = [prepare_image(*read_image(image, mask), crop=crop, **form) for image, mask in pairs]
+    prepared = [prepare_image(*_read(image, mask), crop=crop, **form) for image, mask in pairs]
     names = [Path(image).stem for image in images]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]
@@ -215,19 +200,3 @@ def _resample(stored: np.ndarray, left: float, top: float, side: float, size: in
     pad = max(0, -left, -top, left + side - stored.shape[1], top + side - stored.shape[0])
     square = np.pad(stored, ((pad, pad), (pad, pad), (0, 0)))[top + pad :, left + pad :][:side, :side]
     return skimage.transform.resize(square, (size, size), order=1, anti_aliasing=side > size)
-
-
-def _open(path: Path) -> Image.Image:
-    """The image, upright: cameras write the pixels as they lie on the sensor, and the turn into the EXIF data."""
-    try:
-        image = Image.open(path)
-        image.load()
-        return ImageOps.exif_transpose(image)
-    except FileNotFoundError:
-        raise ValueError(f"there is no image {path}") from None
-    except (UnidentifiedImageError, OSError) as error:
-        raise ValueError(f"{path} cannot be read as an image: {error}") from None
-
-
-def _size(image: Image.Image) -> str:
-    return f"{image.size[0]}x{image.size[1]}"

@@ -152,7 +152,7 @@ def test_unreadable_photos_are_named(tmp_path: Path) -> None:
     colors = np.full((8, 6, 3), 10, np.uint8)
     with pytest.raises(FileNotFoundError, match=r"there is no image .*a.png"):
         read_photo(tmp_path / "a.png")
-    with pytest.raises(ValueError, match=r"a.png has no transparency and no mask: put one into masks/"):
+    with pytest.raises(ValueError, match=r"a.png has no transparency and no mask: give a mask image"):
         read_photo(save(tmp_path / "a.png", colors))
     (tmp_path / "b.heic").write_bytes(b"\0\0\0\x18ftypheic")
     with pytest.raises(ValueError, match=r"b.heic is no image that can be read here; JPEG and PNG can, HEIC cannot"):

@@ -12,9 +12,9 @@ import nmr
 from learn3d.data.crops import Crops
 from learn3d.data.kato import mesh_to_object
 from learn3d.reconstruction import (
+    _read,
     export_mesh,
     prepare_image,
-    read_image,
     reconstruct_dataset,
     reconstruct_files,
 )
@@ -101,7 +101,7 @@ def test_pictures_are_turned_upright(tmp_path, turned: str) -> None:
             exif[0x0112] = 6  # stored lying on its left side: a viewer turns it by 90 degrees clockwise
             pixels = np.rot90(pixels)
         Image.fromarray(np.ascontiguousarray(pixels)).save(tmp_path / f"{name}.png", exif=exif)
-    read, read_mask = read_image(tmp_path / "image.png", tmp_path / "mask.png")
+    read, read_mask = _read(tmp_path / "image.png", tmp_path / "mask.png")
     assert np.array_equal(read, colors)
     assert np.array_equal(read_mask, mask)
 
@@ -112,7 +112,7 @@ def test_read_image_with_transparency_or_mask(tmp_path) -> None:
     Image.fromarray(rgba).save(tmp_path / "a.png")
     Image.fromarray(rgba[..., :3]).save(tmp_path / "b.png")
     Image.fromarray(rgba[..., 3]).save(tmp_path / "mask.png")
-    for colors, mask in (read_image(tmp_path / "a.png"), read_image(tmp_path / "b.png", tmp_path / "mask.png")):
+    for colors, mask in (_read(tmp_path / "a.png"), _read(tmp_path / "b.png", tmp_path / "mask.png")):
         assert np.array_equal(colors, rgba[..., :3])
         assert np.array_equal(mask, rgba[..., 3])
     Image.fromarray(np.zeros((3, 3), np.uint8)).save(tmp_path / "black.png")
@@ -120,13 +120,13 @@ def test_read_image_with_transparency_or_mask(tmp_path) -> None:
     (tmp_path / "text.png").write_text("no image")
     for arguments, message in (
         (("b.png",), "has no transparency"),
-        (("b.png", "black.png"), "mask .* is 3x3, image .* is 8x6"),
+        (("b.png", "black.png"), "black.png has 3x3 pixels, .*b.png has 8x6"),
         (("b.png", "empty.png"), "mask of .* is empty"),
         (("c.png",), "there is no image"),
-        (("text.png",), "cannot be read as an image"),
+        (("text.png",), "is no image that can be read here"),
     ):
-        with pytest.raises(ValueError, match=message):
-            read_image(*(tmp_path / name for name in arguments))
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
+            _read(*(tmp_path / name for name in arguments))
 
 
 @pytest.mark.parametrize("kind", ["obj", "glb", "ply"])
