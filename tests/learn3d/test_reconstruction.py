@@ -112,7 +112,7 @@ def test_read_image_with_transparency_or_mask(tmp_path) -> None:
     Image.fromarray(rgba).save(tmp_path / "a.png")
     Image.fromarray(rgba[..., :3]).save(tmp_path / "b.png")
     Image.fromarray(rgba[..., 3]).save(tmp_path / "mask.png")
-    for colors, mask in (_read(tmp_path / "a.png"), _read(tmp_path / "b.png", tmp_path / "mask.png")):
+    for colors, mask in (_read(tmp_path / "a.png", None), _read(tmp_path / "b.png", tmp_path / "mask.png")):
         assert np.array_equal(colors, rgba[..., :3])
         assert np.array_equal(mask, rgba[..., 3])
     Image.fromarray(np.zeros((3, 3), np.uint8)).save(tmp_path / "black.png")
@@ -126,7 +126,7 @@ def test_read_image_with_transparency_or_mask(tmp_path) -> None:
         (("text.png",), "is no image that can be read here"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=message):
-            _read(*(tmp_path / name for name in arguments))
+            _read(*(tmp_path / name for name in arguments), *[None] * (2 - len(arguments)))
 
 
 @pytest.mark.parametrize("kind", ["obj", "glb", "ply"])
