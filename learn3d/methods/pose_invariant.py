@@ -23,7 +23,7 @@ class PoseInvariantSettings:
     """Networks, weights and forms of the terms of L_tot; a weight of 0 means that the term is not computed."""
 
     encoder: EncoderName = "conv"
-    """conv: three convolutions, 64-pixel RGB and mask. resnet18: 224-pixel RGB."""
+    """conv: three convolutions, 64-pixel RGB and mask. conv-small: a fifteenth of it. resnet18: 224-pixel RGB."""
     generator: GeneratorName = "sphere"
     """sphere: 642 free vertices. symmetric: mirrored at z = 0."""
     pretrained: Path | None = None

@@ -137,9 +137,18 @@ class SymmetricSphereGenerator(nn.Module):
         return deform_sphere(self.sphere, torch.cat([middle, right, left], dim=1)[:, self.order])
 
 
-GeneratorName = Literal["sphere", "symmetric", "bounded"]
+class SmallSphereGenerator(SphereGenerator):
+    """The same input and output with one hidden layer of 512: for small data sets and quick experiments; no paper's."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(CODE_SIZE, 512), nn.ReLU(), nn.Linear(512, self.sphere.shape[0] * 3))
+
+
+GeneratorName = Literal["sphere", "sphere-small", "symmetric", "bounded"]
 GENERATORS: dict[str, type[nn.Module]] = {
     "sphere": SphereGenerator,
+    "sphere-small": SmallSphereGenerator,
     "symmetric": SymmetricSphereGenerator,
     "bounded": BoundedGenerator,
 }
