@@ -23,7 +23,16 @@ import pytest
 from learn3d import training
 from learn3d.experiments import formats, published, results
 from learn3d.experiments.experiment import Call, run_experiment
-from learn3d.experiments.plan import Options, State, command_line, found_runs, plan_runs, read_results, read_state
+from learn3d.experiments.plan import (
+    Options,
+    State,
+    command_line,
+    found_runs,
+    is_current,
+    plan_runs,
+    read_results,
+    read_state,
+)
 from learn3d.experiments.statistics import percentile_interval, resampled_means, t_interval
 from learn3d.experiments.tables import TABLES
 from learn3d.experiments.worker import carry_out, sole_use
@@ -39,12 +48,14 @@ import json, os, sys, time
 request = json.loads(sys.stdin.readline())
 config, folder = request["config"], request["config"]["output"]
 print("threads", os.environ["OMP_NUM_THREADS"], config["threads"], "fresh", request["fresh"], flush=True)
+print("own session", os.getsid(0) == os.getpid() if hasattr(os, "getsid") else None, flush=True)
 if request["category"] == "fails":
     print("first line"); print("error: no such data"); sys.exit(1)
 if request["category"] == "waits":
     try:
         print("waiting", flush=True); time.sleep(60)
     except KeyboardInterrupt:
+        time.sleep(0.5 * (request["variant"]["name"] == "proposed"))
         print("saved", flush=True); sys.exit(75)
 base = {"vanilla": 0.3, "proposed": 0.4}[request["variant"]["name"]] + 0.01 * request["seed"]
 means = [round(base + 0.02 * k, 5) for k in range(5)]
@@ -245,6 +256,15 @@ def test_finished_runs_are_skipped_and_shared(tmp_path, stub, capsys) -> None:
     assert run_experiment(Call("kato", options(tmp_path, seeds=2)), worker=broken) == 1
 
 
+def test_a_result_of_fewer_iterations_is_not_taken(made_by_hand) -> None:
+    """As where tools/train.py took a measured run further by hand."""
+    run = made_by_hand()
+    result = {"iterations": 3, "checkpoint": "last", "data": str(run.config.data.resolve())}
+    assert not is_current(run, result)
+    assert is_current(run, result | {"iterations": 4})
+    assert not is_current(run, result | {"iterations": 4, "checkpoint": "best"})
+
+
 def test_a_result_of_other_data_is_not_taken(tmp_path, stub) -> None:
     run_experiment(Call("kato", options(tmp_path)), worker=stub)
     moved = plan_runs(TABLES["kato"], dataclasses.replace(options(tmp_path), data=tmp_path / "elsewhere"))
@@ -283,6 +303,7 @@ def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, stub, capsys)
     threading.Thread(target=interrupt).start()
     assert run_experiment(call, worker=stub) == 130
     assert all("saved" in log.read_text() for log in logs)
+    assert all("own session True" in log.read_text() for log in logs), "else the terminal would interrupt them too"
     assert "stopped; the same command goes on" in capsys.readouterr().err
     assert not (tmp_path / "out/runs/airplane").exists(), "nothing new is started"
 
