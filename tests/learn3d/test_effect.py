@@ -36,9 +36,12 @@ def seen_from_four_sides(dataset: ViewDataset, objects: int) -> ViewDataset:
 @pytest.fixture(scope="module")
 def splits(tmp_path_factory: pytest.TempPathFactory) -> tuple[ViewDataset, ViewDataset]:
     folder = tmp_path_factory.mktemp("airplanes")
-    config = DatasetConfig(output=folder, category="airplane", procedural=36, test=20, val=0)
+    config = DatasetConfig(output=folder, category="airplane", procedural=120, test=20, val=4)
     make_dataset(config, progress=False)
-    return tuple(seen_from_four_sides(kato.load(folder, "airplane", split), 20) for split in ("train", "test"))
+    return tuple(
+        seen_from_four_sides(kato.load(folder, "airplane", split), objects)
+        for split, objects in (("train", 16), ("test", 20))
+    )
 
 
 def train_small(preset: str, train_set: ViewDataset, test_set: ViewDataset, **changes: float) -> Evaluation:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from learn3d import checkpoint
-from learn3d.evaluation import evaluate_runs
+from learn3d.evaluation_report import evaluate_runs
 from learn3d.training import train
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
