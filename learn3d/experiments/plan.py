@@ -155,7 +155,8 @@ def found_runs(table: Table, options: Options) -> list[Run]:
                 continue
             result = load_json(path)
             config = config_from_dict(result["config"], source=str(path))
-            config = dataclasses.replace(config, output=path.parent, iterations=result["iterations"])
+            where = {"output": path.parent, "data": Path(result["data"])}  # a relative path was of another folder
+            config = dataclasses.replace(config, iterations=result["iterations"], **where)
             runs.append(Run(row.variant, category, seed, config))
     if not runs:
         raise ValueError(f"there is no result for the table {table.name} in {options.output / 'runs'}; train first")
