@@ -15,7 +15,9 @@ from pathlib import Path
 from learn3d.experiments.plan import LOG_FILE, Run
 from learn3d.experiments.worker import STOPPED, request_of
 
-WORKER = (sys.executable, "-m", "learn3d.experiments.worker")
+#: Python puts the working directory first on its path, where a source folder would hide the installed package.
+NOT_FROM_HERE = "import sys; sys.path[:1] = [] if sys.path[0] == '' else sys.path[:1]; "
+WORKER = (sys.executable, "-c", NOT_FROM_HERE + "from learn3d.experiments.worker import main; sys.exit(main())")
 TAIL_LINES = 5  # of a failed run's log, shown at the end
 SECONDS_BETWEEN_LINES = 60.0
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")

@@ -33,6 +33,7 @@ from learn3d.experiments.plan import (
     read_results,
     read_state,
 )
+from learn3d.experiments.pool import NOT_FROM_HERE
 from learn3d.experiments.statistics import percentile_interval, resampled_means, t_interval
 from learn3d.experiments.tables import TABLES
 from learn3d.experiments.worker import carry_out, sole_use
@@ -531,7 +532,9 @@ def test_a_worker_resumes_or_starts_anew(made_by_hand, monkeypatch, iterations, 
 
 def test_a_worker_stops_when_its_parent_is_gone() -> None:
     code = "import time; from learn3d.experiments import worker; worker._stop_with_parent(); time.sleep(60)"
-    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-c", NOT_FROM_HERE + code], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+    )
     process.stdin.close()
     assert b"KeyboardInterrupt" in process.stderr.read()
     assert process.wait(timeout=30) != 0

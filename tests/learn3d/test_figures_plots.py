@@ -223,7 +223,7 @@ def test_plots_change_no_settings_of_others() -> None:
     assert dict(matplotlib.rcParams) == before
 
 
-def test_training_does_without_the_packages_of_plots() -> None:
+def test_training_does_without_the_packages_of_plots(tmp_path) -> None:
     code = "import sys, learn3d.figures.paper; print({'matplotlib', 'sklearn'} & set(sys.modules))"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert result.stdout.strip() == "set()"
