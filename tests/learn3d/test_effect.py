@@ -1,10 +1,10 @@
 """The paper's claim in small: pose confusion takes the view out of the codes.
 
-16 procedural airplanes from four sides, every image on its own, small networks, 1,200 steps: some 40 s for each of three
-trainings. Measured: MMD of confusion alone, without the prior, 0.73, 0.40, 0.02 of Vanilla-AE's with seeds 0, 1, 2; of
-the whole method 0.63, 0.45, 0.66. A confusion loss whose gradient does not reach the encoder gives 1: nothing differs
-from Vanilla-AE then. The IoU is not tested: it rose by 0.03 to 0.04 with these seeds on one thread, and fell by 0.01 with
-seed 1 on two. What the method does for the shapes shows in longer trainings (docs/results.md).
+16 procedural airplanes from four sides, every image on its own, small networks, 1,200 steps: some 40 s for each of
+three trainings. Measured: MMD of confusion alone, without the prior, 0.73, 0.40, 0.02 of Vanilla-AE's with seeds 0, 1,
+2; of the whole method 0.63, 0.45, 0.66. A confusion loss whose gradient does not reach the encoder gives 1: nothing
+differs from Vanilla-AE then. The IoU is not tested: it rose by 0.03 to 0.04 with these seeds on one thread, and fell by
+0.01 with seed 1 on two. What the method does for the shapes shows in longer trainings (docs/results.md).
 """
 
 from __future__ import annotations
