@@ -65,7 +65,7 @@ PRGAN = {
 }
 
 #: Voxel IoU on Kar's data, one view per training object, networks with the best validation IoU. The two quoted rows
-#: were measured with another voxeliser (kato19, with thicker surfaces) than the paper's own (kato18).
+#: were measured with another voxeliser (kato19) than the paper's own (kato18).
 KAR = {
     "Vanilla-AE": _row(
         0.479, 0.266, 0.466, 0.550, 0.367, 0.265, 0.454,
