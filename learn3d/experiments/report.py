@@ -30,7 +30,7 @@ IOUS = ("kato18", "kato19")
 PROTOCOL = {
     "kato18": "voxel IoU of 32^3 grids, mean over images, then over categories; by the voxeliser of Kato et al. 2018, "
     "with which the paper's own figures were measured",
-    "kato19": "the same by the voxeliser of Kato and Harada 2019 (every cell that a face touches); not comparable with kato18",
+    "kato19": "that of Kato and Harada 2019 (every cell that a face touches); not comparable with kato18",
     "mmd": f"mean over all pairs of view classes, up to {CODES_PER_VIEW} codes each; five kernels, no root (the "
     "published code, and the paper's table)",
     "mmd_paper": "the same by the printed formula: one kernel, square root",
