@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from learn3d import training
+from learn3d import validation
 from learn3d.config import DEFAULT_PRESET, TrainConfig
 from learn3d.data import kato
 from learn3d.data.views import ViewDataset
@@ -90,7 +90,7 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable
 def small_picture_grids() -> Iterator[None]:
     """Two rows instead of eight in the grids that a run draws."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "PICTURE_ROWS", 2)
+        patch.setattr(validation, "PICTURE_ROWS", 2)
         yield
 
 

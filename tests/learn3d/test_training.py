@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import nmr
-from learn3d import checkpoint, training
+from learn3d import checkpoint, run_state, training
 from learn3d.config import (
     TrainConfig,
     check_resume,
@@ -369,7 +369,7 @@ def test_resume_from_a_checkpoint_without_conditions(tiny_config, tiny_folder, f
 
 
 def test_resume_command_is_quoted(tmp_path) -> None:
-    words = shlex.split(training.resume_command(tmp_path / "my runs" / "it's"))
+    words = shlex.split(run_state.resume_command(tmp_path / "my runs" / "it's"))
     assert words == ["python", "tools/train.py", "--output", str(tmp_path / "my runs" / "it's"), "--resume"]
 
 
@@ -386,7 +386,7 @@ def test_used_folder_is_refused_and_overwrite_keeps_foreign_files(
     (run_folder / "metrics.jsonl").write_text('{"step": 0, "split": "train"}\n')
     with pytest.raises(ValueError, match="is not empty; continue that run"):
         train(tiny_config(run_folder))
-    monkeypatch.setattr(training, "_draw", lambda *arguments: None)
+    monkeypatch.setattr(training, "draw", lambda *arguments: None)
     train(tiny_config(run_folder, iterations=1, preset=VANILLA), overwrite=True)
     assert (run_folder / "notes.txt").read_text() == "mine"
     assert read_metrics(run_folder)[0]["step"] == 1
@@ -421,5 +421,5 @@ def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> 
         method.generator.layers[0].bias[3] = float("inf")
     run_folder.mkdir()
     with pytest.raises(FloatingPointError, match="generator has weights that are not finite; there is no checkpoint"):
-        training.save_last(run_folder, config, None, method, DataShape(24), training.Progress())
+        run_state.save_last(run_folder, config, None, method, DataShape(24), run_state.Progress())
     assert not list(run_folder.iterdir())

@@ -1,0 +1,35 @@
+"""Signals that end a run in good order."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+
+@dataclass
+class Stop:
+    requested: bool = False
+    name: str = ""
+
+
+@contextlib.contextmanager
+def stop_on_signal() -> Iterator[Stop]:
+    """Turn the first SIGINT or SIGTERM into a request to stop; a second SIGINT interrupts at once."""
+    stop = Stop()
+
+    def handle(number: int, frame: object) -> None:
+        if stop.requested and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        stop.requested, stop.name = True, signal.Signals(number).name
+
+    previous: dict[int, object] = {}
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            with contextlib.suppress(ValueError):  # not the main thread: leave signals alone
+                previous[number] = signal.signal(number, handle)
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,0 +1,68 @@
+"""What a run measures and draws while it trains: IoU and MMD of the validation split, pictures of a few images."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from learn3d import checkpoint, figures
+from learn3d.config import TrainConfig
+from learn3d.data.views import ViewDataset
+from learn3d.evaluation import evaluate
+from learn3d.methods import DataShape, Method
+from learn3d.run_state import Progress, check_networks
+from learn3d.runlog import RunLog
+
+PICTURE_ROWS = 8
+
+
+def validate(
+    config: TrainConfig,
+    method: Method,
+    shape: DataShape,
+    val_set: ViewDataset,
+    progress: Progress,
+    log: RunLog,
+) -> None:
+    """Measure voxel IoU and MMD on the validation images; keep the networks when they are the best so far.
+
+    A data set without true shapes has no best: its MMD alone says nothing about the shapes.
+    """
+    result = evaluate(method, val_set, max_images=config.max_val_images)
+    log.metrics(progress.step, config.val_split, {k: v for k, v in result.summary().items() if v is not None})
+    mmd = "" if result.mmd is None else f", MMD {result.mmd:.3f}"
+    iou = -1.0 if result.voxel_iou is None else result.voxel_iou
+    better = iou > progress.best_iou
+    mark = " (best so far)" if better else ""
+    shown = "undefined" if result.voxel_iou is None else f"{iou:.4f}"
+    log.say(f"step {progress.step}: {config.val_split} voxel IoU {shown}{mmd}{mark}")
+    if result.undefined:
+        log.say(f"warning: {result.undefined} images have no IoU (prediction and truth are both empty); left out")
+    if better:
+        progress.best_iou, progress.best_step = iou, progress.step
+        metadata = checkpoint.method_metadata(shape, config) | dataclasses.asdict(progress)
+        check_networks(method, config.output)
+        checkpoint.save(config.output / "best.safetensors", checkpoint.network_tensors(method), metadata)
+
+
+def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
+    """Write pictures/<step>.png: the same few validation images every time, of different objects and views."""
+    grid = figures.picture_grid(method, val_set, picture_samples(val_set, PICTURE_ROWS))
+    folder = config.output / "pictures"
+    folder.mkdir(exist_ok=True)
+    figures.save_png(folder / f"{step:06}.png", grid)
+    log.picture(step, config.val_split, grid)
+
+
+def picture_samples(dataset: ViewDataset, count: int) -> Tensor:
+    """Samples for pictures, int64 [count] or fewer: of objects spread over the set, each seen from another side."""
+    rows = min(count, len(dataset))
+    chosen = []
+    for row, number in enumerate(np.linspace(0, dataset.num_objects - 1, rows).round().astype(int)):
+        samples = np.flatnonzero(dataset.object_ids == number)
+        if len(samples):
+            chosen.append(samples[(row * 7 + 3) % len(samples)])
+    return torch.from_numpy(np.array(chosen))
