@@ -74,14 +74,14 @@ def load(
     split: str,
     *,
     image_size: int = 64,
-    view_bins: AngleBins | None = None,
     views_per_object: int | None = None,
     progress: bool = False,
 ) -> ViewDataset:
     """Read one category (name or synset id) and split of a folder.
 
+    Pose classes are cells of 15 x 20 degrees of azimuth and elevation over elevations -20 .. 40 (K = 72).
+
     image_size: side of the images in pixels, 64 or up to 224. The masks to be matched have 64 pixels in any case.
-    view_bins: cells of azimuth and elevation, by default 15 x 20 degrees over elevations -20 .. 40 (K = 72).
     views_per_object: use the first 1 .. 20 renders of each object; None: 1 for training, all for the other splits.
     Raises FileNotFoundError or ValueError naming the first file that is missing or not as described above.
     """
@@ -96,7 +96,7 @@ def load(
     )
     images, masks, tables, voxels = assemble(read, len(ids), views, image_size)
     poses = LookAtPoses(tables[:, 0], tables[:, 1], tables[:, 3], HALF_FOV_DEG)
-    bins = AngleBins.parse(VIEW_BINS) if view_bins is None else view_bins
+    bins = AngleBins.parse(VIEW_BINS)
     return ViewDataset(
         category=category,
         split=split,

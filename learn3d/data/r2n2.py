@@ -71,14 +71,14 @@ def load(
     split: str,
     *,
     image_size: int = 64,
-    view_bins: AngleBins | None = None,
     views_per_object: int | None = None,
     progress: bool = False,
 ) -> ViewDataset:
     """Read one category (name or synset id) and split ("train" or "test") of a folder.
 
+    Pose classes are cells of 15 x 5 degrees of azimuth and elevation over elevations 25 .. 30 (K = 24).
+
     image_size: side of the images in pixels, up to 137. The masks to be matched have 64 pixels in any case.
-    view_bins: cells of azimuth and elevation, by default 15 x 5 degrees over elevations 25 .. 30 (K = 24).
     views_per_object: use the first 1 .. 24 images of each object; None: all.
     Raises FileNotFoundError or ValueError naming the first file that is missing or not as described above.
     """
@@ -92,7 +92,7 @@ def load(
     )
     images, masks, tables, voxels = assemble(read, len(ids), views, image_size)
     poses = LookAtPoses(*tables.T, HALF_FOV_DEG)
-    bins = AngleBins.parse(VIEW_BINS) if view_bins is None else view_bins
+    bins = AngleBins.parse(VIEW_BINS)
     return ViewDataset(
         category=category,
         split=split,
