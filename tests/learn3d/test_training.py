@@ -47,6 +47,20 @@ def make_step(config: TrainConfig, data: ViewDataset):
     return method.networks, lambda iteration: method.train_step(batch, iteration)
 
 
+def test_a_run_knows_how_colours_are_stored_and_goes_on_as_it_began(tiny_config, run_folder) -> None:
+    """Runs from before encoders turned colours back have no entry: resuming them must not change their input."""
+    small = {"preset": "peng2020-kato-vpl", "encoder": "resnet18", "image_size": 64, "lambda_discriminator": 0.0}
+    train(tiny_config(run_folder, **small, iterations=1))
+    path = run_folder / "last.safetensors"
+    assert checkpoint.data_shape(checkpoint.load_metadata(path)).inverted
+    assert checkpoint.load_method(path)[0].encoder.resnet.inverted
+    tensors, metadata = checkpoint.load(path)
+    del metadata["shape"]["inverted"]
+    checkpoint.save(path, tensors, metadata)
+    train(tiny_config(run_folder, **small, iterations=2), resume=True)
+    assert not checkpoint.load_method(path)[0].encoder.resnet.inverted
+
+
 def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
     networks, step = make_step(tiny_config(tmp_path), tiny_set)
     for iteration in (1, 2, 3):
