@@ -49,8 +49,8 @@ def _read(path: Path, *, tensors: bool) -> tuple[dict[str, Tensor], dict[str, An
     path = Path(path)
     if not path.is_file():
         raise ValueError(
-            f"there is no checkpoint {path}; a run folder holds last.safetensors and, where the validation images have "
-            "voxels, best.safetensors"
+            f"there is no checkpoint {path}; a run folder holds last.safetensors and, from the first validation that "
+            "measured an IoU, best.safetensors"
         )
     try:
         with safe_open(path, framework="pt") as file:

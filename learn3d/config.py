@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from learn3d.data.augment import Augmentation
-from learn3d.data.layouts import Layout
+from learn3d.data.layouts import LAYOUTS, Layout, check_options
 from learn3d.data.sampling import Sampling
-from learn3d.data.view_bins import AngleBins
 from learn3d.presets import PRESETS, Settings
 
 DEFAULT_PRESET = next(iter(PRESETS))
@@ -85,7 +84,6 @@ class TrainConfig:
             )
         check_fields(self.settings)
         object.__setattr__(self, "augment", tuple(self.augment))
-        _check_choice("layout", self.layout, typing.get_args(Layout))
         _check_choice("sampling", self.sampling, typing.get_args(Sampling))
         for name in self.augment:
             _check_choice("augment", name, typing.get_args(Augmentation))
@@ -97,10 +95,10 @@ class TrainConfig:
         _check_choice("device", self.device, ("cpu", "cuda"))
         _check_choice("precision", self.precision, ("auto", "bf16", "fp32"))
         _check_choice("val_split", self.val_split, ("val", "test"))
-        if self.layout == "r2n2" and self.val_split == "val":
-            raise ValueError("3D-R2N2's data have no val split; validate on test (val_split test)")
-        if self.view_bins is not None:
-            AngleBins.parse(self.view_bins)
+        options = {name: getattr(self, name) for name in ("view_bins", "views_per_object")}
+        check_options(self.layout, image_size=self.settings.image_size, **options)
+        if self.val_split == "val" and not LAYOUTS[self.layout].validation:
+            raise ValueError(f"the layout {self.layout!r} has no split val; validate on test (val_split test)")
         if not self.category:
             raise ValueError("category must be a class name such as 'airplane', got an empty string")
         for name in ("iterations", "batch_size", "validate_every", "pictures_every", "checkpoint_every", "log_every"):

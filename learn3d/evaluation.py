@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 import nmr
+from learn3d.data.batch import Batch
 from learn3d.data.conventions import Definition
 from learn3d.data.views import ViewDataset
 from learn3d.losses import mmd_from_distances
@@ -35,6 +36,7 @@ class Evaluation:
     ]  # float [M] per voxeliser; NaN where prediction and truth are empty; {} without truth
     chamfer_l1: Tensor | None  # float [M], None when not asked for or without truth
     f_score: Tensor | None  # float [M], likewise
+    silhouette_iou: Tensor | None  # float [M], where there are no voxels and shapes are meshes
     mmd: float | None
     mmd_paper: float | None
 
@@ -58,6 +60,13 @@ class Evaluation:
         """Mean IoU over the images by the first voxeliser; None when it is defined for no image."""
         return _mean(next(iter(self.ious.values()))) if self.ious else None
 
+    @property
+    def chosen_by(self) -> tuple[str, float | None]:
+        """Name and value of what networks are chosen by: the voxel IoU, or that of silhouettes where it is all."""
+        if self.silhouette_iou is not None:
+            return "silhouette IoU", _mean(self.silhouette_iou)
+        return "voxel IoU", self.voxel_iou
+
     def summary(self) -> dict[str, Any]:
         """Means as plain values; what was not computed is None."""
         return {
@@ -65,6 +74,7 @@ class Evaluation:
             **{f"voxel_iou_{name}": _mean(values) for name, values in self.ious.items()},
             "chamfer_l1": _mean(self.chamfer_l1),
             "f_score": _mean(self.f_score),
+            "silhouette_iou": _mean(self.silhouette_iou),
             "mmd": self.mmd,
             "mmd_paper": self.mmd_paper,
             "mmd_codes": self.mmd_codes,
@@ -91,12 +101,16 @@ def evaluate(
     `spread_samples`. `paper_mmd` also computes the MMD as the paper prints it. `surfaces` also compares points on the
     surfaces, in units of the object frame: Chamfer-L1 and F-score at a distance of 0.05, 2,000 points of each;
     where the data set has no points, the truth is the surface of its voxels, which limits them to about 1/32.
+
+    Where the data set has no voxels, meshes are seen by the camera of another image of the object instead (of the only
+    one where there is no other) and compared with that image's mask: the IoU of silhouettes.
     """
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
     generator = torch.Generator().manual_seed(0)
     truth = _true_surfaces(dataset, generator) if surfaces else None
     ious: dict[Definition, list[Tensor]] = {name: [] for name in definitions if dataset.voxels is not None}
-    codes, views, objects, distances = [], [], [], []
+    codes, views, objects, distances, silhouettes = [], [], [], [], []
+    others = _other_images(dataset.object_ids)
     was_training = method.training
     method.set_training(False)
     try:
@@ -109,6 +123,8 @@ def evaluate(
             if truth is not None:
                 points = _surface_points(shapes, generator)
                 distances += [_compare(a, truth[b]) for a, b in zip(points, batch.object_ids.tolist(), strict=True)]
+            if dataset.voxels is None and isinstance(shapes, Meshes):
+                silhouettes.append(_silhouette_ious(shapes, dataset.batch(others[chosen])))
             codes.append(code.float().cpu())
             views.append(batch.view_ids)
             objects.append(batch.object_ids)
@@ -123,6 +139,7 @@ def evaluate(
         ious={name: torch.cat(values) for name, values in ious.items()},
         chamfer_l1=chamfer,
         f_score=f_score,
+        silhouette_iou=torch.cat(silhouettes) if silhouettes else None,
         mmd=means.get("released"),
         mmd_paper=means.get("paper"),
     )
@@ -135,6 +152,29 @@ def occupancy(shapes: Meshes | Grids, dataset: ViewDataset, definition: Definiti
     if dataset.convention.box != 1.0:
         raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {dataset.convention.name} voxels")
     return dataset.convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))
+
+
+def _other_images(object_ids: np.ndarray) -> Tensor:
+    """For each sample another one of its object, int64 [M]: a quarter of the object's images further on.
+
+    That is a quarter turn where the views go around the object: half of one would show the same outline mirrored.
+    """
+    order = np.argsort(object_ids, kind="stable")
+    others = np.empty_like(order)
+    for group in np.split(order, np.flatnonzero(np.diff(object_ids[order])) + 1):
+        others[group] = np.roll(group, -max(1, len(group) // 4))
+    return torch.from_numpy(others)
+
+
+def _silhouette_ious(shapes: Meshes, batch: Batch) -> Tensor:
+    """IoU [B] of silhouettes at the cameras of a batch with its masks: sum of the smaller over sum of the larger value.
+
+    1 where they are equal, soft borders included; NaN where both are empty.
+    """
+    size = batch.masks.shape[-1]
+    seen = nmr.render_silhouette(shapes.vertices, shapes.faces, batch.cameras, image_size=size).flatten(1)
+    masks = batch.masks.flatten(1)
+    return torch.minimum(seen, masks).sum(1) / torch.maximum(seen, masks).sum(1)
 
 
 def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> Tensor:

@@ -17,6 +17,7 @@ COLUMNS = {
     "voxel_iou_kato19": "IoU (kato19)",
     "chamfer_l1": "Chamfer-L1",
     "f_score": "F-score",
+    "silhouette_iou": "silhouette IoU",
     "mmd": "MMD",
     "mmd_paper": "MMD (printed formula)",
 }
@@ -73,6 +74,7 @@ def evaluate_runs(
         "voxels": "32^3, filled surface voxels, mean over images, then over classes; kato18 and kato19 are the two "
         "published voxelisers of predictions, not comparable with each other",
         "surfaces": f"{SURFACE_POINTS} points each, object frame; F-score at a distance of {F_SCORE_DISTANCE}",
+        "silhouettes": "data without voxels: IoU with the mask of another image of the object, at its camera",
         "mmd": f"mean over all pairs of views, up to {CODES_PER_VIEW} codes each; five kernels, no root",
         "mmd_paper": "the same with the paper's printed formula: one kernel, square root",
     }

@@ -203,14 +203,3 @@ PRESETS: dict[str, Preset] = {
         augment=("crop", "flip-image"),
     ),
 }
-
-
-def method_name(settings: Settings) -> str:
-    """The method that settings belong to: pose_invariant, multi_view ..."""
-    names = {
-        PoseInvariantSettings: "pose_invariant",
-        MultiViewSettings: "multi_view",
-        VPLSettings: "vpl",
-        PrGANSettings: "prgan",
-    }
-    return names[type(settings)]

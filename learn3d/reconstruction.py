@@ -16,7 +16,7 @@ from learn3d import checkpoint, figures, files
 from learn3d.data.crops import Crops
 from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo
 from learn3d.data.kato import mesh_to_object
-from learn3d.data.layouts import NATURAL_COLORS, Layout, load_dataset
+from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
 from learn3d.methods import Method
 
 STRIP_SIZE = 160
@@ -56,7 +56,7 @@ def prepare_image(
         centre_y, centre_x = mask.shape[0] / 2, mask.shape[1] / 2
         side = float(max(mask.shape))
     resized = _resample(stored, centre_x - side / 2, centre_y - side / 2, side, size)
-    if layout in NATURAL_COLORS:
+    if not LAYOUTS[layout].inverted:
         resized[..., :3] = 255 - resized[..., :3]
     return np.rint(resized.transpose(2, 0, 1)).clip(0, 255).astype(np.uint8)
 
@@ -144,7 +144,7 @@ def reconstruct_files(
     names = [Path(image).stem for image in images]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]
-    options["inverted"] = config.layout not in NATURAL_COLORS
+    options["inverted"] = LAYOUTS[config.layout].inverted
     return _save_all(method, folder, names, np.stack(prepared), options)
 
 

@@ -23,7 +23,7 @@ class Progress:
     """Where a run stands."""
 
     step: int = 0  # steps taken
-    best_iou: float = -1.0  # best validation voxel IoU so far; -1 before the first validation
+    best_iou: float = -1.0  # best validation IoU so far, see `validate`; -1 before the first validation
     best_step: int = 0
     seconds: float = 0.0  # spent in training, over all resumptions
     object_share: float = 0.0  # side of the objects' bounding squares over that of the pictures, training mean

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from learn3d import files
+from learn3d import checkpoint, files
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.data.augment import augment
 from learn3d.data.layouts import load_dataset
@@ -65,7 +65,12 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         torch.set_num_threads(config.threads)
     train_set, val_set = load_splits(config)
     precision = resolve_precision(config.precision, config.device)
-    shape = DataShape(train_set.num_views, train_set.num_classes, train_set.poses.num_features)
+    shape = DataShape(
+        train_set.num_views, train_set.num_classes, train_set.poses.num_features, inverted=train_set.inverted
+    )
+    if resume:  # a run goes on as it began, also one from before encoders could turn colours back
+        began = checkpoint.data_shape(checkpoint.load_metadata(config.output / "last.safetensors"))
+        shape = replace(shape, inverted=began.inverted)
     method = create_method(config.settings, shape, device=config.device, precision=precision, seed=config.seed)
     progress = Progress(object_share=object_share(train_set))
     conditions = Conditions(len(train_set), f"{zlib.crc32(np.ascontiguousarray(train_set.images)):08x}", precision)

@@ -27,18 +27,18 @@ def validate(
     progress: Progress,
     log: RunLog,
 ) -> None:
-    """Measure voxel IoU and MMD on the validation images; keep the networks when they are the best so far.
+    """Measure IoU and MMD on the validation images; keep the networks when their IoU is the best so far.
 
-    A data set without true shapes has no best: its MMD alone says nothing about the shapes.
+    It is the IoU of voxels; where no true shapes are known that of silhouettes, at cameras that were not the input's.
     """
     result = evaluate(method, val_set, max_images=config.max_val_images)
     log.metrics(progress.step, config.val_split, {k: v for k, v in result.summary().items() if v is not None})
     mmd = "" if result.mmd is None else f", MMD {result.mmd:.3f}"
-    iou = -1.0 if result.voxel_iou is None else result.voxel_iou
-    better = iou > progress.best_iou
+    kind, iou = result.chosen_by
+    better = iou is not None and iou > progress.best_iou
     mark = " (best so far)" if better else ""
-    shown = "undefined" if result.voxel_iou is None else f"{iou:.4f}"
-    log.say(f"step {progress.step}: {config.val_split} voxel IoU {shown}{mmd}{mark}")
+    shown = "undefined" if iou is None else f"{iou:.4f}"
+    log.say(f"step {progress.step}: {config.val_split} {kind} {shown}{mmd}{mark}")
     if result.undefined:
         log.say(f"warning: {result.undefined} images have no IoU (prediction and truth are both empty); left out")
     if better:

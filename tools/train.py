@@ -80,7 +80,7 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     state = "finished" if summary.finished else "stopped"
-    best = f"best validation voxel IoU {summary.best_iou:.4f} at step {summary.best_step}; "
+    best = f"best validation IoU {summary.best_iou:.4f} at step {summary.best_step}; "
     print(
         f"{state} at step {summary.step} after {summary.seconds / 60:.1f} min; "
         f"{best if summary.best_step else ''}everything is in {summary.folder}"

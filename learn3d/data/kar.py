@@ -29,7 +29,6 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import scipy.io
@@ -38,11 +37,11 @@ from PIL import Image
 from learn3d.data.conventions import KAR, VOXEL_SIZE
 from learn3d.data.findings import AGAIN, DamagedFile, Findings, MissingFile, Problem
 from learn3d.data.kato import synset_of
-from learn3d.data.poses import LookAtPoses
 from learn3d.data.reading import (
-    assemble,
+    ReadObject,
     check_split,
     check_square,
+    join_objects,
     map_objects,
     read_image,
     read_table,
@@ -51,7 +50,6 @@ from learn3d.data.reading import (
     warn_if_empty,
     warn_of_repeats,
 )
-from learn3d.data.view_bins import AngleBins
 from learn3d.data.views import SPLITS, ViewDataset
 
 NUM_RENDERS = 20
@@ -62,26 +60,20 @@ BROKEN = frozenset(
 )
 
 
-class _Object(NamedTuple):
-    views: list[tuple[np.ndarray, np.ndarray] | None]  # V times image uint8 [4, S, S] and mask uint8 [64, 64]
-    poses: np.ndarray | None  # float64 [V, 4], columns of view.txt
-    voxels: np.ndarray | None  # bool [32, 32, 32]
-
-
 def load(
     folder: Path | str,
     category: str,
     split: str,
     *,
     image_size: int = 64,
-    view_bins: AngleBins | None = None,
     views_per_object: int | None = None,
     progress: bool = False,
 ) -> ViewDataset:
     """Read one category (name or synset id) and split of a folder.
 
+    Pose classes are cells of 15 x 20 degrees of azimuth and elevation over elevations -20 .. 40 (K = 72).
+
     image_size: side of the images in pixels, 64 or up to 224. The masks to be matched have 64 pixels in any case.
-    view_bins: cells of azimuth and elevation, by default 15 x 20 degrees over elevations -20 .. 40 (K = 72).
     views_per_object: use the first 1 .. 20 renders of each object; None: 1 for training, all for the other splits.
     Raises FileNotFoundError or ValueError naming the first file that is missing or not as described above.
     """
@@ -94,22 +86,16 @@ def load(
     read = map_objects(
         lambda name: _read(folder, synset_of(category), name, views, image_size, findings), ids, category, progress
     )
-    images, masks, tables, voxels = assemble(read, len(ids), views, image_size)
-    poses = LookAtPoses(tables[:, 0], tables[:, 1], tables[:, 3], HALF_FOV_DEG)
-    bins = AngleBins.parse(VIEW_BINS) if view_bins is None else view_bins
-    return ViewDataset(
+    return join_objects(
+        read,
+        ids,
+        views,
+        image_size,
         category=category,
         split=split,
-        images=images,
-        poses=poses,
-        view_ids=bins.ids(poses).numpy(),
-        view_names=tuple(bins.names()),
-        object_ids=np.repeat(np.arange(len(ids)), views),
-        object_names=tuple(ids),
-        voxels=voxels,
+        half_fov_deg=HALF_FOV_DEG,
+        view_bins=VIEW_BINS,
         convention=KAR,
-        masks=masks,
-        inverted=False,
     )
 
 
@@ -191,16 +177,16 @@ def _read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
     return lists
 
 
-def _read(folder: Path, synset: str, name: str, views: int, size: int, findings: Findings) -> _Object:
+def _read(folder: Path, synset: str, name: str, views: int, size: int, findings: Findings) -> ReadObject:
     """One object; None for the parts that findings tell of."""
     root = folder / "renders" / synset / name
     voxels = findings.attempt(_read_voxels, folder / "voxels" / "modelVoxels32" / synset / f"{name}.mat")
     if voxels is not None and not voxels.any():
         findings.warn(folder / "voxels" / "modelVoxels32" / synset / f"{name}.mat", "the grid is empty")
     if findings.attempt(_check_folder, root) is None:
-        return _Object([], None, voxels)
+        return ReadObject([], None, voxels)
     table = findings.attempt(_read_views, root / "view.txt", views)
-    return _Object([_read_view(root, k, size, findings) for k in range(views)], table, voxels)
+    return ReadObject([_read_view(root, k, size, findings) for k in range(views)], table, voxels)
 
 
 def _check_folder(root: Path) -> Path:
@@ -210,6 +196,7 @@ def _check_folder(root: Path) -> Path:
 
 
 def _read_views(path: Path, rows: int) -> np.ndarray:
+    """Azimuth, elevation and distance of each render, float64 [rows, 3]."""
     wanted = "a row per render: azimuth, elevation, (unused), distance"
     table = read_table(path, rows, 4, wanted)
     if (bad := (np.abs(table[:, 1]) >= 90) | (table[:, 3] <= 0)).any():
@@ -217,7 +204,7 @@ def _read_views(path: Path, rows: int) -> np.ndarray:
         raise DamagedFile(
             path, f"row {k} has elevation {table[k, 1]:g} and distance {table[k, 3]:g}; expected {wanted}"
         )
-    return table
+    return table[:, [0, 1, 3]]
 
 
 def _read_view(root: Path, k: int, size: int, findings: Findings) -> tuple[np.ndarray, np.ndarray] | None:

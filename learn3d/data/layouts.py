@@ -1,19 +1,62 @@
-"""Data sets by the name of their layout: the one place that knows which reader goes with which."""
+"""Data sets by the name of their layout: what sets each layout apart, and its reader, `learn3d.data.<layout>`."""
 
 from __future__ import annotations
 
-from functools import partial
+import importlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 from learn3d.data import kato
 from learn3d.data.view_bins import AngleBins
 from learn3d.data.views import ViewDataset, concatenate
 
 Layout = Literal["kato", "dvr", "kar", "r2n2", "pascal3d", "photos"]
-LAYOUTS: tuple[str, ...] = get_args(Layout)
-#: Layouts whose images keep their colours as they are (`ViewDataset.inverted` is False).
-NATURAL_COLORS = frozenset({"kar", "r2n2", "pascal3d"})
+
+
+@dataclass(frozen=True)
+class LayoutProperties:
+    """What is true of all data sets of a layout."""
+
+    voxels: bool  # there are true shapes, with which voxel IoU can be measured
+    inverted: bool  # colours are stored as 255 - colour over black, see `ViewDataset.inverted`
+    validation: bool = True  # there is a split "val"; without one, networks are validated on "test"
+    angles: bool = True  # cameras have azimuth and elevation, whose cells can serve as view classes
+    options: tuple[str, ...] = ()  # of `load_dataset`, beside view_bins, that the reader knows
+
+
+#: Every layout. Kato's renderings (and DVR's copy of them) are 24 views of 64x64 pixels, whatever is asked for.
+LAYOUTS: dict[str, LayoutProperties] = {
+    "kato": LayoutProperties(voxels=True, inverted=True),
+    "dvr": LayoutProperties(voxels=False, inverted=True, options=("progress",)),
+    "kar": LayoutProperties(voxels=True, inverted=False, options=("image_size", "views_per_object", "progress")),
+    "r2n2": LayoutProperties(
+        voxels=True, inverted=False, validation=False, options=("image_size", "views_per_object", "progress")
+    ),
+    "pascal3d": LayoutProperties(voxels=True, inverted=False, angles=False, options=("image_size",)),
+    "photos": LayoutProperties(voxels=False, inverted=True, options=("image_size", "progress")),
+}
+
+
+def check_options(
+    layout: str, *, image_size: int = kato.IMAGE_SIZE, view_bins: str | None = None, views_per_object: int | None = None
+) -> None:
+    """Raise a ValueError for an unknown layout and for an option of `load_dataset` that does not go with it."""
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
+    properties = LAYOUTS[layout]
+    if "image_size" not in properties.options and image_size != kato.IMAGE_SIZE:
+        size = f"{kato.IMAGE_SIZE}x{kato.IMAGE_SIZE}"
+        raise ValueError(f"images of the layout {layout!r} have {size} pixels, but {image_size} are wanted")
+    if "views_per_object" not in properties.options and views_per_object is not None:
+        raise ValueError(f"views_per_object cannot be chosen with the layout {layout!r}: it uses all there are")
+    if view_bins is not None:
+        AngleBins.parse(view_bins)
+        if not properties.angles:
+            raise ValueError(
+                f"view_bins {view_bins!r}: cells of azimuth and elevation need cameras that look at the object, those "
+                f"of the layout {layout!r} are rotations; choose a preset that is made for it"
+            )
 
 
 def load_dataset(
@@ -22,7 +65,7 @@ def load_dataset(
     category: str,
     split: str,
     *,
-    image_size: int = 64,
+    image_size: int = kato.IMAGE_SIZE,
     view_bins: str | None = None,
     views_per_object: int | None = None,
     progress: bool = False,
@@ -37,46 +80,12 @@ def load_dataset(
     Raises ValueError for an unknown layout, an option that the layout does not have, and damaged files (named);
     FileNotFoundError for missing ones.
     """
-    if layout not in LAYOUTS:
-        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}; got {layout!r}")
+    check_options(layout, image_size=image_size, view_bins=view_bins, views_per_object=views_per_object)
     names = [name.strip() for name in category.split(",")]
     if len(set(names)) != len(names) or not all(names):
         raise ValueError(f"category must be one name, or different names joined by commas, got {category!r}")
-    bins = None if view_bins is None else AngleBins.parse(view_bins)
-    random_views = {"image_size": image_size, "view_bins": bins, "views_per_object": views_per_object}
-    # Readers are imported when they are asked for: each needs other packages.
-    if layout == "kato":
-        _check_fixed_views(layout, image_size, views_per_object)
-        load = kato.load
-    elif layout == "dvr":
-        from learn3d.data import dvr
-
-        _check_fixed_views(layout, image_size, views_per_object)
-        load = partial(dvr.load, progress=progress)
-    elif layout == "kar":
-        from learn3d.data import kar
-
-        load = partial(kar.load, **random_views, progress=progress)
-    elif layout == "r2n2":
-        from learn3d.data import r2n2
-
-        load = partial(r2n2.load, **random_views, progress=progress)
-    elif views_per_object is not None:
-        raise ValueError(f"views_per_object cannot be chosen with the layout {layout!r}: it uses all there are")
-    elif layout == "pascal3d":
-        from learn3d.data import pascal3d
-
-        load = partial(pascal3d.load, image_size=image_size)
-    else:
-        from learn3d.data import photos
-
-        load = partial(photos.load, image_size=image_size, progress=progress)
-    dataset = concatenate([load(folder, name, split) for name in names])
-    return dataset.with_bins(bins) if bins is not None and layout not in ("kar", "r2n2") else dataset
-
-
-def _check_fixed_views(layout: str, image_size: int, views_per_object: int | None) -> None:
-    if image_size != kato.IMAGE_SIZE or views_per_object is not None:
-        raise ValueError(
-            f"image_size and views_per_object cannot be chosen with the layout {layout!r}: 24 views, 64x64"
-        )
+    reader = importlib.import_module(f"learn3d.data.{layout}")  # now, as each needs other packages
+    given = {"image_size": image_size, "views_per_object": views_per_object, "progress": progress}
+    options = {name: given[name] for name in LAYOUTS[layout].options}
+    dataset = concatenate([reader.load(folder, name, split, **options) for name in names])
+    return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))

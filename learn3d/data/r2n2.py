@@ -28,7 +28,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -36,12 +35,12 @@ from learn3d.data.binvox import Binvox, read_binvox
 from learn3d.data.conventions import R2N2, VOXEL_SIZE
 from learn3d.data.findings import DamagedFile, Findings, MissingFile, Problem
 from learn3d.data.kato import synset_of
-from learn3d.data.poses import LookAtPoses
 from learn3d.data.reading import (
-    assemble,
+    ReadObject,
     category_folder,
     check_split,
     check_square,
+    join_objects,
     map_objects,
     read_image,
     read_table,
@@ -49,7 +48,6 @@ from learn3d.data.reading import (
     split_alpha,
     warn_if_empty,
 )
-from learn3d.data.view_bins import AngleBins
 from learn3d.data.views import ViewDataset
 
 NUM_RENDERS = 24
@@ -59,26 +57,20 @@ VIEW_BINS = "15x5:25:30"  # K = 24: elevations differ by five degrees only
 SPLITS = ("train", "test")
 
 
-class _Object(NamedTuple):
-    views: list[tuple[np.ndarray, np.ndarray] | None]  # V times image uint8 [4, S, S] and mask uint8 [64, 64]
-    poses: np.ndarray | None  # float64 [V, 3]: azimuth of the object frame, elevation, distance
-    voxels: np.ndarray | None  # bool [32, 32, 32]
-
-
 def load(
     folder: Path | str,
     category: str,
     split: str,
     *,
     image_size: int = 64,
-    view_bins: AngleBins | None = None,
     views_per_object: int | None = None,
     progress: bool = False,
 ) -> ViewDataset:
     """Read one category (name or synset id) and split ("train" or "test") of a folder.
 
+    Pose classes are cells of 15 x 5 degrees of azimuth and elevation over elevations 25 .. 30 (K = 24).
+
     image_size: side of the images in pixels, up to 137. The masks to be matched have 64 pixels in any case.
-    view_bins: cells of azimuth and elevation, by default 15 x 5 degrees over elevations 25 .. 30 (K = 24).
     views_per_object: use the first 1 .. 24 images of each object; None: all.
     Raises FileNotFoundError or ValueError naming the first file that is missing or not as described above.
     """
@@ -90,22 +82,16 @@ def load(
     read = map_objects(
         lambda name: _read(folder, synset_of(category), name, views, image_size, findings), ids, category, progress
     )
-    images, masks, tables, voxels = assemble(read, len(ids), views, image_size)
-    poses = LookAtPoses(*tables.T, HALF_FOV_DEG)
-    bins = AngleBins.parse(VIEW_BINS) if view_bins is None else view_bins
-    return ViewDataset(
+    return join_objects(
+        read,
+        ids,
+        views,
+        image_size,
         category=category,
         split=split,
-        images=images,
-        poses=poses,
-        view_ids=bins.ids(poses).numpy(),
-        view_names=tuple(bins.names()),
-        object_ids=np.repeat(np.arange(len(ids)), views),
-        object_names=tuple(ids),
-        voxels=voxels,
+        half_fov_deg=HALF_FOV_DEG,
+        view_bins=VIEW_BINS,
         convention=R2N2,
-        masks=masks,
-        inverted=False,
     )
 
 
@@ -147,7 +133,7 @@ def object_ids(folder: Path | str, category: str, split: str) -> list[str]:
     return chosen
 
 
-def _read(folder: Path, synset: str, name: str, views: int, size: int, findings: Findings) -> _Object:
+def _read(folder: Path, synset: str, name: str, views: int, size: int, findings: Findings) -> ReadObject:
     """One object; None for the parts that findings tell of."""
     root = folder / "ShapeNetRendering" / synset / name / "rendering"
     path = folder / "ShapeNetVox32" / synset / name / "model.binvox"
@@ -155,12 +141,12 @@ def _read(folder: Path, synset: str, name: str, views: int, size: int, findings:
     if grid is not None:
         _warn_of_grid(path, grid, findings)
     if findings.attempt(_check_folder, root) is None:
-        return _Object([], None, None)
+        return ReadObject([], None, None)
     table = findings.attempt(_read_poses, root / "rendering_metadata.txt", views)
     if table is not None and grid is not None:
         table[:, 2] /= grid.scale
     images = [_read_view(root / f"{k:02d}.png", size, findings) for k in range(views)]
-    return _Object(images, table, None if grid is None else grid.voxels)
+    return ReadObject(images, table, None if grid is None else grid.voxels)
 
 
 def _warn_of_grid(path: Path, grid: Binvox, findings: Findings) -> None:

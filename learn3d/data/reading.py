@@ -10,15 +10,18 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from learn3d.data.conventions import VoxelConvention
 from learn3d.data.findings import AGAIN, DamagedFile, Findings, MissingFile
 from learn3d.data.kato import synset_of
-from learn3d.data.views import MASK_SIZE, SPLITS
+from learn3d.data.poses import LookAtPoses
+from learn3d.data.view_bins import AngleBins
+from learn3d.data.views import MASK_SIZE, SPLITS, ViewDataset
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -164,25 +167,54 @@ def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
     return table
 
 
-def assemble(
-    objects: Iterable[tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray, np.ndarray]],
-    count: int,
-    views: int,
-    size: int,
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]:
-    """The arrays of a data set from `count` objects: `views` results of `shrink`, a pose table and voxels each.
+class ReadObject(NamedTuple):
+    """One object as its files have it; None for the parts that findings tell of."""
 
-    Returns images uint8 [M, 4, size, size]; masks uint8 [M, 64, 64], or None where they are the images' fourth channel;
-    the rows of the tables float64 [M, C]; voxels bool [N, 32, 32, 32].
+    views: list[tuple[np.ndarray, np.ndarray] | None]  # V results of `shrink`
+    poses: np.ndarray | None  # float64 [V, 3]: azimuth of the object frame, elevation (degrees), distance
+    voxels: np.ndarray | None  # bool [32, 32, 32]
+
+
+def join_objects(
+    objects: Iterable[ReadObject],
+    names: Sequence[str],
+    views: int,
+    image_size: int,
+    *,
+    category: str,
+    split: str,
+    half_fov_deg: float,
+    view_bins: str,
+    convention: VoxelConvention,
+) -> ViewDataset:
+    """The data set of objects with these names, each seen from `views` sides of its own by one kind of camera.
+
+    view_bins: pose classes as `AngleBins.parse` takes them. Colours are as they are, not inverted.
     """
-    images = np.empty((count * views, 4, size, size), np.uint8)
-    masks = None if size == MASK_SIZE else np.empty((count * views, MASK_SIZE, MASK_SIZE), np.uint8)
+    count = len(names)
+    images = np.empty((count * views, 4, image_size, image_size), np.uint8)
+    masks = None if image_size == MASK_SIZE else np.empty((count * views, MASK_SIZE, MASK_SIZE), np.uint8)
     tables, grids = [], []
-    for i, (pairs, table, grid) in enumerate(objects):
-        for row, (image, mask) in enumerate(pairs, i * views):
+    for i, item in enumerate(objects):
+        for row, (image, mask) in enumerate(item.views, i * views):
             images[row] = image
             if masks is not None:
                 masks[row] = mask
-        tables.append(table)
-        grids.append(grid)
-    return images, masks, np.concatenate(tables), np.stack(grids)
+        tables.append(item.poses)
+        grids.append(item.voxels)
+    poses = LookAtPoses(*np.concatenate(tables).T, half_fov_deg)
+    bins = AngleBins.parse(view_bins)
+    return ViewDataset(
+        category=category,
+        split=split,
+        images=images,
+        poses=poses,
+        view_ids=bins.ids(poses).numpy(),
+        view_names=tuple(bins.names()),
+        object_ids=np.repeat(np.arange(count), views),
+        object_names=tuple(names),
+        voxels=np.stack(grids),
+        convention=convention,
+        masks=masks,
+        inverted=False,
+    )

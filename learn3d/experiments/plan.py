@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from learn3d import checkpoint
 from learn3d.config import TrainConfig, config_from_dict, differences, load_config
-from learn3d.data.layouts import Layout
+from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.experiments.tables import Row, Table, Variant
 from learn3d.networks import resolve_precision
 from learn3d.presets import PRESETS
@@ -21,7 +21,6 @@ RESULT_FILE = "test.json"
 LOG_FILE = "log.txt"
 #: Settings that are steps of the schedule, as the presets have them, for any number of iterations.
 _SCHEDULES = {"encoder_from_step": lambda n: n // 2 + 1, "decay_at_step": lambda n: n * 95 // 100}
-_WITHOUT_VOXELS = ("dvr", "photos")
 _OWN_OPTIONS = ("data", "category", "output", "preset", "settings", "layout", "iterations", "batch_size", "seed")
 
 
@@ -90,7 +89,8 @@ def plan_runs(table: Table, options: Options) -> list[Run]:
     Raises ValueError for an unknown method or preset, for a layout without true voxels, and for options that do not fit
     (see `TrainConfig`).
     """
-    if (layout := options.layout or table.layout) in _WITHOUT_VOXELS:
+    layout = options.layout or table.layout
+    if layout in LAYOUTS and not LAYOUTS[layout].voxels:
         raise ValueError(f"the layout {layout!r} has no true voxels, so that no run of the table could be measured")
     variants = [row.variant for row in selected_rows(table, options.methods) if row.variant]
     changes = _changes_by_variant(variants, table, options.changes)

@@ -22,6 +22,7 @@ class DataShape:
     num_views: int  # K pose classes
     num_classes: int = 1  # categories in the set
     pose_features: int = 3  # size of `Poses.features()`: 3 for an eye position, 9 for a rotation
+    inverted: bool = False  # colours are stored as 255 - colour (not looked at by runs whose checkpoints lack it)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.views import MASK_SIZE
 from learn3d.methods.method import DataShape, Meshes, Method, check_finite
-from learn3d.networks import ENCODERS, GENERATORS, EncoderName, GeneratorName, network_input
+from learn3d.networks import ENCODERS, GENERATORS, EncoderName, GeneratorName, create_encoder, network_input
 
 CENTROID_LEARNING_RATE = 0.1  # of the centroid's layer, relative to all others
 DECAY = 0.1  # of the step size, after `decay_at_step`
@@ -50,7 +50,7 @@ class MultiView(Method):
     ) -> None:
         self.settings, self.image_size = settings, settings.image_size
         self.device, self.precision = torch.device(device), precision
-        self.encoder = ENCODERS[settings.encoder]()
+        self.encoder = create_encoder(settings.encoder, inverted=shape.inverted)
         self.generator = GENERATORS[settings.generator]()
         self.networks = {"encoder": self.encoder, "generator": self.generator}
         for network in self.networks.values():

@@ -14,7 +14,15 @@ from learn3d.data.batch import Batch
 from learn3d.data.views import MASK_SIZE
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import DataShape, Meshes, Method, adam, check_finite, frozen
-from learn3d.networks import ENCODERS, GENERATORS, EncoderName, GeneratorName, PoseDiscriminator, network_input
+from learn3d.networks import (
+    ENCODERS,
+    GENERATORS,
+    EncoderName,
+    GeneratorName,
+    PoseDiscriminator,
+    create_encoder,
+    network_input,
+)
 from learn3d.networks.resnet import load_pretrained
 
 
@@ -27,7 +35,8 @@ class PoseInvariantSettings:
     generator: GeneratorName = "sphere"
     """sphere: 642 free vertices. symmetric: mirrored at z = 0."""
     pretrained: Path | None = None
-    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's. None: random."""
+    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's. None: random.
+    The encoder gets natural colours, R, G, B, normalised as ImageNet's, however the data set stores them."""
     learning_rate: float = 1e-4
     """Adam's step size, the same for the three networks and constant."""
     lambda_smooth: float = 0.001
@@ -71,7 +80,7 @@ class PoseInvariant(Method):
     ) -> None:
         self.settings, self.image_size = settings, settings.image_size
         self.device, self.precision = torch.device(device), precision
-        self.encoder = ENCODERS[settings.encoder]()
+        self.encoder = create_encoder(settings.encoder, inverted=shape.inverted)
         if settings.pretrained is not None:
             load_pretrained(self.encoder, settings.pretrained)
         self.generator = GENERATORS[settings.generator]()

@@ -48,7 +48,7 @@ class VPLSettings:
     The last two take any multiple of 32 pixels."""
     pretrained: Path | None = None
     """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's; its batch norms
-    stay frozen then. None: random weights."""
+    stay frozen then. None: random weights. The encoder gets natural colours, however the data set stores them."""
     image_size: int = 64
     """Side of the input images in pixels."""
     generator: Literal["sphere", "cube-conv", "cube-fc"] = "sphere"
@@ -110,7 +110,7 @@ class VPL(Method):
         _check(settings, shape)
         self.settings, self.device, self.precision = settings, torch.device(device), precision
         self.image_size = settings.image_size
-        self.encoder = _create_encoder(settings)
+        self.encoder = _create_encoder(settings, shape)
         self.generator = _create_generator(settings)
         self.networks = {"encoder": self.encoder, "generator": self.generator}
         if settings.lambda_discriminator > 0:
@@ -257,11 +257,11 @@ def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> 
     return torch.multinomial(weights, 1).squeeze(1)
 
 
-def _create_encoder(settings: VPLSettings) -> nn.Module:
+def _create_encoder(settings: VPLSettings, shape: DataShape) -> nn.Module:
     if settings.encoder == "preact-resnet18":
         return PreactResNet18(settings.image_size)
     if settings.encoder == "resnet18":
-        return FlatResNet18(settings.image_size, settings.pretrained)
+        return FlatResNet18(settings.image_size, settings.pretrained, shape.inverted)
     encoder = ENCODERS[settings.encoder]()
     if settings.image_size != encoder.image_size:
         raise ValueError(

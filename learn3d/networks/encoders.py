@@ -78,6 +78,15 @@ ENCODERS: dict[str, type[nn.Module]] = {
 }
 
 
+def create_encoder(name: EncoderName, *, inverted: bool) -> nn.Module:
+    """The encoder `name` for images whose colours are stored as 255 - colour, or as they are.
+
+    Only resnet18 cares, whose normalisation and pretrained weights are those of natural colours; the others learn from
+    scratch, and, as published, on whatever is stored.
+    """
+    return ResNet18Encoder(inverted) if name == "resnet18" else ENCODERS[name]()
+
+
 def network_input(images: Tensor, device: torch.device | str, size: int = 64) -> Tensor:
     """Stored images uint8 [B,4,size,size] -> float32 in [0,1] on `device`, channels last."""
     if images.dtype != torch.uint8 or images.ndim != 4 or images.shape[1:] != (4, size, size):

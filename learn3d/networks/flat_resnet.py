@@ -13,17 +13,19 @@ from learn3d.networks.resnet import ResNet18Encoder, load_pretrained
 class FlatResNet18(nn.Module):
     """Images [B,4,S,S] in [0,1], the mask unused -> shape code [B,512], linear in the 512 * (S/32)^2 last features.
 
+    `inverted`: the images hold 1 - colour, see `ResNet18Encoder`.
+
     `pretrained`: file of ImageNet weights (torchvision's resnet18). With it the batch norms stay as they are in the
     file, statistics, gain and offset, as published; the convolutions are trained. Without it everything is trained from
     scratch: batch norms frozen at their initial values would normalise nothing.
     """
 
-    def __init__(self, image_size: int = 224, pretrained: Path | None = None) -> None:
+    def __init__(self, image_size: int = 224, pretrained: Path | None = None, inverted: bool = False) -> None:
         super().__init__()
         if image_size < 32 or image_size % 32:
             raise ValueError(f"image_size must be a multiple of 32 for FlatResNet18, got {image_size}")
         self.image_size = image_size
-        self.resnet = ResNet18Encoder()
+        self.resnet = ResNet18Encoder(inverted)
         self.code = nn.Linear(512 * (image_size // 32) ** 2, CODE_SIZE)
         self.frozen_norms: list[nn.BatchNorm2d] = []
         if pretrained is not None:

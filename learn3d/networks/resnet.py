@@ -34,14 +34,18 @@ class _Block(nn.Module):
 class ResNet18Encoder(nn.Module):
     """Images [B, 4, 224, 224] in [0, 1] -> shape codes [B, 512]: the average-pooled features, which are not negative.
 
-    The first three channels are normalised by ImageNet's mean and deviation; the mask is not looked at. As in the
-    published code of Peng et al. 2020 on Pascal3D+ the pooled features are the code, without a layer behind them.
+    The first three channels, R, G, B, are normalised by ImageNet's mean and deviation; the mask is not looked at. As in
+    the published code of Peng et al. 2020 on Pascal3D+ the pooled features are the code, without a layer behind them.
+
+    `inverted`: the images hold 1 - colour, as Kato's form has it. They are turned back first: ImageNet's mean and
+    weights are those of natural colours.
     """
 
     image_size = 224
 
-    def __init__(self) -> None:
+    def __init__(self, inverted: bool = False) -> None:
         super().__init__()
+        self.inverted = inverted
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
         self.conv1 = nn.Conv2d(3, 64, 7, 2, padding=3, bias=False)
@@ -56,7 +60,8 @@ class ResNet18Encoder(nn.Module):
 
     def features(self, images: Tensor) -> Tensor:
         """The last features [B, 512, 7, 7], before they are pooled."""
-        x = (images[:, :3] - self.mean) / self.std
+        colors = 1 - images[:, :3] if self.inverted else images[:, :3]
+        x = (colors - self.mean) / self.std
         x = F.max_pool2d(F.relu(self.bn1(self.conv1(x))), 3, 2, padding=1)
         return self.layer4(self.layer3(self.layer2(self.layer1(x))))
 

@@ -102,10 +102,29 @@ def test_grids_are_pooled_and_brought_into_the_axes(tiny_set) -> None:
         evaluate(Constant(Grids(grid)), pascal, max_images=2)
 
 
-def test_without_voxels_there_is_an_mmd_alone(tiny_set) -> None:
-    result = evaluate(Constant(egg()), dataclasses.replace(tiny_set, voxels=None), surfaces=True)
+def test_without_voxels_silhouettes_at_other_cameras_are_compared(tiny_set) -> None:
+    def silhouettes_of(shape: Meshes):
+        """The data set as photographs of the shape."""
+        masks = nmr.render_silhouette(shape.vertices, shape.faces, tiny_set.poses.cameras(), image_size=64)
+        images = tiny_set.images.copy()
+        images[:, 3] = (255 * masks).round()
+        return dataclasses.replace(tiny_set, images=images, voxels=None)
+
+    photographs = silhouettes_of(egg())
+    result = evaluate(Constant(egg()), photographs, surfaces=True)
     assert (result.voxel_iou, result.undefined, result.chamfer_l1) == (None, 0, None)
     assert result.mmd is not None
+    assert result.chosen_by == ("silhouette IoU", pytest.approx(1, abs=0.01))
+    assert result.silhouette_iou.shape == (72,)
+    flat = Meshes(egg().vertices * torch.tensor([1.0, 1.0, 0.1]), egg().faces)  # the same from views 0 and 12
+    facing = photographs.select(np.flatnonzero(np.isin(photographs.view_ids, (0, 6))))
+    own, other = (evaluate(Constant(flat), facing).silhouette_iou[k::2].mean() for k in (1, 0))
+    assert own > 0.9 > 0.6 > other, "each image is judged by the other view"
+    single = photographs.select(np.flatnonzero(photographs.view_ids == 0))
+    assert evaluate(Constant(flat), single).silhouette_iou.mean() > 0.9, "or by itself where there is no other"
+    assert evaluate(Constant(egg()), tiny_set).silhouette_iou is None, "true shapes say more"
+    grids = Grids(torch.zeros(1, 64, 64, 64))
+    assert evaluate(Constant(grids), photographs).chosen_by == ("voxel IoU", None)
 
 
 def test_images_without_iou_are_counted_and_left_out(tiny_set) -> None:

@@ -71,7 +71,7 @@ def test_protocol_of_the_published_code(original):
     table = np.loadtxt(renders(original, "b1") / "view.txt")
     wanted = (table[:, 0] + 180) // 15 * 3 + (table[:, 1] + 20) // 20
     np.testing.assert_array_equal(everything.view_ids, wanted)
-    coarse = kar.load(original, "chair", "train", view_bins=AngleBins(60, 60))
+    coarse = kar.load(original, "chair", "train").with_bins(AngleBins(60, 60))
     assert coarse.num_views == 6
 
 

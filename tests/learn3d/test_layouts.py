@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import json
 import shutil
+from typing import get_args
 
 import numpy as np
 import pytest
 from shapenet_files import CHAIR, write_dvr, write_kar, write_r2n2
 
-from learn3d.data.layouts import LAYOUTS, load_dataset
+from learn3d.data.layouts import LAYOUTS, Layout, check_options, load_dataset
 
 LISTS = {"train": ["b1"], "val": ["c2"], "test": ["a0"]}
 
@@ -66,16 +69,32 @@ def test_progress_is_off_unless_asked_for(folders, capsys):
     assert "chair" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("layout", ["kato", "dvr"])
-@pytest.mark.parametrize("option", [{"image_size": 224}, {"views_per_object": 1}])
-def test_layouts_of_fixed_views_refuse_to_choose(folders, layout, option):
-    with pytest.raises(ValueError, match=f"cannot be chosen with the layout '{layout}': 24 views, 64x64"):
-        load_dataset(layout, folders / layout, "chair", "test", **option)
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("image_size", 224, "images of the layout '{}' have 64x64 pixels, but 224 are wanted"),
+        ("views_per_object", 1, "views_per_object cannot be chosen with the layout '{}'"),
+    ],
+)
+def test_options_that_a_layout_does_not_have_are_refused(layout, option, value, message):
+    if option in LAYOUTS[layout].options:
+        check_options(layout, **{option: value})
+    else:
+        with pytest.raises(ValueError, match=message.format(layout)):
+            load_dataset(layout, "nowhere", "chair", "test", **{option: value})
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_table_says_what_each_reader_takes(layout):
+    reader = importlib.import_module(f"learn3d.data.{layout}")
+    known = set(inspect.signature(reader.load).parameters) & {"image_size", "views_per_object", "progress"}
+    assert known == set(LAYOUTS[layout].options)
 
 
 def test_unknown_names(folders):
-    assert LAYOUTS == ("kato", "dvr", "kar", "r2n2", "pascal3d", "photos")
-    with pytest.raises(ValueError, match="layout must be one of kato, dvr, kar, r2n2, pascal3d, photos; got 'lsm'"):
+    assert tuple(LAYOUTS) == get_args(Layout) == ("kato", "dvr", "kar", "r2n2", "pascal3d", "photos")
+    with pytest.raises(ValueError, match="layout must be one of kato, dvr, kar, r2n2, pascal3d, photos, got 'lsm'"):
         load_dataset("lsm", folders, "chair", "test")
     for category in ("chair,chair", "", "chair,"):
         with pytest.raises(ValueError, match="different names joined by commas, got"):

@@ -14,12 +14,16 @@ import torch
 from PIL import Image
 
 import nmr
+from learn3d import checkpoint
+from learn3d.config import TrainConfig
 from learn3d.data import photos
 from learn3d.data.layouts import load_dataset
 from learn3d.data.photo_table import split_objects
 from learn3d.data.poses import LookAtPoses
+from learn3d.evaluation import evaluate
 from learn3d.methods.method import DataShape
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
+from learn3d.training import train
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "make_photo_folder.py"
 COLUMNS = ["file", "azimuth_deg", "elevation_deg", "distance", "fov_deg"]
@@ -29,6 +33,19 @@ COLUMNS = ["file", "azimuth_deg", "elevation_deg", "distance", "fov_deg"]
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("photos")
     return runpy.run_path(str(EXAMPLE))["main"](folder, "chair", objects=4, photos=3).parent
+
+
+def test_the_best_networks_are_those_with_the_best_silhouettes(made: Path, tmp_path: Path) -> None:
+    settings = PoseInvariantSettings(encoder="conv-small", generator="sphere-small", learning_rate=0.01)
+    about = {"data": made, "category": "chair", "layout": "photos", "settings": settings, "output": tmp_path / "run"}
+    summary = train(TrainConfig(**about, iterations=3, batch_size=4, precision="fp32", validate_every=1))
+    lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    measured = {line["step"]: line["silhouette_iou"] for line in lines if line["split"] == "val"}
+    assert summary.best_step == max(measured, key=measured.get)
+    method, _, metadata = checkpoint.load_method(tmp_path / "run" / "best.safetensors")
+    assert metadata["step"] == summary.best_step and measured[summary.best_step] == summary.best_iou
+    again = evaluate(method, load_dataset("photos", made, "chair", "val")).silhouette_iou
+    assert float(again.mean()) == pytest.approx(summary.best_iou, abs=1e-5)
 
 
 @pytest.fixture

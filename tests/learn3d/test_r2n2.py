@@ -85,7 +85,7 @@ def test_first_four_fifths_of_the_sorted_ids_are_for_training(tmp_path):
 
 def test_options(original):
     assert len(r2n2.load(original, "chair", "test", views_per_object=5)) == 5
-    bins = r2n2.load(original, "chair", "test", view_bins=AngleBins(60, 5, 25, 30))
+    bins = r2n2.load(original, "chair", "test").with_bins(AngleBins(60, 5, 25, 30))
     assert bins.num_views == 6 and len(set(bins.view_ids.tolist())) > 3
     with pytest.raises(ValueError, match=r"views_per_object must lie in 1 \.\. 24, got 0"):
         r2n2.load(original, "chair", "test", views_per_object=0)

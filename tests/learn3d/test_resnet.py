@@ -12,8 +12,9 @@ from torch import Tensor
 
 from learn3d.methods.method import DataShape
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
+from learn3d.methods.vpl import VPL, VPLSettings
 from learn3d.networks import ENCODERS, network_input
-from learn3d.networks.resnet import ResNet18Encoder, load_pretrained
+from learn3d.networks.resnet import IMAGENET_MEAN, IMAGENET_STD, ResNet18Encoder, load_pretrained
 
 
 def torchvision_names() -> dict[str, tuple[int, ...]]:
@@ -107,6 +108,28 @@ def test_it_takes_stored_images() -> None:
         assert ResNet18Encoder().eval()(network_input(images, "cpu", 224)).shape == (2, 512)
     with pytest.raises(ValueError, match=r"images must be uint8 \[B, 4, 224, 224\]"):
         network_input(images[:, :, :64, :64], "cpu", 224)
+
+
+@pytest.mark.parametrize("inverted", [True, False])
+@pytest.mark.parametrize("kind", ["pooled", "flat"])
+def test_it_sees_natural_colours_of_every_layout(kind: str, inverted: bool) -> None:
+    """A red pixel reaches the first convolution as ImageNet's red, whether it is stored as red or as 255 - red."""
+    stored = torch.zeros(1, 4, 224, 224, dtype=torch.uint8)
+    stored[:, 0], stored[:, 3] = 255, 255
+    stored[:, :3] = 255 - stored[:, :3] if inverted else stored[:, :3]
+    shape = DataShape(3, inverted=inverted)
+    if kind == "flat":
+        method = VPL(VPLSettings(encoder="resnet18", image_size=224), shape, "cpu", "fp32")
+        convolution = method.encoder.resnet.conv1
+    else:
+        method = PoseInvariant(PoseInvariantSettings(encoder="resnet18"), shape, "cpu", "fp32")
+        convolution = method.encoder.conv1
+    seen = []
+    convolution.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
+    with torch.no_grad():
+        method.encode(stored)
+    red = (torch.tensor([1.0, 0.0, 0.0]) - torch.tensor(IMAGENET_MEAN)) / torch.tensor(IMAGENET_STD)
+    torch.testing.assert_close(seen[0][0, :, 7, 11], red)
 
 
 def test_a_method_starts_from_pretrained_weights(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from lopsided_meshes import write_meshes
 
 import nmr
 from learn3d.data.kato import mesh_to_object
-from learn3d.data.layouts import LAYOUTS, NATURAL_COLORS, load_dataset
+from learn3d.data.layouts import LAYOUTS, load_dataset
 from learn3d.data.render import DatasetConfig, make_dataset
 
 SETTINGS = {
@@ -63,7 +63,7 @@ def mesh_of(made, split, number, name, count):
 def test_masks_cameras_and_voxels(made):
     for split in ("train", "val" if made.layout == "pascal3d" else "test"):
         dataset = load_dataset(made.layout, made.folder, "chair", split)
-        assert dataset.inverted == (made.layout not in NATURAL_COLORS)
+        assert dataset.inverted == LAYOUTS[made.layout].inverted
         expected = {"kato": 24, "dvr": 24, "kar": 20, "r2n2": 24, "pascal3d": 4, "photos": 4}[made.layout]
         if made.layout == "kar" and split == "train":
             expected = 1  # the published protocol
@@ -102,5 +102,5 @@ def test_masks_cameras_and_voxels(made):
 
 def test_every_layout_has_voxels_or_points_or_says_that_it_has_none(made):
     dataset = load_dataset(made.layout, made.folder, "chair", "train")
-    assert (dataset.voxels is not None) == (made.layout in ("kato", "kar", "r2n2", "pascal3d"))
+    assert (dataset.voxels is not None) == LAYOUTS[made.layout].voxels
     assert (dataset.points is not None) == (made.layout == "dvr")

@@ -118,7 +118,7 @@ def test_best_iou_is_said_where_there_is_one(best_step: int, shown: bool, tmp_pa
     assert call(module, monkeypatch, "--data", tmp_path, "--category", "chair", "--output", tmp_path) == 0
     out = capsys.readouterr().out
     assert out.startswith("stopped at step 700 after 1.0 min; ")
-    assert ("best validation voxel IoU 0.2500 at step 500" in out, "IoU" in out) == (shown, shown)
+    assert ("best validation IoU 0.2500 at step 500" in out, "IoU" in out) == (shown, shown)
     assert out.endswith(f"everything is in {tmp_path}\n")
 
 

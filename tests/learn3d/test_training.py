@@ -47,6 +47,20 @@ def make_step(config: TrainConfig, data: ViewDataset):
     return method.networks, lambda iteration: method.train_step(batch, iteration)
 
 
+def test_a_run_knows_how_colours_are_stored_and_goes_on_as_it_began(tiny_config, run_folder) -> None:
+    """Runs from before encoders turned colours back have no entry: resuming them must not change their input."""
+    small = {"preset": "peng2020-kato-vpl", "encoder": "resnet18", "image_size": 64, "lambda_discriminator": 0.0}
+    train(tiny_config(run_folder, **small, iterations=1))
+    path = run_folder / "last.safetensors"
+    assert checkpoint.data_shape(checkpoint.load_metadata(path)).inverted
+    assert checkpoint.load_method(path)[0].encoder.resnet.inverted
+    tensors, metadata = checkpoint.load(path)
+    del metadata["shape"]["inverted"]
+    checkpoint.save(path, tensors, metadata)
+    train(tiny_config(run_folder, **small, iterations=2), resume=True)
+    assert not checkpoint.load_method(path)[0].encoder.resnet.inverted
+
+
 def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
     networks, step = make_step(tiny_config(tmp_path), tiny_set)
     for iteration in (1, 2, 3):
@@ -145,7 +159,10 @@ def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
         ({"sampling": "all"}, "sampling must be one of views, pairs, classes"),
         ({"augment": ("zoom",)}, "augment must be one of flip, "),
         ({"augment": ("channels", "flip")}, "the discriminator of 'peng2020-kato' is told the class of the original"),
-        ({"layout": "r2n2"}, r"3D-R2N2's data have no val split; validate on test"),
+        ({"layout": "r2n2"}, "the layout 'r2n2' has no split val; validate on test"),
+        ({"encoder": "resnet18"}, "images of the layout 'kato' have 64x64 pixels, but 224 are wanted"),
+        ({"views_per_object": 1}, "views_per_object cannot be chosen with the layout 'kato'"),
+        ({"layout": "pascal3d", "view_bins": "15x20"}, "view_bins '15x20': .* of the layout 'pascal3d' are rotations"),
         ({"preset": "gadelha2017-kato"}, "encoder_from_step=53051 lies beyond the 4 iterations: .* such as 3"),
         ({"view_bins": "15"}, "view bins are written as AZIMUTHxELEVATION"),
         ({"prior_form": "cube"}, "prior_form must be one of squared, norm"),
