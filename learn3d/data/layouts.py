@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
 from learn3d.data import kato
+from learn3d.data.findings import DamagedFile, MissingFile
 from learn3d.data.view_bins import AngleBins
 from learn3d.data.views import ViewDataset, concatenate
 
@@ -71,7 +73,13 @@ def load_dataset(
         from learn3d.data import photos
 
         load = partial(photos.load, image_size=image_size, progress=progress)
-    dataset = concatenate([load(folder, name, split) for name in names])
+    try:
+        dataset = concatenate([load(folder, name, split) for name in names])
+    except (DamagedFile, MissingFile) as error:
+        check = f"python tools/check_dataset.py {shlex.quote(str(folder))} --layout {layout}"
+        raise type(error)(
+            error.path, f"{error.message}. All that is wrong with the data set is listed by: {check}"
+        ) from error
     return dataset.with_bins(bins) if bins is not None and layout not in ("kar", "r2n2") else dataset
 
 

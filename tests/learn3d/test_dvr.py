@@ -137,7 +137,7 @@ FAULTS = {
     ),
     "cameras.npz: is missing": lambda root: (root / "cameras.npz").unlink(),
     "cameras.npz: cannot be read": lambda root: cut_short(root / "cameras.npz"),
-    "cannot be read (it is a single npy array)": lambda root: (root / "pointcloud.npz").write_bytes(npy_bytes()),
+    "is not an npz file (it is a single npy array)": lambda root: (root / "pointcloud.npz").write_bytes(npy_bytes()),
     "lacks world_mat_7 (1 of 24 matrices)": lambda root: change_cameras(root, lambda a: a.pop("world_mat_7")),
     "world_mat_2 has the shape [3, 3]": set_matrix(2, lambda m: m[:3, :3]),
     "cameras.npz: has numbers that are not finite": set_matrix(2, lambda m: m * np.nan),
