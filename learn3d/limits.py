@@ -39,7 +39,7 @@ MESH_VERTICES = 20_000_000
 MESH_FACES = 20_000_000  # `max_faces` of make_dataset, 1,000,000, is the one that counts
 MESH_MEMORY = 8 * GIB  # bytes that reading one mesh may add; trimesh takes some 20 times a text file's size
 MESH_SECONDS = 300.0  # for reading one mesh file; one of 100 MB takes 20
-POLYGON_CORNERS = 5000  # of one polygon of a text format: cutting ears takes the square of it, or its cube
+POLYGON_CORNERS = 2000  # of one polygon of a text format: cutting ears takes the square of it, or its cube
 
 # Debian packages
 PACKAGE_FILE_BYTES = 512 * MIB  # one file of a package; the largest wanted today is a 61 MB catalogue
@@ -51,6 +51,7 @@ CATALOGUE_MEMBER_BYTES = 64 * MIB  # one file inside a catalogue; the largest wa
 CHECKPOINT_BYTES = 16 * GIB  # one with optimizer states: 0.7
 CHECKPOINT_HEADER_BYTES = 16 * MIB  # names, shapes and metadata: 50 kB
 WEIGHTS_BYTES = GIB  # pretrained weights: ResNet-18 has 45 MB
+WEIGHTS_SECONDS = 60.0  # for reading them: 0.1
 
 # Options: what a configuration may ask for
 ITERATIONS = 10**9  # steps
@@ -58,7 +59,7 @@ BATCH_SIZE = 65_536
 THREADS = 4096
 SEED = 2**63 - 1
 INPUT_SIDE = 1024  # pixels of the networks' images; 224 in the papers
-CHANNELS = 4096  # of a layer; 512 in the papers
+CHANNELS = 1024  # of the layer that a setting names; 128 in the papers
 VIEW_CLASSES = 100_000  # cells of azimuth and elevation; 512 in the papers
 CLASSES = 10_000  # categories trained together
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from learn3d import limits
 from learn3d.data import debian_packages as packages
 from learn3d.data.debian_aircraft import is_airplane_file, turn_to_front, without_effects
 from learn3d.data.debian_furniture import furniture_category, place_furniture, read_catalogue
@@ -235,7 +236,7 @@ def test_output_is_replaced_only_when_asked_and_ours(debs: Path, tmp_path: Path)
 
 def test_a_failure_leaves_nothing_behind(debs: Path, tmp_path: Path):
     deb(debs, "sweethome3d-furniture", {"usr/share/x.sh3f": b"no zip"})  # same name and version: replaces the good one
-    with pytest.raises(ValueError, match=r"x\.sh3f is not a zip archive"):
+    with pytest.raises(ValueError, match=r"x\.sh3f is refused as a zip archive"):
         fetch(tmp_path / "out", debs)
     assert [path.name for path in tmp_path.iterdir()] == ["debs"]
 
@@ -254,12 +255,12 @@ def test_unsafe_members_are_refused(debs: Path, tmp_path: Path):
 
 
 def test_oversized_members_are_refused(debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(packages, "MAX_FILE_BYTES", 100)
+    monkeypatch.setattr(limits, "PACKAGE_FILE_BYTES", 100)
     with pytest.raises(ValueError, match=r"bytes, at most 100 are read"):
         fetch(tmp_path / "out", debs)
     with zipfile.ZipFile(io.BytesIO(), "w") as archive:
         archive.writestr("m", b"x")
-        archive.getinfo("m").file_size = packages.MAX_MEMBER_BYTES + 1
+        archive.getinfo("m").file_size = limits.CATALOGUE_MEMBER_BYTES + 1
         with pytest.raises(ValueError, match="refused"):
             packages.read_member(archive, "m")
 
