@@ -118,8 +118,6 @@ def read_header(file: BinaryIO) -> Header:
         raise ValueError(f"npy format {version[0]}.{version[1]} is not read here, only 1.0")
     try:
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    except (ValueError, OSError, EOFError):
-        raise
     except Exception as error:  # the parser of Python's literals raises whatever a strange header leads it to
         raise ValueError(f"its header cannot be read ({type(error).__name__}: {error})") from error
     if len(shape) > 8 or not all(type(n) is int and n >= 0 for n in shape):

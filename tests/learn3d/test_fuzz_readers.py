@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import random
 import signal
-import tracemalloc
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ import pytest
 from fuzz_targets import ERRORS, TARGETS, Target
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from memory_checks import at_most
 
 MIB = 2**20
 SECONDS = 20  # an example that takes longer is a hang
@@ -53,13 +53,10 @@ def bounded() -> Iterator[None]:
 
     before = signal.signal(signal.SIGALRM, stop)
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
-    tracemalloc.start()
     try:
-        yield
-        peak = tracemalloc.get_traced_memory()[1]
-        assert peak < MEMORY, f"it took {peak / MIB:.0f} MiB"
+        with at_most(MEMORY):
+            yield
     finally:
-        tracemalloc.stop()
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
 
