@@ -190,7 +190,10 @@ def _part_colors(part) -> np.ndarray:
     if visual is None or not visual.defined:
         return none
     try:
-        colors = np.asarray((visual.to_color() if visual.kind == "texture" else visual).face_colors)
+        if visual.kind == "texture":  # sampled, it does not know its mesh
+            colors = np.asarray(visual.to_color().vertex_colors, dtype=np.float64)[part.faces].mean(axis=1)
+        else:
+            colors = np.asarray(visual.face_colors)
     except Exception:  # a texture that cannot be read must not cost the mesh
         return none
     return (colors[:, :3] / 255).astype(np.float32) if len(colors) == len(none) else none

@@ -176,6 +176,8 @@ def test_faults_of_the_lists(folder):
     expect(dvr, folder, "test", "chair test lists a0 more than once", "warning")
     path.write_text("b1\n")
     expect(dvr, folder, "test", "chair test shares 1 objects with train, such as b1", "warning")
+    path.write_text("../../etc\n")
+    expect(dvr, folder, "test", "softras_test.lst: names the object '../../etc'; expected the plain name of a folder")
     path.write_text("\n")
     expect(dvr, folder, "test", "names no object; expected one id per line")
     path.unlink()
