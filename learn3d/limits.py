@@ -30,7 +30,7 @@ VOLUME_BYTES = 4 * MIB  # a voxel file (.mat, .binvox) of 32^3 cells: 0.3 as flo
 # Images
 IMAGE_FILE_BYTES = 256 * MIB
 IMAGE_SIDE = 10_000  # pixels; photographs are padded to squares: 400 MB
-IMAGE_PIXELS = 64_000_000  # a photograph; decoding, masking and framing take up to 45 bytes for each
+IMAGE_PIXELS = 64_000_000  # a photograph; decoding, masking and framing take 29 bytes for each
 RENDER_SIDE = 2048  # pixels, renderings of a data set; published ones have up to 224, and 16 are read at once
 
 # Meshes
