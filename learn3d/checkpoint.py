@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from learn3d import files
+from learn3d import checkpoint_checks, files
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict
 from learn3d.methods import DataShape, Method, create_method
 from learn3d.networks import resolve_precision
@@ -53,17 +53,21 @@ def _read(path: Path, *, tensors: bool) -> tuple[dict[str, Tensor], dict[str, An
             "measured an IoU, best.safetensors"
         )
     try:
+        checkpoint_checks.check_header(path)
         with safe_open(path, framework="pt") as file:
             header = (file.metadata() or {}).get("learn3d")
             contents = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, ValueError) as error:
         raise ValueError(
             f"{path} cannot be read as a checkpoint ({error}); it is damaged or was cut short: "
             "use another checkpoint of the run, or a copy"
         ) from None
     if header is None:
         raise ValueError(f"{path} is a safetensors file, but not a checkpoint of learn3d")
-    metadata = json.loads(header)
+    try:
+        metadata = checkpoint_checks.parse_metadata(header)
+    except ValueError as error:
+        raise ValueError(f"{path} is no checkpoint that can be used: {error}; use another one of the run") from None
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} has checkpoint format {metadata.get('format')}, this version reads format {FORMAT}")
     return contents, metadata
@@ -84,8 +88,9 @@ def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path) -
         prefix = f"network.{name}."
         state = {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
         try:
+            checkpoint_checks.check_weights(name, network.state_dict(), state)
             network.load_state_dict(state)
-        except RuntimeError as error:
+        except (RuntimeError, ValueError) as error:
             raise ValueError(f"{source} does not fit the {name}: {error}") from None
 
 
@@ -98,8 +103,10 @@ def optimizer_tensors(name: str, optimizer: torch.optim.Optimizer) -> dict[str, 
     }
 
 
-def restore_optimizer(name: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Put back what `optimizer_tensors` gave.
+def restore_optimizer(
+    name: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], source: Path | str = "the checkpoint"
+) -> None:
+    """Put back what `optimizer_tensors` gave. Raises ValueError where it does not go with the parameters.
 
     Each tensor takes the memory layout of its parameter again (channels last, for convolutions): the fused kernel walks
     through parameter, gradient and state by position in memory and would mix up weights of different layouts.
@@ -107,14 +114,38 @@ def restore_optimizer(name: str, optimizer: torch.optim.Optimizer, tensors: dict
     prefix = f"optimizer.{name}."
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
-    for key, tensor in tensors.items():
-        if key.startswith(prefix):
-            index, field = key.removeprefix(prefix).split(".")
-            parameter = parameters[int(index)]
-            if tensor.shape == parameter.shape:
-                tensor = torch.empty_like(parameter, device="cpu").copy_(tensor)
-            state.setdefault(int(index), {})[field] = tensor
+    try:
+        for key, tensor in tensors.items():
+            if key.startswith(prefix):
+                index, _, field = key.removeprefix(prefix).partition(".")
+                if not index.isdecimal() or int(index) >= len(parameters):
+                    raise ValueError(f"{key} belongs to none of the {len(parameters)} parameters")
+                parameter = parameters[int(index)]
+                checkpoint_checks.check_moment(key, field, tensor, parameter)
+                if field != "step":
+                    tensor = torch.empty_like(parameter, device="cpu").copy_(tensor)
+                state.setdefault(int(index), {})[field] = tensor
+        if lacking := [index for index, fields in state.items() if len(fields) < 3]:
+            raise ValueError(f"{prefix}{lacking[0]} lacks some of step, exp_avg, exp_avg_sq")
+    except ValueError as error:
+        raise ValueError(f"{source} does not fit the optimizer {name}: {error}") from None
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def random_state(tensors: dict[str, Tensor], source: Path | str) -> Tensor:
+    """The state of torch's random numbers in a checkpoint, uint8, of the length that this torch has."""
+    found, wanted = tensors.get("random.cpu"), torch.get_rng_state()
+    if found is None or found.dtype != torch.uint8 or found.shape != wanted.shape:
+        got = "none" if found is None else f"{found.dtype} {list(found.shape)}"
+        raise ValueError(
+            f"{source} holds no state of the random numbers (random.cpu) as this torch has it: wanted torch.uint8 "
+            f"{list(wanted.shape)}, got {got}; is it the last checkpoint of a run?"
+        )
+    try:
+        torch.Generator().set_state(found)
+    except RuntimeError as error:
+        raise ValueError(f"{source} holds a state of the random numbers that cannot be ({error})") from None
+    return found
 
 
 def find(path: Path, which: str = "last") -> Path:
@@ -128,6 +159,7 @@ def load_method(
 ) -> tuple[Method, TrainConfig, dict[str, Any]]:
     """A trained method ready for use, from a checkpoint file: (method in evaluation mode, configuration, metadata)."""
     tensors, metadata = load(path)
+    checkpoint_checks.require(metadata, ("config", "step", "num_views" if "shape" not in metadata else "shape"), path)
     config = config_from_dict(metadata["config"], source=str(path))
     settings = config.settings
     if getattr(settings, "pretrained", None) is not None:  # only training starts from that file, which may be gone

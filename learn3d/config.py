@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import typing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from learn3d import limits
 from learn3d.data.augment import Augmentation
+from learn3d.data.findings import DamagedFile
 from learn3d.data.layouts import LAYOUTS, Layout, check_options
 from learn3d.data.sampling import Sampling
+from learn3d.inputs import parse_json, read_bytes
 from learn3d.presets import PRESETS, Settings
 
 DEFAULT_PRESET = next(iter(PRESETS))
+_LARGEST = 1e30  # of a number among the settings; float32 ends at 3e38
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +75,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         for name in ("data", "output"):
-            object.__setattr__(self, name, Path(getattr(self, name)))
+            if not isinstance(value := getattr(self, name), (str, Path)) or "\0" in str(value):
+                raise ValueError(f"{name} must be the path of a folder, got {value!r}")
+            object.__setattr__(self, name, Path(value))
         _check_choice("preset", self.preset, tuple(PRESETS))
         preset = PRESETS[self.preset]
         for name in ("settings", "layout", "view_bins", "sampling", "augment", "iterations", "batch_size"):
@@ -83,6 +88,8 @@ class TrainConfig:
                 f"preset {self.preset!r} takes {type(preset.settings).__name__}, got {type(self.settings).__name__}"
             )
         check_fields(self.settings)
+        if not isinstance(self.augment, (list, tuple)):
+            raise ValueError(f"augment must be a list of names, got {self.augment!r}")
         object.__setattr__(self, "augment", tuple(self.augment))
         _check_choice("sampling", self.sampling, typing.get_args(Sampling))
         for name in self.augment:
@@ -95,52 +102,69 @@ class TrainConfig:
         _check_choice("device", self.device, ("cpu", "cuda"))
         _check_choice("precision", self.precision, ("auto", "bf16", "fp32"))
         _check_choice("val_split", self.val_split, ("val", "test"))
+        if self.view_bins is not None and not isinstance(self.view_bins, str):
+            raise ValueError(f"view_bins must be written as AZIMUTHxELEVATION, such as 15x20, got {self.view_bins!r}")
         options = {name: getattr(self, name) for name in ("view_bins", "views_per_object")}
         check_options(self.layout, image_size=self.settings.image_size, **options)
         if self.val_split == "val" and not LAYOUTS[self.layout].validation:
             raise ValueError(f"the layout {self.layout!r} has no split val; validate on test (val_split test)")
-        if not self.category:
-            raise ValueError("category must be a class name such as 'airplane', got an empty string")
-        for name in ("iterations", "batch_size", "validate_every", "pictures_every", "checkpoint_every", "log_every"):
-            _check_positive_int(name, getattr(self, name))
+        if not isinstance(self.category, str) or not self.category:
+            empty = "an empty string" if self.category == "" else repr(self.category)
+            raise ValueError(f"category must be a class name such as 'airplane', got {empty}")
+        for name in ("iterations", "validate_every", "pictures_every", "checkpoint_every", "log_every"):
+            _check_positive_int(name, getattr(self, name), limits.ITERATIONS)
+        _check_positive_int("batch_size", self.batch_size, limits.BATCH_SIZE)
         if getattr(self.settings, "encoder_from_step", 0) > self.iterations:
             raise ValueError(
                 f"encoder_from_step={self.settings.encoder_from_step} lies beyond the {self.iterations} iterations: "
                 f"the encoder would never be trained; give a step such as {self.iterations // 2 + 1}"
             )
-        for name in ("threads", "max_val_images", "views_per_object"):
+        for name, most in (("threads", limits.THREADS), ("max_val_images", None), ("views_per_object", None)):
             if getattr(self, name) is not None:
-                _check_positive_int(name, getattr(self, name))
-        if not isinstance(self.seed, int) or self.seed < 0:
-            raise ValueError(f"seed must be a whole number >= 0, got {self.seed!r}")
+                _check_positive_int(name, getattr(self, name), most)
+        if not isinstance(self.seed, int) or isinstance(self.seed, bool) or not 0 <= self.seed <= limits.SEED:
+            raise ValueError(f"seed must be a whole number >= 0 and below 2^63, got {self.seed!r}")
 
 
 def check_fields(settings: Settings) -> None:
     """Raise a ValueError naming the setting that is no choice of its kind, negative, or not finite.
 
-    Rates (...learning_rate) must be positive; whole numbers at least 1; all other numbers, such as weights, at least 0.
+    Rates (...learning_rate) must be positive; whole numbers at least 1, and at most what a network of this size can be
+    made of (sides of images and channels: 1024); all other numbers, such as weights, at least 0.
     """
     types = typing.get_type_hints(type(settings))
     for field in dataclasses.fields(settings):
-        value, kind = getattr(settings, field.name), types[field.name]
-        if typing.get_origin(kind) is Literal:
-            _check_choice(field.name, value, typing.get_args(kind))
-        elif kind is bool:
-            _check_choice(field.name, value, (False, True))
-        elif kind is int:
-            _check_positive_int(field.name, value)
-        elif typing.get_origin(kind) is tuple:
-            if not isinstance(value, tuple) or len(value) != len(typing.get_args(kind)):
-                raise ValueError(f"{field.name} must be {len(typing.get_args(kind))} whole numbers, got {value!r}")
-            for item in value:
-                _check_positive_int(field.name, item)
-        elif kind is float:
-            positive = "learning_rate" in field.name
-            fits = isinstance(value, (int, float)) and math.isfinite(value) and (value > 0 if positive else value >= 0)
-            if not fits:
-                raise ValueError(
-                    f"{field.name} must be a {'positive number' if positive else 'number >= 0'}, got {value!r}"
-                )
+        _check_field(field.name, getattr(settings, field.name), types[field.name])
+
+
+def _check_field(name: str, value: Any, kind: Any) -> None:
+    """Raise a ValueError for a value that is not of this kind; kinds that are none of a setting's pass."""
+    if typing.get_origin(kind) is Literal:
+        _check_choice(name, value, typing.get_args(kind))
+    elif kind is bool:
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} must be true or false, got {value!r}")
+    elif kind is int:
+        _check_positive_int(name, value, _most(name))
+    elif typing.get_origin(kind) is tuple:
+        if not isinstance(value, tuple) or len(value) != len(typing.get_args(kind)):
+            raise ValueError(f"{name} must be {len(typing.get_args(kind))} whole numbers, got {value!r}")
+        for item in value:
+            _check_positive_int(name, item, _most(name))
+    elif kind is float:
+        positive = "learning_rate" in name
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= _LARGEST
+        if not number or not (value > 0 if positive else value >= 0):
+            raise ValueError(f"{name} must be a {'positive number' if positive else 'number >= 0'}, got {value!r}")
+    elif kind == Path | None and not isinstance(value, (str, Path, type(None))):
+        raise ValueError(f"{name} must be the path of a file, got {value!r}")
+
+
+def _most(name: str) -> int:
+    """The largest whole number that makes sense for a setting of this name: a step, a side in pixels, or channels."""
+    if name.endswith("_step"):
+        return limits.ITERATIONS
+    return limits.INPUT_SIDE if name.endswith("_size") else limits.CHANNELS
 
 
 #: Options that a resumed run may change: they say where and how long to compute and what to report, not what to learn.
@@ -160,6 +184,8 @@ def config_from_dict(values: dict[str, Any], source: str = "config") -> TrainCon
 
     Configurations of version 0.1, with a method beside the preset, are understood too.
     """
+    if not isinstance(values, dict):
+        raise ValueError(f"{source} must hold options by name ({{...}}), got {type(values).__name__}")
     values = dict(values)
     if "method" in values:
         values = _from_first_version(values)
@@ -168,24 +194,35 @@ def config_from_dict(values: dict[str, Any], source: str = "config") -> TrainCon
     required = [name for name, f in known.items() if f.default is dataclasses.MISSING]
     if missing := [name for name in required if name not in values]:
         raise ValueError(f"{source} lacks the options {missing}")
-    if isinstance(values.get("settings"), dict):
+    if not isinstance(settings := values.get("settings"), (dict, Settings, type(None))):
+        raise ValueError(f"{source}: settings must be options by name ({{...}}), got {settings!r}")
+    if isinstance(settings, dict):
         _check_choice("preset", values.get("preset", DEFAULT_PRESET), tuple(PRESETS))
         kind = type(PRESETS[values.get("preset", DEFAULT_PRESET)].settings)
         _check_names(values["settings"], {f.name for f in dataclasses.fields(kind)}, f"{source}: settings")
         given = {k: tuple(v) if isinstance(v, list) else v for k, v in values["settings"].items()}
-        values["settings"] = kind(**given)
-    if values.get("augment") is not None:
-        values["augment"] = tuple(values["augment"])
-    return TrainConfig(**values)
+        types = typing.get_type_hints(kind)
+        try:
+            for name, value in given.items():
+                _check_field(name, value, types[name])
+            values["settings"] = kind(**given)
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from None
+    try:
+        return TrainConfig(**values)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Read the config.json of a run."""
+    """Read the config.json of a run. Raises ValueError where there is none, or none that can be read."""
     try:
-        values = json.loads(Path(path).read_text())
+        values = parse_json(read_bytes(path, limits.CONFIG_BYTES, "the options of a run"))
     except FileNotFoundError:
         raise ValueError(f"no {path}: is this the folder of a training run?") from None
-    except json.JSONDecodeError as error:
+    except DamagedFile:
+        raise
+    except ValueError as error:
         raise ValueError(f"{path} is not valid JSON: {error}") from None
     return config_from_dict(values, source=str(path))
 
@@ -223,7 +260,7 @@ def _from_first_version(values: dict[str, Any]) -> dict[str, Any]:
         ("vanilla", "released"): "peng2020-kato-vanilla",
         ("vanilla", "paper"): "peng2020-kato-vanilla",
     }
-    if (method, forms) not in names:
+    if not isinstance(method, str) or not isinstance(forms, str) or (method, forms) not in names:
         raise ValueError(f"unknown method and preset {method!r}, {forms!r} in a configuration of version 0.1")
     name = names[method, forms]
     weights = ("lambda_smooth", "lambda_classification", "lambda_adversarial", "lambda_prior", "learning_rate")
@@ -241,6 +278,8 @@ def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
         raise ValueError(f"{name} must be one of {', '.join(map(str, choices))}, got {value!r}")
 
 
-def _check_positive_int(name: str, value: Any) -> None:
+def _check_positive_int(name: str, value: Any, most: int | None = None) -> None:
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name} must be a whole number >= 1, got {value!r}")
+    if most is not None and value > most:
+        raise ValueError(f"{name} must be at most {most}, got {value}")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from learn3d import checkpoint
+from learn3d import checkpoint, checkpoint_checks
 from learn3d.config import TrainConfig, check_resume, config_from_dict
 from learn3d.methods import DataShape, Method
 from learn3d.versions import versions
@@ -88,6 +88,7 @@ def restore(
     record are not checked.
     """
     tensors, metadata = checkpoint.load(path)
+    checkpoint_checks.require(metadata, ("config", "step"), path)
     saved, recorded = config_from_dict(metadata["config"], source=str(path)), metadata.get("conditions", {})
     if recorded.get("precision") == conditions.precision:  # asked for by name or by "auto", it is the same
         saved = dataclasses.replace(saved, precision=config.precision)
@@ -95,10 +96,10 @@ def restore(
     _check_conditions(conditions, recorded, config.data)
     checkpoint.restore_networks(method, tensors, path)
     for name, optimizer in method.optimizers.items():
-        checkpoint.restore_optimizer(name, optimizer, tensors)
+        checkpoint.restore_optimizer(name, optimizer, tensors, path)
     for field in dataclasses.fields(Progress):
         setattr(progress, field.name, metadata.get(field.name, getattr(progress, field.name)))
-    torch.set_rng_state(tensors["random.cpu"])
+    torch.set_rng_state(checkpoint.random_state(tensors, path))
     if config.device == "cuda" and "random.cuda" in tensors:
         torch.cuda.set_rng_state(tensors["random.cuda"])
 

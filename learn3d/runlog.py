@@ -90,13 +90,13 @@ def _forget_after(path: Path, step: int) -> None:
     if not path.exists():
         return
     kept = []
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in path.read_bytes().splitlines():
         try:
             if json.loads(line)["step"] <= step:
-                kept.append(line + "\n")
-        except (json.JSONDecodeError, KeyError):
+                kept.append(line + b"\n")
+        except (ValueError, KeyError, TypeError, RecursionError):  # not JSON, not UTF-8; JSON of another form
             continue
-    files.write_bytes(path, "".join(kept).encode())
+    files.write_bytes(path, b"".join(kept))
 
 
 def _tensorboard_writer(folder: Path, start: int) -> Any:

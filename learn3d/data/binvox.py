@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from learn3d.data.findings import AGAIN, DamagedFile, MissingFile
+from learn3d import limits
+from learn3d.data.findings import AGAIN, DamagedFile
+from learn3d.inputs import read_bytes
 
 _WANTED = "a binvox file: '#binvox 1', the lines dim, translate, scale and data, then pairs of bytes"
 
@@ -22,12 +24,7 @@ class Binvox(NamedTuple):
 
 def read_binvox(path: Path, size: int) -> Binvox:
     """Read a grid of size^3 cells. The file keeps y fastest, then z, then x. Raises DamagedFile, MissingFile."""
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise MissingFile(path, "is missing; expected a voxel grid in the binvox format") from None
-    except OSError as error:
-        raise DamagedFile(path, f"cannot be read ({error}). {AGAIN}") from error
+    content = read_bytes(path, limits.VOLUME_BYTES, "a voxel grid in the binvox format")
     head, found, runs = content.partition(b"\ndata\n")
     lines = [line.split() for line in head.split(b"\n")]
     header = {line[0]: line[1:] for line in lines if line}
@@ -41,8 +38,11 @@ def read_binvox(path: Path, size: int) -> Binvox:
         raise DamagedFile(path, f"has no such header; expected {_WANTED}. {AGAIN}")
     if dim != [size] * 3:
         raise DamagedFile(path, f"holds {'x'.join(map(str, dim))} cells; expected {size}x{size}x{size}")
-    if translate.shape != (3,) or not np.isfinite(translate).all() or not (np.isfinite(scale) and scale > 0):
-        raise DamagedFile(path, f"has translate {translate} and scale {scale}; expected three numbers and one above 0")
+    low, high = limits.DISTANCE
+    if translate.shape != (3,) or not (np.abs(translate) <= high).all() or not low <= scale <= high:
+        raise DamagedFile(
+            path, f"has translate {translate} and scale {scale}; expected three numbers and one of {low:g} .. {high:g}"
+        )
     pairs = np.frombuffer(runs[: len(runs) // 2 * 2], np.uint8).reshape(-1, 2)
     total = int(pairs[:, 1].sum(dtype=np.int64))
     if total != size**3:

@@ -9,8 +9,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from tqdm import tqdm
 
+from learn3d import limits
 from learn3d.data import debian_packages as packages
 from learn3d.data.mesh_text import Part, read_ac3d
+from learn3d.inputs import within
 
 AIRCRAFT_PACKAGE = "flightgear-data-ai"
 AIRCRAFT_FOLDER = "usr/share/games/flightgear/AI/Aircraft/"
@@ -114,10 +116,11 @@ def aircraft_models(package: packages.Package, licences: Path, progress: bool) -
 
 def _aircraft_mesh(text: str) -> tuple[np.ndarray, np.ndarray] | str:
     try:
-        parts = read_ac3d(text, skip=lambda name: EFFECTS.search(name) is not None)
+        with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
+            parts = read_ac3d(text, skip=lambda name: EFFECTS.search(name) is not None)
+            parts = without_effects(parts) if parts else []
     except ValueError as error:
         return f"unreadable ({error})"
-    parts = without_effects(parts) if parts else []
     if not parts:
         return "empty (no polygon is left)"
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])

@@ -13,8 +13,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from tqdm import tqdm
 
+from learn3d import limits
 from learn3d.data import debian_packages as packages
 from learn3d.data.mesh_text import read_obj
+from learn3d.inputs import within
 
 FURNITURE_PACKAGES = ("sweethome3d-furniture", "sweethome3d-furniture-nonfree")  # the second is optional
 CATALOGUE = "PluginFurnitureCatalog.properties"
@@ -57,7 +59,10 @@ def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
         match = re.match(r"\s*(\w+)(?:#(\d+))?\s*=\s*(.*)", line)
         if match:
             key, number, value = match.groups()
+            if len(number or "") > 9:
+                continue
             value = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value).strip()
+            value = value.encode("utf-8", "replace").decode()  # half of a pair of surrogates is no character
             (general if number is None else entries.setdefault(int(number), {}))[key] = value
     return general, [entries[number] for number in sorted(entries)]
 
@@ -118,7 +123,8 @@ def _furniture_mesh(
     if model.suffix.lower() != ".obj":
         return f"unreadable (only OBJ models are read, this is {model.suffix or 'nothing'})"
     try:
-        vertices, faces = read_obj(packages.read_member(archive, str(model)).decode("latin-1"))
-        return place_furniture(vertices, entry), faces
+        with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
+            vertices, faces = read_obj(packages.read_member(archive, str(model)).decode("latin-1"))
+            return place_furniture(vertices, entry), faces
     except ValueError as error:
         return f"unreadable ({error})"

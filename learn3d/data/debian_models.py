@@ -20,12 +20,14 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from learn3d import limits
 from learn3d.data import debian_packages as packages
 from learn3d.data.debian_aircraft import AIRCRAFT_PACKAGE, aircraft_models
 from learn3d.data.debian_furniture import FURNITURE_PACKAGES, furniture_models
 from learn3d.data.mesh_cleaning import clean_mesh, overlap, surface_grid
 from learn3d.data.mesh_text import write_ply
 from learn3d.data.meshes import is_watertight
+from learn3d.inputs import within
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side when surfaces are compared
@@ -185,10 +187,11 @@ def _keep(
     if isinstance(candidate.mesh, str):
         return drop(candidate.mesh)
     try:
-        vertices, faces = clean_mesh(*candidate.mesh)
+        with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
+            vertices, faces = clean_mesh(*candidate.mesh)
+            grids = surface_grid(vertices, faces, GRID), surface_grid(vertices, faces, GRID, per_axis=True)
     except ValueError as error:
         return drop(f"unreadable ({error})")
-    grids = surface_grid(vertices, faces, GRID), surface_grid(vertices, faces, GRID, per_axis=True)
     for name, *others in known:
         iou, stretched = (overlap(mine, other) for mine, other in zip(grids, others, strict=True))
         if iou > config.duplicate_iou:

@@ -6,21 +6,35 @@ are read into memory one at a time, and an archive with an absolute path, a ".."
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import io
+import lzma
 import shutil
 import subprocess
 import tarfile
 import zipfile
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
+from typing import BinaryIO
 from urllib.parse import unquote
 
 import numpy as np
 
-MAX_FILE_BYTES = 512 * 2**20  # one file of a package; the largest wanted today is a 61 MB catalogue
-MAX_MEMBER_BYTES = 64 * 2**20  # one file inside a catalogue; the largest wanted today is a 9 MB model
+from learn3d import limits
+from learn3d.data import archives
+
+_HEADER_BYTES = 2**20  # between the contents of two members; long names and their kin take a few thousand
+_UNPACKERS: dict[str, Callable[[BinaryIO], BinaryIO]] = {
+    "": lambda file: file,
+    "gz": lambda file: gzip.GzipFile(fileobj=file),
+    "bz2": bz2.BZ2File,
+    "xz": lzma.LZMAFile,
+}
+_FAULTS = (tarfile.TarError, EOFError, OSError, zlib.error, lzma.LZMAError)
 
 
 class PackageMissing(ValueError):
@@ -54,10 +68,10 @@ class Candidate:
 
 def check_member_path(path: str, archive: str) -> str:
     """The path of an archive member without a leading "./"; ValueError if it leaves the archive's folder."""
-    parts = PurePosixPath(path).parts
-    if path.startswith("/") or "\\" in path or ".." in parts:
-        raise ValueError(f"{archive} is refused: its member {path!r} points outside the archive; get the package again")
-    return "/".join(parts)
+    try:
+        return archives.check_member_path(path)
+    except ValueError as error:
+        raise ValueError(f"{archive} is refused: {error}; get the package again") from None
 
 
 def download_package(name: str, folder: Path) -> Package:
@@ -120,20 +134,23 @@ def read_package(package: Package, suffixes: tuple[str, ...]) -> Iterator[tuple[
             path = check_member_path(line.lstrip("/"), f"the file list of {package.name}")
             file = package.root / path
             if path.endswith(suffixes) and file.is_file() and not file.is_symlink():
-                _check_size(file.stat().st_size, path, package.name, MAX_FILE_BYTES)
+                _check_size(file.stat().st_size, path, package.name, limits.PACKAGE_FILE_BYTES)
                 yield path, file.read_bytes()
         return
     archive = package.deb.name
     try:
-        with _data_tar(package.deb) as tar:
-            for member in tar:
+        with _data_tar(package.deb) as (tar, meter):
+            for number, member in enumerate(tar):
                 path = check_member_path(member.name, archive)
+                if number >= limits.PACKAGE_MEMBERS:
+                    raise ValueError(f"{archive} is refused: it has more than {number} members")
+                meter.allow(member.size)
                 if member.isreg() and path.endswith(suffixes):
-                    _check_size(member.size, path, archive, MAX_FILE_BYTES)
+                    _check_size(member.size, path, archive, limits.PACKAGE_FILE_BYTES)
                     stream = tar.extractfile(member)
                     assert stream is not None
                     yield path, stream.read()
-    except (tarfile.TarError, EOFError, OSError) as error:
+    except _FAULTS as error:
         raise ValueError(f"{archive} cannot be read as a Debian package ({error}); download it again") from error
 
 
@@ -151,21 +168,18 @@ def read_keeping_copyright(package: Package, suffixes: tuple[str, ...], folder: 
 def open_catalogue(content: bytes, name: str) -> zipfile.ZipFile:
     """A zip archive (.sh3f) held in memory, every member's path checked; ValueError if unsafe or not a zip file."""
     try:
-        archive = zipfile.ZipFile(io.BytesIO(content))
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"{name} is not a zip archive ({error}); download its package again") from error
-    for member in archive.namelist():
-        check_member_path(member, name)
-    return archive
+        return archives.open_zip(io.BytesIO(content), limits.PACKAGE_BYTES)
+    except ValueError as error:
+        raise ValueError(f"{name} is refused as a zip archive: {error}; get its package again") from error
 
 
 def read_member(archive: zipfile.ZipFile, path: str) -> bytes:
     """The content of one member of a zip archive; ValueError if it is missing, damaged or over 64 MiB."""
     try:
         info = archive.getinfo(path)
-        _check_size(info.file_size, path, "the catalogue", MAX_MEMBER_BYTES)
+        _check_size(info.file_size, path, "the catalogue", limits.CATALOGUE_MEMBER_BYTES)
         return archive.read(info)
-    except (KeyError, zipfile.BadZipFile) as error:
+    except (KeyError, RuntimeError, NotImplementedError, zipfile.BadZipFile, *_FAULTS) as error:
         raise ValueError(f"{path} cannot be read from the catalogue ({error})") from error
 
 
@@ -174,32 +188,72 @@ def _check_size(size: int, path: str, archive: str, limit: int) -> None:
         raise ValueError(f"{path} of {archive} is refused: {size} bytes, at most {limit} are read")
 
 
+class _Part(io.RawIOBase):
+    """The next `size` bytes of a file."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file, self._left = file, size
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:
+        content = self._file.read(min(len(buffer), self._left))
+        buffer[: len(content)] = content
+        self._left -= len(content)
+        return len(content)
+
+
+class _Meter:
+    """What a tar archive unpacks to, stopped where a header takes much more than headers do (tarfile keeps them)."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._left, self._total = file, _HEADER_BYTES, limits.PACKAGE_BYTES
+
+    def allow(self, size: int) -> None:
+        """A member of that size follows, and then another header."""
+        self._left = size + _HEADER_BYTES
+
+    def read(self, size: int) -> bytes:
+        content = self._file.read(size)
+        self._left -= len(content)
+        self._total -= len(content)
+        if self._left < 0 or self._total < 0:
+            raise ValueError(f"it unpacks to more than its headers say, or than {limits.PACKAGE_BYTES} bytes")
+        return content
+
+
 @contextmanager
-def _data_tar(deb: Path) -> Iterator[tarfile.TarFile]:
-    """The data.tar.* of a .deb as a stream; one that tarfile cannot decompress (zstd) goes through dpkg-deb."""
+def _data_tar(deb: Path) -> Iterator[tuple[tarfile.TarFile, _Meter]]:
+    """The data.tar.* of a .deb as a stream; one that Python cannot unpack (zstd) goes through dpkg-deb."""
     with deb.open("rb") as file:
-        if file.read(8) != b"!<arch>\n":
-            raise ValueError(f"{deb.name} is not a Debian package; download it again")
-        while len(header := file.read(60)) == 60:
-            member = header[:16].decode("ascii", "replace").strip().rstrip("/")
-            size = int(header[48:58])
-            if member.startswith("data.tar"):
-                kind = member.removeprefix("data.tar").removeprefix(".")
-                break
-            file.seek(size + size % 2, io.SEEK_CUR)
-        else:
-            raise ValueError(f"{deb.name} holds no data.tar; download it again")
-        if kind in ("", "gz", "bz2", "xz"):
-            with tarfile.open(fileobj=file, mode=f"r|{kind}") as tar:
-                yield tar
+        kind, size = _find_data(deb, file)
+        if kind in _UNPACKERS:
+            meter = _Meter(_UNPACKERS[kind](io.BufferedReader(_Part(file, size))))
+            with tarfile.open(fileobj=meter, mode="r|") as tar:
+                yield tar, meter
             return
     if shutil.which("dpkg-deb") is None:
         raise ValueError(f"{deb.name} is compressed with {kind}, which needs dpkg-deb; install Debian's package dpkg")
-    with (
-        subprocess.Popen(["dpkg-deb", "--fsys-tarfile", str(deb)], stdout=subprocess.PIPE) as process,
-        tarfile.open(fileobj=process.stdout, mode="r|") as tar,
-    ):
+    with subprocess.Popen(["dpkg-deb", "--fsys-tarfile", str(deb)], stdout=subprocess.PIPE) as process:
         try:
-            yield tar
+            meter = _Meter(process.stdout)
+            with tarfile.open(fileobj=meter, mode="r|") as tar:
+                yield tar, meter
         finally:
             process.kill()
+
+
+def _find_data(deb: Path, file: BinaryIO) -> tuple[str, int]:
+    """How the member data.tar.* is compressed and its size in bytes; the file then stands at its beginning."""
+    if file.read(8) != b"!<arch>\n":
+        raise ValueError(f"{deb.name} is not a Debian package; download it again")
+    while len(header := file.read(60)) == 60:
+        member = header[:16].decode("ascii", "replace").strip().rstrip("/")
+        if not (length := header[48:58].strip()).isdigit():
+            raise ValueError(f"{deb.name} is damaged: its member {member!r} has no size; download it again")
+        size = int(length)
+        if member.startswith("data.tar"):
+            return member.removeprefix("data.tar").removeprefix("."), size
+        file.seek(size + size % 2, io.SEEK_CUR)
+    raise ValueError(f"{deb.name} holds no data.tar; download it again")

@@ -25,11 +25,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from learn3d import limits
 from learn3d.data import kato
 from learn3d.data.conventions import KATO
 from learn3d.data.findings import AGAIN, DamagedFile, Findings, MissingFile, Problem
 from learn3d.data.reading import (
     category_folder,
+    check_ids,
     check_split,
     map_objects,
     read_image,
@@ -39,6 +41,7 @@ from learn3d.data.reading import (
     warn_of_repeats,
 )
 from learn3d.data.views import SPLITS, ViewDataset
+from learn3d.inputs import read_text
 
 POINTS = 10_000  # kept of each object's point cloud, which holds 100,000
 _EYE_TOLERANCE = 0.01  # units of the object frame
@@ -121,6 +124,7 @@ def object_ids(folder: Path | str, category: str, split: str) -> list[str]:
         raise MissingFile(path, f"is missing; expected a list of object ids, one per line. Splits here: {found}")
     if not (ids := _read_list(path)):
         raise DamagedFile(path, f"names no object; expected one id per line. {AGAIN}")
+    check_ids(path, ids)
     return ids
 
 
@@ -132,7 +136,7 @@ def _list_path(folder: Path, category: str, split: str) -> Path:
 
 
 def _read_list(path: Path) -> list[str]:
-    return path.read_text(errors="replace").split()
+    return read_text(path, limits.TEXT_BYTES, "a list of object ids", errors="replace").split()
 
 
 def _splits(folder: Path, category: str) -> tuple[str, ...]:
@@ -181,8 +185,8 @@ def _read_64(path: Path) -> np.ndarray:
 def _fit_world(path: Path) -> np.ndarray:
     """Orthogonal [3, 3] that takes the world of cameras.npz to the object frame; DamagedFile where it does not fit."""
     wanted = "world_mat_0 .. world_mat_23, 4x4, from the world to Kato's 24 cameras"
-    arrays = read_npz(path, wanted)
     names = [f"world_mat_{k}" for k in range(kato.NUM_VIEWS)]
+    arrays = read_npz(path, names, wanted)
     if missing := [name for name in names if name not in arrays]:
         raise DamagedFile(path, f"lacks {missing[0]} ({len(missing)} of {len(names)} matrices); expected {wanted}")
     if wrong := [name for name in names if arrays[name].shape not in ((4, 4), (3, 4))]:
@@ -219,7 +223,7 @@ def _fit_world(path: Path) -> np.ndarray:
 def _read_points(path: Path, count: int, to_object: np.ndarray) -> np.ndarray:
     """The first `count` points in the object frame, float32 [P, 3]."""
     wanted = "the array 'points' [P, 3]: finite, within the unit cube"
-    points = read_npz(path, wanted).get("points")
+    points = read_npz(path, ["points"], wanted).get("points")
     if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points):
         shape = "no such array" if points is None else f"the shape {list(points.shape)}"
         raise DamagedFile(path, f"has {shape}; expected {wanted}")

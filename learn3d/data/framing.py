@@ -17,6 +17,10 @@ from typing import Literal
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from learn3d import limits
+from learn3d.data.findings import DamagedFile, MissingFile
+from learn3d.data.images import PHOTOGRAPHS, open_image
+
 Framing = Literal["whole", "object"]
 OBJECT_SHARE = 0.65  # of the side of the square that the object takes with "object", about what Kato's renderings have
 _SUPERSAMPLE = 4  # pixels, per side, that are averaged to one where the camera is turned
@@ -158,15 +162,17 @@ def _outline(inside: np.ndarray) -> np.ndarray:
 def _open(path: Path) -> Image.Image:
     """The image, upright: cameras write the pixels as they lie on the sensor, and the turn into the EXIF data."""
     try:
-        with Image.open(path) as image:
-            image.load()
-            return ImageOps.exif_transpose(image)
-    except FileNotFoundError:
+        image = open_image(path, PHOTOGRAPHS, limits.IMAGE_SIDE)
+    except MissingFile:
         raise FileNotFoundError(f"there is no image {path}") from None
-    except UnidentifiedImageError:
-        raise ValueError(f"{path} is no image that can be read here; JPEG and PNG can, HEIC cannot") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{path} cannot be read as an image: {error}") from None
+    except DamagedFile as error:
+        if isinstance(error.__cause__, UnidentifiedImageError):
+            raise ValueError(f"{path} is no image that can be read here; JPEG and PNG can, HEIC cannot") from None
+        raise
+    try:
+        return ImageOps.exif_transpose(image)
+    except Exception:  # its EXIF data are damaged: whatever Pillow's parser raises, the picture itself is sound
+        return image
 
 
 def _transparency(image: Image.Image) -> np.ndarray | None:

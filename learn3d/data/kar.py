@@ -24,21 +24,21 @@ What is done with them follows the published code of Peng et al. 2020, except wh
 
 from __future__ import annotations
 
-import io
-import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import scipy.io
 from PIL import Image
 
+from learn3d import limits
 from learn3d.data.conventions import KAR, VOXEL_SIZE
 from learn3d.data.findings import AGAIN, DamagedFile, Findings, MissingFile, Problem
 from learn3d.data.kato import synset_of
+from learn3d.data.matlab import read_matlab
 from learn3d.data.reading import (
     ReadObject,
+    check_ids,
     check_split,
     check_square,
     join_objects,
@@ -51,6 +51,7 @@ from learn3d.data.reading import (
     warn_of_repeats,
 )
 from learn3d.data.views import SPLITS, ViewDataset
+from learn3d.inputs import parse_json, read_bytes, read_text
 
 NUM_RENDERS = 20
 HALF_FOV_DEG = math.degrees(math.atan(16 / 60))  # 14.9314
@@ -153,8 +154,9 @@ def renders_of(folder: Path) -> int:
     numbers = [path.stem.removeprefix("render_") for path in folder.glob("render_*.png")]
     files = max((int(number) + 1 for number in numbers if number.isdecimal()), default=0)
     try:
-        rows = sum(bool(line.strip()) for line in (folder / "view.txt").read_text().splitlines())
-    except (OSError, UnicodeDecodeError):  # reading the object will tell
+        table = read_text(folder / "view.txt", limits.TABLE_BYTES, "a row per render")
+        rows = sum(bool(line.strip()) for line in table.splitlines())
+    except (OSError, ValueError):  # reading the object will tell
         rows = 0
     return min(max(files, rows), NUM_RENDERS) or NUM_RENDERS
 
@@ -162,18 +164,21 @@ def renders_of(folder: Path) -> int:
 def _read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
     path = folder / "splits.json"
     wanted = 'expected {synset: {"name": .., "train": [id, ..], "val": [..], "test": [..]}}'
-    try:
-        lists = json.loads(path.read_text())
-    except FileNotFoundError:
+    if not path.exists():
         hint = "take data/splits.json of the LSM code" if folder.is_dir() else "there is no such folder"
-        raise MissingFile(path, f"is missing: {hint}; {wanted}") from None
-    except (OSError, ValueError) as error:
+        raise MissingFile(path, f"is missing: {hint}; {wanted}")
+    content = read_bytes(path, limits.JSON_BYTES, "the lists of objects as JSON")
+    try:
+        lists = parse_json(content)
+    except ValueError as error:
         raise DamagedFile(path, f"cannot be read as JSON ({error}); {wanted}. {AGAIN}") from error
     entries = lists.values() if isinstance(lists, dict) else [None]
     for entry in entries:
         named = [entry.get(split, []) for split in SPLITS] if isinstance(entry, dict) else [None]
         if not all(isinstance(ids, list) and all(isinstance(name, str) for name in ids) for ids in named):
             raise DamagedFile(path, f"has another structure; {wanted}")
+        for ids in named:
+            check_ids(path, ids)
     return lists
 
 
@@ -199,10 +204,14 @@ def _read_views(path: Path, rows: int) -> np.ndarray:
     """Azimuth, elevation and distance of each render, float64 [rows, 3]."""
     wanted = "a row per render: azimuth, elevation, (unused), distance"
     table = read_table(path, rows, 4, wanted)
-    if (bad := (np.abs(table[:, 1]) >= 90) | (table[:, 3] <= 0)).any():
+    low, high = limits.DISTANCE
+    turns = np.abs(table[:, 0]) > limits.ANGLE_DEG
+    if (bad := turns | (np.abs(table[:, 1]) >= 90) | (table[:, 3] < low) | (table[:, 3] > high)).any():
         k = int(bad.argmax())
         raise DamagedFile(
-            path, f"row {k} has elevation {table[k, 1]:g} and distance {table[k, 3]:g}; expected {wanted}"
+            path,
+            f"row {k} has azimuth {table[k, 0]:g}, elevation {table[k, 1]:g} and distance {table[k, 3]:g}; "
+            f"expected {wanted}",
         )
     return table[:, [0, 1, 3]]
 
@@ -247,13 +256,8 @@ def _grey(path: Path, depth: Image.Image) -> np.ndarray:
 
 def _read_voxels(path: Path) -> np.ndarray:
     wanted = "a MATLAB file with the array 'Volume' [32, 32, 32]"
-    try:
-        volume = scipy.io.loadmat(io.BytesIO(path.read_bytes()), variable_names=["Volume"]).get("Volume")
-    except FileNotFoundError:
-        raise MissingFile(path, f"is missing; expected {wanted}") from None
-    except Exception as error:  # scipy's parser raises whatever a damaged file leads it to
-        raise DamagedFile(path, f"cannot be read ({error}); expected {wanted}. {AGAIN}") from error
-    if not isinstance(volume, np.ndarray) or volume.shape != (VOXEL_SIZE,) * 3 or volume.dtype.kind not in "buif":
-        found = "no such array" if volume is None else f"{volume.dtype} {list(volume.shape)}"
+    volume = read_matlab(path, "Volume", wanted)
+    if volume is None or volume.shape != (VOXEL_SIZE,) * 3:
+        found = "no such array of numbers" if volume is None else f"{volume.dtype} {list(volume.shape)}"
         raise DamagedFile(path, f"has {found}; expected {wanted}")
     return volume != 0

@@ -14,8 +14,8 @@ The oddities that this module hides (Kato et al. 2018):
 from __future__ import annotations
 
 import contextlib
+import math
 import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,8 +23,9 @@ import numpy as np
 import torch
 
 import nmr
+from learn3d.data import npz
 from learn3d.data.conventions import KATO, VOXEL_SIZE
-from learn3d.data.findings import Problem
+from learn3d.data.findings import AGAIN, DamagedFile, Problem
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.views import SPLITS, ViewDataset
 
@@ -37,6 +38,11 @@ HALF_FOV_DEG = 15.0
 VIEW_NAMES = tuple(f"azimuth {AZIMUTH_STEP_DEG * view:g}°" for view in range(NUM_VIEWS))
 
 _KINDS = ("images", "voxels")
+_KEY = "arr_0"
+_ARRAYS = {  # dtype and shape of one object
+    "images": (np.dtype(np.uint8), (NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE)),
+    "voxels": (np.dtype(np.bool_), (VOXEL_SIZE,) * 3),
+}
 
 SYNSETS = {
     "airplane": "02691156",
@@ -117,8 +123,10 @@ def load(folder: Path | str, category: str, split: str) -> ViewDataset:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}; got {split!r}")
     for path in split_paths(folder, category, split):
         _check_there(path, category, split)
-    images, voxels = (_read(folder, category, split, kind) for kind in _KINDS)
-    _check_counts(folder, category, split, len(images), len(voxels))
+    objects, grids = (_count(folder, category, split, kind) for kind in _KINDS)
+    _check_counts(folder, category, split, objects, grids)
+    images = _read(folder, category, split, "images")
+    voxels = _read(folder, category, split, "voxels", objects=objects)  # mostly zeros: no expansion would be suspect
     return from_arrays(images, voxels, category, split)
 
 
@@ -145,8 +153,12 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
     arrays = {}
     for kind, path in zip(_KINDS, split_paths(folder, category, split), strict=True):
         try:
-            arrays[kind] = _read(folder, category, split, kind)
-        except (ValueError, FileNotFoundError) as error:
+            objects = len(arrays["images"]) if "images" in arrays else None
+            arrays[kind] = _read(folder, category, split, kind, objects=objects)
+        except DamagedFile as error:
+            yield Problem(str(path), error.message)
+            continue
+        except FileNotFoundError as error:
             yield Problem(str(path), str(error))
             continue
         whole = arrays[kind][:, :, 3].max((2, 3)) < 128 if kind == "images" else ~arrays[kind].any((1, 2, 3))
@@ -156,8 +168,8 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
     if len(arrays) == len(_KINDS):
         try:
             _check_counts(folder, category, split, *map(len, arrays.values()))
-        except ValueError as error:
-            yield Problem(str(split_paths(folder, category, split)[0]), str(error))
+        except DamagedFile as error:
+            yield Problem(str(error.path), error.message)
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -173,22 +185,48 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 def count(folder: Path | str, category: str, split: str) -> int:
     """How many objects a split holds, from the header of its voxels (or images) file alone; 0 where it has none."""
-    for path in reversed(split_paths(folder, category, split)):
-        with contextlib.suppress(OSError, KeyError, ValueError, zipfile.BadZipFile):
-            with zipfile.ZipFile(path) as archive, archive.open("arr_0.npy") as file:
-                version = np.lib.format.read_magic(file)
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                return int((read(file)[0] or (0,))[0])
+    for kind in reversed(_KINDS):
+        with contextlib.suppress(OSError, ValueError):
+            return _count(folder, category, split, kind)
     return 0
 
 
-def _read(folder: Path | str, category: str, split: str, kind: str) -> np.ndarray:
-    """The array of the images or of the voxels file."""
+def _count(folder: Path | str, category: str, split: str, kind: str) -> int:
+    """The number of objects that the header of the images or of the voxels file states."""
+    with _open(folder, category, split, kind) as (archive, _):
+        return npz.header(archive, _KEY).shape[0]
+
+
+def _read(folder: Path | str, category: str, split: str, kind: str, *, objects: int | None = None) -> np.ndarray:
+    """The array of the images or of the voxels file, of at most so many objects where it is known how many they are."""
+    with _open(folder, category, split, kind) as (archive, size):
+        return npz.read(archive, _KEY, max_bytes=None if objects is None else objects * size)
+
+
+@contextlib.contextmanager
+def _open(folder: Path | str, category: str, split: str, kind: str) -> Iterator[tuple[zipfile.ZipFile, int]]:
+    """The images or the voxels file, whose header is right, and the bytes that an object takes in it."""
     path = split_paths(folder, category, split)[_KINDS.index(kind)]
     _check_there(path, category, split)
-    if kind == "images":
-        return _read_array(path, np.uint8, (NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE), kind)
-    return _read_array(path, np.bool_, (VOXEL_SIZE,) * 3, kind)
+    dtype, shape = _ARRAYS[kind]
+    wanted = f"{dtype} [N, {', '.join(map(str, shape))}] under the key '{_KEY}'"
+    try:
+        with npz.open_npz(path) as archive:
+            if _KEY not in npz.keys(archive):
+                keys = npz.keys(archive)[:8]
+                raise DamagedFile(path, f"holds the keys {keys}; the {kind} file must hold {wanted}")
+            head = npz.header(archive, _KEY)
+            if not head.dtype.hasobject and (head.dtype != dtype or head.shape[1:] != shape or not head.shape):
+                raise DamagedFile(path, f"the {kind} file must hold {wanted}, got {head}")
+            yield archive, math.prod(shape) * dtype.itemsize
+    except DamagedFile:
+        raise
+    except ValueError as error:
+        raise DamagedFile(
+            path,
+            f"cannot read the {kind} file: {error}; it must be an npz file with {wanted} and no pickled objects. "
+            f"{AGAIN}",
+        ) from error
 
 
 def _check_there(path: Path, category: str, split: str) -> None:
@@ -199,34 +237,13 @@ def _check_there(path: Path, category: str, split: str) -> None:
 def _check_counts(folder: Path | str, category: str, split: str, images: int, voxels: int) -> None:
     paths = split_paths(folder, category, split)
     if images != voxels:
-        raise ValueError(
-            f"{paths[0].name} holds {images} objects but {paths[1].name} holds {voxels}; "
-            "the two files must come from the same data set: fetch or make both again"
+        raise DamagedFile(
+            paths[0],
+            f"holds {images} objects but {paths[1].name} holds {voxels}; "
+            "the two files must come from the same data set: fetch or make both again",
         )
     if images == 0:
-        raise ValueError(f"{paths[0]} holds no object; make the data set with more meshes or another split")
-
-
-def _read_array(path: Path, dtype: type, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """The array 'arr_0' of an npz file, checked: `dtype` and [N, *shape]."""
-    wanted = f"{np.dtype(dtype)} [N, {', '.join(map(str, shape))}] under the key 'arr_0'"
-    try:
-        archive = np.load(path, allow_pickle=False)
-        if isinstance(archive, np.ndarray):
-            raise ValueError("it is a single npy array")
-        with archive:
-            keys = archive.files
-            array = archive["arr_0"] if "arr_0" in keys else None
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        raise ValueError(
-            f"cannot read the {what} file {path}: {error}; it must be an npz file with {wanted} "
-            "and no pickled objects. Perhaps the download or copy was cut short: fetch it again"
-        ) from error
-    if array is None:
-        raise ValueError(f"{path} holds the keys {keys}; the {what} file must hold {wanted}")
-    if array.dtype != dtype or array.ndim != len(shape) + 1 or array.shape[1:] != shape:
-        raise ValueError(f"the {what} file {path} must hold {wanted}, got {array.dtype} {list(array.shape)}")
-    return array
+        raise DamagedFile(paths[0], "holds no object; make the data set with more meshes or another split")
 
 
 def _what_is_there(folder: Path, category: str, split: str, missing: Path) -> str:

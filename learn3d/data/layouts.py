@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from learn3d.data import kato
+from learn3d.data.findings import DamagedFile, MissingFile
 from learn3d.data.view_bins import AngleBins
 from learn3d.data.views import ViewDataset, concatenate
 
@@ -42,7 +44,7 @@ def check_options(
     layout: str, *, image_size: int = kato.IMAGE_SIZE, view_bins: str | None = None, views_per_object: int | None = None
 ) -> None:
     """Raise a ValueError for an unknown layout and for an option of `load_dataset` that does not go with it."""
-    if layout not in LAYOUTS:
+    if not isinstance(layout, str) or layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
     properties = LAYOUTS[layout]
     if "image_size" not in properties.options and image_size != kato.IMAGE_SIZE:
@@ -87,5 +89,11 @@ def load_dataset(
     reader = importlib.import_module(f"learn3d.data.{layout}")  # now, as each needs other packages
     given = {"image_size": image_size, "views_per_object": views_per_object, "progress": progress}
     options = {name: given[name] for name in LAYOUTS[layout].options}
-    dataset = concatenate([reader.load(folder, name, split, **options) for name in names])
+    try:
+        dataset = concatenate([reader.load(folder, name, split, **options) for name in names])
+    except (DamagedFile, MissingFile) as error:
+        check = f"python tools/check_dataset.py {shlex.quote(str(folder))} --layout {layout}"
+        raise type(error)(
+            error.path, f"{error.message}. All that is wrong with the data set is listed by: {check}"
+        ) from error
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))

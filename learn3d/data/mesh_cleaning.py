@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+_SAMPLES = 2_000_000  # points of surfaces in memory at a time
+
 
 def clean_mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
     """The welded mesh with its box centred at the origin and its longest side 1: float64 [V, 3], int64 [F, 3].
@@ -63,9 +65,11 @@ def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: b
         i, j = np.divmod(np.arange((count + 1) ** 2), count + 1)
         i, j = i[i + j <= count], j[i + j <= count]
         weights = np.stack([i, j, count - i - j], axis=1) / count
-        cells = (weights @ corners[steps == count]).reshape(-1, 3)
-        cells = np.clip(np.floor(cells).astype(np.int64), 0, size - 1)
-        grid[cells[:, 0], cells[:, 1], cells[:, 2]] = True
+        chosen = corners[steps == count]
+        for part in np.array_split(chosen, 1 + len(chosen) * len(weights) // _SAMPLES):
+            cells = (weights @ part).reshape(-1, 3)
+            cells = np.clip(np.floor(cells).astype(np.int64), 0, size - 1)
+            grid[cells[:, 0], cells[:, 1], cells[:, 2]] = True
     return grid
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d import files
+from learn3d import files, limits
 
 Polygon = Sequence[int]
 
@@ -79,7 +79,7 @@ def _read_object(lines: Iterator[str], stack: list[list], parts: list[Part], ski
     """Read one AC3D object up to its `kids` line; push it as the ancestor of its children."""
     stack[-1][0] -= 1
     _, rotation, translation, skipped = stack[-1]
-    name, vertices, polygons = "", np.zeros((0, 3)), []
+    name, vertices, polygons, kind = "", np.zeros((0, 3)), [], -1
     own_rotation, own_translation = np.eye(3), np.zeros(3)
     while True:
         key, _, value = _next(lines).partition(" ")
@@ -125,10 +125,12 @@ def triangulate(polygons: Sequence[Polygon], vertices: np.ndarray) -> np.ndarray
     by_size: dict[int, list[Polygon]] = {}
     for polygon in polygons:
         by_size.setdefault(len(polygon), []).append(polygon)
-    for group in by_size.values():
-        indices = np.array(group, dtype=np.int64)
-        if indices.min() < 0 or indices.max() >= len(vertices):
-            raise ValueError(f"a polygon names vertex {indices.max()}, but there are {len(vertices)} vertices")
+    if (most := max(by_size, default=0)) > limits.POLYGON_CORNERS:
+        raise ValueError(f"a polygon has {most} corners; at most {limits.POLYGON_CORNERS} are read")
+    for polygon in polygons:
+        if min(polygon) < 0 or max(polygon) >= len(vertices):  # of any size: before they become an array
+            worst = max(polygon, key=abs)
+            raise ValueError(f"a polygon names vertex {str(worst)[:20]}, but there are {len(vertices)} vertices")
     triangles = [np.array(by_size.pop(3, []), dtype=np.int64).reshape(-1, 3)]
     quads = np.array(by_size.pop(4, []), dtype=np.int64).reshape(-1, 4)
     first, second = _cut_quads(quads, vertices)

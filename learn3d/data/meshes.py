@@ -6,6 +6,7 @@ ValueError where the file cannot be read, and `checked` where a mesh cannot be u
 
 from __future__ import annotations
 
+import io
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -13,6 +14,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+
+from learn3d import limits
+from learn3d.data import npz
+from learn3d.inputs import read_bytes, within
 
 EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # what trimesh reads without further packages
 SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
@@ -48,7 +53,7 @@ def folder_sources(folder: Path) -> tuple[list[MeshSource], Counter[str]]:
             f"no mesh file in {folder} or below it: wanted {', '.join(EXTENSIONS)}, "
             f"found {dict(ignored) or 'nothing'}; convert the meshes to one of these, or give another folder"
         )
-    return [MeshSource(p.relative_to(folder).as_posix(), lambda p=p: read_mesh(p)) for p in meshes], ignored
+    return [MeshSource(p.relative_to(folder).as_posix(), lambda p=p: read_mesh(p, folder)) for p in meshes], ignored
 
 
 def pack_sources(path: Path) -> list[MeshSource]:
@@ -58,22 +63,29 @@ def pack_sources(path: Path) -> list[MeshSource]:
     """
     wanted = "an npz file with n, v0, f0, v1, f1, ... and no pickled objects"
     try:
-        pack = np.load(path, allow_pickle=False)
-        count = int(pack["n"]) if "n" in pack else -1
-    except Exception as error:  # numpy and zipfile raise half a dozen types for a foreign or truncated file
+        pack = npz.open_npz(path)
+        there = set(npz.keys(pack))
+        count = _count(npz.read(pack, "n", max_bytes=8)) if "n" in there else -1
+    except ValueError as error:
         raise ValueError(f"cannot read the mesh pack {path}: {error}; it must be {wanted}") from error
-    missing = [key for i in range(max(count, 0)) for key in (f"v{i}", f"f{i}") if key not in pack]
+    missing = [key for i in range(count) for key in (f"v{i}", f"f{i}") if key not in there][:4]
     if count < 1 or missing:
-        raise ValueError(f"{path} is no mesh pack: it must be {wanted}; n is {count}, missing keys: {missing[:4]}")
+        raise ValueError(f"{path} is no mesh pack: it must be {wanted}; n is {count}, missing keys: {missing}")
     width = len(str(count - 1))
 
     def read(i: int) -> RawMesh:
-        try:
-            return RawMesh(pack[f"v{i}"], pack[f"f{i}"])
-        except Exception as error:
-            raise _unreadable(error) from error
+        vertices = npz.read(pack, f"v{i}", max_bytes=24 * limits.MESH_VERTICES)
+        return RawMesh(vertices, npz.read(pack, f"f{i}", max_bytes=24 * limits.MESH_FACES))
 
     return [MeshSource(f"{i:0{width}d}", lambda i=i: read(i)) for i in range(count)]
+
+
+def _count(n: np.ndarray) -> int:
+    """The number of meshes of a pack; ValueError where it is none."""
+    if n.size != 1 or n.dtype.kind not in "iu" or not 0 <= int(n.reshape(())) <= limits.ZIP_MEMBERS // 2:
+        most = limits.ZIP_MEMBERS // 2
+        raise ValueError(f"n must be the number of meshes, at most {most}, got {n.dtype} {n.reshape(-1)[:4].tolist()}")
+    return int(n.reshape(()))
 
 
 def procedural_sources(category: str, count: int, seed: int) -> list[MeshSource]:
@@ -101,26 +113,68 @@ def object_names(sources: list[MeshSource]) -> list[str]:
     return names
 
 
-def read_mesh(path: Path) -> RawMesh:
+def read_mesh(path: Path, root: Path | None = None) -> RawMesh:
     """All triangles of a mesh file, scenes concatenated with their transforms, with their colours where it has any.
 
-    Raises ValueError where it cannot be read or holds no triangle.
+    root: the folder out of which files that it refers to (materials, textures, buffers) are read; None: its own.
+    Raises ValueError where it cannot be read, holds no triangle, or is beyond a limit: 256 MiB, 20 million vertices or
+    faces, 300 seconds, 8 GiB of memory.
     """
     import trimesh
 
     try:
-        scene = trimesh.load(str(path), force="scene", process=False)
-        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        content = io.BytesIO(read_bytes(path, limits.MESH_FILE_BYTES, "a mesh file"))
+        beside = _files_below(path.parent, path.parent if root is None else root)
+        kind = path.suffix.lower().lstrip(".")
+        with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
+            scene = trimesh.load(content, file_type=kind, resolver=beside, force="scene", process=False)
+            return _joined([p for p in scene.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)])
     except Exception as error:  # trimesh's readers raise whatever a foreign or truncated file makes them trip over
         raise _unreadable(error) from error
+
+
+def _joined(parts: list) -> RawMesh:
+    """The triangles of several trimesh.Trimesh as one mesh."""
     if not parts:
         raise ValueError("no faces")
+    vertices, faces = sum(len(part.vertices) for part in parts), sum(len(part.faces) for part in parts)
+    if vertices > limits.MESH_VERTICES or faces > limits.MESH_FACES:
+        raise ValueError(
+            f"too large: {vertices} vertices and {faces} faces, the limits are {limits.MESH_VERTICES} and "
+            f"{limits.MESH_FACES}"
+        )
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     return RawMesh(
         vertices=np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]),
         faces=np.concatenate([np.asarray(p.faces, dtype=np.int64) + o for p, o in zip(parts, offsets, strict=True)]),
         face_colors=np.concatenate([_part_colors(part) for part in parts]),
     )
+
+
+def _files_below(folder: Path, root: Path):
+    """A trimesh resolver of names in `folder`, which gives nothing out that lies outside of `root`."""
+    from trimesh.resolvers import Resolver
+
+    class Below(Resolver):
+        def __init__(self) -> None:
+            """There is nothing to keep."""
+
+        def get(self, name: str) -> bytes:
+            path = (folder / str(name).strip()).resolve()
+            if not path.is_relative_to(root.resolve()):
+                raise ValueError(f"it refers to {name!r}, which lies outside of {root}")
+            return read_bytes(path, limits.MESH_FILE_BYTES, "a file that a mesh refers to")
+
+        def namespaced(self, namespace: str) -> Resolver:
+            return _files_below(folder / namespace, root)
+
+        def keys(self) -> list[str]:
+            return []
+
+        def write(self, name: str, data: bytes) -> None:
+            raise ValueError("a mesh that is read writes nothing")
+
+    return Below()
 
 
 def _unreadable(error: Exception) -> ValueError:
@@ -136,7 +190,10 @@ def _part_colors(part) -> np.ndarray:
     if visual is None or not visual.defined:
         return none
     try:
-        colors = np.asarray((visual.to_color() if visual.kind == "texture" else visual).face_colors)
+        if visual.kind == "texture":  # sampled, it does not know its mesh
+            colors = np.asarray(visual.to_color().vertex_colors, dtype=np.float64)[part.faces].mean(axis=1)
+        else:
+            colors = np.asarray(visual.face_colors)
     except Exception:  # a texture that cannot be read must not cost the mesh
         return none
     return (colors[:, :3] / 255).astype(np.float32) if len(colors) == len(none) else none

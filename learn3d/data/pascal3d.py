@@ -18,7 +18,9 @@ The oddities that this module hides:
 
 from __future__ import annotations
 
+import contextlib
 import warnings
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,10 +29,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from learn3d.data import conventions, safe_pickle
+from learn3d import limits
+from learn3d.data import conventions, npz, safe_pickle
 from learn3d.data.conventions import VOXEL_SIZE
 from learn3d.data.crops import SMALLEST, Crops, bounds
-from learn3d.data.findings import Problem
+from learn3d.data.findings import DamagedFile, Problem
 from learn3d.data.poses import RotationPoses
 from learn3d.data.views import MASK_SIZE, SPLITS, ViewDataset
 
@@ -69,7 +72,7 @@ def load(folder: Path | str, category: str, split: str, *, image_size: int = IMA
     files = [_read(path) for path in _paths(folder, category, split)]
     for file in files:
         if problem := next(_severe_problems(file), None):
-            raise ValueError(f"{file.path}: {problem}")
+            raise DamagedFile(file.path, problem)
     rotations = np.concatenate([file.rotations for file in files])
     training = rotations
     if split != "train":
@@ -165,7 +168,10 @@ def class_name(category: str) -> str:
 
 def _read(path: Path) -> _File:
     with _open(path) as archive:
-        images = list(safe_pickle.read_member(archive, "images"))  # if all have one size, they are one array
+        images = safe_pickle.read_member(archive, "images")
+        if isinstance(images, np.ndarray) and images.ndim != 4:  # if all have one size, they are one array
+            raise DamagedFile(path, f"images must be uint8 [H, W, 3] each, got one array {list(images.shape)}")
+        images = list(images)
         count, whole = len(images), (IMAGE_SIZE, IMAGE_SIZE, 4)
         limits = {"images_ref": 4 * IMAGE_SIZE**2, "bounding_boxes": 4 * 8, "rotation_matrices": 9 * 8}
         limits |= {"voxels": 8 * VOXEL_SIZE**3}
@@ -177,24 +183,32 @@ def _read(path: Path) -> _File:
     _check_shape(path, "rotation_matrices", rotations, (count, 3, 3))
     _check_shape(path, "voxels", voxels, (count, *(VOXEL_SIZE,) * 3))
     if count == 0:
-        raise ValueError(f"{path}: it holds no images")
+        raise DamagedFile(path, "it holds no images")
     return _File(path, images, references, boxes.astype(np.float64), rotations.astype(np.float64), voxels > 0)
 
 
 def _read_rotations(path: Path) -> np.ndarray:
     """The rotations alone, float64 [N, 3, 3]."""
     with _open(path) as archive:
-        limit = safe_pickle.MAX_ITEMS * 9 * 8
+        limit = limits.PICKLED_ARRAYS * 9 * 8
         rotations = safe_pickle.read_member(archive, "rotation_matrices", max_bytes=limit)
-    _check_shape(path, "rotation_matrices", rotations, (len(rotations), 3, 3))
+    count = len(rotations) if isinstance(rotations, np.ndarray) and rotations.ndim else 0
+    _check_shape(path, "rotation_matrices", rotations, (count, 3, 3))
     for text in _rotation_problems(rotations):
-        raise ValueError(f"{path}: {text}")
+        raise DamagedFile(path, text)
     return rotations.astype(np.float64)
 
 
-def _open(path: Path):
+@contextlib.contextmanager
+def _open(path: Path) -> Iterator[zipfile.ZipFile]:
+    """An npz file; what is wrong with it or its arrays names it."""
     try:
-        return safe_pickle.open_npz(path)
+        with npz.open_npz(path) as archive:
+            yield archive
+    except DamagedFile:
+        raise
+    except ValueError as error:
+        raise DamagedFile(path, str(error)) from error
     except FileNotFoundError:
         there = ", ".join(sorted(p.name for p in path.parent.glob("*.npz"))) or "no npz file"
         name = path.stem.split("_")[0]
@@ -208,7 +222,7 @@ def _check_shape(path: Path, key: str, array: object, shape: tuple[int, ...], dt
     if not isinstance(array, np.ndarray) or array.shape != shape or (dtype is not None and array.dtype != dtype):
         got = f"{array.dtype} {list(array.shape)}" if isinstance(array, np.ndarray) else "an object array"
         wanted = f"{np.dtype(dtype)} " if dtype else ""
-        raise ValueError(f"{path}: {key} must be {wanted}{list(shape)} (as many as there are images), got {got}")
+        raise DamagedFile(path, f"{key} must be {wanted}{list(shape)} (as many as there are images), got {got}")
 
 
 def _severe_problems(file: _File) -> Iterator[str]:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
+from learn3d import limits
 from learn3d.data.framing import Framing
 from learn3d.data.views import SPLITS
+from learn3d.inputs import parse_json, read_bytes
 
 TABLES = ("poses.csv", "poses.json")
 NUMBERS = ("azimuth_deg", "elevation_deg", "distance", "fov_deg")
@@ -80,6 +81,8 @@ def read_table(table: Path) -> tuple[list[Photo], list[str]]:
     rows = list(_csv_rows(table) if table.suffix == ".csv" else _json_rows(table))
     if not rows:
         raise ValueError(f"{table} lists no photographs")
+    if len(rows) > limits.OBJECTS:
+        raise ValueError(f"{table} lists {len(rows)} photographs; at most {limits.OBJECTS} are read")
     masks = table.parent / "masks"
     by_stem = {path.stem: path for path in sorted(masks.iterdir())} if masks.is_dir() else {}
     photos, faults = [], []
@@ -97,21 +100,26 @@ def read_table(table: Path) -> tuple[list[Photo], list[str]]:
 
 
 def _csv_rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    content = read_bytes(table, limits.TEXT_BYTES, "the table of photographs")
     try:
-        lines = table.read_text(encoding="utf-8-sig").splitlines()
+        lines = content.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"{table} is not UTF-8 text ({error}); save it as 'CSV UTF-8'") from None
     header = lines[0] if lines else ""
     reader = csv.DictReader(lines, delimiter=";" if ";" in header else ",", skipinitialspace=True)
-    _check_columns(table, [name.strip() for name in reader.fieldnames or []])
-    reader.fieldnames = [name.strip() for name in reader.fieldnames]
-    for row in reader:
-        yield f"{table.name}, line {reader.line_num}", row
+    try:
+        _check_columns(table, [name.strip() for name in reader.fieldnames or []])
+        reader.fieldnames = [name.strip() for name in reader.fieldnames]
+        for row in reader:
+            yield f"{table.name}, line {reader.line_num}", row
+    except csv.Error as error:
+        raise ValueError(f"{table}, line {reader.line_num} is no line of a table: {error}") from None
 
 
 def _json_rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    content = read_bytes(table, limits.TEXT_BYTES, "the table of photographs")
     try:
-        rows = json.loads(table.read_text(encoding="utf-8"))
+        rows = parse_json(content)
     except ValueError as error:
         raise ValueError(f"{table} is not valid JSON: {error}") from None
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
@@ -140,10 +148,15 @@ def _photo(folder: Path, where: str, row: dict[str, Any], masks: dict[str, Path]
     values = {name: _number(name, row[name]) for name in NUMBERS}
     if not -90 < values["elevation_deg"] < 90:
         raise ValueError(f"elevation_deg must lie between -90 and 90, got {values['elevation_deg']:g}")
-    if not values["distance"] > 0.5:
-        raise ValueError(f"distance must be above 0.5 (lengths of the longest side), got {values['distance']:g}")
-    if not 0 < values["fov_deg"] < 170:
-        raise ValueError(f"fov_deg must lie between 0 and 170, got {values['fov_deg']:g}")
+    if abs(values["azimuth_deg"]) > limits.ANGLE_DEG:
+        most = limits.ANGLE_DEG
+        raise ValueError(f"azimuth_deg must lie between {-most:g} and {most:g}, got {values['azimuth_deg']:g}")
+    if not 0.5 < values["distance"] <= limits.DISTANCE[1]:
+        got = f"and at most {limits.DISTANCE[1]:g}, got {values['distance']:g}"
+        raise ValueError(f"distance must be above 0.5 (lengths of the longest side) {got}")
+    low, high = limits.FOV_DEG
+    if not low <= values["fov_deg"] < high:
+        raise ValueError(f"fov_deg must lie between {low:g} and {high:g}, got {values['fov_deg']:g}")
     split = _choice("split", row.get("split"), SPLITS)
     framing = _choice("framing", row.get("framing"), get_args(Framing)) or "whole"
     mask = _inside(folder / "masks", "mask", row["mask"]) if row.get("mask") else masks.get(file.stem)
@@ -156,7 +169,7 @@ def _inside(folder: Path, name: str, value: Any) -> Path:
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"{name} must be the name of a file in {folder.name}/, got {value!r}")
     path = Path(value.strip().removeprefix(f"{folder.name}/"))
-    if path.is_absolute() or ".." in path.parts:
+    if path.is_absolute() or ".." in path.parts or "\0" in value:
         raise ValueError(f"{name} must be a file in {folder.name}/, got {value!r}")
     return folder / path
 
@@ -164,11 +177,11 @@ def _inside(folder: Path, name: str, value: Any) -> Path:
 def _number(name: str, value: Any) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         comma = "; write a point, not a comma" if isinstance(value, str) and "," in value else ""
-        raise ValueError(f"{name} must be a number, got {value!r}{comma}") from None
+        raise ValueError(f"{name} must be a number, got {_short(value)}{comma}") from None
     if not math.isfinite(number):
-        raise ValueError(f"{name} must be a finite number, got {value!r}")
+        raise ValueError(f"{name} must be a finite number, got {_short(value)}")
     return number
 
 
@@ -179,3 +192,8 @@ def _choice(name: str, value: Any, choices: tuple[str, ...]) -> Any:
     if value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
     return value
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."

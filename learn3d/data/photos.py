@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 import nmr
 from learn3d.data import conventions
-from learn3d.data.findings import Problem
+from learn3d.data.findings import DamagedFile, MissingFile, Problem
 from learn3d.data.framing import check_mask, frame, mask_box, read_photo
 from learn3d.data.photo_table import TABLES, Photo, find_table, read_table, split_objects
 from learn3d.data.poses import LookAtPoses
@@ -54,7 +54,7 @@ def load(
     table = find_table(folder, category)
     photos, faults = read_table(table)
     if faults:
-        raise ValueError(f"{table.parent}: {faults[0]}" + (f" (and {len(faults) - 1} more)" if faults[1:] else ""))
+        raise DamagedFile(table.parent, faults[0] + (f" (and {len(faults) - 1} more)" if faults[1:] else ""))
     splits = split_objects(table, photos)
     chosen = [photo for photo in photos if splits[photo.object] == split]
     if not chosen or "train" not in splits.values():
@@ -98,8 +98,8 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
     for photo in tqdm(chosen, desc=f"{category} {split}", disable=not progress, dynamic_ncols=True):
         try:
             _, mask = _read(photo)
-        except (ValueError, OSError) as error:
-            yield Problem(str(photo.file), str(error))
+        except (DamagedFile, MissingFile) as error:
+            yield Problem(str(error.path), error.message)
             continue
         left, top, right, bottom = mask_box(mask)
         if left == 0 or top == 0 or right == mask.shape[1] or bottom == mask.shape[0]:
@@ -189,13 +189,16 @@ def _read_images(
 
 
 def _read(photo: Photo) -> tuple[np.ndarray, np.ndarray]:
+    """Colours and mask; DamagedFile or MissingFile, which name the row, too."""
     try:
         colors, mask = read_photo(photo.file, photo.mask)
         check_mask(mask)
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"{photo.where}: {error}") from None
+        raise MissingFile(photo.file, f"{error} ({photo.where})") from None
+    except DamagedFile as error:
+        raise DamagedFile(error.path, f"{error.message} ({photo.where})") from None
     except ValueError as error:
-        raise ValueError(f"{photo.where} ({photo.file.name}): {error}") from None
+        raise DamagedFile(photo.file, f"{error} ({photo.where})") from None
     return colors, mask
 
 

@@ -31,6 +31,7 @@ from pathlib import Path
 
 import numpy as np
 
+from learn3d import limits
 from learn3d.data.binvox import Binvox, read_binvox
 from learn3d.data.conventions import R2N2, VOXEL_SIZE
 from learn3d.data.findings import DamagedFile, Findings, MissingFile, Problem
@@ -170,9 +171,11 @@ def _read_poses(path: Path, rows: int) -> np.ndarray:
     """Azimuth of the object frame, elevation and distance (in units of the mesh) of each image, float64 [rows, 3]."""
     wanted = "a row per image: azimuth, elevation, yaw 0, ratio of the distance, field of view"
     azimuth, elevation, yaw, ratio, _ = read_table(path, rows, 5, wanted).T
-    if (bad := (np.abs(elevation) >= 90) | (np.abs(yaw) > 1e-3) | (ratio <= 0)).any():
+    low, high = limits.DISTANCE
+    turns = np.abs(azimuth) > limits.ANGLE_DEG
+    if (bad := turns | (np.abs(elevation) >= 90) | (np.abs(yaw) > 1e-3) | (ratio < low) | (ratio > high)).any():
         k = int(bad.argmax())
-        found = f"elevation {elevation[k]:g}, yaw {yaw[k]:g} and ratio {ratio[k]:g}"
+        found = f"azimuth {azimuth[k]:g}, elevation {elevation[k]:g}, yaw {yaw[k]:g} and ratio {ratio[k]:g}"
         raise DamagedFile(path, f"row {k} has {found}; expected {wanted}")
     return np.stack([-azimuth, elevation, DISTANCE * ratio], axis=1)
 

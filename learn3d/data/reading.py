@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,12 +14,16 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from learn3d import limits
+from learn3d.data import npz
 from learn3d.data.conventions import VoxelConvention
 from learn3d.data.findings import AGAIN, DamagedFile, Findings, MissingFile
+from learn3d.data.images import RENDERINGS, open_image
 from learn3d.data.kato import synset_of
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import AngleBins
 from learn3d.data.views import MASK_SIZE, SPLITS, ViewDataset
+from learn3d.inputs import read_text
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -71,15 +73,8 @@ def warn_if_empty(findings: Findings, path: Path, mask: np.ndarray) -> None:
 
 
 def read_image(path: Path) -> Image.Image:
-    """A decoded image file in its own mode; DamagedFile or MissingFile."""
-    try:
-        with Image.open(path) as image:
-            image.load()
-            return image
-    except FileNotFoundError:
-        raise MissingFile(path, "is missing; expected an image") from None
-    except (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError) as error:
-        raise DamagedFile(path, f"cannot be decoded as an image ({error}). {AGAIN}") from error
+    """A decoded rendering of at most 2048 pixels a side, in its own mode; DamagedFile or MissingFile."""
+    return open_image(path, RENDERINGS, limits.RENDER_SIDE)
 
 
 def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
@@ -131,28 +126,32 @@ def _area_weights(source: int, size: int) -> np.ndarray:
     return (overlap.clip(0) * (size / source)).astype(np.float32)
 
 
-def read_npz(path: Path, wanted: str) -> dict[str, np.ndarray]:
-    """All arrays of an npz file without pickled objects; `wanted` says what it should hold."""
+def read_npz(path: Path, names: Iterable[str], wanted: str) -> dict[str, np.ndarray]:
+    """Those of the named arrays that an npz file of one object has; `wanted` says what it should hold."""
     try:
-        archive = np.load(path, allow_pickle=False)
-        if isinstance(archive, np.ndarray):
-            raise ValueError("it is a single npy array")
-        with archive:
-            return {name: archive[name] for name in archive.files}
+        with npz.open_npz(path, most=limits.OBJECT_BYTES) as archive:
+            there = set(npz.keys(archive))
+            return {name: npz.read(archive, name) for name in names if name in there}
     except FileNotFoundError:
         raise MissingFile(path, f"is missing; expected {wanted}") from None
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+    except ValueError as error:
         raise DamagedFile(path, f"cannot be read ({error}); expected an npz file with {wanted}. {AGAIN}") from error
+
+
+def check_ids(path: Path, ids: Sequence[str]) -> None:
+    """Raise DamagedFile where the ids that a list names are too many, or one is no plain name of a folder."""
+    if len(ids) > limits.OBJECTS:
+        raise DamagedFile(path, f"names {len(ids)} objects; at most {limits.OBJECTS} are read")
+    for name in ids:
+        if name in ("", ".", "..") or len(name) > limits.NAME_LENGTH or set(name) & set("/\\:\0"):
+            raise DamagedFile(
+                path, f"names the object {name[:40]!r}; expected the plain name of a folder (no '/', no '..')"
+            )
 
 
 def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
     """The first `rows` rows of a table of numbers in a text file, float64 [rows, C] with C >= `columns`, all finite."""
-    try:
-        text = path.read_text()
-    except FileNotFoundError:
-        raise MissingFile(path, f"is missing; expected {wanted}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise DamagedFile(path, f"cannot be read ({error}); expected {wanted}. {AGAIN}") from error
+    text = read_text(path, limits.TABLE_BYTES, wanted)
     lines = [line.split() for line in text.splitlines() if line.strip()]
     if len(lines) < rows:
         raise DamagedFile(path, f"has {len(lines)} rows, {rows} are needed; expected {wanted}. {AGAIN}")

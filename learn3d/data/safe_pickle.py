@@ -14,17 +14,13 @@ import re
 import struct
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-MAX_BYTES = 16 * 2**30  # uncompressed size of one member of an archive
-MAX_ITEMS = 200_000  # arrays in an object array
-MAX_EXPANSION = 300  # a member above 64 MiB that was compressed to less than 1/300 holds no photographs
-_LARGE = 64 * 2**20
+from learn3d import limits
+from learn3d.data import npz
 
 _MAKERS = {
     ("numpy.core.multiarray", "_reconstruct"): "make",
@@ -61,25 +57,8 @@ class _Array:
         self.value: np.ndarray | list[np.ndarray] | None = None
 
 
-def open_npz(path: Path | str) -> zipfile.ZipFile:
-    """Open an npz archive. Raises FileNotFoundError, and ValueError for what is no zip archive."""
-    try:
-        return zipfile.ZipFile(path)
-    except FileNotFoundError:
-        raise FileNotFoundError(f"there is no file {path}") from None
-    except (OSError, zipfile.BadZipFile) as error:
-        raise ValueError(
-            f"{path} is not an npz file ({error}); perhaps the download was cut short: fetch it again"
-        ) from None
-
-
-def keys(archive: zipfile.ZipFile) -> list[str]:
-    """Names of the arrays in the archive."""
-    return [name.removesuffix(".npy") for name in archive.namelist()]
-
-
 def read_member(archive: zipfile.ZipFile, key: str, *, max_bytes: int | None = None) -> np.ndarray | list[np.ndarray]:
-    """The array `key` of the archive: an ndarray of numbers or bools, or the ndarrays of an object array [N].
+    """The array `key` of an archive (`npz.open_npz`): an ndarray, or the ndarrays of an object array [N].
 
     max_bytes: refuse arrays larger than that. None: it is not known how large they may be, and then an archive that
     unpacks to very many times its size is taken for a trap.
@@ -87,47 +66,24 @@ def read_member(archive: zipfile.ZipFile, key: str, *, max_bytes: int | None = N
     Raises ValueError, naming file and key, where the key is missing, the file damaged, the array of another kind, or
     the pickle asks for anything but arrays; nothing in it has been executed then. Arrays may be read-only.
     """
-    try:
-        try:
-            info = archive.getinfo(f"{key}.npy")
-        except KeyError:
-            raise ValueError(f"it holds the keys {keys(archive)}") from None
-        limit = MAX_BYTES if max_bytes is None else min(MAX_BYTES, max_bytes + 1000)  # the header takes 128
-        if info.file_size > limit:
-            raise ValueError(f"it would unpack to {info.file_size} bytes; at most {limit} are read")
-        if max_bytes is None and info.file_size > max(_LARGE, MAX_EXPANSION * info.compress_size):
-            raise ValueError(f"it would unpack to {info.file_size / max(1, info.compress_size):.0f} times its size")
-        with archive.open(info) as file:
-            return _read_npy(file, info.file_size)
-    except (OSError, EOFError, ValueError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"cannot read the array {key!r} of {archive.filename}: {error}") from error
-
-
-def _read_npy(file: BinaryIO, size: int) -> np.ndarray | list[np.ndarray]:
-    """An npy file of `size` bytes."""
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):  # others are for records with very many fields
-        raise ValueError(f"npy format {version[0]}.{version[1]} is not read here, only 1.0")
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Reading `.npy`")  # Python 2's headers have numbers such as 12L
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    stream = _Stream(file, size - file.tell())
-    if dtype == np.dtype(object):
-        if len(shape) != 1 or not 0 <= shape[0] <= MAX_ITEMS:
-            raise ValueError(f"an object array must be one-dimensional with at most {MAX_ITEMS} items, got {shape}")
+    with npz.open_member(archive, key, max_bytes=max_bytes) as (file, size):
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Reading `.npy`")  # Python 2's headers have numbers such as 12L
+            head = npz.read_header(file)
+        stream = _Stream(file, size - file.tell())
+        if head.dtype != np.dtype(object):
+            npz.check_size(head, stream.left)
+            array = npz.from_bytes(stream.read(stream.left), head)
+            stream.finish()
+            return array
+        if len(head.shape) != 1 or head.shape[0] > limits.PICKLED_ARRAYS:
+            most = limits.PICKLED_ARRAYS
+            raise ValueError(f"an object array must be one-dimensional with at most {most} items, got {head.shape}")
         items = _Interpreter(stream).run()
-        if len(items) != shape[0]:
-            raise ValueError(f"its header promises {shape[0]} items, it holds {len(items)}")
+        if len(items) != head.shape[0]:
+            raise ValueError(f"its header promises {head.shape[0]} items, it holds {len(items)}")
         stream.finish()
         return items
-    if dtype.kind not in "biuf":
-        raise ValueError(f"its values must be numbers, got {dtype}")
-    count = math.prod(shape)
-    if min(shape, default=0) < 0 or count * dtype.itemsize != stream.left:
-        raise ValueError(f"{dtype} {list(shape)} takes {count * dtype.itemsize} bytes, but {stream.left} are there")
-    array = np.frombuffer(stream.read(stream.left), dtype)
-    stream.finish()
-    return array.reshape(shape, order="F" if fortran else "C")
 
 
 class _Stream:
@@ -167,7 +123,7 @@ class _Interpreter:
 
     def __init__(self, stream: _Stream) -> None:
         self.stream, self.stack, self.memo, self.encoded = stream, [], {}, 0
-        self.budget = 1000 + 64 * MAX_ITEMS  # instructions: an array takes about 30
+        self.budget = 1000 + 64 * limits.PICKLED_ARRAYS  # instructions: an array takes about 30
         read, unpack = stream.read, stream.unpack
         self.instructions: dict[bytes, Callable[[], Any]] = {
             b"\x80": lambda: self._protocol(unpack("<B")),
@@ -312,7 +268,7 @@ def _array_value(shape: Any, dtype: Any, fortran: Any, data: Any, *, limit: int)
         raise ValueError("its pickle holds an array whose shape or dtype is none")
     count = math.prod(shape)
     if dtype.code == "O":
-        if type(data) is not list or len(data) != count or len(shape) != 1 or count > MAX_ITEMS:
+        if type(data) is not list or len(data) != count or len(shape) != 1 or count > limits.PICKLED_ARRAYS:
             raise ValueError(f"its pickle holds an object array {list(shape)} that does not fit its items")
         if not all(isinstance(item, _Array) and isinstance(item.value, np.ndarray) for item in data):
             raise ValueError("the items of an object array must be arrays of numbers")

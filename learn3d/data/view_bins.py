@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from learn3d import limits
 from learn3d.data.poses import LookAtPoses, wrap_deg
 
 
@@ -25,6 +27,9 @@ class AngleBins:
     elevation_high_deg: float = 40.0
 
     def __post_init__(self) -> None:
+        numbers = (self.azimuth_width_deg, self.elevation_width_deg, self.elevation_low_deg, self.elevation_high_deg)
+        if not all(map(math.isfinite, numbers)):
+            raise ValueError(f"widths and elevations of bins must be finite, got {numbers}")
         if not (0 < self.azimuth_width_deg <= 360 and 0 < self.elevation_width_deg):
             raise ValueError(
                 "bin widths must be positive and the azimuth's at most 360 degrees, got "
@@ -34,6 +39,9 @@ class AngleBins:
             raise ValueError(
                 f"elevations must go from low to high, got {self.elevation_low_deg} .. {self.elevation_high_deg}"
             )
+        cells = 360 / self.azimuth_width_deg * ((self.elevation_high_deg - self.elevation_low_deg) / numbers[1])
+        if cells > limits.VIEW_CLASSES:
+            raise ValueError(f"there would be {cells:.0f} bins; at most {limits.VIEW_CLASSES} are possible")
 
     @classmethod
     def parse(cls, text: str) -> AngleBins:

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d import checkpoint
+from learn3d import checkpoint, checkpoint_checks
 from learn3d.config import TrainConfig, config_from_dict, differences, load_config
 from learn3d.data.layouts import LAYOUTS, Layout
+from learn3d.experiments.stored import read_result
 from learn3d.experiments.tables import Row, Table, Variant
 from learn3d.networks import resolve_precision
 from learn3d.presets import PRESETS
@@ -132,12 +133,12 @@ def read_state(run: Run) -> State:
         return State("new")
     if step < run.config.iterations:
         return State("unfinished", step)
-    return State("done" if result.is_file() and is_current(run, load_json(result)) else "trained", step)
+    return State("done" if result.is_file() and is_current(run, read_result(result)) else "trained", step)
 
 
 def read_results(runs: Sequence[Run]) -> dict[Path, dict[str, Any]]:
     """The stored results of those runs that have one that is theirs, by folder."""
-    found = {run.folder: load_json(path) for run in runs if (path := run.folder / RESULT_FILE).is_file()}
+    found = {run.folder: read_result(path) for run in runs if (path := run.folder / RESULT_FILE).is_file()}
     return {run.folder: found[run.folder] for run in runs if run.folder in found and is_current(run, found[run.folder])}
 
 
@@ -150,10 +151,13 @@ def found_runs(table: Table, options: Options) -> list[Run]:
     for row in selected_rows(table, options.methods):
         pattern = f"*/{row.variant.name}-seed*/{RESULT_FILE}" if row.variant else ""
         for path in sorted((options.output / "runs").glob(pattern)) if pattern else []:
-            category, seed = path.parts[-3], int(path.parts[-2].rpartition("seed")[2])
+            category, number = path.parts[-3], path.parts[-2].rpartition("seed")[2]
+            if not number.isdecimal():
+                continue
+            seed = int(number)
             if category not in (options.categories or [category]) or seed >= (options.seeds or seed + 1):
                 continue
-            result = load_json(path)
+            result = read_result(path)
             config = config_from_dict(result["config"], source=str(path))
             where = {"output": path.parent, "data": Path(result["data"])}  # a relative path was of another folder
             config = dataclasses.replace(config, iterations=result["iterations"], **where)
@@ -171,14 +175,6 @@ def is_current(run: Run, result: dict[str, Any]) -> bool:
         and result.get("checkpoint") == run.variant.checkpoint
         and result.get("data") == str(run.config.data.resolve())
     )
-
-
-def load_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file; a damaged one is a ValueError that names it."""
-    try:
-        return json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} is not valid JSON ({error}); remove it, and it is made again") from None
 
 
 def command_line(config: TrainConfig, **placeholders: str) -> str:
@@ -273,7 +269,7 @@ def _parse(text: str, kind: str) -> Any:
     """A value as JSON has it (0.5, true, null, [1, 2]), else the text itself; "a,b" where several values are wanted."""
     try:
         value = json.loads(text)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         value = text
     if "tuple" in kind and isinstance(value, str):
         return tuple(_parse(part, "") for part in value.split(",") if part)
@@ -286,10 +282,11 @@ def _recorded(run: Run) -> tuple[TrainConfig | None, int, str | None]:
     last, result = run.folder / "last.safetensors", run.folder / RESULT_FILE
     if last.is_file():
         metadata = checkpoint.load_metadata(last)
+        checkpoint_checks.require(metadata, ("config", "step"), last)
         config = config_from_dict(metadata["config"], source=str(last))
         return config, metadata["step"], metadata.get("conditions", {}).get("precision")
     if result.is_file():
-        values = load_json(result)
+        values = read_result(result)
         config = config_from_dict(values["config"], source=str(result))
         return config, values["iterations"], values.get("conditions", {}).get("precision")
     if (run.folder / "config.json").is_file():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from learn3d import limits
 from learn3d.figures import plots
+from learn3d.inputs import parse_json, read_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,19 +52,21 @@ def read_metrics(path: Path) -> dict[Key, Curve]:
     """All curves of a run folder (or of a metrics.jsonl), by split and name.
 
     A last line cut short is left out: the run may be writing it. Raises FileNotFoundError without such a file and
-    ValueError, naming the line, for one that is not a record of a run.
+    ValueError for one above 256 MiB and, naming it, for a line that is not a record of a run.
     """
     path = Path(path)
     file = path / "metrics.jsonl" if path.is_dir() else path
     if not file.is_file():
         raise FileNotFoundError(f"there is no {file}; give the folder of a training run, which has a metrics.jsonl")
-    lines = file.read_text(encoding="utf-8").splitlines()
+    lines = read_text(file, limits.METRICS_BYTES, "the metrics of a run", errors="replace").splitlines()
     points: dict[Key, dict[int, float]] = {}
     for number, line in enumerate(lines, start=1):
         try:
-            record = json.loads(line)
-            step, split = int(record.pop("step")), str(record.pop("split"))
-        except (json.JSONDecodeError, KeyError, TypeError, AttributeError, ValueError):
+            record = parse_json(line, finite=False)
+            step, split = record.pop("step"), str(record.pop("split"))
+            if type(step) is not int or not 0 <= step <= limits.ITERATIONS:
+                raise ValueError("no step")
+        except (KeyError, TypeError, AttributeError, ValueError):
             if number == len(lines) and number > 1:
                 break
             raise ValueError(f"{file}, line {number} is no record with a step and a split: {line[:60]!r}") from None

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from learn3d import files
+from learn3d import files, limits
 from learn3d.config import load_config
 from learn3d.data.conventions import Definition
 from learn3d.evaluation import spread_samples
@@ -18,6 +17,7 @@ from learn3d.figures.drawing import azimuths_deg, beside, save_gif, save_png, st
 from learn3d.figures.grids import comparison_grid, spread_views
 from learn3d.figures.interpolation import AZIMUTHS_DEG, interpolation_strip, morph, typical_views
 from learn3d.figures.runs import Run, by_dataset, encode, name_runs, title_of
+from learn3d.inputs import parse_json, read_bytes
 
 IMAGES = 6  # rows of a grid of one category
 IMAGES_PER_CATEGORY = 2  # rows of each of several categories
@@ -123,12 +123,17 @@ def save_polar(runs: Sequence[Run], output: Path, *, definition: Definition = "k
 
 def redraw_polar(values: Path, output: Path) -> list[Path]:
     """The plot of `save_polar` from the JSON that it wrote."""
+    what = "give the .json that 'polar' wrote beside its picture"
     try:
-        stored = json.loads(Path(values).read_text())["profiles"]
+        content = read_bytes(values, limits.JSON_BYTES, "the figures of a plot")
     except FileNotFoundError:
-        raise FileNotFoundError(f"there is no {values}; give the .json that 'polar' wrote beside its picture") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
-        raise ValueError(f"{values} holds no profiles; give the .json that 'polar' wrote beside its picture") from None
+        raise FileNotFoundError(f"there is no {values}; {what}") from None
+    try:
+        stored = parse_json(content)["profiles"]
+        if not isinstance(stored, list) or not stored:
+            raise TypeError
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(f"{values} holds no profiles; {what}") from None
     profiles = [polar.ViewProfile.from_json(value, source=str(values)) for value in stored]
     return plots.save_figure(polar.plot_profiles(profiles), _in_folder(output))
 

@@ -54,10 +54,12 @@ class ViewProfile:
                 name: float("nan" if values[name] is None else values[name]) for name in ("mean_iou", "consistency")
             }
             profile = cls(label=str(values["label"]), **rows, **single)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"{source} holds no profile over views ({type(error).__name__}: {error})") from None
         if not profile.azimuths_deg.shape == profile.iou.shape == profile.agreement.shape:
             raise ValueError(f"{source} holds a profile whose azimuths and values differ in number")
+        if profile.azimuths_deg.ndim != 1 or not np.isfinite(profile.azimuths_deg).all():
+            raise ValueError(f"{source} holds a profile whose azimuths are no list of finite numbers")
         return profile
 
 

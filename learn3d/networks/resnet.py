@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from learn3d import limits
+from learn3d.data.archives import open_zip
+from learn3d.inputs import check_file, within
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -91,6 +96,8 @@ def load_pretrained(encoder: nn.Module, path: Path | str) -> None:
     for name, value in given.items():
         if value.shape != own[name].shape:
             raise ValueError(f"{path}: {name} is {list(value.shape)}, ResNet-18 has {list(own[name].shape)}{hint}")
+        if not bool(value.isfinite().all()):
+            raise ValueError(f"{path}: {name} has values that are not finite{hint}")
     encoder.load_state_dict(given, strict=False)
 
 
@@ -98,11 +105,16 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise FileNotFoundError(f"there is no file of pretrained weights {path}")
     try:
+        check_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18")
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
 
-            return load_file(path)
-        weights = torch.load(path, map_location="cpu", weights_only=True)
+            weights = load_file(path)
+        else:
+            if zipfile.is_zipfile(path):  # what torch.save writes: stored, not compressed
+                open_zip(path, limits.WEIGHTS_BYTES).close()
+            with within(limits.WEIGHTS_SECONDS, 4 * limits.WEIGHTS_BYTES):
+                weights = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # the readers raise half a dozen kinds for a damaged or a hostile file
         raise ValueError(f"cannot read pretrained weights from {path}: {error}") from error
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):

@@ -12,17 +12,30 @@ _PILLOW = (
 )
 
 
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "TGA", "WEBP", "GIF", "PPM")
+_MOST_PIXELS = 2**26  # 8192 x 8192; each takes some 30 bytes
+
+
 def read_image(filename: str) -> np.ndarray:
     """Colours ``[H, W, 3]`` float32 in [0, 1], row 0 = top: grey becomes RGB, alpha is left out, 16 bits stay."""
     try:
         from PIL import Image
     except ImportError as error:
         raise ImportError(_PILLOW) from error
-    with Image.open(filename) as image:
-        if image.mode.startswith("I"):
-            grey = np.asarray(image, dtype=np.float32) / 65535
-            return np.repeat(grey[:, :, None], 3, axis=2)
-        return np.asarray(image.convert("RGB"), dtype=np.float32) / 255
+    if os.path.exists(filename) and not os.path.isfile(filename):
+        raise ValueError(f"the image {filename} is no plain file")
+    try:
+        with Image.open(filename, formats=_FORMATS) as image:
+            if image.width * image.height > _MOST_PIXELS:
+                raise ValueError(f"{image.width}x{image.height} pixels, at most {_MOST_PIXELS} are read")
+            if image.mode.startswith("I"):
+                grey = np.asarray(image, dtype=np.float32) / 65535
+                return np.repeat(grey[:, :, None], 3, axis=2)
+            return np.asarray(image.convert("RGB"), dtype=np.float32) / 255
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # Pillow's decoders raise whatever a damaged file leads them to
+        raise ValueError(f"the image {filename} cannot be read: {error}") from error
 
 
 def write_png(filename: str, image: np.ndarray) -> None:

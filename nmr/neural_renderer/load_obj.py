@@ -13,6 +13,8 @@ from ._images import read_image
 
 WRAPPINGS = ("REPEAT", "MIRRORED_REPEAT", "CLAMP_TO_EDGE", "CLAMP_TO_BORDER")
 _GREY = 0.5  # of faces without a material
+_LARGEST = float(np.finfo(np.float32).max)
+_MOST_BYTES = 2**30  # of an .obj or .mtl file; reading one takes some 30 times its size
 
 
 @dataclass
@@ -80,6 +82,11 @@ def load_obj(
         vertices = vertices - vertices.amin(0)
         vertices = vertices / vertices.abs().max() * 2
         vertices = vertices - vertices.amax(0) / 2
+    if not vertices.isfinite().all():
+        raise ValueError(
+            f"{filename_obj}: its vertices have no box that could be scaled, or are not finite; normalization=False "
+            "leaves them as they are, if they are finite numbers of float32"
+        )
     if not load_texture:
         return vertices, faces
     return vertices, faces, _textures(filename_obj, obj, texture_size, texture_wrapping, use_bilinear)
@@ -87,6 +94,7 @@ def load_obj(
 
 def _read_obj(filename: str) -> _Obj:
     obj, material = _Obj(), ""
+    _check_file(filename)
     with open(filename, encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
             keyword, _, rest = line.strip().partition(" ")
@@ -115,10 +123,18 @@ def _read_obj(filename: str) -> _Obj:
     return obj
 
 
+def _check_file(filename: str) -> None:
+    """Refuse a pipe, which would be waited for, and what is too large; that it is missing, `open` tells."""
+    if os.path.exists(filename) and not os.path.isfile(filename):
+        raise ValueError(f"{filename} is no plain file")
+    if os.path.exists(filename) and os.path.getsize(filename) > _MOST_BYTES:
+        raise ValueError(f"{filename} has {os.path.getsize(filename)} bytes; at most {_MOST_BYTES} are read")
+
+
 def _numbers(rest: str, count: int) -> tuple[float, ...]:
     values = tuple(float(x) for x in rest.split()[:count])
-    if len(values) < count:
-        raise ValueError(f"{count} numbers are needed")
+    if len(values) < count or not all(abs(value) <= _LARGEST for value in values):
+        raise ValueError(f"{count} numbers are needed, finite in float32")
     return values
 
 
@@ -146,6 +162,7 @@ def _index(text: str, count: int) -> int:
 def load_mtl(filename_mtl: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Colours ``Kd`` and image names ``map_Kd`` of the materials of an .mtl file."""
     colors, images, material = {}, {}, ""
+    _check_file(filename_mtl)
     with open(filename_mtl, encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
             keyword, _, rest = line.strip().partition(" ")
@@ -175,17 +192,19 @@ def _textures(filename_obj: str, obj: _Obj, texture_size: int, wrapping: str, bi
             more_colors, more_images = load_mtl(os.path.join(folder, one))
             colors.update(more_colors)
             images.update(more_images)
-    materials = np.array(obj.materials)
     uv_faces = np.array(obj.uv_faces)
-    textures = np.full((len(materials), texture_size, texture_size, texture_size, 3), _GREY, dtype=np.float32)
-    for name, color in colors.items():
-        textures[materials == name] = color
-    for name, filename in images.items():
-        chosen = (materials == name) & (uv_faces >= 0).all(1)
-        if chosen.any():
-            path = os.path.join(folder, filename)
+    textures = np.full((len(uv_faces), texture_size, texture_size, texture_size, 3), _GREY, dtype=np.float32)
+    faces_of: dict[str, list[int]] = {}
+    for face, name in enumerate(obj.materials):
+        faces_of.setdefault(name, []).append(face)
+    for name, faces in faces_of.items():
+        if name in colors:
+            textures[faces] = colors[name]
+        chosen = np.array(faces)[(uv_faces[faces] >= 0).all(1)]
+        if name in images and len(chosen):
+            path = os.path.join(folder, images[name])
             if not os.path.exists(path):  # map_Kd may have options before the name
-                path = os.path.join(folder, filename.split()[-1])
+                path = os.path.join(folder, (images[name].split() or [""])[-1])
             uv = np.array(obj.uv, dtype=np.float32)[uv_faces[chosen]]
             textures[chosen] = bake_textures(read_image(path), uv, texture_size, wrapping, bilinear)
     return torch.from_numpy(textures)

@@ -11,7 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz_targets import deb_bytes
+from memory_checks import at_most
 
+from learn3d import limits
 from learn3d.data import debian_packages as packages
 from learn3d.data.debian_aircraft import is_airplane_file, turn_to_front, without_effects
 from learn3d.data.debian_furniture import furniture_category, place_furniture, read_catalogue
@@ -235,7 +238,7 @@ def test_output_is_replaced_only_when_asked_and_ours(debs: Path, tmp_path: Path)
 
 def test_a_failure_leaves_nothing_behind(debs: Path, tmp_path: Path):
     deb(debs, "sweethome3d-furniture", {"usr/share/x.sh3f": b"no zip"})  # same name and version: replaces the good one
-    with pytest.raises(ValueError, match=r"x\.sh3f is not a zip archive"):
+    with pytest.raises(ValueError, match=r"x\.sh3f is refused as a zip archive"):
         fetch(tmp_path / "out", debs)
     assert [path.name for path in tmp_path.iterdir()] == ["debs"]
 
@@ -254,12 +257,12 @@ def test_unsafe_members_are_refused(debs: Path, tmp_path: Path):
 
 
 def test_oversized_members_are_refused(debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(packages, "MAX_FILE_BYTES", 100)
+    monkeypatch.setattr(limits, "PACKAGE_FILE_BYTES", 100)
     with pytest.raises(ValueError, match=r"bytes, at most 100 are read"):
         fetch(tmp_path / "out", debs)
     with zipfile.ZipFile(io.BytesIO(), "w") as archive:
         archive.writestr("m", b"x")
-        archive.getinfo("m").file_size = packages.MAX_MEMBER_BYTES + 1
+        archive.getinfo("m").file_size = limits.CATALOGUE_MEMBER_BYTES + 1
         with pytest.raises(ValueError, match="refused"):
             packages.read_member(archive, "m")
 
@@ -524,3 +527,77 @@ def test_ply_reads_back(tmp_path: Path):
     np.testing.assert_array_equal(mesh.vertices, corners)
     np.testing.assert_array_equal(mesh.faces, faces)
     assert [path.name for path in tmp_path.iterdir()] == ["box.ply"]
+
+
+def test_archives_that_lead_astray_are_refused(debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refused(message: str) -> None:
+        with pytest.raises(ValueError, match=message):
+            fetch(tmp_path / "out", debs, categories=("chair",))
+
+    file = deb(debs, "sweethome3d-furniture", {"usr/x.sh3f": catalogue([], {})})
+    content = file.read_bytes()
+    at = content.index(b"control.tar")
+    for size in (b"-60       ", b"1e9       ", b"          "):  # the first would be read for ever
+        file.write_bytes(content[: at + 48] + size + content[at + 58 :])
+        refused("its member 'control.tar.xz' has no size")
+    file.write_bytes(content)
+    monkeypatch.setattr(limits, "PACKAGE_MEMBERS", 0)
+    refused("it has more than 0 members")
+    monkeypatch.undo()
+    monkeypatch.setattr(limits, "PACKAGE_BYTES", 5000)
+    refused("unpacks to more than its headers say, or than 5000 bytes")
+
+
+def test_a_tar_header_that_unpacks_to_very_much_is_not_kept(debs: Path, tmp_path: Path):
+    """A long name of 100 MB takes 15 kB in the package, and tarfile would hold all of it."""
+    data = io.BytesIO()
+    with tarfile.open(fileobj=data, mode="w:xz", format=tarfile.GNU_FORMAT) as tar:
+        tar.addfile(tarfile.TarInfo("n" * 100_000_000))
+    file = deb(debs, "sweethome3d-furniture", {})
+    content = file.read_bytes()
+    start, packed = content.index(b"data.tar"), data.getvalue()
+    file.write_bytes(content[:start] + f"{'data.tar.xz':<48}{len(packed):<10}`\n".encode() + packed)
+    assert len(packed) < 100_000
+    with at_most(2**25), pytest.raises(ValueError, match="unpacks to more than its headers say"):
+        fetch(tmp_path / "out", debs, categories=("chair",))
+
+
+@pytest.mark.parametrize("kind", ["gz", "bz2", "xz"])
+def test_packages_of_every_compression_are_read(tmp_path: Path, kind: str):
+    (tmp_path / "p_1_all.deb").write_bytes(deb_bytes({"usr/a.ac": b"1" * 30_000, "usr/b.ac": b"2"}, kind))
+    found = dict(packages.read_package(packages.find_package("p", tmp_path), (".ac",)))
+    assert found == {"usr/a.ac": b"1" * 30_000, "usr/b.ac": b"2"}
+
+
+TEXTS = {
+    "a vertex beyond any": ("v 0 0 0\nf 1 1 " + "9" * 400, "names vertex 9999"),
+    "a vertex before any": ("v 0 0 0\nf 1 1 -9", "names vertex -8"),
+    "many corners": ("v 0 0 0\nf" + " 1" * 2001, "a polygon has 2001 corners; at most 2000 are read"),
+    "no number": ("f 1 2 x", "invalid literal"),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_obj_texts_that_cannot_be(name: str):
+    text, message = TEXTS[name]
+    with pytest.raises(ValueError, match=message):
+        read_obj(text)
+
+
+def test_ac3d_polygons_without_a_kind_are_left_out():
+    assert read_ac3d("AC3Db\nOBJECT poly\nnumvert 1\n0 0 0\nrefs 3\n0 0 0\n0 0 0\n0 0 0\nkids 0") == []
+    with pytest.raises(ValueError, match="ends in the middle"):
+        read_ac3d("AC3Db\nOBJECT poly\nnumvert 99999999999\n0 0 0")
+
+
+def test_names_that_are_no_characters_and_numbers_that_are_none():
+    _, entries = read_catalogue("name#1=half \\ud83d a pair\nname#" + "9" * 5000 + "=x\nname#2=ok")
+    assert [e["name"] for e in entries] == ["half ? a pair", "ok"]
+
+
+def test_large_faces_are_sampled_piece_by_piece():
+    rng = np.random.default_rng(0)
+    vertices = rng.uniform(-0.5, 0.5, (600, 3))
+    with at_most(2**28):
+        grid = surface_grid(vertices, np.arange(600).reshape(-1, 3), 64)
+    assert grid.mean() > 0.1

@@ -137,7 +137,7 @@ FAULTS = {
     ),
     "cameras.npz: is missing": lambda root: (root / "cameras.npz").unlink(),
     "cameras.npz: cannot be read": lambda root: cut_short(root / "cameras.npz"),
-    "cannot be read (it is a single npy array)": lambda root: (root / "pointcloud.npz").write_bytes(npy_bytes()),
+    "is not an npz file (it is a single npy array)": lambda root: (root / "pointcloud.npz").write_bytes(npy_bytes()),
     "lacks world_mat_7 (1 of 24 matrices)": lambda root: change_cameras(root, lambda a: a.pop("world_mat_7")),
     "world_mat_2 has the shape [3, 3]": set_matrix(2, lambda m: m[:3, :3]),
     "cameras.npz: has numbers that are not finite": set_matrix(2, lambda m: m * np.nan),
@@ -176,6 +176,8 @@ def test_faults_of_the_lists(folder):
     expect(dvr, folder, "test", "chair test lists a0 more than once", "warning")
     path.write_text("b1\n")
     expect(dvr, folder, "test", "chair test shares 1 objects with train, such as b1", "warning")
+    path.write_text("../../etc\n")
+    expect(dvr, folder, "test", "softras_test.lst: names the object '../../etc'; expected the plain name of a folder")
     path.write_text("\n")
     expect(dvr, folder, "test", "names no object; expected one id per line")
     path.unlink()

@@ -159,13 +159,13 @@ def test_unreadable_photos_are_named(tmp_path: Path) -> None:
         read_photo(tmp_path / "b.heic")
     content = save(tmp_path / "c.png", np.random.default_rng(0).integers(0, 256, (90, 90, 3), np.uint8)).read_bytes()
     (tmp_path / "c.png").write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match=r"c.png cannot be read as an image: "):
+    with pytest.raises(ValueError, match=r"c.png: cannot be decoded as an image"):
         read_photo(tmp_path / "c.png")
 
 
 def test_huge_photos_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
-    with pytest.raises(ValueError, match=r"a.png cannot be read as an image: .* decompression bomb"):
+    with pytest.raises(ValueError, match=r"a.png: has too many pixels .*make it smaller"):
         read_photo(save(tmp_path / "a.png", np.zeros((9, 9, 3), np.uint8)))
 
 

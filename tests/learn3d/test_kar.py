@@ -166,8 +166,9 @@ FAULTS = {
     "view.txt: row 3 is '1 2 x 4'": rewrite_row(3, "1 2 x 4"),
     "view.txt: row 2 is '1 2'": rewrite_row(2, "1 2"),
     "view.txt: row 4 has numbers that are not finite": rewrite_row(4, "1 nan 0 2"),
-    "view.txt: row 4 has elevation 95 and distance 2": rewrite_row(4, "1 95 0 2"),
-    "view.txt: row 4 has elevation 5 and distance 0": rewrite_row(4, "1 5 0 0"),
+    "view.txt: row 4 has azimuth 1e+30": rewrite_row(4, "1e30 5 0 2"),
+    "view.txt: row 4 has azimuth 1, elevation 95 and distance 2": rewrite_row(4, "1 95 0 2"),
+    "view.txt: row 4 has azimuth 1, elevation 5 and distance 0": rewrite_row(4, "1 5 0 0"),
     "a0.mat: is missing": lambda f: volume(f).unlink(),
     "a0.mat: cannot be read": lambda f: volume(f).write_bytes(b"MATLAB 5.0 nonsense" * 20),
     "a0.mat: has no such array": lambda f: scipy.io.savemat(volume(f), {"volume": np.ones((32, 32, 32))}),
@@ -204,6 +205,9 @@ LIST_FAULTS = {
     "splits.json: has another structure": '{"03001627": {"test": "a0"}}',
     "has another structure; expected": '["03001627"]',
     "has no entry 03001627 (chair); it has: 02691156": '{"02691156": {"test": ["a0"]}}',
+    "names the object '../../../etc'; expected the plain name": '{"03001627": {"test": ["../../../etc"]}}',
+    "names the object '/etc'; expected the plain name": '{"03001627": {"test": ["/etc"]}}',
+    "cannot be read as JSON (it is nested more than 32 levels deep)": "[" * 100_000,
     "names no object for 03001627 (chair), test": '{"03001627": {"test": []}}',
 }
 

@@ -162,7 +162,7 @@ def test_too_little_memory_is_not_called_a_damaged_file(tmp_path, arrays, monkey
         raise MemoryError
 
     write(tmp_path, *arrays)
-    monkeypatch.setattr(np, "load", fail)
+    monkeypatch.setattr(np, "empty", fail)
     with pytest.raises(MemoryError):
         kato.load(tmp_path, "chair", "test")
 

@@ -13,15 +13,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from python2_pickles import HEADER, npy, python2_pickle, short_string
+from python2_pickles import HEADER, python2_pickle, short_string
+from python2_pickles import npy as npy_bytes
 
-from learn3d.data import safe_pickle
+from learn3d import limits
+from learn3d.data import npz, safe_pickle
 
 
 def read(path: Path, member: bytes, key: str = "images", method: int = zipfile.ZIP_DEFLATED):
     with zipfile.ZipFile(path, "w", method) as archive:
         archive.writestr(f"{key}.npy", member)
-    with safe_pickle.open_npz(path) as archive:
+    with npz.open_npz(path) as archive:
         return safe_pickle.read_member(archive, key)
 
 
@@ -48,9 +50,9 @@ def same(arrays: list[np.ndarray], images: list[np.ndarray]) -> None:
 def test_python_2s_files_are_read(tmp_path: Path) -> None:
     content = python2_pickle(IMAGES)
     same(pickle.loads(content, encoding="latin1"), IMAGES)  # the bytes of this test are a pickle for Python, too
-    same(read(tmp_path / "a.npz", npy(content)), IMAGES)
+    same(read(tmp_path / "a.npz", npy_bytes(content)), IMAGES)
     for header in (b"{'descr': '|O8', 'fortran_order': False, 'shape': (2,), }", HEADER.replace(b"%d", b"2L")):
-        same(read(tmp_path / "a.npz", npy(content, header=header)), IMAGES)
+        same(read(tmp_path / "a.npz", npy_bytes(content, header=header)), IMAGES)
 
 
 @pytest.mark.parametrize("protocol", [2, 3, 4])
@@ -61,18 +63,18 @@ def test_python_3s_files_are_read(tmp_path: Path, protocol: int, module: bytes) 
     for old in (b"numpy.core.multiarray", b"numpy._core.multiarray"):
         if protocol < 4:
             content = content.replace(b"c" + old, b"c" + module)
-    same(read(tmp_path / "a.npz", npy(content, len(images))), images)
+    same(read(tmp_path / "a.npz", npy_bytes(content, len(images))), images)
 
 
 def test_what_numpy_saves_is_read(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "a.npz", images=object_array(*IMAGES), numbers=np.arange(6.0).reshape(2, 3).T)
-    with safe_pickle.open_npz(tmp_path / "a.npz") as archive:
-        assert safe_pickle.keys(archive) == ["images", "numbers"]
+    with npz.open_npz(tmp_path / "a.npz") as archive:
+        assert npz.keys(archive) == ["images", "numbers"]
         same(safe_pickle.read_member(archive, "images"), IMAGES)
         np.testing.assert_array_equal(safe_pickle.read_member(archive, "numbers"), np.arange(6.0).reshape(2, 3).T)
         with pytest.raises(ValueError, match=r"cannot read the array 'voxels' of .*a.npz: .*\['images', 'numbers'\]"):
             safe_pickle.read_member(archive, "voxels")
-    same(read(tmp_path / "b.npz", npy(pickle.dumps(object_array()), 0)), [])
+    same(read(tmp_path / "b.npz", npy_bytes(pickle.dumps(object_array()), 0)), [])
 
 
 class Runs:
@@ -114,7 +116,7 @@ HOSTILE = {
 def test_hostile_pickles_are_refused_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=r"cannot read the array 'images' of .*a.npz: its pickle"):
-        read(tmp_path / "a.npz", npy(HOSTILE[name]))
+        read(tmp_path / "a.npz", npy_bytes(HOSTILE[name]))
     assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
 
 
@@ -125,7 +127,7 @@ def test_pythons_own_unpickler_would_run_them(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(
         ValueError, match=r"its pickle asks for (posix|nt)\.system, which no array needs; it is refused"
     ):
-        read(tmp_path / "a.npz", npy(HOSTILE["os.system"]))
+        read(tmp_path / "a.npz", npy_bytes(HOSTILE["os.system"]))
 
 
 def python2(images: list[np.ndarray], *changes: tuple[bytes, bytes]) -> bytes:
@@ -176,25 +178,25 @@ DAMAGED = {
 def test_damaged_and_strange_pickles_are_refused(tmp_path: Path, name: str) -> None:
     content, message = DAMAGED[name]
     with pytest.raises(ValueError, match=message):
-        read(tmp_path / "a.npz", npy(content))
+        read(tmp_path / "a.npz", npy_bytes(content))
 
 
 def test_one_array_cannot_be_listed_many_times_nor_one_string_encoded_many_times(tmp_path: Path) -> None:
     big = np.random.default_rng(0).integers(0, 256, 10_000, np.uint8)
     with pytest.raises(ValueError, match="more bytes than the file has"):
-        read(tmp_path / "a.npz", npy(pickle.dumps(object_array(*[big] * 50), protocol=4), 50))
+        read(tmp_path / "a.npz", npy_bytes(pickle.dumps(object_array(*[big] * 50), protocol=4), 50))
     text = b"X" + struct.pack("<I", 1000) + b"a" * 1000 + b"q\x00"
     encode = b"c_codecs\nencode\nh\x00X\x06\x00\x00\x00latin1\x86R0"
     with pytest.raises(ValueError, match="makes more bytes than the file has"):
-        read(tmp_path / "a.npz", npy(b"\x80\x02" + text + encode.replace(b"R0", b"R") * 20 + b"."))
+        read(tmp_path / "a.npz", npy_bytes(b"\x80\x02" + text + encode.replace(b"R0", b"R") * 20 + b"."))
 
 
 def test_too_many_instructions_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safe_pickle, "MAX_ITEMS", 10)
+    monkeypatch.setattr(limits, "PICKLED_ARRAYS", 10)
     with pytest.raises(ValueError, match="too many instructions"):
-        read(tmp_path / "a.npz", npy(b"\x80\x02" + b"]" * 5000 + b"."))
+        read(tmp_path / "a.npz", npy_bytes(b"\x80\x02" + b"]" * 5000 + b"."))
     with pytest.raises(ValueError, match=r"at most 10 items, got \(11,\)"):
-        read(tmp_path / "a.npz", npy(b"", 11))
+        read(tmp_path / "a.npz", npy_bytes(b"", 11))
 
 
 HEADERS = {
@@ -213,7 +215,7 @@ HEADERS = {
 def test_strange_headers_are_refused(tmp_path: Path, name: str) -> None:
     header, message = HEADERS[name]
     with pytest.raises(ValueError, match=message):
-        read(tmp_path / "a.npz", npy(b"abcd", header=header))
+        read(tmp_path / "a.npz", npy_bytes(b"abcd", header=header))
 
 
 def test_other_npy_versions_are_refused(tmp_path: Path) -> None:
@@ -222,27 +224,27 @@ def test_other_npy_versions_are_refused(tmp_path: Path) -> None:
 
 
 def test_zip_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safe_pickle, "_LARGE", 100_000)
-    bomb = npy(b"\0" * 1_000_000, header=b"{'descr': '|u1', 'fortran_order': False, 'shape': (1000000,), }")
+    monkeypatch.setattr(limits, "SMALL_BYTES", 100_000)
+    bomb = npy_bytes(b"\0" * 1_000_000, header=b"{'descr': '|u1', 'fortran_order': False, 'shape': (1000000,), }")
     with pytest.raises(ValueError, match=r"would unpack to \d+ times its size"):
         read(tmp_path / "a.npz", bomb)
     assert len(read(tmp_path / "a.npz", bomb, method=zipfile.ZIP_STORED)) == 1_000_000
-    monkeypatch.setattr(safe_pickle, "MAX_BYTES", 1000)
+    monkeypatch.setattr(limits, "ARRAY_BYTES", 1000)
     with pytest.raises(ValueError, match="would unpack to"):
         read(tmp_path / "a.npz", bomb)
-    monkeypatch.setattr(safe_pickle, "MAX_BYTES", 2**30)
-    with safe_pickle.open_npz(tmp_path / "a.npz") as archive:
+    monkeypatch.setattr(limits, "ARRAY_BYTES", 2**30)
+    with npz.open_npz(tmp_path / "a.npz") as archive:
         assert len(safe_pickle.read_member(archive, "images", max_bytes=1_000_000)) == 1_000_000
         with pytest.raises(ValueError, match="at most 2000 are read"):
             safe_pickle.read_member(archive, "images", max_bytes=1000)
 
 
 def test_a_lying_zip_directory_gives_no_more_than_it_declares(tmp_path: Path) -> None:
-    path, size = tmp_path / "a.npz", struct.pack("<I", len(npy(python2_pickle(IMAGES))))
+    path, size = tmp_path / "a.npz", struct.pack("<I", len(npy_bytes(python2_pickle(IMAGES))))
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("images.npy", npy(python2_pickle(IMAGES)))
+        archive.writestr("images.npy", npy_bytes(python2_pickle(IMAGES)))
     path.write_bytes(path.read_bytes().replace(size, struct.pack("<I", 200)))
-    with safe_pickle.open_npz(path) as archive, pytest.raises(ValueError, match="cannot read the array 'images'"):
+    with npz.open_npz(path) as archive, pytest.raises(ValueError, match="cannot read the array 'images'"):
         safe_pickle.read_member(archive, "images")
 
 
@@ -252,13 +254,13 @@ def test_flipped_bits_and_cut_files_are_noticed(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[content.find(IMAGES[1].tobytes()) + 5] ^= 1
     path.write_bytes(content)
-    with safe_pickle.open_npz(path) as archive, pytest.raises(ValueError, match=r"'images' of .*a.npz: Bad CRC-32"):
+    with npz.open_npz(path) as archive, pytest.raises(ValueError, match=r"'images' of .*a.npz: Bad CRC-32"):
         safe_pickle.read_member(archive, "images")
     path.write_bytes(content[:100])
     with pytest.raises(ValueError, match=r"a.npz is not an npz file .*fetch it again"):
-        safe_pickle.open_npz(path)
+        npz.open_npz(path)
     with pytest.raises(FileNotFoundError, match=r"there is no file .*b.npz"):
-        safe_pickle.open_npz(tmp_path / "b.npz")
+        npz.open_npz(tmp_path / "b.npz")
 
 
 @settings(max_examples=300, deadline=None)

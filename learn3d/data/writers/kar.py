@@ -16,7 +16,6 @@ its field of view is 14.9314 degrees.
 from __future__ import annotations
 
 import io
-import json
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 import nmr
+from learn3d import limits
 from learn3d.data import conventions, viewpoints
 from learn3d.data.kato import synset_of
 from learn3d.data.poses import LookAtPoses
@@ -32,6 +32,7 @@ from learn3d.data.writers.dvr import world_from_object
 from learn3d.data.writers.pictures import write_png
 from learn3d.data.writers.writer import RenderedObject, Writer
 from learn3d.files import write_json
+from learn3d.inputs import parse_json, read_bytes
 
 DEEPEST = 240  # value of the farthest point of an object in depth_{i}.png
 NOTHING = 255
@@ -121,7 +122,7 @@ def _read_splits(output: Path) -> dict[str, dict]:
     """What splits.json of the folder holds now; ValueError where it is damaged."""
     path = output / "splits.json"
     try:
-        splits = json.loads(path.read_text()) if path.exists() else {}
+        splits = parse_json(read_bytes(path, limits.JSON_BYTES, "the lists of objects")) if path.exists() else {}
     except ValueError as error:
         raise ValueError(f"cannot read {path}, which other categories share: {error}; repair or remove it") from error
     if not isinstance(splits, dict):

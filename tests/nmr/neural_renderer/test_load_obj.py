@@ -1,8 +1,10 @@
 import builtins
+import sys
 
 import numpy as np
 import pytest
 import torch
+from memory_checks import at_most
 from vectors import load_vector, vector_names
 
 import nmr.neural_renderer as nr
@@ -143,3 +145,53 @@ def test_images_without_pillow(tmp_path, monkeypatch):
         nr.load_obj(path, load_texture=True)
     with pytest.raises(ImportError, match=r"pip install pillow"):
         nr.save_obj(tmp_path / "b.obj", torch.rand(3, 3), torch.tensor([[0, 1, 2]]), torch.rand(1, 2, 2, 2, 3))
+
+
+HOSTILE = {
+    "nan": ("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "3 numbers are needed, finite in float32"),
+    "beyond float32": ("v 0 0 1e39\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite in float32"),
+    "one point": ("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no box that could be scaled"),
+    "too wide": ("v -3e38 0 0\nv 3e38 0 0\nv 0 1 0\nf 1 2 3\n", "no box that could be scaled"),
+    "a number beyond any": ("v 0 0 0\nf 1 1 " + "9" * 400 + "\n", "a face refers to vertex 9999"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_files(tmp_path, name):
+    text, message = HOSTILE[name]
+    write(tmp_path, **{"a_obj": text})
+    with pytest.raises(ValueError, match=message):
+        nr.load_obj(tmp_path / "a.obj")
+
+
+def test_hostile_materials_and_images(tmp_path, monkeypatch):
+    from PIL import Image
+
+    triangle = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    write(tmp_path, **{"a_obj": triangle, "a_mtl": "newmtl m\nmap_Kd t.png\n"})
+
+    def refused(message, kind=ValueError):
+        with pytest.raises(kind, match=message):
+            nr.load_obj(tmp_path / "a.obj", load_texture=True)
+
+    (tmp_path / "t.png").write_bytes(b"no image")
+    refused(r"the image .*t\.png cannot be read")
+    Image.new("RGB", (9, 9)).save(tmp_path / "t.png")
+    monkeypatch.setattr("nmr.neural_renderer._images._MOST_PIXELS", 80)
+    refused("9x9 pixels, at most 80 are read")
+    (tmp_path / "t.png").unlink()
+    refused("t.png", FileNotFoundError)
+    write(tmp_path, **{"a_mtl": "newmtl m\nmap_Kd \n"})
+    refused("is no plain file|No such file", (ValueError, OSError))
+    monkeypatch.setattr(sys.modules["nmr.neural_renderer.load_obj"], "_MOST_BYTES", 20)
+    refused(r"a\.obj has \d+ bytes; at most 20 are read")
+
+
+def test_long_names_of_materials_take_no_memory_per_face(tmp_path):
+    name = "m" * 200_000
+    faces = "f 1 2 3\n" * 2000
+    write(tmp_path, **{"a_obj": f"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl {name}\n{faces}"})
+    write(tmp_path, **{"a_mtl": f"newmtl {name}\nKd 1 0 0\n"})
+    with at_most(2**26):
+        textures = nr.load_obj(tmp_path / "a.obj", load_texture=True, texture_size=2)[2]
+    assert textures.shape == (2000, 2, 2, 2, 3) and (textures[..., 0] == 1).all()
