@@ -7,7 +7,8 @@ comments say by how much), so none can be changed from outside. docs/untrusted-i
 MIB, GIB = 2**20, 2**30
 
 # Text and JSON
-TEXT_BYTES = 64 * MIB  # a list of ids, a table of photographs; the ids of all of ShapeNet take 2
+TEXT_BYTES = 64 * MIB  # a list of ids; those of all of ShapeNet take 2
+PHOTO_TABLE_BYTES = 16 * MIB  # poses.csv: some 250,000 photographs; in memory it takes 80 times its size
 TABLE_BYTES = MIB  # the cameras of one object (view.txt): 24 rows take 2 kB
 CONFIG_BYTES = MIB  # config.json of a run: 2 kB
 JSON_BYTES = 64 * MIB  # splits.json: 2 MB; test.json of a run on 10,000 objects: 1 MB
@@ -51,6 +52,7 @@ CATALOGUE_MEMBER_BYTES = 64 * MIB  # one file inside a catalogue; the largest wa
 CHECKPOINT_BYTES = 16 * GIB  # one with optimizer states: 0.7
 CHECKPOINT_HEADER_BYTES = 16 * MIB  # names, shapes and metadata: 50 kB
 WEIGHTS_BYTES = GIB  # pretrained weights: ResNet-18 has 45 MB
+WEIGHTS_MEMORY = 256 * MIB  # bytes that reading them may add, beside four times the file's size
 WEIGHTS_SECONDS = 60.0  # for reading them: 0.1
 
 # Options: what a configuration may ask for

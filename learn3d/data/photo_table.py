@@ -100,7 +100,7 @@ def read_table(table: Path) -> tuple[list[Photo], list[str]]:
 
 
 def _csv_rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    content = read_bytes(table, limits.TEXT_BYTES, "the table of photographs")
+    content = read_bytes(table, limits.PHOTO_TABLE_BYTES, "the table of photographs")
     try:
         lines = content.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -117,7 +117,7 @@ def _csv_rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _json_rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    content = read_bytes(table, limits.TEXT_BYTES, "the table of photographs")
+    content = read_bytes(table, limits.PHOTO_TABLE_BYTES, "the table of photographs")
     try:
         rows = parse_json(content)
     except ValueError as error:

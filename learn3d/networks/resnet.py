@@ -105,7 +105,7 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise FileNotFoundError(f"there is no file of pretrained weights {path}")
     try:
-        check_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18")
+        size = check_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18")
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
 
@@ -113,7 +113,7 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
         else:
             if zipfile.is_zipfile(path):  # what torch.save writes: stored, not compressed
                 open_zip(path, limits.WEIGHTS_BYTES).close()
-            with within(limits.WEIGHTS_SECONDS, 4 * limits.WEIGHTS_BYTES):
+            with within(limits.WEIGHTS_SECONDS, limits.WEIGHTS_MEMORY + 4 * size):
                 weights = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # the readers raise half a dozen kinds for a damaged or a hostile file
         raise ValueError(f"cannot read pretrained weights from {path}: {error}") from error

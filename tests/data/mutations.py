@@ -10,9 +10,21 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 Mutation = Callable[[random.Random, bytes], bytes]
+
+
+@dataclass
+class Target:
+    """A folder of sound files, those to damage with the damage that suits each, and what reads the folder."""
+
+    folder: Path
+    damaged: dict[str, Mutation]
+    read: Callable[[Path], None]
+
 
 WORDS = [b"nan", b"-inf", b"1e400", b"-1", b"0", b"99999999999999999999", b"1" * 400, b"9" * 5000, b"0x10", b"",
          b"1e-320", b"../../x", b"/etc/x", b"\0", b"\xff\xfe", b'"', b"{", b"[" * 3000, b"4294967296"]  # fmt: skip

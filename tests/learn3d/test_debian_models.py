@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz_targets import deb_bytes
+from fuzz_meshes import deb_bytes
 from memory_checks import at_most
 
 from learn3d import limits

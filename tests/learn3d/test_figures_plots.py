@@ -12,6 +12,7 @@ import pytest
 import skimage.color
 from PIL import Image
 
+from learn3d import limits
 from learn3d.figures import codes, curves, paper, plots, polar
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -99,7 +100,7 @@ def records(offset: float, steps: int = 4) -> list[dict]:
     return [*training, {"step": 100, "split": "val", "voxel_iou": 0.5 + offset, "images": 24}]
 
 
-def test_metrics_become_curves(tmp_path) -> None:
+def test_metrics_become_curves(tmp_path, monkeypatch) -> None:
     read = curves.read_metrics(write_metrics(tmp_path / "run", records(0.25), tail='{"step": 200, "spl'))
     assert set(read) == {("train", "projection"), ("train", "total"), ("val", "voxel_iou")}
     assert read["train", "projection"].steps.tolist() == [50, 100, 150]
@@ -110,6 +111,15 @@ def test_metrics_become_curves(tmp_path) -> None:
         curves.read_metrics(write_metrics(tmp_path / "foreign", [[], *records(0)]))
     with pytest.raises(ValueError, match="no numbers yet"):
         curves.read_metrics(write_metrics(tmp_path / "new", []))
+    for line in ("[" * 100_000, '{"step": true, "split": "val"}', '{"step": 1e300, "split": "val"}', "5", "\udcff"):
+        folder = write_metrics(tmp_path / "hostile", records(0.25))
+        content = (folder / "metrics.jsonl").read_bytes()
+        (folder / "metrics.jsonl").write_bytes(line.encode("utf-8", "surrogateescape") + b"\n" + content)
+        with pytest.raises(ValueError, match="line 1 is no record with a step and a split"):
+            curves.read_metrics(folder)
+    monkeypatch.setattr(limits, "METRICS_BYTES", 10)
+    with pytest.raises(ValueError, match=r"metrics\.jsonl: has \d+ bytes, and at most 10 are read"):
+        curves.read_metrics(folder)
 
 
 def test_seeds_become_a_band(tmp_path) -> None:
@@ -193,7 +203,7 @@ def test_profiles_are_kept_as_json(tmp_path) -> None:
     assert written[1].read_bytes() == (tmp_path / "direct.svg").read_bytes()
     with pytest.raises(FileNotFoundError, match=r"no .*q.json; give the .json that 'polar' wrote"):
         paper.redraw_polar(tmp_path / "q.json", tmp_path / "q")
-    for content in ("[]", "{", "\xff\xfe"):
+    for content in ("[]", "{", "\xff\xfe", '{"profiles": []}', '{"profiles": 5}', "[" * 100_000):
         (tmp_path / "q.json").write_text(content, encoding="latin-1")
         with pytest.raises(ValueError, match=r"holds no profiles; give the \.json"):
             paper.redraw_polar(tmp_path / "q.json", tmp_path / "q")
@@ -201,6 +211,8 @@ def test_profiles_are_kept_as_json(tmp_path) -> None:
     for broken, message in (
         ({k: v for k, v in whole.items() if k != "iou"}, "KeyError: 'iou'"),
         (whole | {"iou": [0.5]}, "differ in number"),
+        (whole | {name: [[0.5]] for name in ("azimuths_deg", "iou", "agreement")}, "no list of finite numbers"),
+        (5, "TypeError"),
     ):
         (tmp_path / "q.json").write_text(json.dumps({"profiles": [broken]}))
         with pytest.raises(ValueError, match=f"q.json holds .*{message}"):

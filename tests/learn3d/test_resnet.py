@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import Tensor
 
+from learn3d import limits
 from learn3d.methods.method import DataShape
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.vpl import VPL, VPLSettings
@@ -165,6 +167,8 @@ def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     refused({k: v for k, v in weights.items() if "layer4" not in k}, f"w.pth lacks 'layer4.* and 24 more.*{hint}")
     refused(weights | {"layer4.2.conv1.weight": torch.ones(1)}, f"w.pth has 'layer4.2.conv1.weight' and 0 more.*{hint}")
     refused(weights | {"bn1.bias": torch.ones(3)}, rf"w.pth: bn1.bias is \[3\], ResNet-18 has \[64\]; {hint}")
+    nan = torch.full((64,), float("nan"))
+    refused(weights | {"bn1.bias": nan}, f"w.pth: bn1.bias has values that are not finite; {hint}")
     refused([1, 2], r"w.pth must hold a state dict \(names -> tensors\), got list")
     refused(weights | {"bn1.bias": Runs()}, "cannot read pretrained weights from .*w.pth: Weights only load failed")
     assert not Path("ran").exists()
@@ -176,3 +180,15 @@ def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         load_pretrained(encoder, tmp_path / "w.safetensors")
     with pytest.raises(FileNotFoundError, match=r"there is no file of pretrained weights .*none.pth"):
         load_pretrained(encoder, tmp_path / "none.pth")
+
+
+def test_weights_beyond_the_limits_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, encoder = tmp_path / "w.pth", ResNet18Encoder()
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:  # torch.save compresses nothing
+        archive.writestr("w/data.pkl", bytes(100_000_000))
+    monkeypatch.setattr(limits, "WEIGHTS_BYTES", 10_000_000)
+    with pytest.raises(ValueError, match=r"w\.pth: it would unpack to 100000000 bytes; at most 10000000 are read"):
+        load_pretrained(encoder, path)
+    torch.save(torch.zeros(3_000_000), path)
+    with pytest.raises(ValueError, match=r"w\.pth: has 12\d+ bytes, and at most 10000000 are read"):
+        load_pretrained(encoder, path)
