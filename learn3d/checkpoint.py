@@ -1,9 +1,14 @@
-"""Checkpoints: all tensors of a run in one safetensors file, everything else as JSON in its header. No pickle."""
+"""Checkpoints: all tensors of a run in one safetensors file, everything else as JSON in its header. No pickle.
+
+The header holds three texts: "learn3d", the JSON; "metadata_crc32" of its bytes; "tensors_crc32" of the names, types,
+shapes and bytes of all tensors in the order of their names. Format 1 had the first alone and is still read.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +22,11 @@ from learn3d.config import TrainConfig, config_from_dict, config_to_dict
 from learn3d.methods import DataShape, Method, create_method
 from learn3d.networks import resolve_precision
 
-FORMAT = 1
+FORMAT = 2
+
+
+class DamagedError(ValueError):
+    """A checkpoint that is cut short or changed, or a file that is none; another checkpoint of the run may be whole."""
 
 
 def save(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
@@ -25,18 +34,48 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> No
 
     Raises OSError where it cannot be written (no permission, no room).
     """
-    header = {"learn3d": json.dumps({"format": FORMAT, **metadata})}
-    contiguous = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    text = json.dumps({"format": FORMAT, **metadata})
+    ours = _independent(tensors)
+    header = {"learn3d": text, "metadata_crc32": _crc(text.encode()), "tensors_crc32": _tensors_crc(ours)}
     with files.replacing(path, sync=True) as temporary:
         try:
-            save_file(contiguous, temporary, metadata=header)
+            save_file(ours, temporary, metadata=header)
         except SafetensorError as error:
             raise OSError(f"cannot write the checkpoint {path}: {error}") from None
         temporary.chmod(0o644)
 
 
+def _independent(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors on the CPU and contiguous, as the format wants them; only what shares memory is copied for that."""
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    seen: set[int] = set()
+    for name, tensor in contiguous.items():
+        storage = tensor.untyped_storage()
+        if storage.data_ptr() in seen or storage.nbytes() != tensor.nbytes:
+            contiguous[name] = tensor.clone()
+        seen.add(storage.data_ptr())
+    return contiguous
+
+
+def _crc(content: bytes) -> str:
+    return f"{zlib.crc32(content):08x}"
+
+
+def _tensors_crc(tensors: dict[str, Tensor]) -> str:
+    """CRC-32 of names, types, shapes and bytes, in the order of the names."""
+    crc = 0
+    for name, tensor in sorted(tensors.items()):
+        crc = zlib.crc32(f"{name} {tensor.dtype} {list(tensor.shape)}".encode(), crc)
+        if tensor.numel():
+            crc = zlib.crc32(tensor.contiguous().reshape(-1).view(torch.uint8).numpy(), crc)
+    return f"{crc:08x}"
+
+
 def load(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `save` wrote, on the CPU. A missing, truncated or foreign file is a ValueError that says so."""
+    """Read what `save` wrote, on the CPU, and compare it with its checksums.
+
+    A truncated, changed or foreign file is a DamagedError; a missing one, or one of a later version, a ValueError.
+    """
     return _read(path, tensors=True)
 
 
@@ -54,19 +93,36 @@ def _read(path: Path, *, tensors: bool) -> tuple[dict[str, Tensor], dict[str, An
         )
     try:
         with safe_open(path, framework="pt") as file:
-            header = (file.metadata() or {}).get("learn3d")
+            header = file.metadata() or {}
             contents = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}
     except (SafetensorError, OSError) as error:
-        raise ValueError(
+        raise DamagedError(
             f"{path} cannot be read as a checkpoint ({error}); it is damaged or was cut short: "
             "use another checkpoint of the run, or a copy"
         ) from None
-    if header is None:
-        raise ValueError(f"{path} is a safetensors file, but not a checkpoint of learn3d")
-    metadata = json.loads(header)
-    if metadata.get("format") != FORMAT:
-        raise ValueError(f"{path} has checkpoint format {metadata.get('format')}, this version reads format {FORMAT}")
+    if "learn3d" not in header:
+        raise DamagedError(f"{path} is a safetensors file, but not a checkpoint of learn3d")
+    if "metadata_crc32" in header:
+        _check_crc(path, header["metadata_crc32"], _crc(header["learn3d"].encode()))
+    metadata = json.loads(header["learn3d"])
+    if metadata.get("format") not in (1, FORMAT):
+        raise ValueError(
+            f"{path} has checkpoint format {metadata.get('format')}, this version reads formats 1 to {FORMAT}; "
+            "use the version of learn3d that wrote it, or a later one"
+        )
+    if metadata["format"] == 2:
+        _check_crc(path, header.get("metadata_crc32"), _crc(header["learn3d"].encode()))
+        if tensors:
+            _check_crc(path, header.get("tensors_crc32"), _tensors_crc(contents))
     return contents, metadata
+
+
+def _check_crc(path: Path, written: str | None, found: str) -> None:
+    if written != found:
+        raise DamagedError(
+            f"{path} has changed since it was written (CRC-32 {written}, now {found}): the disk or a copy damaged it; "
+            "use another checkpoint of the run, or a copy"
+        )
 
 
 def network_tensors(method: Method) -> dict[str, Tensor]:

@@ -68,6 +68,8 @@ class TrainConfig:
     """Steps between picture grids."""
     checkpoint_every: int = 1000
     """Steps between saves of the last checkpoint."""
+    keep_checkpoints: int = 2
+    """Number of checkpoints to keep: last.safetensors and the ones before it, in checkpoints/."""
     log_every: int = 50
     """Steps between logged losses."""
 
@@ -103,7 +105,7 @@ class TrainConfig:
             AngleBins.parse(self.view_bins)
         if not self.category:
             raise ValueError("category must be a class name such as 'airplane', got an empty string")
-        for name in ("iterations", "batch_size", "validate_every", "pictures_every", "checkpoint_every", "log_every"):
+        for name in ("iterations", "batch_size", *_REPORTING):
             _check_positive_int(name, getattr(self, name))
         if getattr(self.settings, "encoder_from_step", 0) > self.iterations:
             raise ValueError(
@@ -145,10 +147,10 @@ def check_fields(settings: Settings) -> None:
                 )
 
 
+_REPORTING = ("validate_every", "pictures_every", "checkpoint_every", "keep_checkpoints", "log_every")
 #: Options that a resumed run may change: they say where and how long to compute and what to report, not what to learn.
 RESUME_MAY_CHANGE = frozenset(
-    {"data", "output", "iterations", "device", "threads"}
-    | {"val_split", "validate_every", "max_val_images", "pictures_every", "checkpoint_every", "log_every"}
+    {"data", "output", "iterations", "device", "threads"} | {"val_split", "max_val_images", *_REPORTING}
 )
 
 

@@ -36,8 +36,9 @@ from learn3d.experiments.plan import (
 from learn3d.experiments.pool import NOT_FROM_HERE
 from learn3d.experiments.statistics import percentile_interval, resampled_means, t_interval
 from learn3d.experiments.tables import TABLES
-from learn3d.experiments.worker import carry_out, sole_use
+from learn3d.experiments.worker import carry_out
 from learn3d.presets import PRESETS
+from learn3d.run_folder import sole_use
 from learn3d.training import Summary
 
 TOOLS = Path(__file__).parents[2] / "tools"

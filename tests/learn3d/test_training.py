@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import nmr
-from learn3d import checkpoint, run_state, training
+from learn3d import checkpoint, run_folder, run_state, training
 from learn3d.config import (
     TrainConfig,
     check_resume,
@@ -223,6 +223,7 @@ def test_a_finished_run_leaves_everything(finished_run, read_metrics) -> None:
         "last.safetensors",
         "best.safetensors",
         "metrics.jsonl",
+        "journal.txt",
         "tensorboard",
         "pictures",
     }
@@ -369,7 +370,7 @@ def test_resume_from_a_checkpoint_without_conditions(tiny_config, tiny_folder, f
 
 
 def test_resume_command_is_quoted(tmp_path) -> None:
-    words = shlex.split(run_state.resume_command(tmp_path / "my runs" / "it's"))
+    words = shlex.split(run_folder.resume_command(tmp_path / "my runs" / "it's"))
     assert words == ["python", "tools/train.py", "--output", str(tmp_path / "my runs" / "it's"), "--resume"]
 
 
@@ -420,6 +421,6 @@ def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> 
     with torch.no_grad():
         method.generator.layers[0].bias[3] = float("inf")
     run_folder.mkdir()
-    with pytest.raises(FloatingPointError, match="generator has weights that are not finite; there is no checkpoint"):
+    with pytest.raises(FloatingPointError, match="generator has weights that are not finite"):
         run_state.save_last(run_folder, config, None, method, DataShape(24), run_state.Progress())
     assert not list(run_folder.iterdir())
