@@ -12,9 +12,9 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from learn3d import files
@@ -35,26 +35,51 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> No
     Raises OSError where it cannot be written (no permission, no room).
     """
     text = json.dumps({"format": FORMAT, **metadata})
-    ours = _independent(tensors)
-    header = {"learn3d": text, "metadata_crc32": _crc(text.encode()), "tensors_crc32": _tensors_crc(ours)}
-    with files.replacing(path, sync=True) as temporary:
-        try:
-            save_file(ours, temporary, metadata=header)
-        except SafetensorError as error:
-            raise OSError(f"cannot write the checkpoint {path}: {error}") from None
-        temporary.chmod(0o644)
+    flat = {name: tensor.detach().cpu().contiguous() for name, tensor in sorted(tensors.items())}
+    header = {"learn3d": text, "metadata_crc32": _crc(text.encode()), "tensors_crc32": _tensors_crc(flat)}
+    try:
+        with files.replacing(path, sync=True) as temporary:
+            _write(temporary, flat, header)
+    except OSError as error:
+        raise OSError(f"cannot write the checkpoint {path}: {error.strerror or error}") from error
 
 
-def _independent(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors on the CPU and contiguous, as the format wants them; only what shares memory is copied for that."""
-    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    seen: set[int] = set()
-    for name, tensor in contiguous.items():
-        storage = tensor.untyped_storage()
-        if storage.data_ptr() in seen or storage.nbytes() != tensor.nbytes:
-            contiguous[name] = tensor.clone()
-        seen.add(storage.data_ptr())
-    return contiguous
+_TYPES = {
+    torch.float64: "F64",
+    torch.float32: "F32",
+    torch.bfloat16: "BF16",
+    torch.float16: "F16",
+    torch.int64: "I64",
+    torch.int32: "I32",
+    torch.int16: "I16",
+    torch.int8: "I8",
+    torch.uint8: "U8",
+    torch.bool: "BOOL",
+}
+
+
+def _write(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
+    """Write a safetensors file: the length of a JSON header, the header, the tensors one after the other.
+
+    The library's own `save_file` writes beside a temporary file of a name of its own, which a killed process leaves
+    behind, and copies all tensors first in versions before 0.6. Large elements come first, so that all are aligned.
+    """
+    ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))
+    header, end = {"__metadata__": metadata}, 0
+    for name, tensor in ordered:
+        start, end = end, end + tensor.nbytes
+        header[name] = {"dtype": _TYPES[tensor.dtype], "shape": list(tensor.shape), "data_offsets": [start, end]}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    with open(path, "wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for _, tensor in ordered:
+            file.write(_bytes_of(tensor))
+
+
+def _bytes_of(tensor: Tensor) -> np.ndarray:
+    """The bytes of a contiguous tensor on the CPU, uint8 [n], in the same memory."""
+    return tensor.reshape(-1).view(torch.uint8).numpy()
 
 
 def _crc(content: bytes) -> str:
@@ -66,8 +91,7 @@ def _tensors_crc(tensors: dict[str, Tensor]) -> str:
     crc = 0
     for name, tensor in sorted(tensors.items()):
         crc = zlib.crc32(f"{name} {tensor.dtype} {list(tensor.shape)}".encode(), crc)
-        if tensor.numel():
-            crc = zlib.crc32(tensor.contiguous().reshape(-1).view(torch.uint8).numpy(), crc)
+        crc = zlib.crc32(_bytes_of(tensor), crc)
     return f"{crc:08x}"
 
 

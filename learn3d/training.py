@@ -44,7 +44,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
 
     What the folder holds afterwards is listed in `run_folder`. SIGINT, SIGTERM and SIGHUP end the current step, save
     and return. With `resume` the run continues from its last checkpoint, bit for bit (same machine, device and number
-    of threads), or from the start if it was stopped before its first one.
+    of threads), or from the start if it was stopped before its first one. A finished run stays as it is.
 
     Raises ValueError for a folder in use, options or training data that conflict with the resumed run or data that do
     not fit, FloatingPointError when a loss is no longer finite (the last checkpoint is from before that), OSError when
@@ -70,12 +70,12 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool) -> Summary:
         notes = continue_run(folder, config, conditions, method, progress)
     else:
         run_folder.claim(folder, overwrite)
-    if progress.step >= config.iterations:
-        raise ValueError(
-            f"{folder} has taken {progress.step} steps of {config.iterations} already; "
-            "to continue ask for more iterations"
-        )
     run_folder.remove_partials(folder)
+    if progress.step > config.iterations:
+        raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
+    if progress.step == config.iterations:  # also after a kill between the last save and the end
+        run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
+        return _summary(folder, config, progress, started)
     files.write_json(folder / run_folder.CONFIG, config_to_dict(config), sync=True)
     before = progress.seconds
 
@@ -109,9 +109,12 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool) -> Summary:
                 log.say(f"stopped by {stop.name} after step {step}; continue with: {run_folder.resume_command(folder)}")
                 break
 
-    seconds = time.monotonic() - started
-    finished = progress.step == config.iterations
-    return Summary(folder, progress.step, finished, progress.best_iou, progress.best_step, seconds)
+    return _summary(folder, config, progress, started)
+
+
+def _summary(folder: Path, config: TrainConfig, at: Progress, started: float) -> Summary:
+    finished = at.step == config.iterations
+    return Summary(folder, at.step, finished, at.best_iou, at.best_step, time.monotonic() - started)
 
 
 def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:
