@@ -7,7 +7,8 @@ It reads one request per line of its standard input, as JSON, and answers with o
     ... "at": [phase, module, line, time]                 SIGKILL before this line is executed for the time-th time
     ... "at": [...], "fuse": seconds                      SIGKILL from outside so long after that
     ... "at": [...], "half": true                         SIGKILL in the middle of the next checkpoint that is written
-    ... "after": seconds, "signal": number                a signal from outside, so long after the start
+    ... "after": seconds, "signal": number                a signal from outside, so long after the start; a SIGSTOP
+                                                          is followed by SIGCONT
 The answer has "status" (exit status; -9 for SIGKILL), "stack" (functions that were running, innermost first; only with
 "at") and "lines" ([phase, module, line, times] each; only with "trace"). A phase is what the training loop called, and
 what that called: "save_last>keep_previous".
@@ -128,6 +129,10 @@ def _watch(process: int, reading: int, request: dict[str, Any]) -> dict[str, Any
         ready, _, _ = select.select([reading], [], [], max(0.0, end - time.monotonic()))
         if not ready:
             os.kill(process, number)
+            if number == signal.SIGSTOP:
+                time.sleep(0.3)
+                os.kill(process, signal.SIGCONT)
+                number = signal.SIGKILL
             end = time.monotonic() + LIMIT
             continue
         part = os.read(reading, 1 << 16)

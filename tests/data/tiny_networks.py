@@ -22,7 +22,8 @@ class TinyGenerator(SmallSphereGenerator):
         super().__init__()
         self.layers = nn.Sequential(nn.Linear(CODE_SIZE, 16), nn.ReLU(), nn.Linear(16, self.sphere.shape[0] * 3))
         with torch.no_grad():
-            self.layers[-1].weight.mul_(0.1)  # nearly a sphere, whatever the codes are
+            for parameter in self.layers[-1].parameters():
+                parameter.mul_(0.1)  # nearly a sphere, whatever the codes are
 
 
 def put_in_place() -> None:

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from run_server import ENVIRONMENT, RunServer
+from runs import check_same
 
 import learn3d
 from learn3d import checkpoint, run_folder, validation
@@ -46,7 +46,7 @@ def server() -> Iterator[RunServer]:
 
 
 @pytest.fixture(scope="module")
-def small_config(tiny_folder, tmp_path_factory) -> TrainConfig:
+def killed_config(tiny_folder, tmp_path_factory) -> TrainConfig:
     """12 steps with everything in them: 6 validations, 4 checkpoints, 3 pictures."""
     folder = tmp_path_factory.mktemp("killed")
     for path in tiny_folder.iterdir():  # not compressed: the tests read them a hundred times
@@ -61,37 +61,15 @@ def small_config(tiny_folder, tmp_path_factory) -> TrainConfig:
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(server, small_config) -> tuple[Path, float]:
+def uninterrupted(server, killed_config) -> tuple[Path, float]:
     """The folder of a run that nothing disturbed, and the seconds it took."""
     started = time.monotonic()
-    assert server(small_config)["status"] == 0  # the server warms up
+    assert server(killed_config)["status"] == 0  # the server warms up
     started = time.monotonic()
-    again = dataclasses.replace(small_config, output=small_config.output.with_name("again"))
+    again = dataclasses.replace(killed_config, output=killed_config.output.with_name("again"))
     assert server(again)["status"] == 0
-    check_same(again.output, small_config.output)
-    return small_config.output, time.monotonic() - started
-
-
-def check_same(folder: Path, other: Path) -> None:
-    """Weights, optimizers, random state, best networks, metrics and pictures of two runs agree to the bit."""
-    for name in ("last", "best"):
-        (ours, about), (theirs, about_other) = (checkpoint.load(f / f"{name}.safetensors") for f in (folder, other))
-        assert ours.keys() == theirs.keys()
-        assert [key for key in ours if not same_bits(ours[key], theirs[key])] == []
-        for values in (about, about_other):
-            del values["seconds"], values["config"]["output"]
-        assert about == about_other
-    assert (folder / "metrics.jsonl").read_text() == (other / "metrics.jsonl").read_text()
-    pictures = [{path.name: path.read_bytes() for path in (f / "pictures").iterdir()} for f in (folder, other)]
-    assert pictures[0] == pictures[1]
-    earlier = [[path.name for path in run_folder.checkpoints(f)] for f in (folder, other)]
-    assert earlier[0][0] == earlier[1][0] == "last.safetensors"
-    assert len(earlier[0]) == len(earlier[1]) == 2
-    assert not list(folder.rglob(".*")), "locks and half-written files are gone"
-
-
-def same_bits(a: torch.Tensor, b: torch.Tensor) -> bool:
-    return a.dtype == b.dtype and a.shape == b.shape and a.numpy().tobytes() == b.numpy().tobytes()
+    check_same(again.output, killed_config.output)
+    return killed_config.output, time.monotonic() - started
 
 
 def check_whole(folder: Path) -> None:
@@ -158,16 +136,16 @@ PHASES = (
 )
 
 
-def test_killed_at_any_place(server, small_config, uninterrupted) -> None:
+def test_killed_at_any_place(server, killed_config, uninterrupted) -> None:
     reference, _ = uninterrupted
     rng = random.Random(SEED)
-    lines = places(server, small_config)
+    lines = places(server, killed_config)
     assert len(lines) > 20, sorted(lines)
     assert sum(map(len, lines.values())) > 300
     hit: Counter[str] = Counter()
     tried: Counter[str] = Counter()
     kills = attempts = chains = in_chain = 0
-    config = small_config
+    config = killed_config
     while attempts < MOST_ATTEMPTS:
         if in_chain == 0:
             chains += 1
@@ -202,10 +180,10 @@ def test_killed_at_any_place(server, small_config, uninterrupted) -> None:
     assert not set(PHASES) - set(hit)
 
 
-def test_signals_at_any_time(server, small_config, uninterrupted) -> None:
+def test_signals_at_any_time(server, killed_config, uninterrupted) -> None:
     reference, seconds = uninterrupted
     rng = random.Random(SEED)
-    config, chains, statuses = small_config, 0, []
+    config, chains, statuses = killed_config, 0, []
     for number in [*TIMED_SIGNALS, None]:
         if chains == 0 or statuses[-1] == "finished":
             chains += 1
@@ -231,15 +209,22 @@ def test_signals_at_any_time(server, small_config, uninterrupted) -> None:
     assert statuses[-1] == "finished"
 
 
-def test_the_command_killed_at_any_time(small_config, tmp_path, monkeypatch) -> None:
+def test_a_run_that_was_put_to_sleep_goes_on(server, killed_config, uninterrupted) -> None:
+    reference, seconds = uninterrupted
+    config = dataclasses.replace(killed_config, output=reference.with_name("asleep"))
+    assert server(config, after=seconds / 2, signal=signal.SIGSTOP)["status"] == 0
+    check_same(config.output, reference)
+
+
+def test_the_command_killed_at_any_time(killed_config, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(validation, "PICTURE_ROWS", 8)  # as the command draws them
-    reference = dataclasses.replace(small_config, output=tmp_path / "uninterrupted")
+    reference = dataclasses.replace(killed_config, output=tmp_path / "uninterrupted")
     train(reference)
     names = ("iterations", "batch_size", "precision", "threads", "max_val_images")
     names += ("log_every", "validate_every", "checkpoint_every", "pictures_every")
-    options = [f"--{name.replace('_', '-')}={getattr(small_config, name)}" for name in names]
+    options = [f"--{name.replace('_', '-')}={getattr(killed_config, name)}" for name in names]
     options += ["--encoder=conv-small", "--generator=sphere-small", "--learning-rate=3e-3"]
-    options += [f"--data={small_config.data}", "--category=airplane"]
+    options += [f"--data={killed_config.data}", "--category=airplane"]
     run = tmp_path / "run"
     script = [sys.executable, str(Path(__file__).parents[2] / "tools" / "train.py"), f"--output={run}"]
     packages = [str(Path(learn3d.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
