@@ -224,6 +224,23 @@ def test_runs_made_by_hand_are_adopted(made_by_hand) -> None:
     assert read_state(made_by_hand(threads=7)) == State("trained", 4), "what does not decide the result may differ"
 
 
+def test_a_trained_run_whose_checkpoint_is_damaged_goes_on(made_by_hand, finished_run) -> None:
+    run = made_by_hand()
+    run.folder.unlink()
+    run.folder.mkdir()
+    last = run.folder / "last.safetensors"
+    shutil.copy(finished_run / "last.safetensors", last)
+    with open(last, "r+b") as file:
+        file.seek(-1000, os.SEEK_END)
+        file.write(b"rubbish")
+    assert read_state(run) == State("unfinished", 4), "training finds the damage and goes back to the one before"
+    (run.folder / "checkpoints").mkdir()
+    shutil.copy(finished_run / "last.safetensors", run.folder / "checkpoints" / "step-000004.safetensors")
+    last.write_bytes(b"rubbish")
+    assert read_state(run).step == 4, "the header of the one before counts"
+    shutil.rmtree(run.folder)
+
+
 def test_other_options_are_named(made_by_hand) -> None:
     with pytest.raises(ValueError, match=r"proposed-seed0 has a run with other options: batch_size: 4 .* 5 asked for"):
         read_state(made_by_hand(batch_size=5))
