@@ -1,15 +1,20 @@
-"""Checkpoints: all tensors of a run in one safetensors file, everything else as JSON in its header. No pickle."""
+"""Checkpoints: all tensors of a run in one safetensors file, everything else as JSON in its header. No pickle.
+
+The header holds three texts: "learn3d", the JSON; "metadata_crc32" of its bytes; "tensors_crc32" of the names, types,
+shapes and bytes of all tensors in the order of their names. Format 1 had the first alone and is still read.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import zlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from learn3d import checkpoint_checks, files
@@ -17,7 +22,11 @@ from learn3d.config import TrainConfig, config_from_dict, config_to_dict
 from learn3d.methods import DataShape, Method, create_method
 from learn3d.networks import resolve_precision
 
-FORMAT = 1
+FORMAT = 2
+
+
+class DamagedError(ValueError):
+    """A checkpoint that is cut short or changed, or a file that is none; another checkpoint of the run may be whole."""
 
 
 def save(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
@@ -25,18 +34,72 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> No
 
     Raises OSError where it cannot be written (no permission, no room).
     """
-    header = {"learn3d": json.dumps({"format": FORMAT, **metadata})}
-    contiguous = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    with files.replacing(path, sync=True) as temporary:
-        try:
-            save_file(contiguous, temporary, metadata=header)
-        except SafetensorError as error:
-            raise OSError(f"cannot write the checkpoint {path}: {error}") from None
-        temporary.chmod(0o644)
+    text = json.dumps({"format": FORMAT, **metadata})
+    flat = {name: tensor.detach().cpu().contiguous() for name, tensor in sorted(tensors.items())}
+    header = {"learn3d": text, "metadata_crc32": _crc(text.encode()), "tensors_crc32": _tensors_crc(flat)}
+    try:
+        with files.replacing(path, sync=True) as temporary:
+            _write(temporary, flat, header)
+    except OSError as error:
+        raise OSError(f"cannot write the checkpoint {path}: {error.strerror or error}") from error
+
+
+_TYPES = {
+    torch.float64: "F64",
+    torch.float32: "F32",
+    torch.bfloat16: "BF16",
+    torch.float16: "F16",
+    torch.int64: "I64",
+    torch.int32: "I32",
+    torch.int16: "I16",
+    torch.int8: "I8",
+    torch.uint8: "U8",
+    torch.bool: "BOOL",
+}
+
+
+def _write(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
+    """Write a safetensors file: the length of a JSON header, the header, the tensors one after the other.
+
+    The library's own `save_file` writes beside a temporary file of a name of its own, which a killed process leaves
+    behind, and copies all tensors first in versions before 0.6. Large elements come first, so that all are aligned.
+    """
+    ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))
+    header, end = {"__metadata__": metadata}, 0
+    for name, tensor in ordered:
+        start, end = end, end + tensor.nbytes
+        header[name] = {"dtype": _TYPES[tensor.dtype], "shape": list(tensor.shape), "data_offsets": [start, end]}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    with open(path, "wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for _, tensor in ordered:
+            file.write(_bytes_of(tensor))
+
+
+def _bytes_of(tensor: Tensor) -> np.ndarray:
+    """The bytes of a contiguous tensor on the CPU, uint8 [n], in the same memory."""
+    return tensor.reshape(-1).view(torch.uint8).numpy()
+
+
+def _crc(content: bytes) -> str:
+    return f"{zlib.crc32(content):08x}"
+
+
+def _tensors_crc(tensors: dict[str, Tensor]) -> str:
+    """CRC-32 of names, types, shapes and bytes, in the order of the names."""
+    crc = 0
+    for name, tensor in sorted(tensors.items()):
+        crc = zlib.crc32(f"{name} {tensor.dtype} {list(tensor.shape)}".encode(), crc)
+        crc = zlib.crc32(_bytes_of(tensor), crc)
+    return f"{crc:08x}"
 
 
 def load(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `save` wrote, on the CPU. A missing, truncated or foreign file is a ValueError that says so."""
+    """Read what `save` wrote, on the CPU, and compare it with its checksums.
+
+    A truncated, changed or foreign file is a DamagedError; a missing one, or one of a later version, a ValueError.
+    """
     return _read(path, tensors=True)
 
 
@@ -55,22 +118,39 @@ def _read(path: Path, *, tensors: bool) -> tuple[dict[str, Tensor], dict[str, An
     try:
         checkpoint_checks.check_header(path)
         with safe_open(path, framework="pt") as file:
-            header = (file.metadata() or {}).get("learn3d")
+            header = file.metadata() or {}
             contents = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}
     except (SafetensorError, OSError, ValueError) as error:
-        raise ValueError(
+        raise DamagedError(
             f"{path} cannot be read as a checkpoint ({error}); it is damaged or was cut short: "
             "use another checkpoint of the run, or a copy"
         ) from None
-    if header is None:
-        raise ValueError(f"{path} is a safetensors file, but not a checkpoint of learn3d")
+    if "learn3d" not in header:
+        raise DamagedError(f"{path} is a safetensors file, but not a checkpoint of learn3d")
+    if "metadata_crc32" in header:
+        _check_crc(path, header["metadata_crc32"], _crc(header["learn3d"].encode()))
     try:
-        metadata = checkpoint_checks.parse_metadata(header)
+        metadata = checkpoint_checks.parse_metadata(header["learn3d"])
     except ValueError as error:
-        raise ValueError(f"{path} is no checkpoint that can be used: {error}; use another one of the run") from None
-    if metadata.get("format") != FORMAT:
-        raise ValueError(f"{path} has checkpoint format {metadata.get('format')}, this version reads format {FORMAT}")
+        raise DamagedError(f"{path} is no checkpoint that can be used: {error}; use another one of the run") from None
+    if metadata.get("format") not in (1, FORMAT):
+        raise ValueError(
+            f"{path} has checkpoint format {metadata.get('format')}, this version reads formats 1 to {FORMAT}; "
+            "use the version of learn3d that wrote it, or a later one"
+        )
+    if metadata["format"] == 2:
+        _check_crc(path, header.get("metadata_crc32"), _crc(header["learn3d"].encode()))
+        if tensors:
+            _check_crc(path, header.get("tensors_crc32"), _tensors_crc(contents))
     return contents, metadata
+
+
+def _check_crc(path: Path, written: str | None, found: str) -> None:
+    if written != found:
+        raise DamagedError(
+            f"{path} has changed since it was written (CRC-32 {written}, now {found}): the disk or a copy damaged it; "
+            "use another checkpoint of the run, or a copy"
+        )
 
 
 def network_tensors(method: Method) -> dict[str, Tensor]:
@@ -159,7 +239,7 @@ def load_method(
 ) -> tuple[Method, TrainConfig, dict[str, Any]]:
     """A trained method ready for use, from a checkpoint file: (method in evaluation mode, configuration, metadata)."""
     tensors, metadata = load(path)
-    checkpoint_checks.require(metadata, ("config", "step", "num_views" if "shape" not in metadata else "shape"), path)
+    checkpoint_checks.require_run(metadata, path)
     config = config_from_dict(metadata["config"], source=str(path))
     settings = config.settings
     if getattr(settings, "pretrained", None) is not None:  # only training starts from that file, which may be gone

@@ -49,6 +49,11 @@ def require(metadata: dict[str, Any], names: Sequence[str], source: Path | str) 
         raise ValueError(f"{source} is no checkpoint of a training run: its metadata lacks {', '.join(missing)}")
 
 
+def require_run(metadata: dict[str, Any], source: Path | str) -> None:
+    """Raise a ValueError where the metadata is not that of a training run: options, steps, shape of the data."""
+    require(metadata, ("config", "step", "shape" if "shape" in metadata else "num_views"), source)
+
+
 def _count(most: int) -> Callable[[Any], bool]:
     return lambda value: type(value) is int and 0 <= value <= most
 

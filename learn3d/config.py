@@ -70,6 +70,8 @@ class TrainConfig:
     """Steps between picture grids."""
     checkpoint_every: int = 1000
     """Steps between saves of the last checkpoint."""
+    keep_checkpoints: int = 2
+    """Number of checkpoints to keep: last.safetensors and the ones before it, in checkpoints/."""
     log_every: int = 50
     """Steps between logged losses."""
 
@@ -111,7 +113,7 @@ class TrainConfig:
         if not isinstance(self.category, str) or not self.category:
             empty = "an empty string" if self.category == "" else repr(self.category)
             raise ValueError(f"category must be a class name such as 'airplane', got {empty}")
-        for name in ("iterations", "validate_every", "pictures_every", "checkpoint_every", "log_every"):
+        for name in ("iterations", *_REPORTING):
             _check_positive_int(name, getattr(self, name), limits.ITERATIONS)
         _check_positive_int("batch_size", self.batch_size, limits.BATCH_SIZE)
         if getattr(self.settings, "encoder_from_step", 0) > self.iterations:
@@ -167,10 +169,10 @@ def _most(name: str) -> int:
     return limits.INPUT_SIDE if name.endswith("_size") else limits.CHANNELS
 
 
+_REPORTING = ("validate_every", "pictures_every", "checkpoint_every", "keep_checkpoints", "log_every")
 #: Options that a resumed run may change: they say where and how long to compute and what to report, not what to learn.
 RESUME_MAY_CHANGE = frozenset(
-    {"data", "output", "iterations", "device", "threads"}
-    | {"val_split", "validate_every", "max_val_images", "pictures_every", "checkpoint_every", "log_every"}
+    {"data", "output", "iterations", "device", "threads"} | {"val_split", "max_val_images", *_REPORTING}
 )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from typing import Any
 def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
     """Gives a temporary path in the folder of `path`; what was written there takes the name `path` when the block ends.
 
-    After an exception nothing is left of it. With `sync` the content is on the disk before it takes the name, so that
-    not even a power cut leaves half a file. Raises OSError where `path` is there and no plain file: a folder, or a
-    device such as /dev/null, which must not be replaced.
+    After an exception nothing is left of it; a killed process leaves the temporary file (`remove_partials`). With
+    `sync` the content is on the disk before it takes the name, and the name before the block ends, so that not even a
+    power cut leaves half a file or brings the old one back. Raises OSError where `path` is there and no plain file: a
+    folder, or a device such as /dev/null, which must not be replaced.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
@@ -28,16 +30,52 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
         os.replace(temporary, path)
+        if sync:
+            sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def write_bytes(path: Path, content: bytes) -> None:
+def sync_folder(folder: Path) -> None:
+    """Put the names in a folder on the disk; nothing where the system cannot open folders (Windows)."""
+    if os.name != "posix":
+        return
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
+
+
+def remove_partials(*folders: Path) -> None:
+    """Remove the temporary files that a killed process left in these folders."""
+    for folder in folders:
+        for path in folder.glob(".*.partial"):
+            path.unlink(missing_ok=True)
+
+
+def give_second_name(path: Path, name: Path) -> None:
+    """Let a file be found under another name as well, by a hard link, or as a copy where the file system has none.
+
+    A file of that name is replaced. The content of `path` is on the disk already.
+    """
+    with replacing(name) as temporary:
+        temporary.unlink(missing_ok=True)
+        try:
+            os.link(path, temporary)
+        except OSError:
+            shutil.copyfile(path, temporary)
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
+    sync_folder(name.parent)
+
+
+def write_bytes(path: Path, content: bytes, *, sync: bool = False) -> None:
     """Write a whole file."""
-    with replacing(path) as temporary:
+    with replacing(path, sync=sync) as temporary:
         temporary.write_bytes(content)
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: Any, *, sync: bool = False) -> None:
     """Write a value as indented JSON with a line break at the end."""
-    write_bytes(path, (json.dumps(value, indent=2) + "\n").encode())
+    write_bytes(path, (json.dumps(value, indent=2) + "\n").encode(), sync=sync)

@@ -1,21 +1,20 @@
-"""The state of a run on disk: its folder, what is saved to continue it bit for bit, and under which conditions."""
+"""The state of a run: what is saved to continue it bit for bit, and the conditions that it must find again."""
 
 from __future__ import annotations
 
 import dataclasses
-import shlex
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
 
-from learn3d import checkpoint, checkpoint_checks
-from learn3d.config import TrainConfig, check_resume, config_from_dict
+from learn3d import checkpoint, checkpoint_checks, run_folder
+from learn3d.config import TrainConfig, check_resume, config_from_dict, load_config
 from learn3d.methods import DataShape, Method
+from learn3d.run_folder import CONFIG, LAST
 from learn3d.versions import versions
-
-CONFIG_FILE = "config.json"
 
 
 @dataclass
@@ -38,21 +37,19 @@ class Conditions:
     precision: str  # bf16 or fp32: what "auto" came to
 
 
-def claim_folder(folder: Path, overwrite: bool) -> None:
-    """Make the run's folder; one with something in it is refused, or with `overwrite` cleared of an earlier run."""
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"output {folder} is a file; give a folder for the run")
-    if folder.is_dir() and any(folder.iterdir()):
-        if not overwrite:
-            raise ValueError(
-                f"{folder} is not empty; continue that run (--resume), replace it (--overwrite) "
-                "or choose another folder"
-            )
-        for name in (CONFIG_FILE, "last.safetensors", "best.safetensors", "metrics.jsonl"):
-            (folder / name).unlink(missing_ok=True)
-        for name in ("tensorboard", "pictures"):
-            shutil.rmtree(folder / name, ignore_errors=True)
-    folder.mkdir(parents=True, exist_ok=True)
+@dataclass(frozen=True, eq=False)
+class Saved:
+    """A checkpoint that a run goes on from."""
+
+    path: Path
+    tensors: dict[str, Tensor]
+    metadata: dict[str, Any]
+    notes: tuple[str, ...] = ()  # what was wrong with newer ones
+
+    @property
+    def shape(self) -> DataShape:
+        """What the run's networks were made for."""
+        return checkpoint.data_shape(self.metadata)
 
 
 def save_last(
@@ -63,8 +60,11 @@ def save_last(
     shape: DataShape,
     progress: Progress,
 ) -> None:
-    """Write last.safetensors: networks, optimizers, random state, progress, configuration, conditions and versions."""
-    check_networks(method, folder)
+    """Write last.safetensors: networks, optimizers, random state, progress, configuration, conditions and versions.
+
+    A complete file has that name at every moment; the ones before it are kept as `config.keep_checkpoints` says.
+    """
+    check_networks(method)
     tensors = checkpoint.network_tensors(method) | {"random.cpu": torch.get_rng_state()}
     if config.device == "cuda":
         tensors["random.cuda"] = torch.cuda.get_rng_state()
@@ -72,34 +72,58 @@ def save_last(
         tensors |= checkpoint.optimizer_tensors(name, optimizer)
     metadata = checkpoint.method_metadata(shape, config) | dataclasses.asdict(progress)
     metadata |= {"conditions": dataclasses.asdict(conditions), "versions": versions()}
-    checkpoint.save(folder / "last.safetensors", tensors, metadata)
+    if config.keep_checkpoints > 1:
+        run_folder.keep_previous(folder)
+    checkpoint.save(folder / LAST, tensors, metadata)
+    run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
 
 
-def restore(
-    path: Path,
-    config: TrainConfig,
-    conditions: Conditions,
-    method: Method,
-    progress: Progress,
-) -> None:
+def load_last(folder: Path, config: TrainConfig) -> Saved | None:
+    """The newest checkpoint of the run in `folder` that is whole, or None where the run was stopped before its first.
+
+    A damaged last.safetensors is put aside and the one before it takes its place; `notes` say so. Raises ValueError
+    where there is no run, or one without a checkpoint that began with other options than `config`, and DamagedError
+    where there are checkpoints, but none of them is whole.
+    """
+    candidates = run_folder.checkpoints(folder)
+    if not candidates and not (folder / CONFIG).is_file():
+        raise ValueError(f"there is no checkpoint and no {CONFIG} in {folder}; start the run without --resume")
+    notes: list[str] = []
+    for path in candidates:
+        try:
+            tensors, metadata = checkpoint.load(path)
+        except checkpoint.DamagedError as error:
+            notes.append(str(error))
+            continue
+        checkpoint_checks.require_run(metadata, path)
+        if path.name != LAST:
+            run_folder.put_in_place(path)
+            notes.append(f"going on from the checkpoint before it, {path}; the steps since then are repeated")
+        return Saved(path, tensors, metadata, tuple(notes))
+    if candidates:
+        raise checkpoint.DamagedError("; ".join(notes) + "; no checkpoint is whole: start a new run (--overwrite)")
+    check_resume(config, load_config(folder / CONFIG))
+    return None
+
+
+def restore(saved: Saved, config: TrainConfig, conditions: Conditions, method: Method, progress: Progress) -> None:
     """Bring everything back to the state that `save_last` wrote.
 
     An option or a condition that differs is a ValueError that names it. Conditions that an older checkpoint does not
     record are not checked.
     """
-    tensors, metadata = checkpoint.load(path)
-    checkpoint_checks.require(metadata, ("config", "step"), path)
-    saved, recorded = config_from_dict(metadata["config"], source=str(path)), metadata.get("conditions", {})
+    tensors, metadata = saved.tensors, saved.metadata
+    before, recorded = config_from_dict(metadata["config"], source=str(saved.path)), metadata.get("conditions", {})
     if recorded.get("precision") == conditions.precision:  # asked for by name or by "auto", it is the same
-        saved = dataclasses.replace(saved, precision=config.precision)
-    check_resume(config, saved)
+        before = dataclasses.replace(before, precision=config.precision)
+    check_resume(config, before)
     _check_conditions(conditions, recorded, config.data)
-    checkpoint.restore_networks(method, tensors, path)
+    checkpoint.restore_networks(method, tensors, saved.path)
     for name, optimizer in method.optimizers.items():
-        checkpoint.restore_optimizer(name, optimizer, tensors, path)
+        checkpoint.restore_optimizer(name, optimizer, tensors, saved.path)
     for field in dataclasses.fields(Progress):
         setattr(progress, field.name, metadata.get(field.name, getattr(progress, field.name)))
-    torch.set_rng_state(checkpoint.random_state(tensors, path))
+    torch.set_rng_state(checkpoint.random_state(tensors, saved.path))
     if config.device == "cuda" and "random.cuda" in tensors:
         torch.cuda.set_rng_state(tensors["random.cuda"])
 
@@ -124,20 +148,8 @@ def _check_conditions(now: Conditions, recorded: dict[str, object], data: Path) 
         )
 
 
-def check_networks(method: Method, folder: Path) -> None:
+def check_networks(method: Method) -> None:
     """Refuse to save networks that are no longer finite: the checkpoint on disk is better than they are."""
     for name, network in method.networks.items():
         if not all(bool(parameter.isfinite().all()) for parameter in network.parameters()):
-            raise FloatingPointError(f"the {name} has weights that are not finite; {last_good(folder)}")
-
-
-def last_good(folder: Path) -> str:
-    path = folder / "last.safetensors"
-    if not path.is_file():
-        return "there is no checkpoint yet; try a lower learning_rate or precision fp32"
-    return f"the last good checkpoint is {path}; try a lower learning_rate or precision fp32"
-
-
-def resume_command(folder: Path) -> str:
-    """The command line that continues the run in `folder`, quoted for a POSIX shell."""
-    return f"python tools/train.py --output {shlex.quote(str(folder))} --resume"
+            raise FloatingPointError(f"the {name} has weights that are not finite")

@@ -16,7 +16,10 @@ class Stop:
 
 @contextlib.contextmanager
 def stop_on_signal() -> Iterator[Stop]:
-    """Turn the first SIGINT or SIGTERM into a request to stop; a second SIGINT interrupts at once."""
+    """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop; a second SIGINT interrupts at once.
+
+    SIGHUP comes when the terminal is closed. Where it is ignored (nohup) it stays so.
+    """
     stop = Stop()
 
     def handle(number: int, frame: object) -> None:
@@ -24,9 +27,12 @@ def stop_on_signal() -> Iterator[Stop]:
             raise KeyboardInterrupt
         stop.requested, stop.name = True, signal.Signals(number).name
 
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
     previous: dict[int, object] = {}
     try:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in numbers:
             with contextlib.suppress(ValueError):  # not the main thread: leave signals alone
                 previous[number] = signal.signal(number, handle)
         yield stop

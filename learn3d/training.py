@@ -4,32 +4,24 @@ from __future__ import annotations
 
 import time
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from learn3d import checkpoint, files
+from learn3d import files, run_folder
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.data.augment import augment
 from learn3d.data.layouts import load_dataset
 from learn3d.data.sampling import sample_indices
 from learn3d.data.views import ViewDataset
+from learn3d.faults import explained
 from learn3d.memory import keep_freed_memory
 from learn3d.methods import DataShape, create_method
 from learn3d.networks import resolve_precision
 from learn3d.presets import PRESETS
-from learn3d.run_state import (
-    CONFIG_FILE,
-    Conditions,
-    Progress,
-    claim_folder,
-    last_good,
-    restore,
-    resume_command,
-    save_last,
-)
+from learn3d.run_state import Conditions, Progress, load_last, restore, save_last
 from learn3d.runlog import RunLog
 from learn3d.signals import stop_on_signal
 from learn3d.validation import draw, validate
@@ -50,52 +42,60 @@ class Summary:
 def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False) -> Summary:
     """Train one model and leave everything in `config.output`.
 
-    The folder receives config.json, last.safetensors (all that a resumption needs), best.safetensors (the networks with
-    the best validation IoU), metrics.jsonl, tensorboard/ and pictures/. SIGINT and SIGTERM end the current step, save
-    and return. With `resume` the run continues from last.safetensors, bit for bit (same machine, device and number of
-    threads).
+    What the folder holds afterwards is listed in `run_folder`. SIGINT, SIGTERM and SIGHUP end the current step, save
+    and return. With `resume` the run continues from its last checkpoint, bit for bit (same machine, device and number
+    of threads), or from the start if it was stopped before its first one. A finished run stays as it is.
 
     Raises ValueError for a folder in use, options or training data that conflict with the resumed run or data that do
-    not fit, FloatingPointError when a loss is no longer finite (the last checkpoint is from before that), and OSError
-    when something cannot be written.
+    not fit, FloatingPointError when a loss is no longer finite (the last checkpoint is from before that), OSError when
+    a checkpoint cannot be written or another process works in the folder, MemoryError when there is too little memory.
     """
+    with run_folder.sole_use(config.output):
+        return _train(config, resume, overwrite)
+
+
+def _train(config: TrainConfig, resume: bool, overwrite: bool) -> Summary:
     started = time.monotonic()
     keep_freed_memory()
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     train_set, val_set = load_splits(config)
     precision = resolve_precision(config.precision, config.device)
-    shape = DataShape(
-        train_set.num_views, train_set.num_classes, train_set.poses.num_features, inverted=train_set.inverted
-    )
-    if resume:  # a run goes on as it began, also one from before encoders could turn colours back
-        began = checkpoint.data_shape(checkpoint.load_metadata(config.output / "last.safetensors"))
-        shape = replace(shape, inverted=began.inverted)
+    folder = config.output
+    saved = load_last(folder, config) if resume else None
+    # A run goes on as it began, also one from before encoders could turn colours back.
+    inverted = train_set.inverted if saved is None else saved.shape.inverted
+    shape = DataShape(train_set.num_views, train_set.num_classes, train_set.poses.num_features, inverted)
     method = create_method(config.settings, shape, device=config.device, precision=precision, seed=config.seed)
     progress = Progress(object_share=object_share(train_set))
     conditions = Conditions(len(train_set), f"{zlib.crc32(np.ascontiguousarray(train_set.images)):08x}", precision)
-    folder = config.output
-    if resume:
-        restore(folder / "last.safetensors", config, conditions, method, progress)
-    else:
-        claim_folder(folder, overwrite)
-    if progress.step >= config.iterations:
-        raise ValueError(
-            f"{folder} has taken {progress.step} steps of {config.iterations} already; "
-            "to continue ask for more iterations"
-        )
-    files.write_json(folder / CONFIG_FILE, config_to_dict(config))
+    if saved is not None:
+        restore(saved, config, conditions, method, progress)
+    elif not resume:
+        run_folder.claim(folder, overwrite)
+    notes = () if saved is None else saved.notes
+    del saved  # and its tensors
+    run_folder.remove_partials(folder)
+    if progress.step > config.iterations:
+        raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
+    if progress.step == config.iterations:  # also after a kill between the last save and the end
+        run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
+        return _summary(folder, config, progress, started)
+    files.write_json(folder / run_folder.CONFIG, config_to_dict(config), sync=True)
     before = progress.seconds
 
-    with stop_on_signal() as stop, RunLog(folder, start=progress.step, total=config.iterations) as log:
+    with (
+        explained(folder),
+        stop_on_signal() as stop,
+        RunLog(folder, start=progress.step, total=config.iterations) as log,
+    ):
+        for note in notes:
+            log.say(f"warning: {note}")
         log.say(_describe(config, precision, train_set, val_set, progress))
         for step in range(progress.step + 1, config.iterations + 1):
             indices = sample_indices(train_set, config.sampling, config.batch_size, config.seed, step)
             batch = augment(train_set.batch(indices), config.augment, config.seed, step)
-            try:
-                losses = method.train_step(batch, step)
-            except FloatingPointError as error:
-                raise FloatingPointError(f"{error}; {last_good(folder)}") from None
+            losses = method.train_step(batch, step)
             progress.step = step
             progress.seconds = before + time.monotonic() - started
             log.step(step, losses)
@@ -108,14 +108,18 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
             if last or step % config.pictures_every == 0:
                 draw(config, method, val_set, step, log)
             if last or stop.requested or step % config.checkpoint_every == 0:
+                log.sync()
                 save_last(folder, config, conditions, method, shape, progress)
             if stop.requested and not last:
-                log.say(f"stopped by {stop.name} after step {step}; continue with: {resume_command(folder)}")
+                log.say(f"stopped by {stop.name} after step {step}; continue with: {run_folder.resume_command(folder)}")
                 break
 
-    seconds = time.monotonic() - started
-    finished = progress.step == config.iterations
-    return Summary(folder, progress.step, finished, progress.best_iou, progress.best_step, seconds)
+    return _summary(folder, config, progress, started)
+
+
+def _summary(folder: Path, config: TrainConfig, at: Progress, started: float) -> Summary:
+    finished = at.step == config.iterations
+    return Summary(folder, at.step, finished, at.best_iou, at.best_step, time.monotonic() - started)
 
 
 def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:

@@ -13,6 +13,7 @@ from learn3d.config import TrainConfig
 from learn3d.data.views import ViewDataset
 from learn3d.evaluation import evaluate
 from learn3d.methods import DataShape, Method
+from learn3d.run_folder import BEST, PICTURES
 from learn3d.run_state import Progress, check_networks
 from learn3d.runlog import RunLog
 
@@ -44,16 +45,19 @@ def validate(
     if better:
         progress.best_iou, progress.best_step = iou, progress.step
         metadata = checkpoint.method_metadata(shape, config) | dataclasses.asdict(progress)
-        check_networks(method, config.output)
-        checkpoint.save(config.output / "best.safetensors", checkpoint.network_tensors(method), metadata)
+        check_networks(method)
+        checkpoint.save(config.output / BEST, checkpoint.network_tensors(method), metadata)
 
 
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
     """Write pictures/<step>.png: the same few validation images every time, of different objects and views."""
     grid = figures.picture_grid(method, val_set, picture_samples(val_set, PICTURE_ROWS))
-    folder = config.output / "pictures"
-    folder.mkdir(exist_ok=True)
-    figures.save_png(folder / f"{step:06}.png", grid)
+    folder = config.output / PICTURES
+    try:
+        folder.mkdir(exist_ok=True)
+        figures.save_png(folder / f"{step:06}.png", grid)
+    except OSError as error:
+        log.warn("pictures cannot be written", error, "training goes on")
     log.picture(step, config.val_split, grid)
 
 

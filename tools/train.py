@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import tyro
 
@@ -76,16 +78,28 @@ def main() -> int:
         if command.resume and command.overwrite:
             raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
         summary = train(command.config, resume=command.resume, overwrite=command.overwrite)
-    except (ValueError, OSError, FloatingPointError) as error:
-        print(f"error: {error}", file=sys.stderr)
+    except (ValueError, OSError, FloatingPointError, MemoryError) as error:
+        _say(f"error: {error}", sys.stderr)
         return 1
+    except KeyboardInterrupt:  # before the training, which saves and ends well, or the second one in it
+        _say("interrupted; what was saved before is as it was", sys.stderr)
+        return 130
     state = "finished" if summary.finished else "stopped"
     best = f"best validation IoU {summary.best_iou:.4f} at step {summary.best_step}; "
-    print(
+    _say(
         f"{state} at step {summary.step} after {summary.seconds / 60:.1f} min; "
-        f"{best if summary.best_step else ''}everything is in {summary.folder}"
+        f"{best if summary.best_step else ''}everything is in {summary.folder}",
+        sys.stdout,
     )
     return 0
+
+
+def _say(text: str, stream: TextIO) -> None:
+    """Print a line; a terminal that was closed does not change how the run ended."""
+    try:
+        print(text, file=stream, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # for the interpreter's own flush at the end
 
 
 if __name__ == "__main__":

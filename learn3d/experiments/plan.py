@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d import checkpoint, checkpoint_checks
+from learn3d import checkpoint, checkpoint_checks, run_folder
 from learn3d.config import TrainConfig, config_from_dict, differences, load_config
 from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.experiments.stored import read_result
@@ -133,7 +133,9 @@ def read_state(run: Run) -> State:
         return State("new")
     if step < run.config.iterations:
         return State("unfinished", step)
-    return State("done" if result.is_file() and is_current(run, read_result(result)) else "trained", step)
+    if result.is_file() and is_current(run, read_result(result)):
+        return State("done", step)
+    return State("unfinished" if _is_damaged(run.folder / run_folder.LAST) else "trained", step)
 
 
 def read_results(runs: Sequence[Run]) -> dict[Path, dict[str, Any]]:
@@ -276,14 +278,28 @@ def _parse(text: str, kind: str) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def _is_damaged(path: Path) -> bool:
+    """Whether a checkpoint disagrees with its checksums: training then repeats the steps since the one before it."""
+    try:
+        checkpoint.load(path)
+    except checkpoint.DamagedError:
+        return True
+    except ValueError:  # there is none, or it is a later version's: measuring says so
+        pass
+    return False
+
+
 def _recorded(run: Run) -> tuple[TrainConfig | None, int, str | None]:
     """(configuration, steps taken, precision) of what is in the run's folder, from its last checkpoint, its result
     (where checkpoints were removed to save space) or its configuration; (None, 0, None) for no run."""
-    last, result = run.folder / "last.safetensors", run.folder / RESULT_FILE
-    if last.is_file():
-        metadata = checkpoint.load_metadata(last)
-        checkpoint_checks.require(metadata, ("config", "step"), last)
-        config = config_from_dict(metadata["config"], source=str(last))
+    result = run.folder / RESULT_FILE
+    for path in run_folder.checkpoints(run.folder):
+        try:
+            metadata = checkpoint.load_metadata(path)
+        except checkpoint.DamagedError:  # the training says so, and goes on from the one before it
+            continue
+        checkpoint_checks.require(metadata, ("config", "step"), path)
+        config = config_from_dict(metadata["config"], source=str(path))
         return config, metadata["step"], metadata.get("conditions", {}).get("precision")
     if result.is_file():
         values = read_result(result)

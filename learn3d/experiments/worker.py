@@ -6,21 +6,20 @@ whatever reason, the worker sees the end of the file and stops as at Ctrl-C, its
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from learn3d.config import config_from_dict, config_to_dict
 from learn3d.experiments import plan
 from learn3d.experiments.plan import Run
 from learn3d.experiments.tables import Variant
+from learn3d.run_folder import sole_use
 
+LOCK = ".experiment.lock"  # of a worker, also while it measures; training has its own
 STOPPED = 75  # exit status of a run that was stopped and can go on (sysexits' EX_TEMPFAIL)
 
 
@@ -54,24 +53,6 @@ def carry_out(run: Run, *, fresh: bool) -> bool:
     return True
 
 
-@contextlib.contextmanager
-def sole_use(folder: Path) -> Iterator[None]:
-    """Keep other processes from working in the same run folder. Raises OSError where one does; where the system has no
-    file locks (Windows), nothing is kept."""
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
-    with open(folder / ".lock", "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise OSError(f"another process works in {folder}; wait for it, or stop it") from None
-        yield
-
-
 def _stop_with_parent() -> None:
     """Interrupt this process when the standard input ends."""
 
@@ -88,7 +69,7 @@ def main() -> int:
     _stop_with_parent()
     run = run_of(request)
     try:
-        with sole_use(run.folder):
+        with sole_use(run.folder, LOCK):
             finished = carry_out(run, fresh=request["fresh"])
     except (ValueError, OSError, FloatingPointError) as error:
         print(f"error: {error}", file=sys.stderr, flush=True)

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny_networks
 import torch
 
 from learn3d import validation
 from learn3d.config import DEFAULT_PRESET, TrainConfig
 from learn3d.data import kato
 from learn3d.data.views import ViewDataset
+from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.presets import PRESETS
 from learn3d.training import train
 
@@ -84,6 +86,31 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable
     assert summary.step == 4
     yield folder
     shutil.rmtree(folder)
+
+
+@pytest.fixture(scope="module")
+def tiny_names() -> Iterator[None]:
+    """The names conv-small and sphere-small mean the networks of `tiny_networks`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ENCODERS, "conv-small", tiny_networks.TinyEncoder)
+        patch.setitem(GENERATORS, "sphere-small", tiny_networks.TinyGenerator)
+        yield
+
+
+@pytest.fixture(scope="module")
+def tiny_run(tiny_names: None, tiny_config: Callable[..., TrainConfig]) -> Callable[..., TrainConfig]:
+    """Makes a configuration of six steps of milliseconds with everything in them, every two steps."""
+    small = {"encoder": "conv-small", "generator": "sphere-small", "batch_size": 2, "threads": 1, "iterations": 6}
+    often = {"log_every": 1, "validate_every": 2, "checkpoint_every": 2, "pictures_every": 2}
+    return lambda output, **options: tiny_config(output, **(small | often | options))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tiny_run: Callable[..., TrainConfig], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of such a run that nothing disturbed. Do not change it."""
+    folder = tmp_path_factory.mktemp("undisturbed") / "run"
+    train(tiny_run(folder))
+    return folder
 
 
 @pytest.fixture(autouse=True, scope="session")

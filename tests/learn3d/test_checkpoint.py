@@ -28,12 +28,12 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch) -> None:
     path = tmp_path / "a.safetensors"
     checkpoint.save(path, {"x": torch.zeros(1)}, {"step": 1})
 
-    def fail(tensors, file, metadata):
+    def fail(file, tensors, metadata):
         file.write_bytes(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(checkpoint, "save_file", fail)
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr(checkpoint, "_write", fail)
+    with pytest.raises(OSError, match=r"cannot write the checkpoint .*a\.safetensors: disk full"):
         checkpoint.save(path, {"x": torch.ones(1)}, {"step": 2})
     assert checkpoint.load(path)[1]["step"] == 1
     assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]

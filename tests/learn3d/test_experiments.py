@@ -36,8 +36,9 @@ from learn3d.experiments.plan import (
 from learn3d.experiments.pool import NOT_FROM_HERE
 from learn3d.experiments.statistics import percentile_interval, resampled_means, t_interval
 from learn3d.experiments.tables import TABLES
-from learn3d.experiments.worker import carry_out, sole_use
+from learn3d.experiments.worker import carry_out
 from learn3d.presets import PRESETS
+from learn3d.run_folder import sole_use
 from learn3d.training import Summary
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -221,6 +222,23 @@ def test_runs_made_by_hand_are_adopted(made_by_hand) -> None:
     assert read_state(made_by_hand()) == State("trained", 4)
     assert read_state(made_by_hand(iterations=9)) == State("unfinished", 4)
     assert read_state(made_by_hand(threads=7)) == State("trained", 4), "what does not decide the result may differ"
+
+
+def test_a_trained_run_whose_checkpoint_is_damaged_goes_on(made_by_hand, finished_run) -> None:
+    run = made_by_hand()
+    run.folder.unlink()
+    run.folder.mkdir()
+    last = run.folder / "last.safetensors"
+    shutil.copy(finished_run / "last.safetensors", last)
+    with open(last, "r+b") as file:
+        file.seek(-1000, os.SEEK_END)
+        file.write(b"rubbish")
+    assert read_state(run) == State("unfinished", 4), "training finds the damage and goes back to the one before"
+    (run.folder / "checkpoints").mkdir()
+    shutil.copy(finished_run / "last.safetensors", run.folder / "checkpoints" / "step-000004.safetensors")
+    last.write_bytes(b"rubbish")
+    assert read_state(run).step == 4, "the header of the one before counts"
+    shutil.rmtree(run.folder)
 
 
 def test_other_options_are_named(made_by_hand) -> None:

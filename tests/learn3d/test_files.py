@@ -40,7 +40,7 @@ def test_sync_comes_before_the_new_name(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(os, "replace", lambda a, b: (calls.append("replace"), replace(a, b)))
     with files.replacing(tmp_path / "a", sync=True) as temporary:
         Path(temporary).write_bytes(b"x")
-    assert calls == ["fsync", "replace"]
+    assert calls == ["fsync", "replace", "fsync"], "the content, the name, the folder that holds the name"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs /dev/null")

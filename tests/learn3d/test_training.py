@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import nmr
-from learn3d import checkpoint, run_state, training
+from learn3d import checkpoint, run_folder, run_state, training
 from learn3d.config import (
     TrainConfig,
     check_resume,
@@ -240,6 +240,7 @@ def test_a_finished_run_leaves_everything(finished_run, read_metrics) -> None:
         "last.safetensors",
         "best.safetensors",
         "metrics.jsonl",
+        "journal.txt",
         "tensorboard",
         "pictures",
     }
@@ -316,11 +317,16 @@ def test_interrupted_run_resumes_bit_for_bit(
 def test_resume_refuses_conflicts_and_finished_runs(tiny_config, finished_run) -> None:
     with pytest.raises(ValueError, match=r"cannot resume with different options .*learning_rate"):
         train(tiny_config(finished_run, learning_rate=1e-3), resume=True)
-    with pytest.raises(ValueError, match=ALREADY):
-        train(tiny_config(finished_run), resume=True)
+    with pytest.raises(ValueError, match="has taken 4 steps, more than the 3 asked for"):
+        train(tiny_config(finished_run, iterations=3), resume=True)
 
 
-ALREADY = "taken 4 steps of 4 already"  # what a finished run says when everything fits
+def check_nothing_to_do(config: TrainConfig) -> None:
+    """What happens to a finished run when everything fits: nothing."""
+    before = {path: path.stat().st_mtime_ns for path in config.output.rglob("*") if path.is_file()}
+    summary = train(config, resume=True)
+    assert (summary.step, summary.finished, summary.best_step) == (4, True, 4)
+    assert {path: path.stat().st_mtime_ns for path in config.output.rglob("*") if path.is_file()} == before
 
 
 def change_metadata(monkeypatch: pytest.MonkeyPatch, change) -> None:
@@ -364,14 +370,12 @@ def test_resume_refuses_other_data(tiny_config, tiny_folder, finished_run, tmp_p
 
 def test_resume_finds_its_data_in_another_folder(tiny_config, tiny_folder, finished_run, tmp_path) -> None:
     shutil.copytree(tiny_folder, tmp_path / "moved")
-    with pytest.raises(ValueError, match=ALREADY):
-        train(tiny_config(finished_run, data=tmp_path / "moved"), resume=True)
+    check_nothing_to_do(tiny_config(finished_run, data=tmp_path / "moved"))
 
 
 def test_resume_refuses_another_arithmetic(tiny_config, finished_run, monkeypatch) -> None:
     change_metadata(monkeypatch, lambda m: m | {"config": m["config"] | {"precision": "auto"}})
-    with pytest.raises(ValueError, match=ALREADY):  # fp32 by name is what "auto" was
-        train(tiny_config(finished_run, precision="fp32"), resume=True)
+    check_nothing_to_do(tiny_config(finished_run, precision="fp32"))  # by name it is what "auto" was
     monkeypatch.setattr(training, "resolve_precision", lambda precision, device: "bf16")
     with pytest.raises(ValueError, match="the run computes in fp32, but precision 'auto' means bf16 here; ask for"):
         train(tiny_config(finished_run, precision="auto"), resume=True)
@@ -379,14 +383,13 @@ def test_resume_refuses_another_arithmetic(tiny_config, finished_run, monkeypatc
 
 def test_resume_from_a_checkpoint_without_conditions(tiny_config, tiny_folder, finished_run, monkeypatch) -> None:
     change_metadata(monkeypatch, lambda m: {k: v for k, v in m.items() if k != "conditions"})
-    with pytest.raises(ValueError, match=ALREADY):
-        train(tiny_config(finished_run), resume=True)
+    check_nothing_to_do(tiny_config(finished_run))
     with pytest.raises(ValueError, match="precision: 'fp32' in the run, 'bf16' asked for"):
         train(tiny_config(finished_run, precision="bf16"), resume=True)
 
 
 def test_resume_command_is_quoted(tmp_path) -> None:
-    words = shlex.split(run_state.resume_command(tmp_path / "my runs" / "it's"))
+    words = shlex.split(run_folder.resume_command(tmp_path / "my runs" / "it's"))
     assert words == ["python", "tools/train.py", "--output", str(tmp_path / "my runs" / "it's"), "--resume"]
 
 
@@ -437,6 +440,6 @@ def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> 
     with torch.no_grad():
         method.generator.layers[0].bias[3] = float("inf")
     run_folder.mkdir()
-    with pytest.raises(FloatingPointError, match="generator has weights that are not finite; there is no checkpoint"):
+    with pytest.raises(FloatingPointError, match="generator has weights that are not finite"):
         run_state.save_last(run_folder, config, None, method, DataShape(24), run_state.Progress())
     assert not list(run_folder.iterdir())

@@ -1,0 +1,162 @@
+"""The folder of a run: what lies in it, who may work in it, and which checkpoints are kept.
+
+config.json           the options
+last.safetensors      all that a resumption needs; a complete file at every moment after the first save
+checkpoints/          step-<step>.safetensors: the ones before last.safetensors, `keep_checkpoints` with it
+best.safetensors      the networks with the best validation IoU
+metrics.jsonl         losses and measurements
+journal.txt           what the run said, with the time
+tensorboard/, pictures/
+damaged.safetensors   what was found under the name last.safetensors and could not be used
+.lock                 held by the process that works here; .<name>.partial: a file being written
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from learn3d import checkpoint, files
+
+CONFIG, LAST, BEST = "config.json", "last.safetensors", "best.safetensors"
+METRICS, JOURNAL, DAMAGED = "metrics.jsonl", "journal.txt", "damaged.safetensors"
+EARLIER, PICTURES, TENSORBOARD = "checkpoints", "pictures", "tensorboard"
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def sole_use(folder: Path, lock: str = LOCK) -> Iterator[None]:
+    """Make the folder and keep other processes from working in it while the block runs.
+
+    The lock is the operating system's: it ends with its process, however that ends. Raises ValueError where `folder` is
+    a file, OSError where another process holds the lock or the folder cannot be written to. Where the system or the
+    file system has no file locks (Windows, some network drives), nothing is kept. A folder that was made and is still
+    empty at the end is removed.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"output {folder} is a file; give a folder for the run")
+    made = not folder.is_dir()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = _locked(folder / lock)
+    except BlockingIOError:
+        raise OSError(f"another process works in {folder}; wait for it, or stop it") from None
+    except OSError as error:
+        raise OSError(
+            f"the output folder {folder} cannot be written to ({error.strerror}); choose another --output"
+        ) from None
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # a full or read-only disk; the folder is gone
+            (folder / lock).unlink()
+        os.close(file)
+        if made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+def _locked(path: Path) -> int:
+    """An open file that this process alone has locked. Raises BlockingIOError where another one has."""
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(file)
+            raise
+        except (ImportError, OSError):  # no locks here
+            return file
+        with contextlib.suppress(FileNotFoundError):
+            if os.fstat(file).st_ino == os.stat(path).st_ino:
+                return file
+        os.close(file)  # its holder has removed it between the two calls: that is no lock any more
+
+
+def claim(folder: Path, overwrite: bool) -> None:
+    """Take an empty folder for a new run; one with something in it is refused, or with `overwrite` cleared of a run.
+
+    What a run that was killed before it had anything leaves behind (a lock, a half-written file) does not count.
+    """
+    if found := [path for path in folder.iterdir() if path.name != LOCK and not path.match(".*.partial")]:
+        if not overwrite:
+            raise ValueError(
+                f"{folder} is not empty; continue that run (--resume), replace it (--overwrite) "
+                "or choose another folder"
+            )
+        del found
+        for path in (*checkpoints(folder), *(folder / name for name in (CONFIG, BEST, METRICS, JOURNAL, DAMAGED))):
+            path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # something of the user's is in it
+            (folder / EARLIER).rmdir()
+        for name in (TENSORBOARD, PICTURES):
+            shutil.rmtree(folder / name, ignore_errors=True)
+    remove_partials(folder)
+
+
+def remove_partials(folder: Path) -> None:
+    """Remove the half-written files of a run that was killed."""
+    files.remove_partials(folder, folder / EARLIER, folder / PICTURES)
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints that a run can go on from, newest first: last.safetensors, then those in checkpoints/."""
+    earlier = {
+        path: step for path in (folder / EARLIER).glob("step-*.safetensors") if (step := _step(path)) is not None
+    }
+    last = [folder / LAST] if (folder / LAST).is_file() else []
+    return last + sorted(earlier, key=earlier.__getitem__, reverse=True)
+
+
+def _step(path: Path) -> int | None:
+    digits = path.name.removeprefix("step-").removesuffix(".safetensors")
+    return int(digits) if digits.isdecimal() else None
+
+
+def keep_previous(folder: Path) -> None:
+    """Before last.safetensors is replaced: let it also be found as checkpoints/step-<step>.safetensors.
+
+    One that cannot be read is not kept.
+    """
+    last = folder / LAST
+    if not last.is_file():
+        return
+    try:
+        step = checkpoint.load_metadata(last)["step"]
+    except checkpoint.DamagedError:
+        return
+    (folder / EARLIER).mkdir(exist_ok=True)
+    files.give_second_name(last, folder / EARLIER / f"step-{step:06}.safetensors")
+
+
+def remove_old(folder: Path, step: int, keep: int) -> None:
+    """After last.safetensors of `step` was written: of the checkpoints before it keep the newest `keep` - 1."""
+    earlier = [path for path in checkpoints(folder)[1:] if _step(path) < step]
+    for path in earlier[keep - 1 :]:
+        path.unlink(missing_ok=True)
+
+
+def put_in_place(path: Path) -> None:
+    """Make an earlier checkpoint the last one; what has that name now is kept as damaged.safetensors."""
+    folder = path.parent.parent
+    if (folder / LAST).exists():
+        os.replace(folder / LAST, folder / DAMAGED)
+    files.give_second_name(path, folder / LAST)
+
+
+def resume_command(folder: Path) -> str:
+    """The command line that continues the run in `folder`, quoted for a POSIX shell."""
+    return f"python tools/train.py --output {shlex.quote(str(folder))} --resume"
+
+
+def last_good(folder: Path) -> str:
+    """Where the run can go on from, as part of a sentence."""
+    found = checkpoints(folder)
+    return f"the last good checkpoint is {found[0]}" if found else "there is no checkpoint yet"

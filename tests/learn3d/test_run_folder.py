@@ -1,0 +1,141 @@
+"""Who may work in a run's folder, and which checkpoints stay in it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import learn3d
+from learn3d import checkpoint, files, run_folder
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from learn3d.run_folder import sole_use
+with sole_use(Path(sys.argv[1])):
+    print("mine", flush=True)
+    time.sleep(60)
+"""
+
+
+def save(folder: Path, step: int, keep: int) -> None:
+    run_folder.keep_previous(folder)
+    checkpoint.save(folder / "last.safetensors", {"x": torch.full((3,), float(step))}, {"step": step})
+    run_folder.remove_old(folder, step, keep)
+
+
+def steps(folder: Path) -> list[int]:
+    return [checkpoint.load_metadata(path)["step"] for path in run_folder.checkpoints(folder)]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file locks are kept on POSIX systems")
+def test_a_folder_in_use_is_refused_and_a_killed_process_does_not_hold_it(tmp_path) -> None:
+    folder = tmp_path / "run"
+    path = [str(Path(learn3d.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path)}
+    command = [sys.executable, "-c", HOLDER, str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as holder:
+        assert holder.stdout.readline() == b"mine\n"
+        with pytest.raises(OSError, match=r"another process works in .*run; wait for it, or stop it"):
+            with run_folder.sole_use(folder):
+                pass
+        holder.send_signal(signal.SIGKILL)
+        holder.wait(timeout=30)
+    assert (folder / ".lock").exists()
+    with run_folder.sole_use(folder):
+        run_folder.claim(folder, overwrite=False)
+    assert not (folder / ".lock").exists()
+
+
+def test_a_lock_whose_file_was_removed_is_none(tmp_path, monkeypatch) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    flock, calls = fcntl.flock, []
+
+    def remove_and_lock(file: int, how: int) -> None:
+        calls.append(file)
+        if len(calls) == 1:
+            (tmp_path / ".lock").unlink()  # its holder ends just now
+        flock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", remove_and_lock)
+    with run_folder.sole_use(tmp_path):
+        assert len(calls) == 2
+        assert (tmp_path / ".lock").exists()
+
+
+def test_without_file_locks_the_run_goes_on(tmp_path, monkeypatch) -> None:
+    fcntl = pytest.importorskip("fcntl")
+
+    def no_locks(file: int, how: int) -> None:
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with run_folder.sole_use(tmp_path), run_folder.sole_use(tmp_path):
+        pass
+
+
+def test_a_folder_that_was_made_for_nothing_is_removed(tmp_path) -> None:
+    with pytest.raises(ValueError, match="no data"), run_folder.sole_use(tmp_path / "run"):
+        raise ValueError("no data")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("keep", "kept"), [(1, [50]), (2, [50, 40]), (3, [50, 40, 30])])
+def test_the_last_ones_are_kept(tmp_path, keep: int, kept: list[int]) -> None:
+    for step in (10, 20, 30, 40, 50):
+        save(tmp_path, step, keep)
+    assert steps(tmp_path) == kept
+    names = [path.name for path in run_folder.checkpoints(tmp_path)]
+    assert names == ["last.safetensors", *(f"step-{step:06}.safetensors" for step in kept[1:])]
+
+
+def test_a_file_system_without_hard_links(tmp_path, monkeypatch) -> None:
+    def no_links(*arguments) -> None:
+        raise OSError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", no_links)
+    for step in (10, 20):
+        save(tmp_path, step, keep=2)
+    assert steps(tmp_path) == [20, 10]
+
+
+def test_saving_again_where_a_kill_left_both_names(tmp_path) -> None:
+    save(tmp_path, 10, keep=2)
+    run_folder.keep_previous(tmp_path)  # killed here: two names for one file
+    assert steps(tmp_path) == [10, 10]
+    save(tmp_path, 20, keep=2)
+    assert steps(tmp_path) == [20, 10]
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_a_damaged_last_checkpoint_is_not_kept(tmp_path) -> None:
+    save(tmp_path, 10, keep=2)
+    save(tmp_path, 20, keep=2)
+    (tmp_path / "last.safetensors").write_bytes(b"rubbish")
+    save(tmp_path, 30, keep=2)
+    assert steps(tmp_path) == [30, 10]
+
+
+def test_overwriting_leaves_what_is_not_of_a_run(tmp_path) -> None:
+    for step in (10, 20):
+        save(tmp_path, step, keep=2)
+    mine = [tmp_path / "notes.txt", tmp_path / "checkpoints" / "copy-of-step-10.safetensors"]
+    for path in mine:
+        path.write_text("mine")
+    run_folder.claim(tmp_path, overwrite=True)
+    assert sorted(path for path in tmp_path.rglob("*") if path.is_file()) == sorted(mine)
+
+
+def test_half_written_files_do_not_make_a_folder_used_and_are_removed(tmp_path) -> None:
+    (tmp_path / ".config.json.partial").write_text("{")
+    run_folder.claim(tmp_path, overwrite=False)
+    assert not list(tmp_path.iterdir())
+    files.write_bytes(tmp_path / "x", b"")
+    with pytest.raises(ValueError, match="is not empty"):
+        run_folder.claim(tmp_path, overwrite=False)
