@@ -21,7 +21,7 @@ from typing import Any
 from learn3d import limits
 from learn3d.data.findings import AGAIN, DamagedFile, MissingFile
 
-_STRING = re.compile(r'"(?:[^"\\]|\\.)*+"?' if sys.version_info >= (3, 11) else r'"(?:[^"\\]|\\.)*"?', re.DOTALL)
+_ESCAPE, _STRING = re.compile(r"\\.", re.DOTALL), re.compile(r'"[^"]*"?')
 
 
 def check_file(path: Path | str, most: int, wanted: str) -> int:
@@ -73,7 +73,7 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
 
 def _check_depth(text: str) -> None:
     depth = 0
-    for bracket in re.finditer(r"[\[\]{}]", _STRING.sub("", text)):
+    for bracket in re.finditer(r"[\[\]{}]", _STRING.sub("", _ESCAPE.sub("", text))):
         depth += 1 if bracket[0] in "[{" else -1
         if depth > limits.JSON_DEPTH:
             raise ValueError(f"it is nested more than {limits.JSON_DEPTH} levels deep")
