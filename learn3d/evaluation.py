@@ -15,6 +15,7 @@ from torch import Tensor
 import nmr
 from learn3d.data.conventions import Definition
 from learn3d.data.views import ViewDataset
+from learn3d.distributed import ALONE, Ranks
 from learn3d.losses import mmd_from_distances
 from learn3d.methods import Grids, Meshes, Method
 from learn3d.surfaces import grid_surface
@@ -91,16 +92,24 @@ def evaluate(
     `spread_samples`. `paper_mmd` also computes the MMD as the paper prints it. `surfaces` also compares points on the
     surfaces, in units of the object frame: Chamfer-L1 and F-score at a distance of 0.05, 2,000 points of each;
     where the data set has no points, the truth is the surface of its voxels, which limits them to about 1/32.
+
+    Where several processes train the method, all of them call this; they share the work, and all return the result that
+    one process gives with these networks. Raises ValueError for `surfaces` there: they are measured in one process.
     """
+    ranks = method.ranks
+    if surfaces and not ranks.alone:
+        raise ValueError("surfaces are measured in one process; evaluate the run when it has ended")
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
     generator = torch.Generator().manual_seed(0)
     truth = _true_surfaces(dataset, generator) if surfaces else None
     ious: dict[Definition, list[Tensor]] = {name: [] for name in definitions if dataset.voxels is not None}
-    codes, views, objects, distances = [], [], [], []
+    codes, distances = [], []
+    chunks = spread_samples(dataset.object_ids, dataset.view_ids, count).split(batch_size)
+    rows = torch.arange(count).split(batch_size)[ranks.rank :: ranks.world]
     was_training = method.training
     method.set_training(False)
     try:
-        for chosen in spread_samples(dataset.object_ids, dataset.view_ids, count).split(batch_size):
+        for chosen in chunks[ranks.rank :: ranks.world]:
             batch = dataset.batch(chosen)
             code = method.encode(batch.images)
             shapes = method.decode(code)
@@ -110,17 +119,18 @@ def evaluate(
                 points = _surface_points(shapes, generator)
                 distances += [_compare(a, truth[b]) for a, b in zip(points, batch.object_ids.tolist(), strict=True)]
             codes.append(code.float().cpu())
-            views.append(batch.view_ids)
-            objects.append(batch.object_ids)
     finally:
         method.set_training(was_training)
     forms = ("released", "paper") if paper_mmd else ("released",)
-    means = mean_mmd(torch.cat(codes), torch.cat(views), forms=forms)
+    own = torch.cat(rows) if rows else torch.empty(0, dtype=torch.int64)
+    samples = torch.cat(chunks).numpy()
+    view_ids = torch.from_numpy(dataset.view_ids[samples])
+    means = mean_mmd(ranks.gather(codes, own, count), view_ids, forms=forms, ranks=ranks)
     chamfer, f_score = torch.tensor(distances).T if distances else (None, None)
     return Evaluation(
-        object_ids=torch.cat(objects),
-        view_ids=torch.cat(views),
-        ious={name: torch.cat(values) for name, values in ious.items()},
+        object_ids=torch.from_numpy(dataset.object_ids[samples]),
+        view_ids=view_ids,
+        ious={name: ranks.gather(values, own, count) for name, values in ious.items()},
         chamfer_l1=chamfer,
         f_score=f_score,
         mmd=means.get("released"),
@@ -167,12 +177,13 @@ def mean_mmd(
     *,
     per_view: int = CODES_PER_VIEW,
     forms: tuple[Literal["released", "paper"], ...] = ("released",),
+    ranks: Ranks = ALONE,
 ) -> dict[str, float]:
     """Mean MMD over all pairs of views (276 for 24) between the codes [N,C] of their images; {} for a single view.
 
     Of each view the first `per_view` codes count; all views use as many as the poorest one has. Views with one code are
     left out: between two single codes the MMD is a constant (6.19), whatever they are. Distances within a view are
-    computed once, not once per pair.
+    computed once, not once per pair. Several processes share the pairs.
     """
     groups = [group for view in view_ids.unique() if len(group := codes[view_ids == view]) > 1]
     size = codes_per_view(view_ids, per_view=per_view)
@@ -186,13 +197,15 @@ def mean_mmd(
         return (squared + norms[i][:, None]).clamp_min_(0).float()
 
     within = [distances(i, i) for i in range(len(groups))]
-    sums = dict.fromkeys(forms, 0.0)
     pairs = list(itertools.combinations(range(len(groups)), 2))
-    for i, j in pairs:
+    own = torch.arange(len(pairs))[ranks.rank :: ranks.world]
+    values: dict[str, list[Tensor]] = {form: [] for form in forms}
+    for i, j in pairs[ranks.rank :: ranks.world]:
         between = distances(i, j)
         for form in forms:
-            sums[form] += float(mmd_from_distances(within[i], within[j], between, form))
-    return {form: value / len(pairs) for form, value in sums.items()}
+            values[form].append(mmd_from_distances(within[i], within[j], between, form)[None])
+    of_pairs = {form: ranks.gather(parts, own, len(pairs)) for form, parts in values.items()}
+    return {form: sum(of_pairs[form].tolist()) / len(pairs) for form in forms}
 
 
 def codes_per_view(view_ids: Tensor, *, per_view: int = CODES_PER_VIEW) -> int:

@@ -4,6 +4,7 @@ Examples:
   python tools/train.py --data DATA --category airplane --output runs/airplane
   python tools/train.py --preset peng2020-kato-vanilla --data DATA --category airplane --output runs/vanilla
   python tools/train.py --output runs/airplane --resume
+  torchrun --nproc-per-node 2 tools/train.py --data DATA --category airplane --output runs/airplane
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 import tyro
 
 from learn3d.config import DEFAULT_PRESET, TrainConfig, load_config
+from learn3d.distributed import LostPeerError, label, start
 from learn3d.presets import PRESETS
 from learn3d.training import train
 
@@ -75,10 +77,13 @@ def main() -> int:
         command = parse(sys.argv[1:])
         if command.resume and command.overwrite:
             raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
-        summary = train(command.config, resume=command.resume, overwrite=command.overwrite)
-    except (ValueError, OSError, FloatingPointError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        with start(command.config.device) as ranks:
+            summary = train(command.config, resume=command.resume, overwrite=command.overwrite, ranks=ranks)
+    except (ValueError, OSError, FloatingPointError, LostPeerError) as error:
+        print(f"error: {label()}{error}", file=sys.stderr)
         return 1
+    if not ranks.main:
+        return 0
     state = "finished" if summary.finished else "stopped"
     best = f"best validation voxel IoU {summary.best_iou:.4f} at step {summary.best_step}; "
     print(
