@@ -117,7 +117,8 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
                     log.sync()
                     save_last(folder, config, conditions, method, shape, progress)
             if stopped_by and not last:
-                log.say(f"stopped by {stopped_by} after step {step}; continue with: {run_folder.resume_command(folder)}")
+                then = run_folder.resume_command(folder)
+                log.say(f"stopped by {stopped_by} after step {step}; continue with: {then}")
                 break
 
     return _summary(folder, config, progress, started)
