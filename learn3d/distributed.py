@@ -155,7 +155,7 @@ class Ranks:
         for network in method.networks.values():
             use_whole_batch(network, self)
         for optimizer in method.optimizers.values():
-            optimizer.register_step_pre_hook(_sum_gradients)
+            optimizer.register_step_pre_hook(sum_gradients)
 
 
 ALONE = Ranks()
@@ -224,8 +224,11 @@ class _Sum(torch.autograd.Function):
 
 
 @torch.no_grad()
-def _sum_gradients(optimizer: torch.optim.Optimizer, *_: Any) -> None:
-    """Large gradients where they are, the others in one piece: allocating takes longer than sending."""
+def sum_gradients(optimizer: torch.optim.Optimizer, *_: Any) -> None:
+    """Replace the gradients of an optimizer by their sums over the processes.
+
+    Large ones are summed where they are, the others in one piece: to copy them all takes as long as to send them.
+    """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     small = [grad for grad in gradients if grad.numel() < LARGE or not grad.is_contiguous()]
     for grad in gradients:
