@@ -78,8 +78,9 @@ def run(task: dict, ranks: Ranks) -> None:
 
 
 def main() -> None:
-    with start("cpu") as ranks:
-        for task in json.loads(Path(sys.argv[1]).read_text()):
+    tasks = json.loads(Path(sys.argv[1]).read_text())
+    with start(tasks[0]["config"]["device"]) as ranks:
+        for task in tasks:
             try:
                 run(task, ranks)
             except (ValueError, FloatingPointError) as error:  # those that all processes raise together

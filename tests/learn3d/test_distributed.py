@@ -141,12 +141,19 @@ def launch(*command: object, world: int = 2) -> Processes:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    variables = {"WORLD_SIZE": world, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": 1}
+    variables = {
+        "WORLD_SIZE": world,
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": port,
+        "OMP_NUM_THREADS": 1,
+        "LOCAL_WORLD_SIZE": world,
+    }
     return Processes(
         [
             subprocess.Popen(
                 [sys.executable, *map(str, command)],
-                env=os.environ | {key: str(value) for key, value in (variables | {"RANK": rank}).items()},
+                env=os.environ
+                | {key: str(value) for key, value in (variables | {"RANK": rank, "LOCAL_RANK": rank}).items()},
                 stderr=subprocess.PIPE,
                 text=True,
             )
@@ -251,6 +258,22 @@ def test_the_error_of_one_process_ends_all(tiny_config, tmp_path) -> None:
     cause = "the cat is on the keyboard"
     assert f"RuntimeError: {cause}" in said[1]
     assert f"ends because of another process: rank 1 on {socket.gethostname()}: {cause}" in said[0]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_two_processes_share_a_gpu(tiny_config, tmp_path) -> None:
+    tasks = []
+    for name in ("proposed", "vpl"):
+        options = RUNS[name][0] | {"device": "cuda"}
+        with linear_optimizer():
+            train(tiny_config(tmp_path / "one" / name, **options))
+        config = tiny_config(tmp_path / "two" / name, **options)
+        tasks.append({"config": config_to_dict(config), "linear": True})
+    (tmp_path / "tasks.json").write_text(json.dumps(tasks))
+    codes, said = launch(TASKS, tmp_path / "tasks.json").wait()
+    assert codes == [0, 0], said
+    for name in ("proposed", "vpl"):
+        assert distance(tmp_path / "one" / name, tmp_path / "two" / name) < 1e-3, name
 
 
 def command(tiny_folder: Path, run_folder: Path) -> list[object]:
