@@ -141,25 +141,11 @@ def launch(*command: object, world: int = 2) -> Processes:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    variables = {
-        "WORLD_SIZE": world,
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": port,
-        "OMP_NUM_THREADS": 1,
-        "LOCAL_WORLD_SIZE": world,
-    }
-    return Processes(
-        [
-            subprocess.Popen(
-                [sys.executable, *map(str, command)],
-                env=os.environ
-                | {key: str(value) for key, value in (variables | {"RANK": rank, "LOCAL_RANK": rank}).items()},
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-            for rank in range(world)
-        ]
-    )
+    common = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1"}
+    common |= dict.fromkeys(("WORLD_SIZE", "LOCAL_WORLD_SIZE"), str(world))
+    line = [sys.executable, *map(str, command)]
+    own = [dict.fromkeys(("RANK", "LOCAL_RANK"), str(rank)) for rank in range(world)]
+    return Processes([subprocess.Popen(line, env=common | names, stderr=subprocess.PIPE, text=True) for names in own])
 
 
 @pytest.fixture(scope="module")
