@@ -16,6 +16,7 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import Definition
 from learn3d.data.views import ViewDataset
+from learn3d.distributed import ALONE, Ranks
 from learn3d.losses import mmd_from_distances
 from learn3d.methods import Grids, Meshes, Method
 from learn3d.surfaces import grid_surface
@@ -104,17 +105,25 @@ def evaluate(
 
     Where the data set has no voxels, meshes are seen by the camera of another image of the object instead (of the only
     one where there is no other) and compared with that image's mask: the IoU of silhouettes.
+
+    Where several processes train the method, all of them call this; they share the work, and all return the result that
+    one process gives with these networks. Raises ValueError for `surfaces` there: they are measured in one process.
     """
+    ranks = method.ranks
+    if surfaces and not ranks.alone:
+        raise ValueError("surfaces are measured in one process; evaluate the run when it has ended")
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
     generator = torch.Generator().manual_seed(0)
     truth = _true_surfaces(dataset, generator) if surfaces else None
     ious: dict[Definition, list[Tensor]] = {name: [] for name in definitions if dataset.voxels is not None}
-    codes, views, objects, distances, silhouettes = [], [], [], [], []
+    codes, distances, silhouettes = [], [], []
     others = _other_images(dataset.object_ids)
+    chunks = spread_samples(dataset.object_ids, dataset.view_ids, count).split(batch_size)
+    rows = torch.arange(count).split(batch_size)[ranks.rank :: ranks.world]
     was_training = method.training
     method.set_training(False)
     try:
-        for chosen in spread_samples(dataset.object_ids, dataset.view_ids, count).split(batch_size):
+        for chosen in chunks[ranks.rank :: ranks.world]:
             batch = dataset.batch(chosen)
             code = method.encode(batch.images)
             shapes = method.decode(code)
@@ -126,20 +135,22 @@ def evaluate(
             if dataset.voxels is None and isinstance(shapes, Meshes):
                 silhouettes.append(_silhouette_ious(shapes, dataset.batch(others[chosen])))
             codes.append(code.float().cpu())
-            views.append(batch.view_ids)
-            objects.append(batch.object_ids)
     finally:
         method.set_training(was_training)
     forms = ("released", "paper") if paper_mmd else ("released",)
-    means = mean_mmd(torch.cat(codes), torch.cat(views), forms=forms)
+    own = torch.cat(rows) if rows else torch.empty(0, dtype=torch.int64)
+    samples = torch.cat(chunks).numpy()
+    view_ids = torch.from_numpy(dataset.view_ids[samples])
+    means = mean_mmd(ranks.gather(codes, own, count), view_ids, forms=forms, ranks=ranks)
     chamfer, f_score = torch.tensor(distances).T if distances else (None, None)
+    seen = ranks.any(bool(silhouettes))
     return Evaluation(
-        object_ids=torch.cat(objects),
-        view_ids=torch.cat(views),
-        ious={name: torch.cat(values) for name, values in ious.items()},
+        object_ids=torch.from_numpy(dataset.object_ids[samples]),
+        view_ids=view_ids,
+        ious={name: ranks.gather(values, own, count) for name, values in ious.items()},
         chamfer_l1=chamfer,
         f_score=f_score,
-        silhouette_iou=torch.cat(silhouettes) if silhouettes else None,
+        silhouette_iou=ranks.gather(silhouettes, own, count) if seen else None,
         mmd=means.get("released"),
         mmd_paper=means.get("paper"),
     )
@@ -207,12 +218,13 @@ def mean_mmd(
     *,
     per_view: int = CODES_PER_VIEW,
     forms: tuple[Literal["released", "paper"], ...] = ("released",),
+    ranks: Ranks = ALONE,
 ) -> dict[str, float]:
     """Mean MMD over all pairs of views (276 for 24) between the codes [N,C] of their images; {} for a single view.
 
     Of each view the first `per_view` codes count; all views use as many as the poorest one has. Views with one code are
     left out: between two single codes the MMD is a constant (6.19), whatever they are. Distances within a view are
-    computed once, not once per pair.
+    computed once, not once per pair. Several processes share the pairs.
     """
     groups = [group for view in view_ids.unique() if len(group := codes[view_ids == view]) > 1]
     size = codes_per_view(view_ids, per_view=per_view)
@@ -226,13 +238,15 @@ def mean_mmd(
         return (squared + norms[i][:, None]).clamp_min_(0).float()
 
     within = [distances(i, i) for i in range(len(groups))]
-    sums = dict.fromkeys(forms, 0.0)
     pairs = list(itertools.combinations(range(len(groups)), 2))
-    for i, j in pairs:
+    own = torch.arange(len(pairs))[ranks.rank :: ranks.world]
+    values: dict[str, list[Tensor]] = {form: [] for form in forms}
+    for i, j in pairs[ranks.rank :: ranks.world]:
         between = distances(i, j)
         for form in forms:
-            sums[form] += float(mmd_from_distances(within[i], within[j], between, form))
-    return {form: value / len(pairs) for form, value in sums.items()}
+            values[form].append(mmd_from_distances(within[i], within[j], between, form)[None])
+    of_pairs = {form: ranks.gather(parts, own, len(pairs)) for form, parts in values.items()}
+    return {form: sum(of_pairs[form].tolist()) / len(pairs) for form in forms}
 
 
 def codes_per_view(view_ids: Tensor, *, per_view: int = CODES_PER_VIEW) -> int:

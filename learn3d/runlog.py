@@ -191,6 +191,28 @@ class _Terminal:
             return False
 
 
+class SilentLog:
+    """What a process that does not report has in place of a `RunLog`."""
+
+    def __enter__(self) -> SilentLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def step(self, step: int, losses: Mapping[str, float]) -> None:
+        pass
+
+    def metrics(self, step: int, split: str, values: Mapping[str, Any]) -> None:
+        pass
+
+    def picture(self, step: int, name: str, rgb: np.ndarray) -> None:
+        pass
+
+    def say(self, text: str) -> None:
+        pass
+
+
 def _forget_after(path: Path, step: int) -> None:
     """Drop metrics of steps after `step`, and a last line cut short by a crash: the resumed run writes them again."""
     if not path.exists():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import time
 import zlib
 from dataclasses import dataclass
@@ -16,13 +18,14 @@ from learn3d.data.augment import augment
 from learn3d.data.layouts import load_dataset
 from learn3d.data.sampling import sample_indices
 from learn3d.data.views import ViewDataset
+from learn3d.distributed import ALONE, Ranks, weights_digest
 from learn3d.faults import explained
 from learn3d.memory import keep_freed_memory
-from learn3d.methods import DataShape, create_method
+from learn3d.methods import DataShape, Method, create_method
 from learn3d.networks import resolve_precision
 from learn3d.presets import PRESETS
 from learn3d.run_state import Conditions, Progress, load_last, restore, save_last
-from learn3d.runlog import RunLog
+from learn3d.runlog import RunLog, SilentLog
 from learn3d.signals import stop_on_signal
 from learn3d.validation import draw, validate
 
@@ -39,30 +42,35 @@ class Summary:
     seconds: float
 
 
-def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False) -> Summary:
+def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False, ranks: Ranks = ALONE) -> Summary:
     """Train one model and leave everything in `config.output`.
 
     What the folder holds afterwards is listed in `run_folder`. SIGINT, SIGTERM and SIGHUP end the current step, save
-    and return. With `resume` the run continues from its last checkpoint, bit for bit (same machine, device and number
-    of threads), or from the start if it was stopped before its first one. A finished run stays as it is.
+    and return. With `resume` the run continues from its last checkpoint, bit for bit (same machine, device and numbers
+    of threads and processes), or from the start if it was stopped before its first one. A finished run stays as it is.
+
+    Several processes, each with its `ranks`, train one model together (learn3d/distributed.py); the first one writes.
 
     Raises ValueError for a folder in use, options or training data that conflict with the resumed run or data that do
     not fit, FloatingPointError when a loss is no longer finite (the last checkpoint is from before that), OSError when
     a checkpoint cannot be written or another process works in the folder, MemoryError when there is too little memory.
     """
-    with run_folder.sole_use(config.output):
-        return _train(config, resume, overwrite)
+    with run_folder.sole_use(config.output) if ranks.main else contextlib.nullcontext():
+        return _train(config, resume, overwrite, ranks)
 
 
-def _train(config: TrainConfig, resume: bool, overwrite: bool) -> Summary:
+def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> Summary:
     started = time.monotonic()
     keep_freed_memory()
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     train_set, val_set = load_splits(config)
     precision = resolve_precision(config.precision, config.device)
-    folder = config.output
-    saved = load_last(folder, config) if resume else None
+    ranks = ranks.divide(config.batch_size, config.sampling)
+    folder, saved = config.output, None
+    if resume:
+        with ranks.main_first():  # it may have to put an earlier checkpoint in place
+            saved = load_last(folder, config)
     # A run goes on as it began, also one from before encoders could turn colours back.
     inverted = train_set.inverted if saved is None else saved.shape.inverted
     shape = DataShape(train_set.num_views, train_set.num_classes, train_set.poses.num_features, inverted)
@@ -71,47 +79,52 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool) -> Summary:
     conditions = Conditions(len(train_set), f"{zlib.crc32(np.ascontiguousarray(train_set.images)):08x}", precision)
     if saved is not None:
         restore(saved, config, conditions, method, progress)
-    elif not resume:
+    elif not resume and ranks.main:
         run_folder.claim(folder, overwrite)
     notes = () if saved is None else saved.notes
     del saved  # and its tensors
-    run_folder.remove_partials(folder)
+    if ranks.main:
+        run_folder.remove_partials(folder)
     if progress.step > config.iterations:
         raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
     if progress.step == config.iterations:  # also after a kill between the last save and the end
-        run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
+        if ranks.main:
+            run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
         return _summary(folder, config, progress, started)
-    files.write_json(folder / run_folder.CONFIG, config_to_dict(config), sync=True)
+    ranks.join(method)
+    ranks.check_same(**_beginning(config, conditions, val_set, method, progress))
+    if ranks.main:
+        files.write_json(folder / run_folder.CONFIG, config_to_dict(config), sync=True)
     before = progress.seconds
 
-    with (
-        explained(folder),
-        stop_on_signal() as stop,
-        RunLog(folder, start=progress.step, total=config.iterations) as log,
-    ):
+    with explained(folder), stop_on_signal() as stop, _open_log(config, progress, ranks) as log:
         for note in notes:
             log.say(f"warning: {note}")
-        log.say(_describe(config, precision, train_set, val_set, progress))
+        log.say(_describe(config, precision, train_set, val_set, progress, ranks))
         for step in range(progress.step + 1, config.iterations + 1):
             indices = sample_indices(train_set, config.sampling, config.batch_size, config.seed, step)
-            batch = augment(train_set.batch(indices), config.augment, config.seed, step)
+            batch = augment(train_set.batch(indices, ranks.rows), config.augment, config.seed, step)
             losses = method.train_step(batch, step)
             progress.step = step
             progress.seconds = before + time.monotonic() - started
             log.step(step, losses)
+            stopped_by = ranks.stopped_by(stop)
 
             last = step == config.iterations
             if last or step % config.log_every == 0:
                 log.metrics(step, "train", losses)
             if last or step % config.validate_every == 0:
                 validate(config, method, shape, val_set, progress, log)
-            if last or step % config.pictures_every == 0:
+            if ranks.main and (last or step % config.pictures_every == 0):
                 draw(config, method, val_set, step, log)
-            if last or stop.requested or step % config.checkpoint_every == 0:
-                log.sync()
-                save_last(folder, config, conditions, method, shape, progress)
-            if stop.requested and not last:
-                log.say(f"stopped by {stop.name} after step {step}; continue with: {run_folder.resume_command(folder)}")
+            if last or stopped_by or step % config.checkpoint_every == 0:
+                ranks.check_same(weights=weights_digest(method) if ranks.world > 1 else 0)
+                if ranks.main:
+                    log.sync()
+                    save_last(folder, config, conditions, method, shape, progress)
+            if stopped_by and not last:
+                then = run_folder.resume_command(folder)
+                log.say(f"stopped by {stopped_by} after step {step}; continue with: {then}")
                 break
 
     return _summary(folder, config, progress, started)
@@ -145,8 +158,33 @@ def object_share(dataset: ViewDataset) -> float:
     return float(np.maximum(*sides).mean())
 
 
-def _describe(config: TrainConfig, precision: str, train_set: ViewDataset, val_set: ViewDataset, at: Progress) -> str:
+def _open_log(config: TrainConfig, progress: Progress, ranks: Ranks) -> RunLog | SilentLog:
+    return RunLog(config.output, start=progress.step, total=config.iterations) if ranks.main else SilentLog()
+
+
+def _beginning(
+    config: TrainConfig, conditions: Conditions, val_set: ViewDataset, method: Method, progress: Progress
+) -> dict[str, object]:
+    """What must be the same in all processes when they begin, by the name that a user knows it by."""
+    if method.ranks.alone:
+        return {}
+    options = dataclasses.replace(config, data=Path(), output=Path(), threads=None)
+    return {
+        "options": config_to_dict(options),
+        "precision": conditions.precision,
+        "training data": conditions,
+        "validation data": (len(val_set), zlib.crc32(np.ascontiguousarray(val_set.images))),
+        "steps taken": progress.step,
+        "weights": weights_digest(method),
+    }
+
+
+def _describe(
+    config: TrainConfig, precision: str, train_set: ViewDataset, val_set: ViewDataset, at: Progress, ranks: Ranks
+) -> str:
     where = f"{config.device}, {precision}, {torch.get_num_threads()} threads"
+    if not ranks.alone:
+        where += f" in each of {ranks.world} processes"
     data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
     verb = f"resuming at step {at.step}" if at.step else "training"
     name = f"{PRESETS[config.preset].label} ({config.preset})"

@@ -46,7 +46,8 @@ def validate(
         progress.best_iou, progress.best_step = iou, progress.step
         metadata = checkpoint.method_metadata(shape, config) | dataclasses.asdict(progress)
         check_networks(method)
-        checkpoint.save(config.output / BEST, checkpoint.network_tensors(method), metadata)
+        if method.ranks.main:
+            checkpoint.save(config.output / BEST, checkpoint.network_tensors(method), metadata)
 
 
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:

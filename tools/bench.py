@@ -10,6 +10,7 @@
     python tools/bench.py voxels        voxel IoU of 1000 predictions
     python tools/bench.py step          a training step of the proposed method, batch 128, by part, in bf16 and in fp32
     python tools/bench.py memory        bytes per image and per raster pixel, in fresh processes
+    python tools/bench.py processes     steps of the proposed method, one batch of 128 shared by 1, 2, 4 ... processes
     python tools/bench.py scaling       w1, w2, w3 at 1, 2, 4, 8, 16 threads, as far as there are cores
     python tools/bench.py count         the work in w1 (faces, pixels, sweeps, divisions, bytes) and the floor it sets
 
@@ -32,6 +33,7 @@ import torch
 import tyro
 from bench_count import count
 from bench_memory import bench_memory
+from bench_processes import bench_processes
 from bench_step import bench_step
 from bench_work import (
     Result,
@@ -84,7 +86,8 @@ LANE_OPERATIONS = {
 @dataclass(frozen=True)
 class Options:
     workload: tyro.conf.Positional[
-        Literal["all", "w1", "w2", "w3", "w4", "smoothness", "cameras", "voxels", "step", "memory", "scaling", "count"]
+        Literal["all", "w1", "w2", "w3", "w4", "smoothness", "cameras", "voxels", "step"]
+        | Literal["memory", "processes", "scaling", "count"]
     ] = "w1"
     """What to measure."""
     batch: int = 64
@@ -277,6 +280,8 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     if options.workload == "memory":
         return bench_memory(threads=(1, 2))
+    if options.workload == "processes":
+        return bench_processes(options.repeats)
     keep_freed_memory()
     if options.workload == "count":
         return bench_count(options)

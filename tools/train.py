@@ -4,6 +4,7 @@ Examples:
   python tools/train.py --data DATA --category airplane --output runs/airplane
   python tools/train.py --preset peng2020-kato-vanilla --data DATA --category airplane --output runs/vanilla
   python tools/train.py --output runs/airplane --resume
+  torchrun --nproc-per-node 2 tools/train.py --data DATA --category airplane --output runs/airplane
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import TextIO
 import tyro
 
 from learn3d.config import DEFAULT_PRESET, TrainConfig, load_config
+from learn3d.distributed import LostPeerError, label, start
 from learn3d.presets import PRESETS
 from learn3d.training import train
 
@@ -77,13 +79,16 @@ def main() -> int:
         command = parse(sys.argv[1:])
         if command.resume and command.overwrite:
             raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
-        summary = train(command.config, resume=command.resume, overwrite=command.overwrite)
-    except (ValueError, OSError, FloatingPointError, MemoryError) as error:
-        _say(f"error: {error}", sys.stderr)
+        with start(command.config.device) as ranks:
+            summary = train(command.config, resume=command.resume, overwrite=command.overwrite, ranks=ranks)
+    except (ValueError, OSError, FloatingPointError, MemoryError, LostPeerError) as error:
+        _say(f"error: {label()}{error}", sys.stderr)
         return 1
     except KeyboardInterrupt:  # before the training, which saves and ends well, or the second one in it
         _say("interrupted; what was saved before is as it was", sys.stderr)
         return 130
+    if not ranks.main:
+        return 0
     state = "finished" if summary.finished else "stopped"
     best = f"best validation IoU {summary.best_iou:.4f} at step {summary.best_step}; "
     _say(

@@ -21,11 +21,13 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -
     colours of the input image alone, while every mask stays with its pose (published code of both papers on Pascal3D+;
     it works because the mesh is symmetric). "channels": a random permutation of the three colours. "crop": the colours
     cut anew from the original image, each side of the padded box moved by up to 15 % of the box, uniformly (Pascal3D+,
-    both papers); it comes first, and masks stay as they are.
+    both papers); it comes first, and masks stay as they are. Of a part of a batch, each view is changed as it is in the
+    whole.
 
     Raises ValueError for an unknown name, for "crop" where the data set has no original images, or not first.
     """
     rng = np.random.default_rng([seed, step, 1])
+    count, rows = len(batch.whole), batch.whole.rows
     for position, name in enumerate(names):
         if name == "crop":
             if position > 0:
@@ -37,24 +39,24 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -
                     "the augmentation crop needs the original images and boxes, which only the layout pascal3d has; "
                     "leave it out"
                 )
-            colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (len(batch), 4))))
+            colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))[rows.numpy()]))
             batch = dataclasses.replace(batch, images=torch.cat([colors, batch.images[:, 3:]], dim=1))
         elif name == "flip":
-            chosen = torch.from_numpy(rng.random(len(batch)) < 0.5)
+            mirrored = torch.from_numpy(rng.random(count) < 0.5)
+            chosen = mirrored[rows]
             batch = dataclasses.replace(
-                batch,
+                batch.with_poses(batch.whole.poses.mirrored(mirrored)),
                 images=torch.where(chosen[:, None, None, None], batch.images.flip(3), batch.images),
                 masks=torch.where(chosen[:, None, None], batch.masks.flip(2), batch.masks),
-                poses=batch.poses.mirrored(chosen),
             )
         elif name == "flip-image":
-            chosen = torch.from_numpy(rng.random(len(batch)) < 0.5)
+            chosen = torch.from_numpy(rng.random(count) < 0.5)[rows]
             colors = batch.images[:, :3]
             colors = torch.where(chosen[:, None, None, None], colors.flip(3), colors)
             batch = dataclasses.replace(batch, images=torch.cat([colors, batch.images[:, 3:]], dim=1))
         elif name == "channels":
-            order = np.argsort(rng.random((len(batch), 3)), axis=1)
-            order = torch.from_numpy(np.concatenate([order, np.full((len(batch), 1), 3)], axis=1))
+            order = np.argsort(rng.random((count, 3)), axis=1)
+            order = torch.from_numpy(np.concatenate([order, np.full((count, 1), 3)], axis=1))[rows]
             images = torch.gather(batch.images, 1, order[:, :, None, None].expand_as(batch.images))
             batch = dataclasses.replace(batch, images=images)
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,19 @@ if TYPE_CHECKING:
     import nmr
     from learn3d.data.crops import Crops
     from learn3d.data.poses import Poses
+
+
+@dataclass(frozen=True, eq=False)
+class Whole:
+    """What every process knows about all views of a step, of which it learns from some."""
+
+    rows: torch.Tensor  # int64 [b]: which of the B views are in this process's batch
+    poses: Poses  # where the B cameras stood
+    view_ids: torch.Tensor  # int64 [B]
+    class_ids: torch.Tensor  # int64 [B]
+
+    def __len__(self) -> int:
+        return len(self.view_ids)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +39,7 @@ class Batch:
     class_ids: torch.Tensor  # int64 [B]: which category each object belongs to (0 where there is one only)
     voxels: torch.Tensor | None  # bool [B, 32, 32, 32] ground truth in the data set's axes, None where there is none
     crops: Crops | None = None  # what the augmentation "crop" cuts the images' colours from, where that is known
+    part_of: Whole | None = None  # all views of the step, where other processes have the rest of them
 
     def __len__(self) -> int:
         return len(self.images)
@@ -33,3 +48,15 @@ class Batch:
     def cameras(self) -> nmr.cameras.Camera:
         """The B cameras that saw the images."""
         return self.poses.cameras()
+
+    @property
+    def whole(self) -> Whole:
+        """All views of the step, of which this batch is a part or all."""
+        if self.part_of is not None:
+            return self.part_of
+        return Whole(torch.arange(len(self)), self.poses, self.view_ids, self.class_ids)
+
+    def with_poses(self, poses: Poses) -> Batch:
+        """The same batch, where `poses` are those of all views of the step."""
+        part = None if self.part_of is None else dataclasses.replace(self.part_of, poses=poses)
+        return dataclasses.replace(self, poses=poses if part is None else poses[part.rows], part_of=part)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learn3d.data.batch import Batch
+from learn3d.data.batch import Batch, Whole
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
 from learn3d.data.crops import Crops, join
 from learn3d.data.poses import LookAtPoses, Poses
@@ -86,8 +86,11 @@ class ViewDataset:
         """S: side of the images in pixels."""
         return self.images.shape[2]
 
-    def batch(self, indices: Tensor) -> Batch:
-        """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU."""
+    def batch(self, indices: Tensor, rows: Tensor | None = None) -> Batch:
+        """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU.
+
+        With `rows`, int64 [b], only these of them, as a part of the whole batch.
+        """
         indices = torch.as_tensor(indices)
         if indices.ndim != 1 or indices.is_floating_point() or indices.dtype == torch.bool:
             raise TypeError(f"indices must be an integer tensor [B], got {indices.dtype} {list(indices.shape)}")
@@ -97,21 +100,30 @@ class ViewDataset:
                 f"indices must lie in 0 .. {len(self) - 1} ({len(self)} views of {self.num_objects} objects), "
                 f"got {int(indices.min())} .. {int(indices.max())}"
             )
-        rows = indices.numpy()
-        images = torch.from_numpy(self.images[rows])
-        masks = images[:, 3] if self.masks is None else torch.from_numpy(self.masks[rows])
-        objects = self.object_ids[rows]
-        classes = np.zeros(len(rows), np.int64) if self.class_ids is None else self.class_ids[objects]
+        if rows is not None:
+            whole = Whole(
+                rows, self.poses[indices], torch.from_numpy(self.view_ids[indices.numpy()]), self._classes(indices)
+            )
+            return dataclasses.replace(self.batch(indices[rows]), part_of=whole)
+        samples = indices.numpy()
+        images = torch.from_numpy(self.images[samples])
+        masks = images[:, 3] if self.masks is None else torch.from_numpy(self.masks[samples])
+        objects = self.object_ids[samples]
         return Batch(
             images=images,
             masks=masks.to(torch.float32) / 255,
             poses=self.poses[indices],
-            view_ids=torch.from_numpy(self.view_ids[rows]),
+            view_ids=torch.from_numpy(self.view_ids[samples]),
             object_ids=torch.from_numpy(objects),
-            class_ids=torch.from_numpy(classes),
+            class_ids=self._classes(indices),
             voxels=None if self.voxels is None else torch.from_numpy(self.voxels[objects]),
-            crops=None if self.crops is None else self.crops[rows],
+            crops=None if self.crops is None else self.crops[samples],
         )
+
+    def _classes(self, indices: Tensor) -> Tensor:
+        if self.class_ids is None:
+            return torch.zeros(len(indices), dtype=torch.int64)
+        return torch.from_numpy(self.class_ids[self.object_ids[indices.numpy()]])
 
     def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
         """Occupancy bool [B, 32, 32, 32] of predictions in the data set's voxel axes; see `VoxelConvention`."""

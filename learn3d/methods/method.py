@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.data.batch import Batch
+from learn3d.distributed import ALONE, Ranks
 from learn3d.networks import autocast
 
 
@@ -59,6 +60,7 @@ class Method(abc.ABC):
     optimizers: dict[str, torch.optim.Optimizer]
     device: torch.device
     precision: Literal["bf16", "fp32"]
+    ranks: Ranks = ALONE  # the processes that train it together; `Ranks.join` sets it
     image_size: int  # side of the images that `encode` takes; also a property of the method's settings
 
     @abc.abstractmethod
@@ -75,6 +77,10 @@ class Method(abc.ABC):
     @abc.abstractmethod
     def decode(self, codes: Tensor) -> Meshes | Grids:
         """The shapes of codes [B, C], on the CPU."""
+
+    def backward(self, loss: Tensor) -> None:
+        """Gradients of this process's share of a loss, whose mean over the processes is that of the whole batch."""
+        (loss if self.ranks.alone else self.ranks.share * loss).backward()
 
     def autocast(self) -> torch.autocast:
         """Context in which the networks run at the method's precision."""

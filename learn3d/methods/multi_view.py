@@ -104,9 +104,9 @@ class MultiView(Method):
             total = total + settings.lambda_smooth * losses["smoothness"]
 
         losses["total"] = total
-        values = {name: float(loss.detach()) for name, loss in losses.items()}
+        values = self.ranks.means({name: float(loss.detach()) for name, loss in losses.items()})
         check_finite(values, step)
-        total.backward()
+        self.backward(total)
         for optimizer in self.optimizers.values():
             optimizer.step()
         return values

@@ -139,9 +139,9 @@ class PoseInvariant(Method):
             total = total + settings.lambda_adversarial * losses["confusion"].cpu()
 
         losses["total"] = total
-        values = {name: float(loss.detach()) for name, loss in losses.items()}
+        values = self.ranks.means({name: float(loss.detach()) for name, loss in losses.items()})
         check_finite(values, step)
-        total.backward()
+        self.backward(total)
         self.optimizers["encoder"].step()
         self.optimizers["generator"].step()
         if "classification" in losses:

@@ -9,8 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from learn3d.data.batch import Batch
+from learn3d.data.batch import Batch, Whole
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
+from learn3d.distributed import ALONE, Ranks
 from learn3d.methods.method import DataShape, Grids, Method, adam, check_finite, frozen
 from learn3d.networks import autocast, network_input
 from learn3d.networks.projection import ViewCircle, project
@@ -129,14 +130,14 @@ class PrGAN(Method):
         for optimizer in self.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
         if step >= self.settings.encoder_from_step:
-            return self._encoder_step(len(batch), step)
-        return self._gan_step(batch.masks.to(self.device), step)
+            return self._encoder_step(batch.whole, step)
+        return self._gan_step(batch.masks.to(self.device), batch.whole, step)
 
-    def _gan_step(self, real: Tensor, step: int) -> dict[str, float]:
+    def _gan_step(self, real: Tensor, whole: Whole, step: int) -> dict[str, float]:
         """Discriminator (where its accuracy at the start is at most 0.8), then generator, then generator once more: on
         the statistics of the discriminator's first layer. One z serves all three, as in the published code.
         """
-        z = self.sample_z(len(real))
+        z = self.sample_z(len(whole))[whole.rows]
         losses = {"accuracy": self.accuracy(real, z)}
         self.set_training(True)
 
@@ -153,20 +154,21 @@ class PrGAN(Method):
         with self.autocast():
             first = self.discriminator.first
             of_real, of_fake = (frozen(first, images[:, None]).float() for images in (real, self.generate(z)))
-        self._take_step("generator_statistics", statistics_loss(of_real, of_fake), losses, step)
+        self._take_step("generator_statistics", statistics_loss(of_real, of_fake, self.ranks), losses, step)
         losses["total"] = sum(losses.get(name, 0.0) for name in self.optimizers)
         return losses
 
-    def _encoder_step(self, count: int, step: int) -> dict[str, float]:
+    def _encoder_step(self, whole: Whole, step: int) -> dict[str, float]:
         """The encoder learns z of fresh samples of the generator, which stays as it is (evaluation mode)."""
         self.set_training(False)
-        z = self.sample_z(count)
+        z = self.sample_z(len(whole))[whole.rows]
         with torch.no_grad():
             images = self.generate(z)
         with self.autocast():
             estimate = self.encoder(images)
         losses: dict[str, float] = {}
-        self._take_step("encoder", (estimate.float() - z).square().sum(), losses, step)
+        # A sum over the batch: that over the own rows stands for a part of it only.
+        self._take_step("encoder", (estimate.float() - z).square().sum() / self.ranks.share, losses, step)
         losses["total"] = losses["encoder"]
         return losses
 
@@ -176,20 +178,23 @@ class PrGAN(Method):
         self.set_training(False)
         with self.autocast():
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
-        return float((of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2)
+        accuracy = float((of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2)
+        return self.ranks.means({"accuracy": accuracy})["accuracy"]
 
     def _take_step(self, name: str, loss: Tensor, losses: dict[str, float], step: int) -> None:
-        losses[name] = float(loss.detach())
+        losses |= self.ranks.means({name: float(loss.detach())})
         check_finite(losses, step)
-        loss.backward()
+        self.backward(loss)
         self.optimizers[name].step()
         self.optimizers[name].zero_grad(set_to_none=True)
 
 
-def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
+def statistics_loss(of_real: Tensor, of_fake: Tensor, ranks: Ranks = ALONE) -> Tensor:
     """Squared distance of the batch means of features [B, ...] and of their variances, summed over all features."""
-    variances = (features.var(dim=0, unbiased=False) for features in (of_real, of_fake))
-    return (of_real.mean(0) - of_fake.mean(0)).square().sum() + torch.sub(*variances).square().sum()
+    (real_mean, real_variance), (fake_mean, fake_variance) = (
+        ranks.pool(features.mean(0), features.var(dim=0, unbiased=False)) for features in (of_real, of_fake)
+    )
+    return (real_mean - fake_mean).square().sum() + (real_variance - fake_variance).square().sum()
 
 
 def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:

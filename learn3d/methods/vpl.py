@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 import nmr
-from learn3d.data.batch import Batch
+from learn3d.data.batch import Batch, Whole
 from learn3d.data.poses import Poses
 from learn3d.data.views import MASK_SIZE
 from learn3d.losses import silhouette_pyramid_loss
@@ -144,7 +144,8 @@ class VPL(Method):
         for optimizer in self.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
         if settings.lambda_discriminator > 0:
-            others = other_views(batch, settings.other_views)
+            whole = batch.whole
+            others = other_views(whole, settings.other_views)[whole.rows]
 
         with self.autocast():
             vertices = self.generator(self.encoder(self._encoder_input(batch.images)))
@@ -153,7 +154,7 @@ class VPL(Method):
         vertices = vertices.cpu()
         faces = self.generator.faces.cpu()
         if settings.lambda_discriminator > 0:  # both views of each shape in one call
-            views = batch.poses[torch.cat([torch.arange(len(batch)), others])]
+            views = whole.poses[torch.cat([whole.rows, others])]
             silhouettes, elsewhere = self._render(torch.cat([vertices, vertices]), faces, views).chunk(2)
         else:
             silhouettes = self._render(vertices, faces, batch.poses)
@@ -170,21 +171,21 @@ class VPL(Method):
         if settings.lambda_discriminator > 0 and settings.adversary == "reversal":
             reverse = settings.lambda_discriminator
             real, fake = reverse_gradient(silhouettes, reverse), reverse_gradient(elsewhere, reverse)
-            losses["discrimination"] = self._discrimination_loss(real, fake, others, batch)
+            losses["discrimination"] = self._discrimination_loss(real, fake, others, whole)
             total = total + losses["discrimination"]
         elif settings.lambda_discriminator > 0 and step % 2 == 1:
             real, fake = silhouettes.detach(), elsewhere.detach()
-            losses["discrimination"] = self._discrimination_loss(real, fake, others, batch)
+            losses["discrimination"] = self._discrimination_loss(real, fake, others, whole)
             total = total + losses["discrimination"]
         elif settings.lambda_discriminator > 0:
-            logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, batch)
+            logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, whole)
             losses["adversarial"] = F.softplus(-logits).mean()
             total = total + settings.lambda_discriminator * losses["adversarial"]
 
         losses["total"] = total
-        values = {name: float(loss.detach()) for name, loss in losses.items()}
+        values = self.ranks.means({name: float(loss.detach()) for name, loss in losses.items()})
         check_finite(values, step)
-        total.backward()
+        self.backward(total)
         self.optimizers["encoder"].step()
         self.optimizers["generator"].step()
         if "discrimination" in losses:
@@ -214,26 +215,26 @@ class VPL(Method):
             return silhouette_pyramid_loss(silhouettes, masks)
         return nmr.losses.soft_iou_loss(silhouettes, masks)
 
-    def _discrimination_loss(self, real: Tensor, fake: Tensor, others: Tensor, batch: Batch) -> Tensor:
+    def _discrimination_loss(self, real: Tensor, fake: Tensor, others: Tensor, whole: Whole) -> Tensor:
         """Binary cross-entropy of logits x: softplus(-x) for the target 1, softplus(x) for 0; scalar on the CPU."""
-        real_logits = self._discriminate(self.discriminator, real, torch.arange(len(batch)), batch)
-        fake_logits = self._discriminate(self.discriminator, fake, others, batch)
+        real_logits = self._discriminate(self.discriminator, real, whole.rows, whole)
+        fake_logits = self._discriminate(self.discriminator, fake, others, whole)
         return F.softplus(-real_logits).mean() + F.softplus(fake_logits).mean()
 
-    def _discriminate(self, network: Callable[..., Tensor], images: Tensor, views: Tensor, batch: Batch) -> Tensor:
-        """Logits, on the CPU, for silhouettes [B,S,S] of a batch's shapes, seen at the views of its samples `views`."""
+    def _discriminate(self, network: Callable[..., Tensor], images: Tensor, views: Tensor, whole: Whole) -> Tensor:
+        """Logits, on the CPU, for silhouettes [b,S,S] of the shapes of the own rows, seen at the views of `views`."""
         images = images.to(self.device)
         if self.settings.discriminator == "dcgan":
             with self.autocast():
-                return network(images, batch.view_ids[views].to(self.device)).float().cpu()
+                return network(images, whole.view_ids[views].to(self.device)).float().cpu()
         # In float32: spectral normalisation mixes types otherwise.
-        conditions = [batch.poses[views].features().to(self.device)]
+        conditions = [whole.poses[views].features().to(self.device)]
         if self.settings.class_conditional:
-            conditions.append(batch.class_ids.to(self.device))
+            conditions.append(whole.class_ids[whole.rows].to(self.device))
         return network(images, *conditions).cpu()
 
 
-def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> Tensor:
+def other_views(batch: Batch | Whole, choice: Literal["random", "reversed", "next"]) -> Tensor:
     """For each sample of a batch the sample whose view serves as its other one, int64 [B]; see VPLSettings.other_views.
 
     "random" asks torch's global generator, and takes any sample where all have one view class. Over a data set in which

@@ -1,0 +1,93 @@
+"""One process of several: does what the tasks of a JSON file say, one after the other. Started by test_distributed.py.
+
+{"config": ..., "resume": false}     train; `linear` with steps linear in the gradient, `fault`: see `inject`
+{"evaluate": folder}                 evaluate the last checkpoint of a run, in chunks of 5 images
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
+
+import torch
+
+import nmr
+from learn3d import checkpoint
+from learn3d.config import config_from_dict
+from learn3d.distributed import ALONE, Ranks, start
+from learn3d.evaluation import Evaluation, evaluate
+from learn3d.methods import pose_invariant, prgan, vpl
+from learn3d.training import load_splits, train
+
+
+@contextlib.contextmanager
+def linear_optimizer() -> Iterator[None]:
+    """Adam with so large an eps that its steps are linear in the gradient: rounding then changes the weights as little.
+
+    Otherwise Adam's first steps have the size of the learning rate, whatever that of the gradient: where it is nothing
+    but rounding (a bias before a batch norm, a unit that is off) their direction is chance.
+    """
+
+    def linear(network: torch.nn.Module, learning_rate: float, betas: object = None) -> torch.optim.Optimizer:
+        eps = 1e4
+        return torch.optim.Adam([p for p in network.parameters() if p.requires_grad], lr=3e-3 * eps, eps=eps)
+
+    with contextlib.ExitStack() as stack:
+        for module in (pose_invariant, prgan, vpl):
+            stack.enter_context(mock.patch.object(module, "adam", linear))
+        yield
+
+
+def inject(fault: str, stack: contextlib.ExitStack) -> None:
+    """nan: a loss that is none. error: an exception of the kind that nobody expects, in a step."""
+
+    def fail(*_: object) -> torch.Tensor:
+        if fault == "error":
+            raise RuntimeError("the cat is on the keyboard")
+        return torch.tensor(float("nan"), requires_grad=True)
+
+    stack.enter_context(mock.patch.object(nmr.losses, "soft_iou_loss", fail))
+
+
+def evaluate_last(folder: Path, ranks: Ranks = ALONE) -> Evaluation:
+    method, config, _ = checkpoint.load_method(folder / "last.safetensors")
+    ranks.join(method)
+    return evaluate(method, load_splits(config)[1], batch_size=5, paper_mmd=True)
+
+
+def run(task: dict, ranks: Ranks) -> None:
+    if "evaluate" in task:
+        result = evaluate_last(Path(task["evaluate"]), ranks)
+        if ranks.main:
+            summary = result.summary() | {"ious": result.ious["kato18"].tolist()}
+            Path(task["evaluate"], "evaluation.json").write_text(json.dumps(summary))
+        return
+    config = config_from_dict(task["config"])
+    with contextlib.ExitStack() as stack:
+        if task.get("linear"):
+            stack.enter_context(linear_optimizer())
+        if ranks.rank == 1 and "fault" in task:
+            inject(task["fault"], stack)
+        if ranks.rank == 1 and "seed_of_rank_1" in task:
+            config = dataclasses.replace(config, seed=task["seed_of_rank_1"])
+        train(config, resume=task.get("resume", False), ranks=ranks)
+
+
+def main() -> None:
+    tasks = json.loads(Path(sys.argv[1]).read_text())
+    with start(tasks[0]["config"]["device"]) as ranks:
+        for task in tasks:
+            try:
+                run(task, ranks)
+            except (ValueError, FloatingPointError) as error:  # those that all processes raise together
+                if "raises" not in task or task["raises"] not in str(error):
+                    raise
+
+
+if __name__ == "__main__":
+    main()
