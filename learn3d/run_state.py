@@ -130,7 +130,8 @@ def restore(saved: Saved, config: TrainConfig, conditions: Conditions, method: M
 
 def _check_conditions(now: Conditions, recorded: dict[str, object], data: Path) -> None:
     """Raise a ValueError naming what differs from the conditions that a checkpoint recorded."""
-    then = dataclasses.replace(now, **recorded)
+    known = [field.name for field in dataclasses.fields(now) if field.name in recorded]
+    then = dataclasses.replace(now, **{name: recorded[name] for name in known})
     if then.precision != now.precision:
         raise ValueError(
             f"cannot resume: the run computes in {then.precision}, but precision 'auto' means {now.precision} here; "

@@ -17,6 +17,7 @@ import torch
 from lopsided_meshes import write_meshes
 from mutations import Target
 from PIL import Image
+from safetensors.torch import save_file
 
 from learn3d import checkpoint, runlog
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict, load_config
@@ -125,9 +126,9 @@ def checkpoint_target(tmp: Path) -> Target:
     about |= {"step": 3, "best_iou": 0.5, "best_step": 2, "seconds": 1.5, "object_share": 0.5}
     about |= {"conditions": {"samples": 72, "images": "0a", "precision": "fp32"}, "versions": {"torch": "2"}}
     checkpoint.save(tmp / "last.safetensors", tensors, about)
+    save_file(tensors, tmp / "old.safetensors", metadata={"learn3d": json.dumps({"format": 1, **about})})
 
-    def read(folder: Path) -> None:
-        path = folder / "last.safetensors"
+    def read_one(path: Path) -> None:
         metadata = checkpoint.load_metadata(path)
         assert type(metadata.get("step", 0)) is int
         if "config" in metadata:
@@ -142,7 +143,12 @@ def checkpoint_target(tmp: Path) -> Target:
         if {"shape", "num_views"} & set(metadata):
             checkpoint.data_shape(metadata)
 
-    return Target(tmp, {"last.safetensors": m.damage_safetensors}, read)
+    def read(folder: Path) -> None:
+        for name in ("last", "old"):  # the first has checksums, the second, of version 1, lets more through
+            read_one(folder / f"{name}.safetensors")
+
+    names = ("last.safetensors", "old.safetensors")
+    return Target(tmp, dict.fromkeys(names, m.damage_safetensors), read)
 
 
 class StandIn:

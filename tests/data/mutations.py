@@ -47,6 +47,10 @@ VALUES: list[Any] = [
     {},
     [1],
     {"a": 1},
+    "F4",  # types of tensors
+    "F8_E8M0",
+    "BOOL",
+    "C64",
 ]
 SIZES = [0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**60, 2**63, 2**64 - 1]
 

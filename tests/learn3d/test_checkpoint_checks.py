@@ -11,7 +11,7 @@ import torch
 from memory_checks import at_most
 from safetensors.torch import load_file, save_file
 
-from learn3d import checkpoint, limits
+from learn3d import checkpoint, limits, run_state
 
 
 class StandIn:
@@ -166,3 +166,10 @@ def test_states_of_the_random_numbers(path, state):
     with pytest.raises(ValueError, match=r"last\.safetensors holds (no|a) state of the random numbers"):
         checkpoint.random_state(tensors, path)
     assert torch.equal(checkpoint.random_state(load_file(path), path), load_file(path)["random.cpu"])
+
+
+def test_conditions_of_another_version_are_passed_over(tmp_path):
+    now = run_state.Conditions(72, "0a", "fp32")
+    run_state._check_conditions(now, {"samples": 72, "surprise": 5}, tmp_path)
+    with pytest.raises(ValueError, match="cannot resume with other training data: many images in the run, 72 in"):
+        run_state._check_conditions(now, {"samples": "many"}, tmp_path)
