@@ -182,7 +182,8 @@ def restore_optimizer(name: str, optimizer: torch.optim.Optimizer, tensors: dict
     """Put back what `optimizer_tensors` gave.
 
     Each tensor takes the memory layout of its parameter again (channels last, for convolutions): the fused kernel walks
-    through parameter, gradient and state by position in memory and would mix up weights of different layouts.
+    through parameter, gradient and state by position in memory and would mix up weights of different layouts. All are
+    copies: what was loaded is the file itself, mapped, which would otherwise take room on the disk when it is deleted.
     """
     prefix = f"optimizer.{name}."
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
@@ -191,9 +192,8 @@ def restore_optimizer(name: str, optimizer: torch.optim.Optimizer, tensors: dict
         if key.startswith(prefix):
             index, field = key.removeprefix(prefix).split(".")
             parameter = parameters[int(index)]
-            if tensor.shape == parameter.shape:
-                tensor = torch.empty_like(parameter, device="cpu").copy_(tensor)
-            state.setdefault(int(index), {})[field] = tensor
+            like = parameter if tensor.shape == parameter.shape else tensor
+            state.setdefault(int(index), {})[field] = torch.empty_like(like, device="cpu").copy_(tensor)
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 
 

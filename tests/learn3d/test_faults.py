@@ -376,3 +376,12 @@ def test_what_a_kill_left_half_written_is_removed(tiny_run, undisturbed, run_fol
         (run_folder / name).write_text("half")
     assert train(tiny_run(run_folder), resume=True).finished
     check_same(run_folder, undisturbed)
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="reads /proc of Linux")
+def test_a_resumed_run_holds_nothing_of_the_checkpoint(tiny_run, run_folder, monkeypatch) -> None:
+    train(tiny_run(run_folder, iterations=4))
+    maps: list[str] = []
+    before_step(monkeypatch, 6, lambda: maps.append(Path("/proc/self/maps").read_text()))
+    train(tiny_run(run_folder), resume=True)
+    assert str(run_folder) not in maps[0]
