@@ -189,7 +189,8 @@ def restore_optimizer(
     """Put back what `optimizer_tensors` gave. Raises ValueError where it does not go with the parameters.
 
     Each tensor takes the memory layout of its parameter again (channels last, for convolutions): the fused kernel walks
-    through parameter, gradient and state by position in memory and would mix up weights of different layouts.
+    through parameter, gradient and state by position in memory and would mix up weights of different layouts. All are
+    copies: what was loaded is the file itself, mapped, which would otherwise take room on the disk when it is deleted.
     """
     prefix = f"optimizer.{name}."
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
@@ -202,9 +203,8 @@ def restore_optimizer(
                     raise ValueError(f"{key} belongs to none of the {len(parameters)} parameters")
                 parameter = parameters[int(index)]
                 checkpoint_checks.check_moment(key, field, tensor, parameter)
-                if field != "step":
-                    tensor = torch.empty_like(parameter, device="cpu").copy_(tensor)
-                state.setdefault(int(index), {})[field] = tensor
+                like = tensor if field == "step" else parameter
+                state.setdefault(int(index), {})[field] = torch.empty_like(like, device="cpu").copy_(tensor)
         if lacking := [index for index, fields in state.items() if len(fields) < 3]:
             raise ValueError(f"{prefix}{lacking[0]} lacks some of step, exp_avg, exp_avg_sq")
     except ValueError as error:

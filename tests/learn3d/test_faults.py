@@ -368,3 +368,20 @@ def test_resuming_before_the_first_checkpoint_starts_anew(tiny_run, undisturbed,
         train(tiny_run(run_folder, batch_size=4), resume=True)
     assert train(tiny_run(run_folder), resume=True).finished
     check_same(run_folder, undisturbed)
+
+
+def test_what_a_kill_left_half_written_is_removed(tiny_run, undisturbed, run_folder) -> None:
+    train(tiny_run(run_folder, iterations=4))
+    for name in (".best.safetensors.partial", "checkpoints/.step-000004.safetensors.partial", "pictures/.x.partial"):
+        (run_folder / name).write_text("half")
+    assert train(tiny_run(run_folder), resume=True).finished
+    check_same(run_folder, undisturbed)
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="reads /proc of Linux")
+def test_a_resumed_run_holds_nothing_of_the_checkpoint(tiny_run, run_folder, monkeypatch) -> None:
+    train(tiny_run(run_folder, iterations=4))
+    maps: list[str] = []
+    before_step(monkeypatch, 6, lambda: maps.append(Path("/proc/self/maps").read_text()))
+    train(tiny_run(run_folder), resume=True)
+    assert str(run_folder) not in maps[0]

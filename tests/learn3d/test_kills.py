@@ -35,6 +35,19 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and 
 SEED = int(os.environ.get("KILL_SEED", "0"))
 KILLS = 50  # at places
 MOST_ATTEMPTS = 100
+FUSE, HALF = 0.6, 0.9  # below: killed at the line itself; between: soon after it; above: in the middle of the next file
+#: What comes first, so that nothing is left to chance: phases of `run_server`, each hit in a run that has just begun or
+#: is resumed from step 0, 3 or 6.
+DELIBERATE = (
+    ("claim", 0.0),
+    ("validate>save", 0.0),
+    ("validate>save", 1.0),
+    ("save_last>save", 1.0),
+    ("continue_run>load_last", 0.0),
+    ("draw", 0.0),
+    ("save_last>keep_previous", 0.0),
+    ("metrics>_write", 0.0),
+)
 LONGEST_CHAIN = 15  # kills of one run; then it may end
 TIMED_SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGINT) * 3
 
@@ -47,17 +60,20 @@ def server() -> Iterator[RunServer]:
 
 @pytest.fixture(scope="module")
 def killed_config(tiny_folder, tmp_path_factory) -> TrainConfig:
-    """12 steps with everything in them: 6 validations, 4 checkpoints, 3 pictures."""
+    """10 steps with everything in them: 5 validations, 4 checkpoints, 3 pictures.
+
+    The best networks are those of step 8: a run that forgets them when it is resumed at step 9 takes those of step 10.
+    """
     folder = tmp_path_factory.mktemp("killed")
     for path in tiny_folder.iterdir():  # not compressed: the tests read them a hundred times
         with np.load(path) as archive:
             np.savez(folder / path.name, archive["arr_0"])
-    small = {"encoder": "conv-small", "generator": "sphere-small", "learning_rate": 3e-3}
+    small = {"encoder": "conv-small", "generator": "sphere-small", "learning_rate": 6e-3}
     settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **small)
     often = {"log_every": 1, "validate_every": 2, "checkpoint_every": 3, "pictures_every": 4}
     fixed = {"batch_size": 2, "precision": "fp32", "threads": 1, "max_val_images": 4}
     where = {"data": folder, "category": "airplane", "output": folder / "uninterrupted"}
-    return TrainConfig(**where, settings=settings, iterations=12, **fixed, **often)
+    return TrainConfig(**where, settings=settings, iterations=10, seed=1, **fixed, **often)
 
 
 @pytest.fixture(scope="module")
@@ -145,19 +161,21 @@ def test_killed_at_any_place(server, killed_config, uninterrupted) -> None:
     hit: Counter[str] = Counter()
     tried: Counter[str] = Counter()
     kills = attempts = chains = in_chain = 0
+    deliberate = list(DELIBERATE)
     config = killed_config
     while attempts < MOST_ATTEMPTS:
         if in_chain == 0:
             chains += 1
             config = dataclasses.replace(config, output=reference.with_name(f"chain{chains}"))
-        phase = min(lines, key=lambda name: (tried[name], rng.random()))
+        phase, kind, first = min(lines, key=lambda name: (tried[name], rng.random())), rng.random(), rng.random() < 0.5
+        if deliberate:
+            (phase, kind), first = deliberate.pop(0), True
         tried[phase] += 1
         *place, times = rng.choice(lines[phase])
-        stop = {"at": [*place, rng.randint(1, times)]}
-        kind = rng.random()
-        if kind < 0.3:
+        stop = {"at": [*place, 1 if first else rng.randint(1, times)]}
+        if FUSE <= kind < HALF:
             stop["fuse"] = rng.uniform(0, 0.03)
-        elif kind < 0.4:
+        elif kind >= HALF:
             stop["half"] = True
         if in_chain == LONGEST_CHAIN:
             stop = {}
@@ -220,17 +238,17 @@ def test_the_command_killed_at_any_time(killed_config, tmp_path, monkeypatch) ->
     monkeypatch.setattr(validation, "PICTURE_ROWS", 8)  # as the command draws them
     reference = dataclasses.replace(killed_config, output=tmp_path / "uninterrupted")
     train(reference)
-    names = ("iterations", "batch_size", "precision", "threads", "max_val_images")
+    names = ("iterations", "seed", "batch_size", "precision", "threads", "max_val_images")
     names += ("log_every", "validate_every", "checkpoint_every", "pictures_every")
     options = [f"--{name.replace('_', '-')}={getattr(killed_config, name)}" for name in names]
-    options += ["--encoder=conv-small", "--generator=sphere-small", "--learning-rate=3e-3"]
+    options += ["--encoder=conv-small", "--generator=sphere-small", "--learning-rate=6e-3"]
     options += [f"--data={killed_config.data}", "--category=airplane"]
     run = tmp_path / "run"
     script = [sys.executable, str(Path(__file__).parents[2] / "tools" / "train.py"), f"--output={run}"]
     packages = [str(Path(learn3d.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(packages)}
     rng = random.Random(SEED)
-    for lines in (0, 4, 9, None):  # metrics.jsonl has some 18
+    for lines in (0, 4, 9, None):  # metrics.jsonl has 15
         command = [*script, "--resume"] if (run / "config.json").exists() else [*script, *options]
         with subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True) as process:
             deadline = time.monotonic() + 120

@@ -99,7 +99,10 @@ def test_help_says_what_the_paper_preset_keeps(monkeypatch, capsys) -> None:
     assert "factor 0.5" in " ".join(capsys.readouterr().out.replace("│", " ").split())
 
 
-@pytest.mark.parametrize("error", [PermissionError(13, "no permission"), OSError(28, "No space left on device")])
+@pytest.mark.parametrize(
+    "error",
+    [PermissionError(13, "no permission"), OSError(28, "No space left on device"), MemoryError("out of memory")],
+)
 def test_what_the_disk_refuses_is_one_clear_line(error: OSError, tmp_path, monkeypatch, capsys) -> None:
     def fail(*_, **__):
         raise error
@@ -146,6 +149,26 @@ def test_reconstruct_lists_its_files(finished_run, tiny_folder, tmp_path, monkey
     listed = capsys.readouterr().out.split()
     assert len(listed) == 6
     assert all(Path(path).stat().st_size > 100 for path in listed)
+
+
+def test_an_interrupt_outside_of_the_loop_is_one_line(tmp_path, monkeypatch, capsys) -> None:
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    module = tool("train")
+    monkeypatch.setattr(module, "train", interrupt)
+    assert call(module, monkeypatch, "--data", tmp_path, "--category", "chair", "--output", tmp_path) == 130
+    assert capsys.readouterr().err == "interrupted; what was saved before is as it was\n"
+
+
+def test_a_closed_terminal_does_not_change_how_a_run_ended(tmp_path, monkeypatch) -> None:
+    module = tool("train")
+    monkeypatch.setattr(module, "train", lambda *_, **__: Summary(tmp_path, 3, False, -1.0, 0, 1.0))
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as terminal:
+        monkeypatch.setattr(sys, "stdout", terminal)
+        assert call(module, monkeypatch, "--data", tmp_path, "--category", "chair", "--output", tmp_path) == 0
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT to another process")
