@@ -62,17 +62,43 @@ struct Image {
   FaceTable<T>* table;
 };
 
-// Depth of face `id` (a reversed copy if id >= num_faces) at pixel (column i, row j), as published.
+// What the depth of a face at any pixel is computed from.
 template <class T>
-NMR_INLINE T exact_depth(const Image<T>& image, int32_t id, int64_t i, int64_t j) {
+struct FacePlane {
+  BarycentricMatrix<T> weights;
+  T z[3];
+};
+
+// Of face `id`, a reversed copy if id >= num_faces.
+template <class T>
+NMR_INLINE FacePlane<T> face_plane(const Image<T>& image, int32_t id) {
   const bool reversed = id >= image.num_faces;
   const Triangle<T> t = load_triangle(image.vertices, image.faces + 3 * (reversed ? id - image.num_faces : id), reversed);
-  const BarycentricMatrix<T> m = barycentric_matrix(t, static_cast<T>(image.settings.raster_size));
-  const T column = static_cast<T>(i), row = static_cast<T>(j);
+  return {barycentric_matrix(t, static_cast<T>(image.settings.raster_size)), {t.z[0], t.z[1], t.z[2]}};
+}
+
+// Depth at pixel (column, row), as published.
+template <class T>
+NMR_INLINE T exact_depth(const FacePlane<T>& plane, T column, T row) {
+  const auto& m = plane.weights.m;
   T w[3];
-  for (int k = 0; k < 3; ++k) w[k] = clamp_weight(m.m[k][0] * column + m.m[k][1] * row + m.m[k][2]);
+  for (int k = 0; k < 3; ++k) w[k] = clamp_weight(m[k][0] * column + m[k][1] * row + m[k][2]);
   const T sum = w[0] + w[1] + w[2];
-  return 1 / (w[0] / sum / t.z[0] + w[1] / sum / t.z[1] + w[2] / sum / t.z[2]);
+  return 1 / (w[0] / sum / plane.z[0] + w[1] / sum / plane.z[1] + w[2] / sum / plane.z[2]);
+}
+
+// The same at eight pixels of a row.
+template <class T>
+NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T row) {
+  const auto& m = plane.weights.m;
+  Lanes<T> w[3];
+  for (int k = 0; k < 3; ++k) {
+    w[k] = column * m[k][0] + m[k][1] * row + m[k][2];
+    w[k] = select(w[k] > T(0), w[k], splat(T(0)));
+    w[k] = select(w[k] < T(1), w[k], splat(T(1)));
+  }
+  const Lanes<T> sum = w[0] + w[1] + w[2];
+  return T(1) / (w[0] / sum / plane.z[0] + w[1] / sum / plane.z[1] + w[2] / sum / plane.z[2]);
 }
 
 // Pixels along one axis whose centres lie in [lo, hi]: a face covers no centre outside its bounding box. (NMR itself tests every
@@ -185,26 +211,27 @@ struct Band {
   int32_t* owner;
 };
 
-// Decides by exact depth between a face that covers a pixel and the pixel's owner. Of equally near faces the first one wins,
-// whatever the order in which they are filled.
+// Whether a face that is nowhere farther than `farthest` is nearer than the pixel's owner, by bounds alone. What is stored of the
+// owner is its exact depth, once that has been computed, or else the bound `farthest` of its face.
 template <class T>
-NMR_INLINE void contest(const Image<T>& image, int32_t id, T farthest, int64_t i, int64_t j, T& pixel_farthest, int32_t& owner) {
-  if (owner >= 0) {
-    const int32_t other = owner < image.num_faces ? owner : owner - static_cast<int32_t>(image.num_faces);
-    if (farthest < image.table->nearest[other]) {
-      pixel_farthest = farthest;
-      owner = id;
-      return;
-    }
-  }
-  const T z = exact_depth(image, id, i, j);
+NMR_INLINE bool is_nearer(const FaceTable<T>& table, int32_t num_faces, T farthest, int32_t owner, T stored) {
+  if (owner < 0) return false;
+  const int32_t face = owner < num_faces ? owner : owner - num_faces;
+  return farthest < (stored != table.farthest[face] ? stored : table.nearest[face]);
+}
+
+// Decides by exact depth between a face that covers a pixel, at depth z there, and the pixel's owner. Of equally near faces the first
+// one wins, whatever the order in which they are filled.
+template <class T>
+NMR_INLINE void contest(const Image<T>& image, int32_t id, T z, T column, T row, T& stored, int32_t& owner) {
   if (!(z > image.settings.near && z < image.settings.far)) return;  // also NaN
   if (owner >= 0) {
-    const T other = exact_depth(image, owner, i, j);
-    pixel_farthest = other;
-    if (z > other || (z == other && id > owner)) return;
+    const int32_t num_faces = static_cast<int32_t>(image.num_faces);
+    const bool known = stored != image.table->farthest[owner < num_faces ? owner : owner - num_faces];
+    if (!known) stored = exact_depth(face_plane(image, owner), column, row);
+    if (z > stored || (z == stored && id > owner)) return;
   }
-  pixel_farthest = z;
+  stored = z;
   owner = id;
 }
 
@@ -225,6 +252,8 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
   const T y0 = table.y[k0][f], y1 = table.y[1][f], y2 = table.y[k2][f];
   const T dx0 = x1 - x0, dx1 = x2 - x1, dx2 = x0 - x2;
   const T dy0 = y1 - y0, dy1 = y2 - y1, dy2 = y0 - y2;
+  FacePlane<T> plane;  // made when it is needed
+  bool has_plane = false;
 
   for (int64_t i = i_first; i <= i_last; i += kLanes) {
     const LaneMask<T> in_box = widen_mask<T>(lane_numbers() <= static_cast<int32_t>(i_last - i));
@@ -246,9 +275,27 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
         store_lanes(owner_at, select(narrow_mask(open), splat32(id), owner));
         contested = unsettled & ~open;
       }
+      uint32_t undecided = 0;
       for (uint32_t bits = lane_bits(contested); bits; bits &= bits - 1) {
         const int64_t k = lowest_bit(bits);
-        contest(image, id, farthest, i + k, j, farthest_at[k], owner_at[k]);
+        if (is_nearer(table, static_cast<int32_t>(image.num_faces), farthest, owner_at[k], farthest_at[k])) {
+          farthest_at[k] = farthest;
+          owner_at[k] = id;
+        } else {
+          undecided |= uint32_t(1) << k;
+        }
+      }
+      if (!undecided) continue;
+      if (!has_plane) plane = face_plane(image, id);
+      has_plane = true;
+      T columns[kLanes], z[kLanes];
+      const Lanes<T> column = to_values<T>(lane_numbers() + static_cast<int32_t>(i));
+      const T row = static_cast<T>(j);
+      store_lanes(columns, column);
+      store_lanes(z, exact_depths(plane, column, row));
+      for (uint32_t bits = undecided; bits; bits &= bits - 1) {
+        const int64_t k = lowest_bit(bits);
+        contest(image, id, z[k], columns[k], row, farthest_at[k], owner_at[k]);
       }
     }
   }
