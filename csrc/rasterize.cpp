@@ -77,17 +77,7 @@ NMR_INLINE FacePlane<T> face_plane(const Image<T>& image, int32_t id) {
   return {barycentric_matrix(t, static_cast<T>(image.settings.raster_size)), {t.z[0], t.z[1], t.z[2]}};
 }
 
-// Depth at pixel (column, row), as published.
-template <class T>
-NMR_INLINE T exact_depth(const FacePlane<T>& plane, T column, T row) {
-  const auto& m = plane.weights.m;
-  T w[3];
-  for (int k = 0; k < 3; ++k) w[k] = clamp_weight(m[k][0] * column + m[k][1] * row + m[k][2]);
-  const T sum = w[0] + w[1] + w[2];
-  return 1 / (w[0] / sum / plane.z[0] + w[1] / sum / plane.z[1] + w[2] / sum / plane.z[2]);
-}
-
-// The same at eight pixels of a row.
+// Depths at eight pixels of a row, as published.
 template <class T>
 NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T row) {
   const auto& m = plane.weights.m;
@@ -220,19 +210,29 @@ NMR_INLINE bool is_nearer(const FaceTable<T>& table, int32_t num_faces, T farthe
   return farthest < (stored != table.farthest[face] ? stored : table.nearest[face]);
 }
 
-// Decides by exact depth between a face that covers a pixel, at depth z there, and the pixel's owner. Of equally near faces the first
-// one wins, whatever the order in which they are filled.
+// Decides by exact depth between face `id`, whose depths at eight pixels of a row are z, and the owners of those pixels that are
+// marked in `bits`. Of equally near faces the first one wins, whatever the order in which they are filled.
 template <class T>
-NMR_INLINE void contest(const Image<T>& image, int32_t id, T z, T column, T row, T& stored, int32_t& owner) {
-  if (!(z > image.settings.near && z < image.settings.far)) return;  // also NaN
-  if (owner >= 0) {
-    const int32_t num_faces = static_cast<int32_t>(image.num_faces);
-    const bool known = stored != image.table->farthest[owner < num_faces ? owner : owner - num_faces];
-    if (!known) stored = exact_depth(face_plane(image, owner), column, row);
-    if (z > stored || (z == stored && id > owner)) return;
+NMR_INLINE void contest(const Image<T>& image, int32_t id, Lanes<T> z, Lanes<T> column, T row, uint32_t bits, T* stored, int32_t* owner) {
+  T depth[kLanes], other[kLanes];
+  store_lanes(depth, z);
+  const int32_t num_faces = static_cast<int32_t>(image.num_faces);
+  int32_t plane_of = -1;  // the face whose depths are in `other`: neighbouring pixels often have one owner
+  for (; bits; bits &= bits - 1) {
+    const int64_t k = lowest_bit(bits);
+    if (!(depth[k] > image.settings.near && depth[k] < image.settings.far)) continue;  // also NaN
+    const int32_t rival = owner[k];
+    if (rival >= 0) {
+      if (stored[k] == image.table->farthest[rival < num_faces ? rival : rival - num_faces]) {
+        if (rival != plane_of) store_lanes(other, exact_depths(face_plane(image, rival), column, row));
+        plane_of = rival;
+        stored[k] = other[k];
+      }
+      if (depth[k] > stored[k] || (depth[k] == stored[k] && id > rival)) continue;
+    }
+    stored[k] = depth[k];
+    owner[k] = id;
   }
-  stored = z;
-  owner = id;
 }
 
 // Fills one face into a band.
@@ -288,15 +288,9 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
       if (!undecided) continue;
       if (!has_plane) plane = face_plane(image, id);
       has_plane = true;
-      T columns[kLanes], z[kLanes];
       const Lanes<T> column = to_values<T>(lane_numbers() + static_cast<int32_t>(i));
       const T row = static_cast<T>(j);
-      store_lanes(columns, column);
-      store_lanes(z, exact_depths(plane, column, row));
-      for (uint32_t bits = undecided; bits; bits &= bits - 1) {
-        const int64_t k = lowest_bit(bits);
-        contest(image, id, z[k], columns[k], row, farthest_at[k], owner_at[k]);
-      }
+      contest(image, id, exact_depths(plane, column, row), column, row, undecided, farthest_at, owner_at);
     }
   }
 }
