@@ -86,7 +86,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         log.say(_describe(config, precision, train_set, val_set, progress))
         for step in range(progress.step + 1, config.iterations + 1):
             indices = sample_indices(train_set, config.sampling, config.batch_size, config.seed, step)
-            batch = augment(train_set.batch(indices), config.augment, config.seed, step)
+            batch = augment(train_set.batch(indices, voxels=False), config.augment, config.seed, step)
             try:
                 losses = method.train_step(batch, step)
             except FloatingPointError as error:

@@ -86,8 +86,11 @@ class ViewDataset:
         """S: side of the images in pixels."""
         return self.images.shape[2]
 
-    def batch(self, indices: Tensor) -> Batch:
-        """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU."""
+    def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:
+        """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU.
+
+        Without `voxels` they are left out: training has no use for them, and they are twice as large as the images.
+        """
         indices = torch.as_tensor(indices)
         if indices.ndim != 1 or indices.is_floating_point() or indices.dtype == torch.bool:
             raise TypeError(f"indices must be an integer tensor [B], got {indices.dtype} {list(indices.shape)}")
@@ -109,7 +112,7 @@ class ViewDataset:
             view_ids=torch.from_numpy(self.view_ids[rows]),
             object_ids=torch.from_numpy(objects),
             class_ids=torch.from_numpy(classes),
-            voxels=None if self.voxels is None else torch.from_numpy(self.voxels[objects]),
+            voxels=torch.from_numpy(self.voxels[objects]) if voxels and self.voxels is not None else None,
             crops=None if self.crops is None else self.crops[rows],
         )
 

@@ -188,8 +188,11 @@ class PrGAN(Method):
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
     """Squared distance of the batch means of features [B, ...] and of their variances, summed over all features."""
-    variances = (features.var(dim=0, unbiased=False) for features in (of_real, of_fake))
-    return (of_real.mean(0) - of_fake.mean(0)).square().sum() + torch.sub(*variances).square().sum()
+    means, variances = [], []
+    for features in (of_real, of_fake):
+        means.append(features.mean(0))
+        variances.append((features - means[-1]).square().mean(0))  # torch's var over the first axis takes ten times as long
+    return torch.sub(*means).square().sum() + torch.sub(*variances).square().sum()
 
 
 def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
