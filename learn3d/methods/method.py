@@ -12,8 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.data.batch import Batch
-from learn3d.staging import Download
 from learn3d.networks import autocast
+from learn3d.staging import Download
 
 
 @dataclass(frozen=True)

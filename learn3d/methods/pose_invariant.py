@@ -14,9 +14,9 @@ from learn3d.data.batch import Batch
 from learn3d.data.views import MASK_SIZE
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import DataShape, Meshes, Method, adam, descend, frozen
-from learn3d.staging import Download, upload
 from learn3d.networks import ENCODERS, GENERATORS, EncoderName, GeneratorName, PoseDiscriminator, network_input
 from learn3d.networks.resnet import load_pretrained
+from learn3d.staging import Download, upload
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class PoseInvariant(Method):
             vertices = self.generator(codes)
         codes = codes.float()
 
-        # Rendering runs on the CPU. The losses on codes come first: a GPU computes them while the vertices are rendered.
+        # Rendering runs on the CPU. The losses on codes come first: a GPU computes them meanwhile.
         download = Download(vertices)
         on_codes = {}
         if settings.lambda_prior > 0:

@@ -188,10 +188,10 @@ class PrGAN(Method):
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
     """Squared distance of the batch means of features [B, ...] and of their variances, summed over all features."""
-    means, variances = [], []
+    means, variances = [], []  # not by torch's var, which takes ten times as long over the first axis
     for features in (of_real, of_fake):
         means.append(features.mean(0))
-        variances.append((features - means[-1]).square().mean(0))  # torch's var over the first axis takes ten times as long
+        variances.append((features - means[-1]).square().mean(0))
     return torch.sub(*means).square().sum() + torch.sub(*variances).square().sum()
 
 

@@ -37,8 +37,8 @@ class ConvEncoder(nn.Module):
         )
 
     def forward(self, images: Tensor) -> Tensor:
-        # The last ReLU after the change of layout, not before: its gradient would meet values in another layout than its
-        # own, which costs 9 ms of 270 in a step of 128 images on one core.
+        # The last ReLU after the change of layout, not before: its gradient would meet values in another layout than
+        # its own, which costs 9 ms of 270 in a step of 128 images on one core.
         features = self.convolutions[:-1](images).flatten(1)
         return self.layers(self.convolutions[-1](features))
 
@@ -90,6 +90,6 @@ def network_input(images: Tensor, device: torch.device | str, size: int = 64) ->
         )
     images = upload(images, torch.device(device))
     pixels = torch.empty((len(images), size, size, 4), device=images.device)
-    for channel in range(4):  # converted and put in its place in one pass; torch's own change of layout takes twice as long
+    for channel in range(4):  # converted and put in place in one pass; torch's own change of layout is slower
         pixels[..., channel].copy_(images[:, channel])
     return pixels.div_(255).permute(0, 3, 1, 2)

@@ -25,7 +25,7 @@ DISCRIMINATOR_CHANNELS = (128, 256, 512, 1024)
 class DoublingConvolution(nn.ConvTranspose3d):
     """[B, C, n, n, n] -> [B, C', 2n, 2n, 2n]: a transposed convolution of 4^3 weights with stride 2.
 
-    To a single channel, torch's own forward pass on a CPU is four times slower than `_Double`, its backward pass is not.
+    To a single channel, torch's own forward pass on a CPU takes four times as long as `_Double`; backward it does not.
     """
 
     def __init__(self, before: int, after: int) -> None:
