@@ -117,7 +117,7 @@ struct DepthBound {
   T slope_x, slope_y, level, margin, nearest;
 };
 
-// Of a face with corners (x, y, z), whose depths lie in [lo, hi], lo > 0; `largest` is its largest coordinate in [-1, 1] units, or 1.
+// Of a face with corners (x, y, z), whose depths lie in [lo, hi], lo > 0, on a raster of `size` pixels.
 //
 // Published are weights by the inverse of a matrix, clamped and normalised: q' = sum w_k / z_k. With u the unit roundoff, D twice the
 // area in pixels and M the largest pixel coordinate (R / 2 at least), to first order: the determinant is off by 12 u M L, L <= 2 M the longest side,
@@ -145,7 +145,7 @@ NMR_INLINE DepthBound<T> bound_depth(const T (&x)[3], const T (&y)[3], const T (
     const double x1 = X[1] - X[0], x2 = X[2] - X[0], y1 = Y[1] - Y[0], y2 = Y[2] - Y[0], q1 = q[1] - q[0], q2 = q[2] - q[0];
     const double D = x1 * y2 - x2 * y1, unit = eps * static_cast<double>(M) * M;
     const bool wide = std::abs(D) > 2048 * unit;
-    const double scale = 1 / (wide ? D : 1.0);
+    const double scale = (wide ? 1.0 : 0.0) / (wide ? D : 1.0);
     const double slope_x = (q1 * y2 - q2 * y1) * scale, slope_y = (x1 * q2 - x2 * q1) * scale;
     const T margin = static_cast<T>(320 * unit * std::abs(scale)) * range + rounding;
     bound.slope_x = wide ? static_cast<T>(slope_x) : T(0);
@@ -206,12 +206,16 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
       const T det = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0);
       const bool bounded = (std::abs(det) >= resolution * largest * largest) & (largest * size < moderate) & (near >= 0) &
                            (lo * (1 - 16 * eps) > near) & (hi * (1 + 16 * eps) < far) & (lo > smallest) & (hi < 1 / smallest);
-      const DepthBound<T> bound = bound_depth<T>({x0, x1, x2}, {y0, y1, y2}, {z0, z1, z2}, lo, hi, size);
-      slope_x[n] = bounded ? bound.slope_x : T(0);
-      slope_y[n] = bounded ? bound.slope_y : T(0);
-      level[n] = bounded ? bound.level : T(0);
-      margin[n] = bounded ? bound.margin : infinity;
-      nearest[n] = bounded ? bound.nearest : infinity;
+      // Without bounds, those of some ordinary triangle are computed and not used.
+      const auto checked = [bounded](T value, T ordinary) { return bounded ? value : ordinary; };
+      const DepthBound<T> bound = bound_depth<T>({checked(x0, 0), checked(x1, 1), checked(x2, 0)},
+                                                 {checked(y0, 0), checked(y1, 0), checked(y2, 1)},
+                                                 {checked(z0, 1), checked(z1, 1), checked(z2, 1)}, checked(lo, 1), checked(hi, 1), size);
+      slope_x[n] = bound.slope_x;
+      slope_y[n] = bound.slope_y;
+      level[n] = bound.level;
+      margin[n] = checked(bound.margin, infinity);
+      nearest[n] = checked(bound.nearest, infinity);
       pixel_range(min3(x0, x1, x2), max3(x0, x1, x2), size, i0[n], i1[n]);
       pixel_range(min3(y0, y1, y2), max3(y0, y1, y2), size, j0[n], j1[n]);
       const bool drawn = usable & (i0[n] <= i1[n]) & (j0[n] <= j1[n]);

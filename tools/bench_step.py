@@ -179,7 +179,8 @@ def prepare(options: StepOptions) -> tuple[TrainConfig, ViewDataset, dict[str, T
     else:
         tensors, config = None, TrainConfig(data="", category="spheres", output="", preset=options.preset)
         conditional = getattr(config.settings, "class_conditional", False)
-        dataset = sphere_dataset(48, config.settings.image_size, 2 if conditional else 1)
+        size = config.settings.image_size
+        dataset = sphere_dataset(48 if size == 64 else 8, size, 2 if conditional else 1)
         if config.view_bins is not None:
             dataset = dataset.with_bins(AngleBins.parse(config.view_bins))
         possible = tuple(name for name in config.augment if name != "crop")  # crops need photographs
