@@ -209,10 +209,10 @@ NMR_INLINE auto sum_lanes(V v) {
 }
 
 template <class V>
-NMR_INLINE auto max_lanes(V v) {
-  auto largest = v[0];
-  for (int64_t k = 1; k < kLanes; ++k) largest = v[k] > largest ? v[k] : largest;
-  return largest;
+NMR_INLINE auto min_lanes(V v) {
+  auto least = v[0];
+  for (int64_t k = 1; k < kLanes; ++k) least = v[k] < least ? v[k] : least;
+  return least;
 }
 
 // Number of the lowest bit that is set; bits must not be 0.

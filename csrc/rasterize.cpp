@@ -1,9 +1,12 @@
 // Which face is nearest at each pixel of each image.
 //
-// Three steps per image. Set-up: for each face, which vertex orders face the camera, its box of pixels, its range of depths. Fill:
-// face after face (all originals, then all reversed copies), mark the pixels inside. The exact depth needs seven divisions per
-// pixel, so it is computed only where two faces' ranges of depth overlap; elsewhere the ranges decide. Copy: into the owner map.
+// Three steps per image. Set-up: for each face, which vertex orders face the camera, its box of pixels, bounds of its depth. Fill:
+// face after face (all originals, then all reversed copies), mark the pixels inside. The published depth takes sixteen divisions per
+// pixel and its rounding decides who is nearer, so it is computed only where bounds do not tell. Copy: into the owner map.
 // One image can be shared by several threads: set-up by chunks of faces, fill by bands of rows.
+//
+// Bounds are kept of q = 1 / depth, which is linear on the screen: near a pixel (i, j) inside a face, q is slope_x i + slope_y j +
+// level, give or take `margin`. See `bound_depth`.
 #include <algorithm>
 #include <cstring>
 #include <limits>
@@ -24,11 +27,13 @@ constexpr int64_t kBlock = 8;       // pixels per side of a block whose farthest
 template <class T>
 struct FaceTable {
   std::vector<T> x[3], y[3];                     // corners, in the face's own order
-  std::vector<T> nearest, farthest;              // bounds of the depth at any pixel; see has_depth_bounds
+  std::vector<T> slope_x, slope_y, level;        // of q = 1 / depth
+  std::vector<T> margin;                         // infinity: q is not bounded at all
+  std::vector<T> nearest;                        // largest q at any pixel
   std::vector<int32_t> column_first, column_last, row_first, row_last;  // pixels inside the bounding box
   std::vector<int32_t> front, back;              // per chunk: the faces drawn as they are, and reversed, in ascending order
   std::vector<int32_t> num_front, num_back;      // [chunks]
-  std::vector<T> front_depth, back_depth;        // [chunks] sums of `nearest` over them
+  std::vector<T> front_sum, back_sum;            // [chunks] sums of `nearest` over them
 
   void reserve_faces(int64_t num_faces) {
     const size_t size = static_cast<size_t>(num_faces + kLanes * 2);
@@ -36,11 +41,10 @@ struct FaceTable {
       reserve(x[k], size);
       reserve(y[k], size);
     }
-    reserve(nearest, size);
-    reserve(farthest, size);
+    for (std::vector<T>* v : {&slope_x, &slope_y, &level, &margin, &nearest}) reserve(*v, size);
     for (std::vector<int32_t>* v : {&column_first, &column_last, &row_first, &row_last, &front, &back}) reserve(*v, size);
     for (std::vector<int32_t>* v : {&num_front, &num_back}) reserve(*v, size / kChunk + 1);
-    for (std::vector<T>* v : {&front_depth, &back_depth}) reserve(*v, size / kChunk + 1);
+    for (std::vector<T>* v : {&front_sum, &back_sum}) reserve(*v, size / kChunk + 1);
   }
 };
 
@@ -48,9 +52,9 @@ struct FaceTable {
 template <class T>
 struct BandScratch {
   std::vector<T> centres;        // [R + lanes] pixel centres in [-1, 1]
-  std::vector<T> farthest;       // [rows, R + lanes] upper bound of the owner's depth; infinity on background
+  std::vector<T> most, least;    // [rows, R + lanes] bounds of the owner's q = 1 / depth; -infinity on background
   std::vector<int32_t> owner;    // [rows, R + lanes]
-  std::vector<T> block_farthest; // [rows / block, R / block] the largest of `farthest` in a block
+  std::vector<T> block_least;    // [rows / block, R / block] the smallest of `least` in a block
 };
 
 template <class T>
@@ -62,17 +66,33 @@ struct Image {
   FaceTable<T>* table;
 };
 
-// Depth of face `id` (a reversed copy if id >= num_faces) at pixel (column i, row j), as published.
+// What the depth of a face at any pixel is computed from.
 template <class T>
-NMR_INLINE T exact_depth(const Image<T>& image, int32_t id, int64_t i, int64_t j) {
+struct FacePlane {
+  BarycentricMatrix<T> weights;
+  T z[3];
+};
+
+// Of face `id`, a reversed copy if id >= num_faces.
+template <class T>
+NMR_INLINE FacePlane<T> face_plane(const Image<T>& image, int32_t id) {
   const bool reversed = id >= image.num_faces;
   const Triangle<T> t = load_triangle(image.vertices, image.faces + 3 * (reversed ? id - image.num_faces : id), reversed);
-  const BarycentricMatrix<T> m = barycentric_matrix(t, static_cast<T>(image.settings.raster_size));
-  const T column = static_cast<T>(i), row = static_cast<T>(j);
-  T w[3];
-  for (int k = 0; k < 3; ++k) w[k] = clamp_weight(m.m[k][0] * column + m.m[k][1] * row + m.m[k][2]);
-  const T sum = w[0] + w[1] + w[2];
-  return 1 / (w[0] / sum / t.z[0] + w[1] / sum / t.z[1] + w[2] / sum / t.z[2]);
+  return {barycentric_matrix(t, static_cast<T>(image.settings.raster_size)), {t.z[0], t.z[1], t.z[2]}};
+}
+
+// Depths at eight pixels of a row, as published.
+template <class T>
+NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T row) {
+  const auto& m = plane.weights.m;
+  Lanes<T> w[3];
+  for (int k = 0; k < 3; ++k) {
+    w[k] = column * m[k][0] + m[k][1] * row + m[k][2];
+    w[k] = select(w[k] > T(0), w[k], splat(T(0)));
+    w[k] = select(w[k] < T(1), w[k], splat(T(1)));
+  }
+  const Lanes<T> sum = w[0] + w[1] + w[2];
+  return T(1) / (w[0] / sum / plane.z[0] + w[1] / sum / plane.z[1] + w[2] / sum / plane.z[2]);
 }
 
 // Pixels along one axis whose centres lie in [lo, hi]: a face covers no centre outside its bounding box. (NMR itself tests every
@@ -91,6 +111,51 @@ NMR_INLINE void pixel_range(T lo, T hi, T size, int32_t& first, int32_t& last) {
   last = b < n - 1 ? b : n - 1;
 }
 
+// Bounds of q = 1 / depth of one face: level + slope_x i + slope_y j +- margin at any pixel (i, j) that is inside, and `nearest`.
+template <class T>
+struct DepthBound {
+  T slope_x, slope_y, level, margin, nearest;
+};
+
+// Of a face with corners (x, y, z), whose depths lie in [lo, hi], lo > 0, on a raster of `size` pixels.
+//
+// Published are weights by the inverse of a matrix, clamped and normalised: q' = sum w_k / z_k. With u the unit roundoff, D twice the
+// area in pixels and M the largest pixel coordinate (R / 2 at least), to first order: the determinant is off by 12 u M L, L <= 2 M the longest side,
+// the same for all three weights; each weight besides by 32 u M^2 / D; a pixel that passes the edge test may lie outside by 48 u M^2 / D
+// in terms of weights. So the weights before they are normalised are off by E = 110 u M^2 / D at most, all together after it by 7.1 E
+// (if E is small), q' by half of that times the range of q at the corners, and by 8 u q for its own rounding. The plane below adds
+// 80 u M^2 / D times the range and 8 u q: its coefficients are computed in double and rounded. The margin has more than that:
+// 640 u M^2 / D times the range, and 32 u q, so that faces told apart by it have depths that differ even after rounding.
+// Where E could be large, and for double, the bounds are those of the corners: q' is a weighted mean of their q.
+template <class T>
+NMR_INLINE DepthBound<T> bound_depth(const T (&x)[3], const T (&y)[3], const T (&z)[3], T lo, T hi, T size) {
+  constexpr T eps = std::numeric_limits<T>::epsilon();
+  const T most = 1 / lo, least = 1 / hi, range = most - least, rounding = 16 * eps * most;
+  DepthBound<T> bound{0, 0, (most + least) / 2, range / 2 + rounding, most + rounding};
+  if constexpr (sizeof(T) < sizeof(double)) {
+    double X[3], Y[3], q[3];
+    T M = size / 2;  // pixel coordinates come from sums of this size, however small they are
+    for (int k = 0; k < 3; ++k) {
+      const T px = to_pixel(x[k], size), py = to_pixel(y[k], size);
+      M = max3(M, std::abs(px), std::abs(py));
+      X[k] = px;
+      Y[k] = py;
+      q[k] = 1 / static_cast<double>(z[k]);
+    }
+    const double x1 = X[1] - X[0], x2 = X[2] - X[0], y1 = Y[1] - Y[0], y2 = Y[2] - Y[0], q1 = q[1] - q[0], q2 = q[2] - q[0];
+    const double D = x1 * y2 - x2 * y1, unit = eps * static_cast<double>(M) * M;
+    const bool wide = std::abs(D) > 2048 * unit;
+    const double scale = (wide ? 1.0 : 0.0) / (wide ? D : 1.0);
+    const double slope_x = (q1 * y2 - q2 * y1) * scale, slope_y = (x1 * q2 - x2 * q1) * scale;
+    const T margin = static_cast<T>(320 * unit * std::abs(scale)) * range + rounding;
+    bound.slope_x = wide ? static_cast<T>(slope_x) : T(0);
+    bound.slope_y = wide ? static_cast<T>(slope_y) : T(0);
+    bound.level = wide ? static_cast<T>(q[0] - slope_x * X[0] - slope_y * Y[0]) : bound.level;
+    bound.margin = wide ? margin : bound.margin;
+  }
+  return bound;
+}
+
 // Sets up faces [first, last) and lists those that are drawn.
 template <class T>
 NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
@@ -102,11 +167,11 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
   const bool fill_back = image.settings.fill_back;
   const T* vertices = image.vertices;
   const T infinity = std::numeric_limits<T>::infinity();
-  const T round_down = 1 - 16 * std::numeric_limits<T>::epsilon(), round_up = 1 + 16 * std::numeric_limits<T>::epsilon();
   const T moderate = std::sqrt(std::numeric_limits<T>::max()) / 4;  // products of two pixel coordinates stay finite
-  const T resolution = 288 * std::numeric_limits<T>::epsilon();
+  const T eps = std::numeric_limits<T>::epsilon(), resolution = 288 * eps;
+  const T smallest = std::sqrt(std::numeric_limits<T>::min()) / eps;  // 1 / depth and its slopes stay ordinary numbers
   int32_t num_front = 0, num_back = 0;
-  T front_depth = 0, back_depth = 0;
+  T front_sum = 0, back_sum = 0;
   int32_t *front = table.front.data() + first, *back = table.back.data() + first;
 
   for (int64_t f = first; f < last; f += kGroup) {
@@ -124,7 +189,7 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
         z[k][n] = vertices[corner[k][n] + 2];
       }
     int32_t is_front[kGroup], is_back[kGroup];
-    T nearest[kGroup], farthest[kGroup];
+    T slope_x[kGroup], slope_y[kGroup], level[kGroup], margin[kGroup], nearest[kGroup];
     int32_t i0[kGroup], i1[kGroup], j0[kGroup], j1[kGroup];
     for (int64_t n = 0; n < kGroup; ++n) {
       const T x0 = x[0][n], x1 = x[1][n], x2 = x[2][n], y0 = y[0][n], y1 = y[1][n], y2 = y[2][n];
@@ -137,13 +202,20 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
                           (std::abs(y0) < infinity) & (std::abs(y1) < infinity) & (std::abs(y2) < infinity) & (z0 == z0) &
                           (z1 == z1) & (z2 == z2);
       const T lo = min3(z0, z1, z2), hi = max3(z0, z1, z2);
-      // The depth is a weighted mean of 1 / z, with weights >= 0 whatever their rounding: it lies between the corners'. The only
-      // exception is a face so thin that all three weights could round to nothing.
+      // Only a face so thin that all three weights could round to nothing has no bounds, and one near the limits of T or of depth.
       const T det = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0);
-      const bool bounded =
-          (std::abs(det) >= resolution * largest * largest) & (largest * size < moderate) & (lo * round_down > near) & (hi * round_up < far) & (near >= 0);
-      nearest[n] = bounded ? lo * round_down : -infinity;
-      farthest[n] = bounded ? hi * round_up : infinity;
+      const bool bounded = (std::abs(det) >= resolution * largest * largest) & (largest * size < moderate) & (near >= 0) &
+                           (lo * (1 - 16 * eps) > near) & (hi * (1 + 16 * eps) < far) & (lo > smallest) & (hi < 1 / smallest);
+      // Without bounds, those of some ordinary triangle are computed and not used.
+      const auto checked = [bounded](T value, T ordinary) { return bounded ? value : ordinary; };
+      const DepthBound<T> bound = bound_depth<T>({checked(x0, 0), checked(x1, 1), checked(x2, 0)},
+                                                 {checked(y0, 0), checked(y1, 0), checked(y2, 1)},
+                                                 {checked(z0, 1), checked(z1, 1), checked(z2, 1)}, checked(lo, 1), checked(hi, 1), size);
+      slope_x[n] = bound.slope_x;
+      slope_y[n] = bound.slope_y;
+      level[n] = bound.level;
+      margin[n] = checked(bound.margin, infinity);
+      nearest[n] = checked(bound.nearest, infinity);
       pixel_range(min3(x0, x1, x2), max3(x0, x1, x2), size, i0[n], i1[n]);
       pixel_range(min3(y0, y1, y2), max3(y0, y1, y2), size, j0[n], j1[n]);
       const bool drawn = usable & (i0[n] <= i1[n]) & (j0[n] <= j1[n]);
@@ -154,8 +226,11 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
       std::copy_n(x[k], kGroup, table.x[k].data() + f);
       std::copy_n(y[k], kGroup, table.y[k].data() + f);
     }
+    std::copy_n(slope_x, kGroup, table.slope_x.data() + f);
+    std::copy_n(slope_y, kGroup, table.slope_y.data() + f);
+    std::copy_n(level, kGroup, table.level.data() + f);
+    std::copy_n(margin, kGroup, table.margin.data() + f);
     std::copy_n(nearest, kGroup, table.nearest.data() + f);
-    std::copy_n(farthest, kGroup, table.farthest.data() + f);
     std::copy_n(i0, kGroup, table.column_first.data() + f);
     std::copy_n(i1, kGroup, table.column_last.data() + f);
     std::copy_n(j0, kGroup, table.row_first.data() + f);
@@ -163,14 +238,14 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
     for (int64_t n = 0; n < lanes; ++n) {
       front[num_front] = static_cast<int32_t>(f + n);
       num_front += is_front[n];
-      front_depth += is_front[n] && nearest[n] > 0 ? nearest[n] : 0;
+      front_sum += is_front[n] && nearest[n] < infinity ? nearest[n] : 0;
       back[num_back] = static_cast<int32_t>(f + n);
       num_back += is_back[n];
-      back_depth += is_back[n] && nearest[n] > 0 ? nearest[n] : 0;
+      back_sum += is_back[n] && nearest[n] < infinity ? nearest[n] : 0;
     }
   }
-  table.front_depth[chunk] = front_depth;
-  table.back_depth[chunk] = back_depth;
+  table.front_sum[chunk] = front_sum;
+  table.back_sum[chunk] = back_sum;
   table.num_front[chunk] = num_front;
   table.num_back[chunk] = num_back;
 }
@@ -181,31 +256,29 @@ struct Band {
   int64_t row_first, row_last;  // inclusive, from the bottom
   int64_t size, stride;
   const T* centres;
-  T* farthest;
+  T *most, *least;
   int32_t* owner;
 };
 
-// Decides by exact depth between a face that covers a pixel and the pixel's owner. Of equally near faces the first one wins,
-// whatever the order in which they are filled.
+// Which of eight pixels of a row face `id` wins from their owners by exact depth, of those that are contested. Of equally near faces
+// the first one wins, whatever the order in which they are filled.
 template <class T>
-NMR_INLINE void contest(const Image<T>& image, int32_t id, T farthest, int64_t i, int64_t j, T& pixel_farthest, int32_t& owner) {
-  if (owner >= 0) {
-    const int32_t other = owner < image.num_faces ? owner : owner - static_cast<int32_t>(image.num_faces);
-    if (farthest < image.table->nearest[other]) {
-      pixel_farthest = farthest;
-      owner = id;
-      return;
-    }
+NMR_INLINE LaneMask<T> contest(const Image<T>& image, int32_t id, const FacePlane<T>& plane, LaneMask<T> contested, int64_t i, int64_t j,
+                               const int32_t* owner_at) {
+  const Lanes<T> column = to_values<T>(lane_numbers() + static_cast<int32_t>(i));
+  const T row = static_cast<T>(j);
+  const Lanes<T> z = exact_depths(plane, column, row);
+  contested = contested & (z > image.settings.near) & (z < image.settings.far);  // not NaN either
+  const Lanes32 owner = load_lanes<Lanes32>(owner_at);
+  LaneMask<T> wins = contested & widen_mask<T>(owner < 0), open = contested & ~wins;
+  for (uint32_t bits = lane_bits(open); bits; bits = lane_bits(open)) {
+    const int32_t rival = owner_at[lowest_bit(bits)];
+    const LaneMask<T> here = open & widen_mask<T>((owner >= rival) & (owner <= rival));
+    const Lanes<T> theirs = exact_depths(face_plane(image, rival), column, row);
+    wins = wins | (here & (id < rival ? z <= theirs : z < theirs));
+    open = open & ~here;
   }
-  const T z = exact_depth(image, id, i, j);
-  if (!(z > image.settings.near && z < image.settings.far)) return;  // also NaN
-  if (owner >= 0) {
-    const T other = exact_depth(image, owner, i, j);
-    pixel_farthest = other;
-    if (z > other || (z == other && id > owner)) return;
-  }
-  pixel_farthest = z;
-  owner = id;
+  return wins;
 }
 
 // Fills one face into a band.
@@ -217,98 +290,102 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
   const int64_t j_last = std::min<int64_t>(table.row_last[f], band.row_last);
   if (j_first > j_last) return;
   const int32_t id = reversed ? f + static_cast<int32_t>(image.num_faces) : f;
-  const T nearest = table.nearest[f], farthest = table.farthest[f];
-  const bool bounded = nearest > 0;
+  const T slope_x = table.slope_x[f], slope_y = table.slope_y[f], level = table.level[f], margin = table.margin[f];
+  const bool bounded = table.nearest[f] < std::numeric_limits<T>::infinity();
   if (!bounded && !is_drawable(load_triangle(image.vertices, image.faces + 3 * f, false))) return;
   const int k0 = reversed ? 2 : 0, k2 = reversed ? 0 : 2;
   const T x0 = table.x[k0][f], x1 = table.x[1][f], x2 = table.x[k2][f];
   const T y0 = table.y[k0][f], y1 = table.y[1][f], y2 = table.y[k2][f];
   const T dx0 = x1 - x0, dx1 = x2 - x1, dx2 = x0 - x2;
   const T dy0 = y1 - y0, dy1 = y2 - y1, dy2 = y0 - y2;
+  FacePlane<T> plane;  // made when it is needed
+  bool has_plane = false;
+  const Lanes32 ids = splat32(id);
 
   for (int64_t i = i_first; i <= i_last; i += kLanes) {
     const LaneMask<T> in_box = widen_mask<T>(lane_numbers() <= static_cast<int32_t>(i_last - i));
     const Lanes<T> xp = load_lanes<Lanes<T>>(band.centres + i);
     const Lanes<T> c0 = (xp - x0) * dy0, c1 = (xp - x1) * dy1, c2 = (xp - x2) * dy2;
-    T* farthest_at = band.farthest + (j_first - band.row_first) * band.stride + i;
-    int32_t* owner_at = band.owner + (j_first - band.row_first) * band.stride + i;
-    for (int64_t j = j_first; j <= j_last; ++j, farthest_at += band.stride, owner_at += band.stride) {
+    const Lanes<T> q_column = to_values<T>(lane_numbers() + static_cast<int32_t>(i)) * slope_x + level;
+    const int64_t first = (j_first - band.row_first) * band.stride + i;
+    T *most_at = band.most + first, *least_at = band.least + first;
+    int32_t* owner_at = band.owner + first;
+    for (int64_t j = j_first; j <= j_last; ++j, most_at += band.stride, least_at += band.stride, owner_at += band.stride) {
       const T yp = band.centres[j];
       const T e0 = (yp - y0) * dx0, e1 = (yp - y1) * dx1, e2 = (yp - y2) * dx2;
       const LaneMask<T> inside = in_box & ~((e0 < c0) | (e1 < c1) | (e2 < c2));
-      const Lanes<T> pixel_farthest = load_lanes<Lanes<T>>(farthest_at);
-      const LaneMask<T> unsettled = inside & (pixel_farthest >= nearest);
-      const Lanes32 owner = load_lanes<Lanes32>(owner_at);
-      LaneMask<T> contested = unsettled;
-      if (bounded) {
-        const LaneMask<T> open = unsettled & widen_mask<T>(owner < 0);
-        store_lanes(farthest_at, select(open, splat(farthest), pixel_farthest));
-        store_lanes(owner_at, select(narrow_mask(open), splat32(id), owner));
-        contested = unsettled & ~open;
+      const Lanes<T> q = q_column + slope_y * static_cast<T>(j), q_most = q + margin, q_least = q - margin;
+      const Lanes<T> pixel_most = load_lanes<Lanes<T>>(most_at), pixel_least = load_lanes<Lanes<T>>(least_at);
+      const LaneMask<T> unsettled = inside & (q_most >= pixel_least);
+      LaneMask<T> wins = unsettled & (q_least > pixel_most);
+      const LaneMask<T> contested = unsettled & ~wins;
+      if (lane_bits(contested)) {
+        if (!has_plane) plane = face_plane(image, id);
+        has_plane = true;
+        wins = wins | contest(image, id, plane, contested, i, j, owner_at);
       }
-      for (uint32_t bits = lane_bits(contested); bits; bits &= bits - 1) {
-        const int64_t k = lowest_bit(bits);
-        contest(image, id, farthest, i + k, j, farthest_at[k], owner_at[k]);
-      }
+      store_lanes(most_at, select(wins, q_most, pixel_most));
+      store_lanes(least_at, select(wins, q_least, pixel_least));
+      store_lanes(owner_at, select(narrow_mask(wins), ids, load_lanes<Lanes32>(owner_at)));
     }
   }
 }
 
-// The farthest depth in each block of pixels.
+// The least 1 / depth in each block of pixels.
 template <class T>
-NMR_INLINE void bound_blocks(const Band<T>& band, int64_t blocks, T* block_farthest) {
+NMR_INLINE void bound_blocks(const Band<T>& band, int64_t blocks, T* block_least) {
   static_assert(kBlock == kLanes, "a row of a block is one vector");
   const int64_t rows = band.row_last - band.row_first + 1;
   for (int64_t j = 0; j < rows; j += kBlock)
     for (int64_t n = 0; n < blocks; ++n) {
-      const T* row = band.farthest + j * band.stride + n * kBlock;
-      Lanes<T> farthest = load_lanes<Lanes<T>>(row);
+      const T* row = band.least + j * band.stride + n * kBlock;
+      Lanes<T> least = load_lanes<Lanes<T>>(row);
       for (int64_t r = j + 1; r < std::min(j + kBlock, rows); ++r) {
         row += band.stride;
-        const Lanes<T> z = load_lanes<Lanes<T>>(row);
-        farthest = select(z > farthest, z, farthest);
+        const Lanes<T> q = load_lanes<Lanes<T>>(row);
+        least = select(q < least, q, least);
       }
-      block_farthest[(j / kBlock) * blocks + n] = max_lanes(farthest);
+      block_least[(j / kBlock) * blocks + n] = min_lanes(least);
     }
 }
 
 // Whether every pixel of the face's box already has a nearer owner.
 template <class T>
-NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& band, int64_t blocks, const T* block_farthest) {
+NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& band, int64_t blocks, const T* block_least) {
   const int64_t j_first = std::max<int64_t>(table.row_first[f], band.row_first) - band.row_first;
   const int64_t j_last = std::min<int64_t>(table.row_last[f], band.row_last) - band.row_first;
   const T nearest = table.nearest[f];
   for (int64_t j = j_first / kBlock; j <= j_last / kBlock; ++j)
     for (int64_t n = table.column_first[f] / kBlock; n <= table.column_last[f] / kBlock; ++n)
-      if (!(nearest > block_farthest[j * blocks + n])) return false;
+      if (!(nearest < block_least[j * blocks + n])) return false;
   return true;
 }
 
 template <class T>
-NMR_INLINE void fill_band(const Image<T>& image, const Band<T>& band, int64_t blocks, T* block_farthest, int32_t* owner) {
+NMR_INLINE void fill_band(const Image<T>& image, const Band<T>& band, int64_t blocks, T* block_least, int32_t* owner) {
   const FaceTable<T>& table = *image.table;
   const int64_t rows = band.row_last - band.row_first + 1, R = band.size;
-  std::fill_n(band.farthest, rows * band.stride, std::numeric_limits<T>::infinity());
+  for (T* q : {band.most, band.least}) std::fill_n(q, rows * band.stride, -std::numeric_limits<T>::infinity());
   std::fill_n(band.owner, rows * band.stride, -1);
   const int64_t chunks = (image.num_faces + kChunk - 1) / kChunk;
   // The nearer of the two lists first: then most of the other one is hidden.
-  T front_depth = 0, back_depth = 0;
+  T front_sum = 0, back_sum = 0;
   int64_t num_front = 0, num_back = 0;
   for (int64_t c = 0; c < chunks; ++c) {
-    front_depth += table.front_depth[c];
-    back_depth += table.back_depth[c];
+    front_sum += table.front_sum[c];
+    back_sum += table.back_sum[c];
     num_front += table.num_front[c];
     num_back += table.num_back[c];
   }
-  const bool back_first = back_depth * static_cast<T>(num_front) < front_depth * static_cast<T>(num_back);
+  const bool back_first = back_sum * static_cast<T>(num_front) > front_sum * static_cast<T>(num_back);
   for (int pass = 0; pass < 2; ++pass) {
     const bool reversed = (pass == 0) == back_first;
-    if (pass == 1) bound_blocks(band, blocks, block_farthest);
+    if (pass == 1) bound_blocks(band, blocks, block_least);
     for (int64_t c = 0; c < chunks; ++c) {
       const int32_t* list = (reversed ? table.back : table.front).data() + c * kChunk;
       const int32_t count = (reversed ? table.num_back : table.num_front)[c];
       for (int32_t n = 0; n < count; ++n)
-        if (pass == 0 || !is_hidden(table, list[n], band, blocks, block_farthest)) fill_face(image, list[n], reversed, band);
+        if (pass == 0 || !is_hidden(table, list[n], band, blocks, block_least)) fill_face(image, list[n], reversed, band);
     }
   }
   for (int64_t j = 0; j < rows; ++j)
@@ -317,11 +394,11 @@ NMR_INLINE void fill_band(const Image<T>& image, const Band<T>& band, int64_t bl
 
 NMR_CLONES void set_up_chunk(const Image<float>& image, int64_t chunk) { set_up_faces(image, chunk); }
 NMR_CLONES void set_up_chunk(const Image<double>& image, int64_t chunk) { set_up_faces(image, chunk); }
-NMR_CLONES void fill(const Image<float>& image, const Band<float>& band, int64_t blocks, float* block_farthest, int32_t* owner) {
-  fill_band(image, band, blocks, block_farthest, owner);
+NMR_CLONES void fill(const Image<float>& image, const Band<float>& band, int64_t blocks, float* block_least, int32_t* owner) {
+  fill_band(image, band, blocks, block_least, owner);
 }
-NMR_CLONES void fill(const Image<double>& image, const Band<double>& band, int64_t blocks, double* block_farthest, int32_t* owner) {
-  fill_band(image, band, blocks, block_farthest, owner);
+NMR_CLONES void fill(const Image<double>& image, const Band<double>& band, int64_t blocks, double* block_least, int32_t* owner) {
+  fill_band(image, band, blocks, block_least, owner);
 }
 
 }  // namespace
@@ -341,16 +418,17 @@ void rasterize(const Rasterize<T>& args) {
     parallel_for((num_faces + kChunk - 1) / kChunk, threads, [&](int64_t chunk) { set_up_chunk(image, chunk); });
     parallel_for(bands, threads, [&](int64_t n) {
       BandScratch<T>& scratch = thread_scratch<BandScratch<T>>();
-      Band<T> band{n * R / bands, (n + 1) * R / bands - 1, R, R + kLanes, nullptr, nullptr, nullptr};
+      Band<T> band{n * R / bands, (n + 1) * R / bands - 1, R, R + kLanes, nullptr, nullptr, nullptr, nullptr};
       if (static_cast<int64_t>(scratch.centres.size()) != band.stride) {
         scratch.centres.resize(band.stride);
         for (int64_t i = 0; i < band.stride; ++i) scratch.centres[i] = pixel_centre<T>(i, R);
       }
       const int64_t rows = band.row_last - band.row_first + 1, blocks = (R + kBlock - 1) / kBlock;
       band.centres = scratch.centres.data();
-      band.farthest = reserve(scratch.farthest, rows * band.stride);
+      band.most = reserve(scratch.most, rows * band.stride);
+      band.least = reserve(scratch.least, rows * band.stride);
       band.owner = reserve(scratch.owner, rows * band.stride);
-      fill(image, band, blocks, reserve(scratch.block_farthest, (rows / kBlock + 1) * blocks), args.owner + b * R * R);
+      fill(image, band, blocks, reserve(scratch.block_least, (rows / kBlock + 1) * blocks), args.owner + b * R * R);
     });
   });
 }

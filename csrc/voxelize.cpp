@@ -16,19 +16,31 @@ namespace {
 
 using Vec3f = Eigen::Vector3f;
 
+constexpr uint8_t kEmpty = 0, kSurface = 1, kOutside = 2;
+
 struct VoxelScratch {
-  std::vector<uint8_t> cells;   // [s, s, s] 1 = surface, 2 = outside
+  std::vector<uint8_t> cells;   // [s + 2, s + 2, s + 2]
   std::vector<int32_t> frontier;
 };
 
+// The cells of the grid within a shell of outside cells: nothing that looks at neighbours need ask where the grid ends.
 struct Grid {
   uint8_t* cells;
   int64_t size;
 
+  int64_t side() const { return size + 2; }
+  int64_t index(int64_t x, int64_t y, int64_t z) const { return ((x + 1) * side() + y + 1) * side() + z + 1; }
+
+  void clear() {
+    const int64_t row = side(), slab = row * row;
+    std::fill_n(cells, slab * row, kOutside);
+    for (int64_t x = 0; x < size; ++x)
+      for (int64_t y = 0; y < size; ++y) std::fill_n(cells + index(x, y, 0), size, kEmpty);
+  }
   void mark(const int64_t (&c)[3]) {
     for (int64_t x : c)
       if (x < 0 || x >= size) return;
-    cells[(c[0] * size + c[1]) * size + c[2]] = 1;
+    cells[index(c[0], c[1], c[2])] = kSurface;
   }
 };
 
@@ -88,37 +100,33 @@ void mark_rays_and_vertices(const Vec3f (&corners)[3], Grid& grid) {
 }
 
 void mark_touched(const Vec3f (&corners)[3], Grid& grid) {
-  const int64_t s = grid.size;
-  TriangleCells(corners, s).for_each([&](int64_t x, int64_t y, int64_t z) { grid.cells[(x * s + y) * s + z] = 1; });
+  TriangleCells(corners, grid.size).for_each([&](int64_t x, int64_t y, int64_t z) { grid.cells[grid.index(x, y, z)] = kSurface; });
 }
 
-// Floods the empty cells from the border (6-connected) and marks them 2.
+// Floods the empty cells from the border (6-connected) and marks them as outside.
 void flood_outside(Grid& grid, std::vector<int32_t>& frontier) {
-  const int64_t s = grid.size;
-  frontier.clear();
-  const auto visit = [&](int64_t x, int64_t y, int64_t z) {
-    const int64_t n = (x * s + y) * s + z;
-    if (grid.cells[n] != 0) return;
-    grid.cells[n] = 2;
-    frontier.push_back(static_cast<int32_t>(n));
+  const int64_t s = grid.size, row = grid.side(), slab = row * row;
+  uint8_t* cells = grid.cells;
+  int32_t* end = reserve(frontier, s * s * s + 1);
+  int32_t* const start = end;
+  const auto visit = [&](int64_t n) {
+    *end = static_cast<int32_t>(n);  // kept if the cell was empty
+    end += cells[n] == kEmpty;
+    cells[n] = cells[n] == kEmpty ? kOutside : cells[n];
   };
   for (int64_t a = 0; a < s; ++a)
     for (int64_t b = 0; b < s; ++b)
       for (int64_t side : {int64_t(0), s - 1}) {
-        visit(side, a, b);
-        visit(a, side, b);
-        visit(a, b, side);
+        visit(grid.index(side, a, b));
+        visit(grid.index(a, side, b));
+        visit(grid.index(a, b, side));
       }
-  while (!frontier.empty()) {
-    const int64_t n = frontier.back();
-    frontier.pop_back();
-    const int64_t x = n / (s * s), y = n / s % s, z = n % s;
-    if (x > 0) visit(x - 1, y, z);
-    if (x < s - 1) visit(x + 1, y, z);
-    if (y > 0) visit(x, y - 1, z);
-    if (y < s - 1) visit(x, y + 1, z);
-    if (z > 0) visit(x, y, z - 1);
-    if (z < s - 1) visit(x, y, z + 1);
+  while (end != start) {
+    const int64_t n = *--end;
+    for (int64_t step : {slab, row, int64_t(1)}) {
+      visit(n - step);
+      visit(n + step);
+    }
   }
 }
 
@@ -128,8 +136,8 @@ void voxelize(const Voxelize& args) {
   const int64_t s = args.size, num_cells = s * s * s;
   parallel_for(args.mesh.batch, args.num_threads, [&](int64_t b) {
     VoxelScratch& scratch = thread_scratch<VoxelScratch>();
-    Grid grid{reserve(scratch.cells, num_cells), s};
-    std::fill_n(grid.cells, num_cells, uint8_t(0));
+    Grid grid{reserve(scratch.cells, (s + 2) * (s + 2) * (s + 2)), s};
+    grid.clear();
     const float* vertices = args.mesh.image_vertices(b);
     const int64_t* faces = args.mesh.image_faces(b);
     for (int64_t f = 0; f < args.mesh.face_count(b); ++f) {
@@ -143,7 +151,11 @@ void voxelize(const Voxelize& args) {
     }
     flood_outside(grid, scratch.frontier);
     bool* voxels = args.voxels + b * num_cells;
-    for (int64_t n = 0; n < num_cells; ++n) voxels[n] = grid.cells[n] != 2;
+    for (int64_t x = 0; x < s; ++x)
+      for (int64_t y = 0; y < s; ++y, voxels += s) {
+        const uint8_t* cells = grid.cells + grid.index(x, y, 0);
+        for (int64_t z = 0; z < s; ++z) voxels[z] = cells[z] != kOutside;
+      }
   });
 }
 

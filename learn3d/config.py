@@ -62,8 +62,9 @@ class TrainConfig:
     """CPU threads for the networks. None: PyTorch's default, one per core."""
     val_split: Literal["val", "test"] = "val"
     """Split used for validation during training (and for choosing the best checkpoint)."""
-    validate_every: int = 1000
-    """Steps between validations (voxel IoU and MMD); the last step is always validated."""
+    validate_every: int = 2000
+    """Steps between validations (voxel IoU and MMD); the last step is always validated. With 2000 and 16,800 images
+    they take under 3 % of a run of the default preset."""
     max_val_images: int | None = None
     """Validate on this many images, spread evenly over the objects and views of the split. None: all."""
     pictures_every: int = 1000

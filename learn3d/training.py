@@ -103,7 +103,7 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
         log.say(_describe(config, precision, train_set, val_set, progress, ranks))
         for step in range(progress.step + 1, config.iterations + 1):
             indices = sample_indices(train_set, config.sampling, config.batch_size, config.seed, step)
-            batch = augment(train_set.batch(indices, ranks.rows), config.augment, config.seed, step)
+            batch = augment(train_set.batch(indices, ranks.rows, voxels=False), config.augment, config.seed, step)
             losses = method.train_step(batch, step)
             progress.step = step
             progress.seconds = before + time.monotonic() - started

@@ -61,9 +61,8 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
             f"got {describe(prediction)} and {describe(target)}"
         )
     prediction, target = prediction.flatten(1), target.flatten(1)
-    product = prediction * target
-    intersection = product.sum(1)
-    union = (prediction + target - product).sum(1)
+    intersection = (prediction * target).sum(1)
+    union = prediction.sum(1) + target.sum(1) - intersection
     empty = union == 0
     return 1 - (intersection + empty).div(union + empty).mean()
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import nmr
+from learn3d.presets import PRESETS
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
 
@@ -177,3 +178,44 @@ def test_commands(command, tmp_path, capsys):
         assert all(row["total"] > row["forward"] > 0 for row in figures["rows"])
     command("count", "--batch", 1)
     assert "pulls outside" in capsys.readouterr().out
+
+
+def test_a_part_within_a_part_counts_once():
+    watch = bench_step.Stopwatch()
+    inner = watch.timed("inner", lambda: time.sleep(0.02))
+    watch.timed("outer", lambda: (inner(), time.sleep(0.005)))()
+    assert watch.seconds["inner", "forward"] >= 0.02
+    assert 0.005 <= watch.seconds["outer", "forward"] < 0.02
+
+
+@pytest.mark.parametrize("preset", ["peng2020-kato", "peng2020-kato-vpl", "kato2018-kato"])
+def test_the_parts_of_a_step_are_the_step(preset):
+    options = bench_step.StepOptions(preset=preset, batch=4, repeats=1, threads=1)
+    _, steps, _ = bench_step.measure_steps(options, ["fp32"])
+    (parts,) = steps["fp32"]
+    whole = parts.pop(("step", "forward"))
+    assert sum(parts.values()) == pytest.approx(whole)
+    assert all(seconds >= 0 for seconds in parts.values())
+    names = {part for part, _ in parts}
+    wanted = {"data: samples", "data: batch", "data: augmentation", "images to floats", "camera", "rendering"}
+    wanted |= {"projection loss", "smoothness", "logging", "networks: encoder", "networks: generator"}
+    assert wanted | {"networks: backward", bench_step.REST} <= names
+    for part in ("camera", "rendering", "projection loss", "smoothness", "networks: backward"):
+        assert parts[part, "backward"] > 0, part
+
+
+def test_steps_of_every_preset_can_be_prepared():
+    for name, preset in PRESETS.items():
+        config, dataset, tensors = bench_step.prepare(bench_step.StepOptions(preset=name, batch=2))
+        assert dataset.image_size == preset.settings.image_size and tensors is None and config.batch_size == 2
+
+
+def test_step_and_evaluation_say_what_they_measured(command, capsys, tmp_path):
+    common = ("--batch", 4, "--repeats", 1, "--threads", 1)
+    command("step", *common, "--json", tmp_path / "step.json")
+    text = capsys.readouterr().out
+    assert "sum of the parts" in text and "all else, in % of the networks" in text
+    (figures,) = json.loads((tmp_path / "step.json").read_text())
+    assert figures["unit"] == "% of the networks" and len(figures["rows"]) == 2
+    command("evaluation", *common, "--clock", "cpu")
+    assert "16800 images every 2000 steps" in capsys.readouterr().out

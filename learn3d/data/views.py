@@ -86,10 +86,11 @@ class ViewDataset:
         """S: side of the images in pixels."""
         return self.images.shape[2]
 
-    def batch(self, indices: Tensor, rows: Tensor | None = None) -> Batch:
+    def batch(self, indices: Tensor, rows: Tensor | None = None, *, voxels: bool = True) -> Batch:
         """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU.
 
-        With `rows`, int64 [b], only these of them, as a part of the whole batch.
+        With `rows`, int64 [b], only these of them, as a part of the whole batch. Without `voxels` they are left out:
+        training has no use for them, and they are twice as large as the images.
         """
         indices = torch.as_tensor(indices)
         if indices.ndim != 1 or indices.is_floating_point() or indices.dtype == torch.bool:
@@ -116,7 +117,7 @@ class ViewDataset:
             view_ids=torch.from_numpy(self.view_ids[samples]),
             object_ids=torch.from_numpy(objects),
             class_ids=self._classes(indices),
-            voxels=None if self.voxels is None else torch.from_numpy(self.voxels[objects]),
+            voxels=torch.from_numpy(self.voxels[objects]) if voxels and self.voxels is not None else None,
             crops=None if self.crops is None else self.crops[samples],
         )
 

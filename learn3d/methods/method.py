@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from learn3d.data.batch import Batch
 from learn3d.distributed import ALONE, Ranks
 from learn3d.networks import autocast
+from learn3d.staging import Download
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,41 @@ def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
     state = {name: parameter.detach() for name, parameter in network.named_parameters()}
     state |= {name: buffer.clone() for name, buffer in network.named_buffers()}
     return torch.func.functional_call(network, state, inputs)
+
+
+def descend(losses: dict[str, Tensor], weights: dict[str, float], step: int, ranks: Ranks = ALONE) -> dict[str, float]:
+    """Backpropagate the sum of the losses, each times its weight (1 where none is given); return them, and "total".
+
+    Losses are those of this process's rows; what is returned is of the whole batch, and so is the sum of the gradients
+    over the processes. They may lie on the CPU and on the networks' device: each is added up and goes back where it is,
+    and what lies on the device is read with one copy. Raises FloatingPointError, with no gradient computed yet, when
+    one is not finite.
+    """
+    totals: dict[torch.device, Tensor] = {}
+    for name, loss in losses.items():
+        weight = weights.get(name, 1.0)
+        term = loss if weight == 1.0 else weight * loss
+        totals[loss.device] = totals[loss.device] + term if loss.device in totals else term
+    values = ranks.means(read_back(losses))
+    values["total"] = sum(weights.get(name, 1.0) * value for name, value in values.items())
+    check_finite(values, step)
+    torch.autograd.backward([total if ranks.alone else ranks.share * total for total in totals.values()])
+    return values
+
+
+def read_back(losses: dict[str, Tensor]) -> dict[str, float]:
+    """The values of scalar losses; one copy for all that lie on one device."""
+    by_device: dict[torch.device, list[str]] = {}
+    for name, loss in losses.items():
+        by_device.setdefault(loss.device, []).append(name)
+    copies = {
+        device: Download(torch.stack([losses[name].detach().float() for name in names]))
+        for device, names in by_device.items()
+    }
+    found = {}
+    for device, names in by_device.items():
+        found |= dict(zip(names, copies[device].finish().tolist(), strict=True))
+    return {name: found[name] for name in losses}
 
 
 def check_finite(losses: dict[str, float], step: int) -> None:

@@ -13,8 +13,9 @@ from torch import Tensor
 import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.views import MASK_SIZE
-from learn3d.methods.method import DataShape, Meshes, Method, check_finite
+from learn3d.methods.method import DataShape, Meshes, Method, descend
 from learn3d.networks import ENCODERS, GENERATORS, EncoderName, GeneratorName, create_encoder, network_input
+from learn3d.staging import Download
 
 CENTROID_LEARNING_RATE = 0.1  # of the centroid's layer, relative to all others
 DECAY = 0.1  # of the step size, after `decay_at_step`
@@ -53,6 +54,7 @@ class MultiView(Method):
         self.encoder = create_encoder(settings.encoder, inverted=shape.inverted)
         self.generator = GENERATORS[settings.generator]()
         self.networks = {"encoder": self.encoder, "generator": self.generator}
+        self.faces, self.edges = self.generator.faces, self.generator.edges  # for the renderer, on the CPU
         for network in self.networks.values():
             network.to(device)
         self.encoder.to(memory_format=torch.channels_last)
@@ -73,7 +75,7 @@ class MultiView(Method):
 
     def decode(self, codes: Tensor) -> Meshes:
         with self.autocast():
-            return Meshes(self.generator(codes).cpu(), self.generator.faces.cpu())
+            return Meshes(self.generator(codes).cpu(), self.faces)
 
     def train_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shapes of both views, {a, b}, in both views: the mean of four IoU losses, and lambda_s times the
@@ -91,22 +93,15 @@ class MultiView(Method):
             vertices = self.generator(self.encoder(network_input(batch.images, self.device, self.image_size)))
 
         # Shapes a, b, a, b in the views a, a, b, b. Rendering runs on the CPU.
-        vertices = vertices.cpu()
-        faces, edges = self.generator.faces.cpu(), self.generator.edges.cpu()
+        vertices = Download(vertices).wait()
         seen = torch.arange(2 * pairs).reshape(2, pairs)[[0, 0, 1, 1]].flatten()
         silhouettes = nmr.render_silhouette(
-            torch.cat([vertices, vertices]), faces, batch.poses[seen].cameras(), image_size=MASK_SIZE
+            torch.cat([vertices, vertices]), self.faces, batch.poses[seen].cameras(), image_size=MASK_SIZE
         )
         losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks[seen])}
-        total = losses["projection"]
         if settings.lambda_smooth > 0:
-            losses["smoothness"] = nmr.losses.smoothness_loss(vertices, edges)
-            total = total + settings.lambda_smooth * losses["smoothness"]
-
-        losses["total"] = total
-        values = self.ranks.means({name: float(loss.detach()) for name, loss in losses.items()})
-        check_finite(values, step)
-        self.backward(total)
+            losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.edges)
+        values = descend(losses, {"smoothness": settings.lambda_smooth}, step, self.ranks)
         for optimizer in self.optimizers.values():
             optimizer.step()
         return values

@@ -13,7 +13,7 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.views import MASK_SIZE
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
-from learn3d.methods.method import DataShape, Meshes, Method, adam, check_finite, frozen
+from learn3d.methods.method import DataShape, Meshes, Method, adam, descend, frozen
 from learn3d.networks import (
     ENCODERS,
     GENERATORS,
@@ -24,6 +24,7 @@ from learn3d.networks import (
     network_input,
 )
 from learn3d.networks.resnet import load_pretrained
+from learn3d.staging import Download, upload
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,13 @@ class PoseInvariant(Method):
         self.networks = {"encoder": self.encoder, "generator": self.generator}
         if settings.uses_discriminator:
             self.networks["discriminator"] = self.discriminator = PoseDiscriminator(shape.num_views)
+        self.faces, self.edges = self.generator.faces, self.generator.edges  # for the renderer, on the CPU
+        self.weights = {
+            "smoothness": settings.lambda_smooth,
+            "classification": settings.lambda_classification,
+            "confusion": settings.lambda_adversarial,
+            "prior": settings.lambda_prior,
+        }
         for network in self.networks.values():
             network.to(device)
         self.encoder.to(memory_format=torch.channels_last)
@@ -98,7 +106,7 @@ class PoseInvariant(Method):
 
     def decode(self, codes: Tensor) -> Meshes:
         with self.autocast():
-            return Meshes(self.generator(codes).cpu(), self.generator.faces.cpu())
+            return Meshes(self.generator(codes).cpu(), self.faces)
 
     def train_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Iterations count from 1. In every one encoder and generator descend projection + lambda_1 smoothness +
@@ -115,35 +123,28 @@ class PoseInvariant(Method):
             vertices = self.generator(codes)
         codes = codes.float()
 
-        # Rendering runs on the CPU: the vertices move there, and their gradient comes back, explicitly.
-        vertices = vertices.cpu()
-        faces, edges = self.generator.faces.cpu(), self.generator.edges.cpu()
-        silhouettes = nmr.render_silhouette(vertices, faces, batch.cameras, image_size=MASK_SIZE)
-        losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks)}
-        total = losses["projection"]
-        if settings.lambda_smooth > 0:
-            losses["smoothness"] = nmr.losses.smoothness_loss(vertices, edges)
-            total = total + settings.lambda_smooth * losses["smoothness"]
+        # Rendering runs on the CPU. The losses on codes come first: a GPU computes them meanwhile.
+        download = Download(vertices)
+        on_codes = {}
         if settings.lambda_prior > 0:
-            losses["prior"] = gaussian_prior_loss(codes, settings.prior_form)
-            total = total + settings.lambda_prior * losses["prior"].cpu()
-
+            on_codes["prior"] = gaussian_prior_loss(codes, settings.prior_form)
         discriminator_turn = step % 2 == 1
         if discriminator_turn and settings.lambda_classification > 0:
-            logits, views = self.discriminator(codes.detach()), batch.view_ids.to(self.device)
-            losses["classification"] = pose_classification_loss(logits, views)
-            total = total + settings.lambda_classification * losses["classification"].cpu()
+            logits, views = self.discriminator(codes.detach()), upload(batch.view_ids, self.device)
+            on_codes["classification"] = pose_classification_loss(logits, views)
         if not discriminator_turn and settings.lambda_adversarial > 0:
             logits = frozen(self.discriminator, codes)
-            losses["confusion"] = domain_confusion_loss(logits, settings.adversarial_form)
-            total = total + settings.lambda_adversarial * losses["confusion"].cpu()
+            on_codes["confusion"] = domain_confusion_loss(logits, settings.adversarial_form)
 
-        losses["total"] = total
-        values = self.ranks.means({name: float(loss.detach()) for name, loss in losses.items()})
-        check_finite(values, step)
-        self.backward(total)
+        vertices = download.wait()
+        silhouettes = nmr.render_silhouette(vertices, self.faces, batch.cameras, image_size=MASK_SIZE)
+        losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks)}
+        if settings.lambda_smooth > 0:
+            losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.edges)
+
+        values = descend(losses | on_codes, self.weights, step, self.ranks)
         self.optimizers["encoder"].step()
         self.optimizers["generator"].step()
-        if "classification" in losses:
+        if "classification" in on_codes:
             self.optimizers["discriminator"].step()
         return values

@@ -191,10 +191,13 @@ class PrGAN(Method):
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor, ranks: Ranks = ALONE) -> Tensor:
     """Squared distance of the batch means of features [B, ...] and of their variances, summed over all features."""
-    (real_mean, real_variance), (fake_mean, fake_variance) = (
-        ranks.pool(features.mean(0), features.var(dim=0, unbiased=False)) for features in (of_real, of_fake)
-    )
-    return (real_mean - fake_mean).square().sum() + (real_variance - fake_variance).square().sum()
+    means, variances = [], []  # not by torch's var, which takes ten times as long over the first axis
+    for features in (of_real, of_fake):
+        mean = features.mean(0)
+        mean, variance = ranks.pool(mean, (features - mean).square().mean(0))
+        means.append(mean)
+        variances.append(variance)
+    return torch.sub(*means).square().sum() + torch.sub(*variances).square().sum()
 
 
 def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:

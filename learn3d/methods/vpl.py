@@ -21,7 +21,7 @@ from learn3d.data.batch import Batch, Whole
 from learn3d.data.poses import Poses
 from learn3d.data.views import MASK_SIZE
 from learn3d.losses import silhouette_pyramid_loss
-from learn3d.methods.method import DataShape, Meshes, Method, adam, check_finite, frozen
+from learn3d.methods.method import DataShape, Meshes, Method, adam, descend, frozen
 from learn3d.networks import ENCODERS, GENERATORS, network_input
 from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
 from learn3d.networks.flat_resnet import FlatResNet18
@@ -32,6 +32,7 @@ from learn3d.networks.view_discriminators import (
     PatchDiscriminator,
     SpectralPatchDiscriminator,
 )
+from learn3d.staging import Download, upload
 
 MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object where alpha is at least this
 
@@ -115,6 +116,12 @@ class VPL(Method):
         self.networks = {"encoder": self.encoder, "generator": self.generator}
         if settings.lambda_discriminator > 0:
             self.networks["discriminator"] = self.discriminator = _create_discriminator(settings, shape)
+        self.faces, self.edges = self.generator.faces, self.generator.edges  # for the renderer, on the CPU
+        self.weights = {
+            "smoothness": settings.lambda_smooth,
+            "inflation": settings.lambda_inflation,
+            "adversarial": settings.lambda_discriminator,
+        }
         for network in self.networks.values():
             network.to(device)
         self.encoder.to(memory_format=torch.channels_last)
@@ -127,7 +134,7 @@ class VPL(Method):
 
     def decode(self, codes: Tensor) -> Meshes:
         with self.autocast():
-            return Meshes(self.generator(codes).cpu(), self.generator.faces.cpu())
+            return Meshes(self.generator(codes).cpu(), self.faces)
 
     def train_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Iterations count from 1. In every one encoder and generator descend projection + smoothness + inflation.
@@ -150,9 +157,8 @@ class VPL(Method):
         with self.autocast():
             vertices = self.generator(self.encoder(self._encoder_input(batch.images)))
 
-        # Rendering runs on the CPU: the vertices move there, and their gradient comes back, explicitly.
-        vertices = vertices.cpu()
-        faces = self.generator.faces.cpu()
+        # Rendering runs on the CPU: the vertices move there, and their gradient comes back.
+        vertices, faces = Download(vertices).wait(), self.faces
         if settings.lambda_discriminator > 0:  # both views of each shape in one call
             views = whole.poses[torch.cat([whole.rows, others])]
             silhouettes, elsewhere = self._render(torch.cat([vertices, vertices]), faces, views).chunk(2)
@@ -160,32 +166,23 @@ class VPL(Method):
             silhouettes = self._render(vertices, faces, batch.poses)
 
         losses = {"projection": self._projection_loss(silhouettes, batch)}
-        total = losses["projection"]
         if settings.lambda_smooth > 0:
-            losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.generator.edges.cpu())
-            total = total + settings.lambda_smooth * losses["smoothness"]
+            losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.edges)
         if settings.lambda_inflation > 0:
             losses["inflation"] = nmr.losses.inflation_loss(vertices, faces)
-            total = total + settings.lambda_inflation * losses["inflation"]
 
         if settings.lambda_discriminator > 0 and settings.adversary == "reversal":
             reverse = settings.lambda_discriminator
             real, fake = reverse_gradient(silhouettes, reverse), reverse_gradient(elsewhere, reverse)
             losses["discrimination"] = self._discrimination_loss(real, fake, others, whole)
-            total = total + losses["discrimination"]
         elif settings.lambda_discriminator > 0 and step % 2 == 1:
             real, fake = silhouettes.detach(), elsewhere.detach()
             losses["discrimination"] = self._discrimination_loss(real, fake, others, whole)
-            total = total + losses["discrimination"]
         elif settings.lambda_discriminator > 0:
             logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, whole)
             losses["adversarial"] = F.softplus(-logits).mean()
-            total = total + settings.lambda_discriminator * losses["adversarial"]
 
-        losses["total"] = total
-        values = self.ranks.means({name: float(loss.detach()) for name, loss in losses.items()})
-        check_finite(values, step)
-        self.backward(total)
+        values = descend(losses, self.weights, step, self.ranks)
         self.optimizers["encoder"].step()
         self.optimizers["generator"].step()
         if "discrimination" in losses:
@@ -216,22 +213,22 @@ class VPL(Method):
         return nmr.losses.soft_iou_loss(silhouettes, masks)
 
     def _discrimination_loss(self, real: Tensor, fake: Tensor, others: Tensor, whole: Whole) -> Tensor:
-        """Binary cross-entropy of logits x: softplus(-x) for the target 1, softplus(x) for 0; scalar on the CPU."""
+        """Binary cross-entropy of logits x: softplus(-x) for the target 1, softplus(x) for 0; scalar."""
         real_logits = self._discriminate(self.discriminator, real, whole.rows, whole)
         fake_logits = self._discriminate(self.discriminator, fake, others, whole)
         return F.softplus(-real_logits).mean() + F.softplus(fake_logits).mean()
 
     def _discriminate(self, network: Callable[..., Tensor], images: Tensor, views: Tensor, whole: Whole) -> Tensor:
-        """Logits, on the CPU, for silhouettes [b,S,S] of the shapes of the own rows, seen at the views of `views`."""
-        images = images.to(self.device)
+        """Logits for silhouettes [b,S,S] of the shapes of the own rows, seen at the views of `views`."""
+        images = upload(images, self.device)
         if self.settings.discriminator == "dcgan":
             with self.autocast():
-                return network(images, whole.view_ids[views].to(self.device)).float().cpu()
+                return network(images, upload(whole.view_ids[views], self.device)).float()
         # In float32: spectral normalisation mixes types otherwise.
-        conditions = [whole.poses[views].features().to(self.device)]
+        conditions = [upload(whole.poses[views].features(), self.device)]
         if self.settings.class_conditional:
-            conditions.append(whole.class_ids[whole.rows].to(self.device))
-        return network(images, *conditions).cpu()
+            conditions.append(upload(whole.class_ids[whole.rows], self.device))
+        return network(images, *conditions)
 
 
 def other_views(batch: Batch | Whole, choice: Literal["random", "reversed", "next"]) -> Tensor:

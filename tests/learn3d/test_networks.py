@@ -92,6 +92,8 @@ def test_network_input_scales_bytes_to_the_unit_interval() -> None:
     assert result.sum() == 1
     assert result[1, 3, 5, 6] == 1
     assert result.is_contiguous(memory_format=torch.channels_last)
+    noise = torch.randint(0, 256, (3, 4, 64, 64), dtype=torch.uint8)
+    assert torch.equal(network_input(noise, "cpu"), noise.float() / 255)
 
 
 @pytest.mark.parametrize("images", [torch.zeros(1, 4, 64, 64), torch.zeros(1, 3, 64, 64, dtype=torch.uint8)])

@@ -6,6 +6,7 @@ import copy
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 import nmr
@@ -15,7 +16,14 @@ from learn3d.data.conventions import KATO
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.methods.method import DataShape
 from learn3d.methods.prgan import PrGAN, PrGANSettings, statistics_loss
-from learn3d.networks.voxel_gan import SHAPE_CODE, TAU, InverseEncoder, SilhouetteDiscriminator, VoxelGenerator
+from learn3d.networks.voxel_gan import (
+    SHAPE_CODE,
+    TAU,
+    DoublingConvolution,
+    InverseEncoder,
+    SilhouetteDiscriminator,
+    VoxelGenerator,
+)
 
 VIEWS = 4
 SMALL = {"generator_channels": (4, 4, 2, 1), "discriminator_channels": (4, 4, 4, 8)}
@@ -80,6 +88,20 @@ def test_generator_fills_the_volume_within_its_bounds() -> None:
     assert density.min() >= 0
     assert density.max() <= 1 / TAU
     assert SilhouetteDiscriminator((4, 4, 4, 8))(torch.rand(2, 64, 64)).shape == (2,)
+
+
+@pytest.mark.parametrize("channels", [(1, 1), (5, 1), (3, 2)])
+def test_doubling_is_torchs_transposed_convolution(channels: tuple[int, int]) -> None:
+    torch.manual_seed(0)
+    layer = DoublingConvolution(*channels)
+    x = torch.randn(2, channels[0], 3, 3, 3).to(memory_format=torch.channels_last_3d).requires_grad_()
+    grad = torch.randn(2, channels[1], 6, 6, 6)
+    results = []
+    for function in (layer, lambda y: F.conv_transpose3d(y, layer.weight, layer.bias, stride=2, padding=1)):
+        y = function(x)
+        results.append([y, *torch.autograd.grad(y, (x, layer.weight, layer.bias), grad)])
+    for ours, torchs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, torchs)
 
 
 def test_encoder_divides_by_the_size_of_z() -> None:

@@ -54,6 +54,13 @@ def test_batch_has_what_belongs_to_each_sample() -> None:
         data.batch(torch.tensor([0.5]))
 
 
+def test_training_batches_leave_the_voxels_out() -> None:
+    dataset = continuous()
+    batch = dataset.batch(torch.tensor([0]), voxels=False)
+    assert batch.voxels is None
+    assert torch.equal(batch.images, dataset.batch(torch.tensor([0])).images)
+
+
 def test_masks_of_their_own_go_before_the_fourth_channel() -> None:
     data = continuous(1, 2)
     large = dataclasses.replace(
