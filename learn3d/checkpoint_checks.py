@@ -4,7 +4,6 @@ that fit. Raises ValueErrors that say what is wrong; `checkpoint` says in which 
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -59,7 +58,7 @@ def _count(most: int) -> Callable[[Any], bool]:
 
 
 def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
+    return type(value) in (int, float) and abs(value) <= limits.NUMBER
 
 
 def _is_shape(value: Any) -> bool:

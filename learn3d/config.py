@@ -18,7 +18,6 @@ from learn3d.inputs import parse_json, read_bytes
 from learn3d.presets import PRESETS, Settings
 
 DEFAULT_PRESET = next(iter(PRESETS))
-_LARGEST = 1e30  # of a number among the settings; float32 ends at 3e38
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +155,7 @@ def _check_field(name: str, value: Any, kind: Any) -> None:
             _check_positive_int(name, item, _most(name))
     elif kind is float:
         positive = "learning_rate" in name
-        number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= _LARGEST
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= limits.NUMBER
         if not number or not (value > 0 if positive else value >= 0):
             raise ValueError(f"{name} must be a {'positive number' if positive else 'number >= 0'}, got {value!r}")
     elif kind == Path | None and not isinstance(value, (str, Path, type(None))):

@@ -65,6 +65,8 @@ CHANNELS = 1024  # of the layer that a setting names; 128 in the papers
 VIEW_CLASSES = 100_000  # cells of azimuth and elevation; 512 in the papers
 CLASSES = 10_000  # categories trained together
 
+NUMBER = 1e30  # of any measured or given value: float32 ends at 3e38, and NumPy keeps no whole number beyond 2^64
+
 # Cameras
 ANGLE_DEG = 36_000.0  # azimuths may be counted over a hundred turns; float32 still tells 0.004 degrees apart
 DISTANCE = (1e-3, 1e4)  # lengths of the object

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +58,7 @@ def _check_objects(objects: dict[str, Any]) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    return value is None or (type(value) in (int, float) and math.isfinite(value))
+    return value is None or (type(value) in (int, float) and abs(value) <= limits.NUMBER)
 
 
 def _need(fits: bool, values: dict[str, Any], name: str, wanted: str) -> None:

@@ -48,6 +48,13 @@ def test_lists_of_another_length_are_named(tmp_path, name):
         read_result(stored(tmp_path, result))
 
 
+def test_numbers_beyond_any_array_are_refused(tmp_path):
+    result = copy.deepcopy(RESULT)
+    result["objects"]["kato18"] = [10**200, None]
+    with pytest.raises(ValueError, match="kato18 must be 2 numbers or nulls, got"):
+        read_result(stored(tmp_path, result))
+
+
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="it lacks config, iterations"):
         read_result(stored(tmp_path, {}))
