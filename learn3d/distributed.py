@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.distributed as dist
+import torch.distributed.nn.functional  # keeps the group that it finds, and so its threads: before there is one
 from torch import Tensor
-from torch.distributed.elastic.multiprocessing.errors import get_error_handler
 from torch.distributed.rendezvous import rendezvous
 
 from learn3d.networks import check_device
@@ -194,7 +194,13 @@ def start(device: str) -> Iterator[Ranks]:
     try:
         yield Ranks(rank, world)
     except BaseException as error:
-        _announce(store, error)
+        said = _announce(store, error)
+        if backend == "gloo" and isinstance(
+            error, Exception
+        ):  # NCCL's, or an interrupted sum, might wait for the others
+            dist.destroy_process_group()
+        if said:
+            raise SystemExit(1) from None
         raise
     dist.destroy_process_group()
 
@@ -253,14 +259,16 @@ def _all_reduce(values: Tensor, op: Any = dist.ReduceOp.SUM) -> None:
     try:
         dist.all_reduce(values, op)
     except RuntimeError as error:  # a closed connection, or nobody answered in time
-        raise LostPeerError(str(error).strip().splitlines()[0]) from None
+        raise LostPeerError(str(error).strip().splitlines()[0].split(". ")[0]) from None
 
 
-def _announce(store: dist.Store, error: BaseException) -> None:
-    """Leave the reason to the others. A process that ends because of another one says which, and lets it end first:
-    torchrun reports the first one to end, and ends all others at once.
+def _announce(store: dist.Store, error: BaseException) -> bool:
+    """Leave the reason to the others; whether one of them has said the same already.
+
+    A process that ends because of another one says which, and lets it end first: torchrun reports the first one to end,
+    and ends all others at once.
     """
-    mine = f"{label()}{error or type(error).__name__}"
+    mine, said = f"{label()}{error or type(error).__name__}", False
     with contextlib.suppress(RuntimeError):  # the process that keeps the store is gone
         if isinstance(error, LostPeerError):
             if store.check(["failure"]):
@@ -268,12 +276,13 @@ def _announce(store: dist.Store, error: BaseException) -> None:
             else:
                 error.args = (f"another process of the run was killed or does not answer ({error})",)
         elif (first := store.compare_set("failure", "", mine).decode()) == mine:
-            get_error_handler().record_exception(error)
-            return
-        elif isinstance(error, Exception) and str(error) and first.endswith(str(error)):
-            error = SystemExit(1)
+            from torch.distributed.elastic.multiprocessing.errors import get_error_handler
+
+            get_error_handler().record_exception(error)  # for torchrun's report
+            return False
+        else:
+            said = isinstance(error, Exception) and bool(str(error)) and first.endswith(str(error))
     with contextlib.suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
     time.sleep(LAST_WORDS)
-    if isinstance(error, SystemExit):
-        raise error from None  # the first process says it for all
+    return said
