@@ -90,7 +90,9 @@ def uninterrupted(server, killed_config) -> tuple[Path, float]:
 
 def check_whole(folder: Path) -> None:
     """What has a name is whole, whenever the run was killed."""
-    for path in [*run_folder.checkpoints(folder), folder / "best.safetensors"]:
+    checkpoints = run_folder.checkpoints(folder)
+    assert not checkpoints or checkpoints[0].name == "last.safetensors"
+    for path in [*checkpoints, folder / "best.safetensors"]:
         if path.exists():
             checkpoint.load(path)
     if (folder / "config.json").exists():

@@ -25,7 +25,9 @@ with sole_use(Path(sys.argv[1])):
 
 
 def save(folder: Path, step: int, keep: int) -> None:
+    before = (folder / "last.safetensors").exists()
     run_folder.keep_previous(folder)
+    assert (folder / "last.safetensors").exists() == before, "it is there at every moment"
     checkpoint.save(folder / "last.safetensors", {"x": torch.full((3,), float(step))}, {"step": step})
     run_folder.remove_old(folder, step, keep)
 
