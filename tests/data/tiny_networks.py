@@ -13,7 +13,7 @@ from learn3d.networks.generators import SmallSphereGenerator
 class TinyEncoder(SmallConvEncoder):
     def __init__(self) -> None:
         nn.Module.__init__(self)
-        self.convolutions = nn.Conv2d(4, 4, 8, stride=8)
+        self.convolutions = nn.Sequential(nn.Conv2d(4, 4, 8, stride=8), nn.ReLU())
         self.layers = nn.Linear(256, CODE_SIZE)
 
 
