@@ -68,7 +68,7 @@ def vanilla(splits) -> Evaluation:
 
 @pytest.mark.slow
 def test_the_method_raises_the_iou(tmp_path: Path) -> None:
-    """IOU_MEASURED"""
+    """Measured at d805aa2, one thread: Vanilla-AE .399 and .410 with seeds 0 and 1, Proposed .445 and .453."""
     data, output = tmp_path / "data", tmp_path / "output"
     make_dataset(
         DatasetConfig(output=data, category="airplane", procedural=250, test=0.2, val=0.1, seed=0), progress=False
