@@ -68,7 +68,9 @@ def vanilla(splits) -> Evaluation:
 
 @pytest.mark.slow
 def test_the_method_raises_the_iou(tmp_path: Path) -> None:
-    """Measured at d805aa2, one thread: Vanilla-AE .399 and .410 with seeds 0 and 1, Proposed .445 and .453."""
+    """Measured at d805aa2, one thread: Vanilla-AE .399 and .410 with seeds 0 and 1, Proposed .445 and .453; with a prior
+    that does nothing .419 (seed 0).
+    """
     data, output = tmp_path / "data", tmp_path / "output"
     make_dataset(
         DatasetConfig(output=data, category="airplane", procedural=250, test=0.2, val=0.1, seed=0), progress=False
@@ -79,7 +81,7 @@ def test_the_method_raises_the_iou(tmp_path: Path) -> None:
     subprocess.run([str(word) for word in command], check=True)
     report = json.loads((output / "kato.json").read_text())
     vanilla, proposed = (row["cells"]["airplane"] for row in report["rows"])
-    assert proposed["values"]["kato18"] > vanilla["values"]["kato18"] + 0.015
+    assert proposed["values"]["kato18"] > vanilla["values"]["kato18"] + 0.03
 
 
 @pytest.mark.slow
