@@ -68,8 +68,8 @@ def vanilla(splits) -> Evaluation:
 
 @pytest.mark.slow
 def test_the_method_raises_the_iou(tmp_path: Path) -> None:
-    """Measured at d805aa2, one thread: Vanilla-AE .399 and .410 with seeds 0 and 1, Proposed .445 and .453; with a prior
-    that does nothing .419 (seed 0).
+    """Measured at d805aa2, one thread: Vanilla-AE .399 and .410 with seeds 0 and 1, Proposed .445 and .453; with a
+    prior that does nothing .419 (seed 0).
     """
     data, output = tmp_path / "data", tmp_path / "output"
     make_dataset(
