@@ -70,8 +70,8 @@ def vanilla(splits) -> Evaluation:
 def test_the_method_raises_the_iou(tmp_path: Path) -> None:
     """Measured, one thread: +.046, +.042 (seeds 0, 1, at d805aa2), +.019 (seed 0, with the kernels after it).
 
-    Nearly all of it is the prior's: with a prior that does nothing .020 is left of .046, and with a confusion of the wrong
-    sign all of it, so that a broken confusion shows in the MMD below and not here.
+    Much of it is the prior's: with a prior that does nothing .020 is left of .046, with a confusion of the wrong sign
+    .047, so that a broken confusion shows in the MMD below and not here.
     """
     data, output = tmp_path / "data", tmp_path / "output"
     make_dataset(
