@@ -209,4 +209,5 @@ def _stack(frame: FrameType | None) -> list[str]:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, also by what is tested
     serve()

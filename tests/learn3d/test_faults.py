@@ -285,6 +285,7 @@ def test_other_errors_stay_what_they_are(tiny_run, run_folder, monkeypatch) -> N
 def test_a_closed_terminal_stops_the_run_in_good_order(tiny_run, undisturbed, run_folder, monkeypatch) -> None:
     reading, writing = os.pipe()
     os.close(reading)
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, also by us
     with open(writing, "w", closefd=True) as terminal:
         monkeypatch.setattr(sys, "stderr", terminal)
         before_step(monkeypatch, 3, lambda: signal.raise_signal(signal.SIGHUP))
@@ -292,6 +293,7 @@ def test_a_closed_terminal_stops_the_run_in_good_order(tiny_run, undisturbed, ru
         monkeypatch.undo()
         with contextlib.suppress(BrokenPipeError):
             terminal.close()
+    signal.signal(signal.SIGHUP, before)
     assert (summary.step, summary.finished) == (3, False)
     assert "stopped by SIGHUP after step 3" in (run_folder / "journal.txt").read_text()
     assert train(tiny_run(run_folder), resume=True).finished

@@ -227,7 +227,7 @@ def test_signals_at_any_time(server, killed_config, uninterrupted) -> None:
         if statuses[-1] == "finished":
             check_same(config.output, reference)
     print(Counter(statuses))
-    assert "killed" in statuses
+    assert set(statuses) != {"finished"}
     assert statuses[-1] == "finished"
 
 

@@ -42,7 +42,7 @@ def test_a_folder_in_use_is_refused_and_a_killed_process_does_not_hold_it(tmp_pa
     path = [str(Path(learn3d.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path)}
     command = [sys.executable, "-c", HOLDER, str(folder)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as holder:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, cwd=tmp_path) as holder:
         assert holder.stdout.readline() == b"mine\n"
         with pytest.raises(OSError, match=r"another process works in .*run; wait for it, or stop it"):
             with run_folder.sole_use(folder):
