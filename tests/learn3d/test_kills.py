@@ -210,7 +210,9 @@ def test_signals_at_any_time(server, killed_config, uninterrupted) -> None:
         if chains == 0 or statuses[-1] == "finished":
             chains += 1
             config = dataclasses.replace(config, output=reference.with_name(f"timed{chains}"))
-        stop = {"after": rng.uniform(0.05, seconds), "signal": number} if number else {}
+        # The first, a SIGKILL, hits for sure, also where the machine has got faster since `seconds` were measured.
+        after = rng.uniform(0.05, seconds) if statuses else 0.05
+        stop = {"after": after, "signal": number} if number else {}
         answer = server(config, resume=(config.output / "config.json").exists(), **stop)
         check_whole(config.output)
         if answer["status"] < 0:
@@ -227,7 +229,7 @@ def test_signals_at_any_time(server, killed_config, uninterrupted) -> None:
         if statuses[-1] == "finished":
             check_same(config.output, reference)
     print(Counter(statuses))
-    assert set(statuses) != {"finished"}
+    assert "killed" in statuses
     assert statuses[-1] == "finished"
 
 
