@@ -23,6 +23,7 @@ from learn3d.faults import explained
 from learn3d.memory import keep_freed_memory
 from learn3d.methods import DataShape, Method, create_method
 from learn3d.networks import resolve_precision
+from learn3d.pace import CoreShare
 from learn3d.presets import PRESETS
 from learn3d.run_state import Conditions, Progress, load_last, restore, save_last
 from learn3d.runlog import RunLog, SilentLog
@@ -96,6 +97,8 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
     if ranks.main:
         files.write_json(folder / run_folder.CONFIG, config_to_dict(config), sync=True)
     before = progress.seconds
+    # A GPU's host and processes that wait for each other have idle threads by nature.
+    cores = CoreShare(torch.get_num_threads() if ranks.alone and config.device == "cpu" else 1)
 
     with explained(folder), stop_on_signal() as stop, _open_log(config, progress, ranks) as log:
         for note in notes:
@@ -108,6 +111,8 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
             progress.step = step
             progress.seconds = before + time.monotonic() - started
             log.step(step, losses)
+            if warning := cores.warning():
+                log.say(f"warning: {warning}")
             stopped_by = ranks.stopped_by(stop)
 
             last = step == config.iterations

@@ -190,18 +190,22 @@ def _ours_text(cell: dict[str, Any], metric: str) -> str:
     """Value, half width of the interval over seeds, interval over objects."""
     if metric not in cell.get("values", {}):
         return "-"
-    text = _number(cell["values"][metric], digits=3)
-    if over_seeds := cell["interval_seeds"].get(metric):
-        text += f" ±{_number((over_seeds[1] - over_seeds[0]) / 2, digits=3)}"
+    text = _number(cell["values"][metric], digits=3) + _seeds_text(cell["interval_seeds"].get(metric))
     return text + _interval_text(cell["interval_objects"].get(metric))
 
 
 def _difference_text(difference: dict[str, Any] | None) -> str:
     if difference is None:
         return "-"
+    text = _signed(difference["value"]) + _seeds_text(difference.get("interval_seeds"))
     if "ratio" in difference:
-        return f"{_signed(difference['value'])} (x {difference['ratio']:.2f})"
-    return _signed(difference["value"]) + _interval_text(difference.get("interval_objects"), signed=True)
+        return f"{text} (x {difference['ratio']:.2f})"
+    return text + _interval_text(difference.get("interval_objects"), signed=True)
+
+
+def _seeds_text(interval: Sequence[float] | None) -> str:
+    """Half the width of an interval over seeds."""
+    return "" if interval is None else f" ±{_number((interval[1] - interval[0]) / 2, digits=3)}"
 
 
 def _interval_text(interval: Sequence[float] | None, signed: bool = False) -> str:

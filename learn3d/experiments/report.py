@@ -156,12 +156,18 @@ def _cell(ours: list[dict[int, dict]]) -> dict[str, Any]:
 
 
 def _difference(metric: str, ours: list[dict[int, dict]], theirs: list[dict[int, dict]]) -> dict[str, Any]:
-    """Ours minus the baseline's; for IoU with the interval of a paired bootstrap over the same objects."""
+    """Ours minus the baseline's, with its interval over seeds (paired: the difference of each seed); for IoU also with
+    that of a paired bootstrap over the same objects."""
     key = MEASURES[metric]
     a, b = (
         float(np.mean([np.mean([r[key] for r in results.values()]) for results in side])) for side in (ours, theirs)
     )
     difference: dict[str, Any] = {"metric": metric, "value": a - b}
+    mine, other = _cell(ours), _cell(theirs)
+    if mine["seeds"] == other["seeds"]:
+        pairs = zip(mine["by_seed"][metric], other["by_seed"][metric], strict=True)
+        if interval := t_interval([x - y for x, y in pairs]):
+            difference["interval_seeds"] = interval
     if metric == "mmd":
         return difference | ({"ratio": a / b} if b else {})
     if [_names(results) for results in ours] == [_names(results) for results in theirs]:

@@ -62,6 +62,8 @@ SMALLER = {
     "pascal-vpl": _VPL,
     "pascal-baseline": _SMALL[:1],
     "pascal-proposed": _SMALL[:1],
+    "proposed-fp32": _SMALL,
+    "proposed-bf16": _SMALL,
     "prgan": ("discriminator_channels=4,8,16,32", "generator_channels=16,8,4,1"),
 }
 
@@ -95,8 +97,9 @@ class Laboratory:
         variants = [row.variant.name for row in TABLES[table].rows if row.variant]
         words = [table, "--data", self.folder / TABLES[table].layout, "--output", self.folder / "out"]
         words += ["--categories", CATEGORY, "--iterations", 2, "--batch-size", 4, "--jobs", 2, "--threads", 1]
-        words += ["--seeds", PASCAL_SEEDS] if table == "pascal" else []
-        words += ["--set", "precision=fp32", "max_val_images=6", "log_every=1"]
+        words += ["--seeds", PASCAL_SEEDS if table == "pascal" else 1]
+        words += ["--set", "max_val_images=6", "log_every=1"]
+        words += ["precision=fp32"] if table != "precision" else []
         words += [f"{variant}:{change}" for variant in variants for change in SMALLER[variant]]
         status, _, said = call_tool("experiment", *words)
         paths = {suffix: self.folder / "out" / f"{table}.{suffix}" for suffix in ("json", "csv", "md", "html")}
@@ -224,6 +227,14 @@ def test_losses_that_an_ablation_turns_off_are_not_computed(
     for name, terms in off.items():
         assert logged["proposed"] - logged[name] == terms, name
     assert outcomes["ablation"].cell("w/o prior")["paper"] == 0.552
+
+
+def test_the_precision_is_the_rows(laboratory: Laboratory, outcomes: dict[str, Outcome]) -> None:
+    for row in TABLES["precision"].rows:
+        metadata = checkpoint.load_metadata(laboratory.runs / f"{row.variant.name}-seed0" / "last.safetensors")
+        assert row.label.endswith(metadata["conditions"]["precision"])
+    fp32, bf16 = (outcomes["precision"].cell(row.label)["values"]["kato18"] for row in TABLES["precision"].rows)
+    assert fp32 != bf16
 
 
 def test_pascal_has_seeds_and_quoted_rows(laboratory: Laboratory, outcomes: dict[str, Outcome]) -> None:

@@ -1,0 +1,58 @@
+"""Notices a run whose threads do not get the cores that they ask for."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+
+#: Less than this share of the cores asked for is worth a warning. A step alone on its cores gets 0.9 and more.
+ENOUGH = 0.75
+
+
+class CoreShare:
+    """Compares the CPU time of this process with the time that passes, once, in the first `seconds` of a run.
+
+    Threads meet at a barrier hundreds of times a step. Where other programs take a core from one of them (or a
+    container has fewer cores than its machine), all wait until it runs again: two threads beside another busy program
+    on two cores took 15 times as long for a step (LOG.md), and nothing but the clock tells.
+    """
+
+    def __init__(
+        self,
+        threads: int,
+        *,
+        seconds: float = 20.0,
+        skipped_steps: int = 2,
+        clock: Callable[[], float] = time.monotonic,
+        cpu_clock: Callable[[], float] = time.process_time,
+    ) -> None:
+        self.threads = threads
+        self.seconds = seconds
+        self._skipped = skipped_steps  # the first ones also allocate memory and choose kernels
+        self._clock, self._cpu_clock = clock, cpu_clock
+        self._start: tuple[float, float] | None = None
+        self._done = threads < 2  # one thread waits for nobody, and there is no better number
+
+    def warning(self) -> str | None:
+        """Call it after each step: a sentence once the share is known and small, None otherwise."""
+        if self._done:
+            return None
+        if self._skipped > 0:
+            self._skipped -= 1
+            return None
+        now = (self._clock(), self._cpu_clock())
+        if self._start is None:
+            self._start = now
+        passed, used = (b - a for a, b in zip(self._start, now, strict=True))
+        if passed < self.seconds:
+            return None
+        self._done = True
+        if used / passed >= ENOUGH * self.threads:
+            return None
+        fitting = max(1, int(used / passed + 0.25))
+        return (
+            f"{self.threads} threads got the time of {used / passed:.1f} of {os.cpu_count()} cores: other programs are "
+            f"busy, or this one may not use all cores. Threads that wait for each other can make a step many times "
+            f"slower; if it stays so, stop with Ctrl-C and continue with --threads {fitting}"
+        )
