@@ -105,7 +105,7 @@ class ViewDataset:
             whole = Whole(
                 rows, self.poses[indices], torch.from_numpy(self.view_ids[indices.numpy()]), self._classes(indices)
             )
-            return dataclasses.replace(self.batch(indices[rows]), part_of=whole)
+            return dataclasses.replace(self.batch(indices[rows], voxels=voxels), part_of=whole)
         samples = indices.numpy()
         images = torch.from_numpy(self.images[samples])
         masks = images[:, 3] if self.masks is None else torch.from_numpy(self.masks[samples])
