@@ -241,12 +241,9 @@ def load_method(
     tensors, metadata = load(path)
     checkpoint_checks.require_run(metadata, path)
     config = config_from_dict(metadata["config"], source=str(path))
-    settings = config.settings
-    if getattr(settings, "pretrained", None) is not None:  # only training starts from that file, which may be gone
-        settings = dataclasses.replace(settings, pretrained=None)
     with torch.random.fork_rng(devices=[]):
         method = create_method(
-            settings,
+            config.settings,
             data_shape(metadata),
             device=device,
             precision=resolve_precision(precision, device),

@@ -76,6 +76,8 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
     inverted = train_set.inverted if saved is None else saved.shape.inverted
     shape = DataShape(train_set.num_views, train_set.num_classes, train_set.poses.num_features, inverted)
     method = create_method(config.settings, shape, device=config.device, precision=precision, seed=config.seed)
+    if saved is None:
+        method.start_from_pretrained()
     progress = Progress(object_share=object_share(train_set))
     conditions = Conditions(len(train_set), f"{zlib.crc32(np.ascontiguousarray(train_set.images)):08x}", precision)
     if saved is not None:

@@ -71,6 +71,13 @@ class Method(abc.ABC):
         Raises FloatingPointError, before stepping, when a loss is not finite (`check_finite`).
         """
 
+    def start_from_pretrained(self) -> None:  # noqa: B027
+        """Copy the weights of the file that the settings name, where they name one, into the encoder.
+
+        For the beginning of a run: afterwards they are in its checkpoints, and the file may be gone. Raises as
+        `learn3d.networks.resnet.load_pretrained`.
+        """
+
     @abc.abstractmethod
     def encode(self, images: Tensor) -> Tensor:
         """Shape codes float32 [B, C] on the method's device, of stored images uint8 [B, 4, S, S]."""

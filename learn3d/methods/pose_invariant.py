@@ -82,8 +82,6 @@ class PoseInvariant(Method):
         self.settings, self.image_size = settings, settings.image_size
         self.device, self.precision = torch.device(device), precision
         self.encoder = create_encoder(settings.encoder, inverted=shape.inverted)
-        if settings.pretrained is not None:
-            load_pretrained(self.encoder, settings.pretrained)
         self.generator = GENERATORS[settings.generator]()
         self.networks = {"encoder": self.encoder, "generator": self.generator}
         if settings.uses_discriminator:
@@ -99,6 +97,10 @@ class PoseInvariant(Method):
             network.to(device)
         self.encoder.to(memory_format=torch.channels_last)
         self.optimizers = {name: adam(network, settings.learning_rate) for name, network in self.networks.items()}
+
+    def start_from_pretrained(self) -> None:
+        if self.settings.pretrained is not None:
+            load_pretrained(self.encoder, self.settings.pretrained)
 
     def encode(self, images: Tensor) -> Tensor:
         with self.autocast():

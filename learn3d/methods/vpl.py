@@ -27,6 +27,7 @@ from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenera
 from learn3d.networks.flat_resnet import FlatResNet18
 from learn3d.networks.gradient_reversal import reverse_gradient
 from learn3d.networks.preact_resnet import PreactResNet18, grey_background
+from learn3d.networks.resnet import load_pretrained
 from learn3d.networks.view_discriminators import (
     OneHotViewDiscriminator,
     PatchDiscriminator,
@@ -127,6 +128,10 @@ class VPL(Method):
         self.encoder.to(memory_format=torch.channels_last)
         betas = (settings.adam_beta1, 0.999)
         self.optimizers = {n: adam(network, settings.learning_rate, betas) for n, network in self.networks.items()}
+
+    def start_from_pretrained(self) -> None:
+        if self.settings.pretrained is not None:
+            load_pretrained(self.encoder.resnet, self.settings.pretrained)
 
     def encode(self, images: Tensor) -> Tensor:
         with self.autocast():
@@ -259,7 +264,7 @@ def _create_encoder(settings: VPLSettings, shape: DataShape) -> nn.Module:
     if settings.encoder == "preact-resnet18":
         return PreactResNet18(settings.image_size)
     if settings.encoder == "resnet18":
-        return FlatResNet18(settings.image_size, settings.pretrained, shape.inverted)
+        return FlatResNet18(settings.image_size, settings.pretrained is not None, shape.inverted)
     encoder = ENCODERS[settings.encoder]()
     if settings.image_size != encoder.image_size:
         raise ValueError(

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from torch import Tensor, nn
 
 from learn3d.networks.encoders import CODE_SIZE
-from learn3d.networks.resnet import ResNet18Encoder, load_pretrained
+from learn3d.networks.resnet import ResNet18Encoder
 
 
 class FlatResNet18(nn.Module):
@@ -15,12 +13,12 @@ class FlatResNet18(nn.Module):
 
     `inverted`: the images hold 1 - colour, see `ResNet18Encoder`.
 
-    `pretrained`: file of ImageNet weights (torchvision's resnet18). With it the batch norms stay as they are in the
-    file, statistics, gain and offset, as published; the convolutions are trained. Without it everything is trained from
-    scratch: batch norms frozen at their initial values would normalise nothing.
+    `frozen_norms`: the batch norms stay as they are (statistics, gain, offset) and the rest is trained: as published,
+    for weights of ImageNet (`load_pretrained` on `resnet`). Not for a network that is trained from scratch, where batch
+    norms at their initial values would normalise nothing.
     """
 
-    def __init__(self, image_size: int = 224, pretrained: Path | None = None, inverted: bool = False) -> None:
+    def __init__(self, image_size: int = 224, frozen_norms: bool = False, inverted: bool = False) -> None:
         super().__init__()
         if image_size < 32 or image_size % 32:
             raise ValueError(f"image_size must be a multiple of 32 for FlatResNet18, got {image_size}")
@@ -28,8 +26,7 @@ class FlatResNet18(nn.Module):
         self.resnet = ResNet18Encoder(inverted)
         self.code = nn.Linear(512 * (image_size // 32) ** 2, CODE_SIZE)
         self.frozen_norms: list[nn.BatchNorm2d] = []
-        if pretrained is not None:
-            load_pretrained(self.resnet, pretrained)
+        if frozen_norms:
             self.frozen_norms = [module for module in self.resnet.modules() if isinstance(module, nn.BatchNorm2d)]
             for norm in self.frozen_norms:
                 norm.requires_grad_(False)

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from learn3d.networks.flat_resnet import FlatResNet18
-from learn3d.networks.resnet import ResNet18Encoder
+from learn3d.networks.resnet import ResNet18Encoder, load_pretrained
 
 
 @pytest.fixture(scope="module")
@@ -26,12 +26,17 @@ def weights(tmp_path_factory) -> Path:
     return path
 
 
+def start(network: FlatResNet18, weights: Path) -> FlatResNet18:
+    load_pretrained(network.resnet, weights)
+    return network
+
+
 def norms(network: nn.Module) -> list[nn.BatchNorm2d]:
     return [module for module in network.modules() if isinstance(module, nn.BatchNorm2d)]
 
 
 def test_codes_are_linear_in_the_features(weights: Path) -> None:
-    network = FlatResNet18(64, weights).eval()
+    network = start(FlatResNet18(64, frozen_norms=True), weights).eval()
     plain = ResNet18Encoder().eval()
     plain.load_state_dict(torch.load(weights))
     images = torch.rand(2, 4, 64, 64)
@@ -45,7 +50,7 @@ def test_codes_are_linear_in_the_features(weights: Path) -> None:
 
 
 def test_pretrained_batch_norms_stay_as_they_are(weights: Path) -> None:
-    network = FlatResNet18(32, weights).train()
+    network = start(FlatResNet18(32, frozen_norms=True), weights).train()
     assert not any(norm.training or norm.weight.requires_grad for norm in norms(network))
     before = {name: value.clone() for name, value in network.state_dict().items()}
     optimizer = torch.optim.SGD([p for p in network.parameters() if p.requires_grad], lr=0.1)

@@ -142,9 +142,12 @@ def test_a_method_starts_from_pretrained_weights(tmp_path: Path) -> None:
     )
     assert settings.pretrained == tmp_path / "weights.pth"
     method = PoseInvariant(settings, DataShape(3, pose_features=9), "cpu", "fp32")
+    method.start_from_pretrained()
     assert torch.equal(method.encoder.conv1.weight, weights["conv1.weight"])
     with pytest.raises(ValueError, match="pretrained weights are for the encoder resnet18, not for ConvEncoder"):
-        PoseInvariant(PoseInvariantSettings(pretrained=tmp_path / "weights.pth"), DataShape(3), "cpu", "fp32")
+        PoseInvariant(
+            PoseInvariantSettings(pretrained=tmp_path / "weights.pth"), DataShape(3), "cpu", "fp32"
+        ).start_from_pretrained()
 
 
 class Runs:
