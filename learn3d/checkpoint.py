@@ -7,6 +7,7 @@ shapes and bytes of all tensors in the order of their names. Format 1 had the fi
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import zlib
 from pathlib import Path
@@ -98,7 +99,8 @@ def _tensors_crc(tensors: dict[str, Tensor]) -> str:
 def load(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what `save` wrote, on the CPU, and compare it with its checksums.
 
-    A truncated, changed or foreign file is a DamagedError; a missing one, or one of a later version, a ValueError.
+    A truncated, changed or foreign file is a DamagedError; a missing one, or one of a later version, a ValueError; one
+    that cannot be reached (no permission, a network drive that is away) an OSError.
     """
     return _read(path, tensors=True)
 
@@ -121,6 +123,8 @@ def _read(path: Path, *, tensors: bool) -> tuple[dict[str, Tensor], dict[str, An
             header = file.metadata() or {}
             contents = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}
     except (SafetensorError, OSError, ValueError) as error:
+        if isinstance(error, OSError) and error.errno not in (None, errno.EIO):
+            raise  # it cannot be reached: that is no damage
         raise DamagedError(
             f"{path} cannot be read as a checkpoint ({error}); it is damaged or was cut short: "
             "use another checkpoint of the run, or a copy"

@@ -53,6 +53,7 @@ class Ranks:
     world: int = 1
     rows: Tensor | None = None  # int64 [b]: the rows of every batch that are this process's own; None: all
     share: float = 1.0  # of the batch: the weight of this process's means
+    backend: str = ""  # what exchanges tensors: gloo, or NCCL for those on a GPU
 
     @property
     def alone(self) -> bool:
@@ -173,8 +174,9 @@ ALONE = Ranks()
 def start(device: str) -> Iterator[Ranks]:
     """This process among those that torchrun started, or `ALONE` where nobody did.
 
-    With the device cuda each process of a machine takes a GPU of its own, and NCCL sums on it. Where there are more
-    processes than GPUs they share them, over gloo. When the body raises, the other processes are told why.
+    With the device cuda each process of a machine takes a GPU of its own, and NCCL sums on it. Where on any machine
+    there are more processes than GPUs they share them, and all sum over gloo. When the body raises, the other processes
+    are told why.
     """
     world = int(os.environ.get("WORLD_SIZE", "1"))
     if world == 1:
@@ -182,17 +184,17 @@ def start(device: str) -> Iterator[Ranks]:
         return
     if missing := [name for name in ("RANK", "MASTER_ADDR", "MASTER_PORT") if name not in os.environ]:
         raise ValueError(f"WORLD_SIZE is {world}, but {', '.join(missing)} is not set; start the processes by torchrun")
-    rank, backend = int(os.environ["RANK"]), "gloo"
+    rank, own_gpu = int(os.environ["RANK"]), False
     check_device(device)
     if device == "cuda":
         gpus, local = torch.cuda.device_count(), int(os.environ.get("LOCAL_RANK", "0"))
         torch.cuda.set_device(local % gpus)
-        if int(os.environ.get("LOCAL_WORLD_SIZE", "1")) <= gpus:
-            backend = "cpu:gloo,cuda:nccl"
+        own_gpu = int(os.environ.get("LOCAL_WORLD_SIZE", "1")) <= gpus
     store, _, _ = next(rendezvous("env://", rank, world, timeout=TIMEOUT))
+    backend = "cpu:gloo,cuda:nccl" if all_agree(store, rank, world, own_gpu) else "gloo"
     dist.init_process_group(backend, store=dist.PrefixStore("run", store), rank=rank, world_size=world, timeout=TIMEOUT)
     try:
-        yield Ranks(rank, world)
+        yield Ranks(rank, world, backend="gloo" if backend == "gloo" else "NCCL")
     except BaseException as error:
         said = _announce(store, error)
         if backend == "gloo" and isinstance(
@@ -203,6 +205,12 @@ def start(device: str) -> Iterator[Ranks]:
             raise SystemExit(1) from None
         raise
     dist.destroy_process_group()
+
+
+def all_agree(store: dist.Store, rank: int, world: int, value: bool) -> bool:
+    """Whether `value` is true in every process; before there is a group, through the store that they meet at."""
+    store.set(f"agree/{rank}", str(value))
+    return all(store.get(f"agree/{other}") == b"True" for other in range(world))
 
 
 def label() -> str:
@@ -258,6 +266,8 @@ def sum_gradients(optimizer: torch.optim.Optimizer, *_: Any) -> None:
 def _all_reduce(values: Tensor, op: Any = dist.ReduceOp.SUM) -> None:
     try:
         dist.all_reduce(values, op)
+    except torch.cuda.OutOfMemoryError:
+        raise
     except RuntimeError as error:  # a closed connection, or nobody answered in time
         raise LostPeerError(str(error).strip().splitlines()[0].split(". ")[0]) from None
 

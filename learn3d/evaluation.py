@@ -35,8 +35,8 @@ class Evaluation:
     ious: dict[
         Definition, Tensor
     ]  # float [M] per voxeliser; NaN where prediction and truth are empty; {} without truth
-    chamfer_l1: Tensor | None  # float [M], None when not asked for or without truth
-    f_score: Tensor | None  # float [M], likewise
+    chamfer_l1: Tensor | None  # float [M], NaN where a surface is empty; None when not asked for or without truth
+    f_score: Tensor | None  # float [M], 0 where the prediction alone is empty; likewise
     silhouette_iou: Tensor | None  # float [M], where there are no voxels and shapes are meshes
     mmd: float | None
     mmd_paper: float | None
@@ -55,6 +55,11 @@ class Evaluation:
     def undefined(self) -> int:
         """Images whose prediction and truth are both empty; they are left out of the mean."""
         return int(next(iter(self.ious.values())).isnan().sum()) if self.ious else 0
+
+    @property
+    def without_distance(self) -> int | None:
+        """Images whose predicted (or true) surface is empty; they are left out of the mean Chamfer distance."""
+        return None if self.chamfer_l1 is None else int(self.chamfer_l1.isnan().sum())
 
     @property
     def voxel_iou(self) -> float | None:
@@ -81,6 +86,7 @@ class Evaluation:
             "mmd_codes": self.mmd_codes,
             "images": self.images,
             "undefined": self.undefined,
+            "without_distance": self.without_distance,
         }
 
 
@@ -286,7 +292,8 @@ def _sample(vertices: Tensor, faces: Tensor, generator: torch.Generator) -> Tens
 
 
 def _compare(a: Tensor, b: Tensor) -> tuple[float, float]:
-    """(Chamfer-L1, F-score) of two sets of points; NaN where one is empty."""
+    """(Chamfer-L1, F-score) of two sets of points. A set that is empty has no distance (NaN), and where the other is
+    not, nothing of either is found: an F-score of 0."""
     if not (len(a) and len(b)):
-        return math.nan, math.nan
+        return math.nan, 0.0 if len(a) or len(b) else math.nan
     return float(nmr.metrics.chamfer_distance(a, b, form="l1")), float(nmr.metrics.f_score(a, b, F_SCORE_DISTANCE))

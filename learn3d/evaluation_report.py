@@ -55,6 +55,11 @@ def evaluate_runs(
             result = evaluate(method, dataset, definitions=("kato18", "kato19"), paper_mmd=True, surfaces=True)
             if result.undefined:
                 report_progress(f"warning: {result.undefined} images have no IoU (both shapes empty); left out")
+            if result.without_distance:
+                report_progress(
+                    f"warning: {result.without_distance} images have no Chamfer distance, as the predicted surface is "
+                    "empty; left out of its mean (their F-score is 0)"
+                )
             about = {
                 "checkpoint": str(file),
                 "category": name,

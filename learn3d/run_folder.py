@@ -92,7 +92,8 @@ def claim(folder: Path, overwrite: bool) -> None:
                 "or choose another folder"
             )
         del found
-        for path in (*checkpoints(folder), *(folder / name for name in (CONFIG, BEST, METRICS, JOURNAL, DAMAGED))):
+        # The options first: without them a kill in between leaves nothing that could be taken for the old run.
+        for path in (folder / CONFIG, *checkpoints(folder), *(folder / n for n in (BEST, METRICS, JOURNAL, DAMAGED))):
             path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # something of the user's is in it
             (folder / EARLIER).rmdir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,13 +64,16 @@ def save_last(
     """Write last.safetensors: networks, optimizers, random state, progress, configuration, conditions and versions.
 
     A complete file has that name at every moment; the ones before it are kept as `config.keep_checkpoints` says.
+    Raises FloatingPointError, with nothing written, for values that are not finite, as they could not be resumed from.
     """
     check_networks(method)
     tensors = checkpoint.network_tensors(method) | {"random.cpu": torch.get_rng_state()}
     if config.device == "cuda":
         tensors["random.cuda"] = torch.cuda.get_rng_state()
     for name, optimizer in method.optimizers.items():
-        tensors |= checkpoint.optimizer_tensors(name, optimizer)
+        state = checkpoint.optimizer_tensors(name, optimizer)
+        _check_finite(f"the optimizer of the {name}", state)
+        tensors |= state
     metadata = checkpoint.method_metadata(shape, config) | dataclasses.asdict(progress)
     metadata |= {"conditions": dataclasses.asdict(conditions), "versions": versions()}
     if config.keep_checkpoints > 1:
@@ -78,12 +82,13 @@ def save_last(
     run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
 
 
-def load_last(folder: Path, config: TrainConfig) -> Saved | None:
+def load_last(folder: Path, config: TrainConfig, *, repair: bool = True) -> Saved | None:
     """The newest checkpoint of the run in `folder` that is whole, or None where the run was stopped before its first.
 
-    A damaged last.safetensors is put aside and the one before it takes its place; `notes` say so. Raises ValueError
-    where there is no run, or one without a checkpoint that began with other options than `config`, and DamagedError
-    where there are checkpoints, but none of them is whole.
+    A damaged last.safetensors is put aside and the one before it takes its place; `notes` say so. Without `repair` it
+    is an error instead: of several processes only the first one repairs, before the others look. Raises ValueError
+    where there is no run, or one without a checkpoint that began with other options than `config`, DamagedError where
+    there are checkpoints, but none of them is whole, and OSError where one cannot be reached.
     """
     candidates = run_folder.checkpoints(folder)
     if not candidates and not (folder / CONFIG).is_file():
@@ -93,6 +98,8 @@ def load_last(folder: Path, config: TrainConfig) -> Saved | None:
         try:
             tensors, metadata = checkpoint.load(path)
         except checkpoint.DamagedError as error:
+            if not repair:
+                raise
             notes.append(str(error))
             continue
         checkpoint_checks.require_run(metadata, path)
@@ -152,5 +159,11 @@ def _check_conditions(now: Conditions, recorded: dict[str, object], data: Path) 
 def check_networks(method: Method) -> None:
     """Refuse to save networks that are no longer finite: the checkpoint on disk is better than they are."""
     for name, network in method.networks.items():
-        if not all(bool(parameter.isfinite().all()) for parameter in network.parameters()):
-            raise FloatingPointError(f"the {name} has weights that are not finite")
+        _check_finite(f"the {name}", network.state_dict())
+
+
+def _check_finite(owner: str, tensors: Mapping[str, Tensor]) -> None:
+    """What is not finite would be refused when it is read again."""
+    for name, tensor in tensors.items():
+        if not bool(tensor.isfinite().all()):
+            raise FloatingPointError(f"{owner} has values that are not finite ({name})")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
     """A tensor on the CPU as one on `device`, in the order of what is queued there; its gradient comes back."""
-    if tensor.device == device or device.type == "cpu":
+    if device.type == "cpu" or tensor.device.type != "cpu":
         return tensor.to(device)
     return _Uploaded.apply(tensor, device)
 

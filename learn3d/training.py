@@ -71,7 +71,7 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
     folder, saved = config.output, None
     if resume:
         with ranks.main_first():  # it may have to put an earlier checkpoint in place
-            saved = load_last(folder, config)
+            saved = load_last(folder, config, repair=ranks.main)
     # A run goes on as it began, also one from before encoders could turn colours back.
     inverted = train_set.inverted if saved is None else saved.shape.inverted
     shape = DataShape(train_set.num_views, train_set.num_classes, train_set.poses.num_features, inverted)
@@ -82,11 +82,9 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
     conditions = Conditions(len(train_set), f"{zlib.crc32(np.ascontiguousarray(train_set.images)):08x}", precision)
     if saved is not None:
         restore(saved, config, conditions, method, progress)
-    elif not resume and ranks.main:
-        run_folder.claim(folder, overwrite)
     notes = () if saved is None else saved.notes
     del saved  # and its tensors
-    if ranks.main:
+    if ranks.main and resume:
         run_folder.remove_partials(folder)
     if progress.step > config.iterations:
         raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
@@ -95,8 +93,10 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
             run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
         return _summary(folder, config, progress, started)
     ranks.join(method)
-    ranks.check_same(**_beginning(config, conditions, val_set, method, progress))
+    ranks.check_same(**_beginning(config, conditions, train_set, val_set, method, progress))
     if ranks.main:
+        if not resume:
+            run_folder.claim(folder, overwrite)
         files.write_json(folder / run_folder.CONFIG, config_to_dict(config), sync=True)
     before = progress.seconds
     # A GPU's host and processes that wait for each other have idle threads by nature.
@@ -170,7 +170,12 @@ def _open_log(config: TrainConfig, progress: Progress, ranks: Ranks) -> RunLog |
 
 
 def _beginning(
-    config: TrainConfig, conditions: Conditions, val_set: ViewDataset, method: Method, progress: Progress
+    config: TrainConfig,
+    conditions: Conditions,
+    train_set: ViewDataset,
+    val_set: ViewDataset,
+    method: Method,
+    progress: Progress,
 ) -> dict[str, object]:
     """What must be the same in all processes when they begin, by the name that a user knows it by."""
     if method.ranks.alone:
@@ -179,8 +184,8 @@ def _beginning(
     return {
         "options": config_to_dict(options),
         "precision": conditions.precision,
-        "training data": conditions,
-        "validation data": (len(val_set), zlib.crc32(np.ascontiguousarray(val_set.images))),
+        "training data": (conditions, train_set.digest()),
+        "validation data": (len(val_set), val_set.digest()),
         "steps taken": progress.step,
         "weights": weights_digest(method),
     }
@@ -191,7 +196,7 @@ def _describe(
 ) -> str:
     where = f"{config.device}, {precision}, {torch.get_num_threads()} threads"
     if not ranks.alone:
-        where += f" in each of {ranks.world} processes"
+        where += f" in each of {ranks.world} processes ({ranks.backend})"
     data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
     verb = f"resuming at step {at.step}" if at.step else "training"
     name = f"{PRESETS[config.preset].label} ({config.preset})"

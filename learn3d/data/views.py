@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -129,6 +130,14 @@ class ViewDataset:
     def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
         """Occupancy bool [B, 32, 32, 32] of predictions in the data set's voxel axes; see `VoxelConvention`."""
         return self.convention.voxelize(vertices, faces, definition)
+
+    def digest(self) -> int:
+        """CRC-32 of all that is learnt from or compared with: images, masks, poses, classes, voxels."""
+        parts = (self.images, self.masks, self.view_ids, self.object_ids, self.class_ids, self.voxels)
+        crc = zlib.crc32(np.ascontiguousarray(self.poses.features().numpy()))
+        for part in parts:
+            crc = zlib.crc32(np.ascontiguousarray(part), crc) if part is not None else crc
+        return crc
 
     def with_bins(self, bins: AngleBins) -> ViewDataset:
         """The same views with pose classes from cells of azimuth and elevation."""

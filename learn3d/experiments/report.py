@@ -34,8 +34,9 @@ PROTOCOL = {
     "mmd": f"mean over all pairs of view classes, up to {CODES_PER_VIEW} codes each; five kernels, no root (the "
     "published code, and the paper's table)",
     "mmd_paper": "the same by the printed formula: one kernel, square root",
-    "chamfer_l1": f"between {SURFACE_POINTS} points of each surface, units of the object frame",
-    "f_score": f"of the same points at {F_SCORE_DISTANCE} of the longest side",
+    "chamfer_l1": f"between {SURFACE_POINTS} points of each surface, units of the object frame; an empty "
+    "prediction has none and is left out",
+    "f_score": f"of the same points at {F_SCORE_DISTANCE} of the longest side; 0 for an empty prediction",
     "interval_seeds": f"{LEVEL:.0%} interval of the mean over seeds (Student's t)",
     "interval_objects": f"{LEVEL:.0%} interval over test objects: {RESAMPLES} resamples of objects, not images; the "
     "differences to the baseline are paired",

@@ -31,5 +31,7 @@ def create_method(
         PrGANSettings: PrGAN,
     }
     check_device(device)
+    if device == "cuda":
+        torch.backends.cudnn.allow_tf32 = False  # torch's default for convolutions; fp32 is to mean fp32
     torch.manual_seed(seed)
     return methods[type(settings)](settings, shape, device, precision)

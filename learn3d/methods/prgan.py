@@ -25,6 +25,7 @@ from learn3d.networks.voxel_gan import (
     SilhouetteDiscriminator,
     VoxelGenerator,
 )
+from learn3d.staging import upload
 
 BETAS = (0.5, 0.999)  # of Adam, for the two networks of the GAN
 
@@ -109,17 +110,19 @@ class PrGAN(Method):
         return Grids((self.generator(codes) * TAU).cpu(), self.settings.occupancy_threshold)
 
     def sample_z(self, count: int) -> Tensor:
-        """z ~ U(-1, 1), float32 [count, 201], from torch's global random state on the CPU, whatever the device."""
-        return (2 * torch.rand(count, SHAPE_CODE + 1) - 1).to(self.device)
+        """z ~ U(-1, 1), float32 [count, 201] on the CPU, from torch's global random state."""
+        return 2 * torch.rand(count, SHAPE_CODE + 1) - 1
 
     def view_ids(self, z: Tensor) -> Tensor:
         """The view that the last entry of z asks for: floor((v + 1) K / 2), int64 [B] in 0 .. K-1."""
         return ((z[:, -1] + 1) * (self.views.count / 2)).long().clamp(0, self.views.count - 1)
 
     def generate(self, z: Tensor) -> Tensor:
-        """Silhouettes [B, 64, 64] of what z [B, 201] stands for. In float32: bf16 makes these layers slow on CPUs."""
+        """Silhouettes [B, 64, 64] of what z [B, 201], on the CPU, stands for. In float32: bf16 makes these layers slow
+        on CPUs."""
+        codes = upload(z[:, :SHAPE_CODE], self.device)
         with autocast(self.device, "fp32"):
-            return project(self.generator(z[:, :SHAPE_CODE]), self.view_ids(z), self.views, TAU)
+            return project(self.generator(codes), self.view_ids(z), self.views, TAU)
 
     def train_step(self, batch: Batch, step: int) -> dict[str, float]:
         """A step of the GAN before `encoder_from_step`, of the encoder from there on.
@@ -131,7 +134,7 @@ class PrGAN(Method):
             optimizer.zero_grad(set_to_none=True)
         if step >= self.settings.encoder_from_step:
             return self._encoder_step(batch.whole, step)
-        return self._gan_step(batch.masks.to(self.device), batch.whole, step)
+        return self._gan_step(upload(batch.masks, self.device), batch.whole, step)
 
     def _gan_step(self, real: Tensor, whole: Whole, step: int) -> dict[str, float]:
         """Discriminator (where its accuracy at the start is at most 0.8), then generator, then generator once more: on
@@ -168,7 +171,9 @@ class PrGAN(Method):
             estimate = self.encoder(images)
         losses: dict[str, float] = {}
         # A sum over the batch: that over the own rows stands for a part of it only.
-        self._take_step("encoder", (estimate.float() - z).square().sum() / self.ranks.share, losses, step)
+        self._take_step(
+            "encoder", (estimate.float() - upload(z, self.device)).square().sum() / self.ranks.share, losses, step
+        )
         losses["total"] = losses["encoder"]
         return losses
 

@@ -117,7 +117,7 @@ class SymmetricSphereGenerator(nn.Module):
             raise RuntimeError("the icosphere is not symmetric about z = 0")
         buffers = {"sphere": sphere.float(), "faces": faces, "edges": nmr.edge_table(faces)}
         buffers |= {"middle": middle, "right": right, "left": left}
-        buffers |= {"order": torch.cat([middle, right, left]).argsort()}
+        buffers |= {"order": torch.cat([middle, right, left]).argsort(), "mirror": torch.tensor([1.0, 1.0, -1.0])}
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
         self.layers = nn.Sequential(
@@ -133,7 +133,7 @@ class SymmetricSphereGenerator(nn.Module):
         count = len(self.middle)
         middle = F.pad(outputs[:, : 2 * count].reshape(-1, count, 2), (0, 1))
         right = outputs[:, 2 * count :].reshape(-1, len(self.right), 3)
-        left = right * right.new_tensor([1.0, 1.0, -1.0])
+        left = right * self.mirror
         return deform_sphere(self.sphere, torch.cat([middle, right, left], dim=1)[:, self.order])
 
 

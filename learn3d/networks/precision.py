@@ -18,7 +18,8 @@ def resolve_precision(precision: Literal["auto", "bf16", "fp32"], device: str) -
     if precision != "auto":
         return precision
     if device == "cuda":
-        return "bf16" if torch.cuda.is_bf16_supported() else "fp32"
+        # By itself, is_bf16_supported() also says yes where bf16 is emulated.
+        return "bf16" if torch.cuda.is_bf16_supported(including_emulation=False) else "fp32"
     try:
         with open(CPUINFO) as file:
             flags = next((line.split(":", 1)[1].split() for line in file if line.startswith("flags")), [])

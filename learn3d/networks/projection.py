@@ -64,8 +64,9 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
     """Soft silhouettes P = 1 - exp(-tau * integral of the density along the ray), float32 [B, S, S], row 0 = top.
 
     density float32 [B, S, S, S] at the voxel centres of the box [-0.5, 0.5]^3, axes (x, y, z) of the object frame, zero
-    outside; trilinear between the centres. view_ids int64 [B] in 0 .. K-1. The integral is measured in voxels: a solid
-    of density 1 and a thickness of n voxels gives 1 - exp(-tau n). Differentiable in the density.
+    outside; trilinear between the centres. view_ids int64 [B] in 0 .. K-1, best on the CPU, as they choose tables. The
+    integral is measured in voxels: a solid of density 1 and a thickness of n voxels gives 1 - exp(-tau n).
+    Differentiable in the density.
     """
     size = density.shape[-1]
     if density.shape[1:] != (size,) * 3 or view_ids.shape != density.shape[:1]:
@@ -74,7 +75,7 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
         )
     # Turning an object by a quarter only renumbers its voxels: the tables of a quarter of the circle serve all.
     quarter = views.count // 4 if views.count % 4 == 0 else views.count
-    thickness = torch.empty_like(density[:, :, :, 0]).flatten(1)
+    view_ids = view_ids.cpu()
     volumes, parts, order = density.unbind(), [], []
     for base in (view_ids % quarter).unique().tolist():
         members = (view_ids % quarter == base).nonzero()[:, 0]
@@ -82,7 +83,7 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
         forward, backward = ray_table(views, base, size, density.device)
         parts.append(_Integrate.apply(torch.stack(turned, dim=1), *forward, *backward).T)
         order.append(members)
-    thickness = torch.cat(parts)[torch.cat(order).argsort()]
+    thickness = torch.cat(parts)[torch.cat(order).argsort().to(density.device)]
     return 1 - torch.exp(-tau * thickness).reshape(-1, size, size)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -11,7 +13,8 @@ import torch
 from runs import check_same
 from safetensors.torch import load_file, save_file
 
-from learn3d import checkpoint, run_folder
+from learn3d import checkpoint, run_folder, run_state
+from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.training import train
 
 
@@ -75,6 +78,50 @@ def test_the_checkpoint_before_is_used(tiny_run, undisturbed, stopped, run_folde
         assert (run_folder / "damaged.safetensors").read_bytes() == broken
         (run_folder / "damaged.safetensors").unlink()
     check_same(run_folder, undisturbed)
+
+
+def test_a_checkpoint_that_cannot_be_reached_is_no_damage(tiny_run, stopped, run_folder, monkeypatch) -> None:
+    shutil.copytree(stopped, run_folder)
+    before = {path.name: path.read_bytes() for path in run_folder.rglob("*.safetensors")}
+
+    def away(*_, **__):
+        raise OSError(errno.ESTALE, "Stale file handle")
+
+    monkeypatch.setattr(checkpoint, "safe_open", away)
+    with pytest.raises(OSError, match="Stale file handle"):
+        train(tiny_run(run_folder), resume=True)
+    assert {path.name: path.read_bytes() for path in run_folder.rglob("*.safetensors")} == before
+
+
+def test_only_the_first_process_repairs(tiny_run, stopped, run_folder) -> None:
+    shutil.copytree(stopped, run_folder)
+    cut(run_folder / "last.safetensors")
+    names = sorted(path.name for path in run_folder.rglob("*"))
+    with pytest.raises(checkpoint.DamagedError, match="is damaged or was cut short"):
+        run_state.load_last(run_folder, tiny_run(run_folder), repair=False)
+    assert sorted(path.name for path in run_folder.rglob("*")) == names
+
+
+def test_what_could_not_be_resumed_is_not_saved(tiny_run, stopped, run_folder, monkeypatch) -> None:
+    """Adam's second moment overflows long before a weight does: its square is 1e42 for a gradient of 1e21."""
+    shutil.copytree(stopped, run_folder)
+    before = (run_folder / "last.safetensors").read_bytes()
+    real = PoseInvariant.train_step
+
+    def explode(method, batch, step):
+        losses = real(method, batch, step)
+        method.optimizers["encoder"].state[next(method.encoder.parameters())]["exp_avg_sq"].fill_(math.inf)
+        return losses
+
+    monkeypatch.setattr(PoseInvariant, "train_step", explode)
+    with pytest.raises(
+        FloatingPointError, match="the optimizer of the encoder has values that are not finite"
+    ) as error:
+        train(tiny_run(run_folder), resume=True)
+    assert "the last good checkpoint is" in str(error.value)
+    assert (run_folder / "last.safetensors").read_bytes() == before
+    monkeypatch.undo()
+    assert train(tiny_run(run_folder), resume=True).finished
 
 
 def test_when_none_is_whole_the_run_says_so_and_leaves_all_as_it_is(tiny_run, stopped, run_folder) -> None:

@@ -12,8 +12,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -21,7 +23,7 @@ from train_in_ranks import evaluate_last, linear_optimizer
 
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.data import augment as augmentation
-from learn3d.distributed import ALONE, Ranks, label, start
+from learn3d.distributed import ALONE, Ranks, all_agree, label, start
 from learn3d.networks.whole_batch_norm import use_whole_batch
 from learn3d.training import train
 
@@ -116,6 +118,26 @@ def test_batch_norm_of_one_process_is_the_usual_one() -> None:
     torch.testing.assert_close(inputs[0].grad, inputs[1].grad, atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(usual.state_dict(), ours.state_dict())
     torch.testing.assert_close(usual.eval()(x), ours.eval()(x), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(("values", "agreed"), [((True, True, True), True), ((True, False, True), False)])
+def test_nccl_is_taken_where_all_can(values: tuple[bool, ...], agreed: bool) -> None:
+    store = torch.distributed.HashStore()
+    with ThreadPoolExecutor(len(values)) as threads:
+        found = threads.map(lambda own: all_agree(store, own[0], len(values), own[1]), enumerate(values))
+        assert list(found) == [agreed] * len(values)
+
+
+@pytest.mark.parametrize("name", ["images", "masks", "poses", "view_ids", "object_ids", "voxels"])
+def test_all_data_count_when_processes_compare_them(tiny_set, name: str) -> None:
+    own = dataclasses.replace(tiny_set, masks=tiny_set.images[:, 3].copy())
+    value = getattr(own, name)
+    if name == "poses":
+        other = dataclasses.replace(value, azimuth_deg=value.azimuth_deg.roll(1))
+    else:
+        other = np.roll(value, 1, axis=0)
+    assert own.digest() == dataclasses.replace(own).digest()
+    assert dataclasses.replace(own, **{name: other}).digest() != own.digest()
 
 
 # --- two processes

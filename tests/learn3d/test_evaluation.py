@@ -81,6 +81,22 @@ def test_points_of_the_data_set_are_the_truth_where_it_has_them(tiny_set) -> Non
     assert 0.2 <= result.summary()["chamfer_l1"] < 0.45  # from the centre to the egg
 
 
+def test_an_empty_prediction_has_an_f_score_and_no_distance(tiny_set) -> None:
+    shape = egg()
+    half = torch.zeros(2, 64, 64, 64)
+    half[0, 16:48, 16:48, 16:48] = 1
+    empty_second = Grids(half)
+    result = evaluate(
+        Constant(empty_second), with_truth(tiny_set, shape.vertices, shape.faces), max_images=2, surfaces=True
+    )
+    assert result.chamfer_l1.isnan().tolist() == [False, True]
+    assert result.f_score[0] > 0 and result.f_score[1] == 0
+    summary = result.summary()
+    assert summary["without_distance"] == 1
+    assert summary["f_score"] == pytest.approx(float(result.f_score[0]) / 2), "counted, not left out"
+    assert summary["chamfer_l1"] == pytest.approx(float(result.chamfer_l1[0])), "left out"
+
+
 def test_both_voxelisers(tiny_set) -> None:
     shape = egg()
     data = with_truth(tiny_set, shape.vertices, shape.faces)

@@ -134,6 +134,24 @@ def test_overwriting_leaves_what_is_not_of_a_run(tmp_path) -> None:
     assert sorted(path for path in tmp_path.rglob("*") if path.is_file()) == sorted(mine)
 
 
+def test_a_kill_while_a_run_is_replaced_leaves_nothing_to_continue(tmp_path, monkeypatch) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    for name in ("config.json", "last.safetensors", "checkpoints/step-000002.safetensors"):
+        (tmp_path / name).write_text("of the old run")
+    remove, removed = Path.unlink, []
+
+    def killed(path, **options):
+        if removed:
+            raise KeyboardInterrupt
+        removed.append(path.name)
+        remove(path, **options)
+
+    monkeypatch.setattr(Path, "unlink", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run_folder.claim(tmp_path, overwrite=True)
+    assert removed == ["config.json"], "without it --resume finds no run"
+
+
 def test_half_written_files_do_not_make_a_folder_used_and_are_removed(tmp_path) -> None:
     (tmp_path / ".config.json.partial").write_text("{")
     run_folder.claim(tmp_path, overwrite=False)

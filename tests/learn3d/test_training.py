@@ -440,6 +440,6 @@ def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> 
     with torch.no_grad():
         method.generator.layers[0].bias[3] = float("inf")
     run_folder.mkdir()
-    with pytest.raises(FloatingPointError, match="generator has weights that are not finite"):
+    with pytest.raises(FloatingPointError, match="generator has values that are not finite"):
         run_state.save_last(run_folder, config, None, method, DataShape(24), run_state.Progress())
     assert not list(run_folder.iterdir())
