@@ -70,6 +70,10 @@ def _is_shape(value: Any) -> bool:
     return all(_count(_SHAPE[name])(number) for name, number in numbers.items())
 
 
+def _are_numbers(value: Any) -> bool:
+    return isinstance(value, dict) and all(_is_number(item) for item in value.values())
+
+
 def _are_conditions(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(item, (str, int, float)) for item in value.values())
 
@@ -84,6 +88,7 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "seconds": _NUMBER,
     "best_iou": _NUMBER,
     "object_share": _NUMBER,
+    "losses": (_are_numbers, "a set of finite numbers by name"),
     "config": _BY_NAME,
     "versions": _BY_NAME,
     "conditions": (_are_conditions, "a set of numbers and words by name"),

@@ -116,6 +116,10 @@ class TrainConfig:
         for name in ("iterations", *_REPORTING):
             _check_positive_int(name, getattr(self, name), limits.ITERATIONS)
         _check_positive_int("batch_size", self.batch_size, limits.BATCH_SIZE)
+        if self.sampling == "pairs" and self.batch_size % 2:
+            raise ValueError(
+                f"sampling 'pairs' takes two views of each object: batch_size must be even, got {self.batch_size}"
+            )
         if getattr(self.settings, "encoder_from_step", 0) > self.iterations:
             raise ValueError(
                 f"encoder_from_step={self.settings.encoder_from_step} lies beyond the {self.iterations} iterations: "

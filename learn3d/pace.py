@@ -23,13 +23,15 @@ class CoreShare:
         threads: int,
         *,
         seconds: float = 20.0,
-        skipped_steps: int = 2,
+        skipped_steps: int = 1,
+        cores: int | None = None,
         clock: Callable[[], float] = time.monotonic,
         cpu_clock: Callable[[], float] = time.process_time,
     ) -> None:
         self.threads = threads
+        self.cores = usable_cores() if cores is None else cores
         self.seconds = seconds
-        self._skipped = skipped_steps  # the first ones also allocate memory and choose kernels
+        self._skipped = skipped_steps  # the first one also allocates memory and chooses kernels
         self._clock, self._cpu_clock = clock, cpu_clock
         self._start: tuple[float, float] | None = None
         self._done = threads < 2  # one thread waits for nobody, and there is no better number
@@ -38,6 +40,10 @@ class CoreShare:
         """Call it after each step: a sentence once the share is known and small, None otherwise."""
         if self._done:
             return None
+        if self.threads > self.cores:
+            self._done = True
+            have = f"{self.threads} threads on {self.cores} cores"
+            return f"{have} wait for each other; stop with Ctrl-C and continue with --threads {self.cores}"
         if self._skipped > 0:
             self._skipped -= 1
             return None
@@ -52,7 +58,12 @@ class CoreShare:
             return None
         fitting = max(1, int(used / passed + 0.25))
         return (
-            f"{self.threads} threads got the time of {used / passed:.1f} of {os.cpu_count()} cores: other programs are "
+            f"{self.threads} threads got the time of {used / passed:.1f} of {self.cores} cores: other programs are "
             f"busy, or this one may not use all cores. Threads that wait for each other can make a step many times "
             f"slower; if it stays so, stop with Ctrl-C and continue with --threads {fitting}"
         )
+
+
+def usable_cores() -> int:
+    """Cores that this process may use; a container's share of their time, if it has one, is not seen here."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -17,15 +17,18 @@ import contextlib
 import os
 import shlex
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from learn3d import checkpoint, files
+from learn3d.config import load_config
 
 CONFIG, LAST, BEST = "config.json", "last.safetensors", "best.safetensors"
 METRICS, JOURNAL, DAMAGED = "metrics.jsonl", "journal.txt", "damaged.safetensors"
 EARLIER, PICTURES, TENSORBOARD = "checkpoints", "pictures", "tensorboard"
 LOCK = ".lock"
+_PARTS = {PICTURES: "[0-9]" * 6 + "*.png", TENSORBOARD: "events.out.tfevents.*"}
 
 
 @contextlib.contextmanager
@@ -83,23 +86,58 @@ def _locked(path: Path) -> int:
 def claim(folder: Path, overwrite: bool) -> None:
     """Take an empty folder for a new run; one with something in it is refused, or with `overwrite` cleared of a run.
 
-    What a run that was killed before it had anything leaves behind (a lock, a half-written file) does not count.
+    What a run that was killed before it had anything leaves behind (a lock, a half-written file) does not count. Only
+    what a run has written is removed. Raises ValueError where files have names of a run's and there is no run.
     """
-    if found := [path for path in folder.iterdir() if path.name != LOCK and not path.match(".*.partial")]:
-        if not overwrite:
-            raise ValueError(
-                f"{folder} is not empty; continue that run (--resume), replace it (--overwrite) "
-                "or choose another folder"
-            )
-        del found
-        # The options first: without them a kill in between leaves nothing that could be taken for the old run.
-        for path in (folder / CONFIG, *checkpoints(folder), *(folder / n for n in (BEST, METRICS, JOURNAL, DAMAGED))):
-            path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # something of the user's is in it
-            (folder / EARLIER).rmdir()
-        for name in (TENSORBOARD, PICTURES):
-            shutil.rmtree(folder / name, ignore_errors=True)
+    present = [path for path in _files(folder) if path.exists()]
+    if present and not is_run(folder):
+        raise ValueError(
+            f"{folder} has {present[0].relative_to(folder)}, but no run that it could belong to; choose another folder"
+        )
+    if present and not overwrite:
+        raise ValueError(
+            f"{folder} has a run; continue it (--resume), replace it (--overwrite) or choose another folder"
+        )
+    if not overwrite and any(path.name != LOCK and not path.match(".*.partial") for path in folder.iterdir()):
+        raise ValueError(
+            f"{folder} is not empty; choose another folder, or put the run beside what is in it (--overwrite)"
+        )
+    for path in present:
+        path.unlink(missing_ok=True)
+    for name in (*_PARTS, EARLIER):
+        with contextlib.suppress(OSError):  # there is none, or something of the user's is in it
+            (folder / name).rmdir()
     remove_partials(folder)
+
+
+def is_run(folder: Path) -> bool:
+    """Whether the options or a checkpoint of a run lie in the folder."""
+    try:
+        load_config(folder / CONFIG)
+        return True
+    except (ValueError, OSError):
+        pass
+    for path in (*checkpoints(folder), folder / BEST):
+        try:
+            if path.is_file():
+                checkpoint.load_metadata(path)
+                return True
+        except checkpoint.DamagedError:
+            pass
+        except ValueError:  # of a later version
+            return True
+    return False
+
+
+def _files(folder: Path) -> list[Path]:
+    """What a run writes, there or not, in the order in which it can be removed.
+
+    The options first, without which a kill in between leaves nothing that could be continued by mistake; the
+    checkpoints last, so that the rest is still known as a run's.
+    """
+    parts = [path for name, pattern in _PARTS.items() for path in (folder / name).glob(pattern)]
+    logs = [folder / name for name in (METRICS, JOURNAL, DAMAGED)]
+    return [folder / CONFIG, *logs, *parts, *checkpoints(folder), folder / BEST]
 
 
 def remove_partials(folder: Path) -> None:
@@ -153,8 +191,13 @@ def put_in_place(path: Path) -> None:
 
 
 def resume_command(folder: Path) -> str:
-    """The command line that continues the run in `folder`, quoted for a POSIX shell."""
-    return f"python tools/train.py --output {shlex.quote(str(folder))} --resume"
+    """The command line that continues the run in `folder`, by the program that runs now, quoted for a POSIX shell."""
+    program = ["python", "tools/train.py"]
+    if os.path.basename(sys.argv[0]) == "train.py":
+        found = shutil.which("python")
+        same = found is not None and os.path.samefile(found, sys.executable)
+        program = ["python" if same else sys.executable, sys.argv[0]]
+    return shlex.join([*program, "--output", str(folder), "--resume"])
 
 
 def last_good(folder: Path) -> str:

@@ -14,7 +14,7 @@ from torch import Tensor
 from learn3d import checkpoint, checkpoint_checks, run_folder
 from learn3d.config import TrainConfig, check_resume, config_from_dict, load_config
 from learn3d.methods import DataShape, Method
-from learn3d.run_folder import CONFIG, LAST
+from learn3d.run_folder import BEST, CONFIG, LAST
 from learn3d.versions import versions
 
 
@@ -27,6 +27,7 @@ class Progress:
     best_step: int = 0
     seconds: float = 0.0  # spent in training, over all resumptions
     object_share: float = 0.0  # side of the objects' bounding squares over that of the pictures, training mean
+    losses: dict[str, float] = dataclasses.field(default_factory=dict)  # of the last step
 
 
 @dataclass(frozen=True)
@@ -108,9 +109,26 @@ def load_last(folder: Path, config: TrainConfig, *, repair: bool = True) -> Save
             notes.append(f"going on from the checkpoint before it, {path}; the steps since then are repeated")
         return Saved(path, tensors, metadata, tuple(notes))
     if candidates:
-        raise checkpoint.DamagedError("; ".join(notes) + "; no checkpoint is whole: start a new run (--overwrite)")
-    check_resume(config, load_config(folder / CONFIG))
+        left = f"; {BEST} can still be evaluated" if _reached_by(folder / BEST) else ""
+        raise checkpoint.DamagedError(
+            "; ".join(notes) + f"; no checkpoint is whole: start a new run (--overwrite){left}"
+        )
+    began = load_config(folder / CONFIG)
+    check_resume(config, began)
+    if (reached := _reached_by(folder / BEST)) > began.checkpoint_every:
+        raise ValueError(
+            f"the run in {folder} came to step {reached} at least ({BEST}), but its checkpoints are missing: put "
+            f"{LAST} or one of {run_folder.EARLIER}/ back, or replace the run (--overwrite)"
+        )
     return None
+
+
+def _reached_by(path: Path) -> int:
+    """The step of a checkpoint; 0 where there is none that can be read."""
+    try:
+        return checkpoint.load_metadata(path).get("step", 0)
+    except ValueError:
+        return 0
 
 
 def restore(saved: Saved, config: TrainConfig, conditions: Conditions, method: Method, progress: Progress) -> None:
@@ -123,6 +141,8 @@ def restore(saved: Saved, config: TrainConfig, conditions: Conditions, method: M
     before, recorded = config_from_dict(metadata["config"], source=str(saved.path)), metadata.get("conditions", {})
     if recorded.get("precision") == conditions.precision:  # asked for by name or by "auto", it is the same
         before = dataclasses.replace(before, precision=config.precision)
+    elif config.precision != "auto" and recorded.get("precision") in ("bf16", "fp32"):
+        before = dataclasses.replace(before, precision=recorded["precision"])  # what its "auto" was
     check_resume(config, before)
     _check_conditions(conditions, recorded, config.data)
     checkpoint.restore_networks(method, tensors, saved.path)

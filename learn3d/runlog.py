@@ -53,6 +53,8 @@ class RunLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        if error is not None:  # whoever catches it shows it on the terminal
+            self.note(f"ended by {type(error).__name__}: {error}" if str(error) else f"ended by {type(error).__name__}")
         self.sync()
         if self._bar is not None:
             self._bar.close()
@@ -92,6 +94,10 @@ class RunLog:
             self._bar.write(text, file=self._terminal)
         else:
             print(text, file=self._terminal, flush=True)
+        self.note(text)
+
+    def note(self, text: str) -> None:
+        """Note a line in journal.txt alone."""
         now = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
         self._write(self._journal, f"{now} {text}")
 
@@ -210,6 +216,9 @@ class SilentLog:
         pass
 
     def say(self, text: str) -> None:
+        pass
+
+    def note(self, text: str) -> None:
         pass
 
 

@@ -40,7 +40,20 @@ class Summary:
     finished: bool  # False when a signal stopped it
     best_iou: float
     best_step: int
-    seconds: float
+    seconds: float  # of this call
+    total_seconds: float  # of training, over all resumptions
+    was_finished: bool = False  # before this call
+
+    def __str__(self) -> str:
+        """How it ended, in a line."""
+        if self.was_finished:
+            end = f"was already finished at step {self.step}"
+        else:
+            end = f"{'finished' if self.finished else 'stopped'} at step {self.step} after {self.seconds / 60:.1f} min"
+            if self.total_seconds > self.seconds + 1:
+                end += f" ({self.total_seconds / 60:.1f} min of training in all)"
+        best = f"best validation IoU {self.best_iou:.4f} at step {self.best_step}; " if self.best_step else ""
+        return f"{end}; {best}everything is in {self.folder}"
 
 
 def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False, ranks: Ranks = ALONE) -> Summary:
@@ -82,6 +95,7 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
     conditions = Conditions(len(train_set), f"{zlib.crc32(np.ascontiguousarray(train_set.images)):08x}", precision)
     if saved is not None:
         restore(saved, config, conditions, method, progress)
+    empty = _check_masks(train_set)
     notes = () if saved is None else saved.notes
     del saved  # and its tensors
     if ranks.main and resume:
@@ -91,7 +105,7 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
     if progress.step == config.iterations:  # also after a kill between the last save and the end
         if ranks.main:
             run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
-        return _summary(folder, config, progress, started)
+        return dataclasses.replace(_summary(folder, config, progress, started), was_finished=True)
     ranks.join(method)
     ranks.check_same(**_beginning(config, conditions, train_set, val_set, method, progress))
     if ranks.main:
@@ -103,7 +117,7 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
     cores = CoreShare(torch.get_num_threads() if ranks.alone and config.device == "cpu" else 1)
 
     with explained(folder), stop_on_signal() as stop, _open_log(config, progress, ranks) as log:
-        for note in notes:
+        for note in (*notes, *empty):
             log.say(f"warning: {note}")
         log.say(_describe(config, precision, train_set, val_set, progress, ranks))
         for step in range(progress.step + 1, config.iterations + 1):
@@ -112,14 +126,16 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
             losses = method.train_step(batch, step)
             progress.step = step
             progress.seconds = before + time.monotonic() - started
-            log.step(step, losses)
+            # With those of the step before: methods that take turns compute other ones in odd and in even steps.
+            recent, progress.losses = progress.losses | losses, losses
+            log.step(step, recent)
             if warning := cores.warning():
                 log.say(f"warning: {warning}")
             stopped_by = ranks.stopped_by(stop)
 
             last = step == config.iterations
             if last or step % config.log_every == 0:
-                log.metrics(step, "train", losses)
+                log.metrics(step, "train", recent)
             if last or step % config.validate_every == 0:
                 validate(config, method, shape, val_set, progress, log)
             if ranks.main and (last or step % config.pictures_every == 0):
@@ -133,13 +149,16 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
                 then = run_folder.resume_command(folder)
                 log.say(f"stopped by {stopped_by} after step {step}; continue with: {then}")
                 break
+        summary = _summary(folder, config, progress, started)
+        log.note(str(summary))
 
-    return _summary(folder, config, progress, started)
+    return summary
 
 
 def _summary(folder: Path, config: TrainConfig, at: Progress, started: float) -> Summary:
     finished = at.step == config.iterations
-    return Summary(folder, at.step, finished, at.best_iou, at.best_step, time.monotonic() - started)
+    seconds = time.monotonic() - started
+    return Summary(folder, at.step, finished, at.best_iou, at.best_step, seconds, at.seconds)
 
 
 def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:
@@ -148,6 +167,18 @@ def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:
     where = (config.layout, config.data, config.category)
     train_set = load_dataset(*where, "train", views_per_object=config.views_per_object, **options)
     return train_set, load_dataset(*where, config.val_split, **options)
+
+
+def _check_masks(dataset: ViewDataset) -> tuple[str, ...]:
+    """What to warn about; raises ValueError where no image shows anything."""
+    masks = dataset.images[:, 3] if dataset.masks is None else dataset.masks
+    empty = len(masks) - int(masks.any(axis=(1, 2)).sum())
+    if empty == len(masks):
+        raise ValueError(
+            f"all {empty} {dataset.split} images of {dataset.category} have an empty mask, so that there is nothing to "
+            "learn; look at the data (tools/check_dataset.py)"
+        )
+    return (f"{empty} of {len(masks)} {dataset.split} images have an empty mask",) if empty else ()
 
 
 def object_share(dataset: ViewDataset) -> float:

@@ -89,13 +89,7 @@ def main() -> int:
         return 130
     if not ranks.main:
         return 0
-    state = "finished" if summary.finished else "stopped"
-    best = f"best validation IoU {summary.best_iou:.4f} at step {summary.best_step}; "
-    _say(
-        f"{state} at step {summary.step} after {summary.seconds / 60:.1f} min; "
-        f"{best if summary.best_step else ''}everything is in {summary.folder}",
-        sys.stdout,
-    )
+    _say(str(summary), sys.stdout)
     return 0
 
 

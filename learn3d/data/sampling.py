@@ -25,8 +25,6 @@ def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, se
         return shuffled_epochs(len(dataset), batch_size, seed, step)
     rng = np.random.default_rng([seed, step])
     if sampling == "pairs":
-        if batch_size % 2:
-            raise ValueError(f"pairs of views need an even batch_size, got {batch_size}")
         starts, order = _views_by_object(dataset)
         sizes = np.diff(starts)
         able = np.flatnonzero(sizes >= 2)

@@ -38,6 +38,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "iterations": (BASE | {"iterations": "abc"}, "iterations must be a whole number >= 1, got 'abc'"),
     "endless": (BASE | {"iterations": 10**12}, "iterations must be at most 1000000000, got 1000000000000"),
     "batch": (BASE | {"batch_size": 10**9}, "batch_size must be at most 65536, got 1000000000"),
+    "pairs": (BASE | {"sampling": "pairs", "batch_size": 3}, "batch_size must be even, got 3"),
     "threads": (BASE | {"threads": 10**9}, "threads must be at most 4096"),
     "first version": (BASE | {"method": {}}, "unknown method and preset"),
     "unknown": (BASE | {"latent": 1}, r"unknown options \['latent'\]"),

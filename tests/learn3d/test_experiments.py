@@ -541,7 +541,7 @@ def test_a_worker_resumes_or_starts_anew(made_by_hand, monkeypatch, iterations, 
 
     def train(config, **how):
         calls.append(how)
-        return Summary(config.output, 5, False, 0.0, 0, 0.0)
+        return Summary(config.output, 5, False, 0.0, 0, 0.0, 0.0)
 
     monkeypatch.setattr(training, "train", train)
     monkeypatch.setattr(results, "measure", lambda *_, **__: pytest.fail("a stopped run is not measured"))

@@ -17,7 +17,7 @@ class Clocks:
         self.now, self.cpu = 1000.0, 50.0
 
     def watch(self, threads: int) -> CoreShare:
-        return CoreShare(threads, seconds=10, clock=lambda: self.now, cpu_clock=lambda: self.cpu)
+        return CoreShare(threads, seconds=10, cores=16, clock=lambda: self.now, cpu_clock=lambda: self.cpu)
 
     def steps(self, watched: CoreShare, count: int, *, cores: float) -> list[str]:
         """What is said during steps of one second in which `cores` cores work."""
@@ -53,15 +53,24 @@ def test_a_run_that_has_its_cores_hears_nothing(threads: int, cores: float) -> N
 def test_neither_the_first_steps_nor_later_ones_count() -> None:
     clocks = Clocks()
     watched = clocks.watch(2)
-    assert clocks.steps(watched, 2, cores=0.1) == [], "memory is allocated"
-    assert clocks.steps(watched, 11, cores=2) == []
+    assert clocks.steps(watched, 1, cores=0.1) == [], "memory is allocated"
+    assert clocks.steps(watched, 12, cores=2) == []
     assert clocks.steps(watched, 100, cores=0.1) == [], "a warning in the middle of the night helps nobody"
+
+
+def test_more_threads_than_cores_are_named_at_once() -> None:
+    clocks = Clocks()
+    assert clocks.steps(clocks.watch(17), 5, cores=16) == [
+        "17 threads on 16 cores wait for each other; stop with Ctrl-C and continue with --threads 16"
+    ]
 
 
 def test_a_run_says_it(tiny_run, run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Hungry(CoreShare):
         def __init__(self, threads: int) -> None:
-            super().__init__(threads, seconds=1, skipped_steps=0, clock=iter(range(99)).__next__, cpu_clock=lambda: 0.0)
+            super().__init__(
+                threads, seconds=1, skipped_steps=0, cores=2, clock=iter(range(99)).__next__, cpu_clock=lambda: 0.0
+            )
 
     monkeypatch.setattr(training, "CoreShare", Hungry)
     training.train(tiny_run(run_folder, threads=2, iterations=2))

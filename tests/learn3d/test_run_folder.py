@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -136,8 +138,9 @@ def test_overwriting_leaves_what_is_not_of_a_run(tmp_path) -> None:
 
 def test_a_kill_while_a_run_is_replaced_leaves_nothing_to_continue(tmp_path, monkeypatch) -> None:
     (tmp_path / "checkpoints").mkdir()
-    for name in ("config.json", "last.safetensors", "checkpoints/step-000002.safetensors"):
-        (tmp_path / name).write_text("of the old run")
+    (tmp_path / "config.json").write_text("{}")
+    for step in (1, 2):
+        save(tmp_path, step, keep=2)
     remove, removed = Path.unlink, []
 
     def killed(path, **options):
@@ -150,6 +153,49 @@ def test_a_kill_while_a_run_is_replaced_leaves_nothing_to_continue(tmp_path, mon
     with pytest.raises(KeyboardInterrupt):
         run_folder.claim(tmp_path, overwrite=True)
     assert removed == ["config.json"], "without it --resume finds no run"
+    monkeypatch.undo()
+    run_folder.claim(tmp_path, overwrite=True)
+    assert not list(tmp_path.iterdir()), "what is left is still known as a run's, and can be replaced"
+
+
+def test_what_is_not_a_run_is_not_replaced(tmp_path) -> None:
+    mine = ("pictures/holiday.jpg", "checkpoints/step-000001.safetensors", "config.json", "journal.txt")
+    for name in mine:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(ValueError, match=r"has config.json, but no run that it could belong to; choose another"):
+            run_folder.claim(tmp_path, overwrite)
+    assert all((tmp_path / name).read_text() == "mine" for name in mine)
+
+
+def test_a_run_beside_other_files(tmp_path) -> None:
+    (tmp_path / "pictures").mkdir()
+    for name in ("log.txt", "pictures/holiday.jpg"):
+        (tmp_path / name).write_text("mine")
+    with pytest.raises(ValueError, match="is not empty; choose another folder, or put the run beside"):
+        run_folder.claim(tmp_path, overwrite=False)
+    run_folder.claim(tmp_path, overwrite=True)
+    assert all((tmp_path / name).read_text() == "mine" for name in ("log.txt", "pictures/holiday.jpg"))
+
+
+def test_of_a_run_only_its_own_files_are_removed(tmp_path) -> None:
+    save(tmp_path, 1, keep=1)
+    for name in ("pictures/000200.png", "pictures/holiday.jpg", "tensorboard/events.out.tfevents.1", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("x")
+    run_folder.claim(tmp_path, overwrite=True)
+    left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*"))
+    assert left == ["notes.txt", "pictures", "pictures/holiday.jpg"]
+
+
+def test_the_command_to_continue_is_the_program_that_ran(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["/some where/tools/train.py"])
+    words = shlex.split(run_folder.resume_command(tmp_path / "my run"))
+    assert words[1:] == ["/some where/tools/train.py", "--output", str(tmp_path / "my run"), "--resume"]
+    assert os.path.samefile(shutil.which(words[0]), sys.executable)
+    monkeypatch.setattr(sys, "argv", ["pytest"])
+    assert run_folder.resume_command(tmp_path).startswith("python tools/train.py --output ")
 
 
 def test_half_written_files_do_not_make_a_folder_used_and_are_removed(tmp_path) -> None:

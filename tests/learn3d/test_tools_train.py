@@ -116,11 +116,11 @@ def test_what_the_disk_refuses_is_one_clear_line(error: OSError, tmp_path, monke
 @pytest.mark.parametrize(("best_step", "shown"), [(0, False), (500, True)])
 def test_best_iou_is_said_where_there_is_one(best_step: int, shown: bool, tmp_path, monkeypatch, capsys) -> None:
     module = tool("train")
-    summary = Summary(tmp_path, 700, False, 0.25 if best_step else -1.0, best_step, 60.0)
+    summary = Summary(tmp_path, 700, False, 0.25 if best_step else -1.0, best_step, 60.0, 600.0)
     monkeypatch.setattr(module, "train", lambda *_, **__: summary)
     assert call(module, monkeypatch, "--data", tmp_path, "--category", "chair", "--output", tmp_path) == 0
     out = capsys.readouterr().out
-    assert out.startswith("stopped at step 700 after 1.0 min; ")
+    assert out.startswith("stopped at step 700 after 1.0 min (10.0 min of training in all); ")
     assert ("best validation IoU 0.2500 at step 500" in out, "IoU" in out) == (shown, shown)
     assert out.endswith(f"everything is in {tmp_path}\n")
 
@@ -163,7 +163,7 @@ def test_an_interrupt_outside_of_the_loop_is_one_line(tmp_path, monkeypatch, cap
 
 def test_a_closed_terminal_does_not_change_how_a_run_ended(tmp_path, monkeypatch) -> None:
     module = tool("train")
-    monkeypatch.setattr(module, "train", lambda *_, **__: Summary(tmp_path, 3, False, -1.0, 0, 1.0))
+    monkeypatch.setattr(module, "train", lambda *_, **__: Summary(tmp_path, 3, False, -1.0, 0, 1.0, 1.0))
     reading, writing = os.pipe()
     os.close(reading)
     with open(writing, "w") as terminal:

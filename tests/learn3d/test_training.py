@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shlex
 import shutil
@@ -403,8 +404,9 @@ def test_used_folder_is_refused_and_overwrite_keeps_foreign_files(
 ) -> None:
     run_folder.mkdir()
     (run_folder / "notes.txt").write_text("mine")
+    (run_folder / "config.json").write_text(json.dumps(config_to_dict(tiny_config(run_folder))))
     (run_folder / "metrics.jsonl").write_text('{"step": 0, "split": "train"}\n')
-    with pytest.raises(ValueError, match="is not empty; continue that run"):
+    with pytest.raises(ValueError, match="has a run; continue it"):
         train(tiny_config(run_folder))
     monkeypatch.setattr(training, "draw", lambda *arguments: None)
     train(tiny_config(run_folder, iterations=1, preset=VANILLA), overwrite=True)
@@ -443,3 +445,73 @@ def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> 
     with pytest.raises(FloatingPointError, match="generator has values that are not finite"):
         run_state.save_last(run_folder, config, None, method, DataShape(24), run_state.Progress())
     assert not list(run_folder.iterdir())
+
+
+def test_losses_that_take_turns_are_all_logged(tiny_run, run_folder, read_metrics) -> None:
+    """Whatever log_every is: with an even one only even steps are logged, and the discriminator's are the odd ones."""
+    train(tiny_run(run_folder, log_every=2))
+    lines = [line for line in read_metrics(run_folder) if line["split"] == "train"]
+    assert [line["step"] for line in lines] == [2, 4, 6]
+    assert all({"classification", "confusion", "projection", "total"} <= line.keys() for line in lines)
+
+
+def test_the_journal_says_how_the_run_ended(tiny_run, run_folder, monkeypatch) -> None:
+    train(tiny_run(run_folder, iterations=2))
+    journal = run_folder / "journal.txt"
+    assert " finished at step 2 after 0.0 min; best validation IoU " in journal.read_text().splitlines()[-1]
+
+    def fail(*_):
+        raise RuntimeError("the cat is on the keyboard")
+
+    monkeypatch.setattr(PoseInvariant, "train_step", fail)
+    with pytest.raises(RuntimeError):
+        train(tiny_run(run_folder, iterations=4), resume=True)
+    assert journal.read_text().splitlines()[-1].endswith(" ended by RuntimeError: the cat is on the keyboard")
+
+
+def test_a_finished_run_says_that_it_was(tiny_run, run_folder) -> None:
+    train(tiny_run(run_folder, iterations=2))
+    assert str(train(tiny_run(run_folder, iterations=2), resume=True)).startswith(
+        "was already finished at step 2; best"
+    )
+
+
+def test_empty_masks_are_said_and_nothing_but_empty_ones_refused(tiny_run, run_folder, tiny_set, monkeypatch) -> None:
+    some, none = tiny_set.images.copy(), np.zeros_like(tiny_set.images)
+    some[:5, 3] = 0
+    for images in (some, none):
+        monkeypatch.setattr(training, "load_splits", lambda _, i=images: (dataclasses.replace(tiny_set, images=i),) * 2)
+        if images is some:
+            train(tiny_run(run_folder, iterations=1))
+            assert (
+                f"warning: 5 of {len(some)} test images have an empty mask" in (run_folder / "journal.txt").read_text()
+            )
+        else:
+            with pytest.raises(ValueError, match=f"all {len(some)} test images of airplane have an empty mask"):
+                train(tiny_run(run_folder, iterations=1), overwrite=True)
+
+
+def test_resuming_without_the_checkpoints_that_there_were_is_refused(tiny_run, run_folder) -> None:
+    """Starting anew would write over best.safetensors and the metrics."""
+    train(tiny_run(run_folder, iterations=4))
+    (run_folder / "last.safetensors").unlink()
+    shutil.rmtree(run_folder / "checkpoints")
+    best = (run_folder / "best.safetensors").read_bytes()
+    metadata = checkpoint.load_metadata(run_folder / "best.safetensors")
+    if metadata["step"] <= 2:  # the best of these tiny runs may be the first
+        tensors, _ = checkpoint.load(run_folder / "best.safetensors")
+        checkpoint.save(run_folder / "best.safetensors", tensors, metadata | {"step": 4})
+        best = (run_folder / "best.safetensors").read_bytes()
+    with pytest.raises(ValueError, match=r"came to step 4 at least .* its checkpoints are missing: put last"):
+        train(tiny_run(run_folder, iterations=6), resume=True)
+    assert (run_folder / "best.safetensors").read_bytes() == best
+
+
+def test_another_precision_is_compared_with_what_auto_was(tiny_run, run_folder) -> None:
+    train(tiny_run(run_folder, iterations=1, precision="fp32"))
+    config = tiny_run(run_folder, precision="bf16")
+    tensors, metadata = checkpoint.load(run_folder / "last.safetensors")
+    metadata["config"]["precision"] = "auto"
+    checkpoint.save(run_folder / "last.safetensors", tensors, metadata)
+    with pytest.raises(ValueError, match="precision: 'fp32' in the run, 'bf16' asked for"):
+        train(config, resume=True)
