@@ -73,7 +73,7 @@ class TrainConfig:
     keep_checkpoints: int = 2
     """Number of checkpoints to keep: last.safetensors and the ones before it, in checkpoints/."""
     log_every: int = 50
-    """Steps between logged losses."""
+    """Steps between logged losses, each time with those that only the step before computed: methods may alternate."""
 
     def __post_init__(self) -> None:
         for name in ("data", "output"):
