@@ -83,11 +83,11 @@ def _locked(path: Path) -> int:
         os.close(file)  # its holder has removed it between the two calls: that is no lock any more
 
 
-def claim(folder: Path, overwrite: bool) -> None:
-    """Take an empty folder for a new run; one with something in it is refused, or with `overwrite` cleared of a run.
+def check_free(folder: Path, overwrite: bool) -> None:
+    """Raise a ValueError where a new run may not begin in a folder: it is not empty, or not a run that can be replaced.
 
-    What a run that was killed before it had anything leaves behind (a lock, a half-written file) does not count. Only
-    what a run has written is removed. Raises ValueError where files have names of a run's and there is no run.
+    What a run that was killed before it had anything leaves behind (a lock, a half-written file) does not count. With
+    `overwrite` a run may be replaced, and be put beside other files, but not where these have the names of a run's.
     """
     present = [path for path in _files(folder) if path.exists()]
     if present and not is_run(folder):
@@ -102,7 +102,12 @@ def claim(folder: Path, overwrite: bool) -> None:
         raise ValueError(
             f"{folder} is not empty; choose another folder, or put the run beside what is in it (--overwrite)"
         )
-    for path in present:
+
+
+def claim(folder: Path, overwrite: bool) -> None:
+    """Take a folder for a new run, where `check_free` allows it: what an earlier run has written is removed."""
+    check_free(folder, overwrite)
+    for path in _files(folder):
         path.unlink(missing_ok=True)
     for name in (*_PARTS, EARLIER):
         with contextlib.suppress(OSError):  # there is none, or something of the user's is in it

@@ -78,6 +78,8 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
     keep_freed_memory()
     if config.threads is not None:
         torch.set_num_threads(config.threads)
+    if ranks.main and not resume:
+        run_folder.check_free(config.output, overwrite)  # before data are read; it is cleared when all else is well
     train_set, val_set = load_splits(config)
     precision = resolve_precision(config.precision, config.device)
     ranks = ranks.divide(config.batch_size, config.sampling)
