@@ -10,6 +10,7 @@ from learn3d import checkpoint
 from learn3d.data.layouts import load_dataset
 from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS, evaluate
 from learn3d.presets import PRESETS
+from learn3d.terminal import align
 from learn3d.versions import versions
 
 COLUMNS = {
@@ -97,9 +98,7 @@ def format_table(report: dict[str, Any]) -> str:
     for m in report["means"]:
         label, classes = f"{m['method']} ({m['preset']})", f"{m['classes']} classes" if m["classes"] > 1 else "1 class"
         rows.append(("mean", label, "", "", classes, *(_number(m[key]) for key in COLUMNS)))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join(lines)
+    return align(rows)
 
 
 def _class_means(results: list[dict[str, Any]]) -> list[dict[str, Any]]:

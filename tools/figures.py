@@ -21,6 +21,7 @@ import tyro
 from learn3d.figures import paper
 from learn3d.figures.interpolation import AZIMUTHS_DEG
 from learn3d.figures.runs import Run, open_runs
+from learn3d.terminal import in_a_sentence
 
 
 def report(text: str) -> None:
@@ -164,14 +165,10 @@ Command = (
 )
 
 
+@in_a_sentence()
 def main() -> int:
     command = tyro.cli(Command, description=__doc__)
-    try:
-        written = command.draw()
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    for path in written:
+    for path in command.draw():
         print(path)
     return 0
 

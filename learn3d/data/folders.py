@@ -8,6 +8,8 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
+from learn3d.signals import stop_on_signal
+
 
 def existing(folder: Path, paths: Iterable[str]) -> list[str]:
     """Those of the relative paths that exist in the folder."""
@@ -34,14 +36,16 @@ def publish(new: Path, folder: Path, paths: list[str], stale: list[str], trash: 
     """Move files and folders from `new` to `folder`, where they replace what has their names, and take `stale` away.
 
     All three on one file system. What is replaced or stale goes to `trash`, which the caller removes: a folder of many
-    files is there or not, never half.
+    files is there or not, never half. An interruption waits until all is in place: files of two data sets do not go
+    together.
     """
-    for path in stale:
-        _move(folder / path, trash / "stale" / path)
-    for path in paths:
-        if (folder / path).is_dir():
-            _move(folder / path, trash / "replaced" / path)
-        _move(new / path, folder / path)
+    with stop_on_signal():
+        for path in stale:
+            _move(folder / path, trash / "stale" / path)
+        for path in paths:
+            if (folder / path).is_dir():
+                _move(folder / path, trash / "replaced" / path)
+            _move(new / path, folder / path)
 
 
 def _move(source: Path, target: Path) -> None:

@@ -14,8 +14,7 @@ from learn3d.experiments.pool import WORKER, Outcome, carry_out_all, share_of_co
 from learn3d.experiments.report import make_report
 from learn3d.experiments.tables import TABLES
 from learn3d.presets import PRESETS
-
-INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
+from learn3d.terminal import INTERRUPTED
 
 
 @dataclass(frozen=True)

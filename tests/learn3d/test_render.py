@@ -361,4 +361,4 @@ def test_command_line(tmp_path, folder):
     done = subprocess.run([*command, "--source", str(folder)], capture_output=True, text=True)
     assert done.returncode == 0 and "6 meshes used" in done.stdout, done.stderr
     again = subprocess.run([*command, "--source", str(folder)], capture_output=True, text=True)
-    assert again.returncode == 1 and "make_dataset: " in again.stderr and "Traceback" not in again.stderr
+    assert again.returncode == 1 and again.stderr.startswith("error: ") and "Traceback" not in again.stderr

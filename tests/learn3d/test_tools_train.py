@@ -57,6 +57,19 @@ def test_resume_starts_from_the_saved_options(finished_run, form: str) -> None:
     assert (command.config.data, command.config.batch_size) == (saved.data, saved.batch_size)
 
 
+@pytest.mark.parametrize("name", ["train", "evaluate", "reconstruct", "make_dataset", "figures", "bench_processes"])
+def test_help_keeps_the_examples_apart(name: str, monkeypatch, capsys) -> None:
+    pytest.importorskip("matplotlib")
+    monkeypatch.syspath_prepend(str(TOOLS))
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        tool(name).main()
+    lines = capsys.readouterr().out.splitlines()
+    examples = [line for line in tool(name).__doc__.splitlines() if " tools/" in line]
+    assert examples and [line for line in lines if line in examples] == examples
+
+
 @pytest.mark.parametrize("name", ["train", "evaluate", "reconstruct"])
 def test_help_explains_every_option(name: str, monkeypatch, capsys) -> None:
     monkeypatch.setattr(sys, "argv", [name, "--help"])
