@@ -148,13 +148,15 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
     _prepare_folder(config, writer_class, total)
 
     done = _Done()
-    with tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=config.output) as temporary:
+    with (
+        tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=config.output) as temporary,
+        _progress_bar(total, config.category, progress) as bar,
+    ):
         folder, trash = Path(temporary) / "new", Path(temporary) / "old"
         folder.mkdir()
         writer = writer_class(folder, config.category)
         names = meshes.object_names(sources)
         sheet = []
-        bar = _progress_bar(total, config.category, progress)
         for split in ("train", "val", "test"):
             chosen = [(int(number), sources[number], names[number]) for number in splits[split]]
             rows = _render_split(config, writer, chosen, split, copies[split], done, bar)
