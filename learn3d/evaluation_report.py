@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d import checkpoint
-from learn3d.data.layouts import load_dataset
+from learn3d import checkpoint, checkpoint_checks
+from learn3d.config import config_from_dict
+from learn3d.data.layouts import load_dataset, require_folder
 from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS, evaluate
 from learn3d.presets import PRESETS
 from learn3d.terminal import align
@@ -38,14 +39,16 @@ def evaluate_runs(
     """Evaluate run folders or checkpoint files on a split; a report ready for JSON, see `format_table`.
 
     `data` and `category` default to those each run was trained with; a run on several categories is measured on each of
-    them by itself. The mean over classes is taken per method; several
-    runs of one class and method (seeds) count as one class.
+    them by itself. The mean over classes is taken per method; several runs of one class and method (seeds) count as one
+    class. Raises ValueError or OSError before anything is measured where a checkpoint or a folder of data is not there.
     """
     if not paths:
         raise ValueError("give at least one run folder or checkpoint to evaluate")
+    found = [checkpoint.find(path, which) for path in paths]
+    for file in found:
+        _check(file, data)
     results = []
-    for path in paths:
-        file = checkpoint.find(path, which)
+    for file in found:
         method, config, metadata = checkpoint.load_method(file, device=device, precision=precision)
         folder = data or config.data
         for name in (part.strip() for part in (category or config.category).split(",")):
@@ -85,6 +88,13 @@ def evaluate_runs(
         "mmd_paper": "the same with the paper's printed formula: one kernel, square root",
     }
     return {"protocol": protocol, "versions": versions(), "results": results, "means": _class_means(results)}
+
+
+def _check(file: Path, data: Path | None) -> None:
+    """Raise an error where a checkpoint, or the folder of its data, is not there; only its header is read."""
+    metadata = checkpoint.load_metadata(file)
+    checkpoint_checks.require_run(metadata, file)
+    require_folder(data or config_from_dict(metadata["config"], source=str(file)).data)
 
 
 def format_table(report: dict[str, Any]) -> str:

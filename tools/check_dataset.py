@@ -19,7 +19,7 @@ import tyro
 
 from learn3d.data.checking import check_folder
 from learn3d.data.layouts import Layout
-from learn3d.files import write_json
+from learn3d.files import check_target, write_json
 from learn3d.terminal import in_a_sentence
 
 
@@ -43,6 +43,8 @@ class Command:
 
 @in_a_sentence()
 def main(command: Command) -> int:
+    if command.json is not None:
+        check_target(command.json, "--json")
     report = check_folder(command.layout, command.folder, command.category, command.split, progress=sys.stderr.isatty())
     lines = [f"{p.severity}: {p.path}: {p.message}" for split in report.splits for p in split.problems]
     for line in lines[: command.most]:

@@ -14,7 +14,7 @@ from typing import Literal
 import tyro
 
 from learn3d.evaluation_report import evaluate_runs, format_table
-from learn3d.files import write_json
+from learn3d.files import check_target, write_json
 from learn3d.terminal import in_a_sentence
 
 
@@ -43,6 +43,8 @@ class Command:
 @in_a_sentence()
 def main() -> int:
     command = tyro.cli(Command, description=__doc__)
+    if command.json is not None:
+        check_target(command.json, "--json")
     report = evaluate_runs(
         command.runs,
         data=command.data,

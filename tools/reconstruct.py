@@ -15,6 +15,7 @@ from typing import Literal
 
 import tyro
 
+from learn3d.files import check_target_folder
 from learn3d.reconstruction import reconstruct_dataset, reconstruct_files
 from learn3d.terminal import in_a_sentence
 
@@ -57,6 +58,7 @@ def main() -> int:
     options = {"mesh_format": command.format, "frames": command.frames, "image_size": command.image_size}
     if bool(command.images) == (command.dataset is not None):
         raise ValueError("give either image files or --dataset with --indices")
+    check_target_folder(command.output, "--output")
     if command.dataset is not None:
         paths = reconstruct_dataset(
             command.run,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
+from learn3d.files import check_target_folder
 from learn3d.signals import stop_on_signal
 
 
@@ -18,12 +18,8 @@ def existing(folder: Path, paths: Iterable[str]) -> list[str]:
 
 def check_room(folder: Path, needed: int, what: str) -> None:
     """Make the folder; OSError where it cannot be written into or its disk has less than `needed` bytes free."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise OSError(f"cannot write into the folder {folder}: {error}; give another one with --output") from error
+    check_target_folder(folder, "--output")
+    folder.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise OSError(

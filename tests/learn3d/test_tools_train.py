@@ -156,6 +156,58 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, monkeyp
     assert f"{report['results'][0]['voxel_iou']:.4f}" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        (
+            "evaluate",
+            ["{run}", "--json", "{tmp}/none/t.json"],
+            "there is no folder {tmp}/none; make it, or give another",
+        ),
+        ("evaluate", ["{run}", "{tmp}/nope"], "there is no checkpoint {tmp}/nope"),
+        ("evaluate", ["{run}", "--data", "{tmp}/nope"], "nope: there is no such folder"),
+        ("reconstruct", ["--run", "{run}", "--dataset", "{data}", "--output", "{tmp}/file/x"], "file is no folder"),
+        ("reconstruct", ["--run", "{run}", "--dataset", "{tmp}/nope", "--output", "{tmp}/x"], "is with --dataset"),
+        (
+            "reconstruct",
+            ["--run", "{run}", "--dataset", "{data}", "--output", "{tmp}/x", "--frames", "0"],
+            "frames must",
+        ),
+        (
+            "reconstruct",
+            ["--run", "{run}", "--output", "{tmp}/x", "{tmp}/a.png", "--image-size", "0"],
+            "image_size must",
+        ),
+    ],
+)
+def test_what_cannot_work_is_said_before_a_model_is_loaded(
+    name: str, arguments: list[str], message: str, finished_run, tiny_folder, tmp_path, monkeypatch, capsys
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a model is loaded")
+
+    (tmp_path / "file").touch()
+    places = {"run": finished_run, "tmp": tmp_path, "data": tiny_folder}
+    module = tool(name)
+    monkeypatch.setattr("learn3d.checkpoint.load_method", refuse)
+    assert call(module, monkeypatch, *(a.format(**places) for a in arguments)) == 1
+    out, error = capsys.readouterr()
+    assert (out, error.count("\n")) == ("", 1)
+    assert error.startswith("error: ") and message.format(**places) in error
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_table_that_cannot_be_written_is_printed(finished_run, tmp_path, monkeypatch, capsys) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError("the disk is full")
+
+    module = tool("evaluate")
+    monkeypatch.setattr(module, "write_json", refuse)
+    assert call(module, monkeypatch, finished_run, "--json", tmp_path / "t.json") == 1
+    out, error = capsys.readouterr()
+    assert out.startswith("class") and error.endswith("error: the disk is full\n")
+
+
 def test_reconstruct_lists_its_files(finished_run, tiny_folder, tmp_path, monkeypatch, capsys) -> None:
     options = ["--dataset", tiny_folder, "--indices", 0, 7, "--format", "glb", "--frames", 2, "--image-size", 32]
     assert call(tool("reconstruct"), monkeypatch, "--run", finished_run, "--output", tmp_path, *options) == 0
