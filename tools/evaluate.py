@@ -13,7 +13,7 @@ from typing import Literal
 
 import tyro
 
-from learn3d.evaluation_report import evaluate_runs, format_table
+from learn3d.evaluation_report import describe_columns, evaluate_runs, format_table
 from learn3d.files import check_target, write_json
 from learn3d.terminal import in_a_sentence
 
@@ -42,7 +42,8 @@ class Command:
 
 @in_a_sentence()
 def main() -> int:
-    command = tyro.cli(Command, description=__doc__)
+    columns = "Columns of the table (means over the images, then over the classes; - where there is no value):"
+    command = tyro.cli(Command, description=f"{__doc__}\n{columns}\n{describe_columns()}")
     if command.json is not None:
         check_target(command.json, "--json")
     report = evaluate_runs(

@@ -45,7 +45,9 @@ def parse(arguments: list[str]) -> Command:
     finder.add_argument("--resume", action="store_true")
     finder.add_argument("--output", type=Path)
     finder.add_argument("--preset")
-    known, _ = finder.parse_known_args(arguments)
+    known, others = finder.parse_known_args(arguments)
+    if known.resume and known.output is None and not {"-h", "--help"} & set(others):
+        raise ValueError("--resume needs --output: the folder of the run that is to go on")
     if known.resume and known.output is not None:
         default = load_config(known.output / "config.json")
         if known.preset not in (None, default.preset):

@@ -267,6 +267,6 @@ def _what_is_there(category: str, split: str, missing: Path) -> str:
     if found:
         return f"{wanted}; the folder holds: {', '.join(found)}. Choose one of these, or make the split (make_dataset)"
     return (
-        f"{wanted}; the folder holds no '*_images.npz' with its '*_voxels.npz' at all. Give another folder, or make one "
-        "(make_dataset)"
+        f"{wanted}; the folder holds no '*_images.npz' with its '*_voxels.npz' at all. Give another folder, or make "
+        "one (make_dataset)"
     )

@@ -15,6 +15,7 @@ from types import ModuleType
 import pytest
 
 from learn3d.config import load_config
+from learn3d.evaluation_report import COLUMNS
 from learn3d.training import Summary
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -89,6 +90,9 @@ def test_help_explains_every_option(name: str, monkeypatch, capsys) -> None:
     [
         ("train", ["--data", "{}", "--category", "airplane", "--output", "{}/run"], "02691156_train_images.npz"),
         ("train", ["--output", "{}", "--resume"], "folder of a training run"),
+        ("train", ["--resume"], "--resume needs --output: the folder of the run"),
+        ("train", ["--out", "{}", "--resume"], "--resume needs --output"),
+        ("train", ["--data", "{}/no", "--category", "chair", "--output", "{}/run"], "data set is with --data"),
         ("train", ["--output", "{}", "--preset", "kato"], "there is no preset 'kato'; choose one of peng2020-kato,"),
         ("train", ["--data", "x", "--category", "chair", "--output", "{}", "--resume", "--overwrite"], "folder of a"),
         ("evaluate", ["{}"], "there is no checkpoint"),
@@ -124,6 +128,16 @@ def test_what_the_disk_refuses_is_one_clear_line(error: OSError, tmp_path, monke
     monkeypatch.setattr(module, "train", fail)
     assert call(module, monkeypatch, "--data", tmp_path, "--category", "chair", "--output", tmp_path) == 1
     assert capsys.readouterr().err == f"error: {error}\n"
+
+
+def test_the_help_of_evaluate_explains_every_column(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["evaluate", "--help"])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        tool("evaluate").main()
+    lines = capsys.readouterr().out.splitlines()
+    for column in COLUMNS.values():
+        assert any(line.startswith(f"  {column}: ") and len(line) > len(column) + 30 for line in lines), column
 
 
 @pytest.mark.parametrize(("best_step", "shown"), [(0, False), (500, True)])
