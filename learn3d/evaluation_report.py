@@ -23,6 +23,22 @@ COLUMNS = {
     "mmd": "MMD",
     "mmd_paper": "MMD (printed formula)",
 }
+#: What each of them is, for people.
+MEANINGS = {
+    "voxel_iou_kato18": "of predicted and true 32^3 grids, by the voxeliser of Kato et al. 2018, as in the paper",
+    "voxel_iou_kato19": "the same by that of Kato and Harada 2019: every cell that a face touches; not comparable",
+    "chamfer_l1": f"mean distance of {SURFACE_POINTS} points of either surface to the other, units of the object frame",
+    "f_score": f"of the shares of these points that lie within {F_SCORE_DISTANCE} of the other surface (harmonic mean)",
+    "silhouette_iou": "for data without voxels: with the mask of another image of the object, at its camera",
+    "mmd": "of the shape codes of two views, mean over all pairs of views, by the published code: five kernels, no "
+    "root; the smaller, the less a code tells of the view",
+    "mmd_paper": "the same by the formula that the paper prints: one kernel, square root",
+}
+
+
+def describe_columns() -> str:
+    """A line for each column of figures of `format_table`."""
+    return "\n".join(f"  {COLUMNS[key]}: {text}" for key, text in MEANINGS.items())
 
 
 def evaluate_runs(
@@ -59,6 +75,8 @@ def evaluate_runs(
             result = evaluate(method, dataset, definitions=("kato18", "kato19"), paper_mmd=True, surfaces=True)
             if result.undefined:
                 report_progress(f"warning: {result.undefined} images have no IoU (both shapes empty); left out")
+            if result.without_mmd:
+                report_progress(f"warning: {result.without_mmd}")
             if result.without_distance:
                 report_progress(
                     f"warning: {result.without_distance} images have no Chamfer distance, as the predicted surface is "
