@@ -52,6 +52,14 @@ class Evaluation:
         return codes_per_view(self.view_ids)
 
     @property
+    def without_mmd(self) -> str:
+        """Why there is no MMD; empty where there is one."""
+        if self.mmd_codes:
+            return ""
+        views = len(self.view_ids.unique())
+        return f"no MMD: it takes two images of each of two views, and these are {self.images} images of {views} views"
+
+    @property
     def undefined(self) -> int:
         """Images whose prediction and truth are both empty; they are left out of the mean."""
         return int(next(iter(self.ious.values())).isnan().sum()) if self.ious else 0

@@ -6,10 +6,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d import checkpoint
-from learn3d.data.layouts import load_dataset
+from learn3d import checkpoint, checkpoint_checks
+from learn3d.config import config_from_dict
+from learn3d.data.layouts import load_dataset, require_folder
 from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS, evaluate
 from learn3d.presets import PRESETS
+from learn3d.terminal import align
 from learn3d.versions import versions
 
 COLUMNS = {
@@ -21,6 +23,22 @@ COLUMNS = {
     "mmd": "MMD",
     "mmd_paper": "MMD (printed formula)",
 }
+#: What each of them is, for people.
+MEANINGS = {
+    "voxel_iou_kato18": "of predicted and true 32^3 grids, by the voxeliser of Kato et al. 2018, as in the paper",
+    "voxel_iou_kato19": "the same by that of Kato and Harada 2019: every cell that a face touches; not comparable",
+    "chamfer_l1": f"mean distance of {SURFACE_POINTS} points of either surface to the other, units of the object frame",
+    "f_score": f"of the shares of these points that lie within {F_SCORE_DISTANCE} of the other surface (harmonic mean)",
+    "silhouette_iou": "for data without voxels: with the mask of another image of the object, at its camera",
+    "mmd": "of the shape codes of two views, mean over all pairs of views, by the published code: five kernels, no "
+    "root; the smaller, the less a code tells of the view",
+    "mmd_paper": "the same by the formula that the paper prints: one kernel, square root",
+}
+
+
+def describe_columns() -> str:
+    """A line for each column of figures of `format_table`."""
+    return "\n".join(f"  {COLUMNS[key]}: {text}" for key, text in MEANINGS.items())
 
 
 def evaluate_runs(
@@ -37,14 +55,16 @@ def evaluate_runs(
     """Evaluate run folders or checkpoint files on a split; a report ready for JSON, see `format_table`.
 
     `data` and `category` default to those each run was trained with; a run on several categories is measured on each of
-    them by itself. The mean over classes is taken per method; several
-    runs of one class and method (seeds) count as one class.
+    them by itself. The mean over classes is taken per method; several runs of one class and method (seeds) count as one
+    class. Raises ValueError or OSError before anything is measured where a checkpoint or a folder of data is not there.
     """
     if not paths:
         raise ValueError("give at least one run folder or checkpoint to evaluate")
+    found = [checkpoint.find(path, which) for path in paths]
+    for file in found:
+        _check(file, data)
     results = []
-    for path in paths:
-        file = checkpoint.find(path, which)
+    for file in found:
         method, config, metadata = checkpoint.load_method(file, device=device, precision=precision)
         folder = data or config.data
         for name in (part.strip() for part in (category or config.category).split(",")):
@@ -55,6 +75,8 @@ def evaluate_runs(
             result = evaluate(method, dataset, definitions=("kato18", "kato19"), paper_mmd=True, surfaces=True)
             if result.undefined:
                 report_progress(f"warning: {result.undefined} images have no IoU (both shapes empty); left out")
+            if result.without_mmd:
+                report_progress(f"warning: {result.without_mmd}")
             if result.without_distance:
                 report_progress(
                     f"warning: {result.without_distance} images have no Chamfer distance, as the predicted surface is "
@@ -86,6 +108,13 @@ def evaluate_runs(
     return {"protocol": protocol, "versions": versions(), "results": results, "means": _class_means(results)}
 
 
+def _check(file: Path, data: Path | None) -> None:
+    """Raise an error where a checkpoint, or the folder of its data, is not there; only its header is read."""
+    metadata = checkpoint.load_metadata(file)
+    checkpoint_checks.require_run(metadata, file)
+    require_folder(data or config_from_dict(metadata["config"], source=str(file)).data)
+
+
 def format_table(report: dict[str, Any]) -> str:
     """The report of `evaluate_runs` as a text table: a line per run, then a mean over classes per method."""
     header = ("class", "method", "seed", "iterations", "images", *COLUMNS.values())
@@ -97,9 +126,7 @@ def format_table(report: dict[str, Any]) -> str:
     for m in report["means"]:
         label, classes = f"{m['method']} ({m['preset']})", f"{m['classes']} classes" if m["classes"] > 1 else "1 class"
         rows.append(("mean", label, "", "", classes, *(_number(m[key]) for key in COLUMNS)))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join(lines)
+    return align(rows)
 
 
 def _class_means(results: list[dict[str, Any]]) -> list[dict[str, Any]]:

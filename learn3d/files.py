@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,40 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
             sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def check_target(path: Path, option: str) -> None:
+    """Raise OSError where `replacing(path)` would fail for want of its folder, of permission, or of a plain file.
+
+    For the beginning of long work; `option` is how the command calls the path. Nothing is left of the attempt.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(
+            f"cannot write {path}: there is no folder {path.parent}; make it, or give another {option}"
+        )
+    if path.exists() and not path.is_file():
+        raise OSError(f"{path} is no plain file and is not replaced; give another {option}")
+    _try(path.parent, f"cannot write {path}", option)
+
+
+def check_target_folder(folder: Path, option: str) -> None:
+    """Raise OSError where no files can be written into a folder, which need not be there yet and is not made."""
+    there = Path(folder)
+    while not os.path.lexists(there) and there != there.parent:
+        there = there.parent
+    problem = f"cannot write into the folder {folder}"
+    if not there.is_dir():
+        raise NotADirectoryError(f"{problem}: {there} is no folder; give another {option}")
+    _try(there, problem, option)
+
+
+def _try(folder: Path, problem: str, option: str) -> None:
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(f"{problem}: {error.strerror or error}; give another {option}") from error
 
 
 def sync_folder(folder: Path) -> None:

@@ -20,6 +20,7 @@ from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
 from learn3d.methods import Method
 
 STRIP_SIZE = 160
+LARGEST_PICTURE = 2048  # pixels: shapes are drawn four times as fine, and the renderer goes up to 8192
 
 
 def prepare_image(
@@ -89,6 +90,16 @@ def export_mesh(path: Path, vertices: Tensor, faces: Tensor) -> None:
     files.write_bytes(path, content.encode() if isinstance(content, str) else content)
 
 
+def check_pictures(frames: int = 36, image_size: int = 256) -> None:
+    """Raise a ValueError where no turntable of so many frames, with a side of so many pixels, can be drawn."""
+    if frames < 1:
+        raise ValueError(f"frames must be at least 1, the pictures of a turntable, got {frames}")
+    if not 1 <= image_size <= LARGEST_PICTURE:
+        raise ValueError(
+            f"image_size must be in 1 .. {LARGEST_PICTURE}, the side of a picture in pixels, got {image_size}"
+        )
+
+
 def save_reconstruction(
     folder: Path,
     name: str,
@@ -105,6 +116,7 @@ def save_reconstruction(
 
     inverted: the image's colours are stored as 255 - colour, see `ViewDataset.inverted`.
     """
+    check_pictures(frames, image_size)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png")]
@@ -134,6 +146,7 @@ def reconstruct_files(
     `masks` is empty (the images have transparency) or as long as `images`; `options` go to `save_reconstruction`.
     Returns the files written.
     """
+    _check(options)
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
     pairs = zip(images, masks or [None] * len(images), strict=True)
@@ -163,6 +176,9 @@ def reconstruct_dataset(
 
     Files are named after the object and its view class; where several of the images agree in both, after their index.
     """
+    _check(options)
+    if not Path(data).is_dir():
+        raise FileNotFoundError(f"there is no folder {data}; say where the data set is with --dataset")
     method, config, _ = checkpoint.load_method(checkpoint.find(run, which))
     name = category or config.category
     dataset = load_dataset(config.layout, data, name, split, image_size=method.image_size)
@@ -173,6 +189,11 @@ def reconstruct_dataset(
         names = [f"{dataset.category}_{split}_image{index:06}" for index in indices]
     options["inverted"] = dataset.inverted
     return _save_all(method, folder, names, batch.images.numpy(), options)
+
+
+def _check(options: dict[str, Any]) -> None:
+    """Refuse what `save_reconstruction` would refuse, before a model is loaded."""
+    check_pictures(**{name: options[name] for name in ("frames", "image_size") if name in options})
 
 
 def _save_all(method: Method, folder: Path, names: list[str], images: np.ndarray, options: dict) -> list[Path]:

@@ -35,11 +35,14 @@ def validate(
     result = evaluate(method, val_set, max_images=config.max_val_images)
     log.metrics(progress.step, config.val_split, {k: v for k, v in result.summary().items() if v is not None})
     mmd = "" if result.mmd is None else f", MMD {result.mmd:.3f}"
+    without = f"; {result.without_mmd}" if result.mmd is None else ""
+    if without and result.images < len(val_set):
+        without += f" (max_val_images {config.max_val_images})"
     kind, iou = result.chosen_by
     better = iou is not None and iou > progress.best_iou
     mark = " (best so far)" if better else ""
     shown = "undefined" if iou is None else f"{iou:.4f}"
-    log.say(f"step {progress.step}: {config.val_split} {kind} {shown}{mmd}{mark}")
+    log.say(f"step {progress.step}: {config.val_split} {kind} {shown}{mmd}{mark}{without}")
     if result.undefined:
         log.say(f"warning: {result.undefined} images have no IoU (prediction and truth are both empty); left out")
     if better:

@@ -53,6 +53,7 @@ from bench_work import (
 import nmr
 from learn3d.config import DEFAULT_PRESET
 from learn3d.memory import keep_freed_memory
+from learn3d.terminal import in_a_sentence
 
 
 class Target(NamedTuple):
@@ -294,16 +295,20 @@ SINGLE: dict[str, Callable[[Options], Result]] = {
 }
 
 
-def main() -> None:
+@in_a_sentence()
+def main() -> int:
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(options.threads)
     if options.workload == "memory":
-        return bench_memory(threads=(1, 2))
+        bench_memory(threads=(1, 2))
+        return 0
     if options.workload == "processes":
-        return bench_processes(options.repeats)
+        bench_processes(options.repeats)
+        return 0
     keep_freed_memory()
     if options.workload == "count":
-        return bench_count(options)
+        bench_count(options)
+        return 0
     if options.workload == "all":
         results = bench_all(options)
     elif options.workload == "scaling":
@@ -321,7 +326,8 @@ def main() -> None:
             if missed(r)
         )
         sys.exit("\n".join(["targets missed:", *lines]))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,8 +1,9 @@
 """Steps of the proposed method at one global batch in several processes.
 
-python tools/bench.py processes                                            as many ways as the cores allow, a table
-torchrun --nproc-per-node 2 tools/bench_processes.py --threads 8           one of them
-torchrun --nnodes 2 ... tools/bench_processes.py --threads 8               on several machines, the same on each
+Examples:
+  python tools/bench.py processes                                     as many ways as the cores allow, a table
+  torchrun --nproc-per-node 2 tools/bench_processes.py --threads 8    one of them
+  torchrun --nnodes 2 ... tools/bench_processes.py --threads 8        on several machines, the same on each
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from learn3d.methods import DataShape, create_method
 from learn3d.networks import resolve_precision
 from learn3d.presets import PRESETS
 from learn3d.signals import Stop
+from learn3d.terminal import in_a_sentence
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,8 @@ def bench_processes(repeats: int) -> None:
     print("\n".join(rows))
 
 
-def main() -> None:
+@in_a_sentence()
+def main() -> int:
     options = tyro.cli(Options, description=__doc__)
     with distributed.start(options.device) as ranks:
         step, fastest, summing, busy = measure_steps(options, ranks)
@@ -115,7 +118,8 @@ def main() -> None:
             f"{ranks.world} x {options.threads} threads, batch {options.batch}: {step:.1f} ms a step, fastest "
             f"{fastest:.1f} ms, summing gradients {summing:.1f} ms, CPU {busy:.1f} ms"
         )
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

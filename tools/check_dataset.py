@@ -19,7 +19,8 @@ import tyro
 
 from learn3d.data.checking import check_folder
 from learn3d.data.layouts import Layout
-from learn3d.files import write_json
+from learn3d.files import check_target, write_json
+from learn3d.terminal import in_a_sentence
 
 
 @dataclass(frozen=True)
@@ -40,14 +41,11 @@ class Command:
     """Print at most so many problems; the JSON file has all."""
 
 
+@in_a_sentence()
 def main(command: Command) -> int:
-    try:
-        report = check_folder(
-            command.layout, command.folder, command.category, command.split, progress=sys.stderr.isatty()
-        )
-    except (ValueError, FileNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    if command.json is not None:
+        check_target(command.json, "--json")
+    report = check_folder(command.layout, command.folder, command.category, command.split, progress=sys.stderr.isatty())
     lines = [f"{p.severity}: {p.path}: {p.message}" for split in report.splits for p in split.problems]
     for line in lines[: command.most]:
         print(line)

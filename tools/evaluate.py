@@ -13,8 +13,9 @@ from typing import Literal
 
 import tyro
 
-from learn3d.evaluation_report import evaluate_runs, format_table
-from learn3d.files import write_json
+from learn3d.evaluation_report import describe_columns, evaluate_runs, format_table
+from learn3d.files import check_target, write_json
+from learn3d.terminal import in_a_sentence
 
 
 @dataclass(frozen=True)
@@ -39,25 +40,25 @@ class Command:
     """Also write the figures, with protocol and versions, to this file."""
 
 
+@in_a_sentence()
 def main() -> int:
-    command = tyro.cli(Command, description=__doc__)
-    try:
-        report = evaluate_runs(
-            command.runs,
-            data=command.data,
-            category=command.category,
-            split=command.split,
-            which=command.checkpoint,
-            precision=command.precision,
-            device=command.device,
-            report_progress=lambda text: print(text, file=sys.stderr, flush=True),
-        )
-        if command.json is not None:
-            write_json(command.json, report)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    print(format_table(report))
+    columns = "Columns of the table (means over the images, then over the classes; - where there is no value):"
+    command = tyro.cli(Command, description=f"{__doc__}\n{columns}\n{describe_columns()}")
+    if command.json is not None:
+        check_target(command.json, "--json")
+    report = evaluate_runs(
+        command.runs,
+        data=command.data,
+        category=command.category,
+        split=command.split,
+        which=command.checkpoint,
+        precision=command.precision,
+        device=command.device,
+        report_progress=lambda text: print(text, file=sys.stderr, flush=True),
+    )
+    print(format_table(report), flush=True)
+    if command.json is not None:
+        write_json(command.json, report)
     return 0
 
 

@@ -22,6 +22,7 @@ import tyro
 from learn3d.data.layouts import Layout
 from learn3d.experiments.experiment import Call, describe_tables, run_experiment
 from learn3d.experiments.plan import Options
+from learn3d.terminal import in_a_sentence
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Command:
     """Also put the table into this Markdown page, between its marks."""
 
 
+@in_a_sentence()
 def main() -> int:
     if "--list" in sys.argv[1:]:
         print(describe_tables())
@@ -73,11 +75,7 @@ def main() -> int:
     options = Options(**{name: getattr(command, name) for name in shared}, threads=command.threads, changes=command.set)
     named = ("table", "jobs", "overwrite", "report_only", "page", "beside_code")
     call = Call(options=options, **{name: getattr(command, name) for name in named})
-    try:
-        return run_experiment(call)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    return run_experiment(call)
 
 
 if __name__ == "__main__":

@@ -10,16 +10,15 @@ import sys
 import tyro
 
 from learn3d.data.debian_models import FetchConfig, fetch_debian_models
+from learn3d.terminal import in_a_sentence
 
 
-def main() -> None:
-    config = tyro.cli(FetchConfig, description=__doc__)
-    try:
-        report = fetch_debian_models(config)
-    except (ValueError, OSError) as error:
-        sys.exit(f"fetch_debian_models: {error}")
+@in_a_sentence()
+def main() -> int:
+    report = fetch_debian_models(tyro.cli(FetchConfig, description=__doc__))
     print(report.summary())
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

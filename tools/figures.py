@@ -21,6 +21,8 @@ import tyro
 from learn3d.figures import paper
 from learn3d.figures.interpolation import AZIMUTHS_DEG
 from learn3d.figures.runs import Run, open_runs
+from learn3d.files import check_target_folder
+from learn3d.terminal import in_a_sentence
 
 
 def report(text: str) -> None:
@@ -38,6 +40,11 @@ class Drawn:
     """Folders of training runs (or checkpoint files), in the order in which they are shown."""
     labels: tuple[str, ...] = ()
     """What to call each run. None given: the names of their presets."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the files go."""
+        return self.output.parent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,6 +152,10 @@ class Polar(Measured):
 class All(Measured):
     """Every figure with its defaults, as far as data and runs allow; --output is a folder."""
 
+    @property
+    def folder(self) -> Path:
+        return self.output
+
     def draw(self) -> list[Path]:
         written, failed = paper.save_all(
             self.open(), self.runs, self.output, labels=self.labels, report_progress=report
@@ -164,14 +175,11 @@ Command = (
 )
 
 
+@in_a_sentence()
 def main() -> int:
     command = tyro.cli(Command, description=__doc__)
-    try:
-        written = command.draw()
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    for path in written:
+    check_target_folder(command.folder, "--output")
+    for path in command.draw():
         print(path)
     return 0
 

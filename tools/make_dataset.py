@@ -12,16 +12,15 @@ import sys
 import tyro
 
 from learn3d.data.render import DatasetConfig, make_dataset
+from learn3d.terminal import in_a_sentence
 
 
-def main() -> None:
-    config = tyro.cli(DatasetConfig, description=__doc__)
-    try:
-        report = make_dataset(config)
-    except (ValueError, OSError) as error:
-        sys.exit(f"make_dataset: {error}")
+@in_a_sentence()
+def main() -> int:
+    report = make_dataset(tyro.cli(DatasetConfig, description=__doc__))
     print(report.text())
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

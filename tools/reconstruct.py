@@ -15,7 +15,9 @@ from typing import Literal
 
 import tyro
 
+from learn3d.files import check_target_folder
 from learn3d.reconstruction import reconstruct_dataset, reconstruct_files
+from learn3d.terminal import in_a_sentence
 
 
 @dataclass(frozen=True)
@@ -50,36 +52,34 @@ class Command:
     """Side of the turntable in pixels."""
 
 
+@in_a_sentence()
 def main() -> int:
     command = tyro.cli(Command, description=__doc__)
     options = {"mesh_format": command.format, "frames": command.frames, "image_size": command.image_size}
-    try:
-        if bool(command.images) == (command.dataset is not None):
-            raise ValueError("give either image files or --dataset with --indices")
-        if command.dataset is not None:
-            paths = reconstruct_dataset(
-                command.run,
-                command.output,
-                command.dataset,
-                command.indices,
-                category=command.category,
-                split=command.split,
-                which=command.checkpoint,
-                **options,
-            )
-        else:
-            paths = reconstruct_files(
-                command.run,
-                command.output,
-                command.images,
-                command.masks,
-                crop=command.crop,
-                which=command.checkpoint,
-                **options,
-            )
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    if bool(command.images) == (command.dataset is not None):
+        raise ValueError("give either image files or --dataset with --indices")
+    check_target_folder(command.output, "--output")
+    if command.dataset is not None:
+        paths = reconstruct_dataset(
+            command.run,
+            command.output,
+            command.dataset,
+            command.indices,
+            category=command.category,
+            split=command.split,
+            which=command.checkpoint,
+            **options,
+        )
+    else:
+        paths = reconstruct_files(
+            command.run,
+            command.output,
+            command.images,
+            command.masks,
+            crop=command.crop,
+            which=command.checkpoint,
+            **options,
+        )
     for path in paths:
         print(path)
     return 0

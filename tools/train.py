@@ -11,17 +11,16 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 import tyro
 
 from learn3d.config import DEFAULT_PRESET, TrainConfig, load_config
 from learn3d.distributed import LostPeerError, label, start
 from learn3d.presets import PRESETS
+from learn3d.terminal import in_a_sentence, say
 from learn3d.training import train
 
 
@@ -46,7 +45,9 @@ def parse(arguments: list[str]) -> Command:
     finder.add_argument("--resume", action="store_true")
     finder.add_argument("--output", type=Path)
     finder.add_argument("--preset")
-    known, _ = finder.parse_known_args(arguments)
+    known, others = finder.parse_known_args(arguments)
+    if known.resume and known.output is None and not {"-h", "--help"} & set(others):
+        raise ValueError("--resume needs --output: the folder of the run that is to go on")
     if known.resume and known.output is not None:
         default = load_config(known.output / "config.json")
         if known.preset not in (None, default.preset):
@@ -74,31 +75,17 @@ def _description() -> str:
     return f"{__doc__}\nPresets (--preset NAME --help shows the settings of one):\n{presets}"
 
 
+@in_a_sentence(FloatingPointError, MemoryError, LostPeerError, label=label)
 def main() -> int:
-    try:
-        command = parse(sys.argv[1:])
-        if command.resume and command.overwrite:
-            raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
-        with start(command.config.device) as ranks:
-            summary = train(command.config, resume=command.resume, overwrite=command.overwrite, ranks=ranks)
-    except (ValueError, OSError, FloatingPointError, MemoryError, LostPeerError) as error:
-        _say(f"error: {label()}{error}", sys.stderr)
-        return 1
-    except KeyboardInterrupt:  # before the training, which saves and ends well, or the second one in it
-        _say("interrupted; what was saved before is as it was", sys.stderr)
-        return 130
+    command = parse(sys.argv[1:])
+    if command.resume and command.overwrite:
+        raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
+    with start(command.config.device) as ranks:  # the first Ctrl-C in it saves and ends well
+        summary = train(command.config, resume=command.resume, overwrite=command.overwrite, ranks=ranks)
     if not ranks.main:
         return 0
-    _say(str(summary), sys.stdout)
+    say(str(summary))
     return 0
-
-
-def _say(text: str, stream: TextIO) -> None:
-    """Print a line; a terminal that was closed does not change how the run ended."""
-    try:
-        print(text, file=stream, flush=True)
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # for the interpreter's own flush at the end
 
 
 if __name__ == "__main__":

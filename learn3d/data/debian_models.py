@@ -28,6 +28,7 @@ from learn3d.data.mesh_cleaning import clean_mesh, overlap, surface_grid
 from learn3d.data.mesh_text import write_ply
 from learn3d.data.meshes import is_watertight
 from learn3d.inputs import within
+from learn3d.signals import stop_on_signal
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side when surfaces are compared
@@ -122,9 +123,10 @@ def fetch_debian_models(config: FetchConfig) -> Report:
         written.mkdir()
         downloads.mkdir()
         report = _write_all(config, written, downloads)
-        if output.exists():
-            os.replace(output, Path(scratch, "old"))
-        os.replace(written, output)
+        with stop_on_signal():  # not between the two
+            if output.exists():
+                os.replace(output, Path(scratch, "old"))
+            os.replace(written, output)
     return report
 
 

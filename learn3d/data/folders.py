@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+
+from learn3d.files import check_target_folder
+from learn3d.signals import stop_on_signal
 
 
 def existing(folder: Path, paths: Iterable[str]) -> list[str]:
@@ -16,12 +18,8 @@ def existing(folder: Path, paths: Iterable[str]) -> list[str]:
 
 def check_room(folder: Path, needed: int, what: str) -> None:
     """Make the folder; OSError where it cannot be written into or its disk has less than `needed` bytes free."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise OSError(f"cannot write into the folder {folder}: {error}; give another one with --output") from error
+    check_target_folder(folder, "--output")
+    folder.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise OSError(
@@ -34,14 +32,16 @@ def publish(new: Path, folder: Path, paths: list[str], stale: list[str], trash: 
     """Move files and folders from `new` to `folder`, where they replace what has their names, and take `stale` away.
 
     All three on one file system. What is replaced or stale goes to `trash`, which the caller removes: a folder of many
-    files is there or not, never half.
+    files is there or not, never half. An interruption waits until all is in place: files of two data sets do not go
+    together.
     """
-    for path in stale:
-        _move(folder / path, trash / "stale" / path)
-    for path in paths:
-        if (folder / path).is_dir():
-            _move(folder / path, trash / "replaced" / path)
-        _move(new / path, folder / path)
+    with stop_on_signal():
+        for path in stale:
+            _move(folder / path, trash / "stale" / path)
+        for path in paths:
+            if (folder / path).is_dir():
+                _move(folder / path, trash / "replaced" / path)
+            _move(new / path, folder / path)
 
 
 def _move(source: Path, target: Path) -> None:

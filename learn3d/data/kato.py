@@ -231,7 +231,7 @@ def _open(folder: Path | str, category: str, split: str, kind: str) -> Iterator[
 
 def _check_there(path: Path, category: str, split: str) -> None:
     if not path.is_file():
-        raise FileNotFoundError(_what_is_there(path.parent, category, split, path))
+        raise FileNotFoundError(_what_is_there(category, split, path))
 
 
 def _check_counts(folder: Path | str, category: str, split: str, images: int, voxels: int) -> None:
@@ -246,16 +246,27 @@ def _check_counts(folder: Path | str, category: str, split: str, images: int, vo
         raise DamagedFile(paths[0], "holds no object; make the data set with more meshes or another split")
 
 
-def _what_is_there(folder: Path, category: str, split: str, missing: Path) -> str:
+def _what_is_there(category: str, split: str, missing: Path) -> str:
     """Message for a missing file: what was wanted, what the folder holds, what to do."""
+    folder = missing.parent
     wanted = f"no {missing.name} ({category}, {split}) in {folder}"
     if not folder.is_dir():
         return f"{wanted}: there is no such folder; give the one that holds the npz files, or make it (make_dataset)"
+    pair = split_paths(folder, category, split)
+    for other, kind, lacking in zip(pair, _KINDS, reversed(_KINDS), strict=True):
+        if other.is_file():
+            return (
+                f"{wanted}: the {kind} are there ({other.name}), but a split needs the {lacking}, too. Fetch or copy "
+                "that file from where the other came from, or make both again (make_dataset --overwrite)"
+            )
     names = {synset: name for name, synset in SYNSETS.items()}
     found = []
-    for path in sorted(folder.glob("*_images.npz")):
-        prefix, _, found_split = path.name.removesuffix("_images.npz").rpartition("_")
-        found.append(f"{names.get(prefix, prefix)} {found_split}")
+    for prefix, splits in contents(folder).items():
+        whole = [s for s in splits if all(path.is_file() for path in split_paths(folder, prefix, s))]
+        found += [f"{names.get(prefix, prefix)} {s}" for s in whole]
     if found:
         return f"{wanted}; the folder holds: {', '.join(found)}. Choose one of these, or make the split (make_dataset)"
-    return f"{wanted}; the folder holds no '*_images.npz' at all. Give another folder, or make one (make_dataset)"
+    return (
+        f"{wanted}; the folder holds no '*_images.npz' with its '*_voxels.npz' at all. Give another folder, or make "
+        "one (make_dataset)"
+    )

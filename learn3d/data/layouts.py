@@ -61,6 +61,20 @@ def check_options(
             )
 
 
+def require_folder(folder: Path | str) -> None:
+    """Raise FileNotFoundError where the folder of a data set is not there, saying where it was looked for.
+
+    Runs remember the path that they were given, which from another working directory is another place.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        where = "" if folder.is_absolute() else f" (here that is {folder.absolute()})"
+        raise MissingFile(
+            folder,
+            f"there is no such folder{where}; say where the data set is with --data, or make it (make_dataset)",
+        )
+
+
 def load_dataset(
     layout: Layout,
     folder: Path | str,
@@ -83,6 +97,7 @@ def load_dataset(
     FileNotFoundError for missing ones.
     """
     check_options(layout, image_size=image_size, view_bins=view_bins, views_per_object=views_per_object)
+    require_folder(folder)
     names = [name.strip() for name in category.split(",")]
     if len(set(names)) != len(names) or not all(names):
         raise ValueError(f"category must be one name, or different names joined by commas, got {category!r}")

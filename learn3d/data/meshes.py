@@ -17,6 +17,7 @@ import numpy as np
 
 from learn3d import limits
 from learn3d.data import npz
+from learn3d.data.findings import AGAIN
 from learn3d.inputs import read_bytes, within
 
 EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # what trimesh reads without further packages
@@ -67,7 +68,7 @@ def pack_sources(path: Path) -> list[MeshSource]:
         there = set(npz.keys(pack))
         count = _count(npz.read(pack, "n", max_bytes=8)) if "n" in there else -1
     except ValueError as error:
-        raise ValueError(f"cannot read the mesh pack {path}: {error}; it must be {wanted}") from error
+        raise ValueError(f"cannot read the mesh pack {path}: {error}; it must be {wanted}. {AGAIN}") from error
     missing = [key for i in range(count) for key in (f"v{i}", f"f{i}") if key not in there][:4]
     if count < 1 or missing:
         raise ValueError(f"{path} is no mesh pack: it must be {wanted}; n is {count}, missing keys: {missing}")

@@ -54,9 +54,7 @@ def open_npz(path: Path | str, *, most: int | None = None) -> zipfile.ZipFile:
                 raise ValueError("it is a single npy array")
         return open_zip(Path(path), most)
     except (OSError, ValueError) as error:
-        raise ValueError(
-            f"{path} is not an npz file ({error}); perhaps the download was cut short: fetch it again"
-        ) from None
+        raise ValueError(f"{path} is not an npz file ({error})") from None
 
 
 def keys(archive: zipfile.ZipFile) -> list[str]:

@@ -33,7 +33,7 @@ from learn3d import limits
 from learn3d.data import conventions, npz, safe_pickle
 from learn3d.data.conventions import VOXEL_SIZE
 from learn3d.data.crops import SMALLEST, Crops, bounds
-from learn3d.data.findings import DamagedFile, Problem
+from learn3d.data.findings import AGAIN, DamagedFile, Problem
 from learn3d.data.poses import RotationPoses
 from learn3d.data.views import MASK_SIZE, SPLITS, ViewDataset
 
@@ -208,7 +208,7 @@ def _open(path: Path) -> Iterator[zipfile.ZipFile]:
     except DamagedFile:
         raise
     except ValueError as error:
-        raise DamagedFile(path, str(error)) from error
+        raise DamagedFile(path, f"{error}. {AGAIN}") from error
     except FileNotFoundError:
         there = ", ".join(sorted(p.name for p in path.parent.glob("*.npz"))) or "no npz file"
         name = path.stem.split("_")[0]

@@ -15,10 +15,10 @@ from typing import Literal
 
 import numpy as np
 import torch
-from PIL import Image
 
 from learn3d.data import kato, meshes
-from learn3d.data.contact_sheet import Row, draw_rows, make_row
+from learn3d.data.contact_sheet import Row, draw_sheet, make_row
+from learn3d.data.dataset_report import DatasetReport, lacking
 from learn3d.data.folders import check_room, existing, publish
 from learn3d.data.layouts import Layout
 from learn3d.data.poses import Poses
@@ -51,31 +51,6 @@ class DatasetConfig:
     max_faces: int = 1_000_000  # skip meshes with more faces
     seed: int = 0  # of the split, the scales, the colours, the views and the procedural shapes; same seed, same bytes
     overwrite: bool = False  # replace files of this category that are already in the folder
-
-
-@dataclass(frozen=True)
-class DatasetReport:
-    """What `make_dataset` did."""
-
-    category: str
-    files: list[str]  # files and folders written, relative to the output folder
-    objects: dict[str, int]  # objects per split, augmented copies included
-    used: list[dict]  # per mesh: name, split, vertices, faces, watertight
-    skipped: list[dict]  # per mesh: name, split, reason
-    ignored_files: dict[str, int]  # files in the source folder that are no meshes, per extension
-
-    def text(self) -> str:
-        """The report for people."""
-        faces = np.array([mesh["faces"] for mesh in self.used])
-        watertight = sum(mesh["watertight"] for mesh in self.used)
-        lines = [
-            f"{self.category}: {len(self.used)} meshes used, {len(self.skipped)} skipped",
-            "objects: " + ", ".join(f"{split} {count}" for split, count in self.objects.items()),
-            f"faces per mesh: {faces.min()} .. {faces.max()}, median {int(np.median(faces))}; watertight: {watertight}",
-        ]
-        lines += [f"skipped {mesh['name']} ({mesh['split']}): {mesh['reason']}" for mesh in self.skipped]
-        lines += [f"ignored {count} {extension} file(s)" for extension, count in self.ignored_files.items()]
-        return "\n".join(lines + ["files: " + ", ".join(self.files)])
 
 
 def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, np.ndarray]:
@@ -133,7 +108,7 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
 
     Writes the files of the layout (see its module in `learn3d.data.writers`) for every split that is not empty and
     `{synset}_card.json` (settings, splits), `{synset}_report.json`, `{synset}_report.txt`, `{synset}_contact.png`
-    (rows: objects of each split; columns: 8 views, the mask of the first one, the voxels seen from the front).
+    (see `contact_sheet.LEGEND`).
     Files appear under their names only when all of them are complete.
 
     Raises ValueError (settings that do not fit, no usable mesh), FileNotFoundError (no such source), FileExistsError
@@ -148,18 +123,17 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
     _prepare_folder(config, writer_class, total)
 
     done = _Done()
-    with tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=config.output) as temporary:
+    with (
+        tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=config.output) as temporary,
+        _progress_bar(total, config.category, progress) as bar,
+    ):
         folder, trash = Path(temporary) / "new", Path(temporary) / "old"
         folder.mkdir()
         writer = writer_class(folder, config.category)
         names = meshes.object_names(sources)
-        sheet = []
-        bar = _progress_bar(total, config.category, progress)
         for split in ("train", "val", "test"):
             chosen = [(int(number), sources[number], names[number]) for number in splits[split]]
-            rows = _render_split(config, writer, chosen, split, copies[split], done, bar)
-            if rows:
-                sheet.append(draw_rows(rows))
+            _render_split(config, writer, chosen, split, copies[split], done, bar)
         bar.close()
         objects = writer.finish(config.output, done.objects) if done.objects.get("train") else {}
         if not objects.get("train"):
@@ -171,11 +145,13 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
         for split, written in objects.items():  # some layouts decide on the splits at the end
             for name in written:
                 done.mesh_of[name]["split"] = split
-        Image.fromarray(np.concatenate(sheet)).save(folder / f"{prefix}_contact.png")
+        sheet = draw_sheet({split: [done.rows[name] for name in written] for split, written in objects.items()})
+        sheet.save(folder / f"{prefix}_contact.png")
         own = [path for path in (*writer.paths(config.category), *writer.shared) if (folder / path).exists()]
         files = sorted([*own, *_extra_files(prefix)])
         counts = {split: len(written) for split, written in objects.items() if written}
-        report = DatasetReport(config.category, files, counts, done.used, done.skipped, dict(sorted(ignored.items())))
+        skipped, others = done.skipped, dict(sorted(ignored.items()))
+        report = DatasetReport(config.category, files, counts, done.used, skipped, others, lacking(writer, counts))
         write_json(folder / f"{prefix}_card.json", _card(config, writer, counts, done.used))
         write_json(folder / f"{prefix}_report.json", asdict(report))
         (folder / f"{prefix}_report.txt").write_text(report.text() + "\n")
@@ -192,6 +168,7 @@ class _Done:
     skipped: list[dict] = field(default_factory=list)
     objects: dict[str, list[str]] = field(default_factory=dict)  # names per split
     mesh_of: dict[str, dict] = field(default_factory=dict)  # entry of `used` per object name
+    rows: dict[str, Row] = field(default_factory=dict)  # of the contact sheet, per object name
 
 
 def _render_split(
@@ -202,10 +179,9 @@ def _render_split(
     copies: int,
     done: _Done,
     bar,
-) -> list[Row]:
+) -> None:
     """Render and write the chosen meshes (number, mesh, name) of one split, `copies` objects each."""
     writer.start(split, len(chosen) * copies)
-    rows = []
     for number, source, name in chosen:
         items = []
         try:
@@ -224,10 +200,9 @@ def _render_split(
         for item in items:
             writer.write(item)
             grid = writer.convention.to_object(torch.from_numpy(item.voxels)[None])[0].numpy()
-            rows.append(make_row(item.rgb, item.alpha, grid))
+            done.rows[item.name] = make_row(item.rgb, item.alpha, grid)
             done.objects.setdefault(split, []).append(item.name)
             done.mesh_of[item.name] = entry
-    return rows
 
 
 def _render(

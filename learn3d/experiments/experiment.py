@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from learn3d.experiments.formats import embed, main_table, write_report
+from learn3d.experiments.formats import embed, to_text, write_report
 from learn3d.experiments.plan import Options, Run, State, found_runs, plan_runs, read_results, read_state
 from learn3d.experiments.pool import WORKER, Outcome, carry_out_all, share_of_cores
 from learn3d.experiments.report import make_report
 from learn3d.experiments.tables import TABLES
 from learn3d.presets import PRESETS
-
-INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
+from learn3d.terminal import INTERRUPTED
 
 
 @dataclass(frozen=True)
@@ -54,8 +53,7 @@ def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
     paths = write_report(call.options.output, report)
     if call.page is not None:
         embed(call.page, report)
-    for line in main_table(report):
-        print("  ".join(cell.ljust(8) for cell in line).rstrip())
+    print(to_text(report))
     _say("report: " + ", ".join(map(str, paths)))
     return _conclude(outcomes, [] if call.report_only else report["missing"])
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from learn3d import files
 from learn3d.experiments.report import MEAN
+from learn3d.terminal import align
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 75rem; margin: 2rem auto; padding: 0 1rem }
@@ -76,6 +77,12 @@ def to_markdown(report: dict[str, Any], *, heading: bool = True) -> str:
             "```sh\n" + "\n".join(commands(report)) + "\n```",
         ]
     return "\n\n".join(parts) + "\n"
+
+
+def to_text(report: dict[str, Any]) -> str:
+    """The table for the terminal, how long our runs were trained, and whether that is what was asked for."""
+    trained = f"here: trained for {_trained(report)}" if report["runs"] else ""
+    return "\n".join(filter(None, [align(main_table(report)), trained, _not_as_asked(report)]))
 
 
 def to_html(report: dict[str, Any]) -> str:
@@ -165,13 +172,33 @@ def _notes(report: dict[str, Any]) -> list[str]:
         notes.append(f"{labels}, paper's figures: {note}.")
     if any(_only_printed(row["cells"][MEAN]) for row in report["rows"]):
         notes.append("A mean in parentheses is the paper's over its own categories, which are not the ones here.")
-    lengths = sorted({(run["iterations"], run["batch_size"]) for run in report["runs"]})
-    if len(lengths) > 1:
-        alike = ", ".join(f"{iterations} iterations of batch {batch}" for iterations, batch in lengths)
-        notes.append(f"The runs were not all trained alike: {alike}.")
+    if len(_lengths(report)) > 1:
+        notes.append(f"The runs were not all trained alike: {_trained(report)}.")
+    notes += [_not_as_asked(report)] if _not_as_asked(report) else []
     if report["missing"]:
         notes.append(f"Not there yet: {', '.join(report['missing'])}.")
     return notes
+
+
+def _lengths(report: dict[str, Any]) -> list[tuple[int, int]]:
+    """The different (iterations, batch size) of the runs."""
+    return sorted({(run["iterations"], run["batch_size"]) for run in report["runs"]})
+
+
+def _trained(report: dict[str, Any]) -> str:
+    return ", ".join(f"{iterations} iterations of batch {batch}" for iterations, batch in _lengths(report))
+
+
+def _not_as_asked(report: dict[str, Any]) -> str:
+    """A note where results that are there were trained for longer, or shorter, than was asked for."""
+    asked = report["asked"]
+    if not any(run[name] != value for run in report["runs"] for name, value in asked.items()):
+        return ""
+    wanted = [f"{asked['iterations']} iterations"] if "iterations" in asked else []
+    wanted += [f"batch {asked['batch_size']}"] if "batch_size" in asked else []
+    return (
+        f"These are results of {_trained(report)}, where {' of '.join(wanted)} were asked for: they are what is there."
+    )
 
 
 def _only_printed(cell: dict[str, Any]) -> bool:

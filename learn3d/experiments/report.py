@@ -75,8 +75,15 @@ def make_report(
         "protocol": PROTOCOL,
         "rows": made,
         "runs": [_run(run, records[run.folder]) for run in runs if run.folder in records],
+        "asked": _asked(options),
         "missing": [run.name for run in runs if run.folder not in records],
     }
+
+
+def _asked(options: Options) -> dict[str, int]:
+    """What was asked for of how long to train; with --report-only what is there may have been trained otherwise."""
+    asked = {"iterations": options.iterations, "batch_size": options.batch_size}
+    return {name: value for name, value in asked.items() if value is not None}
 
 
 def _records_of(

@@ -23,7 +23,7 @@ from learn3d.networks import (
     create_encoder,
     network_input,
 )
-from learn3d.networks.resnet import load_pretrained
+from learn3d.networks.resnet import check_pretrained, load_pretrained
 from learn3d.staging import Download, upload
 
 
@@ -56,6 +56,7 @@ class PoseInvariantSettings:
     def __post_init__(self) -> None:
         if self.pretrained is not None:
             object.__setattr__(self, "pretrained", Path(self.pretrained))
+        check_pretrained(self.pretrained, self.encoder)
 
     @property
     def image_size(self) -> int:

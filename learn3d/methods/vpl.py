@@ -27,7 +27,7 @@ from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenera
 from learn3d.networks.flat_resnet import FlatResNet18
 from learn3d.networks.gradient_reversal import reverse_gradient
 from learn3d.networks.preact_resnet import PreactResNet18, grey_background
-from learn3d.networks.resnet import load_pretrained
+from learn3d.networks.resnet import check_pretrained, load_pretrained
 from learn3d.networks.view_discriminators import (
     OneHotViewDiscriminator,
     PatchDiscriminator,
@@ -303,8 +303,7 @@ def _check(settings: VPLSettings, shape: DataShape) -> None:
             f"silhouette_size must be {MASK_SIZE}, the size of the data's masks, or image_size "
             f"({settings.image_size}), got {settings.silhouette_size}"
         )
-    if settings.pretrained is not None and settings.encoder != "resnet18":
-        raise ValueError(f"pretrained weights are for the encoder 'resnet18', got encoder {settings.encoder!r}")
+    check_pretrained(settings.pretrained, settings.encoder)
     if settings.symmetric and settings.generator == "sphere":
         raise ValueError("symmetric needs a cube generator (cube-conv or cube-fc), got generator 'sphere'")
     if settings.class_conditional and settings.discriminator != "spectral-patch":

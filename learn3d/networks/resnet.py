@@ -74,6 +74,15 @@ class ResNet18Encoder(nn.Module):
         return self.features(images).mean(dim=(2, 3))
 
 
+def check_pretrained(path: Path | None, encoder: str) -> None:
+    """Raise a ValueError where a file of pretrained weights is given for an encoder (by its name) that has none."""
+    if path is not None and encoder != "resnet18":
+        raise ValueError(
+            f"pretrained weights are for the encoder 'resnet18', got encoder {encoder!r}; choose that encoder (it "
+            "takes images of 224 pixels), or leave pretrained out"
+        )
+
+
 def load_pretrained(encoder: nn.Module, path: Path | str) -> None:
     """Copy weights of torchvision's resnet18 (.pth, .pt or .safetensors) into a `ResNet18Encoder`, in place.
 

@@ -97,6 +97,18 @@ def test_an_empty_prediction_has_an_f_score_and_no_distance(tiny_set) -> None:
     assert summary["chamfer_l1"] == pytest.approx(float(result.chamfer_l1[0])), "left out"
 
 
+def test_why_there_is_no_mmd_is_said(tiny_set, finished_run) -> None:
+    assert evaluate(Constant(egg()), tiny_set).without_mmd == ""
+    result = evaluate(Constant(egg()), tiny_set, max_images=8)
+    assert result.mmd is None
+    assert result.without_mmd.endswith("two images of each of two views, and these are 8 images of 8 views")
+    said = [line for line in (finished_run / "journal.txt").read_text().splitlines() if "val voxel IoU" in line]
+    assert said and all(line.endswith("these are 4 images of 4 views (max_val_images 4)") for line in said)
+    report = []
+    evaluate_runs([finished_run], report_progress=report.append)
+    assert report[1].startswith("warning: no MMD: ") and report[1].endswith("24 images of 24 views")
+
+
 def test_both_voxelisers(tiny_set) -> None:
     shape = egg()
     data = with_truth(tiny_set, shape.vertices, shape.faces)

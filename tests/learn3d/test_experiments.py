@@ -8,6 +8,7 @@ import importlib.util
 import json
 import math
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -469,6 +470,31 @@ def test_different_lengths_of_training_are_said(tmp_path, stub) -> None:
         "not all trained alike: 6 iterations of batch 4, 8 iterations of batch 4"
         in (tmp_path / "out" / "kato.md").read_text()
     )
+
+
+def test_results_of_another_length_than_asked_for_are_said(tmp_path, stub, capsys) -> None:
+    run_experiment(Call("kato", options(tmp_path, iterations=5)), worker=stub)
+    capsys.readouterr()
+    for asked, note in (
+        ({}, ""),
+        ({"iterations": 5, "batch_size": 4}, ""),
+        ({"iterations": 3}, "results of 5 iterations of batch 4, where 3 iterations were asked for"),
+        ({"iterations": 5, "batch_size": 8}, "where 5 iterations of batch 8 were asked for"),
+    ):
+        given = Options(Path("d"), tmp_path / "out", **asked)
+        assert run_experiment(Call("kato", given, report_only=True), worker=stub) == 0
+        for text in (capsys.readouterr().out, (tmp_path / "out" / "kato.md").read_text()):
+            assert note in text and ("asked for" in text) == bool(note), asked
+
+
+def test_the_table_on_the_terminal_is_aligned_and_says_how_long_ours_were_trained(tmp_path, stub, capsys) -> None:
+    run_experiment(Call("kato", options(tmp_path, iterations=5)), worker=stub)
+    header, *rows, trained = capsys.readouterr().out.splitlines()
+    assert trained == "here: trained for 5 iterations of batch 4"
+    starts = [match.start() for match in re.finditer(r"\S+", header)]
+    assert len(starts) == 3 and len(rows) >= 4
+    for row in rows:
+        assert all(row[start - 2 : start] == "  " and row[start] != " " for start in starts[1:]), row
 
 
 def test_a_page_receives_its_table(report, tmp_path) -> None:

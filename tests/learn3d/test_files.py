@@ -49,3 +49,31 @@ def test_devices_and_folders_are_not_replaced(tmp_path) -> None:
         with pytest.raises(OSError, match="is no plain file and is not replaced"):
             files.write_json(path, {})
     assert Path("/dev/null").is_char_device()
+
+
+def test_a_target_is_checked_before_the_work(tmp_path, monkeypatch) -> None:
+    files.check_target(tmp_path / "t.json", "--json")
+    files.check_target_folder(tmp_path / "a" / "b", "--output")
+    monkeypatch.chdir(tmp_path)
+    files.check_target(Path("t.json"), "--json")
+    files.check_target_folder(Path("a/b"), "--output")
+    assert list(tmp_path.iterdir()) == [], "nothing is made"
+    (tmp_path / "file").touch()
+    for check, name, message in (
+        (files.check_target, "a/t.json", "cannot write .*t.json: there is no folder .*a; make it, or give another --x"),
+        (files.check_target, ".", "is no plain file and is not replaced; give another --x"),
+        (files.check_target, "file/t.json", "there is no folder .*file; make it"),
+        (files.check_target_folder, "file", "into the folder .*file: .*file is no folder; give another --x"),
+        (files.check_target_folder, "file/a/b", "into the folder .*b: .*file is no folder; give another --x"),
+    ):
+        with pytest.raises(OSError, match=message):
+            check(tmp_path / name, "--x")
+
+    def refuse(**_: object) -> None:
+        raise PermissionError(13, "Permission denied", ".tmp8")
+
+    monkeypatch.setattr(files.tempfile, "TemporaryFile", refuse)
+    with pytest.raises(OSError, match=r"^cannot write .*t.json: Permission denied; give another --json$"):
+        files.check_target(tmp_path / "t.json", "--json")
+    with pytest.raises(OSError, match=r"^cannot write into the folder .*a: Permission denied; give another --output$"):
+        files.check_target_folder(tmp_path / "a", "--output")

@@ -103,8 +103,12 @@ def test_missing_files_are_named_with_what_is_there(tmp_path, arrays):
     with pytest.raises(FileNotFoundError, match=r"03001627_train_images.npz.*the folder holds: chair test"):
         kato.load(tmp_path, "chair", "train")
     (tmp_path / "03001627_test_voxels.npz").unlink()
-    with pytest.raises(FileNotFoundError, match="03001627_test_voxels"):
+    half = r"no 03001627_test_voxels.npz .*: the images are there \(03001627_test_images.npz\), but .* needs the voxels"
+    with pytest.raises(FileNotFoundError, match=half) as error:
         kato.load(tmp_path, "chair", "test")
+    assert "the folder holds" not in str(error.value) and "make both again" in str(error.value)
+    with pytest.raises(FileNotFoundError, match=r"holds no '\*_images.npz' with its '\*_voxels.npz'"):
+        kato.load(tmp_path, "chair", "train")
     with pytest.raises(ValueError, match="train, val, test"):
         kato.load(tmp_path, "chair", "validation")
 

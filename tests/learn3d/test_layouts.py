@@ -54,6 +54,17 @@ def test_view_bins_are_a_choice_for_any_layout_with_angles(folders, layout):
     assert dataset.num_views == 8 and dataset.view_names[0] == "azimuth -135°, elevation -45°"
 
 
+def test_a_folder_that_is_not_there_is_named_with_where_it_was_looked_for(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for layout in LAYOUTS:
+        with pytest.raises(FileNotFoundError) as error:
+            load_dataset(layout, "data", "chair", "train")
+        assert f"data: there is no such folder (here that is {tmp_path / 'data'})" in str(error.value)
+        assert "say where the data set is with --data" in str(error.value)
+    with pytest.raises(FileNotFoundError, match="nowhere: there is no such folder; say"):
+        load_dataset("kato", tmp_path / "nowhere", "chair", "train")
+
+
 def test_options_reach_the_reader(folders):
     assert len(load_dataset("kar", folders / "kar", "chair", "train")) == 1
     assert len(load_dataset("kar", folders / "kar", "chair", "train", views_per_object=4)) == 4

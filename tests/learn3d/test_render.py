@@ -18,9 +18,12 @@ import trimesh
 
 import nmr
 from learn3d.data import kato, meshes, render
+from learn3d.data.contact_sheet import draw_sheet, make_row
+from learn3d.data.dataset_report import lacking
 from learn3d.data.kato import mesh_to_object
 from learn3d.data.render import DatasetConfig, make_dataset, render_object, split_objects
 from learn3d.data.viewpoints import kato_views
+from learn3d.data.writers import writer_of
 
 
 @pytest.fixture
@@ -75,8 +78,12 @@ def test_every_format_round_trips_through_the_reader(tmp_path, folder):
     assert (dataset.images[:, :, :3].max(axis=2)[empty] == 0).all()
     assert (dataset.images[:, :, :3].max(axis=2)[dataset.images[:, :, 3] == 255] > 0).all()
     sheet = imageio.imread(tmp_path / "data" / "03001627_contact.png")
-    assert sheet.shape == (6 * 64, 10 * 64, 3) and sheet.std() > 10
-    assert "6 meshes used, 0 skipped" in (tmp_path / "data" / "03001627_report.txt").read_text()
+    assert sheet.shape == (18 + 6 * 64, 40 + 10 * 64, 3) and sheet.std() > 10
+    said = (tmp_path / "data" / "03001627_report.txt").read_text()
+    assert "6 meshes used, 0 skipped" in said
+    assert (
+        "03001627_contact.png: rows: up to 6 objects of each split; columns: up to 8 views, the mask of view 0" in said
+    )
 
 
 @pytest.mark.parametrize(("up", "front"), [("y", None), ("z", None), ("x", "-z")])
@@ -350,6 +357,48 @@ def test_a_data_set_without_training_objects_is_not_made(tmp_path, folder):
     assert list((tmp_path / "data").iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("objects", "said"),
+    [
+        ({"train": 2}, "no val and no test split: tools/train.py cannot validate, nor"),
+        ({"train": 2, "test": 1}, "no val split: train with --val-split test, or make the set again"),
+        ({"train": 2, "val": 1}, "no test split: evaluate with --split val, or make the set again"),
+        ({"train": 2, "val": 1, "test": 1}, None),
+    ],
+)
+def test_splits_that_are_missing_are_a_warning(objects, said):
+    (warning,) = lacking(writer_of("kato"), objects) or [None]
+    assert warning is said is None or (warning.startswith(said) and "3 meshes or more" in warning)
+
+
+def test_splits_that_the_layout_has_not_are_no_warning():
+    assert (
+        lacking(writer_of("pascal3d"), {"train": 2, "val": 1})
+        == lacking(writer_of("r2n2"), {"train": 2, "test": 1})
+        == []
+    )
+    assert lacking(writer_of("pascal3d"), {"train": 2})[0].startswith("no val split: tools/train.py cannot validate")
+
+
+def test_two_meshes_end_with_a_warning(tmp_path):
+    config = DatasetConfig(output=tmp_path, category="chair", procedural=2)
+    text = make_dataset(config, progress=False).text()
+    assert text.splitlines()[-1].startswith("warning: no val and no test split")
+    assert (tmp_path / "03001627_report.txt").read_text() == text + "\n"
+
+
+def test_the_contact_sheet_names_its_columns_and_splits():
+    rgb, alpha = np.full((24, 64, 64, 3), 255, np.uint8), np.zeros((24, 64, 64), np.uint8)
+    row = make_row(rgb, alpha, np.zeros((32, 32, 32), bool))
+    assert row.views == (0, 3, 6, 9, 12, 15, 18, 21)
+    assert make_row(rgb[:3], alpha[:3], np.zeros((32, 32, 32), bool)).views == (0, 1, 2)
+    sheet = np.asarray(draw_sheet({"train": [row] * 9, "val": [], "test": [row]}))
+    assert sheet.shape == (18 + 7 * 64, 40 + 640, 3)
+    titles = [(sheet[:17, 40 + 64 * k : 104 + 64 * k] < 100).any() for k in range(10)]
+    names = [(sheet[20 + 64 * k : 80 + 64 * k, :40] < 100).any() for k in range(7)]
+    assert titles == [True] * 10 and names == [True, *[False] * 5, True]
+
+
 def test_render_object_refuses_what_cannot_be_seen():
     with pytest.raises(ValueError, match="no view shows"):
         render_object(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.ones(3), kato_views(), 64, np.eye(3))
@@ -361,4 +410,4 @@ def test_command_line(tmp_path, folder):
     done = subprocess.run([*command, "--source", str(folder)], capture_output=True, text=True)
     assert done.returncode == 0 and "6 meshes used" in done.stdout, done.stderr
     again = subprocess.run([*command, "--source", str(folder)], capture_output=True, text=True)
-    assert again.returncode == 1 and "make_dataset: " in again.stderr and "Traceback" not in again.stderr
+    assert again.returncode == 1 and again.stderr.startswith("error: ") and "Traceback" not in again.stderr

@@ -144,10 +144,11 @@ def test_a_method_starts_from_pretrained_weights(tmp_path: Path) -> None:
     method = PoseInvariant(settings, DataShape(3, pose_features=9), "cpu", "fp32")
     method.start_from_pretrained()
     assert torch.equal(method.encoder.conv1.weight, weights["conv1.weight"])
-    with pytest.raises(ValueError, match="pretrained weights are for the encoder resnet18, not for ConvEncoder"):
-        PoseInvariant(
-            PoseInvariantSettings(pretrained=tmp_path / "weights.pth"), DataShape(3), "cpu", "fp32"
-        ).start_from_pretrained()
+    message = (
+        r"for the encoder 'resnet18', got encoder 'conv-small'; choose that encoder \(.*\), or leave pretrained out"
+    )
+    with pytest.raises(ValueError, match=message):
+        PoseInvariantSettings(encoder="conv-small", pretrained=tmp_path / "weights.pth")
 
 
 class Runs:

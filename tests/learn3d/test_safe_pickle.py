@@ -257,7 +257,7 @@ def test_flipped_bits_and_cut_files_are_noticed(tmp_path: Path) -> None:
     with npz.open_npz(path) as archive, pytest.raises(ValueError, match=r"'images' of .*a.npz: Bad CRC-32"):
         safe_pickle.read_member(archive, "images")
     path.write_bytes(content[:100])
-    with pytest.raises(ValueError, match=r"a.npz is not an npz file .*fetch it again"):
+    with pytest.raises(ValueError, match=r"a.npz is not an npz file \(.*\)$"):
         npz.open_npz(path)
     with pytest.raises(FileNotFoundError, match=r"there is no file .*b.npz"):
         npz.open_npz(tmp_path / "b.npz")

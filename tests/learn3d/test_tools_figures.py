@@ -112,8 +112,10 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
         (("grid", "--runs", finished_run, "--images", 0), "has 24 images, 0 were asked for"),
         (("tsne", "--runs", finished_run, "--category", "lamp"), "lamp"),
         (("curves", "--runs", tmp_path), "metrics.jsonl"),
+        (("grid", "--runs", finished_run, "--output", f"{TOOL}/grid.png"), "figures.py is no folder; give another"),
+        (("all", "--runs", finished_run, "--output", f"{TOOL}"), "figures.py is no folder; give another --output"),
     ):
-        code, out, err = call(*arguments, *output)
+        code, out, err = call(arguments[0], *output, *arguments[1:])
         assert (code, out) == (1, ""), arguments
         assert err.splitlines()[-1].startswith("error: ") and message in err, (arguments, err)
     assert list(tmp_path.iterdir()) == []

@@ -15,6 +15,7 @@ from types import ModuleType
 import pytest
 
 from learn3d.config import load_config
+from learn3d.evaluation_report import COLUMNS
 from learn3d.training import Summary
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -57,6 +58,19 @@ def test_resume_starts_from_the_saved_options(finished_run, form: str) -> None:
     assert (command.config.data, command.config.batch_size) == (saved.data, saved.batch_size)
 
 
+@pytest.mark.parametrize("name", ["train", "evaluate", "reconstruct", "make_dataset", "figures", "bench_processes"])
+def test_help_keeps_the_examples_apart(name: str, monkeypatch, capsys) -> None:
+    pytest.importorskip("matplotlib")
+    monkeypatch.syspath_prepend(str(TOOLS))
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        tool(name).main()
+    lines = capsys.readouterr().out.splitlines()
+    examples = [line for line in tool(name).__doc__.splitlines() if " tools/" in line]
+    assert examples and [line for line in lines if line in examples] == examples
+
+
 @pytest.mark.parametrize("name", ["train", "evaluate", "reconstruct"])
 def test_help_explains_every_option(name: str, monkeypatch, capsys) -> None:
     monkeypatch.setattr(sys, "argv", [name, "--help"])
@@ -76,6 +90,9 @@ def test_help_explains_every_option(name: str, monkeypatch, capsys) -> None:
     [
         ("train", ["--data", "{}", "--category", "airplane", "--output", "{}/run"], "02691156_train_images.npz"),
         ("train", ["--output", "{}", "--resume"], "folder of a training run"),
+        ("train", ["--resume"], "--resume needs --output: the folder of the run"),
+        ("train", ["--out", "{}", "--resume"], "--resume needs --output"),
+        ("train", ["--data", "{}/no", "--category", "chair", "--output", "{}/run"], "data set is with --data"),
         ("train", ["--output", "{}", "--preset", "kato"], "there is no preset 'kato'; choose one of peng2020-kato,"),
         ("train", ["--data", "x", "--category", "chair", "--output", "{}", "--resume", "--overwrite"], "folder of a"),
         ("evaluate", ["{}"], "there is no checkpoint"),
@@ -113,6 +130,16 @@ def test_what_the_disk_refuses_is_one_clear_line(error: OSError, tmp_path, monke
     assert capsys.readouterr().err == f"error: {error}\n"
 
 
+def test_the_help_of_evaluate_explains_every_column(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["evaluate", "--help"])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        tool("evaluate").main()
+    lines = capsys.readouterr().out.splitlines()
+    for column in COLUMNS.values():
+        assert any(line.startswith(f"  {column}: ") and len(line) > len(column) + 30 for line in lines), column
+
+
 @pytest.mark.parametrize(("best_step", "shown"), [(0, False), (500, True)])
 def test_best_iou_is_said_where_there_is_one(best_step: int, shown: bool, tmp_path, monkeypatch, capsys) -> None:
     module = tool("train")
@@ -141,6 +168,58 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, monkeyp
     report = json.loads((tmp_path / "t.json").read_text())
     assert report["protocol"]["split"] == "val"
     assert f"{report['results'][0]['voxel_iou']:.4f}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        (
+            "evaluate",
+            ["{run}", "--json", "{tmp}/none/t.json"],
+            "there is no folder {tmp}/none; make it, or give another",
+        ),
+        ("evaluate", ["{run}", "{tmp}/nope"], "there is no checkpoint {tmp}/nope"),
+        ("evaluate", ["{run}", "--data", "{tmp}/nope"], "nope: there is no such folder"),
+        ("reconstruct", ["--run", "{run}", "--dataset", "{data}", "--output", "{tmp}/file/x"], "file is no folder"),
+        ("reconstruct", ["--run", "{run}", "--dataset", "{tmp}/nope", "--output", "{tmp}/x"], "is with --dataset"),
+        (
+            "reconstruct",
+            ["--run", "{run}", "--dataset", "{data}", "--output", "{tmp}/x", "--frames", "0"],
+            "frames must",
+        ),
+        (
+            "reconstruct",
+            ["--run", "{run}", "--output", "{tmp}/x", "{tmp}/a.png", "--image-size", "0"],
+            "image_size must",
+        ),
+    ],
+)
+def test_what_cannot_work_is_said_before_a_model_is_loaded(
+    name: str, arguments: list[str], message: str, finished_run, tiny_folder, tmp_path, monkeypatch, capsys
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a model is loaded")
+
+    (tmp_path / "file").touch()
+    places = {"run": finished_run, "tmp": tmp_path, "data": tiny_folder}
+    module = tool(name)
+    monkeypatch.setattr("learn3d.checkpoint.load_method", refuse)
+    assert call(module, monkeypatch, *(a.format(**places) for a in arguments)) == 1
+    out, error = capsys.readouterr()
+    assert (out, error.count("\n")) == ("", 1)
+    assert error.startswith("error: ") and message.format(**places) in error
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_table_that_cannot_be_written_is_printed(finished_run, tmp_path, monkeypatch, capsys) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError("the disk is full")
+
+    module = tool("evaluate")
+    monkeypatch.setattr(module, "write_json", refuse)
+    assert call(module, monkeypatch, finished_run, "--json", tmp_path / "t.json") == 1
+    out, error = capsys.readouterr()
+    assert out.startswith("class") and error.endswith("error: the disk is full\n")
 
 
 def test_reconstruct_lists_its_files(finished_run, tiny_folder, tmp_path, monkeypatch, capsys) -> None:

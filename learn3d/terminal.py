@@ -1,0 +1,54 @@
+"""What the tools share on the terminal: how a command ends, and tables of text."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import ParamSpec, TextIO
+
+P = ParamSpec("P")
+
+INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
+
+
+def in_a_sentence(*errors: type[Exception], label: Callable[[], str] = str) -> Callable[[Callable[P, int]], Callable]:
+    """Decorates a tool's main, which returns its exit status: what stops it is a line on stderr, and no traceback.
+
+    ValueError, OSError and the given errors: status 1 and "error: ", `label()` and what the error says. Ctrl-C: status
+    130 and that it was interrupted. Files get their names when they are complete (`learn3d.files`), so that neither
+    leaves half of one. Anything else is a mistake of ours, and has its traceback.
+    """
+
+    def decorate(main: Callable[P, int]) -> Callable[P, int]:
+        @functools.wraps(main)
+        def ending(*arguments: P.args, **options: P.kwargs) -> int:
+            try:
+                return main(*arguments, **options)
+            except (ValueError, OSError, *errors) as error:
+                say(f"error: {label()}{error}", sys.stderr)
+                return 1
+            except KeyboardInterrupt:
+                say("interrupted; what was saved before is as it was", sys.stderr)
+                return INTERRUPTED
+
+        return ending
+
+    return decorate
+
+
+def say(text: str, stream: TextIO | None = None) -> None:
+    """Print a line; a terminal that was closed does not change how the command ends."""
+    stream = stream or sys.stdout
+    try:
+        print(text, file=stream, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # for the interpreter's own flush at the end
+
+
+def align(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of equally many cells as lines, every column as wide as its widest cell."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)

@@ -1,0 +1,92 @@
+"""How the tools end: errors and Ctrl-C are a line; columns of text."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from learn3d.terminal import align, in_a_sentence, say
+
+TOOLS = Path(__file__).parents[2] / "tools"
+INTERRUPTED = "interrupted; what was saved before is as it was\n"
+
+
+def load_tool(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(TOOLS))  # the benchmarks import each other
+    spec = importlib.util.spec_from_file_location(f"ending_{name}", TOOLS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in TOOLS.glob("*.py") if "__main__" in path.read_text()))
+def test_an_interrupt_is_one_line_in_every_tool(name: str, monkeypatch, capsys) -> None:
+    if name == "figures":
+        pytest.importorskip("matplotlib")
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    module = load_tool(name, monkeypatch)
+    monkeypatch.setattr(sys, "argv", [name])
+    arguments = ()
+    if name == "check_dataset":  # its main is given what was parsed
+        monkeypatch.setattr(module, "check_folder", interrupt)
+        arguments = (module.Command(folder=Path("somewhere")),)
+    else:
+        monkeypatch.setattr(module.tyro, "cli", interrupt)
+    assert module.main(*arguments) == 130
+    assert capsys.readouterr() == ("", INTERRUPTED)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT to another process")
+def test_an_interrupted_data_set_leaves_nothing(tmp_path) -> None:
+    command = [sys.executable, str(TOOLS / "make_dataset.py"), "--output", str(tmp_path / "data")]
+    command += ["--category", "chair", "--procedural", "500"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not list(tmp_path.glob("data/.make_dataset_*/new")) and time.monotonic() < deadline:
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=120)
+    assert (process.returncode, out) == (130, "")
+    assert err.endswith(INTERRUPTED) and "Traceback" not in err
+    assert list((tmp_path / "data").iterdir()) == []
+
+
+def test_errors_are_a_line_and_mistakes_of_ours_are_not_hidden(capsys) -> None:
+    @in_a_sentence(FloatingPointError, label=lambda: "rank 1: ")
+    def main(error: Exception | None) -> int:
+        if error:
+            raise error
+        return 7
+
+    assert main(None) == 7
+    for error in (ValueError("a"), FileNotFoundError("b"), FloatingPointError("c")):
+        assert main(error) == 1
+        assert capsys.readouterr().err == f"error: rank 1: {error}\n"
+    with pytest.raises(TypeError):
+        main(TypeError("d"))
+
+
+def test_a_closed_terminal_is_no_error() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as terminal:
+        say("nobody reads this", terminal)
+
+
+def test_columns_are_as_wide_as_their_widest_cell() -> None:
+    assert align([("a", "b", "c"), ("longer", "", "x"), ("", "long", "")]) == (
+        "a       b     c\nlonger        x\n        long"
+    )
