@@ -1,4 +1,5 @@
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -6,6 +7,9 @@ import pytest
 from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent / "data"))
+
+# A shell lets what it starts in the background ignore SIGINT, and so would the programs that tests start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # On CI the same examples every time: a new counter-example belongs to whoever looks for it, not to an unrelated change.
 settings.register_profile("ci", derandomize=True, print_blob=True)

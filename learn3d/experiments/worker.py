@@ -54,7 +54,9 @@ def carry_out(run: Run, *, fresh: bool) -> bool:
 
 
 def _stop_with_parent() -> None:
-    """Interrupt this process when the standard input ends."""
+    """Interrupt this process when the standard input ends; also where the parent was started with SIGINT ignored, as a
+    shell does with what it starts in the background. Here it is the parent's word."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def watch() -> None:
         while os.read(0, 4096):  # not sys.stdin, whose lock a thread must not hold when the interpreter ends

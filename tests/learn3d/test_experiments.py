@@ -575,10 +575,14 @@ def test_a_worker_resumes_or_starts_anew(made_by_hand, monkeypatch, iterations, 
     assert calls == [{"resume": resume, "overwrite": overwrite}]
 
 
-def test_a_worker_stops_when_its_parent_is_gone() -> None:
+@pytest.mark.parametrize("answer", [signal.SIG_DFL, signal.SIG_IGN], ids=["foreground", "background"])
+def test_a_worker_stops_when_its_parent_is_gone(answer: signal.Handlers) -> None:
     code = "import time; from learn3d.experiments import worker; worker._stop_with_parent(); time.sleep(60)"
     process = subprocess.Popen(
-        [sys.executable, "-c", NOT_FROM_HERE + code], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-c", NOT_FROM_HERE + code],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, answer),
     )
     process.stdin.close()
     assert b"KeyboardInterrupt" in process.stderr.read()
