@@ -4,6 +4,7 @@ that fit. Raises ValueErrors that say what is wrong; `checkpoint` says in which 
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -70,8 +71,10 @@ def _is_shape(value: Any) -> bool:
     return all(_count(_SHAPE[name])(number) for name, number in numbers.items())
 
 
-def _are_numbers(value: Any) -> bool:
-    return isinstance(value, dict) and all(_is_number(item) for item in value.values())
+def _are_losses(value: Any) -> bool:
+    """However large: a run that goes on with such losses must be able to resume, too."""
+    numbers = isinstance(value, dict) and all(type(item) in (int, float) for item in value.values())
+    return numbers and all(math.isfinite(item) for item in value.values())
 
 
 def _are_conditions(value: Any) -> bool:
@@ -88,7 +91,7 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "seconds": _NUMBER,
     "best_iou": _NUMBER,
     "object_share": _NUMBER,
-    "losses": (_are_numbers, "a set of finite numbers by name"),
+    "losses": (_are_losses, "a set of finite numbers by name"),
     "config": _BY_NAME,
     "versions": _BY_NAME,
     "conditions": (_are_conditions, "a set of numbers and words by name"),

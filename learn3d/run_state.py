@@ -86,8 +86,9 @@ def save_last(
 def load_last(folder: Path, config: TrainConfig, *, repair: bool = True) -> Saved | None:
     """The newest checkpoint of the run in `folder` that is whole, or None where the run was stopped before its first.
 
-    A damaged last.safetensors is put aside and the one before it takes its place; `notes` say so. Without `repair` it
-    is an error instead: of several processes only the first one repairs, before the others look. Raises ValueError
+    A damaged last.safetensors is put aside and the one before it takes its place; `notes` say so. Without `repair`
+    nothing is renamed, and a damaged one is an error: of several processes only the first one repairs, before the
+    others look. Raises ValueError
     where there is no run, or one without a checkpoint that began with other options than `config`, DamagedError where
     there are checkpoints, but none of them is whole, and OSError where one cannot be reached.
     """
@@ -104,7 +105,7 @@ def load_last(folder: Path, config: TrainConfig, *, repair: bool = True) -> Save
             notes.append(str(error))
             continue
         checkpoint_checks.require_run(metadata, path)
-        if path.name != LAST:
+        if path.name != LAST and repair:
             run_folder.put_in_place(path)
             notes.append(f"going on from the checkpoint before it, {path}; the steps since then are repeated")
         return Saved(path, tensors, metadata, tuple(notes))

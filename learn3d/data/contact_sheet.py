@@ -15,8 +15,8 @@ ROWS = 6
 LEFT, TOP = 40, 18  # pixels for the names of the splits and of the columns
 
 LEGEND = (
-    "rows: up to 6 objects of each split; columns: up to 8 views, the mask of view 0 (black: the object), the voxels \
-seen from the front (the darker, the thicker)"
+    "rows: up to 6 objects of each split; columns: up to 8 views, the mask of view 0 (black: the object), the voxels "
+    "seen from the front (the darker, the thicker)"
 )
 
 

@@ -170,10 +170,9 @@ class PrGAN(Method):
         with self.autocast():
             estimate = self.encoder(images)
         losses: dict[str, float] = {}
+        difference = estimate.float() - upload(z, self.device)
         # A sum over the batch: that over the own rows stands for a part of it only.
-        self._take_step(
-            "encoder", (estimate.float() - upload(z, self.device)).square().sum() / self.ranks.share, losses, step
-        )
+        self._take_step("encoder", difference.square().sum() / self.ranks.share, losses, step)
         losses["total"] = losses["encoder"]
         return losses
 

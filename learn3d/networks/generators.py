@@ -111,13 +111,14 @@ class SymmetricSphereGenerator(nn.Module):
         super().__init__()
         sphere, faces = nmr.icosphere(3)
         middle, right = (torch.nonzero(where)[:, 0] for where in (sphere[:, 2] == 0, sphere[:, 2] > 0))
-        mirrored = sphere[right] * sphere.new_tensor([1.0, 1.0, -1.0])
+        mirror = torch.tensor([1.0, 1.0, -1.0])
+        mirrored = sphere[right] * mirror.to(sphere)
         left = torch.cdist(mirrored.double(), sphere.double()).argmin(dim=1)
         if not torch.equal(sphere[left], mirrored):
             raise RuntimeError("the icosphere is not symmetric about z = 0")
         buffers = {"sphere": sphere.float(), "faces": faces, "edges": nmr.edge_table(faces)}
         buffers |= {"middle": middle, "right": right, "left": left}
-        buffers |= {"order": torch.cat([middle, right, left]).argsort(), "mirror": torch.tensor([1.0, 1.0, -1.0])}
+        buffers |= {"order": torch.cat([middle, right, left]).argsort(), "mirror": mirror}
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
         self.layers = nn.Sequential(

@@ -92,6 +92,8 @@ METADATA = {
     "config": ({"config": [1]}, r"its config must be a set of values by name, got \[1\]"),
     "conditions": ({"conditions": {"samples": []}}, "its conditions must be"),
     "versions": ({"versions": None}, "its versions must be"),
+    "losses": ({"losses": {"total": "high"}}, "its losses must be a set of finite numbers by name"),
+    "losses as a list": ({"losses": [1.0]}, "its losses must be"),
     "classes": ({"shape": {"num_views": 10**9}}, "its shape must be at most"),
     "names": ({"shape": {"num_views": 3, "other": 1}}, "its shape must be at most"),
     "first version": ({"num_views": "24"}, "its num_views must be"),
@@ -166,6 +168,12 @@ def test_states_of_the_random_numbers(path, state):
     with pytest.raises(ValueError, match=r"last\.safetensors holds (no|a) state of the random numbers"):
         checkpoint.random_state(tensors, path)
     assert torch.equal(checkpoint.random_state(load_file(path), path), load_file(path)["random.cpu"])
+
+
+def test_losses_may_be_as_large_as_those_that_a_run_goes_on_with(tmp_path):
+    losses = {"smoothness": float(torch.finfo(torch.float32).max), "total": 1e41}
+    checkpoint.save(tmp_path / "a.safetensors", {}, {"step": 3, "losses": losses})
+    assert checkpoint.load_metadata(tmp_path / "a.safetensors")["losses"] == losses
 
 
 def test_conditions_of_another_version_are_passed_over(tmp_path):

@@ -100,6 +100,9 @@ def test_only_the_first_process_repairs(tiny_run, stopped, run_folder) -> None:
     with pytest.raises(checkpoint.DamagedError, match="is damaged or was cut short"):
         run_state.load_last(run_folder, tiny_run(run_folder), repair=False)
     assert sorted(path.name for path in run_folder.rglob("*")) == names
+    remove(run_folder / "last.safetensors")
+    assert run_state.load_last(run_folder, tiny_run(run_folder), repair=False).metadata["step"] == 2
+    assert not (run_folder / "last.safetensors").exists()
 
 
 def test_what_could_not_be_resumed_is_not_saved(tiny_run, stopped, run_folder, monkeypatch) -> None:
