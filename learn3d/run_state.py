@@ -88,9 +88,9 @@ def load_last(folder: Path, config: TrainConfig, *, repair: bool = True) -> Save
 
     A damaged last.safetensors is put aside and the one before it takes its place; `notes` say so. Without `repair`
     nothing is renamed, and a damaged one is an error: of several processes only the first one repairs, before the
-    others look. Raises ValueError
-    where there is no run, or one without a checkpoint that began with other options than `config`, DamagedError where
-    there are checkpoints, but none of them is whole, and OSError where one cannot be reached.
+    others look. Raises ValueError where there is no run, or one without a checkpoint that began with other options than
+    `config`, DamagedError where there are checkpoints, but none of them is whole, and OSError where one cannot be
+    reached.
     """
     candidates = run_folder.checkpoints(folder)
     if not candidates and not (folder / CONFIG).is_file():
