@@ -30,11 +30,12 @@ TITLES = {
     "voxel_iou_kato19": "voxel IoU (kato19)",
     "chamfer_l1": "Chamfer-L1 distance",
     "f_score": "F-score",
+    "silhouette_iou": "silhouette IoU",
     "mmd": "MMD between views",
     "mmd_paper": "MMD, printed formula",
 }
 _FIRST = ("voxel_iou", "mmd", "projection", "total")  # panels in this order, then as they come
-_NOT_CURVES = {"images", "undefined", "without_distance", "seconds"}
+_NOT_CURVES = {"images", "undefined", "without_distance", "mmd_codes", "seconds"}
 _NOT_CURVES |= {"voxel_iou_kato18"}  # it is what voxel_iou is
 
 

@@ -122,6 +122,11 @@ def test_metrics_become_curves(tmp_path, monkeypatch) -> None:
         curves.read_metrics(folder)
 
 
+def test_what_a_run_counts_is_no_curve(finished_run) -> None:
+    names = {name for _, name in curves.read_metrics(finished_run)}
+    assert {"voxel_iou", "projection"} <= names <= curves.TITLES.keys()
+
+
 def test_seeds_become_a_band(tmp_path) -> None:
     folders = [write_metrics(tmp_path / "a", records(0.0, 4)), write_metrics(tmp_path / "b", records(0.5, 3))]
     runs = [curves.read_metrics(folder) for folder in folders]
