@@ -2,31 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
+import select
 import sys
 from collections.abc import Callable, Sequence
 from typing import ParamSpec, TextIO
 
 P = ParamSpec("P")
 
-INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
+INTERRUPTED, UNREAD = 130, 141  # exit statuses after Ctrl-C, and after SIGPIPE, as shells have them
 
 
 def in_a_sentence(*errors: type[Exception], label: Callable[[], str] = str) -> Callable[[Callable[P, int]], Callable]:
     """Decorates a tool's main, which returns its exit status: what stops it is a line on stderr, and no traceback.
 
     ValueError, OSError and the given errors: status 1 and "error: ", `label()` and what the error says. Ctrl-C: status
-    130 and that it was interrupted. Files get their names when they are complete (`learn3d.files`), so that neither
-    leaves half of one. Anything else is a mistake of ours, and has its traceback.
+    130 and that it was interrupted. An output that nobody reads any more (`| head`): status 141 and no word. Files get
+    their names when they are complete (`learn3d.files`), so that none of these leaves half of one. Anything else is a
+    mistake of ours, and has its traceback.
     """
 
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
         @functools.wraps(main)
         def ending(*arguments: P.args, **options: P.kwargs) -> int:
             try:
-                return main(*arguments, **options)
+                status = main(*arguments, **options)
+                sys.stdout.flush()
+                return status
             except (ValueError, OSError, *errors) as error:
+                if isinstance(error, BrokenPipeError) and _is_unread(sys.stdout):
+                    return UNREAD
                 say(f"error: {label()}{error}", sys.stderr)
                 return 1
             except KeyboardInterrupt:
@@ -44,7 +51,28 @@ def say(text: str, stream: TextIO | None = None) -> None:
     try:
         print(text, file=stream, flush=True)
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # for the interpreter's own flush at the end
+        _silence(stream)
+
+
+def note(text: str) -> None:
+    """Print a line about the progress on stderr, apart from the results."""
+    say(text, sys.stderr)
+
+
+def _is_unread(stream: TextIO) -> bool:
+    """Whether a stream is a pipe whose reader has gone; what waits to be written is dropped then."""
+    with contextlib.suppress(OSError, AttributeError):  # no file at all; a system without poll (Windows)
+        poll = select.poll()
+        poll.register(stream.fileno(), select.POLLOUT)
+        if any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
+            _silence(stream)
+            return True
+    return False
+
+
+def _silence(stream: TextIO) -> None:
+    """Let a stream lead nowhere, also for the interpreter's own flush at the end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def align(rows: Sequence[Sequence[str]]) -> str:

@@ -46,14 +46,14 @@ def main(command: Command) -> int:
     if command.json is not None:
         check_target(command.json, "--json")
     report = check_folder(command.layout, command.folder, command.category, command.split, progress=sys.stderr.isatty())
+    if command.json is not None:
+        write_json(command.json, report.to_json())
     lines = [f"{p.severity}: {p.path}: {p.message}" for split in report.splits for p in split.problems]
     for line in lines[: command.most]:
         print(line)
     if len(lines) > command.most:
         print(f"... and {len(lines) - command.most} more (--most, --json)")
     print(f"\n{report.table()}\n\n{report.errors} errors, {report.warnings} warnings")
-    if command.json is not None:
-        write_json(command.json, report.to_json())
     return 1 if report.errors else 0
 
 

@@ -15,7 +15,7 @@ import tyro
 
 from learn3d.evaluation_report import describe_columns, evaluate_runs, format_table
 from learn3d.files import check_target, write_json
-from learn3d.terminal import in_a_sentence
+from learn3d.terminal import in_a_sentence, note
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,11 @@ def main() -> int:
         which=command.checkpoint,
         precision=command.precision,
         device=command.device,
-        report_progress=lambda text: print(text, file=sys.stderr, flush=True),
+        report_progress=note,
     )
-    print(format_table(report), flush=True)
     if command.json is not None:
         write_json(command.json, report)
+    print(format_table(report))
     return 0
 
 

@@ -22,12 +22,7 @@ from learn3d.figures import paper
 from learn3d.figures.interpolation import AZIMUTHS_DEG
 from learn3d.figures.runs import Run, open_runs
 from learn3d.files import check_target_folder
-from learn3d.terminal import in_a_sentence
-
-
-def report(text: str) -> None:
-    """Say something about the progress, apart from the results."""
-    print(text, file=sys.stderr, flush=True)
+from learn3d.terminal import in_a_sentence, note
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +66,7 @@ class Measured(Drawn):
             split=self.split,
             which=self.checkpoint,
             device=self.device,
-            report_progress=report,
+            report_progress=note,
         )
 
 
@@ -157,11 +152,9 @@ class All(Measured):
         return self.output
 
     def draw(self) -> list[Path]:
-        written, failed = paper.save_all(
-            self.open(), self.runs, self.output, labels=self.labels, report_progress=report
-        )
+        written, failed = paper.save_all(self.open(), self.runs, self.output, labels=self.labels, report_progress=note)
         for text in failed:
-            report(f"not drawn: {text}")
+            note(f"not drawn: {text}")
         return written
 
 

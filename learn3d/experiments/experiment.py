@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from learn3d.experiments.formats import embed, to_text, write_report
+from learn3d.experiments.formats import check_page, embed, to_text, write_report
 from learn3d.experiments.plan import Options, Run, State, found_runs, plan_runs, read_results, read_state
 from learn3d.experiments.pool import WORKER, Outcome, carry_out_all, share_of_cores
 from learn3d.experiments.report import make_report
 from learn3d.experiments.tables import TABLES
 from learn3d.presets import PRESETS
-from learn3d.terminal import INTERRUPTED
+from learn3d.terminal import INTERRUPTED, note, say
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,8 @@ def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
     """Carry out a table's missing runs and write its report; the exit status: 0, 1 where a run failed, 130 if stopped.
 
     The report is written in any case, with what there is. Raises ValueError for a table, method or option that does not
-    exist, for runs with other options in the output folder (unless `overwrite`), and for damaged files.
+    exist, for a page without a place for the table, for runs with other options in the output folder (unless
+    `overwrite`), and for damaged files; OSError for a page that cannot be replaced.
     """
     if call.table not in TABLES:
         raise ValueError(f"there is no table {call.table!r}; choose one of {', '.join(TABLES)} (see --list)")
@@ -42,6 +42,12 @@ def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
         raise ValueError(f"jobs must be a number of processes, at least 1, got {call.jobs}")
     if call.report_only and call.overwrite:
         raise ValueError("--report-only trains nothing and --overwrite trains anew; give one of them")
+    if call.report_only and call.options.changes:
+        raise ValueError(
+            "--report-only reports the runs that are there with whatever settings they have; leave --set out"
+        )
+    if call.page is not None:
+        check_page(call.page, call.table)
     table, outcomes = TABLES[call.table], []
     if call.report_only:
         runs = found_runs(table, call.options)
@@ -53,8 +59,8 @@ def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
     paths = write_report(call.options.output, report)
     if call.page is not None:
         embed(call.page, report)
-    print(to_text(report))
-    _say("report: " + ", ".join(map(str, paths)))
+    say(to_text(report))
+    note("report: " + ", ".join(map(str, paths)))
     return _conclude(outcomes, [] if call.report_only else report["missing"])
 
 
@@ -65,7 +71,7 @@ def _complete(runs: Sequence[Run], table: str, call: Call, threads: int, worker:
         advice = "ask for the same options, choose another --output, or give --overwrite"
         raise ValueError("\n  ".join([*map(str, conflicts.values()), advice]))
     missing = [run for run, state in zip(runs, states, strict=True) if state.stage != "done"]
-    _say(f"{table}: {len(runs)} runs, of which {_count(states)}; {call.jobs} at a time, {threads} threads each")
+    note(f"{table}: {len(runs)} runs, of which {_count(states)}; {call.jobs} at a time, {threads} threads each")
     fresh = [run for run in runs if run.folder in conflicts]
     return carry_out_all(missing, jobs=call.jobs, threads=threads, fresh=fresh, worker=worker)
 
@@ -106,15 +112,11 @@ def _count(states: Sequence[State]) -> str:
 def _conclude(outcomes: Sequence[Outcome], missing: Sequence[str]) -> int:
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]
     for outcome in failed:
-        _say(f"\nFAILED {outcome.run.name}; the end of its log:\n{outcome.tail}")
+        note(f"\nFAILED {outcome.run.name}; the end of its log:\n{outcome.tail}")
     if failed:
-        _say(f"\n{len(failed)} of {len(outcomes)} runs failed; the same command tries them again")
+        note(f"\n{len(failed)} of {len(outcomes)} runs failed; the same command tries them again")
         return 1
     if missing:
-        _say("stopped; the same command goes on")
+        note("stopped; the same command goes on")
         return INTERRUPTED
     return 0
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

@@ -44,13 +44,24 @@ def embed(page: Path, report: dict[str, Any]) -> None:
 
     Raises ValueError where the page does not have the two lines.
     """
-    name, text = report["table"], page.read_text()
-    start, end = f"<!-- table: {name} -->", f"<!-- end: {name} -->"
+    before, after = _around(page, report["table"])
+    files.write_bytes(page, f"{before}\n{to_markdown(report, heading=False)}{after}".encode())
+
+
+def check_page(page: Path, table: str) -> None:
+    """Raise what `embed` would, for the beginning of long work: ValueError, or OSError for a page that is not there or
+    cannot be replaced."""
+    files.check_target(page, "--page")
+    _around(page, table)
+
+
+def _around(page: Path, table: str) -> tuple[str, str]:
+    """What a page has before and after a table's place, the marks included."""
+    text = page.read_text()
+    start, end = f"<!-- table: {table} -->", f"<!-- end: {table} -->"
     if text.count(start) != 1 or text.count(end) != 1 or text.index(end) < text.index(start):
         raise ValueError(f"{page} must have the lines {start!r} and {end!r}, once each, where the table belongs")
-    before, rest = text.split(start)
-    after = rest.split(end)[1]
-    files.write_bytes(page, f"{before}{start}\n{to_markdown(report, heading=False)}{end}{after}".encode())
+    return text[: text.index(start)] + start, text[text.index(end) :]
 
 
 def to_csv(report: dict[str, Any]) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from learn3d.experiments.plan import LOG_FILE, Run
 from learn3d.experiments.worker import STOPPED, request_of
+from learn3d.terminal import note
 
 #: Python puts the working directory first on its path, where a source folder would hide the installed package.
 NOT_FROM_HERE = "import sys; sys.path[:1] = [] if sys.path[0] == '' else sys.path[:1]; "
@@ -54,7 +55,7 @@ def carry_out_all(
     threads: int,
     fresh: Sequence[Run] = (),
     worker: Sequence[str] = WORKER,
-    say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
+    say: Callable[[str], None] = note,
 ) -> list[Outcome]:
     """Carry out `runs`, at most `jobs` at a time, with `threads` threads each; those in `fresh` start anew.
 

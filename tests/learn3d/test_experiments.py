@@ -519,6 +519,18 @@ def test_calls_that_make_no_sense(tmp_path) -> None:
         run_experiment(Call("kato", options(tmp_path), jobs=0))
     with pytest.raises(ValueError, match="give one of them"):
         run_experiment(Call("kato", options(tmp_path), report_only=True, overwrite=True))
+    with pytest.raises(ValueError, match="whatever settings they have; leave --set out"):
+        run_experiment(Call("kato", options(tmp_path, changes=("lambda_prior=0",)), report_only=True))
+
+
+def test_a_page_without_a_place_is_noticed_before_anything_is_trained(tmp_path, stub) -> None:
+    page = tmp_path / "results.md"
+    page.write_text("<!-- table: bins -->\n<!-- end: bins -->\n")
+    with pytest.raises(ValueError, match="must have the lines '<!-- table: kato -->'"):
+        run_experiment(Call("kato", options(tmp_path), page=page), worker=stub)
+    with pytest.raises(FileNotFoundError):
+        run_experiment(Call("kato", options(tmp_path), page=tmp_path / "other.md"), worker=stub)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_damaged_result_is_named(tmp_path, stub) -> None:

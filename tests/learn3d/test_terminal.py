@@ -86,6 +86,41 @@ def test_a_closed_terminal_is_no_error() -> None:
         say("nobody reads this", terminal)
 
 
+@pytest.mark.skipif(os.name != "posix", reason="a pipe without a reader ends otherwise there")
+@pytest.mark.parametrize("buffered", [True, False])
+@pytest.mark.parametrize("lines", [1, 100_000])
+def test_an_output_that_nobody_reads_is_no_error(lines: int, buffered: bool) -> None:
+    """As with `| head`, for output that fits Python's buffer and for output that does not."""
+    program = f"""
+import sys
+from learn3d.terminal import in_a_sentence
+
+@in_a_sentence()
+def main():
+    for _ in range({lines}):
+        print("a line of a table")
+    return 0
+
+sys.exit(main())
+"""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, *([] if buffered else ["-u"]), "-c", program]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    result = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, env=environment, timeout=120)
+    os.close(writing)
+    assert (result.returncode, result.stderr) == (141, b"")
+
+
+def test_a_pipe_that_breaks_elsewhere_is_an_error(capsys) -> None:
+    @in_a_sentence()
+    def main() -> int:
+        raise BrokenPipeError("of a worker")
+
+    assert main() == 1
+    assert capsys.readouterr().err == "error: of a worker\n"
+
+
 def test_columns_are_as_wide_as_their_widest_cell() -> None:
     assert align([("a", "b", "c"), ("longer", "", "x"), ("", "long", "")]) == (
         "a       b     c\nlonger        x\n        long"
