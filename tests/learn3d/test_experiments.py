@@ -310,6 +310,16 @@ def test_a_failing_run_does_not_stop_the_others(tmp_path, stub, capsys) -> None:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="POSIX signals")
+@pytest.mark.skipif(os.name != "posix", reason="a pipe without a reader ends otherwise there")
+def test_runs_go_on_where_nobody_reads_their_progress(tmp_path, stub, monkeypatch) -> None:
+    for name in ("stdout", "stderr"):
+        reading, writing = os.pipe()
+        os.close(reading)
+        monkeypatch.setattr(sys, name, open(writing, "w"))
+    assert run_experiment(Call("kato", options(tmp_path)), worker=stub) == 0
+    assert (tmp_path / "out" / "kato.md").is_file()
+
+
 def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, stub, capsys) -> None:
     call = Call("kato", options(tmp_path, categories=("waits", "airplane")), jobs=2)
     logs = [tmp_path / f"out/runs/waits/{name}-seed0/log.txt" for name in ("vanilla", "proposed")]
