@@ -12,6 +12,7 @@ step "Style"
 step "Tests"
 # The script pytest, not python -m pytest: the latter would import the source folder in place of the installed package.
 # One thread for each process, as threads that wait for each other on shared cores take many times as long. Files stay together:
-# their tests share trained runs and compiled programs.
+# their tests share trained runs and compiled programs; and in the order of their names, as the longest have the fewest tests and
+# would come last otherwise.
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-exec .venv/bin/pytest -n "${JOBS:-auto}" --maxprocesses 8 --dist loadfile --cov --cov-report=term:skip-covered "$@"
+exec .venv/bin/pytest -n "${JOBS:-auto}" --maxprocesses 8 --dist loadfile --no-loadscope-reorder --cov --cov-report=term:skip-covered "$@"
