@@ -8,12 +8,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from learn3d.experiments.plan import LOG_FILE, Run
 from learn3d.experiments.worker import STOPPED, request_of
+from learn3d.signals import handled_by
 from learn3d.terminal import note
 
 #: Python puts the working directory first on its path, where a source folder would hide the installed package.
@@ -65,8 +66,8 @@ def carry_out_all(
     """
     waiting, running, outcomes = list(runs), [], {}
     last_report = time.monotonic()
-    with _signals() as received:
-        told = 0
+    received, told = [], 0  # a SIGTERM or SIGHUP after the first signal is the same request again, not a second one
+    with handled_by(lambda n: received.append(n) if not received or n == signal.SIGINT else None):
         while (waiting and not received) or running:
             while waiting and not received and len(running) < jobs:
                 run = waiting.pop(0)
@@ -136,28 +137,6 @@ def _tell(running: Sequence[_Job], kill: bool) -> None:
     for job in running:
         with contextlib.suppress(ProcessLookupError):
             job.process.send_signal(signal.SIGKILL if kill else signal.SIGINT)
-
-
-@contextlib.contextmanager
-def _signals() -> Iterator[list[int]]:
-    """The signals received while the block runs, in a list that grows. A SIGTERM or SIGHUP after the first one is the
-    same request again, not a second one."""
-    received: list[int] = []
-
-    def handle(number: int, frame: object) -> None:
-        if not received or number == signal.SIGINT:
-            received.append(number)
-
-    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    previous = {}
-    try:
-        for number in numbers:
-            with contextlib.suppress(ValueError):  # not the main thread: leave signals alone
-                previous[number] = signal.signal(number, handle)
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _duration(seconds: float) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from learn3d import training
-from learn3d.experiments import formats, published, results
+from learn3d.experiments import formats, pool, published, results
 from learn3d.experiments.experiment import Call, run_experiment
 from learn3d.experiments.plan import (
     Options,
@@ -336,6 +336,18 @@ def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, stub, capsys)
     assert all("own session True" in log.read_text() for log in logs), "else the terminal would interrupt them too"
     assert "stopped; the same command goes on" in capsys.readouterr().err
     assert not (tmp_path / "out/runs/airplane").exists(), "nothing new is started"
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals")
+@pytest.mark.parametrize(("nohup", "status"), [(True, 0), (False, 130)])
+def test_a_closed_terminal_stops_the_runs_except_under_nohup(tmp_path, stub, monkeypatch, nohup, status) -> None:
+    start = pool._start
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if nohup else signal.SIG_DFL)
+    monkeypatch.setattr(pool, "_start", lambda *given: (signal.raise_signal(signal.SIGHUP), start(*given))[1])
+    try:
+        assert run_experiment(Call("kato", options(tmp_path)), worker=stub) == status
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 # --- statistics
