@@ -197,9 +197,8 @@ def start(device: str) -> Iterator[Ranks]:
         yield Ranks(rank, world, backend="gloo" if backend == "gloo" else "NCCL")
     except BaseException as error:
         said = _announce(store, error)
-        if backend == "gloo" and isinstance(
-            error, Exception
-        ):  # NCCL's, or an interrupted sum, might wait for the others
+        # Not NCCL's group, nor one whose sum was interrupted: they might wait for the others.
+        if backend == "gloo" and isinstance(error, Exception):
             dist.destroy_process_group()
         if said:
             raise SystemExit(1) from None
