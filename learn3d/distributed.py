@@ -299,23 +299,27 @@ def _first_sentence(error: Exception) -> str:
 
 
 def _announce(store: dist.Store, error: BaseException) -> bool:
-    """Leave the reason to the others; whether one of them has said the same already.
+    """Leave the reason to the others; whether another process of this machine has said the same already.
 
     A process that ends because of another one says which, and lets it end first: torchrun reports the first one to end,
     and ends all others at once.
     """
-    mine, said = f"{label()}{error or type(error).__name__}", False
+    mine, machine, said = f"{label()}{error or type(error).__name__}", os.environ.get("GROUP_RANK", "0"), False
     with contextlib.suppress(RuntimeError):  # the process that keeps the store is gone
         if isinstance(error, LostPeerError):
             if store.check(["failure"]):
-                error.args = (f"ends because of another process: {store.get('failure').decode()}",)
-        elif (first := store.compare_set("failure", "", mine).decode()) == mine:
-            from torch.distributed.elastic.multiprocessing.errors import get_error_handler
-
-            get_error_handler().record_exception(error)  # for torchrun's report
-            return False
+                reason = store.get("failure").decode().partition("\n")[2]
+                error.args = (f"ends because of another process: {reason}",)
         else:
-            said = isinstance(error, Exception) and bool(str(error)) and first.endswith(str(error))
+            first = store.compare_set("failure", "", f"{machine}\n{mine}").decode()
+            where, _, what = first.partition("\n")
+            if what == mine:
+                from torch.distributed.elastic.multiprocessing.errors import get_error_handler
+
+                get_error_handler().record_exception(error)  # for torchrun's report
+                return False
+            if isinstance(error, Exception) and str(error) and what.endswith(str(error)):
+                said = where == machine or store.compare_set(f"said on {machine}", "", mine).decode() != mine
     with contextlib.suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
     time.sleep(LAST_WORDS)

@@ -133,6 +133,18 @@ def test_a_lost_machine_that_kept_the_store_is_a_lost_process(monkeypatch) -> No
     assert str(lost.value) == said
 
 
+def test_what_all_processes_say_is_said_once_on_each_machine(monkeypatch) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(distributed, "LAST_WORDS", 0)
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    store, silent = torch.distributed.HashStore(), []
+    for rank, machine in enumerate((0, 0, 1, 1)):
+        monkeypatch.setenv("RANK", str(rank))
+        monkeypatch.setenv("GROUP_RANK", str(machine))
+        silent.append(distributed._announce(store, ValueError("there is no such folder")))
+    assert silent == [False, True, False, True]
+
+
 def test_batch_norm_of_one_process_is_the_usual_one() -> None:
     """The same mean and variance, in training and afterwards; the other tests have it between processes."""
     torch.manual_seed(0)
