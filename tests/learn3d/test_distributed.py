@@ -79,6 +79,11 @@ def test_too_many_processes_are_refused(batch_size: int, sampling: str, message:
         Ranks(0, 3).divide(batch_size, sampling)
 
 
+def test_too_many_processes_are_refused_before_data_are_read(tiny_config, tmp_path) -> None:
+    with pytest.raises(ValueError, match="a batch of 4 is too small for 5 processes"):
+        train(tiny_config(tmp_path / "run", data=tmp_path / "nowhere"), ranks=Ranks(1, 5))
+
+
 @pytest.mark.parametrize("names", [("flip",), ("flip-image", "channels"), ("channels", "flip")])
 def test_parts_of_a_batch_are_changed_as_the_whole_is(tiny_set, names: tuple[str, ...]) -> None:
     indices = torch.tensor([3, 50, 7, 30, 31])
