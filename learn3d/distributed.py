@@ -190,9 +190,18 @@ def start(device: str) -> Iterator[Ranks]:
         gpus, local = torch.cuda.device_count(), int(os.environ.get("LOCAL_RANK", "0"))
         torch.cuda.set_device(local % gpus)
         own_gpu = int(os.environ.get("LOCAL_WORLD_SIZE", "1")) <= gpus
-    store, _, _ = next(rendezvous("env://", rank, world, timeout=TIMEOUT))
-    backend = "cpu:gloo,cuda:nccl" if all_agree(store, rank, world, own_gpu) else "gloo"
-    dist.init_process_group(backend, store=dist.PrefixStore("run", store), rank=rank, world_size=world, timeout=TIMEOUT)
+    try:
+        store, _, _ = next(rendezvous("env://", rank, world, timeout=TIMEOUT))
+        store = dist.PrefixStore(_attempt(), store)
+        backend = "cpu:gloo,cuda:nccl" if all_agree(store, rank, world, own_gpu) else "gloo"
+        own = dist.PrefixStore("run", store)
+        dist.init_process_group(backend, store=own, rank=rank, world_size=world, timeout=TIMEOUT)
+    except RuntimeError as error:
+        raise LostPeerError(
+            f"the {world} processes of the run did not find each other by {os.environ['MASTER_ADDR']}:"
+            f"{os.environ['MASTER_PORT']} ({_first_sentence(error)}); one of them has ended before (it says why), or "
+            "the machines do not reach each other (docs/multi-process.md)"
+        ) from None
     try:
         yield Ranks(rank, world, backend="gloo" if backend == "gloo" else "NCCL")
     except BaseException as error:
@@ -204,6 +213,16 @@ def start(device: str) -> Iterator[Ranks]:
             raise SystemExit(1) from None
         raise
     dist.destroy_process_group()
+
+
+def _attempt() -> str:
+    """A name of this attempt's own in the store, which torchrun keeps when it starts all processes again.
+
+    They would find what those before them left: addresses that nobody answers at, and why they ended. Several torchruns
+    count differently (pytorch/pytorch#135712), so that there the number says nothing.
+    """
+    number = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") if os.environ.get("GROUP_WORLD_SIZE") == "1" else "0"
+    return f"attempt {number}"
 
 
 def all_agree(store: dist.Store, rank: int, world: int, value: bool) -> bool:
@@ -268,29 +287,38 @@ def _all_reduce(values: Tensor, op: Any = dist.ReduceOp.SUM) -> None:
     except torch.cuda.OutOfMemoryError:
         raise
     except RuntimeError as error:  # a closed connection, or nobody answered in time
-        raise LostPeerError(str(error).strip().splitlines()[0].split(". ")[0]) from None
+        raise LostPeerError(
+            f"another process of the run failed, was killed or does not answer ({_first_sentence(error)})"
+        ) from None
+
+
+def _first_sentence(error: Exception) -> str:
+    """What torch says, without the advice and the stack of calls that follow."""
+    return str(error).strip().split("\n")[0].split(". ")[0]
 
 
 def _announce(store: dist.Store, error: BaseException) -> bool:
-    """Leave the reason to the others; whether one of them has said the same already.
+    """Leave the reason to the others; whether another process of this machine has said the same already.
 
     A process that ends because of another one says which, and lets it end first: torchrun reports the first one to end,
     and ends all others at once.
     """
-    mine, said = f"{label()}{error or type(error).__name__}", False
+    mine, machine, said = f"{label()}{error or type(error).__name__}", os.environ.get("GROUP_RANK", "0"), False
     with contextlib.suppress(RuntimeError):  # the process that keeps the store is gone
         if isinstance(error, LostPeerError):
             if store.check(["failure"]):
-                error.args = (f"ends because of another process: {store.get('failure').decode()}",)
-            else:
-                error.args = (f"another process of the run was killed or does not answer ({error})",)
-        elif (first := store.compare_set("failure", "", mine).decode()) == mine:
-            from torch.distributed.elastic.multiprocessing.errors import get_error_handler
-
-            get_error_handler().record_exception(error)  # for torchrun's report
-            return False
+                reason = store.get("failure").decode().partition("\n")[2]
+                error.args = (f"ends because of another process: {reason}",)
         else:
-            said = isinstance(error, Exception) and bool(str(error)) and first.endswith(str(error))
+            first = store.compare_set("failure", "", f"{machine}\n{mine}").decode()
+            where, _, what = first.partition("\n")
+            if what == mine:
+                from torch.distributed.elastic.multiprocessing.errors import get_error_handler
+
+                get_error_handler().record_exception(error)  # for torchrun's report
+                return False
+            if isinstance(error, Exception) and str(error) and what.endswith(str(error)):
+                said = where == machine or store.compare_set(f"said on {machine}", "", mine).decode() != mine
     with contextlib.suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
     time.sleep(LAST_WORDS)

@@ -33,6 +33,10 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
         os.replace(temporary, path)
         if sync:
             sync_folder(path.parent)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:  # a full disk does not say which file it had no room for
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

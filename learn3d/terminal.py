@@ -29,7 +29,8 @@ def in_a_sentence(*errors: type[Exception], label: Callable[[], str] = str) -> C
         def ending(*arguments: P.args, **options: P.kwargs) -> int:
             try:
                 status = main(*arguments, **options)
-                sys.stdout.flush()
+                if sys.stdout is not None:  # closed before the program began
+                    sys.stdout.flush()
                 return status
             except (ValueError, OSError, *errors) as error:
                 if isinstance(error, BrokenPipeError) and _is_unread(sys.stdout):

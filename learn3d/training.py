@@ -80,9 +80,9 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
         torch.set_num_threads(config.threads)
     if ranks.main and not resume:
         run_folder.check_free(config.output, overwrite)  # before data are read; it is cleared when all else is well
+    ranks = ranks.divide(config.batch_size, config.sampling)
     train_set, val_set = load_splits(config)
     precision = resolve_precision(config.precision, config.device)
-    ranks = ranks.divide(config.batch_size, config.sampling)
     folder, saved = config.output, None
     if resume:
         with ranks.main_first():  # it may have to put an earlier checkpoint in place

@@ -13,7 +13,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -21,9 +23,10 @@ import torch
 from safetensors.torch import load_file
 from train_in_ranks import evaluate_last, linear_optimizer
 
+from learn3d import distributed
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.data import augment as augmentation
-from learn3d.distributed import ALONE, Ranks, all_agree, label, start
+from learn3d.distributed import ALONE, LostPeerError, Ranks, all_agree, label, start
 from learn3d.networks.whole_batch_norm import use_whole_batch
 from learn3d.training import train
 
@@ -76,6 +79,11 @@ def test_too_many_processes_are_refused(batch_size: int, sampling: str, message:
         Ranks(0, 3).divide(batch_size, sampling)
 
 
+def test_too_many_processes_are_refused_before_data_are_read(tiny_config, tmp_path) -> None:
+    with pytest.raises(ValueError, match="a batch of 4 is too small for 5 processes"):
+        train(tiny_config(tmp_path / "run", data=tmp_path / "nowhere"), ranks=Ranks(1, 5))
+
+
 @pytest.mark.parametrize("names", [("flip",), ("flip-image", "channels"), ("channels", "flip")])
 def test_parts_of_a_batch_are_changed_as_the_whole_is(tiny_set, names: tuple[str, ...]) -> None:
     indices = torch.tensor([3, 50, 7, 30, 31])
@@ -98,6 +106,48 @@ def test_without_torchrun_there_is_one_process(monkeypatch) -> None:
     with pytest.raises(ValueError, match=r"WORLD_SIZE is 2, but RANK.* not set; start the processes by torchrun"):
         with start("cpu"):
             pass
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_processes_that_do_not_meet_say_where_and_what_to_look_for(monkeypatch) -> None:
+    port = free_port()
+    for name, value in {"RANK": 1, "WORLD_SIZE": 2, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}.items():
+        monkeypatch.setenv(name, str(value))
+    monkeypatch.setattr(distributed, "TIMEOUT", timedelta(seconds=1))
+    said = rf"the 2 processes of the run did not find each other by 127.0.0.1:{port} \(.*\); one of them has ended"
+    with pytest.raises(LostPeerError, match=said), start("cpu"):
+        pass
+
+
+def test_a_lost_machine_that_kept_the_store_is_a_lost_process(monkeypatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("[pair.cc:537] Connection reset by peer. This is a rare event\nframe #0")
+
+    monkeypatch.setattr(torch.distributed, "all_reduce", fail)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(distributed, "LAST_WORDS", 0)
+    with pytest.raises(LostPeerError) as lost:
+        Ranks(1, 2).any(True)
+    distributed._announce(mock.Mock(check=fail), lost.value)
+    said = "another process of the run failed, was killed or does not answer ([pair.cc:537] Connection reset by peer)"
+    assert str(lost.value) == said
+
+
+def test_what_all_processes_say_is_said_once_on_each_machine(monkeypatch) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(distributed, "LAST_WORDS", 0)
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    store, silent = torch.distributed.HashStore(), []
+    for rank, machine in enumerate((0, 0, 1, 1)):
+        monkeypatch.setenv("RANK", str(rank))
+        monkeypatch.setenv("GROUP_RANK", str(machine))
+        silent.append(distributed._announce(store, ValueError("there is no such folder")))
+    assert silent == [False, True, False, True]
 
 
 def test_batch_norm_of_one_process_is_the_usual_one() -> None:
@@ -160,10 +210,7 @@ class Processes:
 
 def launch(*command: object, world: int = 2) -> Processes:
     """Start processes as torchrun does, but without it: that saves a third of the time."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    common = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1"}
+    common = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "OMP_NUM_THREADS": "1"}
     common |= dict.fromkeys(("WORLD_SIZE", "LOCAL_WORLD_SIZE"), str(world))
     line = [sys.executable, *map(str, command)]
     own = [dict.fromkeys(("RANK", "LOCAL_RANK"), str(rank)) for rank in range(world)]
@@ -325,7 +372,7 @@ def test_a_signal_to_one_stops_all_and_a_killed_one_ends_all(tiny_folder, run_fo
     resumed.processes[1].kill()
     codes, said = resumed.wait(timeout=60)
     assert codes == [1, -signal.SIGKILL], said
-    assert f"error: rank 0 on {socket.gethostname()}: another process of the run was killed" in said[0]
+    assert f"error: rank 0 on {socket.gethostname()}: another process of the run failed, was killed" in said[0]
     assert all(torch.equal(saved[name], value) for name, value in load_file(run_folder / "last.safetensors").items())
 
 
@@ -338,3 +385,27 @@ def test_torchrun_reports_what_went_wrong_once(tmp_path) -> None:
     assert len(lines) == 1, result.stderr
     assert "02691156_train_images.npz" in lines[0]
     assert "02691156_train_images.npz" in result.stderr.split("Root Cause")[1]
+
+
+RESTARTED = """
+import os, time
+from learn3d.distributed import start
+first, rank = os.environ["TORCHELASTIC_RESTART_COUNT"] == "0", os.environ["RANK"]
+if not first and rank == "1":
+    time.sleep(2)  # the other one would find the address that this one had
+with start("cpu") as ranks:
+    if first:
+        raise RuntimeError("once more")
+    assert ranks.any(rank == "1")
+"""
+
+
+def test_processes_that_torchrun_starts_again_do_not_look_for_those_before_them(tmp_path) -> None:
+    (tmp_path / "restarted.py").write_text(RESTARTED)
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command = [*torchrun, "--max-restarts", "1", str(tmp_path / "restarted.py")]
+    packages = os.pathsep.join(filter(None, [str(TRAIN.parents[1]), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": packages}
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert "once more" in result.stderr
+    assert result.returncode == 0, result.stderr

@@ -33,6 +33,14 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path, sync: bool) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_disk_without_room_names_the_file(tmp_path) -> None:
+    (tmp_path / ".a.json.partial").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=r"No space left on device: '.*/a\.json'"):
+        files.write_json(tmp_path / "a.json", {})
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_sync_comes_before_the_new_name(tmp_path, monkeypatch) -> None:
     calls = []
     replace = os.replace

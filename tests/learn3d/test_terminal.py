@@ -86,6 +86,12 @@ def test_a_closed_terminal_is_no_error() -> None:
         say("nobody reads this", terminal)
 
 
+def test_an_output_that_was_never_open_is_no_error(monkeypatch) -> None:
+    """As with `>&-` in a shell: Python has no stdout then."""
+    monkeypatch.setattr(sys, "stdout", None)
+    assert in_a_sentence()(lambda: say("nobody reads this") or 0)() == 0
+
+
 @pytest.mark.skipif(os.name != "posix", reason="a pipe without a reader ends otherwise there")
 @pytest.mark.parametrize("buffered", [True, False])
 @pytest.mark.parametrize("lines", [1, 100_000])
