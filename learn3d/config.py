@@ -225,7 +225,7 @@ def load_config(path: Path) -> TrainConfig:
     try:
         values = parse_json(read_bytes(path, limits.CONFIG_BYTES, "the options of a run"))
     except FileNotFoundError:
-        raise ValueError(f"no {path}: is this the folder of a training run?") from None
+        raise ValueError(f"no {path}: is this the folder of a training run? One begins without --resume") from None
     except DamagedFile:
         raise
     except ValueError as error:

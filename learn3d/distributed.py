@@ -53,6 +53,7 @@ class Ranks:
     world: int = 1
     rows: Tensor | None = None  # int64 [b]: the rows of every batch that are this process's own; None: all
     share: float = 1.0  # of the batch: the weight of this process's means
+    beside: int = 1  # processes on this machine, with this one
     backend: str = ""  # what exchanges tensors: gloo, or NCCL for those on a GPU
 
     @property
@@ -184,12 +185,12 @@ def start(device: str) -> Iterator[Ranks]:
         return
     if missing := [name for name in ("RANK", "MASTER_ADDR", "MASTER_PORT") if name not in os.environ]:
         raise ValueError(f"WORLD_SIZE is {world}, but {', '.join(missing)} is not set; start the processes by torchrun")
-    rank, own_gpu = int(os.environ["RANK"]), False
+    rank, beside, own_gpu = int(os.environ["RANK"]), int(os.environ.get("LOCAL_WORLD_SIZE", "1")), False
     check_device(device)
     if device == "cuda":
         gpus, local = torch.cuda.device_count(), int(os.environ.get("LOCAL_RANK", "0"))
         torch.cuda.set_device(local % gpus)
-        own_gpu = int(os.environ.get("LOCAL_WORLD_SIZE", "1")) <= gpus
+        own_gpu = beside <= gpus
     try:
         store, _, _ = next(rendezvous("env://", rank, world, timeout=TIMEOUT))
         store = dist.PrefixStore(_attempt(), store)
@@ -203,7 +204,7 @@ def start(device: str) -> Iterator[Ranks]:
             "the machines do not reach each other (docs/multi-process.md)"
         ) from None
     try:
-        yield Ranks(rank, world, backend="gloo" if backend == "gloo" else "NCCL")
+        yield Ranks(rank, world, beside=beside, backend="gloo" if backend == "gloo" else "NCCL")
     except BaseException as error:
         said = _announce(store, error)
         # Not NCCL's group, nor one whose sum was interrupted: they might wait for the others.

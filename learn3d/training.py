@@ -115,8 +115,8 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
             run_folder.claim(folder, overwrite)
         files.write_json(folder / run_folder.CONFIG, config_to_dict(config), sync=True)
     before = progress.seconds
-    # A GPU's host and processes that wait for each other have idle threads by nature.
-    cores = CoreShare(torch.get_num_threads() if ranks.alone and config.device == "cpu" else 1)
+    waits = config.device != "cpu" or not ranks.alone
+    cores = CoreShare(torch.get_num_threads(), processes=ranks.beside, waits=waits)
 
     with explained(folder), stop_on_signal() as stop, _open_log(config, progress, ranks) as log:
         for note in (*notes, *empty):

@@ -61,7 +61,9 @@ def test_wrong_options_are_named_with_their_file(tmp_path, name):
 
 def test_files_that_are_no_json_or_too_large(tmp_path, monkeypatch):
     path = tmp_path / "config.json"
-    with pytest.raises(ValueError, match=r"no .*config\.json: is this the folder of a training run\?"):
+    with pytest.raises(
+        ValueError, match=r"no .*config\.json: is this the folder of a training run\? One begins without --resume"
+    ):
         load_config(path)
     for text in ("[" * 100_000, '{"seed": NaN}', "{", "\xff"):
         path.write_text(text, encoding="latin-1")

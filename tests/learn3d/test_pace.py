@@ -16,8 +16,9 @@ class Clocks:
     def __init__(self) -> None:
         self.now, self.cpu = 1000.0, 50.0
 
-    def watch(self, threads: int) -> CoreShare:
-        return CoreShare(threads, seconds=10, cores=16, clock=lambda: self.now, cpu_clock=lambda: self.cpu)
+    def watch(self, threads: int, **options: int) -> CoreShare:
+        clocks = {"clock": lambda: self.now, "cpu_clock": lambda: self.cpu}
+        return CoreShare(threads, seconds=10, cores=16, **clocks, **options)
 
     def steps(self, watched: CoreShare, count: int, *, cores: float) -> list[str]:
         """What is said during steps of one second in which `cores` cores work."""
@@ -65,11 +66,45 @@ def test_more_threads_than_cores_are_named_at_once() -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("processes", "threads", "said"),
+    [
+        (4, 4, []),
+        (16, 1, []),
+        (
+            4,
+            5,
+            [
+                "4 processes of 5 threads each on 16 cores wait for each other; "
+                "stop with Ctrl-C and continue with --threads 4"
+            ],
+        ),
+        (
+            17,
+            1,
+            [
+                "17 processes of 1 thread each on 16 cores wait for each other; "
+                "stop with Ctrl-C and continue with fewer processes"
+            ],
+        ),
+    ],
+)
+def test_processes_share_the_cores_and_may_wait_for_each_other(processes: int, threads: int, said: list[str]) -> None:
+    clocks = Clocks()
+    assert clocks.steps(clocks.watch(threads, processes=processes, waits=True), 100, cores=0.5) == said
+
+
 def test_a_run_says_it(tiny_run, run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Hungry(CoreShare):
-        def __init__(self, threads: int) -> None:
+        def __init__(self, threads: int, **given: int) -> None:
             super().__init__(
-                threads, seconds=1, skipped_steps=0, cores=2, clock=iter(range(99)).__next__, cpu_clock=lambda: 0.0
+                threads,
+                **given,
+                seconds=1,
+                skipped_steps=0,
+                cores=2,
+                clock=iter(range(99)).__next__,
+                cpu_clock=lambda: 0.0,
             )
 
     monkeypatch.setattr(training, "CoreShare", Hungry)
