@@ -14,6 +14,8 @@ CONFIG_BYTES = MIB  # config.json of a run: 2 kB
 JSON_BYTES = 64 * MIB  # splits.json: 2 MB; test.json of a run on 10,000 objects: 1 MB
 JSON_DEPTH = 32  # levels of nesting; no file of ours has more than five
 METRICS_BYTES = 256 * MIB  # metrics.jsonl: a million lines
+CURVES = 100  # numbers that they log, each a panel of a figure; ours log 20
+CURVE_NAME = 60  # characters
 OBJECTS = 1_000_000  # objects of a split, photographs in a table; all of ShapeNet has 51,300
 NAME_LENGTH = 200  # characters of an object's id, which becomes part of a file name
 
