@@ -34,6 +34,7 @@ VOLUME_BYTES = 4 * MIB  # a voxel file (.mat, .binvox) of 32^3 cells: 0.3 as flo
 IMAGE_FILE_BYTES = 256 * MIB
 IMAGE_SIDE = 10_000  # pixels; photographs are padded to squares: 400 MB
 IMAGE_PIXELS = 64_000_000  # a photograph; decoding, masking and framing take 29 bytes for each
+SQUARE_SIDE = 16_000  # that an object is cut out with: a network's objects take 65 % of it, of 10,000 pixels
 RENDER_SIDE = 2048  # pixels, renderings of a data set; published ones have up to 224, and 16 are read at once
 
 # Meshes
@@ -48,6 +49,7 @@ POLYGON_CORNERS = 2000  # of one polygon of a text format: cutting ears takes th
 PACKAGE_FILE_BYTES = 512 * MIB  # one file of a package; the largest wanted today is a 61 MB catalogue
 PACKAGE_BYTES = 16 * GIB  # all files of a package, read past or not; FlightGear's have 0.4
 PACKAGE_MEMBERS = 1_000_000
+PACKAGE_WANTED_BYTES = 2 * GIB  # its catalogues, or models, held at a time; FlightGear's have less than 0.4
 CATALOGUE_MEMBER_BYTES = 64 * MIB  # one file inside a catalogue; the largest wanted today is a 9 MB model
 
 # Checkpoints and weights

@@ -29,7 +29,7 @@ CHANGES = {
     "data": (5, "data must be a text, got 5"),
     "config": ([], r"config must be values by name, got \[\]"),
     "conditions": (7, "conditions must be values by name, got 7"),
-    "trained_by": ({"commit": 5}, "trained_by must be values by name, with a text or null as its commit, got {'commit': 5}"),
+    "trained_by": ({"commit": 5}, "trained_by must be values by name, with a text or null as its commit, got {.*}"),
     "objects": ({}, "names must be texts, got None"),
 }
 
