@@ -136,7 +136,7 @@ def check_fields(settings: Settings) -> None:
     """Raise a ValueError naming the setting that is no choice of its kind, negative, or not finite.
 
     Rates (...learning_rate) must be positive; whole numbers at least 1, and at most what a network of this size can be
-    made of (sides of images and channels: 1024); all other numbers, such as weights, at least 0.
+    made of (sides of images: 1024, channels: 512); all other numbers, such as weights, at least 0.
     """
     types = typing.get_type_hints(type(settings))
     for field in dataclasses.fields(settings):

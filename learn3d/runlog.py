@@ -38,6 +38,9 @@ class RunLog:
         self.total = total
         self.seconds_between_lines = seconds_between_lines
         self._warned: set[str] = set()
+        for name in (METRICS, JOURNAL):  # a pipe would be waited for; a link would have lines appended anywhere
+            if (path := self.folder / name).is_symlink() or (path.exists() and not path.is_file()):
+                raise OSError(f"{path} is no plain file, and nothing is appended to it; move it away")
         _forget_after(self.folder / METRICS, start)
         self._metrics = _Lines(self.folder / METRICS)
         self._journal = _Lines(self.folder / JOURNAL)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import re
 import threading
 from collections import Counter
@@ -27,6 +28,7 @@ EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # what trimesh r
 SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
 TEXTURES = (*PHOTOGRAPHS, "TGA", "GIF", "PPM", "DDS")
 _ONE_AT_A_TIME = threading.RLock()
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else tracebacks of what it passes over are printed
 
 
 @dataclass(frozen=True, eq=False)

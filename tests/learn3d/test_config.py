@@ -44,7 +44,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "unknown": (BASE | {"latent": 1}, r"unknown options \['latent'\]"),
     "channels": (
         BASE | {"preset": "gadelha2017-kato", "settings": {"generator_channels": [10**6, 1, 1, 1]}},
-        "generator_channels must be at most 1024, got 1000000",
+        "generator_channels must be at most 512, got 1000000",
     ),
     "width": (BASE | {"preset": "peng2020-kar", "settings": {"pretrained": [1]}}, "pretrained must be the path"),
 }
