@@ -101,7 +101,8 @@ def test_a_texture_that_cannot_be_read_does_not_cost_the_mesh(tmp_path):
 
 def test_what_trimesh_passes_over_is_not_printed(tmp_path):
     header = b"ply\nformat ascii 1.0\ncomment TextureFile \x1b[2J.png\nelement vertex 3\nproperty float x\n"
-    header += b"property float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    header += b"property float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\n"
+    header += b"end_header\n"
     (tmp_path / "a.ply").write_bytes(header + b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     code = "import sys; from learn3d.data import meshes; from pathlib import Path; meshes.read_mesh(Path(sys.argv[1]))"
     command = [sys.executable, "-c", code, str(tmp_path / "a.ply")]  # pytest has a handler of its own
