@@ -90,7 +90,7 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "best_step": _STEP,
     "seconds": _NUMBER,
     "best_iou": _NUMBER,
-    "object_share": _NUMBER,
+    "object_share": (lambda value: _is_number(value) and 0 <= value <= 1, "a share, 0 .. 1"),
     "losses": (_are_losses, "a set of finite numbers by name"),
     "config": _BY_NAME,
     "versions": _BY_NAME,

@@ -136,7 +136,8 @@ def check_fields(settings: Settings) -> None:
     """Raise a ValueError naming the setting that is no choice of its kind, negative, or not finite.
 
     Rates (...learning_rate) must be positive; whole numbers at least 1, and at most what a network of this size can be
-    made of (sides of images and channels: 1024); all other numbers, such as weights, at least 0.
+    made of (sides of images and channels: 1024; channels that a network multiplies by eight: 512); all other numbers,
+    such as weights, at least 0.
     """
     types = typing.get_type_hints(type(settings))
     for field in dataclasses.fields(settings):
@@ -156,7 +157,7 @@ def _check_field(name: str, value: Any, kind: Any) -> None:
         if not isinstance(value, tuple) or len(value) != len(typing.get_args(kind)):
             raise ValueError(f"{name} must be {len(typing.get_args(kind))} whole numbers, got {value!r}")
         for item in value:
-            _check_positive_int(name, item, _most(name))
+            _check_positive_int(name, item, _most(name, several=True))
     elif kind is float:
         positive = "learning_rate" in name
         number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= limits.NUMBER
@@ -166,11 +167,16 @@ def _check_field(name: str, value: Any, kind: Any) -> None:
         raise ValueError(f"{name} must be the path of a file, got {value!r}")
 
 
-def _most(name: str) -> int:
-    """The largest whole number that makes sense for a setting of this name: a step, a side in pixels, or channels."""
+def _most(name: str, *, several: bool = False) -> int:
+    """The largest whole number that makes sense for a setting of this name: a step, a side in pixels, or channels.
+
+    several: of each layer, not of the first, which the others are multiples of.
+    """
     if name.endswith("_step"):
         return limits.ITERATIONS
-    return limits.INPUT_SIDE if name.endswith("_size") else limits.CHANNELS
+    if name.endswith("_size"):
+        return limits.INPUT_SIDE
+    return limits.CHANNELS if several else limits.BASE_CHANNELS
 
 
 _REPORTING = ("validate_every", "pictures_every", "checkpoint_every", "keep_checkpoints", "log_every")

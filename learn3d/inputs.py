@@ -42,13 +42,19 @@ def check_file(path: Path | str, most: int, wanted: str) -> int:
 
 
 def read_bytes(path: Path | str, most: int, wanted: str) -> bytes:
-    """A whole file of at most `most` bytes."""
+    """A whole file of at most `most` bytes, also where another has taken its place since it was looked at."""
     check_file(path, most, wanted)
     try:
-        with open(path, "rb") as file:
+        with open(path, "rb", opener=_open_at_once) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise OSError("it is no plain file any more")
             return file.read(most)
     except OSError as error:
         raise DamagedFile(Path(path), f"cannot be read ({error}); expected {wanted}. {AGAIN}") from error
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def read_text(path: Path | str, most: int, wanted: str, *, encoding: str = "utf-8", errors: str = "strict") -> str:

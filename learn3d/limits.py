@@ -14,6 +14,8 @@ CONFIG_BYTES = MIB  # config.json of a run: 2 kB
 JSON_BYTES = 64 * MIB  # splits.json: 2 MB; test.json of a run on 10,000 objects: 1 MB
 JSON_DEPTH = 32  # levels of nesting; no file of ours has more than five
 METRICS_BYTES = 256 * MIB  # metrics.jsonl: a million lines
+CURVES = 100  # numbers that they log, each a panel of a figure; ours log 20
+CURVE_NAME = 60  # characters
 OBJECTS = 1_000_000  # objects of a split, photographs in a table; all of ShapeNet has 51,300
 NAME_LENGTH = 200  # characters of an object's id, which becomes part of a file name
 
@@ -32,6 +34,7 @@ VOLUME_BYTES = 4 * MIB  # a voxel file (.mat, .binvox) of 32^3 cells: 0.3 as flo
 IMAGE_FILE_BYTES = 256 * MIB
 IMAGE_SIDE = 10_000  # pixels; photographs are padded to squares: 400 MB
 IMAGE_PIXELS = 64_000_000  # a photograph; decoding, masking and framing take 29 bytes for each
+SQUARE_SIDE = 16_000  # that an object is cut out with: a network's objects take 65 % of it, of 10,000 pixels
 RENDER_SIDE = 2048  # pixels, renderings of a data set; published ones have up to 224, and 16 are read at once
 
 # Meshes
@@ -46,6 +49,7 @@ POLYGON_CORNERS = 2000  # of one polygon of a text format: cutting ears takes th
 PACKAGE_FILE_BYTES = 512 * MIB  # one file of a package; the largest wanted today is a 61 MB catalogue
 PACKAGE_BYTES = 16 * GIB  # all files of a package, read past or not; FlightGear's have 0.4
 PACKAGE_MEMBERS = 1_000_000
+PACKAGE_WANTED_BYTES = 2 * GIB  # its catalogues, or models, held at a time; FlightGear's have less than 0.4
 CATALOGUE_MEMBER_BYTES = 64 * MIB  # one file inside a catalogue; the largest wanted today is a 9 MB model
 
 # Checkpoints and weights
@@ -61,7 +65,8 @@ BATCH_SIZE = 65_536
 THREADS = 4096
 SEED = 2**63 - 1
 INPUT_SIDE = 1024  # pixels of the networks' images; 224 in the papers
-CHANNELS = 1024  # of the layer that a setting names; 128 in the papers
+CHANNELS = 1024  # of a layer that a setting names; as many in PrGAN's last one
+BASE_CHANNELS = 512  # of a network whose widest layer has eight times as many: up to 4.1 GB; 128 in the papers
 VIEW_CLASSES = 100_000  # cells of azimuth and elevation; 512 in the papers
 CLASSES = 10_000  # categories trained together
 

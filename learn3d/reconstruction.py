@@ -12,7 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from learn3d import checkpoint, figures, files
+from learn3d import checkpoint, figures, files, limits
 from learn3d.data.crops import Crops
 from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo
 from learn3d.data.kato import mesh_to_object
@@ -53,6 +53,11 @@ def prepare_image(
         extent = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
         centre_y, centre_x = (rows[0] + rows[-1] + 1) / 2, (columns[0] + columns[-1] + 1) / 2
         side = extent / object_share
+        if side > limits.SQUARE_SIDE:
+            raise ValueError(
+                f"the object is {extent} pixels large and would take {object_share:.3g} of a square of {side:.3g}; at "
+                f"most {limits.SQUARE_SIDE} are made: make the image smaller, or frame it yourself (--no-crop)"
+            )
     else:
         centre_y, centre_x = mask.shape[0] / 2, mask.shape[1] / 2
         side = float(max(mask.shape))

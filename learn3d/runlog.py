@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from learn3d import files
 from learn3d.run_folder import JOURNAL, METRICS, TENSORBOARD
+from learn3d.terminal import plain
 
 
 class RunLog:
@@ -37,6 +38,9 @@ class RunLog:
         self.total = total
         self.seconds_between_lines = seconds_between_lines
         self._warned: set[str] = set()
+        for name in (METRICS, JOURNAL):  # a pipe would be waited for; a link would have lines appended anywhere
+            if (path := self.folder / name).is_symlink() or (path.exists() and not path.is_file()):
+                raise OSError(f"{path} is no plain file, and nothing is appended to it; move it away")
         _forget_after(self.folder / METRICS, start)
         self._metrics = _Lines(self.folder / METRICS)
         self._journal = _Lines(self.folder / JOURNAL)
@@ -90,6 +94,7 @@ class RunLog:
 
     def say(self, text: str) -> None:
         """Print a line without breaking the progress bar, and note it in journal.txt."""
+        text = plain(text)
         if self._bar is not None:
             self._bar.write(text, file=self._terminal)
         else:
@@ -99,7 +104,7 @@ class RunLog:
     def note(self, text: str) -> None:
         """Note a line in journal.txt alone."""
         now = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
-        self._write(self._journal, f"{now} {text}")
+        self._write(self._journal, f"{now} {plain(text)}")
 
     def warn(self, what: str, error: BaseException, then: str) -> None:
         """Say once that something could not be done, and what follows from that."""

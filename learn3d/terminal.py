@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import re
 import select
 import sys
 from collections.abc import Callable, Sequence
@@ -13,6 +14,8 @@ from typing import ParamSpec, TextIO
 P = ParamSpec("P")
 
 INTERRUPTED, UNREAD = 130, 141  # exit statuses after Ctrl-C, and after SIGPIPE, as shells have them
+#: What a terminal would obey, what turns the direction of reading, and halves of characters, which cannot be written.
+_COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def in_a_sentence(*errors: type[Exception], label: Callable[[], str] = str) -> Callable[[Callable[P, int]], Callable]:
@@ -46,11 +49,16 @@ def in_a_sentence(*errors: type[Exception], label: Callable[[], str] = str) -> C
     return decorate
 
 
+def plain(text: str) -> str:
+    r"""The text with control characters but tabs and line ends written out (\x1b): names in it may be a stranger's."""
+    return _COMMANDS.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
 def say(text: str, stream: TextIO | None = None) -> None:
-    """Print a line; a terminal that was closed does not change how the command ends."""
+    """Print a line, as `plain` has it; a terminal that was closed does not change how the command ends."""
     stream = stream or sys.stdout
     try:
-        print(text, file=stream, flush=True)
+        print(plain(text), file=stream, flush=True)
     except OSError:
         _silence(stream)
 

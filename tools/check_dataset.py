@@ -20,7 +20,7 @@ import tyro
 from learn3d.data.checking import check_folder
 from learn3d.data.layouts import Layout
 from learn3d.files import check_target, write_json
-from learn3d.terminal import in_a_sentence
+from learn3d.terminal import in_a_sentence, plain
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ def main(command: Command) -> int:
         write_json(command.json, report.to_json())
     lines = [f"{p.severity}: {p.path}: {p.message}" for split in report.splits for p in split.problems]
     for line in lines[: command.most]:
-        print(line)
+        print(plain(line))
     if len(lines) > command.most:
         print(f"... and {len(lines) - command.most} more (--most, --json)")
-    print(f"\n{report.table()}\n\n{report.errors} errors, {report.warnings} warnings")
+    print(f"\n{plain(report.table())}\n\n{report.errors} errors, {report.warnings} warnings")
     return 1 if report.errors else 0
 
 

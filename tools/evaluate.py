@@ -15,7 +15,7 @@ import tyro
 
 from learn3d.evaluation_report import describe_columns, evaluate_runs, format_table
 from learn3d.files import check_target, write_json
-from learn3d.terminal import in_a_sentence, note
+from learn3d.terminal import in_a_sentence, note, plain
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def main() -> int:
     )
     if command.json is not None:
         write_json(command.json, report)
-    print(format_table(report))
+    print(plain(format_table(report)))
     return 0
 
 

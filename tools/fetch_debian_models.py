@@ -10,13 +10,13 @@ import sys
 import tyro
 
 from learn3d.data.debian_models import FetchConfig, fetch_debian_models
-from learn3d.terminal import in_a_sentence
+from learn3d.terminal import in_a_sentence, plain
 
 
 @in_a_sentence()
 def main() -> int:
     report = fetch_debian_models(tyro.cli(FetchConfig, description=__doc__))
-    print(report.summary())
+    print(plain(report.summary()))
     return 0
 
 

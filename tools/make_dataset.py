@@ -12,13 +12,13 @@ import sys
 import tyro
 
 from learn3d.data.render import DatasetConfig, make_dataset
-from learn3d.terminal import in_a_sentence
+from learn3d.terminal import in_a_sentence, plain
 
 
 @in_a_sentence()
 def main() -> int:
     report = make_dataset(tyro.cli(DatasetConfig, description=__doc__))
-    print(report.text())
+    print(plain(report.text()))
     return 0
 
 

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from learn3d import limits
 
-_END, _END64 = b"PK\5\6", b"PK\6\6"
+_END, _END64, _LOCATOR = b"PK\5\6", b"PK\6\6", b"PK\6\7"
 
 
 def open_zip(source: Path | BinaryIO, most: int) -> zipfile.ZipFile:
@@ -81,6 +81,8 @@ def _check_directory(file: BinaryIO) -> int:
     stated = struct.unpack_from("<I", tail, end + 12)[0]
     if end >= 76 and tail[end - 76 : end - 72] == _END64:
         stated = max(stated % 0xFFFFFFFF, struct.unpack_from("<Q", tail, end - 76 + 40)[0])
+    elif end >= 20 and tail[end - 20 : end - 16] == _LOCATOR:  # its 64-bit size lies elsewhere: any is possible
+        stated = max(stated, size)
     if min(stated, size) > limits.ZIP_DIRECTORY_BYTES:
         raise ValueError(f"its table of contents has {stated} bytes; at most {limits.ZIP_DIRECTORY_BYTES} are read")
     return size

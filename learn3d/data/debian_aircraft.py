@@ -34,6 +34,7 @@ EFFECTS = re.compile(
     r"^pilot($|[-_])|helmet",
     re.IGNORECASE,
 )
+_PATH = re.compile(r"<path>([^<]+)</path>")
 DISC_DIAMETER = 0.09  # of the longest side: a flat disc across the flight direction that wide is a propeller disc
 DETACHED = 2e-3  # of the longest side: a lone quadrilateral that far from every other vertex is drawn light or vapour
 
@@ -93,7 +94,7 @@ def aircraft_models(package: packages.Package, licences: Path, progress: bool) -
             texts[path] = content.decode("latin-1")
         elif author := re.search(r"<author>([^<]+)</author>", text := content.decode("latin-1")):
             name = " ".join(author[1].split())
-            for model in re.findall(r"<path>\s*([^<]+\.ac)\s*</path>", text):
+            for model in filter(lambda found: found.endswith(".ac"), map(str.strip, _PATH.findall(text))):
                 key = folder, PurePosixPath(model).name
                 authors[key] = min(authors.get(key, name), name)
     for path in tqdm(sorted(texts), desc=package.name, unit="model", disable=not progress, leave=False):
@@ -117,7 +118,7 @@ def aircraft_models(package: packages.Package, licences: Path, progress: bool) -
 def _aircraft_mesh(text: str) -> tuple[np.ndarray, np.ndarray] | str:
     try:
         with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
-            parts = read_ac3d(text, skip=lambda name: EFFECTS.search(name) is not None)
+            parts = read_ac3d(text, skip=lambda name: EFFECTS.search(name[: limits.NAME_LENGTH]) is not None)
             parts = without_effects(parts) if parts else []
     except ValueError as error:
         return f"unreadable ({error})"

@@ -26,6 +26,7 @@ import numpy as np
 
 from learn3d import limits
 from learn3d.data import archives
+from learn3d.inputs import check_file
 
 _HEADER_BYTES = 2**20  # between the contents of two members; long names and their kin take a few thousand
 _UNPACKERS: dict[str, Callable[[BinaryIO], BinaryIO]] = {
@@ -155,9 +156,15 @@ def read_package(package: Package, suffixes: tuple[str, ...]) -> Iterator[tuple[
 
 
 def read_keeping_copyright(package: Package, suffixes: tuple[str, ...], folder: Path) -> Iterator[tuple[str, bytes]]:
-    """As `read_package`; the package's copyright file is copied to FOLDER/NAME.copyright on the way."""
-    notice = f"/doc/{package.name}/copyright"
+    """As `read_package`; the package's copyright file is copied to FOLDER/NAME.copyright on the way.
+
+    Raises ValueError for more than 2 GiB in all, too: who calls this keeps the files.
+    """
+    notice, total = f"/doc/{package.name}/copyright", 0
     for path, content in read_package(package, (*suffixes, notice)):
+        total += len(content)
+        if total > (most := limits.PACKAGE_WANTED_BYTES):
+            raise ValueError(f"{package.name} is refused: its files {', '.join(suffixes)} have more than {most} bytes")
         if path.endswith(notice):
             folder.mkdir(exist_ok=True)
             (folder / f"{package.name}.copyright").write_bytes(content)
@@ -226,6 +233,7 @@ class _Meter:
 @contextmanager
 def _data_tar(deb: Path) -> Iterator[tuple[tarfile.TarFile, _Meter]]:
     """The data.tar.* of a .deb as a stream; one that Python cannot unpack (zstd) goes through dpkg-deb."""
+    check_file(deb, limits.PACKAGE_BYTES, "a Debian package")
     with deb.open("rb") as file:
         kind, size = _find_data(deb, file)
         if kind in _UNPACKERS:

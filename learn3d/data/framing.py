@@ -33,6 +33,8 @@ def read_photo(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, n
     Raises FileNotFoundError, and ValueError for what cannot be read, no mask at all, and sizes that differ.
     """
     image = _open(path)
+    if image.mode.startswith(("I", "F")):  # Pillow would make white of all that is above 255
+        raise ValueError(f"{path} has more than 8 bits a pixel and channel ({image.mode}); save it with 8")
     if mask_path is None:
         mask = _transparency(image)
         if mask is None:

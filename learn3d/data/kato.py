@@ -68,6 +68,8 @@ def synset_of(category: str) -> str:
     """
     if not isinstance(category, str) or not category or set(category) & set('/\\:*?"<>|\0') or category.startswith("."):
         raise ValueError(f"category must be a plain name such as 'chair' or a synset id, got {category!r}")
+    if not category.isprintable():
+        raise ValueError(f"category must be a plain name, without control characters, got {category!r}")
     return SYNSETS.get(category, category)
 
 

@@ -6,10 +6,13 @@ ValueError where the file cannot be read, and `checked` where a mesh cannot be u
 
 from __future__ import annotations
 
+import contextlib
 import io
+import logging
 import re
+import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,10 +21,14 @@ import numpy as np
 from learn3d import limits
 from learn3d.data import npz
 from learn3d.data.findings import AGAIN
+from learn3d.data.images import PHOTOGRAPHS
 from learn3d.inputs import read_bytes, within
 
 EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # what trimesh reads without further packages
 SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
+TEXTURES = (*PHOTOGRAPHS, "TGA", "GIF", "PPM", "DDS")
+_ONE_AT_A_TIME = threading.RLock()
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else tracebacks of what it passes over are printed
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +51,12 @@ class MeshSource:
 def folder_sources(folder: Path) -> tuple[list[MeshSource], Counter[str]]:
     """The mesh files below a folder, sorted by relative path, and how many files of which other extension it ignored.
 
-    Raises ValueError where the folder holds no mesh file.
+    Raises ValueError where the folder holds no mesh file, or folders within folders beyond what Python can follow.
     """
-    files = sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.relative_to(folder).as_posix())
+    try:
+        files = sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.relative_to(folder).as_posix())
+    except RecursionError:
+        raise ValueError(f"the folders below {folder} are nested too deeply; give a folder further down") from None
     meshes = [path for path in files if path.suffix.lower() in EXTENSIONS]
     ignored = Counter(p.suffix.lower() or "(none)" for p in files if p.suffix.lower() not in EXTENSIONS + SIDECARS)
     if not meshes:
@@ -105,10 +115,13 @@ def procedural_sources(category: str, count: int, seed: int) -> list[MeshSource]
 
 def object_names(sources: list[MeshSource]) -> list[str]:
     """A name for each mesh that can be part of a file name, all different: letters, digits and underscores."""
-    names, taken = [], set()
+    names, taken, tried = [], set(), Counter()
     for source in sources:
         plain = re.sub(r"\W+", "_", str(Path(source.name).with_suffix(""))).strip("_")[-80:] or "mesh"
-        name = next(n for i in range(len(sources)) if (n := f"{plain}_{i + 1}" if i else plain).lower() not in taken)
+        plain = plain.encode()[-240:].decode(errors="ignore")  # names of files have 255 bytes
+        key = plain.lower()
+        while (name := f"{plain}_{tried[key] + 1}" if tried[key] else plain).lower() in taken:
+            tried[key] += 1
         taken.add(name.lower())
         names.append(name)
     return names
@@ -127,11 +140,34 @@ def read_mesh(path: Path, root: Path | None = None) -> RawMesh:
         content = io.BytesIO(read_bytes(path, limits.MESH_FILE_BYTES, "a mesh file"))
         beside = _files_below(path.parent, path.parent if root is None else root)
         kind = path.suffix.lower().lstrip(".")
-        with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
+        with within(limits.MESH_SECONDS, limits.MESH_MEMORY), _usual_textures():
             scene = trimesh.load(content, file_type=kind, resolver=beside, force="scene", process=False)
             return _joined([p for p in scene.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)])
     except Exception as error:  # trimesh's readers raise whatever a foreign or truncated file makes them trip over
         raise _unreadable(error) from error
+
+
+@contextlib.contextmanager
+def _usual_textures() -> Iterator[None]:
+    """Let trimesh open images of the usual formats only, and decode them at once, where it passes over what it cannot.
+
+    Pillow knows one, EPS, that it hands to Ghostscript: a program, run with what a stranger wrote.
+    """
+    from PIL import Image
+
+    with _ONE_AT_A_TIME:
+        usual = Image.open
+
+        def open_usual(file: io.BytesIO) -> Image.Image:
+            image = usual(file, formats=TEXTURES)
+            image.load()
+            return image
+
+        Image.open = open_usual
+        try:
+            yield
+        finally:
+            Image.open = usual
 
 
 def _joined(parts: list) -> RawMesh:
@@ -192,7 +228,10 @@ def _part_colors(part) -> np.ndarray:
         return none
     try:
         if visual.kind == "texture":  # sampled, it does not know its mesh
-            colors = np.asarray(visual.to_color().vertex_colors, dtype=np.float64)[part.faces].mean(axis=1)
+            colors = np.asarray(visual.to_color().vertex_colors, dtype=np.float64)
+            if colors.ndim == 1:  # without an image: the material's one colour
+                colors = np.broadcast_to(colors, (len(part.vertices), len(colors)))
+            colors = colors[part.faces].mean(axis=1)
         else:
             colors = np.asarray(visual.face_colors)
     except Exception:  # a texture that cannot be read must not cost the mesh

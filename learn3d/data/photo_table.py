@@ -38,7 +38,13 @@ class Photo:
 
 
 def find_table(folder: Path | str, category: str) -> Path:
-    """poses.csv or poses.json of a category. Raises FileNotFoundError, and ValueError where there are both."""
+    """poses.csv or poses.json of a category.
+
+    Raises FileNotFoundError, and ValueError where there are both, or for a category that is no plain name: that
+    of a stranger's model leads nowhere else, neither to read nor, as part of the names of files, to write.
+    """
+    if category in (".", "..") or set(category) & set("/\\") or not category.isprintable():
+        raise ValueError(f"category must be the plain name of a folder such as 'mug', got {_short(category)}")
     places = [Path(folder) / category, Path(folder)]
     for place in places:
         found = [place / name for name in TABLES if (place / name).is_file()]
@@ -133,7 +139,8 @@ def _check_columns(table: Path, names: list[str], where: str = "") -> None:
     missing = [name for name in ("file", *NUMBERS) if name not in names]
     unknown = [name for name in names if name not in ("file", *NUMBERS, *OPTIONAL)]
     if missing or unknown:
-        wrong = [f"lacks {', '.join(missing)}"] * bool(missing) + [f"has unknown {', '.join(unknown)}"] * bool(unknown)
+        wrong = [f"lacks {', '.join(missing)}"] * bool(missing)
+        wrong += [f"has unknown {', '.join(unknown)[:200]}"] * bool(unknown)
         raise ValueError(
             f"{table}{where} {' and '.join(wrong)}; the columns are file, {', '.join(NUMBERS)}, and where you like "
             f"{', '.join(OPTIONAL)}"
@@ -143,7 +150,7 @@ def _check_columns(table: Path, names: list[str], where: str = "") -> None:
 def _photo(folder: Path, where: str, row: dict[str, Any], masks: dict[str, Path]) -> Photo:
     """One row, checked."""
     if None in row:  # what csv.DictReader calls the values beyond the last column
-        raise ValueError(f"there are more values than columns: {', '.join(row[None])}")
+        raise ValueError(f"there are more values than columns: {', '.join(row[None])[:200]}")
     file = _inside(folder / "images", "file", row["file"])
     values = {name: _number(name, row[name]) for name in NUMBERS}
     if not -90 < values["elevation_deg"] < 90:

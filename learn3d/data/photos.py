@@ -68,6 +68,7 @@ def load(
     training = [photo for photo in photos if splits[photo.object] == "train"]
     view_ids, view_names = _view_classes(poses, _poses(training, [photo.fov_deg / 2 for photo in training]))
     names = sorted({photo.object for photo in chosen})
+    numbers = {name: number for number, name in enumerate(names)}
     return ViewDataset(
         category=category,
         split=split,
@@ -76,7 +77,7 @@ def load(
         poses=poses,
         view_ids=view_ids,
         view_names=view_names,
-        object_ids=np.array([names.index(photo.object) for photo in chosen]),
+        object_ids=np.array([numbers[photo.object] for photo in chosen]),
         object_names=tuple(names),
         voxels=None,
         convention=conventions.KATO,

@@ -60,7 +60,7 @@ def warn_of_repeats(
 ) -> None:
     """Note ids that the list of a split (`what`) holds twice, and those that it shares with the lists of others."""
     if repeated := sorted(name for name, times in Counter(ids).items() if times > 1):
-        findings.warn(path, f"{what} lists {', '.join(repeated)} more than once")
+        findings.warn(path, f"{what} lists {', '.join(repeated[:8])}{' ...' * (len(repeated) > 8)} more than once")
     for split, other in others.items():
         if shared := sorted(set(ids) & set(other)):
             findings.warn(path, f"{what} shares {len(shared)} objects with {split}, such as {shared[0]}")

@@ -25,6 +25,7 @@ from learn3d.data.poses import Poses
 from learn3d.data.writers import RenderedObject, Writer, writer_of
 from learn3d.files import write_json
 from learn3d.shading import KEY_LIGHT, shade_mesh
+from learn3d.terminal import plain
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
@@ -154,7 +155,7 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
         report = DatasetReport(config.category, files, counts, done.used, skipped, others, lacking(writer, counts))
         write_json(folder / f"{prefix}_card.json", _card(config, writer, counts, done.used))
         write_json(folder / f"{prefix}_report.json", asdict(report))
-        (folder / f"{prefix}_report.txt").write_text(report.text() + "\n")
+        (folder / f"{prefix}_report.txt").write_text(plain(report.text()) + "\n", encoding="utf-8")
         stale = set(existing(config.output, _own_paths(writer_class, config.category))) - set(files)
         publish(folder, config.output, files, sorted(stale), trash)
     return report

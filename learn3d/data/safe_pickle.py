@@ -29,6 +29,7 @@ _MAKERS = {
     ("numpy", "dtype"): "dtype",
     ("_codecs", "encode"): "encode",
 }
+_STACK = 10_000  # things in hand; pickles append a thousand items at a time, and an array takes ten
 _NUMERIC = re.compile(r"[|<>=]?([biu][1248]|f[248])|\?")
 
 
@@ -79,7 +80,7 @@ def read_member(archive: zipfile.ZipFile, key: str, *, max_bytes: int | None = N
         if len(head.shape) != 1 or head.shape[0] > limits.PICKLED_ARRAYS:
             most = limits.PICKLED_ARRAYS
             raise ValueError(f"an object array must be one-dimensional with at most {most} items, got {head.shape}")
-        items = _Interpreter(stream).run()
+        items = _Interpreter(stream, head.shape[0]).run()
         if len(items) != head.shape[0]:
             raise ValueError(f"its header promises {head.shape[0]} items, it holds {len(items)}")
         stream.finish()
@@ -121,9 +122,9 @@ class _Stream:
 class _Interpreter:
     """Runs the instructions of a pickle of one object array of numeric arrays."""
 
-    def __init__(self, stream: _Stream) -> None:
+    def __init__(self, stream: _Stream, arrays: int) -> None:
         self.stream, self.stack, self.memo, self.encoded = stream, [], {}, 0
-        self.budget = 1000 + 64 * limits.PICKLED_ARRAYS  # instructions: an array takes about 30
+        self.budget = 1000 + 64 * arrays  # instructions: an array takes about 30
         read, unpack = stream.read, stream.unpack
         self.instructions: dict[bytes, Callable[[], Any]] = {
             b"\x80": lambda: self._protocol(unpack("<B")),
@@ -173,6 +174,8 @@ class _Interpreter:
             if code not in self.instructions:
                 raise ValueError(f"its pickle has the instruction {code!r}, which no array needs; it is refused")
             self.instructions[code]()
+            if len(self.stack) > _STACK:
+                raise ValueError("its pickle piles up more than arrays need")
         result = self._pop()
         if self.stack or not isinstance(result, _Array) or not isinstance(result.value, list):
             raise ValueError("its pickle is not that of an object array")

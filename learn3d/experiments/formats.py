@@ -85,9 +85,16 @@ def to_markdown(report: dict[str, Any], *, heading: bool = True) -> str:
         parts += [
             "What was run:",
             _markdown_table(run_table(report)),
-            "```sh\n" + "\n".join(commands(report)) + "\n```",
+            _code(commands(report)),
         ]
     return "\n\n".join(parts) + "\n"
+
+
+def _code(lines: list[str]) -> str:
+    """A block of commands with a fence that is in none of them."""
+    longest = max((len(run) for line in lines for run in re.findall("`+", line)), default=0)
+    fence = "`" * max(3, longest + 1)
+    return "\n".join([f"{fence}sh", *lines, fence])
 
 
 def to_text(report: dict[str, Any]) -> str:
@@ -268,9 +275,14 @@ def _number(value: float | None, digits: int = 4) -> str:
 
 
 def _markdown_table(table: Cells) -> str:
-    header, *rows = [[cell.replace("|", "\\|") for cell in row] for row in table]
+    header, *rows = [[_markdown_cell(cell) for cell in row] for row in table]
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def _markdown_cell(text: str) -> str:
+    """In one line, without HTML: names in results may be a stranger's."""
+    return html.escape(" ".join(text.splitlines()), quote=False).replace("|", "\\|")
 
 
 def _html_table(table: Cells) -> str:

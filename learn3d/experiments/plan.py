@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from learn3d import checkpoint, checkpoint_checks, run_folder
 from learn3d.config import TrainConfig, config_from_dict, differences, load_config
+from learn3d.data.kato import synset_of
 from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.experiments.stored import read_result
 from learn3d.experiments.tables import Row, Table, Variant
@@ -159,6 +160,10 @@ def found_runs(table: Table, options: Options) -> list[Run]:
             seed = int(number)
             if category not in (options.categories or [category]) or seed >= (options.seeds or seed + 1):
                 continue
+            try:
+                synset_of(category)
+            except ValueError as error:  # it goes into pages
+                raise ValueError(f"{path.parent.parent} is no folder of a category: {error}") from None
             result = read_result(path)
             config = config_from_dict(result["config"], source=str(path))
             where = {"output": path.parent, "data": Path(result["data"])}  # a relative path was of another folder

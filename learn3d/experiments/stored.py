@@ -8,7 +8,7 @@ from typing import Any
 from learn3d import limits
 from learn3d.inputs import parse_json, read_bytes
 
-_NAMES = ("config", "iterations", "data", "checkpoint", "command", "objects")
+_NAMES = ("config", "iterations", "data", "checkpoint", "command", "images", "objects")
 _REMOVE = "remove it, and it is made again"
 
 
@@ -43,6 +43,9 @@ def _check(result: Any) -> None:
         _need(name not in result or _is_number(result[name]), result, name, "a number or null")
     for name in ("conditions", "trained_by", "tested_by"):
         _need(isinstance(result.get(name), (dict, type(None))), result, name, "values by name")
+    for name in ("trained_by", "tested_by"):
+        commit = (result.get(name) or {}).get("commit")
+        _need(isinstance(commit, (str, type(None))), result, name, "values by name, with a text or null as its commit")
     _check_objects(result["objects"])
 
 

@@ -74,9 +74,14 @@ def read_metrics(path: Path) -> dict[Key, Curve]:
             raise ValueError(f"{file}, line {number} is no record with a step and a split: {line[:60]!r}") from None
         for name, value in record.items():
             if isinstance(value, (int, float)) and not isinstance(value, bool) and name not in _NOT_CURVES:
+                if not name.isprintable() or not split.isprintable() or len(name + split) > limits.CURVE_NAME:
+                    at_fault = f"{split} {name}"[: limits.CURVE_NAME]
+                    raise ValueError(f"{file}, line {number} has a number whose name is none: {at_fault!r}")
                 points.setdefault((split, name), {})[step] = float(value)
     if not points:
         raise ValueError(f"{file} holds no numbers yet; let the run take some steps first")
+    if len(points) > limits.CURVES:
+        raise ValueError(f"{file} holds {len(points)} different numbers; at most {limits.CURVES} are drawn")
     return {key: Curve(*(np.array(x) for x in zip(*sorted(p.items()), strict=True))) for key, p in points.items()}
 
 

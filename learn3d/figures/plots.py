@@ -35,6 +35,7 @@ _STYLE = {
     "axes.axisbelow": True,
     "lines.linewidth": 1.6,
     "legend.frameon": False,
+    "text.parse_math": False,  # names are names, whatever dollars are in them
     "svg.hashsalt": "learn3d",  # the same drawing gives the same file
     "svg.fonttype": "none",
 }

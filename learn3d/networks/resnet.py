@@ -15,6 +15,8 @@ from learn3d.inputs import check_file, within
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+_REAL = (torch.float32, torch.float64, torch.float16, torch.bfloat16)  # what weights may be stored as
+_WHOLE = (torch.int64, torch.int32)  # and numbers of batches
 
 
 class _Block(nn.Module):
@@ -105,7 +107,11 @@ def load_pretrained(encoder: nn.Module, path: Path | str) -> None:
     for name, value in given.items():
         if value.shape != own[name].shape:
             raise ValueError(f"{path}: {name} is {list(value.shape)}, ResNet-18 has {list(own[name].shape)}{hint}")
-        if not bool(value.isfinite().all()):
+        kinds = _WHOLE if name in counters else _REAL
+        if value.dtype not in kinds or value.layout != torch.strided or value.device.type != "cpu":
+            kind = f"{value.dtype}, {value.layout}, on {value.device}"
+            raise ValueError(f"{path}: {name} must be plain numbers such as {kinds[0]}, got {kind}{hint}")
+        if not bool(value.to(own[name].dtype).isfinite().all()):
             raise ValueError(f"{path}: {name} has values that are not finite{hint}")
     encoder.load_state_dict(given, strict=False)
 
@@ -126,6 +132,7 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
                 weights = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # the readers raise half a dozen kinds for a damaged or a hostile file
         raise ValueError(f"cannot read pretrained weights from {path}: {error}") from error
-    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+    pairs = weights.items() if isinstance(weights, dict) else [(None, None)]
+    if not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in pairs):
         raise ValueError(f"{path} must hold a state dict (names -> tensors), got {type(weights).__name__}")
     return weights

@@ -76,3 +76,13 @@ def test_a_table_of_contents_that_is_too_large_is_not_read(monkeypatch):
     refuse(content, "its table of contents has 5000 bytes; at most 1000 are read")
     monkeypatch.setattr(zipfile, "ZIP_FILECOUNT_LIMIT", 0)  # the size is in another place then
     refuse(packed({f"{k:04d}": b"" for k in range(100)}), r"its table of contents has \d+ bytes; at most 1000 are read")
+
+
+def test_a_size_of_the_table_of_contents_that_lies_elsewhere_is_not_believed(monkeypatch):
+    """Newer versions of Python follow the locator to wherever it points; the end states 5 bytes here."""
+    content = packed({f"{k:04d}": b"" for k in range(100)})
+    end = content.rindex(b"PK\5\6")
+    stated = content[end : end + 12] + struct.pack("<I", 5) + content[end + 16 :]
+    monkeypatch.setattr(limits, "ZIP_DIRECTORY_BYTES", 1000)
+    locator = b"PK\6\7" + struct.pack("<IQI", 0, 0, 1)
+    refuse(content[:end] + locator + stated, r"its table of contents has \d+ bytes; at most 1000 are read")

@@ -89,6 +89,8 @@ METADATA = {
     "bool": ({"best_step": True}, "its best_step must be"),
     "huge": ({"step": 10**200}, "its step must be"),
     "seconds": ({"seconds": "long"}, "its seconds must be a finite number, got 'long'"),
+    "share above one": ({"object_share": 1.5}, "its object_share must be a share, 0 .. 1, got 1.5"),
+    "share below none": ({"object_share": -1e-9}, "its object_share must be a share"),
     "config": ({"config": [1]}, r"its config must be a set of values by name, got \[1\]"),
     "conditions": ({"conditions": {"samples": []}}, "its conditions must be"),
     "versions": ({"versions": None}, "its versions must be"),

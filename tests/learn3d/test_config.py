@@ -46,6 +46,10 @@ WRONG: dict[str, tuple[Any, str]] = {
         BASE | {"preset": "gadelha2017-kato", "settings": {"generator_channels": [10**6, 1, 1, 1]}},
         "generator_channels must be at most 1024, got 1000000",
     ),
+    "base": (
+        BASE | {"preset": "peng2020-kato-vpl", "settings": {"discriminator_channels": 1024}},
+        "discriminator_channels must be at most 512, got 1024",
+    ),
     "width": (BASE | {"preset": "peng2020-kar", "settings": {"pretrained": [1]}}, "pretrained must be the path"),
 }
 

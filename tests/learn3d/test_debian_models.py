@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import subprocess
 import tarfile
 import zipfile
@@ -546,6 +547,25 @@ def test_archives_that_lead_astray_are_refused(debs: Path, tmp_path: Path, monke
     monkeypatch.undo()
     monkeypatch.setattr(limits, "PACKAGE_BYTES", 5000)
     refused("unpacks to more than its headers say, or than 5000 bytes")
+    monkeypatch.undo()
+    monkeypatch.setattr(limits, "PACKAGE_WANTED_BYTES", 50)
+    refused("sweethome3d-furniture is refused: its files .sh3f have more than 50 bytes")
+    if hasattr(os, "mkfifo"):
+        file.unlink()
+        os.mkfifo(file)
+        refused("it is no plain file; expected a Debian package")
+
+
+def test_long_names_and_gaps_take_no_square_of_their_length(debs: Path, tmp_path: Path):
+    """The square of a million takes hours."""
+    assert furniture_category("chair") == "chair" and furniture_category("chair " + "knife " * 10**6) is None
+    name = "prop" * 10**6
+    text = ac_text(ac_object(name, (-5, 0, -0.5), (5, 1, 0.5)), *AIRPLANE)
+    about = f"<author>B. Maker</author><path>{' ' * 10**6}x</path><path> Models/plane.ac\n</path>"
+    files = {f"./{AIRCRAFT}/Plane/Models/plane.ac": text.encode(), f"./{AIRCRAFT}/Plane/plane.xml": about.encode()}
+    deb(debs, "flightgear-data-ai", files)
+    report = fetch(tmp_path / "out", debs, categories=("airplane",))
+    assert [(model.title, model.author) for model in report.models] == [("Plane plane", "B. Maker")]
 
 
 def test_a_tar_header_that_unpacks_to_very_much_is_not_kept(debs: Path, tmp_path: Path):

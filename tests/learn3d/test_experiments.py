@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import dataclasses
 import importlib.util
@@ -532,6 +533,16 @@ def test_a_page_receives_its_table(report, tmp_path) -> None:
     page.write_text("nothing")
     with pytest.raises(ValueError, match="must have the lines '<!-- table: kato -->'"):
         formats.embed(page, report)
+
+
+def test_names_in_results_are_no_html_and_end_no_block(report, tmp_path, stub) -> None:
+    report = copy.deepcopy(report)
+    report["runs"][0] |= {"commit": "<b>\n|", "general_command": "python --pretrained 'a\n```\n<script>'"}
+    text = formats.to_markdown(report)
+    assert "| &lt;b&gt; \\| |\n" in text and "\n````sh\npython --pretrained 'a\n```\n<script>'" in text
+    (tmp_path / "out/runs/airplane").rename(tmp_path / "out/runs/<script>\x1b")
+    with pytest.raises(ValueError, match=r"is no folder of a category: category must be a plain name"):
+        run_experiment(Call("kato", options(tmp_path, categories=()), report_only=True), worker=stub)
 
 
 def test_calls_that_make_no_sense(tmp_path) -> None:

@@ -117,9 +117,20 @@ def test_metrics_become_curves(tmp_path, monkeypatch) -> None:
         (folder / "metrics.jsonl").write_bytes(line.encode("utf-8", "surrogateescape") + b"\n" + content)
         with pytest.raises(ValueError, match="line 1 is no record with a step and a split"):
             curves.read_metrics(folder)
+    for name in ("\ud800", "\x1b[2J", "a" * 61):
+        with pytest.raises(ValueError, match="line 1 has a number whose name is none: 'train "):
+            curves.read_metrics(write_metrics(tmp_path / "odd", [{"step": 1, "split": "train", name: 1.0}]))
+    many = {"step": 1, "split": "train"} | {f"loss{k}": 1.0 for k in range(101)}
+    with pytest.raises(ValueError, match="holds 101 different numbers; at most 100 are drawn"):
+        curves.read_metrics(write_metrics(tmp_path / "many", [many]))
     monkeypatch.setattr(limits, "METRICS_BYTES", 10)
     with pytest.raises(ValueError, match=r"metrics\.jsonl: has \d+ bytes, and at most 10 are read"):
         curves.read_metrics(folder)
+
+
+def test_dollars_in_names_are_no_formulas(tmp_path) -> None:
+    folder = write_metrics(tmp_path / "run", [{"step": 1, "split": "train", "$\\frac{$": 1.0}])
+    assert all(path.stat().st_size for path in paper.save_curves([folder], tmp_path / "c.png", labels=["$\\bad$"]))
 
 
 def test_what_a_run_counts_is_no_curve(finished_run) -> None:

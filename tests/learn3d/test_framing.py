@@ -163,6 +163,16 @@ def test_unreadable_photos_are_named(tmp_path: Path) -> None:
         read_photo(tmp_path / "c.png")
 
 
+@pytest.mark.parametrize("kind", [np.uint16, np.int32, np.float32])
+def test_photos_of_more_than_8_bits_are_refused(tmp_path: Path, kind: type) -> None:
+    """Pillow cuts their values off at 255, which leaves all white."""
+    path = save(tmp_path / "a.tif", np.full((8, 6), 30_000, kind))
+    mask = save(tmp_path / "m.png", np.full((8, 6), 255, np.uint8))
+    with pytest.raises(ValueError, match=r"a.tif has more than 8 bits a pixel and channel \(.*\); save it with 8"):
+        read_photo(path, mask)
+    assert read_photo(mask, save(tmp_path / "m.tif", np.full((8, 6), 65_535, np.uint16)))[1].min() == 255
+
+
 def test_huge_photos_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
     with pytest.raises(ValueError, match=r"a.png: has too many pixels .*make it smaller"):

@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 
+from learn3d import inputs
 from learn3d.inputs import check_file, parse_json, read_bytes, read_text, within
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux only")
@@ -37,6 +38,18 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ValueError, match="pipe: cannot be read: it is no plain file"):
         read_bytes(tmp_path / "pipe", 8, "a text")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
+def test_a_pipe_that_takes_the_place_of_a_file_is_not_waited_for(tmp_path, monkeypatch):
+    def check_and_replace(path, *_):
+        path.unlink()
+        os.mkfifo(path)
+
+    (tmp_path / "a.txt").write_bytes(b"1")
+    monkeypatch.setattr(inputs, "check_file", check_and_replace)
+    with pytest.raises(ValueError, match=r"a\.txt: cannot be read \(it is no plain file any more\)"):
+        read_bytes(tmp_path / "a.txt", 8, "a text")
 
 
 def test_json():

@@ -89,7 +89,7 @@ def test_mesh_to_object_puts_up_up_and_front_to_the_first_camera():
 def test_synset_of_known_and_other_names():
     assert synset_of("airplane") == "02691156" and synset_of("vessel") == "04530566"
     assert synset_of("teapot") == "teapot" and synset_of("03001627") == "03001627"
-    for bad in ("", "../chair", "a/b", ".hidden"):
+    for bad in ("a\nb", "\x1b[31m", "\udcff", "", "../chair", "a/b", ".hidden"):
         with pytest.raises(ValueError, match="plain name"):
             synset_of(bad)
 

@@ -271,6 +271,24 @@ def test_tables_that_are_none_are_named(chairs: Path, tmp_path: Path) -> None:
     refused(f"[{record}]", r"poses.json, entry 1: azimuth_deg must be a number, got \[\]", "poses.json")
 
 
+@pytest.mark.parametrize("category", ["../out", "..", "/tmp/out", "a\\b", "a\nb", "a\0b", "\udcff"])
+def test_categories_are_names(chairs: Path, category: str) -> None:
+    """The category of a stranger's model becomes part of the names of the files that reconstruct.py writes."""
+    with pytest.raises(ValueError, match=r"category must be the plain name of a folder such as 'mug', got '"):
+        load_dataset("photos", chairs, category, "train")
+    assert "plain name" in next(photos.problems(chairs, category, "train")).message
+    assert load_dataset("photos", chairs, "my mug, x".split(",")[0], "train").category == "my mug"
+
+
+def test_messages_have_an_end(chairs: Path) -> None:
+    header, much = ",".join(COLUMNS), "x" * 100_000
+    for text in (f"{header},{much}\n", f"{header}\na.jpg,1,2,3,40,{much}\n"):
+        (chairs / "poses.csv").write_text(text)
+        with pytest.raises(ValueError, match="x") as refusal:
+            photos.load(chairs, "chair", "train")
+        assert len(str(refusal.value)) < 1000
+
+
 def test_two_tables_are_one_too_many(chairs: Path) -> None:
     (chairs / "poses.json").write_text("[]")
     with pytest.raises(ValueError, match=r"chair has both poses.csv and poses.json; remove one"):

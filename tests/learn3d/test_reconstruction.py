@@ -83,6 +83,14 @@ def test_small_images_are_enlarged() -> None:
     assert 0.22 < (stored[3] > 127).mean() < 0.28
 
 
+@pytest.mark.parametrize("share", [0.005, 1e-29])
+def test_squares_beyond_all_bounds_are_not_made(share: float) -> None:
+    mask = np.zeros((120, 120), np.uint8)
+    mask[10:110, 20:100] = 255
+    with pytest.raises(ValueError, match=r"100 pixels large and would take .* of a square of .*; at most 16000"):
+        prepare_image(np.zeros((120, 120, 3), np.uint8), mask, object_share=share)
+
+
 def test_prepare_image_refuses_what_it_cannot_frame() -> None:
     with pytest.raises(ValueError, match=r"colors must be \[H, W, 3\]"):
         prepare_image(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5), np.uint8))

@@ -173,6 +173,16 @@ def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     refused(weights | {"bn1.bias": torch.ones(3)}, rf"w.pth: bn1.bias is \[3\], ResNet-18 has \[64\]; {hint}")
     nan = torch.full((64,), float("nan"))
     refused(weights | {"bn1.bias": nan}, f"w.pth: bn1.bias has values that are not finite; {hint}")
+    for odd in (
+        weights["bn1.bias"].to(torch.complex64),
+        weights["bn1.bias"].to(torch.float8_e4m3fn),
+        weights["bn1.bias"].to("meta"),
+        weights["bn1.bias"].to_sparse(),
+    ):
+        refused(weights | {"bn1.bias": odd}, "w.pth: bn1.bias must be plain numbers such as torch.float32, got ")
+    beyond = torch.full((64,), 1e300, dtype=torch.float64)
+    refused(weights | {"bn1.bias": beyond}, "w.pth: bn1.bias has values that are not finite")
+    refused(weights | {5: torch.ones(1)}, r"w.pth must hold a state dict \(names -> tensors\), got ")
     refused([1, 2], r"w.pth must hold a state dict \(names -> tensors\), got list")
     refused(weights | {"bn1.bias": Runs()}, "cannot read pretrained weights from .*w.pth: Weights only load failed")
     assert not Path("ran").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 
 import numpy as np
@@ -27,6 +28,24 @@ def test_terminal_shows_a_bar_with_losses_and_time_left(tmp_path, monkeypatch) -
     assert "5/10" in shown
     assert "projec 0.25" in shown
     assert "half way" in shown
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
+@pytest.mark.parametrize("name", ["metrics.jsonl", "journal.txt"])
+@pytest.mark.parametrize("kind", ["pipe", "link", "dangling link"])
+def test_only_plain_files_are_appended_to(tmp_path, name: str, kind: str) -> None:
+    """A run folder may be a stranger's: a pipe would be waited for, and a link leads to a file of the user's."""
+    path, other = tmp_path / "run" / name, tmp_path / "other"
+    path.parent.mkdir()
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(other)
+    if kind == "link":
+        other.write_text("mine")
+    with pytest.raises(OSError, match=rf"{name} is no plain file, and nothing is appended to it; move it away"):
+        RunLog(path.parent, start=0, total=10)
+    assert other.read_text() == "mine" if kind == "link" else not other.exists()
 
 
 def test_elsewhere_it_prints_few_lines(tmp_path, capsys) -> None:

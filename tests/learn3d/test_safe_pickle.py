@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from memory_checks import at_most
 from python2_pickles import HEADER, python2_pickle, short_string
 from python2_pickles import npy as npy_bytes
 
@@ -199,6 +200,18 @@ def test_too_many_instructions_are_refused(tmp_path: Path, monkeypatch: pytest.M
         read(tmp_path / "a.npz", npy_bytes(b"", 11))
 
 
+@pytest.mark.parametrize("protocol", [2, 3, 4])
+def test_many_arrays_are_read_and_nothing_else_piles_up(tmp_path: Path, protocol: int) -> None:
+    """12 kB in the file would become a gigabyte of marks."""
+    many = [np.full((1, 2, 3), k % 256, np.uint8) for k in range(12_000)]
+    items = read(tmp_path / "a.npz", npy_bytes(pickle.dumps(object_array(*many), protocol=protocol), len(many)))
+    assert len(items) == 12_000 and items[11_999].tolist() == many[11_999].tolist()
+    with at_most(2**25), pytest.raises(ValueError, match="too many instructions"):
+        read(tmp_path / "a.npz", npy_bytes(b"\x80\x02" + b"(" * 2_000_000 + b".", 1))
+    with at_most(2**25), pytest.raises(ValueError, match="piles up more than arrays need"):
+        read(tmp_path / "a.npz", npy_bytes(b"\x80\x02" + b"(" * 2_000_000 + b".", 200_000))
+
+
 HEADERS = {
     "a huge plain array": (
         b"{'descr': '|u1', 'fortran_order': False, 'shape': (1000000000000,), }",
@@ -271,7 +284,7 @@ def test_random_damage_never_does_anything_but_a_value_error(data: st.DataObject
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     stream = safe_pickle._Stream(io.BytesIO(bytes(content)), len(content))
     try:
-        arrays = safe_pickle._Interpreter(stream).run()
+        arrays = safe_pickle._Interpreter(stream, len(IMAGES)).run()
     except ValueError:
         return
     assert all(isinstance(array, np.ndarray) and array.dtype.kind in "biuf" for array in arrays)

@@ -29,6 +29,7 @@ CHANGES = {
     "data": (5, "data must be a text, got 5"),
     "config": ([], r"config must be values by name, got \[\]"),
     "conditions": (7, "conditions must be values by name, got 7"),
+    "trained_by": ({"commit": 5}, "trained_by must be values by name, with a text or null as its commit, got {.*}"),
     "objects": ({}, "names must be texts, got None"),
 }
 
@@ -58,6 +59,8 @@ def test_numbers_beyond_any_array_are_refused(tmp_path):
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="it lacks config, iterations"):
         read_result(stored(tmp_path, {}))
+    with pytest.raises(ValueError, match="it lacks images;"):
+        read_result(stored(tmp_path, {name: value for name, value in RESULT.items() if name != "images"}))
     with pytest.raises(ValueError, match="it must hold values by name, got list"):
         read_result(stored(tmp_path, []))
     (tmp_path / "test.json").write_text("[" * 99_999)

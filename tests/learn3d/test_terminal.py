@@ -131,3 +131,21 @@ def test_columns_are_as_wide_as_their_widest_cell() -> None:
     assert align([("a", "b", "c"), ("longer", "", "x"), ("", "long", "")]) == (
         "a       b     c\nlonger        x\n        long"
     )
+
+
+def test_names_of_strangers_give_a_terminal_no_commands(capsys) -> None:
+    title, turned, broken = "\x1b]0;title\x07", "\u202etxt.exe", os.fsdecode(b"\xff")
+    say(f"a\tb\n{title} \x9b31m {turned} {broken} Ångström 椅子")
+    assert capsys.readouterr().out == "a\tb\n\\x1b]0;title\\x07 \\x9b31m \\u202etxt.exe \\udcff Ångström 椅子\n"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names that are no text")
+def test_a_mesh_whose_name_is_no_text_is_listed(tmp_path, monkeypatch, capsys) -> None:
+    for name in "abc":
+        (tmp_path / f"{name}.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 1\n3 0 1 2\n")
+    (tmp_path / os.fsdecode(b"\xff\x1b[2J.off")).write_text("no mesh")
+    command = ["make_dataset", "--output", str(tmp_path / "data"), "--category", "chair", "--source", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", [*command, "--test", "0", "--val", "0"])
+    assert load_tool("make_dataset", monkeypatch).main() == 0
+    for text in (capsys.readouterr().out, (tmp_path / "data" / "03001627_report.txt").read_text()):
+        assert "skipped \\udcff\\x1b[2J.off (train): " in text
