@@ -20,7 +20,7 @@ import tyro
 from learn3d.data.checking import check_folder
 from learn3d.data.layouts import Layout
 from learn3d.files import check_target, write_json
-from learn3d.terminal import in_a_sentence, plain
+from learn3d.terminal import in_a_sentence, say
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ def main(command: Command) -> int:
     if command.json is not None:
         check_target(command.json, "--json")
     report = check_folder(command.layout, command.folder, command.category, command.split, progress=sys.stderr.isatty())
-    if command.json is not None:
-        write_json(command.json, report.to_json())
     lines = [f"{p.severity}: {p.path}: {p.message}" for split in report.splits for p in split.problems]
     for line in lines[: command.most]:
-        print(plain(line))
+        say(line)
     if len(lines) > command.most:
-        print(f"... and {len(lines) - command.most} more (--most, --json)")
-    print(f"\n{plain(report.table())}\n\n{report.errors} errors, {report.warnings} warnings")
+        say(f"... and {len(lines) - command.most} more (--most, --json)")
+    say(f"\n{report.table()}\n\n{report.errors} errors, {report.warnings} warnings")
+    if command.json is not None:
+        write_json(command.json, report.to_json())
     return 1 if report.errors else 0
 
 

@@ -15,7 +15,7 @@ import tyro
 
 from learn3d.evaluation_report import describe_columns, evaluate_runs, format_table
 from learn3d.files import check_target, write_json
-from learn3d.terminal import in_a_sentence, note, plain
+from learn3d.terminal import in_a_sentence, note, say
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ def main() -> int:
         device=command.device,
         report_progress=note,
     )
+    say(format_table(report))
     if command.json is not None:
         write_json(command.json, report)
-    print(plain(format_table(report)))
     return 0
 
 

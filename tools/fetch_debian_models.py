@@ -10,13 +10,13 @@ import sys
 import tyro
 
 from learn3d.data.debian_models import FetchConfig, fetch_debian_models
-from learn3d.terminal import in_a_sentence, plain
+from learn3d.terminal import in_a_sentence, say
 
 
 @in_a_sentence()
 def main() -> int:
     report = fetch_debian_models(tyro.cli(FetchConfig, description=__doc__))
-    print(plain(report.summary()))
+    say(report.summary())
     return 0
 
 

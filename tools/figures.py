@@ -22,7 +22,7 @@ from learn3d.figures import paper
 from learn3d.figures.interpolation import AZIMUTHS_DEG
 from learn3d.figures.runs import Run, open_runs
 from learn3d.files import check_target_folder
-from learn3d.terminal import in_a_sentence, note, plain
+from learn3d.terminal import in_a_sentence, note, say
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +173,7 @@ def main() -> int:
     command = tyro.cli(Command, description=__doc__)
     check_target_folder(command.folder, "--output")
     for path in command.draw():
-        print(plain(str(path)))
+        say(str(path))
     return 0
 
 

@@ -12,13 +12,13 @@ import sys
 import tyro
 
 from learn3d.data.render import DatasetConfig, make_dataset
-from learn3d.terminal import in_a_sentence, plain
+from learn3d.terminal import in_a_sentence, say
 
 
 @in_a_sentence()
 def main() -> int:
     report = make_dataset(tyro.cli(DatasetConfig, description=__doc__))
-    print(plain(report.text()))
+    say(report.text())
     return 0
 
 

@@ -17,7 +17,7 @@ import tyro
 
 from learn3d.files import check_target_folder
 from learn3d.reconstruction import reconstruct_dataset, reconstruct_files
-from learn3d.terminal import in_a_sentence, plain
+from learn3d.terminal import in_a_sentence, say
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def main() -> int:
             **options,
         )
     for path in paths:
-        print(plain(str(path)))
+        say(str(path))
     return 0
 
 

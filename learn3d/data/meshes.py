@@ -12,9 +12,10 @@ import logging
 import re
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -158,8 +159,8 @@ def _usual_textures() -> Iterator[None]:
     with _ONE_AT_A_TIME:
         usual = Image.open
 
-        def open_usual(file: io.BytesIO) -> Image.Image:
-            image = usual(file, formats=TEXTURES)
+        def open_usual(file: Any, mode: str = "r", formats: Sequence[str] = TEXTURES) -> Image.Image:
+            image = usual(file, mode, formats)
             image.load()
             return image
 
