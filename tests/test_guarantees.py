@@ -13,7 +13,7 @@ def test_every_promise_has_a_test() -> None:
     lines = [line for line in page.splitlines() if line.startswith("|") and not line.startswith(("|---", "| fault"))]
     assert len(lines) > 20
     for line in lines:
-        named = re.findall(r"`(test_\w+\.py)::(\w+)`", line.split("|")[3])
+        named = re.findall(r"`((?:\w+/)?test_\w+\.py)::(\w+)`", line.split("|")[3])
         assert named, line
         for file, name in named:
             source = (ROOT / "tests" / "learn3d" / file).read_text()

@@ -32,7 +32,7 @@ from learn3d.experiments.tables import TABLES
 
 pytestmark = pytest.mark.slow
 
-TOOLS = Path(__file__).parents[2] / "tools"
+TOOLS = Path(__file__).parents[3] / "tools"
 CATEGORY = "airplane"
 PASCAL_SEEDS = 2
 MEASURES = ("kato18", "kato19", "mmd", "mmd_paper", "chamfer_l1", "f_score")

@@ -1,0 +1,192 @@
+"""What is planned for a table, and what is found again."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import os
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from learn3d.experiments import published
+from learn3d.experiments.experiment import Call, run_experiment
+from learn3d.experiments.plan import (
+    Options,
+    State,
+    command_line,
+    is_current,
+    plan_runs,
+    read_results,
+    read_state,
+)
+from learn3d.experiments.tables import TABLES
+from learn3d.presets import PRESETS
+
+TOOLS = Path(__file__).parents[3] / "tools"
+
+
+def test_runs_of_a_table_have_names_and_configurations(tmp_path) -> None:
+    runs = plan_runs(TABLES["ablation"], Options(tmp_path, tmp_path / "out", categories=("chair", "lamp"), seeds=2))
+    assert len(runs) == 4 * 2 * 2
+    assert len({run.folder for run in runs}) == len(runs)
+    run = next(run for run in runs if run.name == "chair/without-adversarial-seed1")
+    assert run.folder == tmp_path / "out" / "runs" / "chair" / "without-adversarial-seed1"
+    settings = run.config.settings
+    assert (settings.lambda_adversarial, settings.lambda_classification, settings.lambda_prior) == (0, 0, 1)
+    assert (run.config.seed, run.config.iterations, run.config.batch_size) == (1, 20_000, 128)
+
+
+def test_bins_are_a_training_option(tmp_path) -> None:
+    runs = plan_runs(TABLES["bins"], Options(tmp_path, tmp_path, categories=("chair",)))
+    assert [run.config.view_bins for run in runs] == list(published.BINS)
+    assert {run.config.layout for run in runs} == {"kar"}
+
+
+def test_schedules_follow_the_number_of_iterations(tmp_path, options) -> None:
+    settings = [
+        plan_runs(TABLES[table], options(methods=(name,), iterations=2000))[0].config.settings
+        for table, name in (("prgan", "prgan"), ("multi-view", "multi-view"))
+    ]
+    assert (settings[0].encoder_from_step, settings[1].decay_at_step) == (1001, 1900)
+    for table in TABLES.values():
+        for run in plan_runs(table, Options(tmp_path, tmp_path, ("chair",), seeds=1)):
+            usual = PRESETS[run.variant.preset].settings
+            assert run.config.settings == dataclasses.replace(
+                usual, **{name: value for name, value in run.variant.changes.items() if hasattr(usual, name)}
+            ), "what is not changed is as published"
+
+
+def test_changes_reach_the_methods_that_they_name(options) -> None:
+    changes = ("precision=fp32", "Vanilla-AE:learning-rate=3e-4", "lambda_smooth=0.5", "augment=flip-image,channels")
+    vanilla, proposed = plan_runs(TABLES["kato"], options(changes=changes))
+    assert (vanilla.config.settings.learning_rate, proposed.config.settings.learning_rate) == (3e-4, 1e-4)
+    for run in (vanilla, proposed):
+        assert run.config.settings.lambda_smooth == 0.5
+        assert (run.config.precision, run.config.augment) == ("fp32", ("flip-image", "channels"))
+
+
+def test_several_whole_numbers_are_numbers(options) -> None:
+    for text in ("prgan:discriminator_channels=8,16,32,64", "discriminator-channels=[8,16,32,64]"):
+        (run,) = plan_runs(TABLES["prgan"], options(methods=("prgan",), changes=(text,)))
+        assert run.config.settings.discriminator_channels == (8, 16, 32, 64)
+    with pytest.raises(ValueError, match="discriminator_channels must be a whole number >= 1, got 'a'"):
+        plan_runs(TABLES["prgan"], options(methods=("prgan",), changes=("discriminator_channels=8,16,32,a",)))
+    with pytest.raises(ValueError, match=r"discriminator_channels must be 4 whole numbers, got \(8,\)"):
+        plan_runs(TABLES["prgan"], options(methods=("prgan",), changes=("discriminator_channels=[8]",)))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"methods": ("vpn",)}, "no method 'vpn'; it has vanilla, vpl, proposed"),
+        ({"changes": ("lambda_x=1",)}, "no setting 'lambda_x'; there are encoder"),
+        ({"changes": ("lambda_prior",)}, "written as name=value"),
+        ({"changes": ("pascal:lambda_prior=1",)}, "names the method 'pascal'; there are vanilla, proposed"),
+        ({"changes": ("seed=1",)}, "seed has an option of its own"),
+        ({"changes": ("lambda_prior=-1",)}, "lambda_prior must be a number >= 0"),
+        ({"categories": ("chair", "chair")}, "categories must be different"),
+        ({"seeds": 0}, "seeds must be"),
+        ({"iterations": -1}, "iterations must be"),
+        ({"layout": "dvr"}, "the layout 'dvr' has no true voxels"),
+    ],
+)
+def test_wrong_requests_are_named(given, message, options) -> None:
+    with pytest.raises(ValueError, match=message):
+        plan_runs(TABLES["kato"], options(**given))
+
+
+def test_a_method_whose_preset_is_absent_is_named(monkeypatch, options) -> None:
+    monkeypatch.delitem(PRESETS, "peng2020-kato-vanilla")
+    with pytest.raises(ValueError, match=r"method 'vanilla' .* needs the preset 'peng2020-kato-vanilla'.*--methods"):
+        plan_runs(TABLES["kato"], options())
+
+
+@pytest.mark.parametrize("table", ["kato", "ablation", "bins", "prgan"])
+def test_the_command_of_a_run_gives_its_configuration(tmp_path, table: str) -> None:
+    spec = importlib.util.spec_from_file_location("tool_train_commands", TOOLS / "train.py")
+    train = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = train
+    spec.loader.exec_module(train)
+    changes = ("precision=fp32", "augment=flip-image,channels", "max_val_images=4")
+    changes += {"kato": ("vpl:anti_aliasing=false",), "prgan": ("perspective=true",)}.get(table, ("lambda_prior=0.25",))
+    methods = [row.variant.name for row in TABLES[table].rows if row.variant and row.variant.preset in PRESETS]
+    given = Options(tmp_path / "a b", tmp_path, ("chair",), tuple(methods), 7, layout="kar", changes=changes)
+    for run in plan_runs(TABLES[table], given):
+        assert train.parse(shlex.split(command_line(run.config))[2:]).config == run.config
+
+
+def test_runs_made_by_hand_are_adopted(made_by_hand) -> None:
+    assert read_state(made_by_hand()) == State("trained", 4)
+    assert read_state(made_by_hand(iterations=9)) == State("unfinished", 4)
+    assert read_state(made_by_hand(threads=7)) == State("trained", 4), "what does not decide the result may differ"
+
+
+def test_a_trained_run_whose_checkpoint_is_damaged_goes_on(made_by_hand, finished_run) -> None:
+    run = made_by_hand()
+    run.folder.unlink()
+    run.folder.mkdir()
+    last = run.folder / "last.safetensors"
+    shutil.copy(finished_run / "last.safetensors", last)
+    with open(last, "r+b") as file:
+        file.seek(-1000, os.SEEK_END)
+        file.write(b"rubbish")
+    assert read_state(run) == State("unfinished", 4), "training finds the damage and goes back to the one before"
+    (run.folder / "checkpoints").mkdir()
+    shutil.copy(finished_run / "last.safetensors", run.folder / "checkpoints" / "step-000004.safetensors")
+    last.write_bytes(b"rubbish")
+    assert read_state(run).step == 4, "the header of the one before counts"
+    shutil.rmtree(run.folder)
+
+
+def test_other_options_are_named(made_by_hand) -> None:
+    with pytest.raises(ValueError, match=r"proposed-seed0 has a run with other options: batch_size: 4 .* 5 asked for"):
+        read_state(made_by_hand(batch_size=5))
+    with pytest.raises(ValueError, match=r"lambda_prior: 1\.0 in the run, 0\.5 asked for"):
+        read_state(made_by_hand(changes=("precision=fp32", "lambda_prior=0.5")))
+    with pytest.raises(ValueError, match="iterations: 4 taken by the run, 3 asked for"):
+        read_state(made_by_hand(iterations=3))
+
+
+def test_the_split_that_chose_the_best_networks_counts(made_by_hand) -> None:
+    run = made_by_hand(changes=("precision=fp32", "val_split=test"))
+    assert read_state(run) == State("trained", 4)
+    best = dataclasses.replace(run, variant=dataclasses.replace(run.variant, checkpoint="best"))
+    with pytest.raises(ValueError, match="val_split: 'val' chose the run's best networks, 'test' asked for"):
+        read_state(best)
+
+
+def test_runs_in_conflict_stop_the_table_or_are_replaced(tmp_path, stub, capsys, options) -> None:
+    run_experiment(Call("mmd", options()), worker=stub)
+    with pytest.raises(ValueError, match=r"batch_size: 4 in the run, 8 asked for(.|\n)*--overwrite"):
+        run_experiment(Call("mmd", options(batch_size=8)), worker=stub)
+    assert run_experiment(Call("mmd", options(batch_size=8), overwrite=True), worker=stub) == 0
+    log = (tmp_path / "out/runs/airplane/vanilla-seed0/log.txt").read_text()
+    assert log.count("fresh False") == log.count("fresh True") == 1
+
+
+def test_finished_runs_are_skipped_and_shared(stub, capsys, options) -> None:
+    assert run_experiment(Call("kato", options()), worker=stub) == 0
+    broken = (sys.executable, "-c", "raise SystemExit('started')")
+    assert run_experiment(Call("kato", options()), worker=broken) == 0
+    assert run_experiment(Call("mmd", options()), worker=broken) == 0, "the same runs serve another table"
+    assert run_experiment(Call("kato", options(seeds=2)), worker=broken) == 1
+
+
+def test_a_result_of_fewer_iterations_is_not_taken(made_by_hand) -> None:
+    """As where tools/train.py took a measured run further by hand."""
+    run = made_by_hand()
+    result = {"iterations": 3, "checkpoint": "last", "data": str(run.config.data.resolve())}
+    assert not is_current(run, result)
+    assert is_current(run, result | {"iterations": 4})
+    assert not is_current(run, result | {"iterations": 4, "checkpoint": "best"})
+
+
+def test_a_result_of_other_data_is_not_taken(tmp_path, stub, options) -> None:
+    run_experiment(Call("kato", options()), worker=stub)
+    moved = plan_runs(TABLES["kato"], dataclasses.replace(options(), data=tmp_path / "elsewhere"))
+    assert read_state(moved[0]).stage == "trained"
+    assert read_results(moved) == {}

@@ -1,0 +1,32 @@
+"""The tables: figures of the paper, rows, presets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from learn3d.experiments import published
+from learn3d.experiments.tables import TABLES
+
+TOOLS = Path(__file__).parents[3] / "tools"
+
+
+@pytest.mark.parametrize("name", ["KATO", "PRGAN", "KAR", "ABLATION", "MMD", "PASCAL"])
+def test_printed_means_agree_with_the_printed_rows(name: str) -> None:
+    for label, row in getattr(published, name).items():
+        if row.mean is not None:
+            assert np.mean(list(row.values.values())) == pytest.approx(row.mean, abs=0.001), label
+
+
+def test_tables_take_rows_of_the_paper_and_share_runs() -> None:
+    assert set(TABLES) == {"kato", "prgan", "kar", "ablation", "bins", "mmd", "multi-view", "pascal", "precision"}
+    variants: dict[str, object] = {}
+    for table in TABLES.values():
+        assert table.baseline in [row.label for row in table.rows]
+        assert all(row.published is not None for row in table.rows) or table.name == "precision"
+        for variant in table.variants:
+            assert variants.setdefault(variant.name, variant) == variant, "one name, two meanings"
+    assert len(TABLES["bins"].rows) == 7
+    assert TABLES["kar"].rows[2].variant in TABLES["bins"].variants
