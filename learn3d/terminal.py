@@ -30,6 +30,7 @@ def in_a_sentence(*errors: type[Exception], label: Callable[[], str] = str) -> C
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
         @functools.wraps(main)
         def ending(*arguments: P.args, **options: P.kwargs) -> int:
+            _open_missing()
             try:
                 status = main(*arguments, **options)
                 if sys.stdout is not None:  # closed before the program began
@@ -77,6 +78,16 @@ def _is_unread(stream: TextIO) -> bool:
             _silence(stream)
             return True
     return False
+
+
+def _open_missing() -> None:
+    """Let standard streams that were closed before the program began (`2>&-`) lead nowhere: the first files that are
+    opened would take their numbers, and with them what libraries in C write there."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
 
 
 def _silence(stream: TextIO) -> None:

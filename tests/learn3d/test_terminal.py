@@ -92,6 +92,24 @@ def test_an_output_that_was_never_open_is_no_error(monkeypatch) -> None:
     assert in_a_sentence()(lambda: say("nobody reads this") or 0)() == 0
 
 
+@pytest.mark.skipif(os.name != "posix", reason="streams are closed otherwise there")
+def test_no_file_takes_the_number_of_a_closed_stream(tmp_path: Path) -> None:
+    """As with `2>&-`: what libraries in C say would be written into it."""
+    program = f"""
+import sys
+from learn3d.terminal import in_a_sentence
+
+@in_a_sentence()
+def main():
+    with open({str(tmp_path / "file")!r}, "w") as file:
+        return 0 if file.fileno() > 2 else 1
+
+sys.exit(main())
+"""
+    shell = ["sh", "-c", 'exec "$0" -c "$1" <&- >&- 2>&-', sys.executable, program]
+    assert subprocess.run(shell, timeout=120).returncode == 0
+
+
 @pytest.mark.skipif(os.name != "posix", reason="a pipe without a reader ends otherwise there")
 @pytest.mark.parametrize("buffered", [True, False])
 @pytest.mark.parametrize("lines", [1, 100_000])
