@@ -24,8 +24,12 @@ check_machine() { # gigabytes of free disk wanted
             fail "no C++ compiler found; install one (on Debian: apt-get install g++), or set CXX to its path"
     fi
     [ -w . ] || fail "cannot write to $PWD; clone the repository to a folder of your own"
-    free=$(df -Pk . | awk 'NR == 2 {print int($4 / 1048576)}')
-    [ "$free" -ge "$1" ] || fail "only $free GB free on the disk of $PWD, $1 GB are needed; free some space"
+    check_room "$PWD" "$1" ""
+}
+
+check_room() { # folder, gigabytes wanted, what else could be done
+    free=$(df -Pk "$1" | awk 'NR == 2 {print int($4 / 1048576)}')
+    [ "$free" -ge "$2" ] || fail "only $free GB free on the disk of $1, $2 GB are needed; free some space$3"
 }
 
 setup() { # extra of the package: train or test

@@ -10,6 +10,7 @@ step "Style"
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 step "Tests"
+check_room "${TMPDIR:-/tmp}" 5 ", or set TMPDIR to a folder on another disk" # checkpoints of the paper's networks
 # The script pytest, not python -m pytest: the latter would import the source folder in place of the installed package.
 # One thread for each process, as threads that wait for each other on shared cores take many times as long. Files stay together:
 # their tests share trained runs and compiled programs; and in the order of their names, as the longest have the fewest tests and
