@@ -22,8 +22,6 @@ from learn3d.experiments.plan import (
 )
 from learn3d.experiments.tables import TABLES
 
-TOOLS = Path(__file__).parents[3] / "tools"
-
 
 def test_report_has_the_papers_figures_beside_ours(report) -> None:
     vanilla, proposed = report["rows"]

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,8 +27,6 @@ from learn3d.experiments.tables import TABLES
 from learn3d.experiments.worker import carry_out
 from learn3d.run_folder import sole_use
 from learn3d.training import Summary
-
-TOOLS = Path(__file__).parents[3] / "tools"
 
 
 def test_a_failing_run_does_not_stop_the_others(tmp_path, stub, capsys, options) -> None:

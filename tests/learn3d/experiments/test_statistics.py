@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from learn3d.experiments.statistics import percentile_interval, resampled_means, t_interval
-
-TOOLS = Path(__file__).parents[3] / "tools"
 
 
 def test_t_interval_by_hand() -> None:

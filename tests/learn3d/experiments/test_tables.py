@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from learn3d.experiments import published
+from learn3d.experiments.experiment import describe_tables
 from learn3d.experiments.tables import TABLES
-
-TOOLS = Path(__file__).parents[3] / "tools"
 
 
 @pytest.mark.parametrize("name", ["KATO", "PRGAN", "KAR", "ABLATION", "MMD", "PASCAL"])
@@ -30,3 +27,14 @@ def test_tables_take_rows_of_the_paper_and_share_runs() -> None:
             assert variants.setdefault(variant.name, variant) == variant, "one name, two meanings"
     assert len(TABLES["bins"].rows) == 7
     assert TABLES["kar"].rows[2].variant in TABLES["bins"].variants
+
+
+def test_the_list_has_every_table_with_its_rows() -> None:
+    """What `tools/experiment.py --list` prints."""
+    lines = describe_tables().splitlines()
+    for table in TABLES.values():
+        start = lines.index(f"{table.name}: {table.title}") + 2
+        for line, row in zip(lines[start:], table.rows, strict=False):
+            assert line.startswith(f"  {row.label}: {row.variant.name if row.variant else 'quoted'}"), line
+            assert "not in this version" not in line
+    assert "  w/o prior: without-prior, preset peng2020-kato, lambda_prior=0" in describe_tables()
