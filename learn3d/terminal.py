@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import re
@@ -14,6 +15,7 @@ from typing import ParamSpec, TextIO
 P = ParamSpec("P")
 
 INTERRUPTED, UNREAD = 130, 141  # exit statuses after Ctrl-C, and after SIGPIPE, as shells have them
+_NO_READER = (errno.EPIPE, errno.EIO)  # of a pipe; of a terminal that was closed
 #: What a terminal would obey, what turns the direction of reading, and halves of characters, which cannot be written.
 _COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
@@ -39,10 +41,10 @@ def in_a_sentence(*errors: type[Exception], label: Callable[[], str] = str) -> C
             except (ValueError, OSError, *errors) as error:
                 if isinstance(error, BrokenPipeError) and _is_unread(sys.stdout):
                     return UNREAD
-                say(f"error: {label()}{error}", sys.stderr)
+                note(f"error: {label()}{error}")
                 return 1
             except KeyboardInterrupt:
-                say("interrupted; what was saved before is as it was", sys.stderr)
+                note("interrupted; what was saved before is as it was")
                 return INTERRUPTED
 
         return ending
@@ -56,17 +58,23 @@ def plain(text: str) -> str:
 
 
 def say(text: str, stream: TextIO | None = None) -> None:
-    """Print a line, as `plain` has it; a terminal that was closed does not change how the command ends."""
+    """Print a line of the results, as `plain` has it; where nobody reads it any more, that is no error.
+
+    Raises OSError where it cannot be written for another reason (`> file` on a full disk): the result is lost then.
+    """
     stream = stream or sys.stdout
     try:
         print(plain(text), file=stream, flush=True)
-    except OSError:
+    except OSError as error:
         _silence(stream)
+        if error.errno not in _NO_READER:
+            raise
 
 
 def note(text: str) -> None:
-    """Print a line about the progress on stderr, apart from the results."""
-    say(text, sys.stderr)
+    """Print a line about the progress on stderr, apart from the results; no work ends because it cannot be written."""
+    with contextlib.suppress(OSError):
+        say(text, sys.stderr)
 
 
 def _is_unread(stream: TextIO) -> bool:

@@ -205,3 +205,11 @@ def test_half_written_files_do_not_make_a_folder_used_and_are_removed(tmp_path) 
     files.write_bytes(tmp_path / "x", b"")
     with pytest.raises(ValueError, match="is not empty"):
         run_folder.claim(tmp_path, overwrite=False)
+
+
+def test_two_processes_never_share_a_run(tmp_path) -> None:
+    with run_folder.sole_use(tmp_path), pytest.raises(OSError, match="another process works in"):
+        with run_folder.sole_use(tmp_path):
+            pass
+    with run_folder.sole_use(tmp_path):
+        pass

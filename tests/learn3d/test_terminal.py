@@ -92,6 +92,28 @@ def test_an_output_that_was_never_open_is_no_error(monkeypatch) -> None:
     assert in_a_sentence()(lambda: say("nobody reads this") or 0)() == 0
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")
+@pytest.mark.parametrize(("call", "status"), [("say", 1), ("note", 0)])
+def test_a_result_that_cannot_be_written_is_an_error_and_lost_progress_is_none(call: str, status: int) -> None:
+    program = f"""
+import sys
+from learn3d.terminal import in_a_sentence, {call}
+
+@in_a_sentence()
+def main():
+    {call}("a table")
+    return 0
+
+sys.exit(main())
+"""
+    stream = {"say": "stdout", "note": "stderr"}[call]
+    with open("/dev/full", "w") as full:
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | {stream: full}
+        result = subprocess.run([sys.executable, "-c", program], **streams, timeout=120)
+    assert result.returncode == status
+    assert call == "note" or result.stderr == b"error: [Errno 28] No space left on device\n"
+
+
 @pytest.mark.skipif(os.name != "posix", reason="streams are closed otherwise there")
 def test_no_file_takes_the_number_of_a_closed_stream(tmp_path: Path) -> None:
     """As with `2>&-`: what libraries in C say would be written into it."""

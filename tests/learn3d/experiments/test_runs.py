@@ -25,7 +25,6 @@ from learn3d.experiments.plan import (
 from learn3d.experiments.pool import NOT_FROM_HERE
 from learn3d.experiments.tables import TABLES
 from learn3d.experiments.worker import carry_out
-from learn3d.run_folder import sole_use
 from learn3d.training import Summary
 
 
@@ -141,10 +140,3 @@ def test_a_worker_stops_when_its_parent_is_gone(answer: signal.Handlers) -> None
     assert b"KeyboardInterrupt" in process.stderr.read()
     assert process.wait(timeout=30) != 0
     process.stderr.close()
-
-
-def test_two_processes_never_share_a_run(tmp_path) -> None:
-    with sole_use(tmp_path), pytest.raises(OSError, match="another process works in"), sole_use(tmp_path):
-        pass
-    with sole_use(tmp_path):
-        pass
