@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d import limits
 from learn3d.data.augment import Augmentation
-from learn3d.data.findings import DamagedFile
 from learn3d.data.layouts import LAYOUTS, Layout, check_options
 from learn3d.data.sampling import Sampling
-from learn3d.inputs import parse_json, read_bytes
+from learn3d.files import limits
+from learn3d.files.findings import DamagedFile
+from learn3d.files.reading import parse_json, read_bytes
 from learn3d.presets import PRESETS, Settings
 
 DEFAULT_PRESET = next(iter(PRESETS))

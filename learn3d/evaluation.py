@@ -15,11 +15,11 @@ from torch import Tensor
 import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import Definition
-from learn3d.data.views import ViewDataset
-from learn3d.distributed import ALONE, Ranks
+from learn3d.data.dataset import ViewDataset
 from learn3d.losses import mmd_from_distances
 from learn3d.methods import Grids, Meshes, Method
-from learn3d.surfaces import grid_surface
+from learn3d.methods.surfaces import grid_surface
+from learn3d.parallel.ranks import ALONE, Ranks
 
 CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000

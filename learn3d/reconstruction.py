@@ -12,12 +12,14 @@ import torch
 import trimesh
 from torch import Tensor
 
-from learn3d import checkpoint, figures, files, limits
+from learn3d import figures
 from learn3d.data.crops import Crops
 from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo
-from learn3d.data.kato import mesh_to_object
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
+from learn3d.data.readers.kato import mesh_to_object
+from learn3d.files import limits, writing
 from learn3d.methods import Method
+from learn3d.runs import checkpoint
 
 STRIP_SIZE = 160
 LARGEST_PICTURE = 2048  # pixels: shapes are drawn four times as fine, and the renderer goes up to 8192
@@ -92,7 +94,7 @@ def export_mesh(path: Path, vertices: Tensor, faces: Tensor) -> None:
     points = vertices.detach().cpu().double().numpy() @ mesh_to_object()
     mesh = trimesh.Trimesh(points, faces.cpu().numpy()[:, ::-1], process=False)
     content = mesh.export(file_type=kind)
-    files.write_bytes(path, content.encode() if isinstance(content, str) else content)
+    writing.write_bytes(path, content.encode() if isinstance(content, str) else content)
 
 
 def check_pictures(frames: int = 36, image_size: int = 256) -> None:

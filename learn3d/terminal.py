@@ -25,7 +25,7 @@ def in_a_sentence(*errors: type[Exception], label: Callable[[], str] = str) -> C
 
     ValueError, OSError and the given errors: status 1 and "error: ", `label()` and what the error says. Ctrl-C: status
     130 and that it was interrupted. An output that nobody reads any more (`| head`): status 141 and no word. Files get
-    their names when they are complete (`learn3d.files`), so that none of these leaves half of one. Anything else is a
+    their names when they are complete (`files.writing`), so that none of these leaves half of one. Anything else is a
     mistake of ours, and has its traceback.
     """
 

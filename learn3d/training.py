@@ -12,22 +12,22 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from learn3d import files, run_folder
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.data.augment import augment
+from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
 from learn3d.data.sampling import sample_indices
-from learn3d.data.views import ViewDataset
-from learn3d.distributed import ALONE, Ranks, weights_digest
-from learn3d.faults import explained
-from learn3d.memory import keep_freed_memory
+from learn3d.device import keep_freed_memory, resolve_precision
+from learn3d.files import writing
+from learn3d.interrupt import stop_on_signal
 from learn3d.methods import DataShape, Method, create_method
-from learn3d.networks import resolve_precision
-from learn3d.pace import CoreShare
+from learn3d.parallel.ranks import ALONE, Ranks, weights_digest
 from learn3d.presets import PRESETS
-from learn3d.run_state import Conditions, Progress, load_last, restore, save_last
-from learn3d.runlog import RunLog, SilentLog
-from learn3d.signals import stop_on_signal
+from learn3d.runs import folder as run_folder
+from learn3d.runs.faults import explained
+from learn3d.runs.log import RunLog, SilentLog
+from learn3d.runs.pace import CoreShare
+from learn3d.runs.state import Conditions, Progress, load_last, restore, save_last
 from learn3d.validation import draw, validate
 
 
@@ -63,7 +63,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
     and return. With `resume` the run continues from its last checkpoint, bit for bit (same machine, device and numbers
     of threads and processes), or from the start if it was stopped before its first one. A finished run stays as it is.
 
-    Several processes, each with its `ranks`, train one model together (learn3d/distributed.py); the first one writes.
+    Several processes, each with its `ranks`, train one model together (`parallel.ranks`); the first one writes.
 
     Raises ValueError for a folder in use, options or training data that conflict with the resumed run or data that do
     not fit, FloatingPointError when a loss is no longer finite (the last checkpoint is from before that), OSError when
@@ -113,7 +113,7 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
     if ranks.main:
         if not resume:
             run_folder.claim(folder, overwrite)
-        files.write_json(folder / run_folder.CONFIG, config_to_dict(config), sync=True)
+        writing.write_json(folder / run_folder.CONFIG, config_to_dict(config), sync=True)
     before = progress.seconds
     waits = config.device != "cpu" or not ranks.alone
     cores = CoreShare(torch.get_num_threads(), processes=ranks.beside, waits=waits)

@@ -8,14 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learn3d import checkpoint, figures
+from learn3d import figures
 from learn3d.config import TrainConfig
-from learn3d.data.views import ViewDataset
+from learn3d.data.dataset import ViewDataset
 from learn3d.evaluation import evaluate
 from learn3d.methods import DataShape, Method
-from learn3d.run_folder import BEST, PICTURES
-from learn3d.run_state import Progress, check_networks
-from learn3d.runlog import RunLog
+from learn3d.runs import checkpoint
+from learn3d.runs.folder import BEST, PICTURES
+from learn3d.runs.log import RunLog
+from learn3d.runs.state import Progress, check_networks
 
 PICTURE_ROWS = 8
 

@@ -1,4 +1,4 @@
-"""tools/bench.py: every program does the same work, the counts are right, and the table tells a missed target."""
+"""tools/bench/bench.py: every program does the same work, the counts are right, and the table tells a missed target."""
 
 import json
 import mmap
@@ -13,7 +13,7 @@ import torch
 import nmr
 from learn3d.presets import PRESETS
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "tools" / "bench"))
 
 import bench
 import bench_count

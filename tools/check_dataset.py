@@ -19,7 +19,7 @@ import tyro
 
 from learn3d.data.checking import check_folder
 from learn3d.data.layouts import Layout
-from learn3d.files import check_target, write_json
+from learn3d.files.writing import check_target, write_json
 from learn3d.terminal import in_a_sentence, say
 
 

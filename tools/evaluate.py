@@ -13,8 +13,8 @@ from typing import Literal
 
 import tyro
 
-from learn3d.evaluation_report import describe_columns, evaluate_runs, format_table
-from learn3d.files import check_target, write_json
+from learn3d.experiments.evaluation_report import describe_columns, evaluate_runs, format_table
+from learn3d.files.writing import check_target, write_json
 from learn3d.terminal import in_a_sentence, note, say
 
 

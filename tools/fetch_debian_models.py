@@ -9,7 +9,7 @@ import sys
 
 import tyro
 
-from learn3d.data.debian_models import FetchConfig, fetch_debian_models
+from learn3d.make_data.debian.models import FetchConfig, fetch_debian_models
 from learn3d.terminal import in_a_sentence, say
 
 

@@ -21,7 +21,7 @@ import tyro
 from learn3d.figures import paper
 from learn3d.figures.interpolation import AZIMUTHS_DEG
 from learn3d.figures.runs import Run, open_runs
-from learn3d.files import check_target_folder
+from learn3d.files.writing import check_target_folder
 from learn3d.terminal import in_a_sentence, note, say
 
 

@@ -11,7 +11,7 @@ import sys
 
 import tyro
 
-from learn3d.data.render import DatasetConfig, make_dataset
+from learn3d.make_data.render import DatasetConfig, make_dataset
 from learn3d.terminal import in_a_sentence, say
 
 

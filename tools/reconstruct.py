@@ -15,7 +15,7 @@ from typing import Literal
 
 import tyro
 
-from learn3d.files import check_target_folder
+from learn3d.files.writing import check_target_folder
 from learn3d.reconstruction import reconstruct_dataset, reconstruct_files
 from learn3d.terminal import in_a_sentence, say
 

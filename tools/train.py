@@ -18,7 +18,7 @@ from pathlib import Path
 import tyro
 
 from learn3d.config import DEFAULT_PRESET, TrainConfig, load_config
-from learn3d.distributed import LostPeerError, label, start
+from learn3d.parallel.ranks import LostPeerError, label, start
 from learn3d.presets import PRESETS
 from learn3d.terminal import in_a_sentence, say
 from learn3d.training import train

@@ -11,9 +11,9 @@ import tyro
 from PIL import Image
 
 import nmr
-from learn3d.data.kato import mesh_to_object
-from learn3d.data.shapes import make_shape
-from learn3d.shading import shade_mesh
+from learn3d.data.readers.kato import mesh_to_object
+from learn3d.make_data.shading import shade_mesh
+from learn3d.make_data.shapes import make_shape
 
 WIDTH, HEIGHT = 320, 240
 FOV_DEG = 40.0  # across the width

@@ -8,15 +8,15 @@ wrong with them. An error is what `load` would raise, a warning is what it would
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from learn3d.data.findings import Problem
-from learn3d.data.kato import synset_of
 from learn3d.data.layouts import LAYOUTS
+from learn3d.data.readers import READERS
+from learn3d.data.readers.kato import synset_of
+from learn3d.files.findings import Problem
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def check_folder(
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder}")
-    reader = importlib.import_module(f"learn3d.data.{layout}")
+    reader = READERS[layout]
     found = reader.contents(folder)
     if not found and not categories:
         raise FileNotFoundError(f"{folder} holds nothing of the layout {layout!r}; see docs/data-sets.md")

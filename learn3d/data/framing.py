@@ -17,9 +17,9 @@ from typing import Literal
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from learn3d import limits
-from learn3d.data.findings import DamagedFile, MissingFile
-from learn3d.data.images import PHOTOGRAPHS, open_image
+from learn3d.files import limits
+from learn3d.files.findings import DamagedFile, MissingFile
+from learn3d.files.images import PHOTOGRAPHS, open_image
 
 Framing = Literal["whole", "object"]
 OBJECT_SHARE = 0.65  # of the side of the square that the object takes with "object", about what Kato's renderings have

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from learn3d.data import kato
-from learn3d.data.findings import DamagedFile, MissingFile
+from learn3d.data.dataset import ViewDataset, concatenate
+from learn3d.data.readers import READERS, kato
 from learn3d.data.view_bins import AngleBins
-from learn3d.data.views import ViewDataset, concatenate
+from learn3d.files.findings import DamagedFile, MissingFile
 
 Layout = Literal["kato", "dvr", "kar", "r2n2", "pascal3d", "photos"]
 
@@ -101,7 +100,7 @@ def load_dataset(
     names = [name.strip() for name in category.split(",")]
     if len(set(names)) != len(names) or not all(names):
         raise ValueError(f"category must be one name, or different names joined by commas, got {category!r}")
-    reader = importlib.import_module(f"learn3d.data.{layout}")  # now, as each needs other packages
+    reader = READERS[layout]
     given = {"image_size": image_size, "views_per_object": views_per_object, "progress": progress}
     options = {name: given[name] for name in LAYOUTS[layout].options}
     try:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learn3d.data.views import ViewDataset
+from learn3d.data.dataset import ViewDataset
 
 Sampling = Literal["views", "pairs", "classes"]
 

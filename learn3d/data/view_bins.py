@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learn3d import limits
 from learn3d.data.poses import LookAtPoses, wrap_deg
+from learn3d.files import limits
 
 
 @dataclass(frozen=True)

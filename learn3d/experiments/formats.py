@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from learn3d import files
 from learn3d.experiments.report import MEAN
+from learn3d.files import writing
 from learn3d.terminal import align
 
 _STYLE = """
@@ -33,9 +33,9 @@ def write_report(folder: Path, report: dict[str, Any]) -> list[Path]:
     name = report["table"]
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.{suffix}" for suffix in ("json", "csv", "md", "html")]
-    files.write_json(paths[0], report)
+    writing.write_json(paths[0], report)
     for path, text in zip(paths[1:], (to_csv(report), to_markdown(report), to_html(report)), strict=True):
-        files.write_bytes(path, text.encode())
+        writing.write_bytes(path, text.encode())
     return paths
 
 
@@ -45,13 +45,13 @@ def embed(page: Path, report: dict[str, Any]) -> None:
     Raises ValueError where the page does not have the two lines.
     """
     before, after = _around(page, report["table"])
-    files.write_bytes(page, f"{before}\n{to_markdown(report, heading=False)}{after}".encode())
+    writing.write_bytes(page, f"{before}\n{to_markdown(report, heading=False)}{after}".encode())
 
 
 def check_page(page: Path, table: str) -> None:
     """Raise what `embed` would, for the beginning of long work: ValueError, or OSError for a page that is not there or
     cannot be replaced."""
-    files.check_target(page, "--page")
+    writing.check_target(page, "--page")
     _around(page, table)
 
 

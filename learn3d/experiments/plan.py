@@ -10,14 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d import checkpoint, checkpoint_checks, run_folder
 from learn3d.config import TrainConfig, config_from_dict, differences, load_config
-from learn3d.data.kato import synset_of
 from learn3d.data.layouts import LAYOUTS, Layout
+from learn3d.data.readers.kato import synset_of
+from learn3d.device import resolve_precision
 from learn3d.experiments.stored import read_result
 from learn3d.experiments.tables import Row, Table, Variant
-from learn3d.networks import resolve_precision
 from learn3d.presets import PRESETS
+from learn3d.runs import checkpoint, checkpoint_checks
+from learn3d.runs import folder as run_folder
 
 RESULT_FILE = "test.json"
 LOG_FILE = "log.txt"

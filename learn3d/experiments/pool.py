@@ -14,7 +14,7 @@ from pathlib import Path
 
 from learn3d.experiments.plan import LOG_FILE, Run
 from learn3d.experiments.worker import STOPPED, request_of
-from learn3d.signals import handled_by
+from learn3d.interrupt import handled_by
 from learn3d.terminal import note
 
 #: Python puts the working directory first on its path, where a source folder would hide the installed package.

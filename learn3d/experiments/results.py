@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from learn3d import checkpoint, files
 from learn3d.config import config_to_dict
+from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
-from learn3d.data.views import ViewDataset
 from learn3d.evaluation import evaluate
 from learn3d.experiments.plan import RESULT_FILE, Run, command_line
-from learn3d.versions import versions
+from learn3d.files import writing
+from learn3d.runs import checkpoint
+from learn3d.runs.versions import versions
 
 DEFINITIONS = ("kato18", "kato19")
 SPLIT = "test"
@@ -61,7 +62,7 @@ def measure(run: Run, *, check_data: bool) -> dict[str, Any]:
         "views": _means_by(result.view_ids, result.ious, dataset.view_names),
     }
     record |= summary | tables
-    files.write_json(run.folder / RESULT_FILE, record)
+    writing.write_json(run.folder / RESULT_FILE, record)
     return record
 
 

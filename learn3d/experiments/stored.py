@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from learn3d import limits
-from learn3d.inputs import parse_json, read_bytes
+from learn3d.files import limits
+from learn3d.files.reading import parse_json, read_bytes
 
 _NAMES = ("config", "iterations", "data", "checkpoint", "command", "images", "objects")
 _REMOVE = "remove it, and it is made again"

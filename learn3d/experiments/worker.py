@@ -17,7 +17,7 @@ from learn3d.config import config_from_dict, config_to_dict
 from learn3d.experiments import plan
 from learn3d.experiments.plan import Run
 from learn3d.experiments.tables import Variant
-from learn3d.run_folder import sole_use
+from learn3d.runs.folder import sole_use
 
 LOCK = ".experiment.lock"  # of a worker, also while it measures; training has its own
 STOPPED = 75  # exit status of a run that was stopped and can go on (sysexits' EX_TEMPFAIL)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from learn3d import limits
 from learn3d.figures import plots
-from learn3d.inputs import parse_json, read_text
+from learn3d.files import limits
+from learn3d.files.reading import parse_json, read_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,12 +15,12 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 import nmr
-from learn3d import files
-from learn3d.data.kato import DISTANCE, HALF_FOV_DEG
 from learn3d.data.poses import LookAtPoses, Poses
+from learn3d.data.readers.kato import DISTANCE, HALF_FOV_DEG
+from learn3d.files import writing
+from learn3d.make_data.shading import shade_mesh
 from learn3d.methods import Grids, Meshes
-from learn3d.shading import shade_mesh
-from learn3d.surfaces import grid_surface
+from learn3d.methods.surfaces import grid_surface
 
 CLAY = (0.62, 0.68, 0.78)
 TILE = 96
@@ -264,7 +264,7 @@ def save_png(path: Path, rgb: np.ndarray) -> None:
     """Write a picture uint8 [H,W,3]."""
     buffer = io.BytesIO()
     Image.fromarray(rgb).save(buffer, format="PNG", optimize=True)
-    files.write_bytes(path, buffer.getvalue())
+    writing.write_bytes(path, buffer.getvalue())
 
 
 def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0) -> None:
@@ -281,4 +281,4 @@ def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0)
         loop=0,
         optimize=True,
     )
-    files.write_bytes(path, buffer.getvalue())
+    writing.write_bytes(path, buffer.getvalue())

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 import nmr
+from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import wrap_deg
-from learn3d.data.views import MASK_SIZE, ViewDataset
 from learn3d.figures.drawing import (
     TILE,
     Surface,
@@ -26,7 +26,7 @@ from learn3d.figures.drawing import (
     to_uint8,
 )
 from learn3d.methods import Method
-from learn3d.surfaces import grid_surface
+from learn3d.methods.surfaces import grid_surface
 
 TURNS_DEG = (0, 60, 120, 180, 240, 300)
 GRID_COLUMNS = ("input", "target", "rendering", "same view", *(f"+{turn}°" for turn in TURNS_DEG[1:]))

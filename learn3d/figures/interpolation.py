@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import Poses, wrap_deg
-from learn3d.data.views import ViewDataset
 from learn3d.figures.drawing import (
     TILE,
     Surface,

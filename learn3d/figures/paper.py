@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from learn3d import files, limits
 from learn3d.config import load_config
 from learn3d.data.conventions import Definition
 from learn3d.evaluation import spread_samples
@@ -17,7 +16,8 @@ from learn3d.figures.drawing import azimuths_deg, beside, save_gif, save_png, st
 from learn3d.figures.grids import comparison_grid, spread_views
 from learn3d.figures.interpolation import AZIMUTHS_DEG, interpolation_strip, morph, typical_views
 from learn3d.figures.runs import Run, by_dataset, encode, name_runs, title_of
-from learn3d.inputs import parse_json, read_bytes
+from learn3d.files import limits, writing
+from learn3d.files.reading import parse_json, read_bytes
 
 IMAGES = 6  # rows of a grid of one category
 IMAGES_PER_CATEGORY = 2  # rows of each of several categories
@@ -117,7 +117,7 @@ def save_polar(runs: Sequence[Run], output: Path, *, definition: Definition = "k
     """IoU by the azimuth of the input view as PNG and SVG, and the figures in it as JSON."""
     profiles = [polar.measure(title_of(run, runs), run.method, run.dataset, definition) for run in runs]
     path = with_ending(_in_folder(output), ".json")
-    files.write_json(path, {"voxels": definition, "profiles": [p.to_json() for p in profiles]})
+    writing.write_json(path, {"voxels": definition, "profiles": [p.to_json() for p in profiles]})
     return [*plots.save_figure(polar.plot_profiles(profiles), output), path]
 
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 import numpy as np
 import skimage.color
 
-from learn3d import files
 from learn3d.figures.drawing import with_ending
+from learn3d.files import writing
 
 if TYPE_CHECKING:
     from matplotlib.colors import ListedColormap
@@ -95,5 +95,5 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 160) -> list[Path]:
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix[1:], bbox_inches="tight", **options)
         written.append(with_ending(path, suffix))
-        files.write_bytes(written[-1], buffer.getvalue())
+        writing.write_bytes(written[-1], buffer.getvalue())
     return written

@@ -16,7 +16,7 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.conventions import Definition
-from learn3d.data.views import ViewDataset
+from learn3d.data.dataset import ViewDataset
 from learn3d.evaluation import occupancy
 from learn3d.figures import plots
 from learn3d.figures.drawing import azimuths_deg

@@ -11,12 +11,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from learn3d import checkpoint
 from learn3d.config import TrainConfig, differences
+from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
-from learn3d.data.views import ViewDataset
 from learn3d.methods import Method
 from learn3d.presets import PRESETS
+from learn3d.runs import checkpoint
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 
+from learn3d.device import check_device
 from learn3d.methods.method import DataShape, Grids, Meshes, Method
-from learn3d.networks import check_device
 
 if TYPE_CHECKING:
     from learn3d.presets import Settings

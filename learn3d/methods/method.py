@@ -12,9 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.data.batch import Batch
-from learn3d.distributed import ALONE, Ranks
-from learn3d.networks import autocast
-from learn3d.staging import Download
+from learn3d.device import Download, autocast
+from learn3d.parallel.ranks import ALONE, Ranks
 
 
 @dataclass(frozen=True)

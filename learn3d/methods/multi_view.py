@@ -12,10 +12,10 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.batch import Batch
-from learn3d.data.views import MASK_SIZE
+from learn3d.data.dataset import MASK_SIZE
+from learn3d.device import Download
 from learn3d.methods.method import DataShape, Meshes, Method, descend
 from learn3d.networks import ENCODERS, GENERATORS, EncoderName, GeneratorName, create_encoder, network_input
-from learn3d.staging import Download
 
 CENTROID_LEARNING_RATE = 0.1  # of the centroid's layer, relative to all others
 DECAY = 0.1  # of the step size, after `decay_at_step`

@@ -11,7 +11,8 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.batch import Batch
-from learn3d.data.views import MASK_SIZE
+from learn3d.data.dataset import MASK_SIZE
+from learn3d.device import Download, upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import DataShape, Meshes, Method, adam, descend, frozen
 from learn3d.networks import (
@@ -24,7 +25,6 @@ from learn3d.networks import (
     network_input,
 )
 from learn3d.networks.resnet import check_pretrained, load_pretrained
-from learn3d.staging import Download, upload
 
 
 @dataclass(frozen=True)

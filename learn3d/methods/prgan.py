@@ -11,9 +11,9 @@ from torch import Tensor
 
 from learn3d.data.batch import Batch, Whole
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
-from learn3d.distributed import ALONE, Ranks
+from learn3d.device import autocast, upload
 from learn3d.methods.method import DataShape, Grids, Method, adam, check_finite, frozen
-from learn3d.networks import autocast, network_input
+from learn3d.networks import network_input
 from learn3d.networks.projection import ViewCircle, project
 from learn3d.networks.voxel_gan import (
     DISCRIMINATOR_CHANNELS,
@@ -25,7 +25,7 @@ from learn3d.networks.voxel_gan import (
     SilhouetteDiscriminator,
     VoxelGenerator,
 )
-from learn3d.staging import upload
+from learn3d.parallel.ranks import ALONE, Ranks
 
 BETAS = (0.5, 0.999)  # of Adam, for the two networks of the GAN
 

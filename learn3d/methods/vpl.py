@@ -18,8 +18,9 @@ from torch import Tensor, nn
 
 import nmr
 from learn3d.data.batch import Batch, Whole
+from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
-from learn3d.data.views import MASK_SIZE
+from learn3d.device import Download, upload
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.method import DataShape, Meshes, Method, adam, descend, frozen
 from learn3d.networks import ENCODERS, GENERATORS, network_input
@@ -33,7 +34,6 @@ from learn3d.networks.view_discriminators import (
     PatchDiscriminator,
     SpectralPatchDiscriminator,
 )
-from learn3d.staging import Download, upload
 
 MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object where alpha is at least this
 

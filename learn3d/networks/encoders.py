@@ -7,8 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from learn3d.device import upload
 from learn3d.networks.resnet import ResNet18Encoder
-from learn3d.staging import upload
 
 CODE_SIZE = 512
 

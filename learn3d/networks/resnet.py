@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learn3d import limits
-from learn3d.data.archives import open_zip
-from learn3d.inputs import check_file, within
+from learn3d.files import limits
+from learn3d.files.archives import open_zip
+from learn3d.files.reading import check_file, within
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)

@@ -1,4 +1,4 @@
-// Workload W1 of tools/bench.py, as a program whose instructions can be counted and whose results can be compared between builds:
+// Workload W1 of tools/bench/bench.py, as a program whose instructions can be counted and whose results can be compared between builds:
 // deformed spheres of 1280 faces, 64x64 anti-aliased, forward and backward of 1 - soft IoU with the neighbour in the batch.
 //   workload IMAGES        prints hashes of the results
 #include <cinttypes>

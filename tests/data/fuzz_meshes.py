@@ -17,9 +17,10 @@ from mutations import Target
 from PIL import Image
 
 import nmr.neural_renderer as nr
-from learn3d.data import debian_packages, mesh_text, meshes
-from learn3d.data.debian_furniture import CATALOGUE, furniture_models
-from learn3d.data.mesh_cleaning import clean_mesh
+from learn3d.make_data import mesh_text, meshes
+from learn3d.make_data.debian import packages
+from learn3d.make_data.debian.furniture import CATALOGUE, furniture_models
+from learn3d.make_data.mesh_cleaning import clean_mesh
 
 
 def mesh_target(tmp: Path) -> Target:
@@ -201,7 +202,7 @@ def debian_target(tmp: Path) -> Target:
     path.write_bytes(deb_bytes({"usr/share/x.sh3f": catalogue_bytes()}))
 
     def read(folder: Path) -> None:
-        package = debian_packages.find_package("sweethome3d-furniture", folder)
+        package = packages.find_package("sweethome3d-furniture", folder)
         for candidate in furniture_models(package, ("chair",), folder / "licences", False):
             if candidate is not None and not isinstance(candidate.mesh, str):
                 candidate.title.encode()

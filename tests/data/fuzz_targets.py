@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import json
 from collections.abc import Callable
 from functools import partial
@@ -19,24 +18,25 @@ from mutations import Target
 from PIL import Image
 from safetensors.torch import save_file
 
-from learn3d import checkpoint, runlog
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict, load_config
 from learn3d.data.framing import read_photo
-from learn3d.data.photo_table import read_table, split_objects
-from learn3d.data.render import DatasetConfig, make_dataset
+from learn3d.data.readers import READERS
+from learn3d.data.readers.photo_table import read_table, split_objects
 from learn3d.experiments.results import object_sums
 from learn3d.experiments.stored import read_result
 from learn3d.figures.curves import read_metrics
-from learn3d.inputs import parse_json
+from learn3d.files.reading import parse_json
+from learn3d.make_data.render import DatasetConfig, make_dataset
 from learn3d.methods import DataShape
 from learn3d.networks.resnet import _read_weights
+from learn3d.runs import checkpoint, log
 
 ERRORS = (ValueError, FileNotFoundError, OSError)  # what a reader may raise
 
 
 def check_layout(layout: str, split: str) -> Callable[[Path], None]:
     """Reads a split by `load` and by the scan; both must agree on whether it can be read."""
-    reader = importlib.import_module(f"learn3d.data.{layout}")
+    reader = READERS[layout]
 
     def read(folder: Path) -> None:
         found = [p for p in reader.problems(folder, "chair", split) if p.severity == "error"]
@@ -216,7 +216,7 @@ def results_target(tmp: Path) -> Target:
                 assert curve.steps.shape == curve.values.shape
         kept = (folder / "metrics.jsonl").read_bytes()
         try:
-            runlog._forget_after(folder / "metrics.jsonl", 3)
+            log._forget_after(folder / "metrics.jsonl", 3)
         finally:
             (folder / "metrics.jsonl").write_bytes(kept)
         result = read_result(folder / "test.json")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import trimesh
 
-from learn3d.data.dataset_report import DatasetReport
-from learn3d.data.render import DatasetConfig, make_dataset
+from learn3d.make_data.render import DatasetConfig, make_dataset
+from learn3d.make_data.report import DatasetReport
 
 
 def lopsided_mesh(depth: float) -> trimesh.Trimesh:

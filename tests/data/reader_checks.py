@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import nmr
-from learn3d.data.views import ViewDataset
+from learn3d.data.dataset import ViewDataset
 
 
 def expect(reader: ModuleType, folder: Path, split: str, message: str, severity: str = "error") -> None:

@@ -179,7 +179,7 @@ class Probe:
     def _act(self, stack: list[str]) -> None:
         self._report({"stack": stack})
         if self._request.get("half"):
-            from learn3d import checkpoint
+            from learn3d.runs import checkpoint
 
             write = checkpoint._write
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import torch
 
-from learn3d import checkpoint, run_folder
+from learn3d.runs import checkpoint
+from learn3d.runs import folder as run_folder
 
 
 def check_same(folder: Path, other: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.data.debian_models import FetchConfig, Report, fetch_debian_models
+from learn3d.make_data.debian.models import FetchConfig, Report, fetch_debian_models
 
 CATALOGUE = "PluginFurnitureCatalog.properties"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"

@@ -16,7 +16,7 @@ import tiny_networks
 
 from learn3d import training, validation
 from learn3d.config import config_from_dict
-from learn3d.runlog import RunLog
+from learn3d.runs.log import RunLog
 
 
 class Soaked(RunLog):

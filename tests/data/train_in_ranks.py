@@ -17,11 +17,11 @@ from unittest import mock
 import torch
 
 import nmr
-from learn3d import checkpoint
 from learn3d.config import config_from_dict
-from learn3d.distributed import ALONE, Ranks, start
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.methods import pose_invariant, prgan, vpl
+from learn3d.parallel.ranks import ALONE, Ranks, start
+from learn3d.runs import checkpoint
 from learn3d.training import load_splits, train
 
 

@@ -15,8 +15,8 @@ import torch
 
 from learn3d import validation
 from learn3d.config import DEFAULT_PRESET, TrainConfig
-from learn3d.data import kato
-from learn3d.data.views import ViewDataset
+from learn3d.data.dataset import ViewDataset
+from learn3d.data.readers import kato
 from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.presets import PRESETS
 from learn3d.training import train

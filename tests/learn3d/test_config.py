@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from learn3d import limits
 from learn3d.config import config_from_dict, config_to_dict, load_config
 from learn3d.data.view_bins import AngleBins
+from learn3d.files import limits
 
 BASE = {"data": "d", "category": "chair", "output": "o"}
 

@@ -13,10 +13,10 @@ import torch
 import nmr
 from learn3d.data.conventions import PASCAL3D
 from learn3d.evaluation import codes_per_view, evaluate, mean_mmd, spread_samples
-from learn3d.evaluation_report import COLUMNS, _class_means, evaluate_runs, format_table
+from learn3d.experiments.evaluation_report import COLUMNS, _class_means, evaluate_runs, format_table
 from learn3d.losses import mmd
 from learn3d.methods import Grids, Meshes, Method
-from learn3d.versions import versions
+from learn3d.runs.versions import versions
 
 
 class Constant(Method):
@@ -250,7 +250,7 @@ def test_evaluate_runs_reports_and_tabulates(finished_run) -> None:
 
 def test_a_run_on_several_categories_is_measured_on_each(finished_run, monkeypatch, tiny_set) -> None:
     monkeypatch.setattr(
-        "learn3d.evaluation_report.load_dataset",
+        "learn3d.experiments.evaluation_report.load_dataset",
         lambda *where, **options: dataclasses.replace(tiny_set, category=where[2]),
     )
     report = evaluate_runs([finished_run], category="airplane, chair")

@@ -3,11 +3,11 @@ import sys
 
 import pytest
 
-from learn3d import memory
+from learn3d import device
 
 CODE = """
 import sys, torch
-from learn3d.memory import keep_freed_memory
+from learn3d.device import keep_freed_memory
 if sys.argv[1] == "keep" and not keep_freed_memory():
     sys.exit("unavailable")
 def step():
@@ -35,5 +35,5 @@ def test_large_buffers_are_reused():
 
 
 def test_another_c_library_is_left_alone(monkeypatch):
-    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: object())
-    assert memory.keep_freed_memory() is False
+    monkeypatch.setattr(device.ctypes, "CDLL", lambda name: object())
+    assert device.keep_freed_memory() is False

@@ -10,14 +10,8 @@ from PIL import Image
 
 import nmr
 from learn3d.data.crops import Crops
-from learn3d.data.kato import mesh_to_object
-from learn3d.reconstruction import (
-    _read,
-    export_mesh,
-    prepare_image,
-    reconstruct_dataset,
-    reconstruct_files,
-)
+from learn3d.data.readers.kato import mesh_to_object
+from learn3d.reconstruction import _read, export_mesh, prepare_image, reconstruct_dataset, reconstruct_files
 
 
 def test_stored_form_is_inverted_on_black() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from learn3d import staging
+from learn3d import device
+from learn3d.device import Download, upload
 from learn3d.methods.method import descend, read_back
-from learn3d.staging import Download, upload
 
 CPU = torch.device("cpu")
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -25,8 +25,8 @@ class Copies:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.log: list[str] = []
-        monkeypatch.setattr(staging, "_start_copy", self.start)
-        monkeypatch.setattr(staging, "_send", self.send)
+        monkeypatch.setattr(device, "_start_copy", self.start)
+        monkeypatch.setattr(device, "_send", self.send)
 
     def start(self, tensor: torch.Tensor) -> tuple[torch.Tensor, Copies]:
         self.log.append("start")
@@ -57,7 +57,7 @@ def test_a_download_is_waited_for_when_it_is_needed_and_sends_its_gradient_back(
 def test_the_gradient_of_an_upload_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     copies = Copies(monkeypatch)
     x = torch.tensor([1.0, 2.0], requires_grad=True)
-    there = staging._Uploaded.apply(x, torch.device("cuda"))
+    there = device._Uploaded.apply(x, torch.device("cuda"))
     there.square().sum().backward()
     assert copies.log == ["send to cuda", "start", "wait"]
     assert x.grad.tolist() == [2.0, 4.0]

@@ -3,7 +3,7 @@
 import torch
 
 import nmr
-from learn3d.surfaces import grid_surface
+from learn3d.methods.surfaces import grid_surface
 
 
 def test_surface_of_a_ball_is_where_the_ball_is() -> None:

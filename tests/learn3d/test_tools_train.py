@@ -15,7 +15,7 @@ from types import ModuleType
 import pytest
 
 from learn3d.config import load_config
-from learn3d.evaluation_report import COLUMNS
+from learn3d.experiments.evaluation_report import COLUMNS
 from learn3d.training import Summary
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -203,7 +203,7 @@ def test_what_cannot_work_is_said_before_a_model_is_loaded(
     (tmp_path / "file").touch()
     places = {"run": finished_run, "tmp": tmp_path, "data": tiny_folder}
     module = tool(name)
-    monkeypatch.setattr("learn3d.checkpoint.load_method", refuse)
+    monkeypatch.setattr("learn3d.runs.checkpoint.load_method", refuse)
     assert call(module, monkeypatch, *(a.format(**places) for a in arguments)) == 1
     out, error = capsys.readouterr()
     assert (out, error.count("\n")) == ("", 1)

@@ -13,21 +13,17 @@ import pytest
 import torch
 
 import nmr
-from learn3d import checkpoint, run_folder, run_state, training
-from learn3d.config import (
-    TrainConfig,
-    check_resume,
-    config_from_dict,
-    config_to_dict,
-    load_config,
-)
-from learn3d.data import kato
+from learn3d import training
+from learn3d.config import TrainConfig, check_resume, config_from_dict, config_to_dict, load_config
+from learn3d.data.dataset import ViewDataset
+from learn3d.data.readers import kato
 from learn3d.data.sampling import shuffled_epochs
-from learn3d.data.views import ViewDataset
 from learn3d.methods import DataShape, create_method
 from learn3d.methods.multi_view import MultiViewSettings
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.presets import PRESETS
+from learn3d.runs import checkpoint, state
+from learn3d.runs import folder as run_folder
 from learn3d.training import object_share, train
 
 VANILLA = "peng2020-kato-vanilla"
@@ -443,7 +439,7 @@ def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> 
         method.generator.layers[0].bias[3] = float("inf")
     run_folder.mkdir()
     with pytest.raises(FloatingPointError, match="generator has values that are not finite"):
-        run_state.save_last(run_folder, config, None, method, DataShape(24), run_state.Progress())
+        state.save_last(run_folder, config, None, method, DataShape(24), state.Progress())
     assert not list(run_folder.iterdir())
 
 

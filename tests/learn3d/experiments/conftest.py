@@ -11,10 +11,7 @@ from pathlib import Path
 import pytest
 
 from learn3d.experiments.experiment import Call, run_experiment
-from learn3d.experiments.plan import (
-    Options,
-    plan_runs,
-)
+from learn3d.experiments.plan import Options, plan_runs
 from learn3d.experiments.tables import TABLES
 
 #: Stands in for the worker: a category called "fails" fails, "waits" goes on until it is interrupted, others leave a

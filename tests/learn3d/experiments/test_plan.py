@@ -14,15 +14,7 @@ import pytest
 
 from learn3d.experiments import published
 from learn3d.experiments.experiment import Call, run_experiment
-from learn3d.experiments.plan import (
-    Options,
-    State,
-    command_line,
-    is_current,
-    plan_runs,
-    read_results,
-    read_state,
-)
+from learn3d.experiments.plan import Options, State, command_line, is_current, plan_runs, read_results, read_state
 from learn3d.experiments.tables import TABLES
 from learn3d.presets import PRESETS
 

@@ -15,11 +15,7 @@ import pytest
 
 from learn3d.experiments import formats
 from learn3d.experiments.experiment import Call, run_experiment
-from learn3d.experiments.plan import (
-    Options,
-    found_runs,
-    read_results,
-)
+from learn3d.experiments.plan import Options, found_runs, read_results
 from learn3d.experiments.tables import TABLES
 
 

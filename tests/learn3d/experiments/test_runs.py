@@ -18,10 +18,7 @@ import pytest
 from learn3d import training
 from learn3d.experiments import pool, results
 from learn3d.experiments.experiment import Call, run_experiment
-from learn3d.experiments.plan import (
-    Options,
-    plan_runs,
-)
+from learn3d.experiments.plan import Options, plan_runs
 from learn3d.experiments.pool import NOT_FROM_HERE
 from learn3d.experiments.tables import TABLES
 from learn3d.experiments.worker import carry_out

@@ -25,10 +25,10 @@ from typing import Any
 import pytest
 import trimesh
 
-from learn3d import checkpoint
 from learn3d.data.layouts import Layout
-from learn3d.data.render import DatasetConfig, make_dataset
 from learn3d.experiments.tables import TABLES
+from learn3d.make_data.render import DatasetConfig, make_dataset
+from learn3d.runs import checkpoint
 
 pytestmark = pytest.mark.slow
 

@@ -1,0 +1,6 @@
+"""Readers, a file per layout of published data sets."""
+
+from learn3d.data.readers import dvr, kar, kato, pascal3d, photos, r2n2
+
+#: By the name of the layout. Each module has `load`, `problems`, `contents` and `count`.
+READERS = {"kato": kato, "dvr": dvr, "kar": kar, "r2n2": r2n2, "pascal3d": pascal3d, "photos": photos}

@@ -1,0 +1,206 @@
+"""The table of your own photographs, poses.csv or poses.json, checked row by row; and the split of each object."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+from learn3d.data.dataset import SPLITS
+from learn3d.data.framing import Framing
+from learn3d.files import limits
+from learn3d.files.reading import parse_json, read_bytes
+
+TABLES = ("poses.csv", "poses.json")
+NUMBERS = ("azimuth_deg", "elevation_deg", "distance", "fov_deg")
+OPTIONAL = ("object", "split", "mask", "framing")
+VAL_SHARE, TEST_SHARE = 0.1, 0.2  # of the objects, where the table does not say which split they are in
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One row of the table."""
+
+    where: str  # "poses.csv, line 7"
+    file: Path
+    mask: Path | None
+    azimuth_deg: float
+    elevation_deg: float
+    distance: float
+    fov_deg: float
+    object: str
+    split: str | None
+    framing: Framing
+
+
+def find_table(folder: Path | str, category: str) -> Path:
+    """poses.csv or poses.json of a category.
+
+    Raises FileNotFoundError, and ValueError where there are both, or for a category that is no plain name: that
+    of a stranger's model leads nowhere else, neither to read nor, as part of the names of files, to write.
+    """
+    if category in (".", "..") or set(category) & set("/\\") or not category.isprintable():
+        raise ValueError(f"category must be the plain name of a folder such as 'mug', got {_short(category)}")
+    places = [Path(folder) / category, Path(folder)]
+    for place in places:
+        found = [place / name for name in TABLES if (place / name).is_file()]
+        if len(found) == 2:
+            raise ValueError(f"{place} has both {' and '.join(TABLES)}; remove one")
+        if found:
+            return found[0]
+    raise FileNotFoundError(
+        f"there is no poses.csv or poses.json in {places[0]} or {places[1]}; it must list the photographs: file, "
+        + ", ".join(NUMBERS)
+    )
+
+
+def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
+    """The split of every object: the table's, or, ordered by a hash of the names, 20 % test, 10 % val, the rest train.
+
+    Raises ValueError where an object is in two splits or in none, or there are too few to split.
+    """
+    given: dict[str, set[str | None]] = {}
+    for photo in photos:
+        given.setdefault(photo.object, set()).add(photo.split)
+    if any(splits != {None} for splits in given.values()):
+        for name, splits in given.items():
+            if len(splits) > 1 or None in splits:
+                there = ", ".join(sorted(str(s) if s else "none" for s in splits))
+                raise ValueError(f"{table}: object {name!r} must be in one split, got {there}")
+        return {name: next(iter(splits)) for name, splits in given.items()}
+    names = sorted(given, key=lambda name: hashlib.sha256(name.encode()).digest())
+    if len(names) < 3:
+        raise ValueError(
+            f"{table} lists {len(names)} object(s); at least 3 are needed for train, val and test. Photograph more, or "
+            "give every row a split"
+        )
+    test, val = (max(1, round(share * len(names))) for share in (TEST_SHARE, VAL_SHARE))
+    return {name: "test" if k < test else "val" if k < test + val else "train" for k, name in enumerate(names)}
+
+
+def read_table(table: Path) -> tuple[list[Photo], list[str]]:
+    """The rows that can be understood, and what is wrong with the others."""
+    rows = list(_csv_rows(table) if table.suffix == ".csv" else _json_rows(table))
+    if not rows:
+        raise ValueError(f"{table} lists no photographs")
+    if len(rows) > limits.OBJECTS:
+        raise ValueError(f"{table} lists {len(rows)} photographs; at most {limits.OBJECTS} are read")
+    masks = table.parent / "masks"
+    by_stem = {path.stem: path for path in sorted(masks.iterdir())} if masks.is_dir() else {}
+    photos, faults = [], []
+    for where, row in rows:
+        try:
+            photos.append(_photo(table.parent, where, row, by_stem))
+        except ValueError as error:
+            faults.append(f"{where}: {error}")
+    seen: dict[Path, str] = {}
+    for photo in photos:
+        if first := seen.get(photo.file):
+            faults.append(f"{photo.where}: {photo.file.name} is in {first} already")
+        seen.setdefault(photo.file, photo.where)
+    return photos, faults
+
+
+def _csv_rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    content = read_bytes(table, limits.PHOTO_TABLE_BYTES, "the table of photographs")
+    try:
+        lines = content.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{table} is not UTF-8 text ({error}); save it as 'CSV UTF-8'") from None
+    header = lines[0] if lines else ""
+    reader = csv.DictReader(lines, delimiter=";" if ";" in header else ",", skipinitialspace=True)
+    try:
+        _check_columns(table, [name.strip() for name in reader.fieldnames or []])
+        reader.fieldnames = [name.strip() for name in reader.fieldnames]
+        for row in reader:
+            yield f"{table.name}, line {reader.line_num}", row
+    except csv.Error as error:
+        raise ValueError(f"{table}, line {reader.line_num} is no line of a table: {error}") from None
+
+
+def _json_rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    content = read_bytes(table, limits.PHOTO_TABLE_BYTES, "the table of photographs")
+    try:
+        rows = parse_json(content)
+    except ValueError as error:
+        raise ValueError(f"{table} is not valid JSON: {error}") from None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ValueError(f"{table} must be a list of records, such as [{{'file': 'a.jpg', 'azimuth_deg': 30, ...}}]")
+    for number, row in enumerate(rows, 1):
+        _check_columns(table, list(row), f", entry {number}")
+        yield f"{table.name}, entry {number}", row
+
+
+def _check_columns(table: Path, names: list[str], where: str = "") -> None:
+    missing = [name for name in ("file", *NUMBERS) if name not in names]
+    unknown = [name for name in names if name not in ("file", *NUMBERS, *OPTIONAL)]
+    if missing or unknown:
+        wrong = [f"lacks {', '.join(missing)}"] * bool(missing)
+        wrong += [f"has unknown {', '.join(unknown)[:200]}"] * bool(unknown)
+        raise ValueError(
+            f"{table}{where} {' and '.join(wrong)}; the columns are file, {', '.join(NUMBERS)}, and where you like "
+            f"{', '.join(OPTIONAL)}"
+        )
+
+
+def _photo(folder: Path, where: str, row: dict[str, Any], masks: dict[str, Path]) -> Photo:
+    """One row, checked."""
+    if None in row:  # what csv.DictReader calls the values beyond the last column
+        raise ValueError(f"there are more values than columns: {', '.join(row[None])[:200]}")
+    file = _inside(folder / "images", "file", row["file"])
+    values = {name: _number(name, row[name]) for name in NUMBERS}
+    if not -90 < values["elevation_deg"] < 90:
+        raise ValueError(f"elevation_deg must lie between -90 and 90, got {values['elevation_deg']:g}")
+    if abs(values["azimuth_deg"]) > limits.ANGLE_DEG:
+        most = limits.ANGLE_DEG
+        raise ValueError(f"azimuth_deg must lie between {-most:g} and {most:g}, got {values['azimuth_deg']:g}")
+    if not 0.5 < values["distance"] <= limits.DISTANCE[1]:
+        got = f"and at most {limits.DISTANCE[1]:g}, got {values['distance']:g}"
+        raise ValueError(f"distance must be above 0.5 (lengths of the longest side) {got}")
+    low, high = limits.FOV_DEG
+    if not low <= values["fov_deg"] < high:
+        raise ValueError(f"fov_deg must lie between {low:g} and {high:g}, got {values['fov_deg']:g}")
+    split = _choice("split", row.get("split"), SPLITS)
+    framing = _choice("framing", row.get("framing"), get_args(Framing)) or "whole"
+    mask = _inside(folder / "masks", "mask", row["mask"]) if row.get("mask") else masks.get(file.stem)
+    name = str(row.get("object") or file.stem).strip()
+    return Photo(where, file, mask, object=name, split=split, framing=framing, **values)
+
+
+def _inside(folder: Path, name: str, value: Any) -> Path:
+    """A file of the folder; a table must not make us read others."""
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"{name} must be the name of a file in {folder.name}/, got {value!r}")
+    path = Path(value.strip().removeprefix(f"{folder.name}/"))
+    if path.is_absolute() or ".." in path.parts or "\0" in value:
+        raise ValueError(f"{name} must be a file in {folder.name}/, got {value!r}")
+    return folder / path
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        comma = "; write a point, not a comma" if isinstance(value, str) and "," in value else ""
+        raise ValueError(f"{name} must be a number, got {_short(value)}{comma}") from None
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be a finite number, got {_short(value)}")
+    return number
+
+
+def _choice(name: str, value: Any, choices: tuple[str, ...]) -> Any:
+    value = value.strip() if isinstance(value, str) else value
+    if value in (None, ""):
+        return None
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+    return value
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."

@@ -1,0 +1,220 @@
+"""Your own photographs: a folder with images, masks and a table of where the camera stood.
+
+    mug/poses.csv      one row per photograph: file, azimuth_deg, elevation_deg, distance, fov_deg, and where you like
+                       object, split, mask, framing (or poses.json: a list of such records)
+    mug/images/*.jpg   the photographs; PNG files with transparency need no mask
+    mug/masks/*.png    white where the object is, named like its photograph
+
+Angles: azimuth 0 is in front of the object, and grows as you walk around it to your right (anti-clockwise, seen from
+above); elevation is 0 at the object's height and 90 above it. distance: from the middle of the object to the camera, in
+lengths of the object's longest side. fov_deg: the full field of view across the longer side of the photograph.
+`docs/your-own-category.md` tells it step by step, with a drawing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+import nmr
+from learn3d.data import conventions
+from learn3d.data.dataset import MASK_SIZE, SPLITS, ViewDataset
+from learn3d.data.framing import check_mask, frame, mask_box, read_photo
+from learn3d.data.poses import LookAtPoses
+from learn3d.data.readers.photo_table import TABLES, Photo, find_table, read_table, split_objects
+from learn3d.data.view_bins import AngleBins
+from learn3d.files.findings import DamagedFile, MissingFile, Problem
+
+AZIMUTH_WIDTHS_DEG = (15, 20, 30, 45, 60, 90)
+ELEVATION_WIDTH_DEG = 20
+PHOTOS_PER_CLASS = 8  # on average, at least: fewer tell a discriminator nothing
+_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"}
+_SCALE_OFF = 5.0  # times larger or smaller than the distances say: then they are in another unit
+
+
+def load(
+    folder: Path | str, category: str, split: str, *, image_size: int = MASK_SIZE, progress: bool = False
+) -> ViewDataset:
+    """Read one split ("train", "val" or "test") of the photographs in `folder/category`, or in `folder` itself.
+
+    Images have Kato's form (`framing`), so that methods and presets made for renderings take them; there are no voxels.
+    View classes are cells of azimuth and elevation, see `choose_bins`; only those that training photographs occupy
+    count, and another photograph gets the class of the training photograph whose direction is nearest. Where the table
+    has no column "split", whole objects are put into the splits by a hash of their names: 20 % test, 10 % val.
+
+    Raises FileNotFoundError and ValueError naming the file, the row and what was expected; `problems` lists them all.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"split must be one of {', '.join(SPLITS)}; got {split!r}")
+    table = find_table(folder, category)
+    photos, faults = read_table(table)
+    if faults:
+        raise DamagedFile(table.parent, faults[0] + (f" (and {len(faults) - 1} more)" if faults[1:] else ""))
+    splits = split_objects(table, photos)
+    chosen = [photo for photo in photos if splits[photo.object] == split]
+    if not chosen or "train" not in splits.values():
+        there = ", ".join(sorted(set(splits.values())))
+        raise ValueError(
+            f"{table} has no photograph in the split {split if not chosen else 'train'!r}; it has: {there}"
+        )
+    images, masks, half_fovs, scales = _read_images(chosen, image_size, progress)
+    _check_scale(table, scales)
+    poses = _poses(chosen, half_fovs)
+    training = [photo for photo in photos if splits[photo.object] == "train"]
+    view_ids, view_names = _view_classes(poses, _poses(training, [photo.fov_deg / 2 for photo in training]))
+    names = sorted({photo.object for photo in chosen})
+    numbers = {name: number for number, name in enumerate(names)}
+    return ViewDataset(
+        category=category,
+        split=split,
+        images=images,
+        masks=None if image_size == MASK_SIZE else masks,
+        poses=poses,
+        view_ids=view_ids,
+        view_names=view_names,
+        object_ids=np.array([numbers[photo.object] for photo in chosen]),
+        object_names=tuple(names),
+        voxels=None,
+        convention=conventions.KATO,
+    )
+
+
+def problems(folder: Path | str, category: str, split: str, *, progress: bool = False) -> Iterator[Problem]:
+    """Everything that is wrong with one split; where the table has faults, with all photographs that it lists."""
+    try:
+        table = find_table(folder, category)
+        photos, faults = read_table(table)
+        splits = None if faults else split_objects(table, photos)
+    except (ValueError, OSError) as error:
+        yield Problem(str(folder), str(error))
+        return
+    yield from (Problem(str(table), fault) for fault in faults)
+    scales = []
+    chosen = [photo for photo in photos if splits is None or splits[photo.object] == split]
+    for photo in tqdm(chosen, desc=f"{category} {split}", disable=not progress, dynamic_ncols=True):
+        try:
+            _, mask = _read(photo)
+        except (DamagedFile, MissingFile) as error:
+            yield Problem(str(error.path), error.message)
+            continue
+        left, top, right, bottom = mask_box(mask)
+        if left == 0 or top == 0 or right == mask.shape[1] or bottom == mask.shape[0]:
+            message = "its object touches the border; what lies outside counts as empty"
+            yield Problem(str(photo.file), message, "warning")
+        scales.append(_scale(photo, mask))
+    try:
+        _check_scale(table, scales)
+    except ValueError as error:
+        yield Problem(str(table), str(error).removeprefix(f"{table}: "))
+    images, listed = table.parent / "images", {photo.file for photo in photos}
+    for path in sorted(images.iterdir()) if split == "train" and images.is_dir() and not faults else []:
+        if path.suffix.lower() in _SUFFIXES and path not in listed:
+            yield Problem(str(path), f"it is not in {table.name}", "warning")
+
+
+def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
+    """The categories of a folder, or of one that is a category itself, and the splits of each."""
+    folder = Path(folder)
+    places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())] if folder.is_dir() else []
+    found = {}
+    for place in places:
+        if any((place / name).is_file() for name in TABLES):
+            try:
+                table = find_table(place, "")
+                photos, faults = read_table(table)
+                splits = set() if faults else set(split_objects(table, photos).values())
+            except (ValueError, OSError):
+                splits = set()
+            found[place.resolve().name] = tuple(name for name in SPLITS if name in splits) or ("train",)
+    return found
+
+
+def count(folder: Path | str, category: str, split: str) -> int:
+    """How many objects a split has."""
+    table = find_table(folder, category)
+    photos, _ = read_table(table)
+    return sum(name == split for name in split_objects(table, photos).values())
+
+
+def choose_bins(poses: LookAtPoses) -> AngleBins:
+    """Cells for photographs with these cameras: elevations as they occur in steps of about 20 degrees, azimuths in the
+    smallest step from 15 degrees up with which a cell that is occupied has 8 photographs on average."""
+    low, high = math.floor(float(poses.elevations_deg.min())), math.ceil(float(poses.elevations_deg.max()))
+    high = max(high, low + 1)
+    rows = max(1, round((high - low) / ELEVATION_WIDTH_DEG))
+    for width in AZIMUTH_WIDTHS_DEG:
+        bins = AngleBins(width, (high - low) / rows, low, high)
+        if len(poses) >= PHOTOS_PER_CLASS * len(bins.ids(poses).unique()):
+            break
+    return bins
+
+
+def _view_classes(poses: LookAtPoses, training: LookAtPoses) -> tuple[np.ndarray, tuple[str, ...]]:
+    bins = choose_bins(training)
+    cells, training_cells = bins.ids(poses).numpy(), bins.ids(training).numpy()
+    kept = np.unique(training_cells)
+    unseen = ~np.isin(cells, kept)
+    eyes, training_eyes = (
+        nmr.cameras.points_from_angles(1.0, p.elevations_deg, p.azimuth_deg).numpy() for p in (poses, training)
+    )
+    cells[unseen] = training_cells[(eyes[unseen] @ training_eyes.T).argmax(axis=1)]
+    names = bins.names()
+    return np.searchsorted(kept, cells), tuple(names[k] for k in kept)
+
+
+def _poses(photos: list[Photo], half_fovs_deg: list[float]) -> LookAtPoses:
+    columns = ([getattr(photo, name) for photo in photos] for name in ("azimuth_deg", "elevation_deg", "distance"))
+    return LookAtPoses(*(torch.tensor(column, dtype=torch.float32) for column in (*columns, half_fovs_deg)))
+
+
+def _read_images(
+    photos: list[Photo], size: int, progress: bool
+) -> tuple[np.ndarray, np.ndarray, list[float], list[float]]:
+    """Images uint8 [M, 4, size, size], masks uint8 [M, 64, 64], half fields of view, scales (`_scale`)."""
+    images = np.empty((len(photos), 4, size, size), np.uint8)
+    masks = np.empty((len(photos), MASK_SIZE, MASK_SIZE), np.uint8)
+    half_fovs, scales = [], []
+    for k, photo in enumerate(tqdm(photos, desc="photographs", disable=not progress, dynamic_ncols=True)):
+        colors, mask = _read(photo)
+        camera = photo.fov_deg, photo.elevation_deg, photo.framing
+        images[k], half_fov = frame(colors, mask, *camera, size)
+        masks[k] = images[k, 3] if size == MASK_SIZE else frame(colors, mask, *camera, MASK_SIZE)[0][3]
+        half_fovs.append(half_fov)
+        scales.append(_scale(photo, mask))
+    return images, masks, half_fovs, scales
+
+
+def _read(photo: Photo) -> tuple[np.ndarray, np.ndarray]:
+    """Colours and mask; DamagedFile or MissingFile, which name the row, too."""
+    try:
+        colors, mask = read_photo(photo.file, photo.mask)
+        check_mask(mask)
+    except FileNotFoundError as error:
+        raise MissingFile(photo.file, f"{error} ({photo.where})") from None
+    except DamagedFile as error:
+        raise DamagedFile(error.path, f"{error.message} ({photo.where})") from None
+    except ValueError as error:
+        raise DamagedFile(photo.file, f"{error} ({photo.where})") from None
+    return colors, mask
+
+
+def _scale(photo: Photo, mask: np.ndarray) -> float:
+    """How large the object is in the photograph, over how large its distance and the field of view say it is."""
+    left, top, right, bottom = mask_box(mask)
+    share = max(right - left, bottom - top) / max(mask.shape)
+    return share * 2 * photo.distance * math.tan(math.radians(photo.fov_deg) / 2)
+
+
+def _check_scale(table: Path, scales: list[float]) -> None:
+    middle = float(np.median(scales)) if scales else 1.0
+    if not 1 / _SCALE_OFF < middle < _SCALE_OFF:
+        raise ValueError(
+            f"{table}: the objects are {middle:.2g} times as large in the photographs as distance and fov_deg say; "
+            "distance must be in lengths of the object's longest side (a mug of 12 cm from 60 cm: 5), and fov_deg the "
+            "full field of view in degrees"
+        )

@@ -1,0 +1,133 @@
+"""Chairs, tables, cabinets, sofas and lamps from the catalogues (.sh3f) of Debian's sweethome3d-furniture packages.
+
+A catalogue is a zip archive with a properties file (name#N, model#N, modelRotation#N, ...) and one OBJ per model.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from tqdm import tqdm
+
+from learn3d.files import limits
+from learn3d.files.reading import within
+from learn3d.make_data.debian import packages as packages
+from learn3d.make_data.mesh_text import read_obj
+
+FURNITURE_PACKAGES = ("sweethome3d-furniture", "sweethome3d-furniture-nonfree")  # the second is optional
+CATALOGUE = "PluginFurnitureCatalog.properties"
+
+# The first rule whose words occur in the English name of the catalogue gives the category; None leaves the piece out.
+# Each pattern is searched in "name" as written in the catalogue, lower case.
+FURNITURE_RULES: tuple[tuple[str, str | None], ...] = (
+    (r"\b(switch|racket|bat|fan|freezer|wheelchair|ottoman|swinging|opened|skylight|tablet|flashlight)\b", None),
+    (r"\b(knife|towel|clothes|hat|cd|wine|speech) .*\b(stand|rack|unit)\b|washbasin|changing table|extension", None),
+    (r"candle|artwork", None),
+    (r"\b(lamp|lantern|chandelier|lamppost|(light|lights|spotlight|strip)$)", "lamp"),
+    (r"\b(sofa|couch|settee)\b", "sofa"),
+    (r"\b(chair|armchair|stool|class seat)\b", "chair"),
+    (r"\b(bedside table|night ?stand|tv stand)\b", "cabinet"),
+    (r"\b(table|desk|workbench)\b", "table"),
+    (r"\b(corner |cube )?shelf( (cherry|maple))?$", None),  # a board on the wall
+    (r"\b(cabinet|cupboard|wardrobe|bookcase|dresser|sideboard|locker|commode|chest|closet)\b", "cabinet"),
+    (r"\b(drawers?|shelves|bookshelves|shelving|shelf|rack)\b", "cabinet"),
+)
+# Models that do not look like their names: two beds' bedside ends, a bathroom with its basin, two boards on a wall.
+MISFITS = ("comodinoSinistro", "comodinoSinistroCiliegio", "bathroomFurniture", "shelving")
+FURNITURE_SECTIONS_LEFT_OUT = ("Characters", "Doors and windows", "Staircases", "Vehicles")
+
+
+def furniture_category(name: str, section: str = "") -> str | None:
+    """Category of a catalogue entry from its English name and the section it is listed in; None if it has none.
+
+    Nor has one whose name is above 200 characters: some patterns take the square of its length.
+    """
+    if section in FURNITURE_SECTIONS_LEFT_OUT or len(name) > limits.NAME_LENGTH:
+        return None
+    for pattern, category in FURNITURE_RULES:
+        if re.search(pattern, name.lower()):
+            return category
+    return None
+
+
+def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
+    """The general properties and the entries (`key#N`, in the order of N) of a Sweet Home 3D furniture catalogue."""
+    general: dict[str, str] = {}
+    entries: dict[int, dict[str, str]] = {}
+    for line in text.splitlines():
+        match = re.match(r"\s*(\w+)(?:#(\d+))?\s*=\s*(.*)", line)
+        if match:
+            key, number, value = match.groups()
+            if len(number or "") > 9:
+                continue
+            value = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value).strip()
+            value = value.encode("utf-8", "replace").decode()  # half of a pair of surrogates is no character
+            (general if number is None else entries.setdefault(int(number), {}))[key] = value
+    return general, [entries[number] for number in sorted(entries)]
+
+
+def place_furniture(vertices: np.ndarray, entry: dict[str, str]) -> np.ndarray:
+    """Vertices [V, 3] turned by the entry's modelRotation (nine numbers by rows, p' = R p) and stretched to its box.
+
+    The box is width x height x depth along x, y, z, as Sweet Home 3D draws it: y up, the front towards +z.
+    Raises ValueError for a modelRotation that is not a rotation.
+    """
+    if "modelRotation" in entry:
+        numbers = np.array(entry["modelRotation"].split(), dtype=np.float64)
+        rotation = numbers.reshape(3, 3) if numbers.size == 9 else np.zeros((3, 3))
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+            raise ValueError(f"modelRotation is not a rotation: {entry['modelRotation']}")
+        vertices = vertices @ rotation.T
+    if len(vertices) and all(key in entry for key in ("width", "height", "depth")):
+        extents = np.ptp(vertices, axis=0)
+        size = np.array([float(entry[key]) for key in ("width", "height", "depth")])
+        if (extents > 0).all() and (size > 0).all():
+            vertices = vertices * (size / extents)
+    return vertices
+
+
+def furniture_models(
+    package: packages.Package, categories: tuple[str, ...], licences: Path, progress: bool
+) -> Iterator[packages.Candidate | None]:
+    """Models of every catalogue of a package, by catalogue and entry number; None for an entry of no wanted category.
+
+    The package's copyright file goes to the folder `licences`.
+    Raises ValueError for a catalogue that is damaged, or with a member that points outside of it.
+    """
+    for path, content in sorted(packages.read_keeping_copyright(package, (".sh3f",), licences)):
+        catalogue = PurePosixPath(path).name
+        with packages.open_catalogue(content, catalogue) as archive:
+            general, entries = read_catalogue(packages.read_member(archive, CATALOGUE).decode("latin-1"))
+            for entry in tqdm(entries, desc=catalogue, unit="model", disable=not progress, leave=False):
+                model = PurePosixPath(entry.get("model", "").removeprefix("/"))
+                category = furniture_category(entry.get("name", ""), entry.get("category", ""))
+                if category not in categories or model.stem in MISFITS:
+                    yield None
+                    continue
+                yield packages.Candidate(
+                    category=category,
+                    title=entry["name"],
+                    author=entry.get("creator", ""),
+                    licence=" ".join(entry.get("license", general.get("license", "see the package")).split()),
+                    package=package,
+                    source=f"{catalogue}!/{model}",
+                    stem=f"{PurePosixPath(catalogue).stem}-{model.stem}",
+                    mesh=_furniture_mesh(archive, model, entry),
+                )
+
+
+def _furniture_mesh(
+    archive: zipfile.ZipFile, model: PurePosixPath, entry: dict[str, str]
+) -> tuple[np.ndarray, np.ndarray] | str:
+    if model.suffix.lower() != ".obj":
+        return f"unreadable (only OBJ models are read, this is {model.suffix or 'nothing'})"
+    try:
+        with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
+            vertices, faces = read_obj(packages.read_member(archive, str(model)).decode("latin-1"))
+            return place_furniture(vertices, entry), faces
+    except ValueError as error:
+        return f"unreadable ({error})"

@@ -1,0 +1,284 @@
+"""Meshes as they come: from a folder of files, from a mesh pack (npz) or from the procedural generator.
+
+Every source is a list of `MeshSource`, in an order that does not depend on the file system. Reading one raises
+ValueError where the file cannot be read, and `checked` where a mesh cannot be used, each with the reason.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import re
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from learn3d.files import limits, npz
+from learn3d.files.findings import AGAIN
+from learn3d.files.images import PHOTOGRAPHS
+from learn3d.files.reading import read_bytes, within
+
+EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # what trimesh reads without further packages
+SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
+TEXTURES = (*PHOTOGRAPHS, "TGA", "GIF", "PPM", "DDS")
+_ONE_AT_A_TIME = threading.RLock()
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else tracebacks of what it passes over are printed
+
+
+@dataclass(frozen=True, eq=False)
+class RawMesh:
+    """Triangles as read: any scale and place, right-handed, either winding."""
+
+    vertices: np.ndarray  # float64 [V, 3]
+    faces: np.ndarray  # int64 [F, 3]
+    face_colors: np.ndarray | None = None  # float32 [F, 3], RGB in [0, 1], NaN or None where the file gives none
+
+
+@dataclass(frozen=True)
+class MeshSource:
+    """A mesh that can be read when its turn comes."""
+
+    name: str  # unique within its source: path relative to the folder, or the number in the pack
+    read: Callable[[], RawMesh]
+
+
+def folder_sources(folder: Path) -> tuple[list[MeshSource], Counter[str]]:
+    """The mesh files below a folder, sorted by relative path, and how many files of which other extension it ignored.
+
+    Raises ValueError where the folder holds no mesh file, or folders within folders beyond what Python can follow.
+    """
+    try:
+        files = sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.relative_to(folder).as_posix())
+    except RecursionError:
+        raise ValueError(f"the folders below {folder} are nested too deeply; give a folder further down") from None
+    meshes = [path for path in files if path.suffix.lower() in EXTENSIONS]
+    ignored = Counter(p.suffix.lower() or "(none)" for p in files if p.suffix.lower() not in EXTENSIONS + SIDECARS)
+    if not meshes:
+        raise ValueError(
+            f"no mesh file in {folder} or below it: wanted {', '.join(EXTENSIONS)}, "
+            f"found {dict(ignored) or 'nothing'}; convert the meshes to one of these, or give another folder"
+        )
+    return [MeshSource(p.relative_to(folder).as_posix(), lambda p=p: read_mesh(p, folder)) for p in meshes], ignored
+
+
+def pack_sources(path: Path) -> list[MeshSource]:
+    """The meshes of a pack: an npz file with `n` and v0 float [V, 3], f0 int [F, 3], v1, f1, ... (never pickled).
+
+    Raises ValueError where the file is no such pack.
+    """
+    wanted = "an npz file with n, v0, f0, v1, f1, ... and no pickled objects"
+    try:
+        pack = npz.open_npz(path)
+        there = set(npz.keys(pack))
+        count = _count(npz.read(pack, "n", max_bytes=8)) if "n" in there else -1
+    except ValueError as error:
+        raise ValueError(f"cannot read the mesh pack {path}: {error}; it must be {wanted}. {AGAIN}") from error
+    missing = [key for i in range(count) for key in (f"v{i}", f"f{i}") if key not in there][:4]
+    if count < 1 or missing:
+        raise ValueError(f"{path} is no mesh pack: it must be {wanted}; n is {count}, missing keys: {missing}")
+    width = len(str(count - 1))
+
+    def read(i: int) -> RawMesh:
+        vertices = npz.read(pack, f"v{i}", max_bytes=24 * limits.MESH_VERTICES)
+        return RawMesh(vertices, npz.read(pack, f"f{i}", max_bytes=24 * limits.MESH_FACES))
+
+    return [MeshSource(f"{i:0{width}d}", lambda i=i: read(i)) for i in range(count)]
+
+
+def _count(n: np.ndarray) -> int:
+    """The number of meshes of a pack; ValueError where it is none."""
+    if n.size != 1 or n.dtype.kind not in "iu" or not 0 <= int(n.reshape(())) <= limits.ZIP_MEMBERS // 2:
+        most = limits.ZIP_MEMBERS // 2
+        raise ValueError(f"n must be the number of meshes, at most {most}, got {n.dtype} {n.reshape(-1)[:4].tolist()}")
+    return int(n.reshape(()))
+
+
+def procedural_sources(category: str, count: int, seed: int) -> list[MeshSource]:
+    """`count` shapes of the procedural generator; shape i depends on the seed and i alone."""
+    from learn3d.make_data.shapes import CATEGORIES, make_shape
+
+    if category not in CATEGORIES:
+        raise ValueError(f"the procedural generator makes {', '.join(CATEGORIES)}; got category {category!r}")
+
+    def read(i: int) -> RawMesh:
+        shape = make_shape(category, np.random.default_rng([seed, 0, i]))
+        return RawMesh(shape.vertices, shape.faces)
+
+    return [MeshSource(f"{category}_{i:05d}", lambda i=i: read(i)) for i in range(count)]
+
+
+def object_names(sources: list[MeshSource]) -> list[str]:
+    """A name for each mesh that can be part of a file name, all different: letters, digits and underscores."""
+    names, taken, tried = [], set(), Counter()
+    for source in sources:
+        plain = re.sub(r"\W+", "_", str(Path(source.name).with_suffix(""))).strip("_")[-80:] or "mesh"
+        plain = plain.encode()[-240:].decode(errors="ignore")  # names of files have 255 bytes
+        key = plain.lower()
+        while (name := f"{plain}_{tried[key] + 1}" if tried[key] else plain).lower() in taken:
+            tried[key] += 1
+        taken.add(name.lower())
+        names.append(name)
+    return names
+
+
+def read_mesh(path: Path, root: Path | None = None) -> RawMesh:
+    """All triangles of a mesh file, scenes concatenated with their transforms, with their colours where it has any.
+
+    root: the folder out of which files that it refers to (materials, textures, buffers) are read; None: its own.
+    Raises ValueError where it cannot be read, holds no triangle, or is beyond a limit: 256 MiB, 20 million vertices or
+    faces, 300 seconds, 8 GiB of memory.
+    """
+    import trimesh
+
+    try:
+        content = io.BytesIO(read_bytes(path, limits.MESH_FILE_BYTES, "a mesh file"))
+        beside = _files_below(path.parent, path.parent if root is None else root)
+        kind = path.suffix.lower().lstrip(".")
+        with within(limits.MESH_SECONDS, limits.MESH_MEMORY), _usual_textures():
+            scene = trimesh.load(content, file_type=kind, resolver=beside, force="scene", process=False)
+            return _joined([p for p in scene.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)])
+    except Exception as error:  # trimesh's readers raise whatever a foreign or truncated file makes them trip over
+        raise _unreadable(error) from error
+
+
+@contextlib.contextmanager
+def _usual_textures() -> Iterator[None]:
+    """Let trimesh open images of the usual formats only, and decode them at once, where it passes over what it cannot.
+
+    Pillow knows one, EPS, that it hands to Ghostscript: a program, run with what a stranger wrote.
+    """
+    from PIL import Image
+
+    with _ONE_AT_A_TIME:
+        usual = Image.open
+
+        def open_usual(file: Any, mode: str = "r", formats: Sequence[str] = TEXTURES) -> Image.Image:
+            image = usual(file, mode, formats)
+            image.load()
+            return image
+
+        Image.open = open_usual
+        try:
+            yield
+        finally:
+            Image.open = usual
+
+
+def _joined(parts: list) -> RawMesh:
+    """The triangles of several trimesh.Trimesh as one mesh."""
+    if not parts:
+        raise ValueError("no faces")
+    vertices, faces = sum(len(part.vertices) for part in parts), sum(len(part.faces) for part in parts)
+    if vertices > limits.MESH_VERTICES or faces > limits.MESH_FACES:
+        raise ValueError(
+            f"too large: {vertices} vertices and {faces} faces, the limits are {limits.MESH_VERTICES} and "
+            f"{limits.MESH_FACES}"
+        )
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    return RawMesh(
+        vertices=np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]),
+        faces=np.concatenate([np.asarray(p.faces, dtype=np.int64) + o for p, o in zip(parts, offsets, strict=True)]),
+        face_colors=np.concatenate([_part_colors(part) for part in parts]),
+    )
+
+
+def _files_below(folder: Path, root: Path):
+    """A trimesh resolver of names in `folder`, which gives nothing out that lies outside of `root`."""
+    from trimesh.resolvers import Resolver
+
+    class Below(Resolver):
+        def __init__(self) -> None:
+            """There is nothing to keep."""
+
+        def get(self, name: str) -> bytes:
+            path = (folder / str(name).strip()).resolve()
+            if not path.is_relative_to(root.resolve()):
+                raise ValueError(f"it refers to {name!r}, which lies outside of {root}")
+            return read_bytes(path, limits.MESH_FILE_BYTES, "a file that a mesh refers to")
+
+        def namespaced(self, namespace: str) -> Resolver:
+            return _files_below(folder / namespace, root)
+
+        def keys(self) -> list[str]:
+            return []
+
+        def write(self, name: str, data: bytes) -> None:
+            raise ValueError("a mesh that is read writes nothing")
+
+    return Below()
+
+
+def _unreadable(error: Exception) -> ValueError:
+    """A reader's exception as a ValueError of one line, with its kind where that says more than "ValueError"."""
+    reason = (str(error).strip().splitlines() or [""])[0][:300]
+    return ValueError(reason if reason and type(error) is ValueError else f"{type(error).__name__}: {reason}")
+
+
+def _part_colors(part) -> np.ndarray:
+    """Face colours float32 [F, 3] of a trimesh.Trimesh; a texture is sampled at the vertices. NaN where it has none."""
+    none = np.full((len(part.faces), 3), np.nan, dtype=np.float32)
+    visual = part.visual
+    if visual is None or not visual.defined:
+        return none
+    try:
+        if visual.kind == "texture":  # sampled, it does not know its mesh
+            colors = np.asarray(visual.to_color().vertex_colors, dtype=np.float64)
+            if colors.ndim == 1:  # without an image: the material's one colour
+                colors = np.broadcast_to(colors, (len(part.vertices), len(colors)))
+            colors = colors[part.faces].mean(axis=1)
+        else:
+            colors = np.asarray(visual.face_colors)
+    except Exception:  # a texture that cannot be read must not cost the mesh
+        return none
+    return (colors[:, :3] / 255).astype(np.float32) if len(colors) == len(none) else none
+
+
+def checked(mesh: RawMesh, max_faces: int) -> RawMesh:
+    """The mesh with the vertices that no face uses dropped; ValueError with the reason where it cannot be rendered."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise ValueError(f"not a triangle mesh: vertices {list(vertices.shape)}, faces {list(faces.shape)}")
+    if not np.issubdtype(faces.dtype, np.integer) or not np.issubdtype(vertices.dtype, np.number):
+        raise ValueError(f"not a triangle mesh: vertices are {vertices.dtype}, faces are {faces.dtype}")
+    if len(faces) == 0:
+        raise ValueError("no faces")
+    if len(faces) > max_faces:
+        raise ValueError(f"too large: {len(faces)} faces, the limit is {max_faces} (max_faces)")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"faces refer to vertices {faces.min()} .. {faces.max()}, there are {len(vertices)}")
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices = vertices[used].astype(np.float64)
+    if not np.isfinite(vertices).all():
+        raise ValueError("vertices that are not finite (NaN or infinite)")
+    with np.errstate(over="ignore"):
+        extent = float(np.ptp(vertices, axis=0).max())
+    if not 1e-12 < extent < 1e30:
+        raise ValueError(f"no usable extent: its longest side is {extent:g}")
+    return replace(mesh, vertices=vertices, faces=faces.reshape(-1, 3).astype(np.int64))
+
+
+def fit_to_box(vertices: np.ndarray) -> np.ndarray:
+    """Vertices [V, 3] with their bounding box centred at the origin and its longest side 1."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    return (vertices - (low + high) / 2) / (high - low).max()
+
+
+def is_watertight(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """True where every edge has exactly two faces: by vertex number, or with vertices at equal positions taken as one.
+
+    The second suits formats that repeat vertices (STL); the first, closed parts that touch each other.
+    """
+    return _closed(faces) or _closed(np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces])
+
+
+def _closed(faces: np.ndarray) -> bool:
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]  # degenerate faces close nothing
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    _, counts = np.unique(edges[:, 0] * (np.int64(faces.max(initial=0)) + 1) + edges[:, 1], return_counts=True)
+    return len(counts) > 0 and bool((counts == 2).all())

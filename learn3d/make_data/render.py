@@ -1,0 +1,314 @@
+"""Meshes -> a data set in any layout: shaded views, masks, cameras and voxels of every object, by our renderer.
+
+Here meshes are chosen, split, scaled and coloured; `viewpoints` has the cameras, `writers` the layouts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from learn3d.data.layouts import Layout
+from learn3d.data.poses import Poses
+from learn3d.data.readers import kato
+from learn3d.files.writing import write_json
+from learn3d.make_data import meshes
+from learn3d.make_data.contact_sheet import Row, draw_sheet, make_row
+from learn3d.make_data.folders import check_room, existing, publish
+from learn3d.make_data.report import DatasetReport, lacking
+from learn3d.make_data.shading import KEY_LIGHT, shade_mesh
+from learn3d.make_data.writers import RenderedObject, Writer, writer_of
+from learn3d.terminal import plain
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """What to make a data set from, and how."""
+
+    output: Path  # folder for the files; other categories may live in it too
+    category: str  # name of the category; Kato's 13 names become synset ids in the file names
+    layout: Layout = "kato"  # whose files and viewpoints
+    views: int | None = None  # per object; default kar 20, r2n2 24, pascal3d 8, photos 12; kato and dvr have 24
+    source: Path | None = None  # folder of meshes (searched recursively) or a mesh pack (.npz); not with --procedural
+    procedural: int = 0  # make this many shapes with the procedural generator instead of reading meshes
+    # part of the meshes for the test split: a share below 1 (then at least 4 of them), or a count; default 0.2;
+    # pascal3d is tested on val and has none
+    test: float | None = None
+    val: float | None = None  # the same for the validation split, 0 for none; default 0.1; pascal3d 0.2, r2n2 none
+    augment: int = 0  # copies of each training mesh, besides itself, with every axis scaled by a random 0.75 .. 1.25
+    up: Axis = "y"  # mesh axis that points up
+    front: Axis | None = None  # mesh axis that faces the camera of view 0; default x (y where up is x), procedural z
+    color: Literal["random", "mesh"] = "random"  # a random light colour per object, or the mesh's own where it has one
+    max_faces: int = 1_000_000  # skip meshes with more faces
+    seed: int = 0  # of the split, the scales, the colours, the views and the procedural shapes; same seed, same bytes
+    overwrite: bool = False  # replace files of this category that are already in the folder
+
+
+def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, np.ndarray]:
+    """Object numbers per split, out of one permutation: the first are test, then val, the rest train.
+
+    `test` and `val` are counts, or shares (below 1) that give at least 4 objects, or an equal part where there are few.
+    With test = 0.2 and val = 0, test is `default_rng(seed).permutation(count)[:max(4, round(0.2 * count))]`.
+    Raises ValueError for a negative or fractional count, and where none would be left to train on.
+    """
+    sizes = {}
+    equal = count // (1 + (test > 0) + (val > 0))
+    for name, amount in (("test", test), ("val", val)):
+        if not amount >= 0 or (amount >= 1 and amount != int(amount)):
+            raise ValueError(f"{name} must be a share in 0 .. 1 or a whole number of meshes, got {amount}")
+        least = min(4, equal) if amount > 0 else 0
+        sizes[name] = int(amount) if amount >= 1 else max(least, round(amount * count))
+    if sum(sizes.values()) >= count:
+        raise ValueError(
+            f"test ({sizes['test']}) and val ({sizes['val']}) leave none of the {count} meshes to train on; "
+            "give more meshes, or a smaller test or val"
+        )
+    order = np.random.default_rng(seed).permutation(count)
+    bounds = np.cumsum([sizes["test"], sizes["val"]])
+    return dict(zip(("test", "val", "train"), np.split(order, bounds), strict=True))
+
+
+def random_color(rng: np.random.Generator) -> np.ndarray:
+    """One light, slightly tinted grey: float32 [3] in [0.35, 1]."""
+    return np.clip(rng.uniform(0.55, 0.9) + rng.uniform(-0.2, 0.2, size=3), 0.35, 1.0).astype(np.float32)
+
+
+def render_object(
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    face_colors: np.ndarray,
+    poses: Poses,
+    image_size: int,
+    turn: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """All views of one object: rgb uint8 [n, S, S, 3] over white and alpha uint8 [n, S, S].
+
+    vertices float32 [V, 3] in the object frame of the poses; faces int64 [F, 3]; face_colors float [3] or [F, 3]; turn
+    [3, 3] from the frame of `kato.mesh_to_object`, in which the light stays where it is. The alpha is exactly that of
+    `nmr.render_silhouette`. Raises ValueError where no view shows anything.
+    """
+    light = tuple((turn @ KEY_LIGHT).tolist())
+    rgb, alpha = shade_mesh(vertices, faces, face_colors, poses.cameras(), image_size=image_size, light=light)
+    if not alpha.any():
+        raise ValueError("no view shows any of it (all faces have no area, or are smaller than a pixel)")
+    return rgb, alpha
+
+
+def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
+    """Make the data set that `config` describes and return what was done; meshes that cannot be used are skipped.
+
+    Writes the files of the layout (see its module in `learn3d.make_data.writers`) for every split that is not empty and
+    `{synset}_card.json` (settings, splits), `{synset}_report.json`, `{synset}_report.txt`, `{synset}_contact.png`
+    (see `contact_sheet.LEGEND`).
+    Files appear under their names only when all of them are complete.
+
+    Raises ValueError (settings that do not fit, no usable mesh), FileNotFoundError (no such source), FileExistsError
+    (files of the category are there and `overwrite` is off), OSError (folder not writable, disk too full).
+    """
+    config = _complete(config)
+    writer_class, prefix = writer_of(config.layout), kato.synset_of(config.category)
+    sources, ignored = _list_sources(config)
+    splits = split_objects(len(sources), config.test, config.val, config.seed)
+    copies = {split: 1 + (config.augment if split == "train" else 0) for split in splits}
+    total = sum(len(splits[s]) * copies[s] for s in splits)
+    _prepare_folder(config, writer_class, total)
+
+    done = _Done()
+    with (
+        tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=config.output) as temporary,
+        _progress_bar(total, config.category, progress) as bar,
+    ):
+        folder, trash = Path(temporary) / "new", Path(temporary) / "old"
+        folder.mkdir()
+        writer = writer_class(folder, config.category)
+        names = meshes.object_names(sources)
+        for split in ("train", "val", "test"):
+            chosen = [(int(number), sources[number], names[number]) for number in splits[split]]
+            _render_split(config, writer, chosen, split, copies[split], done, bar)
+        bar.close()
+        objects = writer.finish(config.output, done.objects) if done.objects.get("train") else {}
+        if not objects.get("train"):
+            bad = [mesh for mesh in done.skipped if mesh["split"] == "train"]
+            raise ValueError(
+                f"none of the {len(bad)} meshes to train on can be used; the first reasons: "
+                + "; ".join(f"{mesh['name']}: {mesh['reason']}" for mesh in bad[:3])
+            )
+        for split, written in objects.items():  # some layouts decide on the splits at the end
+            for name in written:
+                done.mesh_of[name]["split"] = split
+        sheet = draw_sheet({split: [done.rows[name] for name in written] for split, written in objects.items()})
+        sheet.save(folder / f"{prefix}_contact.png")
+        own = [path for path in (*writer.paths(config.category), *writer.shared) if (folder / path).exists()]
+        files = sorted([*own, *_extra_files(prefix)])
+        counts = {split: len(written) for split, written in objects.items() if written}
+        skipped, others = done.skipped, dict(sorted(ignored.items()))
+        report = DatasetReport(config.category, files, counts, done.used, skipped, others, lacking(writer, counts))
+        write_json(folder / f"{prefix}_card.json", _card(config, writer, counts, done.used))
+        write_json(folder / f"{prefix}_report.json", asdict(report))
+        (folder / f"{prefix}_report.txt").write_text(plain(report.text()) + "\n", encoding="utf-8")
+        stale = set(existing(config.output, _own_paths(writer_class, config.category))) - set(files)
+        publish(folder, config.output, files, sorted(stale), trash)
+    return report
+
+
+@dataclass
+class _Done:
+    """What became of the meshes so far."""
+
+    used: list[dict] = field(default_factory=list)
+    skipped: list[dict] = field(default_factory=list)
+    objects: dict[str, list[str]] = field(default_factory=dict)  # names per split
+    mesh_of: dict[str, dict] = field(default_factory=dict)  # entry of `used` per object name
+    rows: dict[str, Row] = field(default_factory=dict)  # of the contact sheet, per object name
+
+
+def _render_split(
+    config: DatasetConfig,
+    writer: Writer,
+    chosen: list[tuple[int, meshes.MeshSource, str]],
+    split: str,
+    copies: int,
+    done: _Done,
+    bar,
+) -> None:
+    """Render and write the chosen meshes (number, mesh, name) of one split, `copies` objects each."""
+    writer.start(split, len(chosen) * copies)
+    for number, source, name in chosen:
+        items = []
+        try:
+            mesh = meshes.checked(source.read(), config.max_faces)
+            for copy in range(copies):
+                items.append(_render(config, writer, mesh, number, copy, f"{name}-{copy}" if copy else name, split))
+                bar.update()
+        except ValueError as error:  # it cannot be read, rendered or seen: the others go on
+            done.skipped.append({"name": source.name, "split": split, "reason": str(error)})
+            bar.update(copies - len(items))
+            continue
+        size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+        watertight = meshes.is_watertight(mesh.vertices, mesh.faces)
+        entry = {"name": source.name, "split": split, **size, "watertight": watertight}
+        done.used.append(entry)
+        for item in items:
+            writer.write(item)
+            grid = writer.convention.to_object(torch.from_numpy(item.voxels)[None])[0].numpy()
+            done.rows[item.name] = make_row(item.rgb, item.alpha, grid)
+            done.objects.setdefault(split, []).append(item.name)
+            done.mesh_of[item.name] = entry
+
+
+def _render(
+    config: DatasetConfig, writer: Writer, mesh: meshes.RawMesh, number: int, copy: int, name: str, split: str
+) -> RenderedObject:
+    """Object `copy` of mesh `number`: scaled, coloured, placed, looked at."""
+    rng = np.random.default_rng([config.seed, 1, number, copy])
+    scale = rng.uniform(*SCALE_RANGE, size=3)
+    color = random_color(rng)
+    if config.color == "mesh" and mesh.face_colors is not None:
+        color = np.where(np.isnan(mesh.face_colors), color, mesh.face_colors)
+    vertices = mesh.vertices @ kato.mesh_to_object(config.up, _front(config)).T
+    fitted = meshes.fit_to_box(meshes.fit_to_box(vertices) * (scale if copy else 1.0))
+    placed = writer.place(fitted)
+    rng = np.random.default_rng([config.seed, 2, number, copy])
+    poses = writer.views(placed, config.views, rng)
+    vertices = torch.as_tensor(np.ascontiguousarray(placed, dtype=np.float32))
+    faces = torch.as_tensor(np.ascontiguousarray(mesh.faces, dtype=np.int64))
+    rgb, alpha = render_object(vertices, faces, color, poses, writer.image_size, writer.turn)
+    voxels = writer.voxelize(vertices, faces)
+    return RenderedObject(name, split, vertices, faces, poses, rgb, alpha, voxels, rng)
+
+
+def _front(config: DatasetConfig) -> str:
+    return config.front or ("z" if config.procedural else "y" if config.up.endswith("x") else "x")
+
+
+def _complete(config: DatasetConfig) -> DatasetConfig:
+    """The settings with the layout's own where none were given; ValueError where they do not fit."""
+    if (config.source is None) == (config.procedural == 0):
+        raise ValueError("give either a source (a folder of meshes or a mesh pack .npz) or procedural > 0, not both")
+    if config.procedural < 0 or config.augment < 0 or config.max_faces < 1 or config.seed < 0:
+        raise ValueError(
+            "procedural, augment and seed must not be negative and max_faces must be positive, got "
+            f"{config.procedural}, {config.augment}, {config.seed}, {config.max_faces}"
+        )
+    if config.color not in ("random", "mesh"):
+        raise ValueError(f"color must be random or mesh, got {config.color!r}")
+    kato.mesh_to_object(config.up, _front(config))
+    kato.synset_of(config.category)
+    writer = writer_of(config.layout)
+    defaults = {"views": writer.default_views, "test": writer.default_test, "val": writer.default_val}
+    config = dataclasses.replace(config, **{k: v for k, v in defaults.items() if getattr(config, k) is None})
+    if config.views < 1 or (writer.fixed_views and config.views != writer.default_views):
+        allowed = f"exactly {writer.default_views}" if writer.fixed_views else "at least 1"
+        raise ValueError(f"the layout {config.layout} has {allowed} views per object, got {config.views}")
+    for split, default in (("test", writer.default_test), ("val", writer.default_val)):
+        if default == 0 and getattr(config, split) != 0:
+            raise ValueError(f"the layout {config.layout} has no {split} split; leave {split} at 0")
+    writer.check(config.output, config.category, config.test, config.augment)
+    return config
+
+
+def _list_sources(config: DatasetConfig) -> tuple[list[meshes.MeshSource], Counter[str]]:
+    if config.procedural:
+        return meshes.procedural_sources(config.category, config.procedural, config.seed), Counter()
+    source = Path(config.source)
+    if source.is_dir():
+        return meshes.folder_sources(source)
+    if source.is_file() and source.suffix == ".npz":
+        return meshes.pack_sources(source), Counter()
+    if source.exists():
+        raise ValueError(f"the source must be a folder of meshes or a mesh pack (.npz), got the file {source}")
+    raise FileNotFoundError(f"there is no folder or mesh pack {source}")
+
+
+def _extra_files(prefix: str) -> list[str]:
+    """What lies beside the files of every layout."""
+    return [f"{prefix}_{name}" for name in ("card.json", "contact.png", "report.json", "report.txt")]
+
+
+def _own_paths(writer: type[Writer], category: str) -> list[str]:
+    return [*writer.paths(category), *_extra_files(kato.synset_of(category))]
+
+
+def _prepare_folder(config: DatasetConfig, writer: type[Writer], objects: int) -> None:
+    """Create the folder and check that it can take the files: nothing in the way, writable, room on the disk."""
+    there = existing(config.output, _own_paths(writer, config.category))
+    if there and not config.overwrite:
+        raise FileExistsError(
+            f"{config.output} already holds {there[0]} and {len(there) - 1} more file(s) or folder(s) of "
+            f"{config.category}; give another folder, or --overwrite to replace them"
+        )
+    needed = objects * (config.views * writer.bytes_per_view + 32**3) // 2 + 2**24  # renderings shrink to a tenth
+    check_room(config.output, needed, f"{objects} objects")
+
+
+def _card(config: DatasetConfig, writer: Writer, objects: dict[str, int], used: list[dict]) -> dict:
+    """The data set's card: everything needed to make it again, and which mesh went where."""
+    left_out = {"output", "overwrite", "layout"} | ({"views"} if writer.fixed_views else set())
+    settings = {k: v for k, v in asdict(config).items() if k not in left_out}
+    settings["source"] = None if config.source is None else Path(config.source).name
+    return {
+        **({} if config.layout == "kato" else {"layout": config.layout}),
+        **writer.card(),
+        "objects_fill": writer.objects_fill,
+        "object_from_mesh": (writer.turn @ kato.mesh_to_object(config.up, _front(config))).tolist(),
+        "settings": settings,
+        "objects": objects,
+        "augmented": f"in train, each mesh is followed by its {config.augment} scaled copies",
+        "splits": {split: [mesh["name"] for mesh in used if mesh["split"] == split] for split in objects},
+    }
+
+
+def _progress_bar(total: int, name: str, show: bool):
+    from tqdm import tqdm
+
+    return tqdm(total=total, desc=name, unit="object", disable=not show, dynamic_ncols=True)

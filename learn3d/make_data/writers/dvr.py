@@ -1,0 +1,85 @@
+"""Writes the layout of DVR's mirror of Kato's renderings (Niemeyer et al. 2020, NMR_Dataset).
+
+`{synset}/{id}/image/0000.png` .. `0023.png` (RGB over white), `mask/0000.png` (grey, 255 = object), `cameras.npz`,
+`pointcloud.npz`, and the ids of each split in `{synset}/softras_{split}.lst`.
+
+World coordinates are ShapeNet's: right-handed, y up, x towards the camera of view 0, longest side 1; the points of
+`pointcloud.npz` lie in them. `world_mat_k` [4, 4] takes them to camera axes (x right, y down, z away), so its rotation
+has determinant 1, and `camera_mat_k` to [-1, 1] across the image (y down): diag(f, f, 1, 1), f = 1 / tan 15 deg.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+import nmr
+from learn3d.data import conventions
+from learn3d.data.poses import LookAtPoses
+from learn3d.data.readers import kato
+from learn3d.make_data import viewpoints
+from learn3d.make_data.writers.pictures import write_png
+from learn3d.make_data.writers.writer import RenderedObject, Writer, make_generator
+
+NUM_POINTS = 10_000
+
+
+class DvrWriter(Writer):
+    """Pictures, cameras and surface points of every object in a folder of its own; no voxels."""
+
+    image_size = kato.IMAGE_SIZE
+    default_views = kato.NUM_VIEWS
+    fixed_views = True
+    bytes_per_view = 4 * kato.IMAGE_SIZE**2 + 24 * NUM_POINTS // kato.NUM_VIEWS
+    convention = conventions.KATO  # for the contact sheet
+
+    @classmethod
+    def paths(cls, category: str) -> tuple[str, ...]:
+        return (kato.synset_of(category),)
+
+    def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
+        return viewpoints.kato_views()
+
+    def write(self, item: RenderedObject) -> None:
+        folder = self.folder / kato.synset_of(self.category) / item.name
+        for k, (rgb, alpha) in enumerate(zip(item.rgb, item.alpha, strict=True)):
+            write_png(folder / "image" / f"{k:04d}.png", rgb)
+            write_png(folder / "mask" / f"{k:04d}.png", alpha)
+        np.savez(folder / "cameras.npz", **_camera_arrays(item.poses))
+        points = nmr.metrics.sample_surface(item.vertices, item.faces, NUM_POINTS, make_generator(item.rng))
+        world = world_from_object().astype(np.float32)
+        normals = points.normals.numpy() @ world.T
+        np.savez(folder / "pointcloud.npz", points=points.points.numpy() @ world.T, normals=normals)
+
+    def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
+        for split, names in objects.items():
+            listing = "".join(f"{name}\n" for name in names)
+            (self.folder / kato.synset_of(self.category) / f"softras_{split}.lst").write_text(listing)
+        return objects
+
+    def card(self) -> dict[str, str]:
+        return {
+            "images": "PNG 64 x 64 over white; masks: grey, anti-aliased",
+            "points": f"pointcloud.npz: {NUM_POINTS} points and normals on the surface, in world coordinates",
+            "views": "azimuth -15 k, elevation 30, distance 2.732, half field of view 15 degrees",
+            "cameras": "cameras.npz: world_mat_k [4, 4], world to camera axes (x right, y down, z away); camera_mat_k",
+        }
+
+
+def world_from_object() -> np.ndarray:
+    """ShapeNet's coordinates (right-handed, y up, front x) of points in the object frame: [3, 3], determinant -1."""
+    return kato.mesh_to_object("y", "x").T
+
+
+def _camera_arrays(poses: LookAtPoses) -> dict[str, np.ndarray]:
+    focal = 1 / np.tan(np.deg2rad(kato.HALF_FOV_DEG))
+    camera = np.diag([focal, focal, 1.0, 1.0])
+    arrays = {}
+    for k, matrix in enumerate(poses.cameras().projection().plain().matrix.numpy()):
+        world = np.eye(4)
+        world[:3] = matrix
+        world[:3, :3] = matrix[:, :3] @ world_from_object().T
+        arrays |= {f"world_mat_{k}": world, f"world_mat_inv_{k}": np.linalg.inv(world)}
+        arrays |= {f"camera_mat_{k}": camera, f"camera_mat_inv_{k}": np.linalg.inv(camera)}
+    return arrays

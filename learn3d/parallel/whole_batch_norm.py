@@ -1,0 +1,41 @@
+"""Batch norm whose batch is spread over several processes."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+if TYPE_CHECKING:
+    from learn3d.parallel.ranks import Ranks
+
+BatchNorm = nn.BatchNorm1d | nn.BatchNorm2d | nn.BatchNorm3d
+
+
+def use_whole_batch(network: nn.Module, ranks: Ranks) -> None:
+    """Let the batch norms of a network take mean and variance over the rows of all processes, in place.
+
+    `nn.SyncBatchNorm` would do so on CUDA devices only, and for parts of equal size. The modules stay, with their
+    names, so that checkpoints and everyone who holds one of them know no difference.
+    """
+    for module in network.modules():
+        if isinstance(module, BatchNorm):
+            module.forward = functools.partial(_forward, module, ranks)
+
+
+def _forward(norm: BatchNorm, ranks: Ranks, x: Tensor) -> Tensor:
+    if not norm.training:
+        return type(norm).forward(norm, x)
+    shape = [1, -1] + [1] * (x.ndim - 2)
+    values = x.float()
+    variance, mean = torch.var_mean(values, [0, *range(2, x.ndim)], correction=0)
+    mean, variance = ranks.pool(mean, variance)
+    count = round(x.numel() / x.shape[1] / ranks.share)
+    with torch.no_grad():
+        norm.num_batches_tracked.add_(1)
+        norm.running_mean.lerp_(mean, norm.momentum)
+        norm.running_var.lerp_(variance * count / max(1, count - 1), norm.momentum)
+    scale = norm.weight * (variance + norm.eps).rsqrt()
+    return ((values - mean.view(shape)) * scale.view(shape) + norm.bias.view(shape)).to(x.dtype)

@@ -1,0 +1,227 @@
+"""The data set in memory: what goes into a batch, several categories, parts that do not fit; sampling; view classes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import nmr
+from learn3d.data.conventions import KATO
+from learn3d.data.dataset import ViewDataset, concatenate
+from learn3d.data.poses import LookAtPoses, RotationPoses, wrap_deg
+from learn3d.data.sampling import sample_indices
+from learn3d.data.view_bins import AngleBins
+
+
+def continuous(objects: int = 3, views: int = 4, category: str = "cup", seed: int = 0) -> ViewDataset:
+    """Random images seen from random sides, in two pose classes."""
+    rng = np.random.default_rng(seed)
+    count = objects * views
+    poses = LookAtPoses(*(rng.uniform(*limits, count) for limits in ((-180, 180), (-20, 40), (2, 3))), 15.0)
+    return ViewDataset(
+        category=category,
+        split="train",
+        images=rng.integers(0, 256, (count, 4, 64, 64), np.uint8),
+        poses=poses,
+        view_ids=rng.integers(0, 2, count),
+        view_names=("left", "right"),
+        object_ids=np.repeat(np.arange(objects), views),
+        object_names=tuple(f"{category}{i}" for i in range(objects)),
+        voxels=rng.random((objects, 32, 32, 32)) < 0.5,
+        convention=KATO,
+    )
+
+
+def test_batch_has_what_belongs_to_each_sample() -> None:
+    data = continuous()
+    batch = data.batch(torch.tensor([7, 0, 7]))
+    assert len(batch) == 3
+    assert torch.equal(batch.images, torch.from_numpy(data.images[[7, 0, 7]]))
+    assert torch.equal(batch.masks, batch.images[:, 3] / 255)
+    assert batch.object_ids.tolist() == [1, 0, 1]
+    assert batch.class_ids.tolist() == [0, 0, 0]
+    assert torch.equal(batch.voxels, torch.from_numpy(data.voxels[[1, 0, 1]]))
+    wanted = nmr.LookAt.from_angles(
+        data.poses.distance[7], data.poses.elevation_deg[7], data.poses.azimuth_deg[7], half_fov_deg=15.0
+    )
+    assert torch.allclose(batch.cameras.eye[0], wanted.eye, atol=1e-6)
+    with pytest.raises(ValueError, match=r"indices must lie in 0 .. 11 \(12 views of 3 objects\)"):
+        data.batch(torch.tensor([12]))
+    with pytest.raises(TypeError, match="integer tensor"):
+        data.batch(torch.tensor([0.5]))
+
+
+def test_training_batches_leave_the_voxels_out() -> None:
+    dataset = continuous()
+    batch = dataset.batch(torch.tensor([0]), voxels=False)
+    assert batch.voxels is None
+    assert torch.equal(batch.images, dataset.batch(torch.tensor([0])).images)
+
+
+def test_masks_of_their_own_go_before_the_fourth_channel() -> None:
+    data = continuous(1, 2)
+    large = dataclasses.replace(
+        data, images=np.zeros((2, 4, 224, 224), np.uint8), masks=np.full((2, 64, 64), 51, np.uint8)
+    )
+    assert large.image_size == 224
+    assert torch.equal(large.batch(torch.tensor([1])).masks, torch.full((1, 64, 64), 0.2))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"images": np.zeros((12, 4, 64, 64))}, r"images must be uint8 \[M, 4, S, S\], got float64"),
+        ({"images": np.zeros((12, 4, 32, 32), np.uint8)}, "need masks"),
+        ({"view_ids": np.zeros(5, np.int64)}, r"12 images of 3 objects do not go with \{'view_ids': 5\}"),
+        ({"voxels": np.zeros((2, 32, 32, 32), bool)}, r"do not go with \{'voxels': 2\}"),
+        ({"voxels": np.zeros((3, 16, 16, 16), bool)}, r"voxels must be \[N, 32, 32, 32\]"),
+        ({"view_ids": np.full(12, 2)}, r"view_ids must lie in 0 .. 1, got 2 .. 2"),
+        ({"object_ids": np.full(12, -1)}, r"object_ids must lie in 0 .. 2, got -1 .. -1"),
+    ],
+)
+def test_parts_that_do_not_fit_are_named(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(continuous(), **change)
+
+
+def test_several_categories_become_one_set_with_classes() -> None:
+    cups, jars = continuous(), continuous(2, 3, "jar", seed=1)
+    both = concatenate([cups, jars])
+    assert (both.category, both.class_names, both.num_classes, both.num_objects) == ("cup,jar", ("cup", "jar"), 2, 5)
+    batch, alone = both.batch(torch.tensor([3, 12 + 4])), jars.batch(torch.tensor([4]))
+    assert (batch.class_ids.tolist(), batch.object_ids.tolist()) == ([0, 1], [0, 4])
+    assert torch.equal(batch.images[1], alone.images[0])
+    assert torch.equal(batch.voxels[1], alone.voxels[0])
+    assert torch.equal(batch.cameras.eye[1], alone.cameras.eye[0])
+    assert concatenate([cups]) is cups
+    with pytest.raises(ValueError, match="jar and cup differ in view classes"):
+        concatenate([cups, dataclasses.replace(jars, view_names=("a", "b"))])
+    with pytest.raises(ValueError, match="only one of jar and cup has voxels"):
+        concatenate([cups, dataclasses.replace(jars, voxels=None)])
+    turned = dataclasses.replace(jars, poses=RotationPoses(torch.eye(3).expand(6, 3, 3)))
+    with pytest.raises(ValueError, match="cameras of different kinds"):
+        concatenate([cups, turned])
+
+
+def test_one_distance_for_all_joins_a_distance_for_each() -> None:
+    cups, jars = continuous(1, 2), continuous(1, 2, "jar", seed=1)
+    near = dataclasses.replace(jars, poses=dataclasses.replace(jars.poses, distance=2.0))
+    joined = concatenate([cups, near]).poses
+    assert joined.half_fov_deg == 15.0
+    assert torch.equal(joined.distance, torch.cat([cups.poses.distance, torch.tensor([2.0, 2.0])]))
+
+
+def test_select_keeps_all_objects() -> None:
+    part = continuous().select(np.array([0, 5]))
+    assert (len(part), part.num_objects, part.object_ids.tolist()) == (2, 3, [0, 1])
+
+
+def test_pairs_are_two_views_of_one_object() -> None:
+    data = continuous(5, 3)
+    indices = sample_indices(data, "pairs", 40, seed=0, step=1)
+    first, second = data.batch(indices[:20]), data.batch(indices[20:])
+    assert torch.equal(first.object_ids, second.object_ids)
+    assert (indices[:20] != indices[20:]).all()
+    assert len(first.object_ids.unique()) == 5
+    assert torch.equal(indices, sample_indices(data, "pairs", 40, seed=0, step=1))
+    assert not torch.equal(indices, sample_indices(data, "pairs", 40, seed=0, step=2))
+    with pytest.raises(ValueError, match="no object has two views"):
+        sample_indices(continuous(4, 1), "pairs", 2, seed=0, step=1)
+
+
+def test_classes_are_drawn_uniformly_whatever_their_size() -> None:
+    both = concatenate([continuous(40, 4), continuous(1, 2, "jar", seed=1)])
+    drawn = both.batch(sample_indices(both, "classes", 400, seed=0, step=1)).class_ids
+    assert 150 < int((drawn == 1).sum()) < 250
+    with pytest.raises(ValueError, match="sampling must be views, pairs or classes, got 'all'"):
+        sample_indices(both, "all", 4, seed=0, step=1)
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [("60x60", 6), ("30x30", 24), ("20x20", 54), ("20x15", 72), ("15x20", 72), ("15x15", 96), ("10x10", 216)],
+)
+def test_the_papers_seven_settings(text: str, count: int) -> None:
+    bins = AngleBins.parse(text)
+    assert bins.count == count
+    assert len(bins.names()) == count
+    rng = np.random.default_rng(0)
+    azimuth, elevation = rng.uniform(-180, 180, 5000), rng.uniform(-20, 40, 5000)
+    ids = bins.ids(LookAtPoses(azimuth, elevation, 2.0, 15.0))
+    w, h = (float(width) for width in text.split("x"))
+    wanted = np.floor((azimuth.astype(np.float32) + 180) / w) * (60 / h) + np.floor(
+        (elevation.astype(np.float32) + 20) / h
+    )
+    assert (ids.numpy() == wanted).mean() > 0.999  # float32 angles on the edge of a cell
+    assert len(ids.unique()) == count
+
+
+def test_ends_of_the_range_belong_to_cells() -> None:
+    bins = AngleBins(15, 20)
+    poses = LookAtPoses(
+        np.array([180.0, -180.0, 179.9, 0.0, 0.0]), np.array([40.0, -20.0, 40.0, 55.0, -90.0]), 2.0, 15.0
+    )
+    assert bins.ids(poses).tolist() == [71, 0, 71, 38, 36]
+
+
+@pytest.mark.parametrize("text", ["15", "ax20", "15x20:1", "15x20x3"])
+def test_bins_are_written_as_widths(text: str) -> None:
+    with pytest.raises(ValueError, match="view bins are written as AZIMUTHxELEVATION"):
+        AngleBins.parse(text)
+
+
+@pytest.mark.parametrize(("text", "message"), [("0x20", "must be positive"), ("15x20:40:-20", "from low to high")])
+def test_bins_make_sense(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        AngleBins.parse(text)
+
+
+def test_rebinning_changes_the_classes_alone() -> None:
+    data = continuous()
+    binned = data.with_bins(AngleBins.parse("60x60"))
+    assert binned.num_views == 6
+    assert np.array_equal(binned.view_ids, AngleBins.parse("60x60").ids(data.poses).numpy())
+    turned = dataclasses.replace(data, poses=RotationPoses(torch.eye(3).expand(12, 3, 3)))
+    with pytest.raises(ValueError, match="need look-at cameras"):
+        turned.with_bins(AngleBins.parse("60x60"))
+
+
+def test_angles_wrap() -> None:
+    assert wrap_deg(torch.tensor([190.0, -190.0, 180.0, 540.0])).tolist() == [-170.0, 170.0, -180.0, -180.0]
+
+
+def lopsided() -> tuple[torch.Tensor, torch.Tensor]:
+    """A mesh that is symmetric about z = 0 and nothing else."""
+    sphere, faces = nmr.icosphere(3)
+    x, y, _ = sphere.unbind(1)
+    return sphere * 0.3 + torch.stack([0.2 * y**2, 0.1 * (x > 0.2), torch.zeros_like(x)], 1), faces
+
+
+@pytest.mark.parametrize("kind", ["look-at", "rotation"])
+def test_mirrored_pose_sees_the_mirrored_image_of_a_symmetric_object(kind: str) -> None:
+    vertices, faces = lopsided()
+    if kind == "look-at":  # the mirror plane of a mirrored azimuth is x = 0
+        vertices = vertices[:, [2, 1, 0]]
+        poses = LookAtPoses(np.array([35.0, -100.0]), np.array([20.0, -10.0]), 2.732, 15.0)
+    else:
+        rotation = torch.linalg.qr(torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0)))[0]
+        poses = RotationPoses(rotation * torch.linalg.det(rotation)[:, None, None])
+    seen, mirrored = (
+        nmr.render_silhouette(vertices, faces, p.cameras(), image_size=64)
+        for p in (poses, poses.mirrored(torch.tensor([True, False])))
+    )
+    assert (seen[0] > 0).float().mean() > 0.05
+    assert (mirrored[0] - seen[0].flip(1)).abs().mean() < 2e-3
+    assert (mirrored[0] - seen[0]).abs().mean() > 0.01
+    assert torch.equal(mirrored[1], seen[1])
+    assert poses.features().shape == (2, poses.num_features)
+
+
+def test_poses_of_wrong_shape() -> None:
+    with pytest.raises(ValueError, match=r"distance must be \[2\] or one number, got \[3\]"):
+        LookAtPoses(np.zeros(2), 0.0, np.zeros(3), 15.0)
+    with pytest.raises(ValueError, match=r"rotation must be \[M, 3, 3\]"):
+        RotationPoses(torch.eye(3))

@@ -1,0 +1,384 @@
+"""Pascal3D+ files, written byte for byte as VPL packs them: what is read, where it lies, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from python2_pickles import npy, python2_pickle
+from scipy.spatial.transform import Rotation
+
+import nmr
+from learn3d.config import TrainConfig
+from learn3d.data.augment import augment
+from learn3d.data.crops import Crops, join
+from learn3d.data.dataset import concatenate
+from learn3d.data.layouts import load_dataset
+from learn3d.data.readers import pascal3d
+from learn3d.methods.method import DataShape
+from learn3d.methods.pose_invariant import PoseInvariant
+from learn3d.networks.resnet import ResNet18Encoder
+from learn3d.presets import PRESETS
+from learn3d.runs.checkpoint import load_method
+from learn3d.training import train
+
+
+def rotation(*angles_deg: float) -> np.ndarray:
+    return Rotation.from_euler("yzx", angles_deg, degrees=True).as_matrix()
+
+
+def tetrahedra() -> tuple[torch.Tensor, torch.Tensor]:
+    """A solid without any symmetry but z -> -z, within [-1, 1]: [V, 3], [F, 3]."""
+    corners = torch.tensor([[-0.9, -0.2, 0.0], [0.5, -0.5, 0.6], [0.5, -0.5, -0.6], [0.7, 0.1, 0.0], [0.1, 0.8, 0.0]])
+    faces = torch.tensor([[0, 1, 2], [0, 1, 4], [0, 2, 4], [1, 3, 4], [2, 3, 4], [1, 2, 3]])
+    return corners, faces
+
+
+def vpl_silhouette(vertices: torch.Tensor, faces: torch.Tensor, rotations: np.ndarray, size: int) -> torch.Tensor:
+    """The silhouettes of VPL's renderer, written out: u = R v, depth + 1 + 1e-5, an image that is in the end turned
+    upside down (y up) and left-right (x to the left)."""
+    u = vertices @ torch.from_numpy(rotations).float().transpose(1, 2)
+    u = u + torch.tensor([0.0, 0.0, 1 + 1e-5])
+    return nmr.render_silhouette(u, faces, None, image_size=size).flip(2)
+
+
+ANGLES = [(0.0, 10.0, 0.0), (50.0, -20.0, 10.0), (-100.0, 5.0, -15.0), (170.0, 30.0, 40.0), (30.0, 20.0, -130.0)]
+
+
+def arrays(seed: int, angles: list[tuple[float, float, float]]) -> dict[str, np.ndarray | list[np.ndarray]]:
+    rng = np.random.default_rng(seed)
+    count = len(angles)
+    sizes = rng.integers(60, 120, (count, 2))
+    images = [rng.integers(0, 256, (*size, 3), np.uint8) for size in sizes]
+    rotations = np.stack([rotation(*a) for a in angles])
+    references = np.zeros((count, 224, 224, 4), np.uint8)
+    references[..., :3] = 77
+    references[..., 3] = 255 * vpl_silhouette(*tetrahedra(), rotations, 224).round().numpy()
+    voxels = rng.random((count, 32, 32, 32)) < 0.3
+    boxes = np.stack([[10.0, 20.0, 30.5, 25.0]] * count)
+    boxes[0] = [-5, 0, 200, 300]  # Pascal's boxes may leave the image
+    return {
+        "images": images,
+        "images_ref": references,
+        "bounding_boxes": boxes,
+        "rotation_matrices": rotations.astype(np.float32),
+        "voxels": voxels,
+    }
+
+
+def write(path: Path, content: dict[str, np.ndarray | list[np.ndarray]]) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        for key, value in content.items():
+            if isinstance(value, list):
+                archive.writestr(f"{key}.npy", npy(python2_pickle(value), len(value)))
+            else:
+                with archive.open(f"{key}.npy", "w") as file:
+                    np.lib.format.write_array(file, value, version=(1, 0))
+
+
+@pytest.fixture(scope="module")
+def contents() -> dict[str, dict]:
+    return {
+        "train": arrays(1, ANGLES[:3]),
+        "imagenet": arrays(2, ANGLES[1:4]),
+        "val": arrays(3, [(1.0, 11.0, 1.0), (55.0, -20.0, 10.0), (30.0, 20.0, -130.0)]),
+    }
+
+
+@pytest.fixture
+def folder(tmp_path: Path, contents: dict[str, dict]) -> Path:
+    for name, content in contents.items():
+        write(tmp_path / f"aeroplane_{name}.npz", content)
+    return tmp_path
+
+
+def test_training_is_train_and_imagenet(folder: Path, contents: dict[str, dict]) -> None:
+    dataset = pascal3d.load(folder, "aeroplane", "train")
+    assert len(dataset) == dataset.num_objects == 6 and dataset.image_size == 224
+    assert dataset.object_names[2:4] == ("aeroplane_train/2", "aeroplane_imagenet/0")
+    assert not dataset.inverted and dataset.convention is pascal3d.conventions.PASCAL3D
+    np.testing.assert_array_equal(dataset.voxels[3:], contents["imagenet"]["voxels"])
+    assert dataset.num_views == 4 and sorted(set(dataset.view_ids)) == [0, 1, 2, 3]
+    np.testing.assert_array_equal(dataset.view_ids[[1, 2]], dataset.view_ids[[3, 4]])  # the same rotations
+
+
+def test_the_image_is_the_padded_clipped_stretched_box(folder: Path, contents: dict[str, dict]) -> None:
+    dataset = pascal3d.load(folder, "airplane", "train")
+    train = contents["train"]
+    # box 10, 20, 30.5, 25: padded by 15 % to 5.425 .. 45.075 and 16.25 .. 48.75, cut to whole pixels
+    cut = Image.fromarray(train["images"][1][16:48, 5:45]).resize((224, 224), Image.Resampling.BILINEAR)
+    np.testing.assert_array_equal(dataset.images[1, :3], np.asarray(cut).transpose(2, 0, 1))
+    whole = Image.fromarray(train["images"][0]).resize((224, 224), Image.Resampling.BILINEAR)
+    np.testing.assert_array_equal(dataset.images[0, :3], np.asarray(whole).transpose(2, 0, 1))
+    reference = train["images_ref"][..., 3]
+    np.testing.assert_array_equal(dataset.images[:3, 3], reference)
+    wanted = torch.nn.functional.interpolate(torch.from_numpy(reference)[:, None].float(), 64)[:, 0]
+    np.testing.assert_array_equal(dataset.masks[:3], wanted.numpy())
+    assert pascal3d.load(folder, "airplane", "train", image_size=64).images.shape == (6, 4, 64, 64)
+
+
+def test_cameras_show_what_vpl_draws(folder: Path) -> None:
+    """The stored masks were drawn by VPL's rule; a camera that is mirrored or upside down shows something else."""
+    dataset = pascal3d.load(folder, "02691156", "train")
+    batch = dataset.batch(torch.arange(6))
+    vertices, faces = tetrahedra()
+    drawn = nmr.render_silhouette(vertices, faces, batch.cameras, image_size=224)
+    masks = torch.from_numpy(dataset.images[:, 3]).float() / 255
+    assert nmr.losses.soft_iou_loss(drawn, masks) < 0.01
+    assert nmr.losses.soft_iou_loss(drawn.flip(2), masks) > 0.1
+    assert nmr.losses.soft_iou_loss(drawn.flip(1), masks) > 0.1
+
+
+@pytest.mark.parametrize("z", [-0.9, -0.7, 0.0, 1.7])
+def test_nothing_is_cut_off_that_vpl_draws(z: float) -> None:
+    """VPL's near plane is at z' = -0.9; nearer triangles, up to the corner of the cube [-1, 1], are drawn, too."""
+    triangle = torch.tensor([[-0.5, -0.5, z], [0.5, -0.5, z], [0.0, 0.5, z + 1e-4]])
+    camera = pascal3d.poses(np.eye(3)[None]).cameras()
+    drawn = nmr.render_silhouette(triangle, torch.tensor([[0, 1, 2]]), camera, image_size=32)
+    vpl = vpl_silhouette(triangle, torch.tensor([[0, 1, 2]]), np.eye(3)[None], 32)
+    assert (drawn >= vpl).all() and vpl.sum() > 100
+    corner = torch.tensor([[-0.5, -0.5, -(3**0.5)], [0.5, -0.5, -(3**0.5)], [0.0, 0.5, -(3**0.5)]])
+    assert nmr.render_silhouette(corner, torch.tensor([[0, 1, 2]]), camera, image_size=32).sum() > 100
+
+
+def test_mirrored_poses_show_a_symmetric_object_mirrored(folder: Path) -> None:
+    dataset = pascal3d.load(folder, "aeroplane", "train")
+    vertices, faces = tetrahedra()
+    chosen = torch.tensor([True, False, True, True, True, False])
+    straight, mirrored = (
+        nmr.render_silhouette(vertices, faces, poses.cameras(), image_size=64)
+        for poses in (dataset.poses, dataset.poses.mirrored(chosen))
+    )
+    wanted = torch.where(chosen[:, None, None], straight.flip(2), straight)
+    torch.testing.assert_close(mirrored, wanted, atol=1e-6, rtol=0)
+    assert (straight != straight.flip(2)).any()
+    # A mirrored pose is one that a camera can have: no rotation becomes a reflection, nor the reverse.
+    determinants = torch.linalg.det(dataset.poses.mirrored(chosen).rotation)
+    torch.testing.assert_close(determinants, torch.linalg.det(dataset.poses.rotation), atol=1e-5, rtol=0)
+
+
+def test_voxels_of_the_object_overlap_with_the_convention(folder: Path) -> None:
+    """The object's voxels under VPL's rule: (v + 1) / 2, last two axes exchanged, all three reversed."""
+    vertices, faces = tetrahedra()
+    grid = nmr.voxelize((vertices + 1) / 2, faces, size=32)
+    wanted = grid.transpose(2, 3).flip((1, 2, 3))
+    assert torch.equal(pascal3d.conventions.PASCAL3D.voxelize(vertices, faces), wanted)
+    assert not torch.equal(grid, wanted)
+
+
+def test_view_classes_of_val_are_those_of_training(folder: Path) -> None:
+    train, val = (pascal3d.load(folder, "aeroplane", split) for split in ("train", "val"))
+    assert train.view_names == val.view_names
+    # The first two share the cells of training views; the third is in a cell of its own and nearest to ANGLES[1].
+    assert val.view_ids[:2].tolist() == train.view_ids[:2].tolist()
+    angles = [(Rotation.from_matrix(rotation(*ANGLES[4]).T @ rotation(*a))).magnitude() for a in ANGLES[:4]]
+    assert val.view_ids[2] == train.view_ids[[0, 1, 2, 5][int(np.argmin(angles))]]
+    test = pascal3d.load(folder, "aeroplane", "test")
+    np.testing.assert_array_equal(test.images, val.images)
+    assert test.split == "test"
+
+
+def test_rotation_cells_are_45_degrees_of_scipys_yzx_angles() -> None:
+    angles = np.array(
+        [[-180, 0, 0], [-135.1, 0, 0], [-134.9, 0, 0], [0, -46, 0], [0, 0, 44.9], [0, 0, 45.1], [179, 0, 0]]
+    )
+    cells = pascal3d.rotation_cells(np.stack([rotation(*a) for a in angles]))
+    wanted = [(0, 4, 4), (0, 4, 4), (1, 4, 4), (4, 2, 4), (4, 4, 4), (4, 4, 5), (7, 4, 4)]
+    got = [(c // 64, c // 8 % 8, c % 8) for c in cells.tolist()]
+    assert got[1:] == wanted[1:] and got[0] in [(0, 4, 4), (7, 4, 4)]  # -180 and 180 are the same rotation
+    noise = np.random.default_rng(0).normal(0, 1e-7, (50, 3, 3))
+    assert len(set(pascal3d.rotation_cells(np.eye(3) + noise))) == 1
+    ids, names = pascal3d.view_classes(np.eye(3)[None], np.stack([np.eye(3), rotation(100, 0, 0)]))
+    assert ids.tolist() == [0] and names == ("y 22.5°, z 22.5°, x 22.5°", "y 112.5°, z 22.5°, x 22.5°")
+
+
+def test_crop_jitter_is_a_function_of_seed_and_step(folder: Path, contents: dict[str, dict]) -> None:
+    dataset = pascal3d.load(folder, "aeroplane", "train")
+    batch = dataset.batch(torch.tensor([1, 4, 1, 0]))
+    one, same, other, seed = (augment(batch, ["crop"], s, k).images for s, k in ((0, 7), (0, 7), (0, 8), (1, 7)))
+    assert torch.equal(one, same)
+    assert all((one != x).any() for x in (other, seed, batch.images))
+    assert (one[0] != one[2]).any()  # the same photograph twice: cropped in two ways
+    assert torch.equal(one[:, 3], batch.images[:, 3])  # the mask stays
+    # It is the published rule on the original image, with the same random numbers.
+    shifts = np.random.default_rng([0, 7, 1]).uniform(-1, 1, (4, 4))[0] * 0.15
+    left, top, w, h = contents["train"]["bounding_boxes"][1]
+    image = contents["train"]["images"][1]
+    x0, y0 = max(0, int(left - (0.15 + shifts[0]) * w)), max(0, int(top - (0.15 + shifts[1]) * h))
+    x1 = min(image.shape[1], int(left + w + (0.15 + shifts[2]) * w))
+    y1 = min(image.shape[0], int(top + h + (0.15 + shifts[3]) * h))
+    cut = Image.fromarray(image[y0:y1, x0:x1]).resize((224, 224), Image.Resampling.BILINEAR)
+    np.testing.assert_array_equal(one[0, :3].numpy(), np.asarray(cut).transpose(2, 0, 1))
+
+
+def test_flip_image_leaves_mask_and_pose(folder: Path) -> None:
+    batch = pascal3d.load(folder, "aeroplane", "train").batch(torch.arange(6))
+    changed = augment(batch, ["crop", "flip-image"], 0, 1)
+    cropped = augment(batch, ["crop"], 0, 1)
+    flipped = (changed.images[:, :3] == cropped.images[:, :3].flip(3)).flatten(1).all(1)
+    same = (changed.images[:, :3] == cropped.images[:, :3]).flatten(1).all(1)
+    assert (flipped ^ same).all() and flipped.any() and same.any()
+    assert torch.equal(changed.images[:, 3], batch.images[:, 3]) and torch.equal(changed.masks, batch.masks)
+    assert changed.poses is batch.poses
+
+
+def test_crop_is_refused_where_it_cannot_be(folder: Path) -> None:
+    batch = pascal3d.load(folder, "aeroplane", "train").batch(torch.arange(2))
+    with pytest.raises(ValueError, match=r"crop must be the first augmentation, .* got flip, crop"):
+        augment(batch, ["flip", "crop"], 0, 1)
+    bare = pascal3d.ViewDataset.batch
+    dataset = pascal3d.load(folder, "aeroplane", "train")
+    object.__setattr__(dataset, "crops", None)
+    with pytest.raises(ValueError, match="only the layout pascal3d has"):
+        augment(bare(dataset, torch.arange(2)), ["crop"], 0, 1)
+
+
+def test_crops_follow_selection_and_joining(folder: Path) -> None:
+    dataset = pascal3d.load(folder, "aeroplane", "train")
+    some = dataset.select(np.array([4, 1]))
+    np.testing.assert_array_equal(some.crops.cut(), dataset.images[[4, 1], :3])
+    both = concatenate([dataset, dataset])
+    np.testing.assert_array_equal(both.crops.cut(), np.concatenate([dataset.images[:, :3]] * 2))
+    with pytest.raises(ValueError, match="different sizes"):
+        join([dataset.crops, Crops.from_images([], np.empty((0, 4)), 64)])
+
+
+def test_layouts_know_it(folder: Path) -> None:
+    assert load_dataset("pascal3d", folder, "aeroplane", "val", image_size=224).image_size == 224
+    with pytest.raises(ValueError, match="rotations"):
+        load_dataset("pascal3d", folder, "aeroplane", "val", image_size=224, view_bins="15x20")
+
+
+DAMAGE = {
+    "shape": ({"images_ref": np.zeros((3, 64, 64, 4), np.uint8)}, r"images_ref must be uint8 \[3, 224, 224, 4\]"),
+    "type": ({"images_ref": np.zeros((3, 224, 224, 4), np.int8)}, "images_ref must be uint8"),
+    "count": ({"voxels": np.zeros((2, 32, 32, 32), bool)}, r"voxels must be \[3, 32, 32, 32\]"),
+    "objects": ({"voxels": [np.zeros(3, np.uint8)] * 3}, "voxels must be .* got an object array"),
+    "grey": ({"images": [np.zeros((9, 9, 1), np.uint8)] * 3}, r"images\[0\] must be uint8 \[H, W, 3\], got uint8"),
+    "box": ({"bounding_boxes": np.array([[0, 0, -1, 5]] * 3)}, r"bounding_boxes\[0\] must be left, top, width, height"),
+    "outside": (
+        {"bounding_boxes": np.array([[900, 0, 5, 5]] * 3)},
+        r"bounding_boxes\[0\] .* has no pixel in its image",
+    ),
+    "reflection": ({"rotation_matrices": -np.stack([np.eye(3)] * 3)}, r"rotation_matrices\[0\] is no rotation"),
+    "nan": ({"rotation_matrices": np.full((3, 3, 3), np.nan)}, r"rotation_matrices\[0\] is no rotation"),
+    "none": ({"images": []}, "holds no images"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damaged_files_are_named(folder: Path, contents: dict[str, dict], name: str) -> None:
+    change, message = DAMAGE[name]
+    if name == "none":
+        change = {key: value[:0] for key, value in contents["val"].items()}
+    write(folder / "aeroplane_val.npz", contents["val"] | change)
+    with pytest.raises(ValueError, match=rf"aeroplane_val.npz.*{message}"):
+        pascal3d.load(folder, "aeroplane", "val")
+    found = list(pascal3d.problems(folder, "aeroplane", "val"))
+    assert found and all(p.path == str(folder / "aeroplane_val.npz") and p.severity == "error" for p in found[:1])
+
+
+def test_a_damaged_training_file_is_named_by_val_too(folder: Path, contents: dict[str, dict]) -> None:
+    write(folder / "aeroplane_imagenet.npz", {"rotation_matrices": np.zeros((3, 3, 3))})
+    with pytest.raises(ValueError, match=r"aeroplane_imagenet.npz: rotation_matrices\[0\] is no rotation"):
+        pascal3d.load(folder, "aeroplane", "val")
+    (folder / "aeroplane_imagenet.npz").unlink()
+    with pytest.raises(
+        FileNotFoundError, match=r"no .*aeroplane_imagenet.npz; its folder has aeroplane_train.npz, aer"
+    ):
+        pascal3d.load(folder, "aeroplane", "train")
+
+
+def test_wrong_names_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="Pascal3D\\+ has the categories aeroplane, car, chair; got 'sofa'"):
+        pascal3d.load(tmp_path, "sofa", "train")
+    with pytest.raises(ValueError, match="split must be one of train, val, test; got 'imagenet'"):
+        pascal3d.load(tmp_path, "car", "imagenet")
+    with pytest.raises(FileNotFoundError, match=r"its folder has no npz file. Pascal3D\+ is car_train.npz"):
+        pascal3d.load(tmp_path / "none", "car", "train")
+
+
+def test_the_scan_reports_everything(folder: Path, contents: dict[str, dict]) -> None:
+    def scan() -> list[tuple[str, str]]:
+        splits = pascal3d.contents(folder)["aeroplane"]
+        found = [problem for split in splits for problem in pascal3d.problems(folder, "aeroplane", split)]
+        return [(Path(p.path).name, f"{p.severity}: {p.message}") for p in found]
+
+    assert scan() == [] and pascal3d.contents(folder) == {"aeroplane": ("train", "val")}
+    assert [pascal3d.count(folder, "aeroplane", split) for split in ("train", "val", "test")] == [6, 3, 3]
+    (folder / "aeroplane_train.npz").unlink()
+    references = contents["val"]["images_ref"].copy()
+    references[1, ..., 3] = 0
+    voxels = contents["val"]["voxels"].copy()
+    voxels[2] = False
+    skewed = contents["val"]["rotation_matrices"] * 1.1
+    boxes = np.array([[0, 0, 0, 0], [10, 10, 5, 5], [900, 0, 5, 5]])
+    change = {"images_ref": references, "voxels": voxels, "rotation_matrices": skewed, "bounding_boxes": boxes}
+    write(folder / "aeroplane_val.npz", contents["val"] | change)
+    (folder / "aeroplane_imagenet.npz").write_bytes(b"PK")
+    found = scan()
+    assert [name for name, _ in found].count("aeroplane_val.npz") == 7
+    texts = " | ".join(text for _, text in found)
+    for part in (
+        "error: there is no",
+        "not an npz",
+        "warning: images_ref[1] has an empty mask",
+        "voxels[2] is",
+        "orthonormal",
+    ):
+        assert part in texts
+    assert "bounding_boxes[0] must be" in texts and "bounding_boxes[2] = " in texts
+
+
+@pytest.mark.parametrize("name", ["peng2020-pascal", "peng2020-pascal-vanilla"])
+def test_the_presets_train_and_are_measured(folder: Path, name: str) -> None:
+    preset = PRESETS[name]
+    train = load_dataset(preset.layout, folder, "aeroplane", "train", image_size=224)
+    torch.manual_seed(0)
+    shape = DataShape(train.num_views, pose_features=train.poses.features().shape[1])
+    method = PoseInvariant(preset.settings, shape, "cpu", "fp32")
+    assert method.image_size == train.image_size
+    losses = {}
+    for step in (1, 2):
+        batch = augment(train.batch(torch.arange(3)), preset.augment, 0, step)
+        losses |= method.train_step(batch, step)
+    assert all(np.isfinite(value) for value in losses.values())
+    assert ("confusion" in losses and "prior" in losses) == (name == "peng2020-pascal")
+    method.set_training(False)
+    val = load_dataset(preset.layout, folder, "aeroplane", "val", image_size=224).batch(torch.arange(3))
+    with torch.no_grad():
+        meshes = method.decode(method.encode(val.images))
+    iou = nmr.metrics.voxel_iou(train.voxelize(meshes.vertices, meshes.faces), val.voxels)
+    assert ((0 < iou) & (iou < 1)).all()
+
+
+def test_a_trained_model_does_without_the_pretrained_weights(folder: Path, tmp_path: Path) -> None:
+    weights = tmp_path / "resnet18.pth"
+    torch.save(ResNet18Encoder().state_dict(), weights)
+    settings = dataclasses.replace(PRESETS["peng2020-pascal"].settings, pretrained=weights)
+    options = {"preset": "peng2020-pascal", "settings": settings, "iterations": 1, "batch_size": 2, "precision": "fp32"}
+    config = TrainConfig(data=folder, category="aeroplane", output=tmp_path / "run", **options)
+    assert train(config).finished
+    weights.unlink()
+    assert train(dataclasses.replace(config, iterations=2), resume=True).step == 2
+    method, saved, _ = load_method(tmp_path / "run" / "last.safetensors")
+    assert saved.settings == settings and method.image_size == 224
+    shutil.rmtree(tmp_path / "run")
+
+
+def test_the_presets_are_the_papers() -> None:
+    settings = PRESETS["peng2020-pascal"].settings
+    weights = [getattr(settings, f"lambda_{n}") for n in ("smooth", "classification", "adversarial", "prior")]
+    assert weights == [0.001, 1, 0.01, 0.01]
+    assert (settings.encoder, settings.generator, PRESETS["peng2020-pascal"].iterations) == (
+        "resnet18",
+        "symmetric",
+        40_000,
+    )
+    assert not PRESETS["peng2020-pascal-vanilla"].settings.uses_discriminator

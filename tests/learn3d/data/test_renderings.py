@@ -1,0 +1,69 @@
+"""What the readers of folders share."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from learn3d.data.readers.renderings import map_objects, read_image, shrink, split_alpha
+
+
+def test_shrinking_takes_the_mean_over_each_pixels_area():
+    rng = np.random.default_rng(0)
+    color, mask = rng.integers(0, 256, (128, 128, 3), np.uint8), rng.integers(0, 256, (128, 128), np.uint8)
+    image, small = shrink(color, mask, 64)
+    blocks = np.dstack([color, mask]).reshape(64, 2, 64, 2, 4).mean((1, 3)).transpose(2, 0, 1)
+    assert image.dtype == np.uint8 and np.abs(image - blocks).max() <= 0.51
+    np.testing.assert_array_equal(small, image[3])
+
+
+def test_shrinking_by_three_and_a_half_keeps_the_covered_area():
+    mask = np.zeros((224, 224), np.uint8)
+    mask[10:101, 50:171] = 255
+    color = np.dstack([mask] * 3)
+    image, small = shrink(color, mask, 224)
+    np.testing.assert_array_equal(image[3], mask)
+    assert small.sum() * 3.5**2 == pytest.approx(mask.sum(), rel=1e-3)
+    assert small[:, 10].max() == 0 and small[20, 20] == 255
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])
+def test_transparent_pixels_become_white(tmp_path, mode):
+    pixels = np.zeros((4, 4, 4), np.uint8)
+    pixels[1, 2] = (90, 90, 90, 255)
+    image = Image.fromarray(pixels)
+    if mode == "P":
+        image = image.convert("RGB").quantize(2)
+        image.info["transparency"] = image.getpixel((0, 0))
+    image = image.convert(mode) if mode == "LA" else image
+    image.save(tmp_path / "image.png", transparency=image.info.get("transparency"))
+    image = read_image(tmp_path / "image.png")
+    assert image.mode == mode
+    color, alpha = split_alpha(image)
+    assert color[1, 2].tolist() == [90] * 3 and color[0, 0].tolist() == [255] * 3
+    assert alpha[1, 2] == 255 and alpha.sum() == 255
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB"])
+def test_images_without_transparency_have_no_alpha(tmp_path, mode):
+    Image.fromarray(np.full((4, 4), 255, np.uint8)).convert(mode).save(tmp_path / "image.png")
+    color, alpha = split_alpha(read_image(tmp_path / "image.png"))
+    assert alpha is None and color.shape == (4, 4, 3) and (color == 255).all()
+
+
+def test_objects_keep_their_order_and_an_exception_stops_the_others():
+    assert list(map_objects(lambda i: time.sleep(0.001 * (i % 3)) or i, range(50), "test", False)) == list(range(50))
+    done, lock = [], threading.Lock()
+
+    def work(i):
+        time.sleep(0.002)
+        if i == 3:
+            raise ValueError("bad object")
+        with lock:
+            done.append(i)
+
+    with pytest.raises(ValueError, match="bad object"):
+        list(map_objects(work, range(2000), "test", False))
+    assert len(done) < 1500

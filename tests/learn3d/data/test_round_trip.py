@@ -1,0 +1,106 @@
+"""Meshes -> files of a layout -> the layout's reader: masks, cameras and voxels are those of the meshes."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from lopsided_meshes import write_meshes
+
+import nmr
+from learn3d.data.layouts import LAYOUTS, load_dataset
+from learn3d.data.readers.kato import mesh_to_object
+from learn3d.make_data.render import DatasetConfig, make_dataset
+
+SETTINGS = {
+    "kato": {"test": 1, "val": 0},
+    "dvr": {"test": 1, "val": 0},
+    "kar": {"test": 1, "val": 0},
+    "r2n2": {},
+    "pascal3d": {"val": 1, "views": 4},
+    "photos": {"test": 1, "val": 0, "views": 4},
+}
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory):
+    return write_meshes(tmp_path_factory.mktemp("meshes"))
+
+
+@pytest.fixture(scope="module", params=LAYOUTS)
+def made(request, sources, tmp_path_factory):
+    """A data set of each layout."""
+    output = tmp_path_factory.mktemp("data")
+    settings = SETTINGS[request.param]
+    config = DatasetConfig(output=output, category="chair", source=sources, layout=request.param, **settings)
+    make_dataset(config, progress=False)
+    card = json.loads((output / "03001627_card.json").read_text())
+    return SimpleNamespace(layout=request.param, folder=output, sources=sources, card=card)
+
+
+def mesh_of(made, split, number, name, count):
+    """The true mesh of an object in the layout's object frame, float32 [V, 3], and its faces."""
+    files = made.card["splits"][split]
+    if made.layout == "kato" or (made.layout == "pascal3d" and split == "val"):  # whose readers have no names
+        file = files[number * len(files) // count]
+    elif made.layout == "pascal3d":  # pictures of every object in chair_train, then others of them in chair_imagenet
+        file = files[number % (count // 2) * len(files) // (count // 2)]
+    else:
+        (file,) = (f for f in files if f.removesuffix(".ply").replace(" ", "_") in name)
+    mesh = trimesh.load(made.sources / file, force="mesh", process=False)
+    vertices = (mesh.vertices - mesh.bounds.mean(axis=0)) / mesh.extents.max()
+    if made.layout == "pascal3d":  # the frame of mesh files, half the diagonal 1
+        vertices = vertices * 2 / np.linalg.norm(np.ptp(vertices, axis=0))
+    else:
+        vertices = vertices @ mesh_to_object("y", "x").T
+    return torch.tensor(vertices, dtype=torch.float32), torch.tensor(np.asarray(mesh.faces))
+
+
+def test_masks_cameras_and_voxels(made):
+    for split in ("train", "val" if made.layout == "pascal3d" else "test"):
+        dataset = load_dataset(made.layout, made.folder, "chair", split)
+        assert dataset.inverted == LAYOUTS[made.layout].inverted
+        expected = {"kato": 24, "dvr": 24, "kar": 20, "r2n2": 24, "pascal3d": 4, "photos": 4}[made.layout]
+        if made.layout == "kar" and split == "train":
+            expected = 1  # the published protocol
+        assert len(dataset) == expected * (4 if split == "train" else 1)
+        batch = dataset.batch(torch.arange(len(dataset)))
+        for number in range(dataset.num_objects):
+            samples = torch.from_numpy(np.flatnonzero(dataset.object_ids == number))
+            vertices, faces = mesh_of(made, split, number, dataset.object_names[number], dataset.num_objects)
+            cameras = batch.poses[samples].cameras()
+            if made.layout == "pascal3d":  # every 3.5th pixel, as published
+                rows = torch.arange(64) * 224 // 64
+                wanted = nmr.render_silhouette(vertices, faces, cameras, image_size=224)[:, rows][:, :, rows]
+            else:  # the covered share of each pixel
+                fine = nmr.render_silhouette(vertices, faces, cameras, image_size=256)
+                wanted = torch.nn.functional.avg_pool2d(fine[:, None], 4)[:, 0]
+            error = (wanted - batch.masks[samples]).abs().mean((1, 2))
+            shifted = [(wanted - wanted.roll(1, axis)).abs().mean((1, 2)) for axis in (1, 2)]
+            # Stored masks are samples of that, so they differ a little; half a pixel in one view would be too much.
+            relative = error / torch.minimum(*shifted)
+            assert relative.max() < 0.5 and relative.mean() < 0.25, (split, relative)
+            if dataset.voxels is not None:
+                voxels = dataset.voxelize(vertices, faces)[0].numpy()
+                assert (voxels == dataset.voxels[number]).all()
+            if dataset.points is not None:
+                low, high = vertices.numpy().min(0), vertices.numpy().max(0)
+                np.testing.assert_allclose(dataset.points[number].min(0), low, atol=0.01)
+                np.testing.assert_allclose(dataset.points[number].max(0), high, atol=0.01)
+        # colours: nothing outside of the object, something on it
+        colors = batch.images[:, :3].float()
+        background = colors.permute(0, 2, 3, 1)[(batch.images[:, 3] == 0)]
+        if made.layout == "pascal3d":
+            assert background.std() > 5
+        else:  # Kar's masks, from depth, have harder edges than the colours
+            assert (background == (0 if dataset.inverted else 255)).float().mean() > 0.98
+
+
+def test_every_layout_has_voxels_or_points_or_says_that_it_has_none(made):
+    dataset = load_dataset(made.layout, made.folder, "chair", "train")
+    assert (dataset.voxels is not None) == LAYOUTS[made.layout].voxels
+    assert (dataset.points is not None) == (made.layout == "dvr")

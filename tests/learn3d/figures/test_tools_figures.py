@@ -1,0 +1,139 @@
+"""tools/figures.py from the command line to files, with the checkpoint of a real short run."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import shutil
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from learn3d.evaluation import evaluate
+from learn3d.figures import paper
+from learn3d.figures.runs import name_runs, open_runs
+from learn3d.runs import checkpoint
+
+pytest.importorskip("matplotlib")
+TOOL = Path(__file__).parents[3] / "tools" / "figures.py"
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("tool_figures", TOOL)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def call(tool, monkeypatch, capsys):
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["figures", *map(str, arguments)])
+        code = tool.main()
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def test_all_figures_of_a_run(call, finished_run, tmp_path, monkeypatch) -> None:
+    pytest.importorskip("sklearn")
+    monkeypatch.setattr(paper, "FRAMES", 1)
+    monkeypatch.setattr(paper, "TILE_SIZE", 32)
+    code, out, err = call("all", "--runs", finished_run, "--output", tmp_path / "out", "--split", "train")
+    assert code == 0, err
+    written = [Path(line) for line in out.splitlines()]
+    plots = [f"{name}.{kind}" for name in ("curves", "polar", "tsne") for kind in ("png", "svg")]
+    names = sorted([*plots, "grid.png", "interpolation.gif", "interpolation.png", "polar.json"])
+    assert sorted(path.name for path in written) == names
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
+    for path in written:
+        if path.suffix == ".png":
+            picture = np.asarray(Image.open(path).convert("L"))
+            assert min(picture.shape) > 100
+            assert 0.005 < (picture < 200).mean() < 0.7, path  # something is drawn, and the page is not dark
+    with Image.open(tmp_path / "out" / "interpolation.gif") as image:
+        assert image.n_frames == 3
+    method, config, _ = checkpoint.load_method(finished_run / "last.safetensors")
+    (run,) = open_runs([finished_run], split="train")
+    stored = json.loads((tmp_path / "out" / "polar.json").read_text())["profiles"][0]
+    assert stored["mean_iou"] == pytest.approx(evaluate(method, run.dataset).voxel_iou, abs=1e-6)
+    assert stored["label"] == "Proposed" and config.seed == 0
+
+    again = ("polar", "--values", tmp_path / "out" / "polar.json", "--output", tmp_path / "again.png")
+    assert call(*again)[0] == 0
+    assert (tmp_path / "again.svg").read_bytes() == (tmp_path / "out" / "polar.svg").read_bytes()
+
+
+def test_what_could_not_be_drawn_is_said(call, finished_run, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(paper, "save_all", lambda *_, **__: ([tmp_path / "grid.png"], ["polar: no voxels"]))
+    code, out, err = call("all", "--runs", finished_run, "--output", tmp_path)
+    assert (code, out.split()) == (0, [str(tmp_path / "grid.png")])
+    assert err.splitlines()[-1] == "not drawn: polar: no voxels"
+
+
+def test_the_morph_has_the_frames_that_were_asked_for(call, finished_run, tmp_path) -> None:
+    options = ("--split", "train", "--indices", 1, 30, 60, "--frames", 2, "--steps", 1, "--azimuths", 20)
+    code, out, err = call("interpolation", "--runs", finished_run, "--output", tmp_path / "i.gif", *options)
+    assert code == 0, err
+    assert out.split() == [str(tmp_path / "i.png"), str(tmp_path / "i.gif")]
+    with Image.open(tmp_path / "i.gif") as image:
+        assert (image.n_frames, image.size) == (6, (192, 192))
+
+
+def test_seeds_are_one_curve(call, finished_run, tmp_path) -> None:
+    folders = []
+    for seed in (1, 2):
+        folder = tmp_path / f"seed{seed}"
+        folder.mkdir()
+        shutil.copy(finished_run / "metrics.jsonl", folder)
+        config = json.loads((finished_run / "config.json").read_text())
+        (folder / "config.json").write_text(json.dumps(config | {"seed": seed}))
+        folders.append(folder)
+    assert call("curves", "--runs", *folders, "--output", tmp_path / "c.svg")[0] == 0
+    assert "Proposed (2 seeds: mean and range)" in (tmp_path / "c.svg").read_text()
+
+
+def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> None:
+    output = ("--output", tmp_path / "x")
+    for arguments, message in (
+        (("grid",), "at least one run folder or checkpoint"),
+        (("curves",), "at least one run folder"),
+        (("polar",), "either --runs to measure, or --values to draw"),
+        (("polar", "--runs", finished_run, "--values", tmp_path / "x.json"), "either --runs"),
+        (("grid", "--runs", tmp_path / "nowhere"), "nowhere"),
+        (("grid", "--runs", finished_run, "--labels", "a", "b"), "there are 1 runs but 2 labels"),
+        (("grid", "--runs", finished_run, "--images", 0), "has 24 images, 0 were asked for"),
+        (("tsne", "--runs", finished_run, "--category", "lamp"), "lamp"),
+        (("curves", "--runs", tmp_path), "metrics.jsonl"),
+        (("grid", "--runs", finished_run, "--output", f"{TOOL}/grid.png"), "figures.py is no folder; give another"),
+        (("all", "--runs", finished_run, "--output", f"{TOOL}"), "figures.py is no folder; give another --output"),
+    ):
+        code, out, err = call(arguments[0], *output, *arguments[1:])
+        assert (code, out) == (1, ""), arguments
+        assert err.splitlines()[-1].startswith("error: ") and message in err, (arguments, err)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_runs_are_called_by_what_tells_them_apart(tiny_config, tmp_path) -> None:
+    proposed, vanilla = tiny_config(tmp_path), tiny_config(tmp_path, preset="peng2020-kato-vanilla")
+    second, free = dataclasses.replace(proposed, seed=1), tiny_config(tmp_path, lambda_prior=0.0)
+    paths = [tmp_path / "a", tmp_path / "b"]
+    assert name_runs([vanilla, proposed], paths) == ["Vanilla-AE", "Proposed"]
+    assert name_runs([proposed, second], paths) == ["Proposed, seed 0", "Proposed, seed 1"]
+    assert name_runs([proposed, second], paths, seeds_apart=False) == ["Proposed", "Proposed"]
+    assert name_runs([proposed, free], paths) == ["a", "b"]
+    assert name_runs([proposed, free], paths, seeds_apart=False) == ["a", "b"]
+    assert name_runs([proposed, proposed], paths) == ["a", "b"]
+    chair = dataclasses.replace(proposed, category="chair")
+    assert name_runs([proposed, chair], paths) == ["Proposed", "Proposed"]
+    assert name_runs([proposed, chair], paths, ["x", "y"]) == ["x", "y"]
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "best.safetensors").touch()
+    assert name_runs([proposed, proposed], [tmp_path / "a" / "best.safetensors", tmp_path / "b"]) == ["a/best", "b"]

@@ -1,0 +1,91 @@
+"""Whole files or nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from learn3d.files import writing
+
+
+def test_files_are_replaced_whole(tmp_path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("a much longer content than the new one")
+    writing.write_json(path, {"name": [1, None]})
+    assert json.loads(path.read_text()) == {"name": [1, None]}
+    writing.write_bytes(path, b"x")
+    assert path.read_bytes() == b"x"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("sync", [False, True])
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path, sync: bool) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+    with pytest.raises(OSError, match="disk full"), writing.replacing(path, sync=sync) as temporary:
+        assert temporary.parent == tmp_path
+        temporary.write_bytes(b"ne")
+        raise OSError("disk full")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_disk_without_room_names_the_file(tmp_path) -> None:
+    (tmp_path / ".a.json.partial").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=r"No space left on device: '.*/a\.json'"):
+        writing.write_json(tmp_path / "a.json", {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sync_comes_before_the_new_name(tmp_path, monkeypatch) -> None:
+    calls = []
+    replace = os.replace
+    monkeypatch.setattr(os, "fsync", lambda number: calls.append("fsync"))
+    monkeypatch.setattr(os, "replace", lambda a, b: (calls.append("replace"), replace(a, b)))
+    with writing.replacing(tmp_path / "a", sync=True) as temporary:
+        Path(temporary).write_bytes(b"x")
+    assert calls == ["fsync", "replace", "fsync"], "the content, the name, the folder that holds the name"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs /dev/null")
+def test_devices_and_folders_are_not_replaced(tmp_path) -> None:
+    for path in (Path("/dev/null"), tmp_path):
+        with pytest.raises(OSError, match="is no plain file and is not replaced"):
+            writing.write_json(path, {})
+    assert Path("/dev/null").is_char_device()
+
+
+def test_a_target_is_checked_before_the_work(tmp_path, monkeypatch) -> None:
+    writing.check_target(tmp_path / "t.json", "--json")
+    writing.check_target_folder(tmp_path / "a" / "b", "--output")
+    monkeypatch.chdir(tmp_path)
+    writing.check_target(Path("t.json"), "--json")
+    writing.check_target_folder(Path("a/b"), "--output")
+    assert list(tmp_path.iterdir()) == [], "nothing is made"
+    (tmp_path / "file").touch()
+    for check, name, message in (
+        (
+            writing.check_target,
+            "a/t.json",
+            "cannot write .*t.json: there is no folder .*a; make it",
+        ),
+        (writing.check_target, ".", "is no plain file and is not replaced; give another --x"),
+        (writing.check_target, "file/t.json", "there is no folder .*file; make it"),
+        (writing.check_target_folder, "file", "into the folder .*file: .*file is no folder; give another --x"),
+        (writing.check_target_folder, "file/a/b", "into the folder .*b: .*file is no folder; give another --x"),
+    ):
+        with pytest.raises(OSError, match=message):
+            check(tmp_path / name, "--x")
+
+    def refuse(**_: object) -> None:
+        raise PermissionError(13, "Permission denied", ".tmp8")
+
+    monkeypatch.setattr(writing.tempfile, "TemporaryFile", refuse)
+    with pytest.raises(OSError, match=r"^cannot write .*t.json: Permission denied; give another --json$"):
+        writing.check_target(tmp_path / "t.json", "--json")
+    with pytest.raises(OSError, match=r"^cannot write into the folder .*a: Permission denied; give another --output$"):
+        writing.check_target_folder(tmp_path / "a", "--output")

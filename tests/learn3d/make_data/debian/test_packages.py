@@ -1,0 +1,129 @@
+"""Packages: found, downloaded, read, refused."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+from fuzz_meshes import deb_bytes
+from memory_checks import at_most
+from small_packages import CHAIR, catalogue, deb, entry, fetch
+
+from learn3d.files import limits
+from learn3d.make_data.debian import packages as packages
+
+
+def test_unsafe_members_are_refused(debs: Path, tmp_path: Path):
+    deb(debs, "sweethome3d-furniture", {"../../evil.sh3f": b""})
+    with pytest.raises(ValueError, match=r"refused: its member '\.\./\.\./evil\.sh3f' points outside"):
+        fetch(tmp_path / "out", debs)
+    sh3f = catalogue([entry("Chair", "chair")], {"m/../../evil.obj": CHAIR})
+    deb(debs, "sweethome3d-furniture", {"usr/Test.sh3f": sh3f})
+    with pytest.raises(ValueError, match=r"Test\.sh3f is refused"):
+        fetch(tmp_path / "out", debs)
+
+
+def test_oversized_members_are_refused(debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(limits, "PACKAGE_FILE_BYTES", 100)
+    with pytest.raises(ValueError, match=r"bytes, at most 100 are read"):
+        fetch(tmp_path / "out", debs)
+    with zipfile.ZipFile(io.BytesIO(), "w") as archive:
+        archive.writestr("m", b"x")
+        archive.getinfo("m").file_size = limits.CATALOGUE_MEMBER_BYTES + 1
+        with pytest.raises(ValueError, match="refused"):
+            packages.read_member(archive, "m")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b"", "not a Debian package"), (b"!<arch>\n", "no data.tar"), (None, "cannot be read as a Debian package")],
+)
+def test_damaged_packages(debs: Path, tmp_path: Path, content: bytes | None, message: str):
+    file = next(debs.glob("flightgear*"))
+    file.write_bytes(file.read_bytes()[:-200] if content is None else content)
+    with pytest.raises(ValueError, match=message):
+        fetch(tmp_path / "out", debs, categories=("airplane",))
+
+
+def test_missing_and_doubled_packages(debs: Path, tmp_path: Path):
+    deb(debs, "flightgear-data-ai", {}, version="3")
+    with pytest.raises(ValueError, match="several versions of flightgear-data-ai"):
+        fetch(tmp_path / "out", debs)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="apt-get download sweethome3d-furniture"):
+        fetch(tmp_path / "out", tmp_path / "empty")
+
+
+def test_download_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(packages.shutil, "which", lambda name: None)
+    with pytest.raises(ValueError, match="--packages-dir"):
+        fetch(tmp_path / "out", None)
+    monkeypatch.setattr(packages.shutil, "which", lambda name: name)
+    answer = subprocess.CompletedProcess([], 100, "", "W: x\nE: Unable to locate package p\n")
+    monkeypatch.setattr(packages.subprocess, "run", lambda *args, **kwargs: answer)
+    with pytest.raises(ValueError, match=r"\(Unable to locate package p\); run `apt-get update` as root first"):
+        fetch(tmp_path / "out", None)
+    with pytest.raises(packages.PackageMissing, match="non-free"):
+        packages.download_package("sweethome3d-furniture-nonfree", tmp_path)
+
+
+def test_download_finds_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def run(command, cwd, **kwargs):
+        deb(cwd, command[-1], {})
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(packages.shutil, "which", lambda name: name)
+    monkeypatch.setattr(packages.subprocess, "run", run)
+    assert packages.download_package("flightgear-data-ai", tmp_path).version == "1:2.0-1"
+
+
+def test_archives_that_lead_astray_are_refused(debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refused(message: str) -> None:
+        with pytest.raises(ValueError, match=message):
+            fetch(tmp_path / "out", debs, categories=("chair",))
+
+    file = deb(debs, "sweethome3d-furniture", {"usr/x.sh3f": catalogue([], {})})
+    content = file.read_bytes()
+    at = content.index(b"control.tar")
+    for size in (b"-60       ", b"1e9       ", b"          "):  # the first would be read for ever
+        file.write_bytes(content[: at + 48] + size + content[at + 58 :])
+        refused("its member 'control.tar.xz' has no size")
+    file.write_bytes(content)
+    monkeypatch.setattr(limits, "PACKAGE_MEMBERS", 0)
+    refused("it has more than 0 members")
+    monkeypatch.undo()
+    monkeypatch.setattr(limits, "PACKAGE_BYTES", 5000)
+    refused("unpacks to more than its headers say, or than 5000 bytes")
+    monkeypatch.undo()
+    monkeypatch.setattr(limits, "PACKAGE_WANTED_BYTES", 50)
+    refused("sweethome3d-furniture is refused: its files .sh3f have more than 50 bytes")
+    if hasattr(os, "mkfifo"):
+        file.unlink()
+        os.mkfifo(file)
+        refused("it is no plain file; expected a Debian package")
+
+
+def test_a_tar_header_that_unpacks_to_very_much_is_not_kept(debs: Path, tmp_path: Path):
+    """A long name of 100 MB takes 15 kB in the package, and tarfile would hold all of it."""
+    data = io.BytesIO()
+    with tarfile.open(fileobj=data, mode="w:xz", format=tarfile.GNU_FORMAT) as tar:
+        tar.addfile(tarfile.TarInfo("n" * 100_000_000))
+    file = deb(debs, "sweethome3d-furniture", {})
+    content = file.read_bytes()
+    start, packed = content.index(b"data.tar"), data.getvalue()
+    file.write_bytes(content[:start] + f"{'data.tar.xz':<48}{len(packed):<10}`\n".encode() + packed)
+    assert len(packed) < 100_000
+    with at_most(2**25), pytest.raises(ValueError, match="unpacks to more than its headers say"):
+        fetch(tmp_path / "out", debs, categories=("chair",))
+
+
+@pytest.mark.parametrize("kind", ["gz", "bz2", "xz"])
+def test_packages_of_every_compression_are_read(tmp_path: Path, kind: str):
+    (tmp_path / "p_1_all.deb").write_bytes(deb_bytes({"usr/a.ac": b"1" * 30_000, "usr/b.ac": b"2"}, kind))
+    found = dict(packages.read_package(packages.find_package("p", tmp_path), (".ac",)))
+    assert found == {"usr/a.ac": b"1" * 30_000, "usr/b.ac": b"2"}

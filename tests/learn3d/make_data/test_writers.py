@@ -1,0 +1,286 @@
+"""Every layout against its description: masks and voxels are those of the TRUE mesh under the numbers in its files.
+
+Nothing here goes through our readers, and wherever the description is in right-handed world coordinates, so is the
+test: cameras are OpenCV's, the object frame and LookAt do not occur.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from lopsided_meshes import make, write_meshes
+from PIL import Image
+from scipy.io import loadmat
+from scipy.spatial.transform import Rotation
+
+import nmr
+from learn3d.data import conventions
+from learn3d.data.readers.kato import mesh_to_object
+from learn3d.make_data.writers import RenderedObject
+from learn3d.make_data.writers.r2n2 import binvox_bytes
+
+SYNSET = "03001627"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return write_meshes(tmp_path_factory.mktemp("meshes"))
+
+
+def true_mesh(folder: Path, name: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Vertices float64 [V, 3] in the mesh's right-handed frame (x front, y up), box centred, longest side 1; faces."""
+    (path,) = (p for p in folder.iterdir() if p.stem.replace(" ", "_") in name)
+    mesh = trimesh.load(path, force="mesh", process=False)
+    vertices = (mesh.vertices - mesh.bounds.mean(axis=0)) / mesh.extents.max()
+    return torch.from_numpy(np.asarray(vertices)), torch.from_numpy(np.asarray(mesh.faces))
+
+
+def in_object_frame(vertices: torch.Tensor) -> torch.Tensor:
+    return (vertices @ torch.from_numpy(mesh_to_object("y", "x").T)).float()
+
+
+def silhouette(vertices, faces, camera, size, anti_aliasing=True) -> np.ndarray:
+    alpha = nmr.render_silhouette(vertices.float(), faces, camera, image_size=size, anti_aliasing=anti_aliasing)
+    return np.rint(255 * alpha[0].numpy())
+
+
+def assert_same_mask(stored: np.ndarray, wanted: np.ndarray) -> None:
+    """Equal but for a few subpixels on the edge, which the rounding of another camera model moves."""
+    assert (stored > 0).any() and (stored == 0).any()
+    assert (stored != wanted).mean() < 5e-4 and np.abs(stored - wanted).max() <= 64, (stored != wanted).mean()
+
+
+def assert_oriented(voxels: np.ndarray, vertices: torch.Tensor, faces: torch.Tensor, span: float) -> None:
+    """Of all 48 orientations of the grid, the one it has agrees best with the mesh; axes as the vertices'.
+
+    vertices: in the axes of the grid, which spans [-span / 2, span / 2].
+    """
+    boxes = [part.bounds for part in trimesh.Trimesh(vertices.numpy(), faces.numpy()).split()]
+    centers = (np.indices((32,) * 3).reshape(3, -1).T + 0.5) / 32 * span - span / 2
+    inside = np.any([((low < centers) & (centers < high)).all(axis=1) for low, high in boxes], axis=0)
+    inside = inside.reshape((32,) * 3)
+    scores = {}
+    for order in itertools.permutations(range(3)):
+        for flips in itertools.product((1, -1), repeat=3):
+            other = inside.transpose(order)[:: flips[0], :: flips[1], :: flips[2]]
+            scores[order, flips] = (other & voxels).sum() / (other | voxels).sum()
+    assert max(scores, key=scores.get) == ((0, 1, 2), (1, 1, 1)) and scores[(0, 1, 2), (1, 1, 1)] > 0.75
+
+
+def test_dvr(tmp_path, folder):
+    make(tmp_path, folder, "dvr", test=1)
+    root = tmp_path / SYNSET
+    train, test = ((root / f"softras_{split}.lst").read_text().split() for split in ("train", "test"))
+    assert len(train) == 4 and len(test) == 1 and not (root / "softras_val.lst").exists()
+    name = test[0]
+    vertices, faces = true_mesh(folder, name)
+    cameras = np.load(root / name / "cameras.npz")
+    to_pixels = np.array([[32, 0, 32], [0, 32, 32], [0, 0, 1.0]])
+    for k in range(24):
+        world, camera = cameras[f"world_mat_{k}"], cameras[f"camera_mat_{k}"]
+        assert np.linalg.det(world[:3, :3]) == pytest.approx(1) and world.shape == (4, 4)
+        assert camera[0, 0] * 32 == pytest.approx(1.8660254 * 64)
+        opencv = nmr.cameras.from_opencv(
+            to_pixels @ camera[:3, :3], world[:3, :3], world[:3, 3], height=64, width=64, pixel_center=0.5
+        )
+        mask = np.asarray(Image.open(root / name / "mask" / f"{k:04d}.png")).astype(float)
+        assert_same_mask(mask, silhouette(vertices, faces, opencv, 64))
+        image = np.asarray(Image.open(root / name / "image" / f"{k:04d}.png"))
+        assert image.shape == (64, 64, 3) and (image[mask == 0] == 255).all() and (image[mask == 255] < 255).any()
+    # file k is at azimuth 15 k of Kato's Blender scene: from the front, x, at 0, and seen from -z at 90 degrees
+    eye = -cameras["world_mat_6"][:3, :3].T @ cameras["world_mat_6"][:3, 3]
+    cos, sin = np.cos(np.deg2rad(30)), np.sin(np.deg2rad(30))
+    np.testing.assert_allclose(eye, 2.732 * np.array([0, sin, cos]), atol=1e-5)
+    cloud = np.load(root / name / "pointcloud.npz")
+    mesh = trimesh.Trimesh(vertices.numpy(), faces.numpy())
+    _, distance, _ = trimesh.proximity.closest_point_naive(mesh, cloud["points"][:200])
+    assert cloud["points"].shape == cloud["normals"].shape == (10_000, 3) and distance.max() < 1e-5
+    assert np.abs(np.linalg.norm(cloud["normals"], axis=1) - 1).max() < 1e-4
+
+
+def test_kar(tmp_path, folder):
+    make(tmp_path, folder, "kar", test=1, val=1, views=3)
+    splits = json.loads((tmp_path / "splits.json").read_text())[SYNSET]
+    assert splits["name"] == "chair" and [len(splits[s]) for s in ("train", "val", "test")] == [3, 1, 1]
+    elevations = []
+    for name in splits["test"] + splits["val"]:
+        vertices, faces = true_mesh(folder, name)
+        volume = loadmat(tmp_path / "voxels" / "modelVoxels32" / SYNSET / f"{name}.mat")["Volume"] > 0
+        wanted = conventions.KAR.voxelize(in_object_frame(vertices), faces)[0].numpy()
+        np.testing.assert_array_equal(volume, wanted)
+        x, y, z = in_object_frame(vertices).T
+        assert_oriented(volume, torch.stack([-z, y, x], dim=1), faces, span=1)
+        root = tmp_path / "renders" / SYNSET / name
+        rows = [[float(word) for word in line.split()] for line in (root / "view.txt").read_text().splitlines()]
+        assert len(rows) == 3 and all(
+            len(row) == 4 and row[2] == 0 and -180 <= row[0] < 180 and -20 <= row[1] < 40 for row in rows
+        )
+        elevations += [row[1] for row in rows]
+        for i, (azimuth, elevation, _, distance) in enumerate(rows):
+            camera = nmr.LookAt.from_angles([distance], [elevation], [azimuth], half_fov_deg=14.9314)
+            rgba = np.asarray(Image.open(root / f"render_{i}.png")).astype(float)
+            assert rgba.shape == (224, 224, 4)
+            assert_same_mask(rgba[..., 3], silhouette(in_object_frame(vertices), faces, camera, 224))
+            assert (rgba[rgba[..., 3] == 0] == 0).all() and rgba[rgba[..., 3] > 0][:, :3].min() > 20
+            border = np.concatenate([rgba[[0, -1], :, 3], rgba[:, [0, -1], 3].T])
+            assert (border == 0).all()  # the whole object is seen
+            depth = np.asarray(Image.open(root / f"depth_{i}.png"))
+            hard = silhouette(in_object_frame(vertices), faces, camera, 224, anti_aliasing=False)
+            assert depth.dtype == np.uint8 and depth.shape == (224, 224) and depth.max() == 255
+            assert_same_mask(255.0 * (depth < 250), hard)
+            true_depth = nmr.render_depth(
+                in_object_frame(vertices), faces, camera, image_size=224, anti_aliasing=False
+            )[0].numpy()
+            seen = (depth < 250) & (hard > 0)
+            np.testing.assert_allclose(depth[seen] / 240 * 1.8 + distance - 0.9, true_depth[seen], atol=0.005)
+            matrices = loadmat(root / f"camera_{i}.mat")
+            rotation, offset = matrices["extrinsic"][:, :3], matrices["extrinsic"][:, 3]
+            opencv = nmr.cameras.from_opencv(matrices["K"], rotation, offset, height=224, width=224, pixel_center=0.5)
+            assert_same_mask(rgba[..., 3], silhouette(vertices, faces, opencv, 224))
+            quaternion = Rotation.from_quat(np.roll(matrices["quat"].reshape(4), -1))
+            np.testing.assert_allclose(quaternion.as_matrix(), rotation, atol=1e-6)
+    assert np.ptp(elevations) > 5
+
+
+def read_binvox(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
+    """Grid [x, y, z], translate and scale of a binvox file, by the letter of its specification."""
+    head, _, runs = path.read_bytes().partition(b"data\n")
+    lines = dict(line.split(maxsplit=1) for line in head.decode().splitlines()[1:])
+    values = np.repeat(list(runs[::2]), list(runs[1::2]))
+    grid = np.zeros((32,) * 3, dtype=bool)
+    for number in np.flatnonzero(values):  # index = x * 32 * 32 + z * 32 + y
+        grid[number // 1024, number % 32, number // 32 % 32] = True
+    return grid, np.array(lines["translate"].split(), dtype=float), float(lines["scale"])
+
+
+def test_r2n2(tmp_path, folder):
+    report = make(tmp_path, folder, "r2n2", views=3, test=None, val=None)
+    assert report.objects == {"train": 4, "test": 1}
+    names = sorted(path.name for path in (tmp_path / "ShapeNetRendering" / SYNSET).iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "ShapeNetVox32" / SYNSET).iterdir())
+    card = json.loads((tmp_path / f"{SYNSET}_card.json").read_text())
+    assert card["splits"]["test"][0].removesuffix(".ply").replace(" ", "_") == names[4][6:]  # last of the sorted ids
+    for name in names[:2]:
+        vertices, faces = true_mesh(folder, name)
+        side = 1 / np.linalg.norm(np.ptp(vertices.numpy(), axis=0))  # ShapeNet's: the diagonal is 1
+        grid, translate, scale = read_binvox(tmp_path / "ShapeNetVox32" / SYNSET / name / "model.binvox")
+        assert scale == pytest.approx(side) and translate == pytest.approx([-side / 2] * 3)
+        assert_oriented(grid, vertices, faces, span=1)  # axes x, y, z of the mesh, the cube around it
+        x, y, z = in_object_frame(vertices).T
+        scaled = torch.stack([x, y, z], dim=1) * 31 / 32 + 0.5
+        wanted = nmr.voxelize(scaled, faces)[0].numpy().transpose(2, 1, 0)[::-1, :, ::-1]  # (-z, y, -x)
+        np.testing.assert_array_equal(grid, wanted)
+        root = tmp_path / "ShapeNetRendering" / SYNSET / name / "rendering"
+        rows = [[float(word) for word in line.split()] for line in (root / "rendering_metadata.txt").open()]
+        assert len(rows) == 3
+        for k, (azimuth, elevation, yaw, ratio, fov) in enumerate(rows):
+            assert 0 <= azimuth < 360 and 25 <= elevation < 30 and yaw == 0 and 0.65 <= ratio < 0.95 and fov == 25
+            a, e = np.deg2rad([azimuth, elevation])
+            eye = 1.75 * ratio * np.array([np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)])
+            forward = -eye / np.linalg.norm(eye)
+            right = np.cross(forward, [0, 1, 0]) / np.cos(e)
+            rotation = np.stack([right, np.cross(forward, right), forward])
+            focal = 2.1875 * 137 / 2
+            pixels = [[focal, 0, 68.5], [0, focal, 68.5], [0, 0, 1]]
+            opencv = nmr.cameras.from_opencv(pixels, rotation, -rotation @ eye, height=137, width=137, pixel_center=0.5)
+            rgba = np.asarray(Image.open(root / f"{k:02d}.png")).astype(float)
+            assert rgba.shape == (137, 137, 4)
+            assert_same_mask(rgba[..., 3], silhouette(vertices * side, faces, opencv, 137))
+
+
+def test_colours_are_unmixed_from_white_and_mixed_with_backgrounds():
+    rng = np.random.default_rng(0)
+    color, alpha = rng.integers(0, 256, (2, 8, 8, 3)), rng.choice([0, 64, 128, 191, 255], (2, 8, 8)).astype(np.uint8)
+    share = alpha[..., None] / 255
+    rgb = np.rint(color * share + 255 * (1 - share)).astype(np.uint8)
+    item = RenderedObject("a", "train", None, None, None, rgb, alpha, None, rng)
+    rgba = item.rgba()
+    assert rgba.dtype == np.uint8 and (rgba[..., 3] == alpha).all() and (rgba[alpha == 0] == 0).all()
+    assert np.abs(rgba[..., :3].astype(int) - color)[alpha >= 128].max() <= 2
+    background = rng.integers(0, 256, rgb.shape).astype(np.uint8)
+    wanted = color * share + background * (1 - share)
+    assert np.abs(item.over(background) - wanted).max() <= 1.01
+    np.testing.assert_array_equal(item.over(np.full_like(rgb, 255)), rgb)
+
+
+def test_binvox_runs_are_at_most_255_long():
+    grid = np.zeros((32, 32, 32), dtype=bool)
+    grid[3, 4, 5] = True
+    content = binvox_bytes(grid, [0.0, 0.5, -0.25], 2.0)
+    head, _, runs = content.partition(b"data\n")
+    assert head == b"#binvox 1\ndim 32 32 32\ntranslate 0 0.5 -0.25\nscale 2\n"
+    position = 3 * 1024 + 5 * 32 + 4  # y runs fastest
+    assert runs[:28] == bytes([0, 255]) * 12 + bytes([0, position - 12 * 255, 1, 1])
+    assert sum(runs[1::2]) == 32**3 and set(runs[::2]) == {0, 1}
+    empty = binvox_bytes(np.zeros((32, 32, 32), dtype=bool), [0, 0, 0], 1).partition(b"data\n")[2]
+    assert empty == bytes([0, 255]) * (32**3 // 255) + bytes([0, 32**3 % 255])
+
+
+def test_pascal3d(tmp_path, folder):
+    report = make(tmp_path, folder, "pascal3d", views=3, test=None, val=1)
+    assert report.objects == {"train": 4, "val": 1}
+    files = {name: np.load(tmp_path / f"chair_{name}.npz", allow_pickle=True) for name in ("train", "imagenet", "val")}
+    assert [len(files[name]["images_ref"]) for name in files] == [6, 6, 3]
+    val = files["val"]
+    assert val["images"].dtype == object and len({image.shape for image in val["images"]}) == 3
+    assert val["images_ref"].shape == (3, 224, 224, 4) and val["images_ref"].dtype == np.uint8
+    card = json.loads((tmp_path / f"{SYNSET}_card.json").read_text())
+    vertices, faces = true_mesh(folder, card["splits"]["val"][0].replace(" ", "_"))
+    vertices = vertices * (2 / torch.linalg.vector_norm(vertices.amax(0) - vertices.amin(0)))
+    assert torch.linalg.vector_norm(vertices, dim=1).max() <= 1 + 1e-6  # inside under any rotation
+    wanted = conventions.PASCAL3D.voxelize(vertices.float(), faces)[0].numpy()
+    for k in range(3):
+        np.testing.assert_array_equal(val["voxels"][k], wanted)
+        rotation = val["rotation_matrices"][k].astype(np.float64)
+        assert np.linalg.det(rotation) == pytest.approx(1) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+        x, y, z = torch.from_numpy(rotation) @ vertices.T
+        seen = torch.stack([-x, y, z + 2], dim=1)  # x' points left in the image, and depth moves nothing
+        mask = val["images_ref"][k, ..., 3].astype(float)
+        assert_same_mask(mask, silhouette(seen, faces, None, 224))
+        # the box of the photograph holds what the mask of the reference holds
+        left, top, width, height = val["bounding_boxes"][k]
+        photo = val["images"][k]
+        assert photo.dtype == np.uint8 and left >= 0 and left + width <= photo.shape[1]
+        assert top >= 0 and top + height <= photo.shape[0]
+        rows, columns = (np.flatnonzero((mask > 127).any(axis=axis)) for axis in (1, 0))
+        box = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
+        parts = [Image.fromarray(val["images_ref"][k, ..., :3]).crop(box)]
+        parts.append(Image.fromarray(photo).crop((left, top, left + width, top + height)))
+        small = [np.asarray(part.resize((24, 24), Image.Resampling.BOX)).astype(float) for part in parts]
+        assert np.abs(small[0] - small[1]).mean() < 10
+        assert photo[: max(1, top)].std() > 3  # a background, not paper
+    x, y, z = vertices.T
+    assert_oriented(val["voxels"][0], torch.stack([-x, -z, -y], dim=1), faces, span=2)
+
+
+def test_photos(tmp_path, folder):
+    make(tmp_path, folder, "photos", views=2, test=1)
+    with open(tmp_path / "chair" / "poses.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 10 and [row["split"] for row in rows].count("test") == 2
+    assert len({row["fov_deg"] for row in rows}) == 10  # each by another lens
+    assert sorted(row["file"] for row in rows) == sorted(p.name for p in (tmp_path / "chair" / "images").iterdir())
+    for row in rows[:4]:
+        vertices, faces = true_mesh(folder, row["object"])
+        azimuth, elevation, distance, fov = (
+            float(row[name]) for name in ("azimuth_deg", "elevation_deg", "distance", "fov_deg")
+        )
+        a, e = np.deg2rad([azimuth, elevation])  # anti-clockwise from the front, seen from above: x is front, -z right
+        eye = distance * np.array([np.cos(e) * np.cos(a), np.sin(e), -np.cos(e) * np.sin(a)])
+        forward = -eye / np.linalg.norm(eye)
+        right = np.cross(forward, [0, 1, 0]) / np.cos(e)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        focal = 128 / np.tan(np.deg2rad(fov / 2))
+        pixels = [[focal, 0, 128], [0, focal, 128], [0, 0, 1]]
+        opencv = nmr.cameras.from_opencv(pixels, rotation, -rotation @ eye, height=256, width=256, pixel_center=0.5)
+        mask = np.asarray(Image.open(tmp_path / "chair" / "masks" / row["file"])).astype(float)
+        assert_same_mask(mask, silhouette(vertices, faces, opencv, 256))
+        image = np.asarray(Image.open(tmp_path / "chair" / "images" / row["file"]))
+        assert image.shape == (256, 256, 3) and image[mask == 0].std() > 5

@@ -1,0 +1,331 @@
+"""View prior learning: each of its forms learns, and the discriminator plays by its rules."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+import nmr
+from learn3d.config import check_fields
+from learn3d.data.batch import Batch
+from learn3d.data.conventions import KATO
+from learn3d.data.dataset import ViewDataset
+from learn3d.data.poses import LookAtPoses, RotationPoses
+from learn3d.losses import silhouette_pyramid_loss
+from learn3d.methods import create_method
+from learn3d.methods import vpl as vpl_module
+from learn3d.methods.method import DataShape
+from learn3d.methods.vpl import VPL, VPLSettings, other_views
+from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
+from learn3d.networks.preact_resnet import PreactResNet18
+from learn3d.presets import PRESETS
+
+VPL_PRESETS = [name for name, preset in PRESETS.items() if isinstance(preset.settings, VPLSettings)]
+REIMPLEMENTED = VPLSettings(discriminator_channels=8, lambda_discriminator=0.1, learning_rate=1e-3)
+SMALL = {
+    "image_size": 32,
+    "silhouette_size": 64,
+    "discriminator_channels": 8,
+    "learning_rate": 2e-3,
+}
+SHAPENET = replace(PRESETS["kato2019-kar"].settings, **SMALL)
+SHAPENET_CLASS = replace(PRESETS["kato2019-kar-class"].settings, **SMALL)
+PASCAL = replace(PRESETS["kato2019-pascal"].settings, **SMALL, encoder="preact-resnet18", object_scale=0.6)
+FORMS = {"reimplemented": REIMPLEMENTED, "shapenet": SHAPENET, "class": SHAPENET_CLASS, "pascal": PASCAL}
+SHAPE = DataShape(num_views=3, num_classes=2)
+
+
+class NarrowEncoder(nn.Module):
+    """In place of ConvEncoder, for speed."""
+
+    image_size = 64
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.AvgPool2d(8), nn.Flatten(), nn.Linear(256, 512))
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return self.layers(images)
+
+
+@pytest.fixture(autouse=True)
+def narrow_networks(monkeypatch) -> None:
+    """The published widths are tested in test_networks_*; a step takes a second with them."""
+    monkeypatch.setitem(vpl_module.ENCODERS, "conv", NarrowEncoder)
+    monkeypatch.setattr(vpl_module, "PreactResNet18", partial(PreactResNet18, channels=8))
+    monkeypatch.setattr(vpl_module, "ConvCubeGenerator", partial(ConvCubeGenerator, channels=64))
+    monkeypatch.setattr(vpl_module, "LinearCubeGenerator", partial(LinearCubeGenerator, channels=128))
+
+
+def make_batch(image_size: int, count: int = 2, rotations: bool = False) -> Batch:
+    """Boxy ellipsoids at two views, of two categories."""
+    sphere, faces = nmr.icosphere(2)
+    sizes = torch.tensor([[0.4, 0.2, 0.2], [0.2, 0.4, 0.3], [0.3, 0.3, 0.3], [0.1, 0.3, 0.4]])[:count]
+    if rotations:
+        poses = RotationPoses(torch.linalg.qr(torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0)))[0])
+    else:
+        poses = LookAtPoses(torch.tensor([30.0, 120.0, 30.0, 250.0])[:count], 30.0, 2.732, 15.0)
+    images, masks = (
+        nmr.render_silhouette(sphere * sizes[:, None], faces, poses.cameras(), image_size=size) * 255
+        for size in (image_size, 64)
+    )
+    colors = images[:, None] * torch.tensor([0.3, 0.6, 0.9])[:, None, None]
+    return ViewDataset(
+        category="a,b",
+        split="train",
+        images=torch.cat([colors, images[:, None]], dim=1).byte().numpy(),
+        poses=poses,
+        view_ids=np.array([0, 1, 0, 2])[:count],
+        view_names=("0", "1", "2"),
+        object_ids=np.arange(count),
+        object_names=tuple("abcd"[:count]),
+        voxels=None,
+        convention=KATO,
+        masks=masks.byte().numpy(),
+        class_ids=np.array([0, 1, 0, 0])[:count],
+        class_names=("a", "b"),
+    ).batch(torch.arange(count))
+
+
+def create(settings: VPLSettings, **shape: int) -> VPL:
+    return create_method(settings, replace(SHAPE, **shape), device="cpu", precision="fp32", seed=0)
+
+
+def state_of(network: torch.nn.Module) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in network.state_dict().items()}
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_few_steps_lower_the_projection_loss(form: str) -> None:
+    settings = FORMS[form]
+    rotations = form == "pascal"
+    method = create(settings, pose_features=9 if rotations else 3)
+    batch = make_batch(settings.image_size, rotations=rotations)
+    steps = 20 if form == "reimplemented" else 14
+    losses = [method.train_step(batch, step)["projection"] for step in range(1, steps + 1)]
+    assert losses[-1] < 0.8 * losses[0], losses
+    method.set_training(False)
+    codes = method.encode(batch.images)
+    meshes = method.decode(codes)
+    assert codes.shape == (2, 512)
+    assert codes.dtype == torch.float32
+    assert meshes.vertices.shape == (2, 642 if form == "reimplemented" else 1352, 3)
+    assert meshes.faces.max() < meshes.vertices.shape[1]
+    assert torch.equal(method.encode(batch.images[:1]), codes[:1]) or torch.allclose(
+        method.encode(batch.images[:1]), codes[:1], atol=1e-5
+    )
+
+
+def test_bf16_and_wider_batches_take_steps() -> None:
+    for settings in (REIMPLEMENTED, SHAPENET_CLASS):
+        method = create_method(settings, SHAPE, device="cpu", precision="bf16", seed=0)
+        for step in (1, 2):
+            losses = method.train_step(make_batch(settings.image_size, 3), step)
+            assert all(np.isfinite(list(losses.values())))
+
+
+@pytest.mark.parametrize("form", ["reimplemented", "shapenet"])
+def test_training_repeats_itself(form: str) -> None:
+    runs = []
+    for _ in range(2):
+        method = create(FORMS[form])
+        runs.append([method.train_step(make_batch(FORMS[form].image_size, 4), step) for step in (1, 2)])
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize("form", ["reimplemented", "class"])
+def test_training_goes_on_from_its_saved_state(form: str) -> None:
+    batch = make_batch(FORMS[form].image_size, 4)
+    method, other = create(FORMS[form]), create(FORMS[form])
+    method.train_step(batch, 1)
+    for name, network in method.networks.items():
+        other.networks[name].load_state_dict(network.state_dict())
+        other.optimizers[name].load_state_dict(deepcopy(method.optimizers[name].state_dict()))
+    runs = []
+    for continued in (method, other):
+        torch.manual_seed(1)
+        runs.append([continued.train_step(batch, step) for step in (2, 3)])
+    assert runs[0] == runs[1]
+
+
+def test_alternating_steps_train_one_side() -> None:
+    method = create(REIMPLEMENTED)
+    batch = make_batch(64)
+    before, encoder = state_of(method.discriminator), state_of(method.encoder)
+    losses = method.train_step(batch, 1)
+    assert losses.keys() == {"projection", "smoothness", "discrimination", "total"}
+    after = state_of(method.discriminator)
+    assert not any(torch.equal(before[name], after[name]) for name in before if "bias" not in name)
+    assert not same(encoder, state_of(method.encoder))
+
+    encoder = state_of(method.encoder)
+    losses = method.train_step(batch, 2)
+    assert losses.keys() == {"projection", "smoothness", "adversarial", "total"}
+    assert same(after, state_of(method.discriminator))  # running averages too
+    assert all(parameter.grad is None for parameter in method.discriminator.parameters())
+    assert not same(encoder, state_of(method.encoder))
+
+
+def test_odd_steps_move_shapes_as_without_a_discriminator() -> None:
+    method, baseline = create(REIMPLEMENTED), create(replace(REIMPLEMENTED, lambda_discriminator=0.0))
+    assert "discriminator" not in baseline.networks
+    batch = make_batch(64)
+    losses, plain = method.train_step(batch, 1), baseline.train_step(batch, 1)
+    assert plain.keys() == {"projection", "smoothness", "total"}
+    assert losses["projection"] == plain["projection"]
+    for own, other in zip(method.generator.parameters(), baseline.generator.parameters(), strict=True):
+        torch.testing.assert_close(own.grad, other.grad)
+
+
+def test_even_steps_pull_the_other_view_towards_real() -> None:
+    """The gradient of an even step is that of projection + smoothness + lambda_D BCE(D(other view), 1)."""
+    batch = make_batch(64)
+    baseline, method = create(replace(REIMPLEMENTED, lambda_discriminator=0.0)), create(REIMPLEMENTED)
+    baseline.train_step(batch, 2)
+    losses = method.train_step(batch, 2)
+    adversary = create(REIMPLEMENTED)
+    vertices = adversary.generator(adversary.encoder(batch.images.float() / 255))
+    others = torch.tensor([1, 0])  # the only other view of each
+    fake = nmr.render_silhouette(vertices, adversary.generator.faces, batch.poses[others].cameras(), image_size=64)
+    logits = adversary.discriminator(fake, batch.view_ids[others])
+    adversarial = F.binary_cross_entropy_with_logits(logits, torch.ones(2))
+    assert losses["adversarial"] == pytest.approx(adversarial.item(), rel=1e-4)
+    (0.1 * adversarial).backward()
+    for full, plain, expected in zip(*(m.generator.parameters() for m in (method, baseline, adversary)), strict=True):
+        difference = (full.grad - plain.grad - expected.grad).norm()
+        assert difference < 1e-3 * expected.grad.norm()
+
+
+def test_reversal_gives_shapes_minus_lambda_times_and_the_discriminator_all() -> None:
+    """Gradients of one joint step, against the discrimination loss written out and differentiated plainly."""
+    batch = make_batch(32)
+    plain = create(SHAPENET)
+    images = batch.images.float() / 255
+    vertices = plain.generator(plain.encoder((2 * images[:, :3] - 1) * images[:, 3:]))
+    renderer = {"anti_aliasing": False, "gradient": "local"}
+    silhouettes = [
+        nmr.render_silhouette(vertices, plain.generator.faces, poses.cameras(), image_size=64, **renderer)
+        for poses in (batch.poses, batch.poses[torch.tensor([1, 0])])
+    ]
+    logits = [
+        plain.discriminator(image, poses.features())
+        for image, poses in zip(silhouettes, (batch.poses, batch.poses[torch.tensor([1, 0])]), strict=True)
+    ]
+    loss = F.softplus(-logits[0]).mean() + F.softplus(logits[1]).mean()
+    weights = [parameter for parameter in plain.discriminator.parameters() if parameter.requires_grad]
+    *of_weights, of_real, of_fake = torch.autograd.grad(loss, [*weights, *silhouettes], retain_graph=True)
+    projection = silhouette_pyramid_loss(silhouettes[0], batch.masks)
+    (of_projection,) = torch.autograd.grad(projection, silhouettes[0], retain_graph=True)
+    pressure = 1e-4 * nmr.losses.inflation_loss(vertices, plain.generator.faces)
+
+    for factor in (0.1, 0.7):
+        method = create(replace(SHAPENET, lambda_discriminator=factor))
+        losses = method.train_step(batch, 1)
+        assert losses.keys() == {"projection", "inflation", "discrimination", "total"}
+        assert losses["discrimination"] == pytest.approx(loss.item(), rel=1e-4)
+        own = [parameter.grad for parameter in method.discriminator.parameters() if parameter.requires_grad]
+        for gradient, expected in zip(own, of_weights, strict=True):
+            torch.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-5)
+        # The renderer's gradient is not linear in that of the images (only pixels that lower the loss pull): sum first.
+        of_images = [of_projection - factor * of_real, -factor * of_fake]
+        expected = torch.autograd.grad(
+            [*silhouettes, pressure], [plain.generator.base], [*of_images, torch.ones(())], retain_graph=True
+        )[0]
+        torch.testing.assert_close(method.generator.base.grad, expected, rtol=1e-3, atol=1e-4 * expected.abs().max())
+
+
+def test_other_views_are_random_ones_of_another_class() -> None:
+    batch = make_batch(32, 4)
+    torch.manual_seed(0)
+    drawn = torch.stack([other_views(batch, "random") for _ in range(200)])
+    assert (batch.view_ids[drawn] != batch.view_ids).all()
+    assert set(drawn[:, 0].tolist()) == {1, 3}
+    counts = torch.bincount(drawn[:, 1], minlength=4)
+    assert counts[1] == 0
+    assert (counts[[0, 2, 3]] > 40).all()  # 200 / 3 expected
+    torch.manual_seed(0)
+    assert torch.equal(other_views(batch, "random"), drawn[0])
+    alike = replace(batch, view_ids=torch.zeros(4, dtype=torch.int64))
+    assert other_views(alike, "random").max() < 4
+
+
+def test_other_views_as_published() -> None:
+    batch = make_batch(32, 4)  # categories 0, 1, 0, 0
+    assert other_views(batch, "reversed").tolist() == [3, 2, 1, 0]
+    assert other_views(batch, "next").tolist() == [2, 1, 3, 0]
+
+
+def test_input_mask_is_the_target_at_its_size() -> None:
+    settings = replace(SHAPENET, image_size=96, silhouette_size=96, lambda_discriminator=0.0)
+    batch = make_batch(96)
+    wrong = replace(batch, masks=torch.zeros(2, 64, 64))
+    losses = [create(settings).train_step(b, 1)["projection"] for b in (batch, wrong)]
+    assert losses[0] == losses[1]
+    faint = replace(batch, images=torch.where(batch.images == 0, 25, batch.images))  # 25 / 255 is below 0.1
+    method = create(settings)
+    method._encoder_input = lambda images: VPL._encoder_input(method, batch.images)
+    assert method.train_step(faint, 1)["projection"] == losses[0]
+
+
+def test_presets_of_vpl() -> None:
+    assert VPL_PRESETS == [
+        "peng2020-kato-vpl",
+        "kato2019-kar",
+        "kato2019-kar-class",
+        "kato2019-kar-baseline",
+        "kato2019-pascal",
+        "kato2019-pascal-baseline",
+    ]
+    for name in VPL_PRESETS:
+        preset = PRESETS[name]
+        check_fields(preset.settings)
+        assert isinstance(preset.settings, VPLSettings)
+        assert "published code" in preset.source
+    weights = {n: (PRESETS[n].iterations, PRESETS[n].settings.lambda_discriminator) for n in VPL_PRESETS}
+    assert weights == {
+        "peng2020-kato-vpl": (20_000, 1.0),
+        "kato2019-kar": (100_000, 0.1),
+        "kato2019-kar-class": (100_000, 0.2),
+        "kato2019-kar-baseline": (50_000, 0.0),
+        "kato2019-pascal": (80_000, 0.5),
+        "kato2019-pascal-baseline": (5_000, 0.0),
+    }
+
+
+@pytest.mark.parametrize(
+    ("settings", "shape", "message"),
+    [
+        (VPLSettings(image_size=224), {}, "encoder 'conv' takes images of 64 pixels, got image_size 224"),
+        (VPLSettings(silhouette_size=128), {}, r"silhouette_size must be 64, .* or image_size \(64\), got 128"),
+        (VPLSettings(pretrained="weights.pth"), {}, "weights are for the encoder 'resnet18', got encoder 'conv'"),
+        (VPLSettings(symmetric=True), {}, "symmetric needs a cube generator"),
+        (
+            VPLSettings(class_conditional=True),
+            {},
+            "class_conditional needs discriminator 'spectral-patch', got 'dcgan'",
+        ),
+        (SHAPENET_CLASS, {"num_classes": 1}, "class_conditional needs data of several categories, got one"),
+        (VPLSettings(), {"num_views": 1}, "tells views by their class and needs at least 2, got 1"),
+    ],
+)
+def test_contradictions_are_refused(settings: VPLSettings, shape: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        create(settings, **shape)
+
+
+def test_one_image_has_no_other_view() -> None:
+    settings = replace(SHAPENET, image_size=64)
+    with pytest.raises(ValueError, match="batches of at least 2, got 1"):
+        create(settings).train_step(make_batch(64, 1), 1)
+    assert "projection" in create(replace(settings, lambda_discriminator=0.0)).train_step(make_batch(64, 1), 1)

@@ -1,0 +1,208 @@
+"""ResNet-18: torchvision's names and shapes, its arithmetic written out slowly, and weights from files."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+from torch import Tensor
+
+from learn3d.files import limits
+from learn3d.methods.method import DataShape
+from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
+from learn3d.methods.vpl import VPL, VPLSettings
+from learn3d.networks import ENCODERS, network_input
+from learn3d.networks.resnet import IMAGENET_MEAN, IMAGENET_STD, ResNet18Encoder, load_pretrained
+
+
+def torchvision_names() -> dict[str, tuple[int, ...]]:
+    """Entries and shapes of torchvision's resnet18, the classification layer included."""
+
+    def norm(name: str, width: int) -> dict[str, tuple[int, ...]]:
+        vectors = {f"{name}.{part}": (width,) for part in ("weight", "bias", "running_mean", "running_var")}
+        return vectors | {f"{name}.num_batches_tracked": ()}
+
+    names = {"conv1.weight": (64, 3, 7, 7)} | norm("bn1", 64) | {"fc.weight": (1000, 512), "fc.bias": (1000,)}
+    inputs = 64
+    for layer, width in enumerate((64, 128, 256, 512), 1):
+        for block in (0, 1):
+            prefix = f"layer{layer}.{block}"
+            names |= {f"{prefix}.conv1.weight": (width, inputs, 3, 3), f"{prefix}.conv2.weight": (width, width, 3, 3)}
+            names |= norm(f"{prefix}.bn1", width) | norm(f"{prefix}.bn2", width)
+            if inputs != width:
+                names |= {f"{prefix}.downsample.0.weight": (width, inputs, 1, 1)} | norm(
+                    f"{prefix}.downsample.1", width
+                )
+            inputs = width
+    return names
+
+
+def random_weights(seed: int = 0, counters: bool = True) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    weights = {}
+    for name, shape in torchvision_names().items():
+        if name.endswith("num_batches_tracked"):
+            if counters:
+                weights[name] = torch.tensor(7)
+        elif name.endswith("running_var"):
+            weights[name] = torch.rand(shape, generator=generator) + 0.5
+        else:
+            scale = (2 / max(1, torch.tensor(shape[1:]).prod().item())) ** 0.5 if len(shape) > 1 else 0.2
+            weights[name] = scale * torch.randn(shape, generator=generator)
+    return weights
+
+
+def slow_resnet(images: Tensor, w: dict[str, Tensor]) -> Tensor:
+    """The published architecture as formulas on a state dict, in evaluation mode."""
+
+    def norm(x: Tensor, name: str) -> Tensor:
+        mean, var, weight, bias = (
+            w[f"{name}.{part}"][:, None, None] for part in ("running_mean", "running_var", "weight", "bias")
+        )
+        return (x - mean) / (var + 1e-5).sqrt() * weight + bias
+
+    x = images[:, :3] - torch.tensor([0.485, 0.456, 0.406])[:, None, None]
+    x = x / torch.tensor([0.229, 0.224, 0.225])[:, None, None]
+    x = norm(F.conv2d(x, w["conv1.weight"], stride=2, padding=3), "bn1").clamp(min=0)
+    x = F.max_pool2d(x, 3, stride=2, padding=1)
+    for layer in range(1, 5):
+        for block in (0, 1):
+            name, stride = f"layer{layer}.{block}", 2 if layer > 1 and block == 0 else 1
+            y = norm(F.conv2d(x, w[f"{name}.conv1.weight"], stride=stride, padding=1), f"{name}.bn1").clamp(min=0)
+            y = norm(F.conv2d(y, w[f"{name}.conv2.weight"], padding=1), f"{name}.bn2")
+            if stride == 2:
+                x = norm(F.conv2d(x, w[f"{name}.downsample.0.weight"], stride=2), f"{name}.downsample.1")
+            x = (x + y).clamp(min=0)
+    return x.flatten(2).mean(2)
+
+
+def test_names_and_shapes_are_torchvisions() -> None:
+    own = {name: tuple(value.shape) for name, value in ResNet18Encoder().state_dict().items()}
+    assert own == {name: shape for name, shape in torchvision_names().items() if not name.startswith("fc.")}
+    assert ENCODERS["resnet18"] is ResNet18Encoder and ResNet18Encoder.image_size == 224
+
+
+@pytest.mark.parametrize("form", ["pth", "pt, without counters", "safetensors"])
+def test_weights_from_a_file_give_the_published_networks_output(tmp_path: Path, form: str) -> None:
+    weights = random_weights(counters="without" not in form)
+    path = tmp_path / f"weights.{form.split(',')[0]}"
+    save_file(weights, path) if form == "safetensors" else torch.save(weights, path)
+    encoder = ResNet18Encoder()
+    load_pretrained(encoder, path)
+    images = torch.rand(2, 4, 64, 64)
+    with torch.no_grad():
+        codes = encoder.eval()(images)
+    assert codes.shape == (2, 512)
+    torch.testing.assert_close(codes, slow_resnet(images, weights), rtol=1e-3, atol=1e-3)
+    assert (codes >= 0).all() and codes.std() > 0.01
+    changed = images.clone()
+    changed[:, 3] = 0
+    assert torch.equal(encoder(images), encoder(changed))  # the mask is not looked at
+
+
+def test_it_takes_stored_images() -> None:
+    images = torch.randint(0, 256, (2, 4, 224, 224), dtype=torch.uint8)
+    with torch.no_grad():
+        assert ResNet18Encoder().eval()(network_input(images, "cpu", 224)).shape == (2, 512)
+    with pytest.raises(ValueError, match=r"images must be uint8 \[B, 4, 224, 224\]"):
+        network_input(images[:, :, :64, :64], "cpu", 224)
+
+
+@pytest.mark.parametrize("inverted", [True, False])
+@pytest.mark.parametrize("kind", ["pooled", "flat"])
+def test_it_sees_natural_colours_of_every_layout(kind: str, inverted: bool) -> None:
+    """A red pixel reaches the first convolution as ImageNet's red, whether it is stored as red or as 255 - red."""
+    stored = torch.zeros(1, 4, 224, 224, dtype=torch.uint8)
+    stored[:, 0], stored[:, 3] = 255, 255
+    stored[:, :3] = 255 - stored[:, :3] if inverted else stored[:, :3]
+    shape = DataShape(3, inverted=inverted)
+    if kind == "flat":
+        method = VPL(VPLSettings(encoder="resnet18", image_size=224), shape, "cpu", "fp32")
+        convolution = method.encoder.resnet.conv1
+    else:
+        method = PoseInvariant(PoseInvariantSettings(encoder="resnet18"), shape, "cpu", "fp32")
+        convolution = method.encoder.conv1
+    seen = []
+    convolution.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
+    with torch.no_grad():
+        method.encode(stored)
+    red = (torch.tensor([1.0, 0.0, 0.0]) - torch.tensor(IMAGENET_MEAN)) / torch.tensor(IMAGENET_STD)
+    torch.testing.assert_close(seen[0][0, :, 7, 11], red)
+
+
+def test_a_method_starts_from_pretrained_weights(tmp_path: Path) -> None:
+    weights = random_weights()
+    torch.save(weights, tmp_path / "weights.pth")
+    settings = PoseInvariantSettings(
+        encoder="resnet18", generator="symmetric", pretrained=str(tmp_path / "weights.pth")
+    )
+    assert settings.pretrained == tmp_path / "weights.pth"
+    method = PoseInvariant(settings, DataShape(3, pose_features=9), "cpu", "fp32")
+    method.start_from_pretrained()
+    assert torch.equal(method.encoder.conv1.weight, weights["conv1.weight"])
+    message = (
+        r"for the encoder 'resnet18', got encoder 'conv-small'; choose that encoder \(.*\), or leave pretrained out"
+    )
+    with pytest.raises(ValueError, match=message):
+        PoseInvariantSettings(encoder="conv-small", pretrained=tmp_path / "weights.pth")
+
+
+class Runs:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return open, ("ran", "w")
+
+
+def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    encoder, path, weights = ResNet18Encoder(), tmp_path / "w.pth", random_weights()
+
+    def refused(content: object, message: str) -> None:
+        torch.save(content, path)
+        before = encoder.conv1.weight.clone()
+        with pytest.raises(ValueError, match=message):
+            load_pretrained(encoder, path)
+        assert torch.equal(encoder.conv1.weight, before)
+
+    hint = "it must be a state dict of torchvision's resnet18"
+    refused({k: v for k, v in weights.items() if "layer4" not in k}, f"w.pth lacks 'layer4.* and 24 more.*{hint}")
+    refused(weights | {"layer4.2.conv1.weight": torch.ones(1)}, f"w.pth has 'layer4.2.conv1.weight' and 0 more.*{hint}")
+    refused(weights | {"bn1.bias": torch.ones(3)}, rf"w.pth: bn1.bias is \[3\], ResNet-18 has \[64\]; {hint}")
+    nan = torch.full((64,), float("nan"))
+    refused(weights | {"bn1.bias": nan}, f"w.pth: bn1.bias has values that are not finite; {hint}")
+    for odd in (
+        weights["bn1.bias"].to(torch.complex64),
+        weights["bn1.bias"].to(torch.float8_e4m3fn),
+        weights["bn1.bias"].to("meta"),
+        weights["bn1.bias"].to_sparse(),
+    ):
+        refused(weights | {"bn1.bias": odd}, "w.pth: bn1.bias must be plain numbers such as torch.float32, got ")
+    beyond = torch.full((64,), 1e300, dtype=torch.float64)
+    refused(weights | {"bn1.bias": beyond}, "w.pth: bn1.bias has values that are not finite")
+    refused(weights | {5: torch.ones(1)}, r"w.pth must hold a state dict \(names -> tensors\), got ")
+    refused([1, 2], r"w.pth must hold a state dict \(names -> tensors\), got list")
+    refused(weights | {"bn1.bias": Runs()}, "cannot read pretrained weights from .*w.pth: Weights only load failed")
+    assert not Path("ran").exists()
+    path.write_bytes(b"no weights")
+    with pytest.raises(ValueError, match=r"cannot read pretrained weights from .*w.pth"):
+        load_pretrained(encoder, path)
+    (tmp_path / "w.safetensors").write_bytes(b"no weights")
+    with pytest.raises(ValueError, match=r"cannot read pretrained weights from .*w.safetensors"):
+        load_pretrained(encoder, tmp_path / "w.safetensors")
+    with pytest.raises(FileNotFoundError, match=r"there is no file of pretrained weights .*none.pth"):
+        load_pretrained(encoder, tmp_path / "none.pth")
+
+
+def test_weights_beyond_the_limits_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, encoder = tmp_path / "w.pth", ResNet18Encoder()
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:  # torch.save compresses nothing
+        archive.writestr("w/data.pkl", bytes(100_000_000))
+    monkeypatch.setattr(limits, "WEIGHTS_BYTES", 10_000_000)
+    with pytest.raises(ValueError, match=r"w\.pth: it would unpack to 100000000 bytes; at most 10000000 are read"):
+        load_pretrained(encoder, path)
+    torch.save(torch.zeros(3_000_000), path)
+    with pytest.raises(ValueError, match=r"w\.pth: has 12\d+ bytes, and at most 10000000 are read"):
+        load_pretrained(encoder, path)

@@ -1,0 +1,71 @@
+"""A day of training scaled down: 10,000 steps, with everything that a run does now and then, use no more at the end
+than at the beginning. The step itself costs CPU time, which does not depend on what else the machine does; still, a
+busy machine makes it vary, so that a second attempt is allowed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import pytest
+from run_server import ENVIRONMENT
+
+import learn3d
+from learn3d.config import config_to_dict
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc of Linux"),
+]
+
+STEPS, EVERY = 10_000, 100
+MEMORY_GROWTH = 4e6  # bytes between the first and the last third; 10,000 leaked scalars of torch would be 5e6
+TIME_GROWTH = 1.3
+
+
+def soak(tiny_run, tiny_folder: Path, folder: Path) -> list[dict[str, float]]:
+    for path in tiny_folder.iterdir():
+        with np.load(path) as archive:
+            np.savez(folder / path.name, archive["arr_0"])
+    often = {"log_every": 10, "validate_every": 500, "checkpoint_every": 500, "pictures_every": 1000}
+    config = tiny_run(folder / "run", data=folder, iterations=STEPS, **often)
+    packages = [str(Path(learn3d.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(packages)}
+    script = Path(__file__).parents[2] / "data" / "soak.py"
+    command = [sys.executable, str(script), json.dumps(config_to_dict(config)), str(EVERY)]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
+    assert ended.returncode == 0, ended.stderr
+    return [json.loads(line) for line in ended.stdout.splitlines()]
+
+
+def thirds(values: list[float]) -> tuple[float, float]:
+    """Medians of the first and the last third, after a tenth for warming up."""
+    values = values[len(values) // 10 :]
+    third = len(values) // 3
+    return median(values[:third]), median(values[-third:])
+
+
+def test_nothing_grows(tiny_run, tiny_folder, tmp_path) -> None:
+    for attempt in (1, 2):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        samples = soak(tiny_run, tiny_folder, folder)
+        assert len(samples) == STEPS // EVERY
+        resident = thirds([sample["resident"] for sample in samples])
+        files = thirds([sample["files"] for sample in samples])
+        threads = thirds([sample["threads"] for sample in samples])
+        cpu = thirds(np.diff([sample["cpu"] for sample in samples]).tolist())
+        print(f"resident {resident}, files {files}, threads {threads}, CPU seconds of {EVERY} steps {cpu}")
+        assert files[0] == files[1] == samples[-1]["files"]
+        assert threads[0] == threads[1]
+        assert resident[1] - resident[0] < MEMORY_GROWTH
+        assert len(list((folder / "run").rglob("*.safetensors"))) == 3
+        if cpu[1] < TIME_GROWTH * cpu[0]:
+            return
+    raise AssertionError(f"{EVERY} steps took {cpu[0]:.3f} s of CPU time in the first third, {cpu[1]:.3f} in the last")

@@ -1,0 +1,333 @@
+"""Measure the renderer and what belongs to it, beside other programs in the same run (compare within one run only).
+
+  bench.py all: every row of the table, as Markdown; exit code 1 if a target is missed
+  bench.py w1: 64 spheres, 64x64 anti-aliased; also deodr, and the slow definition
+  bench.py w2: one mesh of 81,920 faces, 512x512
+  bench.py w3: one mesh of 1,280 faces, 1024x1024
+  bench.py w4: w1 with depth, and with alpha + depth in one pass, instead of silhouettes
+  bench.py smoothness: smoothness loss of 128 spheres of 1920 edges; also as a chain of torch calls
+  bench.py cameras: 64 look-at cameras; also as a chain of torch calls
+  bench.py voxels: voxel IoU of 1000 predictions
+  bench.py step: a whole training step by part, in bf16 and in fp32
+  bench.py evaluation: validation during training, by part, and as a share of the run
+  bench.py memory: bytes per image and per raster pixel, in fresh processes
+  bench.py processes: steps of the proposed method, one batch of 128 shared by 1, 2, 4 ... processes
+  bench.py scaling: w1, w2, w3 at 1, 2, 4, 8, 16 threads, as far as there are cores
+  bench.py count: the work in w1 (faces, pixels, sweeps, divisions, bytes) and the floor it sets
+
+Medians over repeats that alternate between the programs, and the fastest. Freed memory is kept for all of them, as in
+training (learn3d/device.py). `pip install deodr` for the comparison.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import bench_peers as peers
+import torch
+import tyro
+from bench_count import count
+from bench_memory import bench_memory
+from bench_processes import bench_processes
+from bench_step import StepOptions, bench_evaluation, bench_step
+from bench_work import (
+    Result,
+    Timing,
+    Workload,
+    deformed_spheres,
+    measure,
+    milliseconds,
+    num_cores,
+    run_ours,
+    save,
+    settings,
+    show,
+)
+
+import nmr
+from learn3d.config import DEFAULT_PRESET
+from learn3d.device import keep_freed_memory
+from learn3d.terminal import in_a_sentence
+
+
+class Target(NamedTuple):
+    """Median of forward + backward that must not be exceeded, with two threads."""
+
+    limit: float
+    unit: str
+    source: str
+
+
+MESHES = 64  # of w1, w4 and count
+_TWO_CORES = "measured on two Zen 4 cores"
+TARGETS = {
+    "w1, 64": Target(8, "ms", f"half of B = 128; deodr in two processes took 27.8, {_TWO_CORES}"),
+    "w1, 128": Target(16, "ms", "published CUDA kernels on an H200: 16.0 ms"),
+    "w2": Target(12, "ms", f"deodr took 37.9, llvmpipe's forward pass alone 10, {_TWO_CORES}"),
+    "w3": Target(8, "ms", f"deodr took 11.6, {_TWO_CORES}"),
+    "w4, 64": Target(8, "ms", f"as w1; deodr took 51.6, {_TWO_CORES}"),
+    "smoothness": Target(3, "ms", "a chain of torch calls takes tens of ms"),
+    "step": Target(8, "% of the networks", "26 ms beside networks of 334 ms are 360 ms a step: 20,000 in two hours"),
+    "evaluation": Target(3, "% of the run", "what a run may spend on looking at itself"),
+}
+
+# Operations on eight lanes that one item of bench_count takes at the least, as far as we know; without its divisions.
+LANE_OPERATIONS = {
+    "raster pixels, by eight": 20,  # cleared, copied, averaged, searched for visible faces and for pixels that pull
+    "faces set up": 8,  # 60 scalar ones: facing, box, range of depths
+    "rows of eight tested": 12,  # three edges, depth and owner: compared, chosen, written
+    "exact depths": 5,  # 40 scalar ones
+    "crossings prepared, by eight": 30,  # crossing, rounding, owners on both sides, levers, masks
+    "pulls outside, by eight": 12,
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    workload: tyro.conf.Positional[
+        Literal["all", "w1", "w2", "w3", "w4", "smoothness", "cameras", "voxels", "step", "evaluation"]
+        | Literal["memory", "processes", "scaling", "count"]
+    ] = "w1"
+    """What to measure."""
+    batch: int | None = None
+    """Meshes of w1, w4 and count, by default 64 (all measures w1 with 64 and with 128); images of a step, by default
+    the preset's."""
+    preset: str = DEFAULT_PRESET
+    """step, evaluation: what is trained, on silhouettes of spheres."""
+    checkpoint: Path | None = None
+    """step, evaluation: train this run (a folder or a checkpoint) instead, on its own data. What rendering costs
+    depends on the shapes, and those of trained networks are not spheres."""
+    clock: Literal["wall", "cpu"] = "wall"
+    """step, evaluation: cpu is for busy machines: the time of all threads of this process; take one thread then."""
+    threads: int = 2
+    """Threads of ours and of torch. deodr has none: it gets one process, and as many as these."""
+    repeats: int = 15
+    """Timed runs of each program."""
+    definition: bool = True
+    """w1: also time the slow definition (nmr/reference.py) on one image, once, scaled to the batch."""
+    json: Path | None = None
+    """Also write the figures here."""
+
+
+# --- renders
+
+
+def render_workload(name: str, batch: int) -> tuple[str, Workload]:
+    if name == "w2":
+        return "W2: one mesh, 81,920 faces, 512x512", deformed_spheres(1, 6, 512, False)
+    if name == "w3":
+        return "W3: one mesh, 1280 faces, 1024x1024", deformed_spheres(1, 3, 1024, False)
+    outputs, what = (("depth",), "depth, ") if name == "w4" else (("alpha",), "")
+    title = f"{name.upper()}: {what}{batch} meshes, 1280 faces, 64x64 anti-aliased"
+    return title, deformed_spheres(batch, 3, 64, True, outputs)
+
+
+def bench_render(name: str, options: Options, batch: int) -> Result:
+    title, workload = render_workload(name, batch)
+    about, targets = settings(options.threads, options.repeats, batch=len(workload.vertices)), workload.targets()
+    programs = {f"nmr, {options.threads} threads": lambda: run_ours(workload, targets)}
+    if name == "w4":
+        both = deformed_spheres(batch, 3, 64, True, ("alpha", "depth"))
+        both_targets = both.targets()
+        programs[f"nmr, {options.threads} threads, alpha + depth in one pass"] = lambda: run_ours(both, both_targets)
+    processes = None
+    if peers.has_deodr():
+        more, processes = peers.deodr_programs(workload, targets, options.threads)
+        programs |= more
+    else:
+        print("deodr is not installed (pip install deodr): no comparison with it")
+    rows = measure(programs, options.repeats)
+    if processes:
+        processes.close()
+    if name == "w1" and options.definition and options.workload == "w1":
+        rows.append(milliseconds("slow definition (1 image x batch)", [peers.run_definition(workload, targets)]))
+    loss = "the mean squared difference" if name == "w4" else "1 - soft IoU"
+    key = f"{name}, {batch}" if name in ("w1", "w4") else name
+    return Result(key, f"{title}, forward + backward of {loss}", rows, about)
+
+
+# --- what belongs to it
+
+
+def bench_smoothness(options: Options) -> Result:
+    spheres = deformed_spheres(128, 3, 64, True)
+    edges = nmr.edge_table(spheres.faces)
+    about = settings(options.threads, options.repeats, batch=len(spheres.vertices))
+    programs = peers.against_chain(
+        lambda vertices: nmr.losses.smoothness_loss(vertices, edges),
+        lambda vertices: peers.smoothness_chain(vertices, edges),
+        spheres.vertices,
+        1e-4,
+        options.threads,
+    )
+    title = f"Smoothness loss, B = 128, {len(edges)} edges, forward + backward"
+    return Result("smoothness", title, measure(programs, options.repeats), about)
+
+
+def bench_cameras(options: Options) -> Result:
+    spheres = deformed_spheres(64, 3, 64, True)
+    camera = spheres.camera
+    about = settings(options.threads, options.repeats, batch=len(spheres.vertices))
+    programs = peers.against_chain(
+        camera.transform,
+        lambda vertices: peers.camera_chain(vertices, camera.eye, camera.half_fov_deg),
+        spheres.vertices,
+        1e-5,
+        options.threads,
+    )
+    title = "LookAt, B = 64, 642 vertices each, forward + backward"
+    return Result("cameras", title, measure(programs, options.repeats), about)
+
+
+def bench_voxels(options: Options) -> Result:
+    repeats = min(options.repeats, 5)
+    about = settings(options.threads, repeats, batch=1000)
+    spheres = deformed_spheres(1000, 3, 64, True)
+    vertices = spheres.vertices * (31 / 32) + 0.5
+
+    def run() -> Timing:
+        start = time.perf_counter()
+        voxels = nmr.voxelize(vertices, spheres.faces)
+        forward = time.perf_counter()
+        (voxels & voxels.roll(1, 0)).sum((1, 2, 3)) / (voxels | voxels.roll(1, 0)).sum((1, 2, 3))
+        return forward - start, time.perf_counter() - start
+
+    rows = measure({f"nmr.voxelize, {options.threads} threads; in all with the IoU": run}, repeats)
+    return Result("voxels", "Voxel IoU of 1000 meshes of 1280 faces at 32^3", rows, about)
+
+
+def bench_scaling(options: Options) -> list[Result]:
+    """Each thread count in turn, after one run that is not timed: the pool of threads changes its size."""
+    threads = [n for n in (1, 2, 4, 8, 16) if n <= num_cores()]
+    results = []
+    for name in ("w1", "w2", "w3"):
+        title, workload = render_workload(name, options.batch or MESHES)
+        targets, times = workload.targets(), {n: [] for n in threads}
+        for _ in range(options.repeats):
+            for n in threads:
+                torch.set_num_threads(n)
+                run_ours(workload, targets)
+                times[n].append(run_ours(workload, targets))
+        rows = [milliseconds(f"nmr, {n} threads", seconds) for n, seconds in times.items()]
+        about = settings(threads[-1], options.repeats, batch=len(workload.vertices))
+        results.append(Result(f"scaling {name}", f"{title}, by threads", rows, about))
+        show(results[-1])
+        speedups = (f"{n}: {rows[0].total / row.total:.2f}" for n, row in zip(threads, rows, strict=True))
+        print(f"times as fast as one thread: {', '.join(speedups)}", flush=True)
+    return results
+
+
+def bench_count(options: Options) -> None:
+    """The work, and its floor at 3 GHz: two operations a cycle; divisions, eight in five cycles; memory for free."""
+    title, workload = render_workload("w1", options.batch or MESHES)
+    counts = count(workload)
+    print(f"{title}: work per image (mean), forward + backward of 1 - soft IoU")
+    for name, value in counts.items():
+        print(f"{name:<34}{value:>14,.1f}")
+    cycles = sum(k * counts[name] for name, k in LANE_OPERATIONS.items()) / 2
+    divisions = 5 / 8 * (counts["divisions forward"] + counts["divisions backward"])
+    images = (options.batch or MESHES) / options.threads / 3e6
+    print(f"{'floor of its operations':<34}{cycles * images:>14.2f} ms for {options.batch or MESHES} images")
+    print(f"{'floor of its divisions':<34}{divisions * images:>14.2f} ms, beside them")
+    print(f"({bench_count.__doc__} {options.threads} threads)")
+
+
+# --- the table
+
+
+def missed(result: Result) -> bool:
+    target = TARGETS.get(result.key)
+    return target is not None and not result.rows[0].total <= target.limit
+
+
+def markdown(results: list[Result]) -> str:
+    """One line for each of our rows; peers and target stand in the first line of their workload."""
+    lines = ["| workload | ours | peers, in the same run | target |", "|---|---|---|---|"]
+    for result in results:
+        unit = "%" if result.unit.startswith("%") else result.unit
+        theirs = "; ".join(f"{row.program} {row.total:.1f}" for row in result.rows if not row.ours)
+        target = TARGETS.get(result.key)
+        wanted = f"<= {target.limit:g} {unit}{': missed' if missed(result) else ''}" if target else "-"
+        for number, row in enumerate(row for row in result.rows if row.ours):
+            about = "" if not row.program.count(", ") else f" ({row.program.split(', ', 1)[1]})"
+            ours = f"**{row.total:.2f}** {unit}{about}; fastest {row.fastest:.2f}"
+            first = number == 0
+            lines.append(
+                f"| {result.title if first else ''} | {ours} | {theirs if first and theirs else '-'} "
+                f"| {wanted if first else '-'} |"
+            )
+    return "\n".join(lines)
+
+
+def bench_all(options: Options) -> list[Result]:
+    """Every row of the table, and the table."""
+    renders = (("w1", 64), ("w1", 128), ("w2", 1), ("w3", 1), ("w4", 64))
+    benches: list[Callable[[], Result]] = [partial(bench_render, name, options, batch) for name, batch in renders]
+    benches += [partial(bench, options) for bench in SINGLE.values()]
+    results = []
+    for bench in benches:
+        results.append(bench())
+        show(results[-1])
+    about = {key: value for key, value in results[0].settings.items() if key != "batch"}
+    print(f"\nForward + backward, medians; {', '.join(f'{key} {value}' for key, value in about.items())}\n")
+    print(markdown(results), flush=True)
+    return results
+
+
+def step_options(options: Options) -> StepOptions:
+    return StepOptions(
+        options.preset, options.batch, options.checkpoint, options.threads, options.repeats, options.clock
+    )
+
+
+SINGLE: dict[str, Callable[[Options], Result]] = {
+    "smoothness": bench_smoothness,
+    "cameras": bench_cameras,
+    "voxels": bench_voxels,
+    "step": lambda options: bench_step(step_options(options)),
+    "evaluation": lambda options: bench_evaluation(step_options(options)),
+}
+
+
+@in_a_sentence()
+def main() -> int:
+    options = tyro.cli(Options, description=__doc__)
+    torch.set_num_threads(options.threads)
+    if options.workload == "memory":
+        bench_memory(threads=(1, 2))
+        return 0
+    if options.workload == "processes":
+        bench_processes(options.repeats)
+        return 0
+    keep_freed_memory()
+    if options.workload == "count":
+        bench_count(options)
+        return 0
+    if options.workload == "all":
+        results = bench_all(options)
+    elif options.workload == "scaling":
+        results = bench_scaling(options)
+    else:
+        bench = SINGLE.get(options.workload)
+        results = [bench(options) if bench else bench_render(options.workload, options, options.batch or MESHES)]
+        show(results[0])
+    if options.json:
+        save(results, options.json)
+    if options.workload == "all" and any(map(missed, results)):
+        lines = (
+            f"{r.title}: {r.rows[0].total:.2f} > {TARGETS[r.key].limit:g} ({TARGETS[r.key].source})"
+            for r in results
+            if missed(r)
+        )
+        sys.exit("\n".join(["targets missed:", *lines]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""Steps of the proposed method at one global batch in several processes.
+
+Examples:
+  python tools/bench/bench.py processes                                     as many ways as the cores allow, a table
+  torchrun --nproc-per-node 2 tools/bench/bench_processes.py --threads 8    one of them
+  torchrun --nnodes 2 ... tools/bench/bench_processes.py --threads 8        on several machines, the same on each
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Literal
+
+import torch
+import tyro
+from bench_step import sphere_dataset
+from bench_work import num_cores
+from torch.optim import Optimizer
+
+from learn3d.data.readers import kato
+from learn3d.data.sampling import shuffled_epochs
+from learn3d.device import keep_freed_memory, resolve_precision
+from learn3d.interrupt import Stop
+from learn3d.methods import DataShape, create_method
+from learn3d.parallel import ranks as distributed
+from learn3d.presets import PRESETS
+from learn3d.terminal import in_a_sentence
+
+
+@dataclass(frozen=True)
+class Options:
+    threads: int = 1
+    """Threads of each process."""
+    repeats: int = 15
+    """Timed steps."""
+    batch: int = 128
+    """Images per step, of all processes together."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where the networks run."""
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    """Arithmetic of the networks."""
+
+
+def measure_steps(options: Options, ranks: distributed.Ranks) -> tuple[float, float, float, float]:
+    """Milliseconds: median step, fastest step; of a step what the sums of gradients take, waiting included; and the
+    processor's time for a step of this process, which hardly depends on what else the machine does.
+    """
+    keep_freed_memory()
+    torch.set_num_threads(options.threads)
+    dataset, precision = sphere_dataset(), resolve_precision(options.precision, options.device)
+    ranks = ranks.divide(options.batch, "views")
+    method = create_method(
+        PRESETS["peng2020-kato"].settings, DataShape(kato.NUM_VIEWS), device=options.device, precision=precision, seed=0
+    )
+    summing, sum_gradients = [0.0], distributed.sum_gradients
+
+    def timed(optimizer: Optimizer, *arguments: object) -> None:
+        start = time.perf_counter()
+        sum_gradients(optimizer, *arguments)
+        summing[0] += time.perf_counter() - start
+
+    distributed.sum_gradients = timed
+    ranks.join(method)
+    steps, sums, busy = [], [], []
+    for step in range(1, options.repeats + 3):
+        summing[0], start, before = 0.0, time.perf_counter(), time.process_time()
+        method.train_step(dataset.batch(shuffled_epochs(len(dataset), options.batch, 0, step), ranks.rows), step)
+        ranks.stopped_by(Stop())
+        if step > 2:
+            steps.append(1e3 * (time.perf_counter() - start))
+            sums.append(1e3 * summing[0])
+            busy.append(1e3 * (time.process_time() - before))
+    return median(steps), min(steps), median(sums), median(busy)
+
+
+def ways(cores: int) -> list[tuple[int, int]]:
+    """(processes, threads of each): all cores shared in every way by powers of two, one thread, and half of them."""
+    powers = [2**k for k in range(cores.bit_length()) if 2**k <= cores]
+    return [(1, n) for n in powers] + [(n, powers[-1] // n) for n in powers[1:]]
+
+
+def bench_processes(repeats: int) -> None:
+    """Each way in processes of its own, one after the other, and the table in Markdown: ratios of the fastest steps."""
+    rows, first = [], 0.0
+    for processes, threads in ways(num_cores()):
+        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)]
+        command += [str(Path(__file__)), "--threads", str(threads), "--repeats", str(repeats)]
+        result = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+        if result.returncode:
+            raise SystemExit(f"{' '.join(command)} failed")
+        print(result.stdout, end="", flush=True)
+        step, fastest, summing, busy = map(float, re.findall(r"([\d.]+) ms", result.stdout))
+        first = first or fastest
+        cells = (f"{processes} x {threads}", f"{step:.0f}", f"{fastest:.0f}", f"{summing:.0f}", f"{busy:.0f}")
+        rows.append(f"| {' | '.join(cells)} | {first / fastest:.2f} |")
+    print("\n| processes x threads | ms a step | fastest | summing gradients | CPU ms of a process | times as fast |")
+    print("|---|---|---|---|---|---|")
+    print("\n".join(rows))
+
+
+@in_a_sentence()
+def main() -> int:
+    options = tyro.cli(Options, description=__doc__)
+    with distributed.start(options.device) as ranks:
+        step, fastest, summing, busy = measure_steps(options, ranks)
+        if not ranks.alone:
+            summing = float(ranks.gather([torch.tensor([summing])], torch.tensor([ranks.rank]), ranks.world).min())
+    if ranks.main:
+        print(
+            f"{ranks.world} x {options.threads} threads, batch {options.batch}: {step:.1f} ms a step, fastest "
+            f"{fastest:.1f} ms, summing gradients {summing:.1f} ms, CPU {busy:.1f} ms"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
