@@ -1,19 +1,25 @@
 #!/usr/bin/env bash
-# Installs the package with everything its tests need into .venv and runs the tests, a process per core (JOBS: that many; 0: in
-# this one). Arguments go to pytest.
+# Installs the package with everything its tests need into .venv and runs the tests.
+# Usage: bash tools/test.sh [--all] [PYTEST ARGUMENTS]
+#   --all   also the slow tests: trainings of minutes, sanitizers, long kills; and the coverage (what CI runs)
+# JOBS: number of processes (default one per core; 0: in this one).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . tools/setup.sh
 
+which=(-m "not slow") room=2
+if [ "${1:-}" = --all ]; then
+    shift
+    which=(--cov --cov-report=term:skip-covered) room=5
+fi
 setup test
 step "Style"
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 step "Tests"
-check_room "${TMPDIR:-/tmp}" 5 ", or set TMPDIR to a folder on another disk" # checkpoints of the paper's networks
-# The script pytest, not python -m pytest: the latter would import the source folder in place of the installed package.
-# One thread for each process, as threads that wait for each other on shared cores take many times as long. Files stay together:
-# their tests share trained runs and compiled programs; and in the order of their names, as the longest have the fewest tests and
-# would come last otherwise.
+check_room "${TMPDIR:-/tmp}" $room ", or set TMPDIR to a folder on another disk"
+# The script pytest, not python -m pytest, which would import the source folder in place of the installed package.
+# One thread per process: threads that wait for each other on shared cores take many times as long. The tests of a file
+# stay together, as they share trained runs and compiled programs. Files go in the order of their names.
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-exec .venv/bin/pytest -n "${JOBS:-auto}" --maxprocesses 8 --dist loadfile --no-loadscope-reorder --cov --cov-report=term:skip-covered "$@"
+exec .venv/bin/pytest -n "${JOBS:-auto}" --maxprocesses 8 --dist loadfile --no-loadscope-reorder "${which[@]}" "$@"
