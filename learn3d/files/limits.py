@@ -61,12 +61,6 @@ WEIGHTS_SECONDS = 60.0  # for reading them: 0.1
 
 # Options: what a configuration may ask for
 ITERATIONS = 10**9  # steps
-BATCH_SIZE = 65_536
-THREADS = 4096
-SEED = 2**63 - 1
-INPUT_SIDE = 1024  # pixels of the networks' images; 224 in the papers
-CHANNELS = 1024  # of a layer that a setting names; as many in PrGAN's last one
-BASE_CHANNELS = 512  # of a network whose widest layer has eight times as many: up to 4.1 GB; 128 in the papers
 VIEW_CLASSES = 100_000  # cells of azimuth and elevation; 512 in the papers
 CLASSES = 10_000  # categories trained together
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -16,13 +15,14 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.device import Download
 from learn3d.methods.method import DataShape, Meshes, Method, descend
 from learn3d.networks import ENCODERS, GENERATORS, EncoderName, GeneratorName, create_encoder, network_input
+from learn3d.settings import Positive, Step, Weight, checked
 
 CENTROID_LEARNING_RATE = 0.1  # of the centroid's layer, relative to all others
 DECAY = 0.1  # of the step size, after `decay_at_step`
 CHUNK = 1 << 20  # weights that the optimizer handles at once
 
 
-@dataclass(frozen=True)
+@checked
 class MultiViewSettings:
     """Networks, weight and schedule of Kato et al. 2018; the defaults are the published code's for one category."""
 
@@ -30,11 +30,11 @@ class MultiViewSettings:
     """conv-relu: that of Kato et al. conv: without the ReLU on the code."""
     generator: GeneratorName = "bounded"
     """bounded: that of Kato et al. sphere: 642 free vertices."""
-    learning_rate: float = 1e-4
+    learning_rate: Positive = 1e-4
     """Adam's step size up to `decay_at_step`, a tenth of it afterwards."""
-    decay_at_step: int = 190_000
+    decay_at_step: Step = 190_000
     """Last step at the full step size (published: 95 % of all iterations)."""
-    lambda_smooth: float = 0.001
+    lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (published: 0.001 for one category, 0 for all together)."""
 
     @property

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -25,9 +23,10 @@ from learn3d.networks import (
     network_input,
 )
 from learn3d.networks.resnet import check_pretrained, load_pretrained
+from learn3d.settings import FilePath, Positive, Weight, checked
 
 
-@dataclass(frozen=True)
+@checked
 class PoseInvariantSettings:
     """Networks, weights and forms of the terms of L_tot; a weight of 0 means that the term is not computed."""
 
@@ -35,18 +34,18 @@ class PoseInvariantSettings:
     """conv: three convolutions, 64-pixel RGB and mask. conv-small: a fifteenth of it. resnet18: 224-pixel RGB."""
     generator: GeneratorName = "sphere"
     """sphere: 642 free vertices. symmetric: mirrored at z = 0."""
-    pretrained: Path | None = None
+    pretrained: FilePath | None = None
     """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's. None: random.
     The encoder gets natural colours, R, G, B, normalised as ImageNet's, however the data set stores them."""
-    learning_rate: float = 1e-4
+    learning_rate: Positive = 1e-4
     """Adam's step size, the same for the three networks and constant."""
-    lambda_smooth: float = 0.001
+    lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1)."""
-    lambda_classification: float = 1.0
+    lambda_classification: Weight = 1.0
     """Weight of the discriminator's own loss (lambda_2)."""
-    lambda_adversarial: float = 1.0
+    lambda_adversarial: Weight = 1.0
     """Weight of the pose confusion loss (lambda_3)."""
-    lambda_prior: float = 1.0
+    lambda_prior: Weight = 1.0
     """Weight of the Gaussian prior on the codes (lambda_4)."""
     adversarial_form: Literal["log", "probability"] = "log"
     """Confusion loss on squares of log-probability (published code) or of probability differences (eq. 4)."""
@@ -54,8 +53,6 @@ class PoseInvariantSettings:
     """Prior on the squared length of the codes (published code) or on their length (eq. 5)."""
 
     def __post_init__(self) -> None:
-        if self.pretrained is not None:
-            object.__setattr__(self, "pretrained", Path(self.pretrained))
         check_pretrained(self.pretrained, self.encoder)
 
     @property

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import Tensor
 
 from learn3d.data.batch import Batch, Whole
@@ -26,36 +26,38 @@ from learn3d.networks.voxel_gan import (
     VoxelGenerator,
 )
 from learn3d.parallel.ranks import ALONE, Ranks
+from learn3d.settings import Items, LayerChannels, Positive, Share, Step, checked
 
 BETAS = (0.5, 0.999)  # of Adam, for the two networks of the GAN
+FourLayers = Annotated[tuple[LayerChannels, LayerChannels, LayerChannels, LayerChannels], Items]
 
 
-@dataclass(frozen=True)
+@checked
 class PrGANSettings:
     """Schedule, step sizes and widths; the defaults are the published code's, the schedule is that for airplanes."""
 
-    encoder_from_step: int = 53_051
+    encoder_from_step: Step = 53_051
     """First step that trains the encoder instead of the GAN (published: after 50 epochs)."""
-    generator_learning_rate: float = 2.5e-3
+    generator_learning_rate: Positive = 2.5e-3
     """Adam's step size for the generator, in both of its steps."""
-    discriminator_learning_rate: float = 1e-4
+    discriminator_learning_rate: Positive = 1e-4
     """Adam's step size for the discriminator."""
-    encoder_learning_rate: float = 1e-5
+    encoder_learning_rate: Positive = 1e-5
     """Adam's step size for the inverse encoder."""
-    accuracy_margin: float = 0.8
+    accuracy_margin: Share = 0.8
     """The discriminator rests in steps that begin with a higher accuracy."""
-    generator_channels: tuple[int, int, int, int] = GENERATOR_CHANNELS
+    generator_channels: FourLayers = GENERATOR_CHANNELS
     """Channels at 4^3, 8^3, 16^3 and 32^3; fewer on a small machine."""
-    discriminator_channels: tuple[int, int, int, int] = DISCRIMINATOR_CHANNELS
+    discriminator_channels: FourLayers = DISCRIMINATOR_CHANNELS
     """Channels at 32^2, 16^2, 8^2 and 4^2; fewer on a small machine."""
-    occupancy_threshold: float = 0.1
+    occupancy_threshold: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """A predicted voxel is full where its mean is higher. Unpublished; Kato's grids hold every cell that a shape
     touches, so that even true shapes reach an IoU of .35 at 0.5, but .74 at 0.1."""
-    elevation_deg: float = 30.0
+    elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 30.0
     """Elevation of the K views, which stand at equal steps of azimuth."""
-    distance: float = 2.732
+    distance: Positive = 2.732
     """Distance of the data set's cameras; with the field of view it gives the size of objects in the images."""
-    half_fov_deg: float = 15.0
+    half_fov_deg: Annotated[float, Field(gt=0, lt=90)] = 15.0
     """Half of the field of view of the data set's cameras."""
     perspective: bool = False
     """Rays of the projection that meet in the eye, as the data set's do, instead of PrGAN's parallel ones."""
@@ -64,12 +66,6 @@ class PrGANSettings:
     def image_size(self) -> int:
         """Side of the images that the encoder takes, in pixels."""
         return IMAGE_SIZE
-
-    def __post_init__(self) -> None:
-        if self.encoder_from_step < 1:
-            raise ValueError(f"encoder_from_step must be a step, from 1, got {self.encoder_from_step}")
-        if not 0 < self.occupancy_threshold < 1:
-            raise ValueError(f"occupancy_threshold must lie between 0 and 1, got {self.occupancy_threshold}")
 
 
 class PrGAN(Method):

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import Tensor, nn
 
 import nmr
@@ -34,11 +33,12 @@ from learn3d.networks.view_discriminators import (
     PatchDiscriminator,
     SpectralPatchDiscriminator,
 )
+from learn3d.settings import Channels, FilePath, Pixels, Positive, Weight, checked
 
 MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object where alpha is at least this
 
 
-@dataclass(frozen=True)
+@checked
 class VPLSettings:
     """Networks, losses and their weights; a weight of 0 means that the term is not computed.
 
@@ -48,22 +48,22 @@ class VPLSettings:
     encoder: Literal["conv", "preact-resnet18", "resnet18"] = "conv"
     """conv: three convolutions, 64-pixel RGB and mask. preact-resnet18: RGB on grey. resnet18: RGB, may be pretrained.
     The last two take any multiple of 32 pixels."""
-    pretrained: Path | None = None
+    pretrained: FilePath | None = None
     """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's; its batch norms
     stay frozen then. None: random weights. The encoder gets natural colours, however the data set stores them."""
-    image_size: int = 64
+    image_size: Pixels = 64
     """Side of the input images in pixels."""
     generator: Literal["sphere", "cube-conv", "cube-fc"] = "sphere"
     """sphere: 642 free vertices. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or not."""
     symmetric: bool = False
     """Cube generators only: mirror the shape at z = 0."""
-    vertex_scale: float = 0.01
+    vertex_scale: Positive = 0.01
     """Cube generators only: s, the factor of the last layer's output."""
-    object_scale: float = 0.5
+    object_scale: Positive = 0.5
     """Cube generators only: factor of the vertices; they start on a sphere of half this radius."""
     discriminator: Literal["dcgan", "spectral-patch", "patch"] = "dcgan"
     """dcgan: one-hot view planes. spectral-patch, patch: features of the camera's pose (ShapeNet, Pascal3D+)."""
-    discriminator_channels: int = 128
+    discriminator_channels: Channels = 128
     """Channels of the discriminator's first layer; the others follow (published: dcgan 128, spectral-patch 32, patch
     64). A narrower one costs its square less."""
     class_conditional: bool = False
@@ -74,7 +74,7 @@ class VPLSettings:
     other_views: Literal["random", "reversed", "next"] = "random"
     """The other view of each sample is that of: a random sample of the batch with another view class; the sample at the
     same place from the batch's end (published, ShapeNet); the next sample of its category (published, Pascal3D+)."""
-    silhouette_size: int = 64
+    silhouette_size: Pixels = 64
     """Side of rendered silhouettes: 64, compared with the data's masks, or image_size, with the input's own mask."""
     anti_aliasing: bool = True
     """Render silhouettes with 2x2 samples a pixel."""
@@ -82,25 +82,21 @@ class VPLSettings:
     """Gradient of the renderer: Kato et al. 2018's, or the local one of Kato and Harada 2019."""
     silhouette_loss: Literal["iou", "pyramid"] = "iou"
     """iou: 1 - soft IoU. pyramid: squared distance of normalised images at five resolutions."""
-    learning_rate: float = 1e-4
+    learning_rate: Positive = 1e-4
     """Adam's step size, the same for the three networks and constant."""
-    adam_beta1: float = 0.9
+    adam_beta1: Annotated[float, Field(ge=0, lt=1)] = 0.9
     """Adam's decay of the mean gradient (of its square: 0.999)."""
-    lambda_smooth: float = 0.001
+    lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss."""
-    lambda_inflation: float = 0.0
+    lambda_inflation: Weight = 0.0
     """Weight of the internal pressure."""
-    lambda_discriminator: float = 1.0
+    lambda_discriminator: Weight = 1.0
     """lambda_D: weight of the adversarial loss on the shapes; the discriminator itself always learns with weight 1."""
 
     @property
     def reads_view_ids(self) -> bool:
         """Whether training depends on the view classes."""
         return self.lambda_discriminator > 0 and (self.discriminator == "dcgan" or self.other_views == "random")
-
-    def __post_init__(self) -> None:
-        if self.pretrained is not None:
-            object.__setattr__(self, "pretrained", Path(self.pretrained))
 
 
 class VPL(Method):

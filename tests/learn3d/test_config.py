@@ -17,38 +17,42 @@ WRONG: dict[str, tuple[Any, str]] = {
     "no options": ([], r"must hold options by name \(\{\.\.\.\}\), got list"),
     "a number": (5, "must hold options by name"),
     "nothing": (None, "must hold options by name"),
-    "data": (BASE | {"data": 5}, "data must be the path of a folder, got 5"),
-    "output": (BASE | {"output": "a\0b"}, "output must be the path of a folder"),
-    "category": (BASE | {"category": 3}, "category must be a class name such as 'airplane', got 3"),
-    "preset": (BASE | {"preset": {}}, "preset must be one of"),
-    "settings": (BASE | {"settings": 3}, "settings must be options by name"),
-    "rate": (BASE | {"settings": {"learning_rate": "x"}}, "learning_rate must be a positive number, got 'x'"),
-    "huge rate": (BASE | {"settings": {"learning_rate": 10**200}}, "learning_rate must be a positive number"),
-    "weight": (BASE | {"settings": {"lambda_smooth": -1}}, "lambda_smooth must be a number >= 0, got -1"),
-    "true weight": (BASE | {"settings": {"lambda_smooth": True}}, "lambda_smooth must be a number >= 0, got True"),
-    "pretrained": (BASE | {"settings": {"pretrained": 5}}, "pretrained must be the path of a file, got 5"),
-    "encoder": (BASE | {"settings": {"encoder": []}}, "encoder must be one of"),
-    "augment": (BASE | {"augment": 5}, "augment must be a list of names, got 5"),
-    "augment's items": (BASE | {"augment": [[]]}, r"augment must be one of .*, got \[\]"),
-    "bins": (BASE | {"view_bins": 7}, "view_bins must be written as AZIMUTHxELEVATION, such as 15x20, got 7"),
+    "data": (BASE | {"data": 5}, "data must be the path"),
+    "output": (BASE | {"output": "a\0b"}, "output must be the path"),
+    "category": (BASE | {"category": 3}, "category must be text, got 3"),
+    "preset": (BASE | {"preset": {}}, "preset must be"),
+    "settings": (BASE | {"settings": 3}, "takes PoseInvariantSettings, got int"),
+    "rate": (BASE | {"settings": {"learning_rate": "x"}}, "learning_rate must be a number, got 'x'"),
+    "huge rate": (BASE | {"settings": {"learning_rate": 10**200}}, "learning_rate must be at most"),
+    "weight": (BASE | {"settings": {"lambda_smooth": -1}}, "lambda_smooth must be at least 0, got -1"),
+    "true weight": (BASE | {"settings": {"lambda_smooth": True}}, "lambda_smooth must be a number, got True"),
+    "pretrained": (BASE | {"settings": {"pretrained": 5}}, "pretrained must be the path"),
+    "encoder": (BASE | {"settings": {"encoder": []}}, "encoder must be 'conv'"),
+    "augment": (BASE | {"augment": 5}, "augment must be a list, got 5"),
+    "augment's items": (BASE | {"augment": [[]]}, r"augment must be .*, got \[\]"),
+    "bins": (BASE | {"view_bins": 7}, "view_bins must be text, got 7"),
+    "too few": (
+        BASE | {"preset": "gadelha2017-kato", "settings": {"generator_channels": [8, 8]}},
+        "generator_channels",
+    ),
+    "lacking": ({"data": "d", "category": "chair"}, "the option output is missing"),
     "many bins": (BASE | {"view_bins": "1e-9x1"}, "there would be 21600000000000 bins; at most 100000"),
     "endless bins": (BASE | {"view_bins": "15x5:-inf:30"}, "widths and elevations of bins must be finite"),
-    "seed": (BASE | {"seed": 2**64}, r"seed must be a whole number >= 0 and below 2\^63, got 18446744073709551616"),
+    "seed": (BASE | {"seed": 2**64}, "seed must be less than"),
     "true seed": (BASE | {"seed": True}, "seed must be a whole number"),
-    "iterations": (BASE | {"iterations": "abc"}, "iterations must be a whole number >= 1, got 'abc'"),
-    "endless": (BASE | {"iterations": 10**12}, "iterations must be at most 1000000000, got 1000000000000"),
-    "batch": (BASE | {"batch_size": 10**9}, "batch_size must be at most 65536, got 1000000000"),
+    "iterations": (BASE | {"iterations": "abc"}, "iterations must be a whole number, got 'abc'"),
+    "endless": (BASE | {"iterations": 10**12}, "iterations must be at most 1000000000"),
+    "batch": (BASE | {"batch_size": 10**9}, "batch_size must be at most 65536"),
     "pairs": (BASE | {"sampling": "pairs", "batch_size": 3}, "batch_size must be even, got 3"),
     "threads": (BASE | {"threads": 10**9}, "threads must be at most 4096"),
-    "first version": (BASE | {"method": {}}, "unknown method and preset"),
-    "unknown": (BASE | {"latent": 1}, r"unknown options \['latent'\]"),
+    "unknown": (BASE | {"latent": 1}, "there is no option 'latent'"),
     "channels": (
         BASE | {"preset": "gadelha2017-kato", "settings": {"generator_channels": [10**6, 1, 1, 1]}},
-        "generator_channels must be at most 1024, got 1000000",
+        "generator_channels must be at most 1024",
     ),
     "base": (
         BASE | {"preset": "peng2020-kato-vpl", "settings": {"discriminator_channels": 1024}},
-        "discriminator_channels must be at most 512, got 1024",
+        "discriminator_channels must be at most 512",
     ),
     "width": (BASE | {"preset": "peng2020-kar", "settings": {"pretrained": [1]}}, "pretrained must be the path"),
 }
@@ -60,7 +64,7 @@ def test_wrong_options_are_named_with_their_file(tmp_path, name):
     (tmp_path / "config.json").write_text(json.dumps(values))
     with pytest.raises(ValueError, match=message) as error:
         load_config(tmp_path / "config.json")
-    assert "version 0.1" in str(error.value) or "config.json" in str(error.value)
+    assert "config.json" in str(error.value)
 
 
 def test_files_that_are_no_json_or_too_large(tmp_path, monkeypatch):

@@ -152,9 +152,9 @@ def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
     [
         ({"preset": "kato"}, "preset must be one of peng2020-kato, "),
         ({"settings": MultiViewSettings()}, "'peng2020-kato' takes PoseInvariantSettings, got MultiViewSettings"),
-        ({"layout": "shapenet"}, "layout must be one of kato, "),
-        ({"sampling": "all"}, "sampling must be one of views, pairs, classes"),
-        ({"augment": ("zoom",)}, "augment must be one of flip, "),
+        ({"layout": "shapenet"}, "layout must be 'kato'"),
+        ({"sampling": "all"}, "sampling must be 'views'"),
+        ({"augment": ("zoom",)}, "augment must be 'flip'"),
         ({"augment": ("channels", "flip")}, "the discriminator of 'peng2020-kato' is told the class of the original"),
         ({"layout": "r2n2"}, "the layout 'r2n2' has no split val; validate on test"),
         ({"encoder": "resnet18"}, "images of the layout 'kato' have 64x64 pixels, but 224 are wanted"),
@@ -162,14 +162,14 @@ def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
         ({"layout": "pascal3d", "view_bins": "15x20"}, "view_bins '15x20': .* of the layout 'pascal3d' are rotations"),
         ({"preset": "gadelha2017-kato"}, "encoder_from_step=53051 lies beyond the 4 iterations: .* such as 3"),
         ({"view_bins": "15"}, "view bins are written as AZIMUTHxELEVATION"),
-        ({"prior_form": "cube"}, "prior_form must be one of squared, norm"),
-        ({"iterations": 0}, "iterations must be a whole number >= 1"),
-        ({"batch_size": 2.5}, "batch_size must be a whole number >= 1"),
-        ({"learning_rate": float("nan")}, "learning_rate must be a positive number"),
-        ({"lambda_smooth": -1.0}, "lambda_smooth must be a number >= 0"),
-        ({"seed": -1}, "seed must be a whole number >= 0"),
-        ({"category": ""}, "category must be a class name"),
-        ({"threads": 0}, "threads must be a whole number >= 1"),
+        ({"prior_form": "cube"}, "prior_form must be 'squared' or 'norm'"),
+        ({"iterations": 0}, "iterations must be at least 1"),
+        ({"batch_size": 2.5}, "batch_size must be a whole number, got 2.5"),
+        ({"learning_rate": float("nan")}, "learning_rate must be a finite number"),
+        ({"lambda_smooth": -1.0}, "lambda_smooth must be at least 0"),
+        ({"seed": -1}, "seed must be at least 0"),
+        ({"category": ""}, "category must have at least 1 character"),
+        ({"threads": 0}, "threads must be at least 1"),
     ],
 )
 def test_wrong_options_are_named(tiny_config, tmp_path, options: dict, message: str) -> None:
@@ -190,11 +190,11 @@ def test_config_survives_json_and_names_unknown_options(tmp_path) -> None:
     )
     values = json.loads(json.dumps(config_to_dict(config)))
     assert config_from_dict(values) == config
-    with pytest.raises(ValueError, match=r"unknown options \['latent'\]"):
+    with pytest.raises(ValueError, match="no option 'latent'"):
         config_from_dict(values | {"latent": 3})
-    with pytest.raises(ValueError, match=r"settings has unknown options \['latent'\]"):
+    with pytest.raises(ValueError, match="no option 'latent'"):
         config_from_dict(values | {"settings": {"latent": 3}})
-    with pytest.raises(ValueError, match=r"lacks the options \['output'\]"):
+    with pytest.raises(ValueError, match="option output is missing"):
         config_from_dict({"data": "a", "category": "b"})
     with pytest.raises(ValueError, match="folder of a training run"):
         load_config(tmp_path / "config.json")

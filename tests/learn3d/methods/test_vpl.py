@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from torch import nn
 
 import nmr
-from learn3d.config import check_fields
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import KATO
 from learn3d.data.dataset import ViewDataset
@@ -289,7 +288,6 @@ def test_presets_of_vpl() -> None:
     ]
     for name in VPL_PRESETS:
         preset = PRESETS[name]
-        check_fields(preset.settings)
         assert isinstance(preset.settings, VPLSettings)
         assert "published code" in preset.source
     weights = {n: (PRESETS[n].iterations, PRESETS[n].settings.lambda_discriminator) for n in VPL_PRESETS}
