@@ -23,6 +23,9 @@ class DamagedFile(ValueError):
         super().__init__(f"{path}: {message}")
         self.path, self.message = path, message
 
+    def __reduce__(self) -> tuple[type, tuple[Path, str]]:
+        return type(self), (self.path, self.message)  # so that it can be pickled
+
 
 class MissingFile(FileNotFoundError):
     """A file or folder that should be there."""
@@ -30,6 +33,9 @@ class MissingFile(FileNotFoundError):
     def __init__(self, path: Path, message: str) -> None:
         super().__init__(f"{path}: {message}")
         self.path, self.message = path, message
+
+    def __reduce__(self) -> tuple[type, tuple[Path, str]]:
+        return type(self), (self.path, self.message)
 
 
 @dataclass(frozen=True)
