@@ -2,7 +2,7 @@
 
 Examples:
   python tools/fetch_debian_models.py --output models
-  python tools/fetch_debian_models.py --output models --packages-dir debs --categories airplane chair
+  python tools/fetch_debian_models.py --output models --packages-dir debs --category airplane chair
 """
 
 import sys

@@ -3,49 +3,31 @@
 from __future__ import annotations
 
 import numpy as np
+import trimesh
+
+from learn3d.files import limits
+from learn3d.make_data.meshes import RawMesh, checked, fit_to_box
 
 _SAMPLES = 2_000_000  # points of surfaces in memory at a time
 
 
-def clean_mesh(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
-    """The welded mesh with its box centred at the origin and its longest side 1: float64 [V, 3], int64 [F, 3].
+def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
+    """The welded mesh with its box centred at the origin and its longest side 1.
 
-    Vertices closer than about `tolerance` of the longest side become one; faces without area, repeated faces (in
-    whatever winding) and unused vertices go.
-    Raises ValueError when nothing solid is left or a coordinate is not finite.
+    Vertices closer than about 1e-5 of the longest side become one; faces without area, repeated faces (in whatever
+    winding) and unused vertices go. Raises ValueError when nothing solid is left or a coordinate is not finite.
     """
-    if len(faces) == 0:
-        raise ValueError("it has no faces")
-    vertices = vertices[: faces.max() + 1]
-    if not np.isfinite(vertices[faces]).all():
-        raise ValueError("a coordinate is not finite")
-    used = vertices[np.unique(faces)]
-    low, high = used.min(axis=0), used.max(axis=0)
-    side = (high - low).max()
-    if side == 0:
-        raise ValueError("it is a single point")
-    points = (vertices - (low + high) / 2) / side
-
-    cells = np.round(points / tolerance)
-    cells[~np.isfinite(cells)] = 0  # of vertices that no face uses
-    _, first, label = np.unique(cells.astype(np.int64), axis=0, return_index=True, return_inverse=True)
-    points, faces = points[first], label.reshape(-1)[faces]
-
-    a, b, c = (points[faces[:, i]] for i in range(3))
-    solid = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12
-    solid &= (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    faces = faces[solid]
-    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    faces = faces[np.sort(once)]
-    if len(faces) == 0:
+    raw = checked(RawMesh(vertices, faces), limits.MESH_FACES)
+    mesh = trimesh.Trimesh(fit_to_box(raw.vertices), raw.faces, process=False)
+    mesh.merge_vertices(digits_vertex=5)
+    mesh.update_faces((mesh.area_faces > 1e-12) & mesh.unique_faces())
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) == 0:
         raise ValueError("no face has an area")
-    kept, faces = np.unique(faces, return_inverse=True)
-    points = points[kept]
-    extents = np.ptp(points, axis=0)
-    if extents.min() < 1e-3 * extents.max():
+    if mesh.extents.min() < 1e-3 * mesh.extents.max():
         raise ValueError("it is flat")
-    points = (points - (points.min(axis=0) + points.max(axis=0)) / 2) / extents.max()
-    return points, faces.reshape(-1, 3).astype(np.int64)
+    mesh.vertices = fit_to_box(mesh.vertices)
+    return mesh
 
 
 def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: bool = False) -> np.ndarray:

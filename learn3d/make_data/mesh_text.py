@@ -1,18 +1,17 @@
-"""Readers of the two text formats of the Debian meshes (OBJ and AC3D), and a writer of binary PLY.
+"""Readers of the two text formats of the Debian meshes: OBJ and AC3D, which trimesh does not know.
 
-Only the geometry is read: positions and polygons, the latter cut into triangles. Both readers are strict about indices
-and lenient about everything that they do not need.
+Only the geometry is read: positions and polygons, the latter cut into triangles. trimesh reads OBJ, too, but makes a
+fan of every polygon, which covers the gaps of concave ones (the backs of some chairs).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from learn3d.files import limits, writing
+from learn3d.files import limits
 
 Polygon = Sequence[int]
 
@@ -119,82 +118,51 @@ def _read_object(lines: Iterator[str], stack: list[list], parts: list[Part], ski
 def triangulate(polygons: Sequence[Polygon], vertices: np.ndarray) -> np.ndarray:
     """Triangles int64 [F, 3] of simple polygons, convex or not; ValueError when an index is outside of `vertices`.
 
-    A quadrilateral is cut along the diagonal that keeps both normals on one side; a larger polygon is cut by ears in
-    the plane of its Newell normal.
+    A polygon is cut into a fan from its first corner where that does not fold over, else by its ears.
     """
     by_size: dict[int, list[Polygon]] = {}
-    for polygon in polygons:
-        by_size.setdefault(len(polygon), []).append(polygon)
-    if (most := max(by_size, default=0)) > limits.POLYGON_CORNERS:
-        raise ValueError(f"a polygon has {most} corners; at most {limits.POLYGON_CORNERS} are read")
     for polygon in polygons:
         if min(polygon) < 0 or max(polygon) >= len(vertices):  # of any size: before they become an array
             worst = max(polygon, key=abs)
             raise ValueError(f"a polygon names vertex {str(worst)[:20]}, but there are {len(vertices)} vertices")
-    triangles = [np.array(by_size.pop(3, []), dtype=np.int64).reshape(-1, 3)]
-    quads = np.array(by_size.pop(4, []), dtype=np.int64).reshape(-1, 4)
-    first, second = _cut_quads(quads, vertices)
-    triangles += [first, second]
+        by_size.setdefault(len(polygon), []).append(polygon)
+    if (most := max(by_size, default=0)) > limits.POLYGON_CORNERS:
+        raise ValueError(f"a polygon has {most} corners; at most {limits.POLYGON_CORNERS} are read")
+    triangles = [np.empty((0, 3), dtype=np.int64)]
     for size in sorted(by_size):
-        for polygon in by_size[size]:
-            triangles.append(np.array(_cut_ears(polygon, vertices), dtype=np.int64).reshape(-1, 3))
+        corners = np.array(by_size[size], dtype=np.int64)  # [P, size]
+        points = vertices[corners]
+        points = points - points[:, :1]
+        normals = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)  # Newell's: the area's, of any polygon
+        fan = np.stack([np.zeros(size - 2, dtype=np.int64), np.arange(1, size - 1), np.arange(2, size)], axis=1)
+        areas = np.cross(points[:, 1:-1], points[:, 2:])
+        folded = ((areas * normals[:, None]).sum(axis=2) < 0).any(axis=1)
+        triangles.append(corners[~folded][:, fan].reshape(-1, 3))
+        triangles += [corners[i][np.array(_ears(points[i], normals[i]))] for i in np.flatnonzero(folded)]
     return np.concatenate(triangles)
 
 
-def _normals(triangles: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    return np.cross(b - a, c - a)
-
-
-def _cut_quads(quads: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two triangles [Q, 3] each of quadrilaterals [Q, 4]."""
-    a, b = quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]
-    c, d = quads[:, [1, 2, 3]], quads[:, [1, 3, 0]]
-    folded = (_normals(a, vertices) * _normals(b, vertices)).sum(axis=1) < 0
-    other_is_flat = (_normals(c, vertices) * _normals(d, vertices)).sum(axis=1) > 0
-    use_other = (folded & other_is_flat)[:, None]
-    return np.where(use_other, c, a), np.where(use_other, d, b)
-
-
-def _cut_ears(polygon: Polygon, vertices: np.ndarray) -> list[tuple[int, int, int]]:
-    """Triangles of one polygon with more than four corners, by ear clipping; what cannot be clipped is fanned."""
-    points = vertices[list(polygon)]
-    normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)  # Newell
+def _ears(points: np.ndarray, normal: np.ndarray) -> list[tuple[int, int, int]]:
+    """Triangles of one polygon [N, 3], cut in the coordinate plane that sees most of it; all N corners are used."""
     axis = int(np.abs(normal).argmax())
-    u, v = ((1, 2), (2, 0), (0, 1))[axis]
-    sign = 1.0 if normal[axis] >= 0 else -1.0
-    flat = [(sign * p[u], p[v]) for p in points.tolist()]
+    u, v = (axis + 1) % 3, (axis + 2) % 3
+    flat = points[:, [u, v] if normal[axis] >= 0 else [v, u]]  # counter-clockwise
 
-    def turn(i: int, j: int, k: int) -> float:
-        (ax, ay), (bx, by), (cx, cy) = flat[i], flat[j], flat[k]
-        return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    def left_of(a: int, b: int, others: int | list[int]) -> np.ndarray:
+        """Twice the area of the triangle from a to b to each of the others: above 0 on the left."""
+        (x, y), to = flat[b] - flat[a], flat[others] - flat[a]
+        return x * to[..., 1] - y * to[..., 0]
 
-    left = list(range(len(polygon)))
-    triangles = []
-    while len(left) > 3:
-        for at in range(len(left)):
-            i, j, k = left[at - 1], left[at], left[(at + 1) % len(left)]
-            if turn(i, j, k) > 0 and not any(
-                turn(i, j, p) >= 0 and turn(j, k, p) >= 0 and turn(k, i, p) >= 0
-                for p in left
-                if flat[p] not in (flat[i], flat[j], flat[k])
-            ):
-                triangles.append((polygon[i], polygon[j], polygon[k]))
-                del left[at]
+    corners, triangles = list(range(len(points))), []
+    while len(corners) > 3:
+        for at, j in enumerate(corners):
+            i, k = corners[at - 1], corners[(at + 1) % len(corners)]
+            inside = (left_of(i, j, corners) >= 0) & (left_of(j, k, corners) >= 0) & (left_of(k, i, corners) >= 0)
+            own = (flat[corners][:, None] == flat[[i, j, k]]).all(axis=2).any(axis=1)
+            if left_of(i, j, k) > 0 and not (inside & ~own).any():
+                triangles.append((i, j, k))
+                del corners[at]
                 break
         else:
-            break
-    triangles += [(polygon[left[0]], polygon[left[i]], polygon[left[i + 1]]) for i in range(1, len(left) - 1)]
-    return triangles
-
-
-def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Write a binary little-endian PLY: float32 vertices [V, 3], int32 faces [F, 3]."""
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
-        "property float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = np.empty(len(faces), dtype=[("size", "u1"), ("face", "<i4", 3)])
-    rows["size"], rows["face"] = 3, faces
-    writing.write_bytes(path, header.encode("ascii") + vertices.astype("<f4").tobytes() + rows.tobytes())
+            break  # nothing can be cut off (the polygon crosses itself): the rest becomes a fan
+    return triangles + [(corners[0], *pair) for pair in zip(corners[1:-1], corners[2:], strict=True)]

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from learn3d.files import limits, npz
 from learn3d.files.findings import AGAIN
@@ -274,11 +275,9 @@ def is_watertight(vertices: np.ndarray, faces: np.ndarray) -> bool:
 
     The second suits formats that repeat vertices (STL); the first, closed parts that touch each other.
     """
-    return _closed(faces) or _closed(np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces])
-
-
-def _closed(faces: np.ndarray) -> bool:
-    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]  # degenerate faces close nothing
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    _, counts = np.unique(edges[:, 0] * (np.int64(faces.max(initial=0)) + 1) + edges[:, 1], return_counts=True)
-    return len(counts) > 0 and bool((counts == 2).all())
+    place = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)
+    for corners in (faces, place[faces]):
+        corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]  # degenerate faces close nothing
+        if len(corners) and trimesh.graph.is_watertight(trimesh.geometry.faces_to_edges(corners))[0]:
+            return True
+    return False

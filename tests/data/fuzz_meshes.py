@@ -172,7 +172,8 @@ def deb_bytes(files: dict[str, bytes], kind: str = "xz") -> bytes:
             info.size = len(content)
             tar.addfile(info, io.BytesIO(content))
     out = bytearray(b"!<arch>\n")
-    for name, content in (("debian-binary", b"2.0\n"), (f"data.tar.{kind}", data.getvalue())):
+    members = {"debian-binary": b"2.0\n", "control.tar.xz": b"odd", f"data.tar.{kind}": data.getvalue()}
+    for name, content in members.items():
         out += f"{name:<16}{0:<12}{0:<6}{0:<6}{'100644':<8}{len(content):<10}`\n".encode()
         out += content + b"\n" * (len(content) % 2)
     return bytes(out)
@@ -204,10 +205,10 @@ def debian_target(tmp: Path) -> Target:
     def read(folder: Path) -> None:
         package = packages.find_package("sweethome3d-furniture", folder)
         for candidate in furniture_models(package, ("chair",), folder / "licences", False):
-            if candidate is not None and not isinstance(candidate.mesh, str):
+            if candidate is not None:
                 candidate.title.encode()
                 with contextlib.suppress(ValueError):
-                    clean_mesh(*candidate.mesh)
+                    clean_mesh(*candidate.read())
 
     return Target(tmp, {path.name: damage_deb}, read)
 

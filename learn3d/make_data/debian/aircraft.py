@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+import trimesh
 from tqdm import tqdm
 
 from learn3d.files import limits
-from learn3d.files.reading import within
-from learn3d.make_data.debian import packages as packages
+from learn3d.make_data.debian.packages import Candidate, Package, read_package
 from learn3d.make_data.mesh_text import Part, read_ac3d
 
 AIRCRAFT_PACKAGE = "flightgear-data-ai"
@@ -70,9 +71,7 @@ def without_effects(parts: list[Part]) -> list[Part]:
         if flat and max(y, z) > DISC_DIAMETER * size:
             continue
         if len(part.faces) <= 2 and len(parts) > 1:
-            middle = corners[index].mean(
-                axis=0
-            )  # a twin at the same place does not count: quadrilaterals with two sides
+            middle = corners[index].mean(axis=0)  # a twin at the same place, its other side, does not count
             others = [points for points in corners if np.abs(points.mean(axis=0) - middle).max() > DETACHED * size]
             gaps = [np.linalg.norm(points[:, None] - corners[index], axis=2).min() for points in others]
             if gaps and min(gaps) > DETACHED * size:
@@ -81,50 +80,42 @@ def without_effects(parts: list[Part]) -> list[Part]:
     return kept
 
 
-def aircraft_models(package: packages.Package, licences: Path, progress: bool) -> Iterator[packages.Candidate | None]:
+def aircraft_models(package: Package, licences: Path, progress: bool) -> Iterator[Candidate | None]:
     """Airplanes of the package by path; None for a file that is no airplane. The copyright file goes to `licences`."""
     texts: dict[str, str] = {}
-    authors: dict[tuple[str, str], str] = {}
-    files = packages.read_keeping_copyright(package, (".ac", ".xml"), licences)
+    authors: dict[tuple[str, str], str] = {}  # of a folder and the name of a model in it
+    files = read_package(package, (".ac", ".xml"), licences)
     for path, content in tqdm(files, desc=f"reading {package.name}", unit="file", disable=not progress, leave=False):
         if not path.startswith(AIRCRAFT_FOLDER):
             continue
-        folder = path.removeprefix(AIRCRAFT_FOLDER).split("/", 1)[0]
+        below, text = path.removeprefix(AIRCRAFT_FOLDER), content.decode("latin-1")
         if path.endswith(".ac"):
-            texts[path] = content.decode("latin-1")
-        elif author := re.search(r"<author>([^<]+)</author>", text := content.decode("latin-1")):
+            texts[below] = text
+        elif author := re.search(r"<author>([^<]+)</author>", text):
             name = " ".join(author[1].split())
-            for model in filter(lambda found: found.endswith(".ac"), map(str.strip, _PATH.findall(text))):
-                key = folder, PurePosixPath(model).name
+            for model in map(str.strip, _PATH.findall(text)):
+                key = below.split("/", 1)[0], PurePosixPath(model).name
                 authors[key] = min(authors.get(key, name), name)
     for path in tqdm(sorted(texts), desc=package.name, unit="model", disable=not progress, leave=False):
-        below, stem = path.removeprefix(AIRCRAFT_FOLDER), PurePosixPath(path).stem
-        folder = below.split("/", 1)[0]
-        if not is_airplane_file(below):
+        folder, stem = path.split("/", 1)[0], PurePosixPath(path).stem
+        if not is_airplane_file(path):
             yield None
             continue
-        yield packages.Candidate(
+        yield Candidate(
             category="airplane",
             title=f"{folder} {stem}",
             author=authors.get((folder, PurePosixPath(path).name), AIRCRAFT_AUTHOR),
             licence=AIRCRAFT_LICENCE,
             package=package,
-            source=path,
+            source=AIRCRAFT_FOLDER + path,
             stem=stem if folder.lower() in stem.lower() else f"{folder}-{stem}",
-            mesh=_aircraft_mesh(texts[path]),
+            read=partial(_read_aircraft, texts[path]),
         )
 
 
-def _aircraft_mesh(text: str) -> tuple[np.ndarray, np.ndarray] | str:
-    try:
-        with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
-            parts = read_ac3d(text, skip=lambda name: EFFECTS.search(name[: limits.NAME_LENGTH]) is not None)
-            parts = without_effects(parts) if parts else []
-    except ValueError as error:
-        return f"unreadable ({error})"
-    if not parts:
-        return "empty (no polygon is left)"
-    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    vertices = np.concatenate([part.vertices for part in parts])
-    faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)])
+def _read_aircraft(text: str) -> tuple[np.ndarray, np.ndarray]:
+    parts = read_ac3d(text, skip=lambda name: EFFECTS.search(name[: limits.NAME_LENGTH]) is not None)
+    if not parts or not (parts := without_effects(parts)):
+        raise ValueError("no polygon is left")
+    vertices, faces = trimesh.util.append_faces([p.vertices for p in parts], [p.faces for p in parts])
     return turn_to_front(vertices), faces

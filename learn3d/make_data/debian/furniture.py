@@ -5,17 +5,20 @@ A catalogue is a zip archive with a properties file (name#N, model#N, modelRotat
 
 from __future__ import annotations
 
+import io
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from tqdm import tqdm
 
 from learn3d.files import limits
-from learn3d.files.reading import within
-from learn3d.make_data.debian import packages as packages
+from learn3d.files.archives import open_zip
+from learn3d.make_data.debian.packages import Candidate, Package, read_package
 from learn3d.make_data.mesh_text import read_obj
 
 FURNITURE_PACKAGES = ("sweethome3d-furniture", "sweethome3d-furniture-nonfree")  # the second is optional
@@ -91,24 +94,28 @@ def place_furniture(vertices: np.ndarray, entry: dict[str, str]) -> np.ndarray:
 
 
 def furniture_models(
-    package: packages.Package, categories: tuple[str, ...], licences: Path, progress: bool
-) -> Iterator[packages.Candidate | None]:
+    package: Package, categories: tuple[str, ...], licences: Path, progress: bool
+) -> Iterator[Candidate | None]:
     """Models of every catalogue of a package, by catalogue and entry number; None for an entry of no wanted category.
 
     The package's copyright file goes to the folder `licences`.
     Raises ValueError for a catalogue that is damaged, or with a member that points outside of it.
     """
-    for path, content in sorted(packages.read_keeping_copyright(package, (".sh3f",), licences)):
+    for path, content in sorted(read_package(package, (".sh3f",), licences)):
         catalogue = PurePosixPath(path).name
-        with packages.open_catalogue(content, catalogue) as archive:
-            general, entries = read_catalogue(packages.read_member(archive, CATALOGUE).decode("latin-1"))
+        try:
+            archive = open_zip(io.BytesIO(content), limits.PACKAGE_BYTES)
+        except ValueError as error:
+            raise ValueError(f"{catalogue} is refused as a zip archive: {error}; get its package again") from error
+        with archive:
+            general, entries = read_catalogue(_member(archive, CATALOGUE))
             for entry in tqdm(entries, desc=catalogue, unit="model", disable=not progress, leave=False):
                 model = PurePosixPath(entry.get("model", "").removeprefix("/"))
                 category = furniture_category(entry.get("name", ""), entry.get("category", ""))
                 if category not in categories or model.stem in MISFITS:
                     yield None
                     continue
-                yield packages.Candidate(
+                yield Candidate(
                     category=category,
                     title=entry["name"],
                     author=entry.get("creator", ""),
@@ -116,18 +123,25 @@ def furniture_models(
                     package=package,
                     source=f"{catalogue}!/{model}",
                     stem=f"{PurePosixPath(catalogue).stem}-{model.stem}",
-                    mesh=_furniture_mesh(archive, model, entry),
+                    read=partial(_read_furniture, archive, model, entry),
                 )
 
 
-def _furniture_mesh(
+def _read_furniture(
     archive: zipfile.ZipFile, model: PurePosixPath, entry: dict[str, str]
-) -> tuple[np.ndarray, np.ndarray] | str:
+) -> tuple[np.ndarray, np.ndarray]:
     if model.suffix.lower() != ".obj":
-        return f"unreadable (only OBJ models are read, this is {model.suffix or 'nothing'})"
+        raise ValueError(f"only OBJ models are read, this is {model.suffix or 'nothing'}")
+    vertices, faces = read_obj(_member(archive, str(model)))
+    return place_furniture(vertices, entry), faces
+
+
+def _member(archive: zipfile.ZipFile, path: str) -> str:
+    """A text in a catalogue; ValueError if it is missing, damaged or over 64 MiB."""
     try:
-        with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
-            vertices, faces = read_obj(packages.read_member(archive, str(model)).decode("latin-1"))
-            return place_furniture(vertices, entry), faces
-    except ValueError as error:
-        return f"unreadable ({error})"
+        info = archive.getinfo(path)
+        if info.file_size > limits.CATALOGUE_MEMBER_BYTES:
+            raise ValueError(f"{info.file_size} bytes; at most {limits.CATALOGUE_MEMBER_BYTES} are read")
+        return archive.read(info).decode("latin-1")
+    except (KeyError, ValueError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise ValueError(f"{path} cannot be read from the catalogue ({error})") from error

@@ -12,7 +12,6 @@ import os
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -22,13 +21,12 @@ from tqdm import tqdm
 
 from learn3d.files import limits
 from learn3d.files.reading import within
+from learn3d.files.writing import write_bytes
 from learn3d.interrupt import stop_on_signal
-from learn3d.make_data.debian import packages as packages
+from learn3d.make_data.debian import packages
 from learn3d.make_data.debian.aircraft import AIRCRAFT_PACKAGE, aircraft_models
 from learn3d.make_data.debian.furniture import FURNITURE_PACKAGES, furniture_models
 from learn3d.make_data.mesh_cleaning import clean_mesh, overlap, surface_grid
-from learn3d.make_data.mesh_text import write_ply
-from learn3d.make_data.meshes import is_watertight
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side when surfaces are compared
@@ -38,14 +36,22 @@ GRID = 24  # cells per side when surfaces are compared
 class FetchConfig:
     """What to take from where."""
 
-    output: Path  # folder to write
-    categories: tuple[str, ...] = CATEGORIES  # which of the six categories
-    packages_dir: Path | None = None  # folder with the .deb files; without it they are downloaded with apt-get
-    root: Path | None = None  # take the packages as installed below this folder ("/" for this machine)
-    overwrite: bool = False  # replace an earlier output
-    duplicate_iou: float = 0.85  # two surfaces whose overlap is greater are one model; 1 keeps all
-    stretched_iou: float = 0.85  # the same with both boxes stretched to cubes; 1 keeps stretched copies
-    progress: bool = True  # draw progress bars
+    output: Path
+    """folder to write"""
+    category: tuple[str, ...] = CATEGORIES
+    """which of the six categories"""
+    packages_dir: Path | None = None
+    """folder with the .deb files; without it they are downloaded with apt-get"""
+    root: Path | None = None
+    """take the packages as installed below this folder ("/" for this machine)"""
+    overwrite: bool = False
+    """replace an earlier output"""
+    duplicate_iou: float = 0.85
+    """two surfaces whose overlap is greater are one model; 1 keeps all"""
+    stretched_iou: float = 0.85
+    """the same with both boxes stretched to cubes; 1 keeps stretched copies"""
+    progress: bool = True
+    """draw progress bars"""
 
 
 @dataclass(frozen=True)
@@ -103,9 +109,9 @@ def fetch_debian_models(config: FetchConfig) -> Report:
     Raises ValueError (a sentence that says what to do) for unknown categories, an output that is there already, a
     package that cannot be had, and archives that are damaged or unsafe. An unreadable model is reported, not raised.
     """
-    unknown = [name for name in config.categories if name not in CATEGORIES]
-    if unknown or not config.categories:
-        raise ValueError(f"categories must be some of {', '.join(CATEGORIES)}; got {', '.join(unknown) or 'none'}")
+    unknown = [name for name in config.category if name not in CATEGORIES]
+    if unknown or not config.category:
+        raise ValueError(f"category must be some of {', '.join(CATEGORIES)}; got {', '.join(unknown) or 'none'}")
     if config.packages_dir is not None and config.root is not None:
         raise ValueError("give either --packages-dir or --root, not both")
     for field in ("duplicate_iou", "stretched_iou"):
@@ -132,18 +138,15 @@ def fetch_debian_models(config: FetchConfig) -> Report:
 
 def _write_all(config: FetchConfig, folder: Path, downloads: Path) -> Report:
     """The body of `fetch_debian_models`: models, tables and copyright files into `folder`."""
-    licences = folder / "licences"
-    furniture = partial(furniture_models, categories=config.categories, licences=licences, progress=config.progress)
-    aircraft = partial(aircraft_models, licences=licences, progress=config.progress)
-    wanted: list[tuple[str, Callable[[packages.Package], Iterator[packages.Candidate | None]]]] = []
-    if set(config.categories) - {"airplane"}:
+    common = {"licences": folder / "licences", "progress": config.progress}
+    wanted = []
+    if set(config.category) - {"airplane"}:
+        furniture = partial(furniture_models, categories=config.category, **common)
         wanted += [(name, furniture) for name in FURNITURE_PACKAGES]
-    if "airplane" in config.categories:
-        wanted.append((AIRCRAFT_PACKAGE, aircraft))
-    found = []
-    notes = []
-    what = "downloading packages" if config.packages_dir is None and config.root is None else "finding packages"
-    for name, reader in tqdm(wanted, desc=what, unit="package", disable=not config.progress, leave=False):
+    if "airplane" in config.category:
+        wanted.append((AIRCRAFT_PACKAGE, partial(aircraft_models, **common)))
+    found, notes = [], []
+    for name, reader in tqdm(wanted, desc="finding packages", disable=not config.progress, leave=False):
         try:
             found.append((_locate(name, config, downloads), reader))
         except packages.PackageMissing as missing:
@@ -151,18 +154,17 @@ def _write_all(config: FetchConfig, folder: Path, downloads: Path) -> Report:
                 raise
             notes.append(f"done without {name}: {missing}")
 
-    models: list[Model] = []
-    dropped: list[Dropped] = []
-    ignored = 0
-    names: set[str] = set()
-    known: dict[str, list[tuple[str, np.ndarray, np.ndarray]]] = {category: [] for category in CATEGORIES}
+    kept, models, dropped, ignored = _Kept(config, folder), [], [], 0
     for package, reader in found:
         for candidate in reader(package):
             if candidate is None:
                 ignored += 1
                 continue
-            outcome = _keep(candidate, known[candidate.category], config, folder, names)
-            (models if isinstance(outcome, Model) else dropped).append(outcome)
+            try:
+                models.append(kept.add(candidate))
+            except ValueError as reason:
+                names = candidate.category, candidate.title, package.name, candidate.source
+                dropped.append(Dropped(*names, str(reason)))
     models.sort(key=lambda model: (CATEGORIES.index(model.category), model.file))
     dropped.sort(key=lambda drop: (CATEGORIES.index(drop.category), drop.package, drop.source))
     _write_table(folder / "index.csv", Model, models)
@@ -178,50 +180,49 @@ def _locate(name: str, config: FetchConfig, downloads: Path) -> packages.Package
     return packages.download_package(name, downloads)
 
 
-def _keep(
-    candidate: packages.Candidate, known: list, config: FetchConfig, folder: Path, names: set[str]
-) -> Model | Dropped:
-    """Clean one candidate, compare it with those kept before it in its category, and write it or say why not."""
+class _Kept:
+    """The models that were written, each with its surface in two grids, for the next ones to be compared with."""
 
-    def drop(reason: str) -> Dropped:
-        return Dropped(candidate.category, candidate.title, candidate.package.name, candidate.source, reason)
+    def __init__(self, config: FetchConfig, folder: Path) -> None:
+        self._config, self._folder = config, folder
+        self._grids: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {name: {} for name in CATEGORIES}
 
-    if isinstance(candidate.mesh, str):
-        return drop(candidate.mesh)
-    try:
-        with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
-            vertices, faces = clean_mesh(*candidate.mesh)
-            grids = surface_grid(vertices, faces, GRID), surface_grid(vertices, faces, GRID, per_axis=True)
-    except ValueError as error:
-        return drop(f"unreadable ({error})")
-    for name, *others in known:
-        iou, stretched = (overlap(mine, other) for mine, other in zip(grids, others, strict=True))
-        if iou > config.duplicate_iou:
-            return drop(f"near-duplicate of {name} (surface IoU {iou:.3f})")
-        if stretched > config.stretched_iou:
-            return drop(f"stretched near-duplicate of {name} (surface IoU {stretched:.3f} as cubes)")
-    stem = re.sub(r"[^a-z0-9]+", "-", candidate.stem.lower()).strip("-") or "model"
-    name, number = f"{candidate.category}/{stem}", 1
-    while name in names:
-        number += 1
-        name = f"{candidate.category}/{stem}-{number}"
-    names.add(name)
-    known.append((name, *grids))
-    (folder / candidate.category).mkdir(exist_ok=True)
-    write_ply(folder / f"{name}.ply", vertices, faces)
-    return Model(
-        category=candidate.category,
-        file=f"{name}.ply",
-        title=candidate.title,
-        author=candidate.author,
-        licence=candidate.licence,
-        package=candidate.package.name,
-        version=candidate.package.version,
-        source=candidate.source,
-        vertices=len(vertices),
-        faces=len(faces),
-        watertight=is_watertight(vertices, faces),
-    )
+    def add(self, candidate: packages.Candidate) -> Model:
+        """Write the candidate's mesh; ValueError, with the reason, where it is left out."""
+        try:
+            with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
+                mesh = clean_mesh(*candidate.read())
+                grids = tuple(surface_grid(mesh.vertices, mesh.faces, GRID, per_axis=cubes) for cubes in (False, True))
+        except ValueError as error:
+            raise ValueError(f"unreadable ({error})") from error
+        known = self._grids[candidate.category]
+        for name, others in known.items():
+            iou, stretched = (overlap(mine, other) for mine, other in zip(grids, others, strict=True))
+            if iou > self._config.duplicate_iou:
+                raise ValueError(f"near-duplicate of {name} (surface IoU {iou:.3f})")
+            if stretched > self._config.stretched_iou:
+                raise ValueError(f"stretched near-duplicate of {name} (surface IoU {stretched:.3f} as cubes)")
+        stem = re.sub(r"[^a-z0-9]+", "-", candidate.stem.lower()).strip("-") or "model"
+        name, number = f"{candidate.category}/{stem}", 1
+        while name in known:
+            number += 1
+            name = f"{candidate.category}/{stem}-{number}"
+        known[name] = grids
+        (self._folder / candidate.category).mkdir(exist_ok=True)
+        write_bytes(self._folder / f"{name}.ply", mesh.export(file_type="ply"))
+        return Model(
+            category=candidate.category,
+            file=f"{name}.ply",
+            title=candidate.title,
+            author=candidate.author,
+            licence=candidate.licence,
+            package=candidate.package.name,
+            version=candidate.package.version,
+            source=candidate.source,
+            vertices=len(mesh.vertices),
+            faces=len(mesh.faces),
+            watertight=mesh.is_watertight,
+        )
 
 
 def _write_table(path: Path, kind: type, rows: list) -> None:

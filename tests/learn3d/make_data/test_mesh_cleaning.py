@@ -17,7 +17,8 @@ def test_clean_mesh_welds_and_drops():
     soup = triangulate(quads, corners)
     vertices = np.concatenate([corners[soup].reshape(-1, 3), [[99, 99, 99]]])
     faces = np.concatenate([np.arange(36).reshape(-1, 3), [[0, 0, 1]], [[2, 1, 0]]])
-    points, clean = clean_mesh(vertices, faces)
+    mesh = clean_mesh(vertices, faces)
+    points, clean = mesh.vertices, mesh.faces
     assert (points.shape, clean.shape) == ((8, 3), (12, 3))
     assert is_watertight(points, clean) and not is_watertight(points, clean[1:])
     np.testing.assert_allclose(np.ptp(points, axis=0), [1, 0.5, 0.5])
@@ -27,7 +28,7 @@ def test_clean_mesh_welds_and_drops():
 @pytest.mark.parametrize(
     ("vertices", "message"),
     [
-        (np.zeros((3, 3)), "single point"),
+        (np.zeros((3, 3)), "no usable extent"),
         (np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2.0]]), "no face has an area"),
         (np.array([[0, 0, 0], [1, 0, 0], [0, 1.0, 0]]), "flat"),
         (np.array([[0, 0, 0], [np.nan, 0, 0], [0, 1.0, 0]]), "not finite"),

@@ -1,14 +1,12 @@
-"""Meshes as text: AC3D, OBJ, polygons as triangles, PLY."""
+"""Meshes as text: AC3D, OBJ, polygons as triangles."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from small_packages import AIRPLANE, ac_object, ac_text, box
+from small_packages import AIRPLANE, ac_object, ac_text
 
-from learn3d.make_data.mesh_text import read_ac3d, read_obj, triangulate, write_ply
+from learn3d.make_data.mesh_text import read_ac3d, read_obj, triangulate
 
 
 def test_ac3d_tree_names_and_transforms():
@@ -56,17 +54,6 @@ def test_obj_text():
         read_obj("v 0 0\nv 1 2 3")
     with pytest.raises(ValueError, match="names vertex 3, but there are 1"):
         read_obj("v 0 0 0\nf 1 2 4")
-
-
-def test_ply_reads_back(tmp_path: Path):
-    trimesh = pytest.importorskip("trimesh")
-    corners, quads = box((0, 0, 0), (2, 1, 1))
-    faces = triangulate(quads, corners)
-    write_ply(tmp_path / "box.ply", corners, faces)
-    mesh = trimesh.load(tmp_path / "box.ply", process=False)
-    np.testing.assert_array_equal(mesh.vertices, corners)
-    np.testing.assert_array_equal(mesh.faces, faces)
-    assert [path.name for path in tmp_path.iterdir()] == ["box.ply"]
 
 
 TEXTS = {

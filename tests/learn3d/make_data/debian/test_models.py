@@ -40,7 +40,7 @@ def test_recipe_writes_meshes_index_and_reasons(debs: Path, tmp_path: Path):
 
 def test_airplane_faces_front_without_its_disc(debs: Path, tmp_path: Path):
     trimesh = pytest.importorskip("trimesh")
-    fetch(tmp_path / "out", debs, categories=("airplane",))
+    fetch(tmp_path / "out", debs, category=("airplane",))
     mesh = trimesh.load(tmp_path / "out/airplane/plane.ply", process=False)
     fin = mesh.vertices[mesh.vertices[:, 1].argmax()]
     tip = mesh.vertices[mesh.vertices[:, 1].argmin()]
@@ -60,7 +60,7 @@ def test_two_runs_give_the_same_bytes(debs: Path, tmp_path: Path):
 
 
 def test_duplicates_are_kept_when_asked_for(debs: Path, tmp_path: Path):
-    report = fetch(tmp_path / "out", debs, categories=("chair",), duplicate_iou=1, stretched_iou=1)
+    report = fetch(tmp_path / "out", debs, category=("chair",), duplicate_iou=1, stretched_iou=1)
     assert [model.file for model in report.models] == [
         "chair/test-chair-2.ply",
         "chair/test-chair.ply",
@@ -77,9 +77,10 @@ def test_installed_packages_are_read_below_root(tmp_path: Path):
     info = root / "var/lib/dpkg/info"
     info.mkdir(parents=True)
     listed = [f"/{path}", f"/{path}".replace("plane.ac", "plane2.ac"), "/usr/share"]
-    (info / "flightgear-data-ai.list").write_text("\n".join(listed))
+    (info / "flightgear-data-ai.list").write_text("\n".join(listed) + "\n")
+    fields = "Status: install ok installed\nMaintainer: A <a@b>\nArchitecture: all\nDescription: x\n"
     (root / "var/lib/dpkg/status").write_text(
-        "Package: other\nVersion: 9\n\nPackage: flightgear-data-ai\nVersion: 1:7-1\n"
+        f"Package: other\nVersion: 9\n{fields}\nPackage: flightgear-data-ai\nVersion: 1:7-1\n{fields}"
     )
     config = FetchConfig(tmp_path / "out", ("airplane",), root=root, progress=False)
     report = fetch_debian_models(config)
@@ -92,10 +93,10 @@ def test_installed_packages_are_read_below_root(tmp_path: Path):
 
 def test_output_is_replaced_only_when_asked_and_ours(debs: Path, tmp_path: Path):
     out = tmp_path / "out"
-    fetch(out, debs, categories=("chair",))
+    fetch(out, debs, category=("chair",))
     with pytest.raises(ValueError, match="--overwrite"):
         fetch(out, debs)
-    fetch(out, debs, categories=("table",), overwrite=True)
+    fetch(out, debs, category=("table",), overwrite=True)
     assert sorted(path.name for path in out.iterdir()) == ["dropped.csv", "index.csv", "licences", "table"]
     (tmp_path / "precious").mkdir()
     with pytest.raises(ValueError, match="not written by this tool"):
@@ -112,8 +113,8 @@ def test_a_failure_leaves_nothing_behind(debs: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"categories": ("car",)}, "got car"),
-        ({"categories": ()}, "got none"),
+        ({"category": ("car",)}, "got car"),
+        ({"category": ()}, "got none"),
         ({"root": Path("/")}, "not both"),
         ({"duplicate_iou": 0}, r"duplicate_iou must be in \(0, 1\]"),
     ],
@@ -131,5 +132,5 @@ def test_long_names_and_gaps_take_no_square_of_their_length(debs: Path, tmp_path
     about = f"<author>B. Maker</author><path>{' ' * 10**6}x</path><path> Models/plane.ac\n</path>"
     files = {f"./{AIRCRAFT}/Plane/Models/plane.ac": text.encode(), f"./{AIRCRAFT}/Plane/plane.xml": about.encode()}
     deb(debs, "flightgear-data-ai", files)
-    report = fetch(tmp_path / "out", debs, categories=("airplane",))
+    report = fetch(tmp_path / "out", debs, category=("airplane",))
     assert [(model.title, model.author) for model in report.models] == [("Plane plane", "B. Maker")]
