@@ -1,47 +1,68 @@
-"""Image files that somebody else may have made, decoded by Pillow once their size is known to be one we can hold."""
+"""Image files that somebody else may have made, decoded by Pillow in a worker process."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from PIL import Image, UnidentifiedImageError
 
-from learn3d.files import limits
+from learn3d.files import child, limits
 from learn3d.files.findings import AGAIN, DamagedFile
 from learn3d.files.reading import check_file
 
 RENDERINGS = ("PNG", "JPEG", "TIFF")
 PHOTOGRAPHS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+_MEMORY_PER_PIXEL = 16  # bytes; two copies of four channels, and one to work with
+_PIXELS_PER_SECOND = 2e7
 
 
 def open_image(path: Path, formats: Sequence[str], most_side: int) -> Image.Image:
     """A decoded image in its own mode, of one of the formats (Pillow's names) and at most `most_side` pixels a side.
 
-    Only the decoders of these formats are ever tried. Raises MissingFile, and DamagedFile for what is no such image,
-    a file above 256 MiB, and more than 64 million pixels; nothing has been decoded then.
+    For functions that run in a worker. Raises MissingFile, and DamagedFile for what is no such image, a file above
+    256 MiB, and more than 64 million pixels.
     """
     check_file(path, limits.IMAGE_FILE_BYTES, "an image")
     try:
-        with Image.open(path, formats=formats) as image:
-            _check_size(path, *image.size, most_side)
+        image = Image.open(path, formats=formats)
+    except UnidentifiedImageError:
+        raise DamagedFile(path, f"cannot be decoded as an image of the kind {', '.join(formats)}. {AGAIN}") from None
+    except Image.DecompressionBombError as error:
+        raise DamagedFile(path, f"has too many pixels ({error}): make it smaller") from None
+    with image:
+        pixels = image.width * image.height
+        if max(image.size) > most_side or pixels > limits.IMAGE_PIXELS:
+            raise DamagedFile(
+                path,
+                f"is {image.width}x{image.height} pixels; at most {most_side} a side and {limits.IMAGE_PIXELS} in all "
+                "are read: make it smaller",
+            )
+        child.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
+        try:
             image.load()
-            return image
-    except DamagedFile:
-        raise
-    except UnidentifiedImageError as error:
-        raise DamagedFile(path, f"cannot be decoded as an image of the kind {', '.join(formats)}. {AGAIN}") from error
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        most = limits.IMAGE_PIXELS
-        raise DamagedFile(path, f"has too many pixels ({error}); at most {most} are read: make it smaller") from error
-    except Exception as error:  # Pillow's decoders raise whatever a damaged file leads them to
-        raise DamagedFile(path, f"cannot be decoded as an image ({type(error).__name__}: {error}). {AGAIN}") from error
+        except (OSError, SyntaxError, ValueError, IndexError) as error:
+            raise DamagedFile(path, f"cannot be decoded ({child.one_line(error)}); expected an image. {AGAIN}") from None
+        return image
 
 
-def _check_size(path: Path, width: int, height: int, most_side: int) -> None:
-    if max(width, height) > most_side or width * height > limits.IMAGE_PIXELS:
-        raise DamagedFile(
-            path,
-            f"is {width}x{height} pixels; at most {most_side} a side and {limits.IMAGE_PIXELS} in all are read: "
-            "make it smaller",
-        )
+@contextlib.contextmanager
+def opening_only(formats: Sequence[str]) -> Iterator[None]:
+    """Let libraries that use Pillow open images of these formats only, and decode them at once.
+
+    Pillow knows one, EPS, that it hands to Ghostscript: a program, run with what a stranger wrote.
+    """
+    usual = Image.open
+
+    def open_whole(file: Any, mode: str = "r", _: Any = None) -> Image.Image:
+        image = usual(file, mode, formats)
+        image.load()
+        return image
+
+    Image.open = open_whole
+    try:
+        yield
+    finally:
+        Image.open = usual

@@ -46,9 +46,10 @@ def read_bytes(path: Path | str, most: int, wanted: str) -> bytes:
     check_file(path, most, wanted)
     try:
         with open(path, "rb", opener=_open_at_once) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
                 raise OSError("it is no plain file any more")
-            return file.read(most)
+            return file.read(min(status.st_size, most))
     except OSError as error:
         raise DamagedFile(Path(path), f"cannot be read ({error}); expected {wanted}. {AGAIN}") from error
 

@@ -6,39 +6,20 @@ ValueError where the file cannot be read, and `checked` where a mesh cannot be u
 
 from __future__ import annotations
 
-import contextlib
-import io
-import logging
 import re
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 
 from learn3d.files import limits, npz
 from learn3d.files.findings import AGAIN
-from learn3d.files.images import PHOTOGRAPHS
-from learn3d.files.reading import read_bytes, within
+from learn3d.files.meshes import EXTENSIONS, RawMesh, read_mesh
 
-EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # what trimesh reads without further packages
 SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
-TEXTURES = (*PHOTOGRAPHS, "TGA", "GIF", "PPM", "DDS")
-_ONE_AT_A_TIME = threading.RLock()
-logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else tracebacks of what it passes over are printed
-
-
-@dataclass(frozen=True, eq=False)
-class RawMesh:
-    """Triangles as read: any scale and place, right-handed, either winding."""
-
-    vertices: np.ndarray  # float64 [V, 3]
-    faces: np.ndarray  # int64 [F, 3]
-    face_colors: np.ndarray | None = None  # float32 [F, 3], RGB in [0, 1], NaN or None where the file gives none
 
 
 @dataclass(frozen=True)
@@ -126,118 +107,6 @@ def object_names(sources: list[MeshSource]) -> list[str]:
         taken.add(name.lower())
         names.append(name)
     return names
-
-
-def read_mesh(path: Path, root: Path | None = None) -> RawMesh:
-    """All triangles of a mesh file, scenes concatenated with their transforms, with their colours where it has any.
-
-    root: the folder out of which files that it refers to (materials, textures, buffers) are read; None: its own.
-    Raises ValueError where it cannot be read, holds no triangle, or is beyond a limit: 256 MiB, 20 million vertices or
-    faces, 300 seconds, 8 GiB of memory.
-    """
-    import trimesh
-
-    try:
-        content = io.BytesIO(read_bytes(path, limits.MESH_FILE_BYTES, "a mesh file"))
-        beside = _files_below(path.parent, path.parent if root is None else root)
-        kind = path.suffix.lower().lstrip(".")
-        with within(limits.MESH_SECONDS, limits.MESH_MEMORY), _usual_textures():
-            scene = trimesh.load(content, file_type=kind, resolver=beside, force="scene", process=False)
-            return _joined([p for p in scene.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)])
-    except Exception as error:  # trimesh's readers raise whatever a foreign or truncated file makes them trip over
-        raise _unreadable(error) from error
-
-
-@contextlib.contextmanager
-def _usual_textures() -> Iterator[None]:
-    """Let trimesh open images of the usual formats only, and decode them at once, where it passes over what it cannot.
-
-    Pillow knows one, EPS, that it hands to Ghostscript: a program, run with what a stranger wrote.
-    """
-    from PIL import Image
-
-    with _ONE_AT_A_TIME:
-        usual = Image.open
-
-        def open_usual(file: Any, mode: str = "r", formats: Sequence[str] = TEXTURES) -> Image.Image:
-            image = usual(file, mode, formats)
-            image.load()
-            return image
-
-        Image.open = open_usual
-        try:
-            yield
-        finally:
-            Image.open = usual
-
-
-def _joined(parts: list) -> RawMesh:
-    """The triangles of several trimesh.Trimesh as one mesh."""
-    if not parts:
-        raise ValueError("no faces")
-    vertices, faces = sum(len(part.vertices) for part in parts), sum(len(part.faces) for part in parts)
-    if vertices > limits.MESH_VERTICES or faces > limits.MESH_FACES:
-        raise ValueError(
-            f"too large: {vertices} vertices and {faces} faces, the limits are {limits.MESH_VERTICES} and "
-            f"{limits.MESH_FACES}"
-        )
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    return RawMesh(
-        vertices=np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]),
-        faces=np.concatenate([np.asarray(p.faces, dtype=np.int64) + o for p, o in zip(parts, offsets, strict=True)]),
-        face_colors=np.concatenate([_part_colors(part) for part in parts]),
-    )
-
-
-def _files_below(folder: Path, root: Path):
-    """A trimesh resolver of names in `folder`, which gives nothing out that lies outside of `root`."""
-    from trimesh.resolvers import Resolver
-
-    class Below(Resolver):
-        def __init__(self) -> None:
-            """There is nothing to keep."""
-
-        def get(self, name: str) -> bytes:
-            path = (folder / str(name).strip()).resolve()
-            if not path.is_relative_to(root.resolve()):
-                raise ValueError(f"it refers to {name!r}, which lies outside of {root}")
-            return read_bytes(path, limits.MESH_FILE_BYTES, "a file that a mesh refers to")
-
-        def namespaced(self, namespace: str) -> Resolver:
-            return _files_below(folder / namespace, root)
-
-        def keys(self) -> list[str]:
-            return []
-
-        def write(self, name: str, data: bytes) -> None:
-            raise ValueError("a mesh that is read writes nothing")
-
-    return Below()
-
-
-def _unreadable(error: Exception) -> ValueError:
-    """A reader's exception as a ValueError of one line, with its kind where that says more than "ValueError"."""
-    reason = (str(error).strip().splitlines() or [""])[0][:300]
-    return ValueError(reason if reason and type(error) is ValueError else f"{type(error).__name__}: {reason}")
-
-
-def _part_colors(part) -> np.ndarray:
-    """Face colours float32 [F, 3] of a trimesh.Trimesh; a texture is sampled at the vertices. NaN where it has none."""
-    none = np.full((len(part.faces), 3), np.nan, dtype=np.float32)
-    visual = part.visual
-    if visual is None or not visual.defined:
-        return none
-    try:
-        if visual.kind == "texture":  # sampled, it does not know its mesh
-            colors = np.asarray(visual.to_color().vertex_colors, dtype=np.float64)
-            if colors.ndim == 1:  # without an image: the material's one colour
-                colors = np.broadcast_to(colors, (len(part.vertices), len(colors)))
-            colors = colors[part.faces].mean(axis=1)
-        else:
-            colors = np.asarray(visual.face_colors)
-    except Exception:  # a texture that cannot be read must not cost the mesh
-        return none
-    return (colors[:, :3] / 255).astype(np.float32) if len(colors) == len(none) else none
 
 
 def checked(mesh: RawMesh, max_faces: int) -> RawMesh:
