@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -165,4 +166,4 @@ def _ears(points: np.ndarray, normal: np.ndarray) -> list[tuple[int, int, int]]:
                 break
         else:
             break  # nothing can be cut off (the polygon crosses itself): the rest becomes a fan
-    return triangles + [(corners[0], *pair) for pair in zip(corners[1:-1], corners[2:], strict=True)]
+    return triangles + [(corners[0], *pair) for pair in pairwise(corners[1:])]

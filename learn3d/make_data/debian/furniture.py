@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path, PurePosixPath
+from typing import NoReturn
 
 import numpy as np
 from tqdm import tqdm
@@ -115,6 +116,10 @@ def furniture_models(
                 if category not in categories or model.stem in MISFITS:
                     yield None
                     continue
+                try:
+                    read = partial(_read_furniture, _member(archive, str(model)), model.suffix, entry)
+                except ValueError as error:
+                    read = partial(_refuse, str(error))
                 yield Candidate(
                     category=category,
                     title=entry["name"],
@@ -123,17 +128,19 @@ def furniture_models(
                     package=package,
                     source=f"{catalogue}!/{model}",
                     stem=f"{PurePosixPath(catalogue).stem}-{model.stem}",
-                    read=partial(_read_furniture, archive, model, entry),
+                    read=read,
                 )
 
 
-def _read_furniture(
-    archive: zipfile.ZipFile, model: PurePosixPath, entry: dict[str, str]
-) -> tuple[np.ndarray, np.ndarray]:
-    if model.suffix.lower() != ".obj":
-        raise ValueError(f"only OBJ models are read, this is {model.suffix or 'nothing'}")
-    vertices, faces = read_obj(_member(archive, str(model)))
+def _read_furniture(text: str, suffix: str, entry: dict[str, str]) -> tuple[np.ndarray, np.ndarray]:
+    if suffix.lower() != ".obj":
+        raise ValueError(f"only OBJ models are read, this is {suffix or 'nothing'}")
+    vertices, faces = read_obj(text)
     return place_furniture(vertices, entry), faces
+
+
+def _refuse(reason: str) -> NoReturn:
+    raise ValueError(reason)
 
 
 def _member(archive: zipfile.ZipFile, path: str) -> str:

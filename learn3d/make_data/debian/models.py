@@ -12,46 +12,58 @@ import os
 import re
 import tempfile
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
+from typing import Annotated, Literal, get_args
 
 import numpy as np
+import trimesh
+from pydantic import Field
 from tqdm import tqdm
 
-from learn3d.files import limits
-from learn3d.files.reading import within
+from learn3d.files import limits, worker
+from learn3d.files.findings import DamagedFile, MissingFile
 from learn3d.files.writing import write_bytes
 from learn3d.interrupt import stop_on_signal
 from learn3d.make_data.debian import packages
 from learn3d.make_data.debian.aircraft import AIRCRAFT_PACKAGE, aircraft_models
 from learn3d.make_data.debian.furniture import FURNITURE_PACKAGES, furniture_models
 from learn3d.make_data.mesh_cleaning import clean_mesh, overlap, surface_grid
+from learn3d.settings import FilePath, checked
 
-CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
+Category = Literal["airplane", "chair", "table", "cabinet", "sofa", "lamp"]
+CATEGORIES: tuple[Category, ...] = get_args(Category)
 GRID = 24  # cells per side when surfaces are compared
+Overlap = Annotated[float, Field(gt=0, le=1)]
+Grids = tuple[np.ndarray, np.ndarray]  # in proportion, and stretched to a cube
 
 
-@dataclass(frozen=True)
+@checked
 class FetchConfig:
     """What to take from where."""
 
-    output: Path
-    """folder to write"""
-    category: tuple[str, ...] = CATEGORIES
-    """which of the six categories"""
-    packages_dir: Path | None = None
-    """folder with the .deb files; without it they are downloaded with apt-get"""
-    root: Path | None = None
-    """take the packages as installed below this folder ("/" for this machine)"""
+    output: FilePath
+    """Folder to write."""
+    category: Annotated[tuple[Category, ...], Field(min_length=1, strict=False)] = CATEGORIES
+    """Which of the six categories."""
+    packages_dir: FilePath | None = None
+    """Folder with the .deb files. None: they are downloaded with apt-get."""
+    root: FilePath | None = None
+    """Take the packages as installed below this folder ("/" for this machine)."""
     overwrite: bool = False
-    """replace an earlier output"""
-    duplicate_iou: float = 0.85
-    """two surfaces whose overlap is greater are one model; 1 keeps all"""
-    stretched_iou: float = 0.85
-    """the same with both boxes stretched to cubes; 1 keeps stretched copies"""
+    """Replace an earlier output."""
+    duplicate_iou: Overlap = 0.85
+    """Two surfaces whose overlap is greater are one model; 1 keeps all."""
+    stretched_iou: Overlap = 0.85
+    """The same with both boxes stretched to cubes; 1 keeps stretched copies."""
     progress: bool = True
-    """draw progress bars"""
+    """Draw progress bars."""
+
+    def __post_init__(self) -> None:
+        if self.packages_dir is not None and self.root is not None:
+            raise ValueError("give either --packages-dir or --root, not both")
 
 
 @dataclass(frozen=True)
@@ -87,10 +99,10 @@ class Report:
     """What `fetch_debian_models` did."""
 
     output: Path
-    models: tuple[Model, ...]
-    dropped: tuple[Dropped, ...]
+    models: list[Model]
+    dropped: list[Dropped]
     ignored: int  # models of other categories
-    notes: tuple[str, ...]  # optional packages that were not there
+    notes: list[str]  # optional packages that were not there
 
     def summary(self) -> str:
         """A few lines for a person: counts per category, reasons of what was dropped, notes."""
@@ -106,17 +118,9 @@ class Report:
 def fetch_debian_models(config: FetchConfig) -> Report:
     """Write the meshes that `config` names into its output folder; the folder appears at once or not at all.
 
-    Raises ValueError (a sentence that says what to do) for unknown categories, an output that is there already, a
-    package that cannot be had, and archives that are damaged or unsafe. An unreadable model is reported, not raised.
+    Raises ValueError (a sentence that says what to do) for an output that is there already, a package that cannot be
+    had, and archives that are damaged. A model that cannot be read is reported, not raised.
     """
-    unknown = [name for name in config.category if name not in CATEGORIES]
-    if unknown or not config.category:
-        raise ValueError(f"category must be some of {', '.join(CATEGORIES)}; got {', '.join(unknown) or 'none'}")
-    if config.packages_dir is not None and config.root is not None:
-        raise ValueError("give either --packages-dir or --root, not both")
-    for field in ("duplicate_iou", "stretched_iou"):
-        if not 0 < getattr(config, field) <= 1:
-            raise ValueError(f"{field} must be in (0, 1], got {getattr(config, field)}")
     output = config.output.resolve()
     if output.exists():
         if not config.overwrite:
@@ -139,24 +143,22 @@ def fetch_debian_models(config: FetchConfig) -> Report:
 def _write_all(config: FetchConfig, folder: Path, downloads: Path) -> Report:
     """The body of `fetch_debian_models`: models, tables and copyright files into `folder`."""
     common = {"licences": folder / "licences", "progress": config.progress}
-    wanted = []
+    readers = {}
     if set(config.category) - {"airplane"}:
-        furniture = partial(furniture_models, categories=config.category, **common)
-        wanted += [(name, furniture) for name in FURNITURE_PACKAGES]
+        readers = dict.fromkeys(FURNITURE_PACKAGES, partial(furniture_models, categories=config.category, **common))
     if "airplane" in config.category:
-        wanted.append((AIRCRAFT_PACKAGE, partial(aircraft_models, **common)))
-    found, notes = [], []
-    for name, reader in tqdm(wanted, desc="finding packages", disable=not config.progress, leave=False):
+        readers[AIRCRAFT_PACKAGE] = partial(aircraft_models, **common)
+    found, notes, models, dropped, ignored = [], [], [], [], 0
+    for name in tqdm(readers, desc="finding packages", disable=not config.progress, leave=False):
         try:
-            found.append((_locate(name, config, downloads), reader))
+            found.append(_locate(name, config, downloads))
         except packages.PackageMissing as missing:
             if name != FURNITURE_PACKAGES[1]:
                 raise
             notes.append(f"done without {name}: {missing}")
-
-    kept, models, dropped, ignored = _Kept(config, folder), [], [], 0
-    for package, reader in found:
-        for candidate in reader(package):
+    kept = _Kept(config, folder)
+    for package in found:
+        for candidate in readers[package.name](package):
             if candidate is None:
                 ignored += 1
                 continue
@@ -169,7 +171,7 @@ def _write_all(config: FetchConfig, folder: Path, downloads: Path) -> Report:
     dropped.sort(key=lambda drop: (CATEGORIES.index(drop.category), drop.package, drop.source))
     _write_table(folder / "index.csv", Model, models)
     _write_table(folder / "dropped.csv", Dropped, dropped)
-    return Report(config.output, tuple(models), tuple(dropped), ignored, tuple(notes))
+    return Report(config.output, models, dropped, ignored, notes)
 
 
 def _locate(name: str, config: FetchConfig, downloads: Path) -> packages.Package:
@@ -185,17 +187,15 @@ class _Kept:
 
     def __init__(self, config: FetchConfig, folder: Path) -> None:
         self._config, self._folder = config, folder
-        self._grids: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {name: {} for name in CATEGORIES}
+        self._grids: dict[str, dict[str, Grids]] = {name: {} for name in CATEGORIES}
 
     def add(self, candidate: packages.Candidate) -> Model:
         """Write the candidate's mesh; ValueError, with the reason, where it is left out."""
+        package, known = candidate.package, self._grids[candidate.category]
         try:
-            with within(limits.MESH_SECONDS, limits.MESH_MEMORY):
-                mesh = clean_mesh(*candidate.read())
-                grids = tuple(surface_grid(mesh.vertices, mesh.faces, GRID, per_axis=cubes) for cubes in (False, True))
-        except ValueError as error:
-            raise ValueError(f"unreadable ({error})") from error
-        known = self._grids[candidate.category]
+            mesh, grids = worker.read(_prepare, package.path, candidate.read, memory=2 * limits.GIB, seconds=60.0)
+        except (DamagedFile, MissingFile) as error:
+            raise ValueError(f"unreadable ({error.message})") from error
         for name, others in known.items():
             iou, stretched = (overlap(mine, other) for mine, other in zip(grids, others, strict=True))
             if iou > self._config.duplicate_iou:
@@ -208,21 +208,22 @@ class _Kept:
             number += 1
             name = f"{candidate.category}/{stem}-{number}"
         known[name] = grids
-        (self._folder / candidate.category).mkdir(exist_ok=True)
-        write_bytes(self._folder / f"{name}.ply", mesh.export(file_type="ply"))
-        return Model(
-            category=candidate.category,
-            file=f"{name}.ply",
-            title=candidate.title,
-            author=candidate.author,
-            licence=candidate.licence,
-            package=candidate.package.name,
-            version=candidate.package.version,
-            source=candidate.source,
-            vertices=len(mesh.vertices),
-            faces=len(mesh.faces),
-            watertight=mesh.is_watertight,
-        )
+        file = self._folder / f"{name}.ply"
+        file.parent.mkdir(exist_ok=True)
+        write_bytes(file, mesh.export(file_type="ply"))
+        said = candidate.title, candidate.author, candidate.licence, package.name, package.version, candidate.source
+        size = len(mesh.vertices), len(mesh.faces), mesh.is_watertight
+        return Model(candidate.category, f"{name}.ply", *said, *size)
+
+
+def _prepare(package: Path, read: Callable[[], tuple[np.ndarray, np.ndarray]]) -> tuple[trimesh.Trimesh, Grids]:
+    """In a worker: a model of the package made fit, and its surface in two grids."""
+    try:
+        mesh = clean_mesh(*read())
+    except ValueError as error:
+        raise DamagedFile(package, str(error)) from error
+    whole, cube = (surface_grid(mesh.vertices, mesh.faces, GRID, per_axis=cubes) for cubes in (False, True))
+    return mesh, (whole, cube)
 
 
 def _write_table(path: Path, kind: type, rows: list) -> None:

@@ -33,9 +33,8 @@ class Package:
 
     name: str
     version: str
-    deb: Path | None = None  # the archive, or
-    root: Path | None = None  # the system's root, together with
-    listed: tuple[str, ...] = ()  # the paths below it
+    path: Path  # the file, or the system's root
+    listed: tuple[str, ...] | None = None  # below the root: the paths of its files
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,8 @@ class Candidate:
     package: Package
     source: str  # path inside the package
     stem: str  # file name to use, without suffix
-    read: Callable[[], tuple[np.ndarray, np.ndarray]]  # vertices float64 [V, 3] (y up, front +z), faces int64 [F, 3]
+    # Gives vertices float64 [V, 3] (y up, front +z) and faces int64 [F, 3]. Called in a worker process.
+    read: Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
 def download_package(name: str, folder: Path) -> Package:
@@ -81,7 +81,7 @@ def find_package(name: str, folder: Path) -> Package:
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
         raise ValueError(f"{folder} holds several versions of {name} ({names}); keep one")
-    return Package(name, unquote(found[0].stem.split("_")[1]), deb=found[0])
+    return Package(name, unquote(found[0].stem.split("_")[1]), found[0])
 
 
 def installed_package(name: str, root: Path) -> Package:
@@ -91,7 +91,7 @@ def installed_package(name: str, root: Path) -> Package:
     version, *listed = result.stdout.splitlines() or [""]
     if result.returncode != 0 or not listed:
         raise PackageMissing(f"{name} is not installed below {root}; install it, or leave --root out to download it")
-    return Package(name, version, root=root, listed=tuple(line.strip().lstrip("/") for line in sorted(listed)))
+    return Package(name, version, root, tuple(line.strip().lstrip("/") for line in sorted(listed)))
 
 
 def read_package(package: Package, suffixes: tuple[str, ...], licences: Path) -> Iterator[tuple[str, bytes]]:
@@ -102,7 +102,7 @@ def read_package(package: Package, suffixes: tuple[str, ...], licences: Path) ->
     Raises ValueError for archives that cannot be read and for more than 2 GiB in all.
     """
     notice, total = f"/doc/{package.name}/copyright", 0
-    for path, size, read in _files_of_system(package) if package.deb is None else _files_of_archive(package.deb):
+    for path, size, read in _files_of_archive(package.path) if package.listed is None else _files_of_system(package):
         if not path.endswith((*suffixes, notice)):
             continue
         total += size
@@ -120,7 +120,7 @@ _Files = Iterator[tuple[str, int, Callable[[], bytes]]]  # path without leading 
 
 def _files_of_system(package: Package) -> _Files:
     for path in package.listed:
-        file = package.root / path
+        file = package.path / path
         if file.is_file() and not file.is_symlink():
             yield path, file.stat().st_size, file.read_bytes
 

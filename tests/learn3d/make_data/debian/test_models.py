@@ -82,13 +82,13 @@ def test_installed_packages_are_read_below_root(tmp_path: Path):
     (root / "var/lib/dpkg/status").write_text(
         f"Package: other\nVersion: 9\n{fields}\nPackage: flightgear-data-ai\nVersion: 1:7-1\n{fields}"
     )
-    config = FetchConfig(tmp_path / "out", ("airplane",), root=root, progress=False)
+    config = FetchConfig(output=tmp_path / "out", category=("airplane",), root=root, progress=False)
     report = fetch_debian_models(config)
     (model,) = report.models
     assert not report.dropped  # the symbolic link was not followed, so there is no duplicate
     assert (model.version, model.source) == ("1:7-1", path)
     with pytest.raises(ValueError, match="sweethome3d-furniture is not installed below"):
-        fetch_debian_models(FetchConfig(tmp_path / "out2", root=root, progress=False))
+        fetch_debian_models(FetchConfig(output=tmp_path / "out2", root=root, progress=False))
 
 
 def test_output_is_replaced_only_when_asked_and_ours(debs: Path, tmp_path: Path):
@@ -113,10 +113,10 @@ def test_a_failure_leaves_nothing_behind(debs: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"category": ("car",)}, "got car"),
-        ({"category": ()}, "got none"),
+        ({"category": ("car",)}, "category .*car"),
+        ({"category": ()}, "category .*at least 1"),
         ({"root": Path("/")}, "not both"),
-        ({"duplicate_iou": 0}, r"duplicate_iou must be in \(0, 1\]"),
+        ({"duplicate_iou": 0}, "duplicate_iou must be .*0"),
     ],
 )
 def test_bad_config(debs: Path, tmp_path: Path, more: dict, message: str):
