@@ -33,6 +33,23 @@ class Preset:
     view_bins: str | None = None  # cells of azimuth and elevation, None: the data set's own view classes
 
 
+#: Short names of the methods, accepted wherever a preset is: those on Kato's data.
+METHODS = {
+    "proposed": "peng2020-kato",
+    "vanilla": "peng2020-kato-vanilla",
+    "multi-view": "kato2018-kato",
+    "vpl": "peng2020-kato-vpl",
+    "prgan": "gadelha2017-kato",
+}
+
+
+def full_name(name: str) -> str:
+    """The name of a preset, from that or from the short name of a method. Raises ValueError for any other."""
+    if METHODS.get(name, name) not in PRESETS:
+        raise ValueError(f"there is no preset {name!r}; choose one of {', '.join([*METHODS, *PRESETS])}")
+    return METHODS.get(name, name)
+
+
 _CODE = "published code of Peng et al. 2020"
 _PAPER = "Peng et al. 2020, section 4"
 _VPL_CODE = "published code of Kato and Harada 2019"

@@ -114,7 +114,7 @@ def save_reconstruction(
     vertices: Tensor,
     faces: Tensor,
     *,
-    mesh_format: Literal["obj", "glb", "ply"] = "obj",
+    mesh_format: Literal["obj", "glb", "ply"] = "glb",
     frames: int = 36,
     image_size: int = 256,
     inverted: bool = True,
@@ -185,7 +185,7 @@ def reconstruct_dataset(
     """
     _check(options)
     if not Path(data).is_dir():
-        raise FileNotFoundError(f"there is no folder {data}; say where the data set is with --dataset")
+        raise FileNotFoundError(f"there is no folder {data}; say where the data set is with --data")
     method, config, _ = checkpoint.load_method(checkpoint.find(run, which))
     name = category or config.category
     dataset = load_dataset(config.layout, data, name, split, image_size=method.image_size)

@@ -178,7 +178,7 @@ def _check_masks(dataset: ViewDataset) -> tuple[str, ...]:
     if empty == len(masks):
         raise ValueError(
             f"all {empty} {dataset.split} images of {dataset.category} have an empty mask, so that there is nothing to "
-            "learn; look at the data (tools/check_dataset.py)"
+            "learn; look at the data (learn3d check-dataset)"
         )
     return (f"{empty} of {len(masks)} {dataset.split} images have an empty mask",) if empty else ()
 

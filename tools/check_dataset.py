@@ -1,61 +1,8 @@
-"""Read every file of a data set and list everything that is wrong: missing, cut short, empty, inconsistent.
-
-Examples:
-  python tools/check_dataset.py DATA                                   (Kato's npz files)
-  python tools/check_dataset.py DATA --layout kar --category airplane chair --split train
-  python tools/check_dataset.py DATA --layout r2n2 --json report.json
-
-The exit code is 1 where training or evaluation would fail (an error), 0 where files are merely odd (a warning).
-"""
-
-from __future__ import annotations
+"""The command `learn3d check-dataset`, from a source folder."""
 
 import sys
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
-import tyro
-
-from learn3d.data.checking import check_folder
-from learn3d.data.layouts import Layout
-from learn3d.files.writing import check_target, write_json
-from learn3d.terminal import in_a_sentence, say
-
-
-@dataclass(frozen=True)
-class Command:
-    """Read every file of a data set and list everything that is wrong: missing, cut short, empty, inconsistent."""
-
-    folder: tyro.conf.Positional[Path]
-    """Folder of the data set."""
-    layout: Layout = "kato"
-    """How its files are arranged, see docs/data-sets.md."""
-    category: tuple[str, ...] = ()
-    """Classes to read, by name or synset id. None given: all that are there."""
-    split: tuple[Literal["train", "val", "test"], ...] = ()
-    """Splits to read. None given: all that are there."""
-    json: Path | None = None
-    """Also write the report to this file."""
-    most: int = 100
-    """Print at most so many problems; the JSON file has all."""
-
-
-@in_a_sentence()
-def main(command: Command) -> int:
-    if command.json is not None:
-        check_target(command.json, "--json")
-    report = check_folder(command.layout, command.folder, command.category, command.split, progress=sys.stderr.isatty())
-    lines = [f"{p.severity}: {p.path}: {p.message}" for split in report.splits for p in split.problems]
-    for line in lines[: command.most]:
-        say(line)
-    if len(lines) > command.most:
-        say(f"... and {len(lines) - command.most} more (--most, --json)")
-    say(f"\n{report.table()}\n\n{report.errors} errors, {report.warnings} warnings")
-    if command.json is not None:
-        write_json(command.json, report.to_json())
-    return 1 if report.errors else 0
-
+from learn3d.commands import main
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Command, description=__doc__)))
+    sys.exit(main("check-dataset"))

@@ -20,9 +20,8 @@ step "Making $objects ${category}s, each rendered from 24 views"
 "$python" tools/make_dataset.py --output "$out/data" --category "$category" --procedural "$objects" --overwrite
 
 for method in proposed vanilla; do
-    case $method in proposed) preset=peng2020-kato ;; vanilla) preset=peng2020-kato-vanilla ;; esac
-    step "Training the method '$method' (preset $preset) for $steps steps"
-    "$python" tools/train.py --data "$out/data" --category "$category" --preset "$preset" --output "$out/$method" \
+    step "Training the method '$method' for $steps steps"
+    "$python" tools/train.py --data "$out/data" --category "$category" --preset "$method" --output "$out/$method" \
         --overwrite --iterations "$steps" --validate-every 200 --pictures-every 200 --checkpoint-every 200
 done
 
@@ -30,8 +29,7 @@ step "Measuring both on the test objects, which neither has seen"
 "$python" tools/evaluate.py "$out/proposed" "$out/vanilla" --data "$out/data" --json "$out/evaluation.json"
 
 step "Reconstructing four test images"
-"$python" tools/reconstruct.py --run "$out/proposed" --dataset "$out/data" --indices 31 85 58 15 --output "$out/meshes" \
-    --format glb
+"$python" tools/reconstruct.py --run "$out/proposed" --data "$out/data" --indices 31 85 58 15 --output "$out/meshes"
 
 cat <<TEXT
 

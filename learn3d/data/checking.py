@@ -1,4 +1,4 @@
-"""Everything that is wrong with a folder of data, found at once: what tools/check_dataset.py prints.
+"""Everything that is wrong with a folder of data, found at once: what `learn3d check-dataset` prints.
 
 A reader takes part with three functions beside `load`: `contents(folder)`, the categories and their splits;
 `count(folder, category, split)`, how many objects a split should have; `problems(folder, category, split)`, what is

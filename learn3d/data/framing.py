@@ -38,7 +38,10 @@ def read_photo(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, n
     if mask_path is None:
         mask = _transparency(image)
         if mask is None:
-            raise ValueError(f"{path} has no transparency and no mask: give a mask image, white where the object is")
+            raise ValueError(
+                f"{path} has no transparency and no mask: give a mask image, white where the object is (reconstruct: "
+                "--masks)"
+            )
     else:
         mask_image = _open(mask_path)
         mask = _transparency(mask_image)

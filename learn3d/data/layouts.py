@@ -105,9 +105,27 @@ def load_dataset(
     options = {name: given[name] for name in LAYOUTS[layout].options}
     try:
         dataset = concatenate([reader.load(folder, name, split, **options) for name in names])
-    except (DamagedFile, MissingFile) as error:
-        check = f"python tools/check_dataset.py {shlex.quote(str(folder))} --layout {layout}"
+    except (DamagedFile, FileNotFoundError) as error:
+        if others := _layouts_in(Path(folder), layout):
+            hint = f"this is no data set of the layout {layout!r}; add --layout {others[0]}"
+            raise MissingFile(Path(folder), hint) from None
+        if not isinstance(error, (DamagedFile, MissingFile)):
+            raise
+        check = f"learn3d check-dataset {shlex.quote(str(folder))} --layout {layout}"
         raise type(error)(
             error.path, f"{error.message}. All that is wrong with the data set is listed by: {check}"
         ) from error
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
+
+
+def _layouts_in(folder: Path, asked: str) -> list[str]:
+    """The layouts of which the folder holds something, where it holds nothing of the one that was asked for."""
+    found = [layout for layout in LAYOUTS if _holds(folder, layout)]
+    return [] if asked in found else found
+
+
+def _holds(folder: Path, layout: str) -> bool:
+    try:
+        return bool(READERS[layout].contents(folder))
+    except (ValueError, OSError):  # the file that lists them is damaged, or another layout's
+        return False

@@ -200,10 +200,10 @@ def command_line(config: TrainConfig, **placeholders: str) -> str:
         value = getattr(config.settings, field.name)
         if value != getattr(preset.settings, field.name):
             values[field.name] = value
-    words = ["python", "tools/train.py"]
+    words = ["learn3d", "train"]
     for name, value in (values | placeholders).items():
         option = name.replace("_", "-")
-        if isinstance(value, bool):  # a flag: train.py takes no word after it
+        if isinstance(value, bool):  # a flag: no word follows it
             words.append(f"--{option}" if value else f"--no-{option}")
             continue
         flat = [str(item) for item in value] if isinstance(value, tuple) else [str(value)]

@@ -12,6 +12,7 @@ from typing import Any, Literal
 from learn3d.data.layouts import Layout
 from learn3d.experiments import published
 from learn3d.experiments.published import CATEGORIES, PublishedRow
+from learn3d.presets import METHODS
 
 
 @dataclass(frozen=True)
@@ -53,11 +54,7 @@ class Table:
         return tuple(row.variant for row in self.rows if row.variant is not None)
 
 
-PROPOSED = Variant("proposed", "peng2020-kato")
-VANILLA = Variant("vanilla", "peng2020-kato-vanilla")
-VPL = Variant("vpl", "peng2020-kato-vpl")
-PRGAN = Variant("prgan", "gadelha2017-kato")
-MULTI_VIEW = Variant("multi-view", "kato2018-kato")
+PROPOSED, VANILLA, MULTI_VIEW, VPL, PRGAN = (Variant(name, preset) for name, preset in METHODS.items())
 
 _NO_PRIOR = Variant("without-prior", "peng2020-kato", {"lambda_prior": 0.0})
 #: The classification loss trains nobody but the discriminator, which nobody listens to then: both are off.

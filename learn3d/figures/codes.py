@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,15 +33,13 @@ class CodeMap:
 def embed(codes: np.ndarray, *, seed: int = 0, perplexity: float = 30.0) -> np.ndarray:
     """Codes float [M, C] in the plane by t-SNE, float32 [M, 2]: the same for the same seed.
 
-    The perplexity is lowered to a third of the codes where there are few. Raises ValueError below 10 codes and where
-    scikit-learn is not installed.
+    The perplexity is lowered to a third of the codes where there are few. Raises ValueError below 10 codes.
     """
-    manifold = _sklearn("manifold")
+    from sklearn.manifold import TSNE
+
     if codes.ndim != 2 or len(codes) < FEWEST:
         raise ValueError(f"an embedding needs codes [M, C] of at least {FEWEST} images, got {list(codes.shape)}")
-    tsne = manifold.TSNE(
-        n_components=2, perplexity=min(perplexity, (len(codes) - 1) / 3), init="pca", random_state=seed
-    )
+    tsne = TSNE(n_components=2, perplexity=min(perplexity, (len(codes) - 1) / 3), init="pca", random_state=seed)
     return tsne.fit_transform(np.ascontiguousarray(codes, np.float32))
 
 
@@ -54,14 +50,17 @@ def view_accuracy(codes: np.ndarray, view_ids: np.ndarray, object_ids: np.ndarra
     other views of the same object lie nearest in a code without pose, and would count as wrong answers. Chance is the
     most frequent view of the other objects. None with a single object or view.
     """
-    selection, neighbors, dummy = _sklearn("model_selection"), _sklearn("neighbors"), _sklearn("dummy")
+    from sklearn.dummy import DummyClassifier
+    from sklearn.model_selection import GroupKFold
+    from sklearn.neighbors import KNeighborsClassifier
+
     objects = len(np.unique(object_ids))
     if objects < 2 or len(np.unique(view_ids)) < 2:
         return None
-    folds = list(selection.GroupKFold(min(FOLDS, objects)).split(codes, view_ids, object_ids))
+    folds = list(GroupKFold(min(FOLDS, objects)).split(codes, view_ids, object_ids))
     neighbours = min(NEIGHBOURS, *(len(train) for train, _ in folds))
     shares = []
-    for model in (neighbors.KNeighborsClassifier(neighbours), dummy.DummyClassifier(strategy="most_frequent")):
+    for model in (KNeighborsClassifier(neighbours), DummyClassifier(strategy="most_frequent")):
         right = [model.fit(codes[a], view_ids[a]).predict(codes[b]) == view_ids[b] for a, b in folds]
         shares.append(float(np.concatenate(right).mean()))
     return shares[0], shares[1]
@@ -130,10 +129,3 @@ def _draw_wheel(axes: Axes) -> None:
     axes.grid(False)
     axes.spines["polar"].set_visible(False)
     axes.text(0, 0, "azimuth\nof the view", ha="center", va="center", fontsize=6.5)
-
-
-def _sklearn(name: str) -> ModuleType:
-    try:
-        return importlib.import_module(f"sklearn.{name}")
-    except ImportError:
-        raise ValueError(plots.missing("scikit-learn")) from None

@@ -1,9 +1,10 @@
-"""The paper's figures, each from opened runs into files; what `tools/figures.py` calls."""
+"""The paper's figures, each from opened runs into files; what `learn3d figures` calls."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -144,12 +145,22 @@ def save_all(
     folder: Path,
     *,
     labels: Sequence[str] = (),
-    report_progress: Callable[[str], None] = lambda text: None,
-) -> tuple[list[Path], list[str]]:
-    """Every figure with its defaults: (files written, for each figure that could not be drawn its name and why).
+    without: Mapping[str, str] = MappingProxyType({}),
+    say: Callable[[str], None] = lambda text: None,
+) -> list[Path]:
+    """Every figure with its defaults, into files of these names in `folder`; returns the files that were written.
 
-    runs: `paths`, opened. A data set without true voxels has no polar plot, a single object no interpolation.
+    runs: `paths`, opened. without: figures to leave out, and why. What cannot be drawn is said, with the reason: before
+    anything is drawn as far as it is known then.
     """
+    datasets = [run.dataset for run in runs]
+    reasons = dict(without)
+    if any(dataset.voxels is None for dataset in datasets):
+        reasons.setdefault("polar", "the data set has no true voxels to compare shapes with")
+    if any(len(np.unique(dataset.object_ids)) < 2 for dataset in datasets):
+        reasons.setdefault("interpolation", "the data set has a single object")
+    for name, reason in reasons.items():
+        say(f"not drawn: {name}: {reason}")
     figures: dict[str, Callable[[Path], list[Path]]] = {
         "grid": lambda path: [save_grid(runs, path)],
         "tsne": lambda path: save_tsne(runs, path),
@@ -157,14 +168,14 @@ def save_all(
         "curves": lambda path: save_curves(paths, path, labels=labels),
         "polar": lambda path: save_polar(runs, path),
     }
-    written, failed = [], []
-    for name, draw in figures.items():
-        report_progress(f"drawing {name}")
+    written = []
+    for name in [name for name in figures if name not in reasons]:
+        say(f"drawing {name}")
         try:
-            written += draw(Path(folder) / name)
+            written += figures[name](Path(folder) / name)
         except (ValueError, OSError) as error:
-            failed.append(f"{name}: {error}")
-    return written, failed
+            say(f"not drawn: {name}: {error}")
+    return written
 
 
 def _in_folder(output: Path) -> Path:

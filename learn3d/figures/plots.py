@@ -44,24 +44,17 @@ _STYLE = {
 def styled(draw: Callable[P, R]) -> Callable[P, R]:
     """Decorator: run a function that uses matplotlib in this module's style, leaving the caller's settings alone.
 
-    It raises ValueError where matplotlib is not installed. Figures are made without pyplot, so no window opens.
+    Figures are made without pyplot, so no window opens.
     """
 
     @functools.wraps(draw)
     def wrapper(*args: P.args, **options: P.kwargs) -> R:
-        try:
-            import matplotlib
-        except ImportError:
-            raise ValueError(missing("matplotlib")) from None
+        import matplotlib
+
         with matplotlib.rc_context(_STYLE):
             return draw(*args, **options)
 
     return wrapper
-
-
-def missing(package: str) -> str:
-    """What to say where a package of the extra `figures` is not installed."""
-    return f"this figure needs {package}, which is not installed; install it: pip install '.[figures]'"
 
 
 def line_style(index: int) -> dict[str, str]:

@@ -198,7 +198,7 @@ def put_in_place(path: Path) -> None:
 
 def resume_command(folder: Path) -> str:
     """The command line that continues the run in `folder`, by the program that runs now, quoted for a POSIX shell."""
-    program = ["python", "tools/train.py"]
+    program = ["learn3d", "train"]
     if os.path.basename(sys.argv[0]) == "train.py":
         found = shutil.which("python")
         same = found is not None and os.path.samefile(found, sys.executable)

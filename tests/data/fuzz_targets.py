@@ -184,7 +184,7 @@ def config_target(tmp: Path) -> Target:
 
 RESULT: dict[str, Any] = {
     "config": {"data": "d", "category": "chair", "output": "o"},
-    "command": "python tools/train.py",
+    "command": "learn3d train",
     "data": "/d",
     "checkpoint": "last",
     "iterations": 10,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 import tiny_networks
 import torch
 
-from learn3d import validation
+from learn3d import commands, validation
 from learn3d.config import DEFAULT_PRESET, TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
@@ -111,6 +112,21 @@ def undisturbed(tiny_run: Callable[..., TrainConfig], tmp_path_factory: pytest.T
     folder = tmp_path_factory.mktemp("undisturbed") / "run"
     train(tiny_run(folder))
     return folder
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Calls `learn3d` with these words; its exit status and what it wrote to both outputs."""
+
+    def call(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["learn3d", *map(str, words)])
+        try:
+            status = commands.main()
+        except SystemExit as end:  # --help
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return call
 
 
 @pytest.fixture(autouse=True, scope="session")

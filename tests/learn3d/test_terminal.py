@@ -2,50 +2,20 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from learn3d.commands import main
 from learn3d.terminal import align, in_a_sentence, say
 
 TOOLS = Path(__file__).parents[2] / "tools"
 INTERRUPTED = "interrupted; what was saved before is as it was\n"
-
-
-def load_tool(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(TOOLS))  # the benchmarks import each other
-    spec = importlib.util.spec_from_file_location(f"ending_{name}", TOOLS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, spec.name, module)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.mark.parametrize("name", sorted(path.stem for path in TOOLS.glob("*.py") if "__main__" in path.read_text()))
-def test_an_interrupt_is_one_line_in_every_tool(name: str, monkeypatch, capsys) -> None:
-    if name == "figures":
-        pytest.importorskip("matplotlib")
-
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    module = load_tool(name, monkeypatch)
-    monkeypatch.setattr(sys, "argv", [name])
-    arguments = ()
-    if name == "check_dataset":  # its main is given what was parsed
-        monkeypatch.setattr(module, "check_folder", interrupt)
-        arguments = (module.Command(folder=Path("somewhere")),)
-    else:
-        monkeypatch.setattr(module.tyro, "cli", interrupt)
-    assert module.main(*arguments) == 130
-    assert capsys.readouterr() == ("", INTERRUPTED)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT to another process")
@@ -184,8 +154,17 @@ def test_a_mesh_whose_name_is_no_text_is_listed(tmp_path, monkeypatch, capsys) -
     for name in "abc":
         (tmp_path / f"{name}.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 1\n3 0 1 2\n")
     (tmp_path / os.fsdecode(b"\xff\x1b[2J.off")).write_text("no mesh")
-    command = ["make_dataset", "--output", str(tmp_path / "data"), "--category", "chair", "--source", str(tmp_path)]
+    command = [
+        "learn3d",
+        "make-dataset",
+        "--output",
+        str(tmp_path / "data"),
+        "--category",
+        "chair",
+        "--source",
+        str(tmp_path),
+    ]
     monkeypatch.setattr(sys, "argv", [*command, "--test", "0", "--val", "0"])
-    assert load_tool("make_dataset", monkeypatch).main() == 0
+    assert main() == 0
     for text in (capsys.readouterr().out, (tmp_path / "data" / "03001627_report.txt").read_text()):
         assert "skipped \\udcff\\x1b[2J.off (train): " in text

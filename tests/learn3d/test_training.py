@@ -387,7 +387,7 @@ def test_resume_from_a_checkpoint_without_conditions(tiny_config, tiny_folder, f
 
 def test_resume_command_is_quoted(tmp_path) -> None:
     words = shlex.split(run_folder.resume_command(tmp_path / "my runs" / "it's"))
-    assert words == ["python", "tools/train.py", "--output", str(tmp_path / "my runs" / "it's"), "--resume"]
+    assert words == ["learn3d", "train", "--output", str(tmp_path / "my runs" / "it's"), "--resume"]
 
 
 def test_resume_without_a_checkpoint(tiny_config, run_folder) -> None:

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import os
 import shlex
 import shutil
 import sys
-from pathlib import Path
 
 import pytest
 
+from learn3d.commands import train
 from learn3d.experiments import published
 from learn3d.experiments.experiment import Call, run_experiment
 from learn3d.experiments.plan import Options, State, command_line, is_current, plan_runs, read_results, read_state
 from learn3d.experiments.tables import TABLES
 from learn3d.presets import PRESETS
-
-TOOLS = Path(__file__).parents[3] / "tools"
 
 
 def test_runs_of_a_table_have_names_and_configurations(tmp_path) -> None:
@@ -99,16 +96,12 @@ def test_a_method_whose_preset_is_absent_is_named(monkeypatch, options) -> None:
 
 @pytest.mark.parametrize("table", ["kato", "ablation", "bins", "prgan"])
 def test_the_command_of_a_run_gives_its_configuration(tmp_path, table: str) -> None:
-    spec = importlib.util.spec_from_file_location("tool_train_commands", TOOLS / "train.py")
-    train = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = train
-    spec.loader.exec_module(train)
     changes = ("precision=fp32", "augment=flip-image,channels", "max_val_images=4")
     changes += {"kato": ("vpl:anti_aliasing=false",), "prgan": ("perspective=true",)}.get(table, ("lambda_prior=0.25",))
     methods = [row.variant.name for row in TABLES[table].rows if row.variant and row.variant.preset in PRESETS]
     given = Options(tmp_path / "a b", tmp_path, ("chair",), tuple(methods), 7, layout="kar", changes=changes)
     for run in plan_runs(TABLES[table], given):
-        assert train.parse(shlex.split(command_line(run.config))[2:]).config == run.config
+        assert train.read(shlex.split(command_line(run.config))[2:]).config == run.config
 
 
 def test_runs_made_by_hand_are_adopted(made_by_hand) -> None:

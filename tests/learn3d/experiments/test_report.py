@@ -46,7 +46,7 @@ def test_report_files_tell_the_same(report, tmp_path) -> None:
     text = (out / "kato.md").read_text()
     assert "| Proposed | paper (kato18) | 0.565 | 0.415 | 0.490 |" in text
     assert "| difference | +0.100 ±0.000 [+0.100, +0.100] |" in text
-    assert "python tools/train.py --preset peng2020-kato --data DATA --category CATEGORY" in text
+    assert "learn3d train --preset peng2020-kato --data DATA --category CATEGORY" in text
     assert str(tmp_path) not in text, "no path of this machine gets into a page"
     changed = report | {"runs": [report["runs"][0] | {"commit": "0123456789ab-dirty"}]}
     assert formats.run_table(changed)[1][-1] == "012345678-dirty"

@@ -1,4 +1,4 @@
-"""Every table of the paper in small: tools/experiment.py from its command line to its reports, workers in processes.
+"""Every table of the paper in small: `learn3d experiment` from its command line to its reports, workers in processes.
 
 Procedural airplanes in three layouts, small networks, two steps of batch 4: the figures say nothing, but each of the 23
 runs is planned, trained, measured, shared between tables and reported as in the real thing. Then the one preset that
@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import html
-import importlib.util
 import io
 import json
 import math
@@ -25,6 +24,7 @@ from typing import Any
 import pytest
 import trimesh
 
+from learn3d import commands
 from learn3d.data.layouts import Layout
 from learn3d.experiments.tables import TABLES
 from learn3d.make_data.render import DatasetConfig, make_dataset
@@ -32,7 +32,6 @@ from learn3d.runs import checkpoint
 
 pytestmark = pytest.mark.slow
 
-TOOLS = Path(__file__).parents[3] / "tools"
 CATEGORY = "airplane"
 PASCAL_SEEDS = 2
 MEASURES = ("kato18", "kato19", "mmd", "mmd_paper", "chamfer_l1", "f_score")
@@ -93,10 +92,10 @@ class Laboratory:
         return self.folder / "out" / "runs" / CATEGORY
 
     def call(self, table: str) -> Outcome:
-        """Make a table as its user would: `python tools/experiment.py TABLE ...`."""
+        """Make a table as its user would: `learn3d experiment TABLE ...`."""
         variants = [row.variant.name for row in TABLES[table].rows if row.variant]
         words = [table, "--data", self.folder / TABLES[table].layout, "--output", self.folder / "out"]
-        words += ["--categories", CATEGORY, "--iterations", 2, "--batch-size", 4, "--jobs", 2, "--threads", 1]
+        words += ["--category", CATEGORY, "--iterations", 2, "--batch-size", 4, "--jobs", 2, "--threads", 1]
         words += ["--seeds", PASCAL_SEEDS if table == "pascal" else 1]
         words += ["--set", "max_val_images=6", "log_every=1"]
         words += ["precision=fp32"] if table != "precision" else []
@@ -108,15 +107,11 @@ class Laboratory:
 
 
 def call_tool(name: str, *words: object) -> tuple[int, str, str]:
-    """Call a tool's command line; its exit status and what it wrote to both outputs."""
-    spec = importlib.util.spec_from_file_location(f"small_{name}", TOOLS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
+    """Call `learn3d`; its exit status and what it wrote to both outputs."""
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        patch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
-        status = module.main()
+        patch.setattr(sys, "argv", ["learn3d", name, *map(str, words)])
+        status = commands.main()
     return status, out.getvalue(), err.getvalue()
 
 
@@ -292,7 +287,7 @@ def test_the_class_conditional_preset_goes_from_meshes_to_meshes(laboratory: Lab
         assert 0 < result["voxel_iou_kato18"] <= 1 and 0 < result["voxel_iou_kato19"] <= 1
         assert 0 <= result["f_score"] <= 1 and math.isfinite(result["chamfer_l1"] + result["mmd"])
 
-    words = ["--run", run, "--output", tmp_path, "--dataset", data, "--category", "chair", "--indices", 0, 25]
+    words = ["--run", run, "--output", tmp_path, "--data", data, "--category", "chair", "--indices", 0, 25]
     status, out, said = call_tool("reconstruct", *words, "--frames", 2, "--image-size", 32, "--format", "ply")
     assert status == 0, said
     meshes = [trimesh.load(path) for path in out.split() if path.endswith(".ply")]

@@ -235,16 +235,6 @@ def test_profiles_are_kept_as_json(tmp_path) -> None:
             paper.redraw_polar(tmp_path / "q.json", tmp_path / "q")
 
 
-def test_missing_packages_are_named(monkeypatch) -> None:
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "matplotlib", None)
-        with pytest.raises(ValueError, match=r"needs matplotlib, which is not installed; .*'\.\[figures\]'"):
-            polar.plot_profiles(profiles())
-    monkeypatch.setitem(sys.modules, "sklearn.manifold", None)
-    with pytest.raises(ValueError, match=r"needs scikit-learn, which is not installed; .*'\.\[figures\]'"):
-        codes.embed(entangled(0.5))
-
-
 def test_plots_change_no_settings_of_others() -> None:
     before = dict(matplotlib.rcParams)
     polar.plot_profiles(profiles())

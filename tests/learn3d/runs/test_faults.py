@@ -83,7 +83,7 @@ def test_full_disk_while_a_checkpoint_is_written(tiny_run, undisturbed, run_fold
     said = str(stop.value)
     assert "No space left on device" in said
     assert f" MB free in {run_folder}" in said
-    assert f"repair that and continue with: python tools/train.py --output {run_folder} --resume" in said
+    assert f"repair that and continue with: learn3d train --output {run_folder} --resume" in said
     assert not list(run_folder.rglob(".*"))
     last = run_folder / "last.safetensors"
     if last.exists():

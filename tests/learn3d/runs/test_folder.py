@@ -197,7 +197,7 @@ def test_the_command_to_continue_is_the_program_that_ran(tmp_path, monkeypatch) 
     assert words[1:] == ["/some where/tools/train.py", "--output", str(tmp_path / "my run"), "--resume"]
     assert os.path.samefile(shutil.which(words[0]), sys.executable)
     monkeypatch.setattr(sys, "argv", ["pytest"])
-    assert run_folder.resume_command(tmp_path).startswith("python tools/train.py --output ")
+    assert run_folder.resume_command(tmp_path).startswith("learn3d train --output ")
 
 
 def test_half_written_files_do_not_make_a_folder_used_and_are_removed(tmp_path) -> None:

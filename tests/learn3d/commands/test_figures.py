@@ -1,14 +1,11 @@
-"""tools/figures.py from the command line to files, with the checkpoint of a real short run."""
+"""`learn3d figures` from the command line to files, with the checkpoint of a real short run."""
 
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 import shutil
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -20,26 +17,11 @@ from learn3d.figures.runs import name_runs, open_runs
 from learn3d.runs import checkpoint
 
 pytest.importorskip("matplotlib")
-TOOL = Path(__file__).parents[3] / "tools" / "figures.py"
-
-
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("tool_figures", TOOL)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
-def call(tool, monkeypatch, capsys):
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["figures", *map(str, arguments)])
-        code = tool.main()
-        return code, *capsys.readouterr()
-
-    return run
+def call(command):
+    return lambda *words: command("figures", *words)
 
 
 def test_all_figures_of_a_run(call, finished_run, tmp_path, monkeypatch) -> None:
@@ -71,11 +53,18 @@ def test_all_figures_of_a_run(call, finished_run, tmp_path, monkeypatch) -> None
     assert (tmp_path / "again.svg").read_bytes() == (tmp_path / "out" / "polar.svg").read_bytes()
 
 
-def test_what_could_not_be_drawn_is_said(call, finished_run, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(paper, "save_all", lambda *_, **__: ([tmp_path / "grid.png"], ["polar: no voxels"]))
+def test_what_cannot_be_drawn_is_said_before_anything_is(call, finished_run, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("learn3d.commands.figures.find_spec", lambda package: None)
+    monkeypatch.setattr(paper, "TILE_SIZE", 32)
+    monkeypatch.setattr(paper, "FRAMES", 1)
     code, out, err = call("all", "--runs", finished_run, "--output", tmp_path)
-    assert (code, out.split()) == (0, [str(tmp_path / "grid.png")])
-    assert err.splitlines()[-1] == "not drawn: polar: no voxels"
+    assert (code, [Path(line).name for line in out.split()]) == (0, ["grid.png"])
+    said = [line for line in err.splitlines() if line.startswith(("not drawn", "drawing"))]
+    assert [line.split(":")[1].strip() for line in said[:4]] == ["tsne", "curves", "polar", "interpolation"]
+    assert said[4:] == ["drawing grid"]
+    assert all('pip install "nmr-learn3d[figures]"' in line for line in said[:3])
+    code, out, err = call("tsne", "--runs", tmp_path / "nowhere", "--output", tmp_path)
+    assert code == 1 and "matplotlib" in err, "the package is looked for first"
 
 
 def test_the_morph_has_the_frames_that_were_asked_for(call, finished_run, tmp_path) -> None:
@@ -112,8 +101,11 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
         (("grid", "--runs", finished_run, "--images", 0), "has 24 images, 0 were asked for"),
         (("tsne", "--runs", finished_run, "--category", "lamp"), "lamp"),
         (("curves", "--runs", tmp_path), "metrics.jsonl"),
-        (("grid", "--runs", finished_run, "--output", f"{TOOL}/grid.png"), "figures.py is no folder; give another"),
-        (("all", "--runs", finished_run, "--output", f"{TOOL}"), "figures.py is no folder; give another --output"),
+        (
+            ("grid", "--runs", finished_run, "--output", f"{__file__}/grid.png"),
+            "test_figures.py is no folder; give another",
+        ),
+        (("all", "--runs", finished_run, "--output", __file__), "test_figures.py is no folder; give another --output"),
     ):
         code, out, err = call(arguments[0], *output, *arguments[1:])
         assert (code, out) == (1, ""), arguments

@@ -1,0 +1,5 @@
+import sys
+
+from learn3d.commands import main
+
+sys.exit(main())

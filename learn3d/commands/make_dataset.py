@@ -1,0 +1,22 @@
+"""Render a data set from a folder of meshes, a mesh pack or procedural shapes, in the layout of any that we read.
+
+Examples:
+  learn3d make-dataset --output data --category chair --source my_chairs --augment 5
+  learn3d make-dataset --output data --category airplane --procedural 300
+  learn3d make-dataset --output kar --category chair --source my_chairs --layout kar --views 20
+  learn3d make-dataset --output pascal --category car --procedural 100 --layout pascal3d
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from learn3d.commands.parsing import parse
+from learn3d.make_data.render import DatasetConfig, make_dataset
+from learn3d.terminal import say
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Make the data set, and say what was made."""
+    say(make_dataset(parse(DatasetConfig, arguments, name="make-dataset", about=__doc__)).text())
+    return 0

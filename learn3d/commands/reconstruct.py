@@ -1,0 +1,73 @@
+"""Turn images into meshes, each with a turntable animation and a strip of views.
+
+Examples:
+  learn3d reconstruct photo.png --run runs/airplane --output meshes    (transparent background)
+  learn3d reconstruct photo.jpg --masks mask.png --run runs/airplane --output meshes
+  learn3d reconstruct --data DATA --indices 0 31 62 --run runs/airplane --output meshes
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from learn3d.commands.parsing import parse
+from learn3d.terminal import say
+
+
+@dataclass(frozen=True)
+class Command:
+    """What is asked for."""
+
+    run: Path
+    """Run folder (or checkpoint file) of the trained model."""
+    output: Path
+    """Folder for the results: of each image a mesh, a turntable GIF and a PNG strip."""
+    images: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Images of any size, with a transparent background (or with --masks)."""
+    masks: tuple[Path, ...] = ()
+    """Mask images (white = object), one for each image, where the background is not transparent."""
+    data: Path | None = None
+    """Take the images from this data set instead."""
+    category: str | None = None
+    """Class in the data set, if not the one the model was trained on."""
+    split: Literal["train", "val", "test"] = "test"
+    """Part of the data set."""
+    indices: tuple[int, ...] = (0,)
+    """Which images of the data set: object * V + view, of V views of each object (Kato's: 24, Kar's: 20)."""
+    format: Literal["glb", "obj", "ply"] = "glb"
+    """Format of the mesh files."""
+    checkpoint: Literal["last", "best"] = "last"
+    """Which networks of a run: the last ones, or those with the best validation IoU."""
+    crop: bool = True
+    """Leave the images as they are. Without it the object is centred and scaled as in the data set."""
+    frames: int = 36
+    """Pictures of the turntable."""
+    image_size: int = 256
+    """Side of the turntable in pixels."""
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Reconstruct, and print the paths of the files."""
+    command = parse(Command, arguments, name="reconstruct", about=__doc__)
+    if bool(command.images) == (command.data is not None):
+        raise ValueError("give either image files, or --data with --indices")
+    from learn3d.files.writing import check_target_folder
+    from learn3d.reconstruction import reconstruct_dataset, reconstruct_files
+
+    check_target_folder(command.output, "--output")
+    options = {"which": command.checkpoint, "mesh_format": command.format}
+    options |= {"frames": command.frames, "image_size": command.image_size}
+    where = (command.run, command.output)
+    if command.data is not None:
+        chosen = {"category": command.category, "split": command.split}
+        paths = reconstruct_dataset(*where, command.data, command.indices, **chosen, **options)
+    else:
+        paths = reconstruct_files(*where, command.images, command.masks, crop=command.crop, **options)
+    for path in paths:
+        say(str(path))
+    return 0
