@@ -240,7 +240,8 @@ def _changes_by_variant(variants: Sequence[Variant], table: Table, texts: Sequen
     """What "name=value" and "method:name=value" change in each variant; without a method, wherever the name exists."""
     labels = {row.label.lower(): row.variant.name for row in table.rows if row.variant}
     changes: dict[str, dict[str, Any]] = {variant.name: {} for variant in variants}
-    options = {f.name: f.type for f in dataclasses.fields(TrainConfig) if f.name not in _OWN_OPTIONS}
+    options = {f.name: f.default for f in dataclasses.fields(TrainConfig) if f.name not in _OWN_OPTIONS}
+    options |= {"augment": ()}
     for variant in variants:
         if variant.preset not in PRESETS:
             raise ValueError(
@@ -260,27 +261,23 @@ def _changes_by_variant(variants: Sequence[Variant], table: Table, texts: Sequen
         meant = [v for v in variants if not colon or v.name == method]
         if not meant:
             raise ValueError(f"{text!r} names the method {method!r}; there are {', '.join(v.name for v in variants)}")
-        known = {v.name: _setting_types(v) | options for v in meant}
+        known = {v.name: dataclasses.asdict(PRESETS[v.preset].settings) | options for v in meant}
         able = [v for v in meant if name in known[v.name]]
         if not able:
             raise ValueError(f"{text!r}: there is no setting {name!r}; there are {', '.join(known[meant[0].name])}")
         for variant in able:
-            changes[variant.name][name] = _parse(value, str(known[variant.name][name]))
+            changes[variant.name][name] = _parse(value, several=isinstance(known[variant.name][name], tuple))
     return changes
 
 
-def _setting_types(variant: Variant) -> dict[str, Any]:
-    return {field.name: field.type for field in dataclasses.fields(PRESETS[variant.preset].settings)}
-
-
-def _parse(text: str, kind: str) -> Any:
+def _parse(text: str, several: bool = False) -> Any:
     """A value as JSON has it (0.5, true, null, [1, 2]), else the text itself; "a,b" where several values are wanted."""
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):
         value = text
-    if "tuple" in kind and isinstance(value, str):
-        return tuple(_parse(part, "") for part in value.split(",") if part)
+    if several and isinstance(value, str):
+        return tuple(_parse(part) for part in value.split(",") if part)
     return tuple(value) if isinstance(value, list) else value
 
 

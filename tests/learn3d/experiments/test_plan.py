@@ -62,9 +62,9 @@ def test_several_whole_numbers_are_numbers(options) -> None:
     for text in ("prgan:discriminator_channels=8,16,32,64", "discriminator-channels=[8,16,32,64]"):
         (run,) = plan_runs(TABLES["prgan"], options(methods=("prgan",), changes=(text,)))
         assert run.config.settings.discriminator_channels == (8, 16, 32, 64)
-    with pytest.raises(ValueError, match="discriminator_channels must be a whole number >= 1, got 'a'"):
+    with pytest.raises(ValueError, match="discriminator_channels"):
         plan_runs(TABLES["prgan"], options(methods=("prgan",), changes=("discriminator_channels=8,16,32,a",)))
-    with pytest.raises(ValueError, match=r"discriminator_channels must be 4 whole numbers, got \(8,\)"):
+    with pytest.raises(ValueError, match="discriminator_channels"):
         plan_runs(TABLES["prgan"], options(methods=("prgan",), changes=("discriminator_channels=[8]",)))
 
 
@@ -76,7 +76,7 @@ def test_several_whole_numbers_are_numbers(options) -> None:
         ({"changes": ("lambda_prior",)}, "written as name=value"),
         ({"changes": ("pascal:lambda_prior=1",)}, "names the method 'pascal'; there are vanilla, proposed"),
         ({"changes": ("seed=1",)}, "seed has an option of its own"),
-        ({"changes": ("lambda_prior=-1",)}, "lambda_prior must be a number >= 0"),
+        ({"changes": ("lambda_prior=-1",)}, "lambda_prior must be"),
         ({"categories": ("chair", "chair")}, "categories must be different"),
         ({"seeds": 0}, "seeds must be"),
         ({"iterations": -1}, "iterations must be"),
