@@ -125,7 +125,7 @@ def test_read_image_with_transparency_or_mask(tmp_path) -> None:
         (("b.png", "black.png"), "black.png has 3x3 pixels, .*b.png has 8x6"),
         (("b.png", "empty.png"), "mask of .* is empty"),
         (("c.png",), "there is no image"),
-        (("text.png",), "is no image that can be read here"),
+        (("text.png",), r"text.png.* image"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=message):
             _read(*(tmp_path / name for name in arguments), *[None] * (2 - len(arguments)))
@@ -153,7 +153,7 @@ def test_unknown_mesh_format(tmp_path) -> None:
 def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_path) -> None:
     options = {"frames": 2, "image_size": 32}
     paths = reconstruct_dataset(finished_run, tmp_path / "a", tiny_folder, [5], **options)
-    assert [p.name for p in paths] == [f"airplane_test_object0000_view05.{s}" for s in ("obj", "gif", "png")]
+    assert [p.name for p in paths] == [f"airplane_test_object0000_view05.{s}" for s in ("glb", "gif", "png")]
     with np.load(tiny_folder / "02691156_test_images.npz") as archive:
         stored = archive["arr_0"][0, 5]
     rgba = np.concatenate([255 - stored[:3], stored[3:]]).transpose(1, 2, 0)
@@ -161,7 +161,8 @@ def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_p
     Image.fromarray(rgba).save(tmp_path / "photo.png")
     Image.fromarray(rgba).save(tmp_path / "in" / "photo.png")
     files = reconstruct_files(finished_run, tmp_path / "b", [tmp_path / "photo.png"], crop=False, **options)
-    assert files[0].read_text() == paths[0].read_text()
+    meshes = [trimesh.load(path[0], force="mesh") for path in (files, paths)]
+    assert np.array_equal(*(mesh.vertices for mesh in meshes)) and np.array_equal(*(mesh.faces for mesh in meshes))
     twins = [tmp_path / "photo.png", tmp_path / "in" / "photo.png"]
     files = reconstruct_files(finished_run, tmp_path / "c", twins, mesh_format="ply", **options)
     assert [p.name for p in files[::3]] == ["000_photo.ply", "001_photo.ply"]
