@@ -7,9 +7,6 @@ are plots (extra `figures`, loaded when used); `runs` opens checkpoints with the
 from learn3d.figures import drawing
 from learn3d.figures.drawing import (
     CLAY,
-    HEADER,
-    MARGIN,
-    TILE,
     Surface,
     as_meshes,
     azimuths_deg,
@@ -20,12 +17,12 @@ from learn3d.figures.drawing import (
     orbit,
     save_gif,
     save_png,
-    tile,
     to_uint8,
     turntable,
 )
 from learn3d.figures.grids import GRID_COLUMNS, comparison_grid, picture_grid
 from learn3d.figures.interpolation import interpolation_strip, morph
+from learn3d.make_data.sheets import HEADER, MARGIN, TILE, tile
 
 __all__ = [
     "CLAY",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import math
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 import nmr
@@ -19,15 +18,11 @@ from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.data.readers.kato import DISTANCE, HALF_FOV_DEG
 from learn3d.files import writing
 from learn3d.make_data.shading import shade_mesh
+from learn3d.make_data.sheets import HEADER, font
 from learn3d.methods import Grids, Meshes
 from learn3d.methods.surfaces import grid_surface
 
 CLAY = (0.62, 0.68, 0.78)
-TILE = 96
-MARGIN = 4
-HEADER = 18
-_TEXT = (60, 60, 60)
-_RULE = (205, 205, 205)
 _LIGHT = (-0.5, 0.45, -0.75)  # towards the light: left of, above and behind the camera, in its own axes
 _FAR = 5.0  # where orthographic cameras stand: outside of any object, so that faces turn to the right side
 
@@ -176,45 +171,6 @@ def to_uint8(values: Tensor) -> np.ndarray:
     return np.repeat(grey[..., None], 3, axis=-1)
 
 
-def tile(
-    rows: Sequence[Sequence[np.ndarray | None]],
-    titles: Sequence[str] | None = None,
-    *,
-    tile_size: int = TILE,
-    row_titles: Sequence[str] | None = None,
-    rows_per_group: int | None = None,
-) -> np.ndarray:
-    """Arrange pictures uint8 [h,w,3] on a white sheet, each scaled to the same square; uint8 [H,W,3].
-
-    None leaves a place free. Titles stand above the columns and to the left of the rows; a thin line parts groups of
-    `rows_per_group` rows.
-    """
-    columns = max(len(row) for row in rows)
-    header = HEADER if titles else 0
-    left = max(text_width(title) for title in row_titles) + 2 * MARGIN if row_titles else 0
-    step = tile_size + MARGIN
-    sheet = Image.new("RGB", (left + columns * step + MARGIN, header + len(rows) * step + MARGIN), (255, 255, 255))
-    draw = ImageDraw.Draw(sheet)
-    for column, title in enumerate(titles or ()):
-        middle = left + column * step + MARGIN + tile_size // 2
-        draw.text((middle, header - 4), title, fill=_TEXT, anchor="ms", font=_font())
-    for row, title in enumerate(row_titles or ()):
-        middle = header + row * step + MARGIN + tile_size // 2
-        draw.text((left - MARGIN, middle), title, fill=_TEXT, anchor="rm", font=_font())
-    for r, row in enumerate(rows):
-        top = header + r * step + MARGIN
-        if rows_per_group and r and r % rows_per_group == 0:
-            draw.line([(0, top - MARGIN // 2), (sheet.width, top - MARGIN // 2)], fill=_RULE)
-        for c, picture in enumerate(row):
-            if picture is None:
-                continue
-            image = Image.fromarray(picture)
-            if image.size != (tile_size, tile_size):
-                image = image.resize((tile_size, tile_size), Image.Resampling.BICUBIC)
-            sheet.paste(image, (left + c * step + MARGIN, top))
-    return np.asarray(sheet)
-
-
 def beside(blocks: Sequence[np.ndarray], labels: Sequence[str], *, gap: int = 14) -> np.ndarray:
     """Pictures uint8 [h,w,3] next to each other, their lower edges in line, a label above each (may be empty)."""
     if len(blocks) != len(labels):
@@ -225,7 +181,7 @@ def beside(blocks: Sequence[np.ndarray], labels: Sequence[str], *, gap: int = 14
     draw, left = ImageDraw.Draw(sheet), 0
     for block, label in zip(blocks, labels, strict=True):
         sheet.paste(Image.fromarray(block), (left, header + height - len(block)))
-        draw.text((left + block.shape[1] // 2, header - 5), label, fill=(0, 0, 0), anchor="ms", font=_font(15))
+        draw.text((left + block.shape[1] // 2, header - 5), label, fill=(0, 0, 0), anchor="ms", font=font(15))
         left += block.shape[1] + gap
     return np.asarray(sheet)
 
@@ -242,16 +198,6 @@ def magnified(pictures: np.ndarray, zoom: float) -> np.ndarray:
     height, width = pictures.shape[1:3]
     top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
     return pictures[:, top : height - top, left : width - left]
-
-
-def text_width(text: str) -> int:
-    """Pixels that a title takes."""
-    return math.ceil(_font().getlength(text))
-
-
-@functools.cache
-def _font(size: int = 12) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)
 
 
 def with_ending(path: Path, suffix: str) -> Path:

@@ -12,7 +12,6 @@ import nmr
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import wrap_deg
 from learn3d.figures.drawing import (
-    TILE,
     Surface,
     as_meshes,
     azimuths_deg,
@@ -22,9 +21,9 @@ from learn3d.figures.drawing import (
     magnified,
     natural_colors,
     orbit,
-    tile,
     to_uint8,
 )
+from learn3d.make_data.sheets import TILE, tile
 from learn3d.methods import Method
 from learn3d.methods.surfaces import grid_surface
 
@@ -103,7 +102,8 @@ def comparison_grid(
         for k, pictures in enumerate(drawn.values())
     ]
     labels = list(drawn) * len(samples)
-    return tile(rows, [title or "input", *titles], tile_size=tile_size, row_titles=labels, rows_per_group=len(shapes))
+    rules = range(len(shapes), len(rows), len(shapes))
+    return tile(rows, [title or "input", *titles], tile_size=tile_size, row_titles=labels, rules=rules)
 
 
 def spread_views(dataset: ViewDataset, count: int) -> Tensor:

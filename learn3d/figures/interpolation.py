@@ -12,7 +12,6 @@ from torch import Tensor
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import Poses, wrap_deg
 from learn3d.figures.drawing import (
-    TILE,
     Surface,
     as_meshes,
     azimuths_deg,
@@ -21,9 +20,9 @@ from learn3d.figures.drawing import (
     magnified,
     natural_colors,
     orbit,
-    tile,
 )
 from learn3d.figures.runs import encode
+from learn3d.make_data.sheets import TILE, tile
 from learn3d.methods import Method
 
 AZIMUTHS_DEG = (-135.0, -45.0)  # the two viewpoints, oblique for whichever axis the object faces

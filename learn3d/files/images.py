@@ -44,7 +44,9 @@ def open_image(path: Path, formats: Sequence[str], most_side: int) -> Image.Imag
         try:
             image.load()
         except (OSError, SyntaxError, ValueError, IndexError) as error:
-            raise DamagedFile(path, f"cannot be decoded ({child.one_line(error)}); expected an image. {AGAIN}") from None
+            raise DamagedFile(
+                path, f"cannot be decoded ({child.one_line(error)}); expected an image. {AGAIN}"
+            ) from None
         return image
 
 

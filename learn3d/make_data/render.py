@@ -6,6 +6,7 @@ Here meshes are chosen, split, scaled and coloured; `viewpoints` has the cameras
 from __future__ import annotations
 
 import dataclasses
+import math
 import tempfile
 from collections import Counter
 from dataclasses import asdict, dataclass, field
@@ -20,14 +21,16 @@ from learn3d.data.poses import Poses
 from learn3d.data.readers import kato
 from learn3d.files.writing import write_json
 from learn3d.make_data import meshes
-from learn3d.make_data.contact_sheet import Row, draw_sheet, make_row
+from learn3d.make_data.contact_sheet import draw_sheet, make_row
 from learn3d.make_data.folders import check_room, existing, publish
 from learn3d.make_data.report import DatasetReport, lacking
 from learn3d.make_data.shading import KEY_LIGHT, shade_mesh
 from learn3d.make_data.writers import RenderedObject, Writer, writer_of
+from learn3d.make_data.writers.pictures import write_png
 from learn3d.terminal import plain
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+KEPT_ROWS = 60  # of each split: the contact sheet shows some of them
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
 
 
@@ -146,8 +149,8 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
         for split, written in objects.items():  # some layouts decide on the splits at the end
             for name in written:
                 done.mesh_of[name]["split"] = split
-        sheet = draw_sheet({split: [done.rows[name] for name in written] for split, written in objects.items()})
-        sheet.save(folder / f"{prefix}_contact.png")
+        rows = {split: [done.rows[name] for name in written if name in done.rows] for split, written in objects.items()}
+        write_png(folder / f"{prefix}_contact.png", draw_sheet(rows, config.views))
         own = [path for path in (*writer.paths(config.category), *writer.shared) if (folder / path).exists()]
         files = sorted([*own, *_extra_files(prefix)])
         counts = {split: len(written) for split, written in objects.items() if written}
@@ -169,7 +172,7 @@ class _Done:
     skipped: list[dict] = field(default_factory=list)
     objects: dict[str, list[str]] = field(default_factory=dict)  # names per split
     mesh_of: dict[str, dict] = field(default_factory=dict)  # entry of `used` per object name
-    rows: dict[str, Row] = field(default_factory=dict)  # of the contact sheet, per object name
+    rows: dict[str, list[np.ndarray]] = field(default_factory=dict)  # of the contact sheet: some objects' pictures
 
 
 def _render_split(
@@ -200,9 +203,11 @@ def _render_split(
         done.used.append(entry)
         for item in items:
             writer.write(item)
-            grid = writer.convention.to_object(torch.from_numpy(item.voxels)[None])[0].numpy()
-            done.rows[item.name] = make_row(item.rgb, item.alpha, grid)
-            done.objects.setdefault(split, []).append(item.name)
+            names = done.objects.setdefault(split, [])
+            if len(names) % math.ceil(len(chosen) * copies / KEPT_ROWS) == 0:
+                grid = writer.convention.to_object(torch.from_numpy(item.voxels)[None])[0].numpy()
+                done.rows[item.name] = make_row(item.rgb, item.alpha, grid)
+            names.append(item.name)
             done.mesh_of[item.name] = entry
 
 

@@ -161,7 +161,7 @@ def test_a_sheet_has_titles_free_places_and_rules() -> None:
     assert plain[figures.MARGIN + 5, figures.MARGIN + 5].tolist() == [0, 0, 0]
     assert (plain[: step - 1, step + figures.MARGIN :] == 255).all()  # the free place
     titled = figures.tile(
-        [[black, None], [black, black]], ["a", "b"], tile_size=20, row_titles=["one", "two"], rows_per_group=1
+        [[black, None], [black, black]], ["a", "b"], tile_size=20, row_titles=["one", "two"], rules=[1]
     )
     left = titled.shape[1] - plain.shape[1]
     assert left > 10 and titled.shape[0] == plain.shape[0] + figures.HEADER

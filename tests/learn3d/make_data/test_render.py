@@ -79,7 +79,7 @@ def test_every_format_round_trips_through_the_reader(tmp_path, folder):
     assert (dataset.images[:, :, :3].max(axis=2)[empty] == 0).all()
     assert (dataset.images[:, :, :3].max(axis=2)[dataset.images[:, :, 3] == 255] > 0).all()
     sheet = imageio.imread(tmp_path / "data" / "03001627_contact.png")
-    assert sheet.shape == (18 + 6 * 64, 40 + 10 * 64, 3) and sheet.std() > 10
+    assert sheet.shape[0] == 18 + 6 * 68 + 4 and sheet.std() > 10
     said = (tmp_path / "data" / "03001627_report.txt").read_text()
     assert "6 meshes used, 0 skipped" in said
     assert (
@@ -391,13 +391,19 @@ def test_two_meshes_end_with_a_warning(tmp_path):
 def test_the_contact_sheet_names_its_columns_and_splits():
     rgb, alpha = np.full((24, 64, 64, 3), 255, np.uint8), np.zeros((24, 64, 64), np.uint8)
     row = make_row(rgb, alpha, np.zeros((32, 32, 32), bool))
-    assert row.views == (0, 3, 6, 9, 12, 15, 18, 21)
-    assert make_row(rgb[:3], alpha[:3], np.zeros((32, 32, 32), bool)).views == (0, 1, 2)
-    sheet = np.asarray(draw_sheet({"train": [row] * 9, "val": [], "test": [row]}))
-    assert sheet.shape == (18 + 7 * 64, 40 + 640, 3)
-    titles = [(sheet[:17, 40 + 64 * k : 104 + 64 * k] < 100).any() for k in range(10)]
-    names = [(sheet[20 + 64 * k : 80 + 64 * k, :40] < 100).any() for k in range(7)]
+    assert len(row) == 10 and len(make_row(rgb[:3], alpha[:3], np.zeros((32, 32, 32), bool))) == 5
+    sheet = draw_sheet({"train": [row] * 9, "val": [], "test": [row]}, 24)
+    left = sheet.shape[1] - 10 * 68 - 4
+    assert sheet.shape[0] == 18 + 7 * 68 + 4 and left > 10
+    titles = [(sheet[:17, left + 68 * k : left + 68 * (k + 1)] < 100).any() for k in range(10)]
+    names = [(sheet[22 + 68 * k : 86 + 68 * k, :left] < 100).any() for k in range(7)]
     assert titles == [True] * 10 and names == [True, *[False] * 5, True]
+
+
+def test_voxels_on_the_contact_sheet_do_not_touch():
+    row = make_row(np.full((1, 64, 64, 3), 255, np.uint8), np.zeros((1, 64, 64), np.uint8), np.ones((32, 32, 32), bool))
+    column = draw_sheet({"train": [row, row]}, 1)[22:, -36]
+    assert (column[:64] == 0).all() and (column[64:68] > 0).all() and (column[68:132] == 0).all()
 
 
 def test_render_object_refuses_what_cannot_be_seen():
