@@ -10,12 +10,11 @@ from dataclasses import dataclass, replace
 from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import Layout
 from learn3d.data.sampling import Sampling
+from learn3d.methods import Schedule, Settings
 from learn3d.methods.multi_view import MultiViewSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.methods.prgan import PrGANSettings
 from learn3d.methods.vpl import VPLSettings
-
-Settings = PoseInvariantSettings | MultiViewSettings | VPLSettings | PrGANSettings
 
 
 @dataclass(frozen=True)
@@ -30,6 +29,7 @@ class Preset:
     source: str  # where the figures come from
     sampling: Sampling = "views"
     augment: tuple[Augmentation, ...] = ()  # what is done to every training batch
+    schedule: Schedule = "constant"  # of the step size
     view_bins: str | None = None  # cells of azimuth and elevation, None: the data set's own view classes
 
 
@@ -80,7 +80,7 @@ _PASCAL_VPL = VPLSettings(
     encoder="resnet18",
     image_size=224,
     generator="cube-fc",
-    symmetric=True,
+    symmetry="z",
     vertex_scale=0.1,
     object_scale=1.0,
     discriminator="patch",
@@ -102,7 +102,8 @@ _PASCAL_VPL = VPLSettings(
 def _vpl_on_kar(label: str, iterations: int, detail: str, **changes: float | bool) -> Preset:
     settings = replace(_KAR_VPL, **changes)
     source = f"{_VPL_CODE}: train_shapenet.sh, {detail}"
-    return Preset(label, settings, "kar", iterations, 64, source, "classes", ("flip", "channels"), "15x20")
+    augment = ("flip", "channels")
+    return Preset(label, settings, "kar", iterations, 64, source, "classes", augment, view_bins="15x20")
 
 
 def _vpl_on_pascal(label: str, iterations: int, detail: str, **changes: float) -> Preset:
@@ -177,8 +178,9 @@ PRESETS: dict[str, Preset] = {
         128,
         "published code of Kato et al. 2018, one category: 64 pairs of views, iterations of airplane; bench 100,000, "
         "dresser 40,000, car 50,000, chair 250,000, display 20,000, lamp 20,000, speaker 40,000, rifle 130,000, sofa "
-        "40,000, table 90,000, phone 30,000, vessel 90,000; decay_at_step at 95 %",
+        "40,000, table 90,000, phone 30,000, vessel 90,000",
         sampling="pairs",
+        schedule="step",
     ),
     # 50 epochs for the GAN and as many for the encoder, of the 2,831 x 24 training images of airplanes.
     "gadelha2017-kato": Preset(
@@ -196,7 +198,7 @@ PRESETS: dict[str, Preset] = {
     "peng2020-pascal": Preset(
         "Proposed",
         PoseInvariantSettings(
-            encoder="resnet18", generator="symmetric", lambda_adversarial=0.01, lambda_prior=0.01, lambda_smooth=0.001
+            encoder="resnet18", symmetry="z", lambda_adversarial=0.01, lambda_prior=0.01, lambda_smooth=0.001
         ),
         "pascal3d",
         40_000,
@@ -208,7 +210,7 @@ PRESETS: dict[str, Preset] = {
         "Vanilla-AE",
         PoseInvariantSettings(
             encoder="resnet18",
-            generator="symmetric",
+            symmetry="z",
             lambda_classification=0.0,
             lambda_adversarial=0.0,
             lambda_prior=0.0,

@@ -89,7 +89,7 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
             saved = load_last(folder, config, repair=ranks.main)
     # A run goes on as it began, also one from before encoders could turn colours back.
     inverted = train_set.inverted if saved is None else saved.shape.inverted
-    shape = DataShape(train_set.num_views, train_set.num_classes, train_set.poses.num_features, inverted)
+    shape = DataShape(train_set.num_views, train_set.num_classes, train_set.pose_features, inverted)
     method = create_method(config.settings, shape, device=config.device, precision=precision, seed=config.seed)
     if saved is None:
         method.start_from_pretrained()
@@ -108,7 +108,7 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
         if ranks.main:
             run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
         return dataclasses.replace(_summary(folder, config, progress, started), was_finished=True)
-    ranks.join(method)
+    method.join(ranks)
     ranks.check_same(**_beginning(config, conditions, train_set, val_set, method, progress))
     if ranks.main:
         if not resume:
@@ -116,7 +116,7 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
         writing.write_json(folder / run_folder.CONFIG, config_to_dict(config), sync=True)
     before = progress.seconds
     waits = config.device != "cpu" or not ranks.alone
-    cores = CoreShare(torch.get_num_threads(), processes=ranks.beside, waits=waits)
+    cores = CoreShare(torch.get_num_threads(), processes=ranks.local_world, waits=waits)
 
     with explained(folder), stop_on_signal() as stop, _open_log(config, progress, ranks) as log:
         for note in (*notes, *empty):
@@ -143,7 +143,7 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
             if ranks.main and (last or step % config.pictures_every == 0):
                 draw(config, method, val_set, step, log)
             if last or stopped_by or step % config.checkpoint_every == 0:
-                ranks.check_same(weights=weights_digest(method) if ranks.world > 1 else 0)
+                ranks.check_same(weights=weights_digest(method.networks) if ranks.world > 1 else 0)
                 if ranks.main:
                     log.sync()
                     save_last(folder, config, conditions, method, shape, progress)
@@ -220,7 +220,7 @@ def _beginning(
         "training data": (conditions, train_set.digest()),
         "validation data": (len(val_set), val_set.digest()),
         "steps taken": progress.step,
-        "weights": weights_digest(method),
+        "weights": weights_digest(method.networks),
     }
 
 

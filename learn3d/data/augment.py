@@ -17,7 +17,7 @@ Augmentation = Literal["flip", "flip-image", "channels", "crop"]
 def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -> Batch:
     """The batch with the named changes, each drawn for every sample on its own, in the order of the names.
 
-    "flip": image, mask and pose mirrored left-right with probability 1/2 (Kato and Harada 2019). "flip-image": the
+    "flip": image, mask and pose (where it is known) mirrored left-right with probability 1/2 (Kato and Harada 2019). "flip-image": the
     colours of the input image alone, while every mask stays with its pose (published code of both papers on Pascal3D+;
     it works because the mesh is symmetric). "channels": a random permutation of the three colours. "crop": the colours
     cut anew from the original image, each side of the padded box moved by up to 15 % of the box, uniformly (Pascal3D+,
@@ -27,7 +27,8 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -
     Raises ValueError for an unknown name, for "crop" where the data set has no original images, or not first.
     """
     rng = np.random.default_rng([seed, step, 1])
-    count, rows = len(batch.whole), batch.whole.rows
+    views = batch.step_views
+    count, rows = len(views), views.rows
     for position, name in enumerate(names):
         if name == "crop":
             if position > 0:
@@ -44,8 +45,10 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -
         elif name == "flip":
             mirrored = torch.from_numpy(rng.random(count) < 0.5)
             chosen = mirrored[rows]
+            if views.poses is not None:
+                batch = batch.with_poses(views.poses.mirrored(mirrored))
             batch = dataclasses.replace(
-                batch.with_poses(batch.whole.poses.mirrored(mirrored)),
+                batch,
                 images=torch.where(chosen[:, None, None, None], batch.images.flip(3), batch.images),
                 masks=torch.where(chosen[:, None, None], batch.masks.flip(2), batch.masks),
             )

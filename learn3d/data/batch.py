@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 
-if TYPE_CHECKING:
-    import nmr
-    from learn3d.data.crops import Crops
-    from learn3d.data.poses import Poses
+import nmr
+from learn3d.data.crops import Crops
+from learn3d.data.poses import Poses
 
 
 @dataclass(frozen=True, eq=False)
-class Whole:
-    """What every process knows about all views of a step, of which it learns from some."""
+class StepViews:
+    """Poses and classes of all B views of a training step. Where processes share the step, each knows all of them."""
 
     rows: torch.Tensor  # int64 [b]: which of the B views are in this process's batch
-    poses: Poses  # where the B cameras stood
+    poses: Poses | None  # where the B cameras stood; None where it is not known
     view_ids: torch.Tensor  # int64 [B]
     class_ids: torch.Tensor  # int64 [B]
 
@@ -33,28 +31,28 @@ class Batch:
 
     images: torch.Tensor  # uint8 [B, 4, S, S]: R, G, B and the mask, in the form that the encoder takes
     masks: torch.Tensor  # float32 [B, 64, 64] in [0, 1]: silhouettes to be matched, row 0 = top
-    poses: Poses  # where the B cameras stood
+    poses: Poses | None  # where the B cameras stood; None where it is not known
     view_ids: torch.Tensor  # int64 [B] in 0 .. K-1: the pose class of each view
     object_ids: torch.Tensor  # int64 [B]: which object of the split each view shows
     class_ids: torch.Tensor  # int64 [B]: which category each object belongs to (0 where there is one only)
     voxels: torch.Tensor | None  # bool [B, 32, 32, 32] ground truth in the data set's axes, None where there is none
-    crops: Crops | None = None  # what the augmentation "crop" cuts the images' colours from, where that is known
-    part_of: Whole | None = None  # all views of the step, where other processes have the rest of them
+    crops: Crops | None = None  # the original images, which the augmentation "crop" cuts colours from; None: unknown
+    part_of: StepViews | None = None  # all views of the step, where other processes have the rest of them
 
     def __len__(self) -> int:
         return len(self.images)
 
     @property
     def cameras(self) -> nmr.cameras.Camera:
-        """The B cameras that saw the images."""
+        """The B cameras that saw the images, where their poses are known."""
         return self.poses.cameras()
 
     @property
-    def whole(self) -> Whole:
-        """All views of the step, of which this batch is a part or all."""
+    def step_views(self) -> StepViews:
+        """All views of the step; this batch holds some of them or all."""
         if self.part_of is not None:
             return self.part_of
-        return Whole(torch.arange(len(self)), self.poses, self.view_ids, self.class_ids)
+        return StepViews(torch.arange(len(self)), self.poses, self.view_ids, self.class_ids)
 
     def with_poses(self, poses: Poses) -> Batch:
         """The same batch, where `poses` are those of all views of the step."""

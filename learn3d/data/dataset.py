@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learn3d.data.batch import Batch, Whole
+from learn3d.data.batch import Batch, StepViews
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
 from learn3d.data.crops import Crops, join
 from learn3d.data.poses import LookAtPoses, Poses
@@ -31,7 +31,7 @@ class ViewDataset:
     category: str  # what the user called it; several names are joined by commas
     split: str
     images: np.ndarray  # uint8 [M, 4, S, S]: R, G, B and the mask
-    poses: Poses  # M camera poses
+    poses: Poses | None  # M camera poses; None where they are not known
     view_ids: np.ndarray  # int64 [M] in 0 .. K-1: pose classes
     view_names: tuple[str, ...]  # K names of the pose classes
     object_ids: np.ndarray  # int64 [M] in 0 .. N-1
@@ -51,12 +51,10 @@ class ViewDataset:
             raise ValueError(f"images must be uint8 [M, 4, S, S], got {self.images.dtype} {list(self.images.shape)}")
         if self.masks is None and self.images.shape[2:] != (MASK_SIZE, MASK_SIZE):
             raise ValueError(f"images of {self.images.shape[2:]} pixels need masks [M, {MASK_SIZE}, {MASK_SIZE}]")
-        wanted = {"poses": m, "view_ids": m, "object_ids": m} | ({"masks": m} if self.masks is not None else {})
-        wanted |= {"crops": m} if self.crops is not None else {}
-        wanted |= {"voxels": n} if self.voxels is not None else {}
-        wanted |= {"points": n} if self.points is not None else {}
-        wanted |= {"class_ids": n} if self.class_ids is not None else {}
-        if wrong := {k: len(getattr(self, k)) for k, size in wanted.items() if len(getattr(self, k)) != size}:
+        wanted = dict.fromkeys(("poses", "view_ids", "object_ids", "masks", "crops"), m)
+        wanted |= dict.fromkeys(("voxels", "points", "class_ids"), n)
+        sizes = {name: len(getattr(self, name)) for name in wanted if getattr(self, name) is not None}
+        if wrong := {name: size for name, size in sizes.items() if size != wanted[name]}:
             raise ValueError(f"{m} images of {n} objects do not go with {wrong}")
         if self.voxels is not None and self.voxels.shape[1:] != (VOXEL_SIZE,) * 3:
             raise ValueError(f"voxels must be [N, {VOXEL_SIZE}, {VOXEL_SIZE}, {VOXEL_SIZE}]")
@@ -87,6 +85,11 @@ class ViewDataset:
         """S: side of the images in pixels."""
         return self.images.shape[2]
 
+    @property
+    def pose_features(self) -> int:
+        """Numbers that describe a pose (`Poses.features`); 0 where poses are not known."""
+        return 0 if self.poses is None else self.poses.num_features
+
     def batch(self, indices: Tensor, rows: Tensor | None = None, *, voxels: bool = True) -> Batch:
         """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU.
 
@@ -103,10 +106,9 @@ class ViewDataset:
                 f"got {int(indices.min())} .. {int(indices.max())}"
             )
         if rows is not None:
-            whole = Whole(
-                rows, self.poses[indices], torch.from_numpy(self.view_ids[indices.numpy()]), self._classes(indices)
-            )
-            return dataclasses.replace(self.batch(indices[rows], voxels=voxels), part_of=whole)
+            view_ids = torch.from_numpy(self.view_ids[indices.numpy()])
+            views = StepViews(rows, self._poses(indices), view_ids, self._classes(indices))
+            return dataclasses.replace(self.batch(indices[rows], voxels=voxels), part_of=views)
         samples = indices.numpy()
         images = torch.from_numpy(self.images[samples])
         masks = images[:, 3] if self.masks is None else torch.from_numpy(self.masks[samples])
@@ -114,13 +116,16 @@ class ViewDataset:
         return Batch(
             images=images,
             masks=masks.to(torch.float32) / 255,
-            poses=self.poses[indices],
+            poses=self._poses(indices),
             view_ids=torch.from_numpy(self.view_ids[samples]),
             object_ids=torch.from_numpy(objects),
             class_ids=self._classes(indices),
             voxels=torch.from_numpy(self.voxels[objects]) if voxels and self.voxels is not None else None,
             crops=None if self.crops is None else self.crops[samples],
         )
+
+    def _poses(self, indices: Tensor) -> Poses | None:
+        return None if self.poses is None else self.poses[indices]
 
     def _classes(self, indices: Tensor) -> Tensor:
         if self.class_ids is None:
@@ -134,7 +139,7 @@ class ViewDataset:
     def digest(self) -> int:
         """CRC-32 of all that is learnt from or compared with: images, masks, poses, classes, voxels."""
         parts = (self.images, self.masks, self.view_ids, self.object_ids, self.class_ids, self.voxels)
-        crc = zlib.crc32(np.ascontiguousarray(self.poses.features().numpy()))
+        crc = 0 if self.poses is None else zlib.crc32(np.ascontiguousarray(self.poses.features().numpy()))
         for part in parts:
             crc = zlib.crc32(np.ascontiguousarray(part), crc) if part is not None else crc
         return crc
@@ -142,7 +147,8 @@ class ViewDataset:
     def with_bins(self, bins: AngleBins) -> ViewDataset:
         """The same views with pose classes from cells of azimuth and elevation."""
         if not isinstance(self.poses, LookAtPoses):
-            raise ValueError("cells of azimuth and elevation need look-at cameras; this data set has rotations")
+            got = "no poses" if self.poses is None else "rotations"
+            raise ValueError(f"cells of azimuth and elevation need look-at cameras; this data set has {got}")
         return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), view_names=tuple(bins.names()))
 
     def select(self, samples: np.ndarray) -> ViewDataset:
@@ -151,7 +157,7 @@ class ViewDataset:
             self,
             images=self.images[samples],
             masks=None if self.masks is None else self.masks[samples],
-            poses=self.poses[torch.from_numpy(samples)],
+            poses=self._poses(torch.from_numpy(samples)),
             view_ids=self.view_ids[samples],
             object_ids=self.object_ids[samples],
             crops=None if self.crops is None else self.crops[samples],
@@ -186,10 +192,12 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
     )
 
 
-def _join_poses(poses: list[Poses]) -> Poses:
+def _join_poses(poses: list[Poses | None]) -> Poses | None:
     kind = type(poses[0])
     if any(type(p) is not kind for p in poses):
         raise ValueError("the categories have cameras of different kinds")
+    if poses[0] is None:
+        return None
     joined = {}
     for field in dataclasses.fields(kind):
         values = [getattr(p, field.name) for p in poses]

@@ -2,36 +2,63 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 
 from learn3d.device import check_device
-from learn3d.methods.method import DataShape, Grids, Meshes, Method
+from learn3d.methods.method import DataShape, Estimate, MeshMethod, Method
+from learn3d.methods.multi_view import MultiView, MultiViewSettings
+from learn3d.methods.optimization import CONSTANT, Plan, Schedule
+from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
+from learn3d.methods.prgan import PrGAN, PrGANSettings
+from learn3d.methods.surfaces import Grids, Meshes
+from learn3d.methods.vpl import VPL, VPLSettings
 
-if TYPE_CHECKING:
-    from learn3d.presets import Settings
+__all__ = [
+    "DataShape",
+    "Estimate",
+    "Grids",
+    "MeshMethod",
+    "Meshes",
+    "Method",
+    "Plan",
+    "Schedule",
+    "Settings",
+    "create_method",
+]
 
-__all__ = ["DataShape", "Grids", "Meshes", "Method", "create_method"]
+Settings = PoseInvariantSettings | MultiViewSettings | VPLSettings | PrGANSettings
+
+METHODS: dict[type, type[Method]] = {
+    PoseInvariantSettings: PoseInvariant,
+    MultiViewSettings: MultiView,
+    VPLSettings: VPL,
+    PrGANSettings: PrGAN,
+}
 
 
 def create_method(
-    settings: Settings, shape: DataShape, *, device: str, precision: Literal["bf16", "fp32"], seed: int
+    settings: Settings,
+    shape: DataShape,
+    *,
+    device: str,
+    precision: Literal["bf16", "fp32"],
+    seed: int,
+    plan: Plan = CONSTANT,
 ) -> Method:
-    """The method of `settings`, with PyTorch's default initialisation of its networks from `seed`."""
-    from learn3d.methods.multi_view import MultiView, MultiViewSettings
-    from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
-    from learn3d.methods.prgan import PrGAN, PrGANSettings
-    from learn3d.methods.vpl import VPL, VPLSettings
+    """The method of `settings`, with PyTorch's default initialisation of its networks from `seed`.
 
-    methods: dict[type, type[Method]] = {
-        PoseInvariantSettings: PoseInvariant,
-        MultiViewSettings: MultiView,
-        VPLSettings: VPL,
-        PrGANSettings: PrGAN,
-    }
+    Raises ValueError where the device is absent, and where the method does not go with the data.
+    """
     check_device(device)
+    kind = METHODS[type(settings)]
+    if kind.needs_poses and shape.pose_features == 0:
+        raise ValueError(
+            f"{kind.__name__} learns from images whose camera poses are known, but this data set has no poses; take "
+            "a data set with poses, or a method that estimates them"
+        )
     if device == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # torch's default for convolutions; fp32 is to mean fp32
     torch.manual_seed(seed)
-    return methods[type(settings)](settings, shape, device, precision)
+    return kind(settings, shape, device, precision, plan)

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import abc
-import math
+import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
+import nmr
 from learn3d.data.batch import Batch
-from learn3d.device import Download, autocast
-from learn3d.parallel.ranks import ALONE, Ranks
+from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.poses import Poses
+from learn3d.device import autocast
+from learn3d.methods.optimization import CONSTANT, Average, Plan, backpropagate
+from learn3d.methods.surfaces import Grids, Meshes
+from learn3d.networks import MeshGenerator, network_input
+from learn3d.parallel.ranks import ALONE, Ranks, sum_gradients
+from learn3d.parallel.whole_batch_norm import use_whole_batch
 
 
 @dataclass(frozen=True)
@@ -22,60 +29,62 @@ class DataShape:
 
     num_views: int  # K pose classes
     num_classes: int = 1  # categories in the set
-    pose_features: int = 3  # size of `Poses.features()`: 3 for an eye position, 9 for a rotation
-    inverted: bool = False  # colours are stored as 255 - colour (not looked at by runs whose checkpoints lack it)
+    pose_features: int = 3  # size of `Poses.features()`: 3 for an eye position, 9 for a rotation; 0: unknown poses
+    inverted: bool = False  # colours are stored as 255 - colour
 
 
 @dataclass(frozen=True, eq=False)
-class Meshes:
-    """Predicted surfaces, on the CPU."""
+class Estimate:
+    """What a method reads from images."""
 
-    vertices: Tensor  # float32 [B, V, 3], object frame
-    faces: Tensor  # int64 [F, 3]
-
-
-@dataclass(frozen=True, eq=False)
-class Grids:
-    """Predicted volumes, on the CPU."""
-
-    occupancy: Tensor  # float32 [B, s, s, s] in [0, 1]; axes (x, y, z) of the object frame over the box [-0.5, 0.5]
-    threshold: float = 0.5  # occupied above it
-
-    def occupied(self, size: int) -> Tensor:
-        """Bool [B, size, size, size]: where the mean over the cell is above the threshold; s is a multiple of size."""
-        factor, rest = divmod(self.occupancy.shape[-1], size)
-        if rest or factor < 1:
-            raise ValueError(f"a grid of {self.occupancy.shape[-1]} cells cannot be pooled to {size}")
-        return F.avg_pool3d(self.occupancy[:, None], factor)[:, 0] > self.threshold
+    codes: Tensor  # float32 [B, C]: shape codes, on the method's device
+    poses: Poses | None = None  # where the B cameras stood, on the CPU; None: the method does not estimate it
 
 
 class Method(abc.ABC):
-    """One method in training or in use. A subclass builds `networks` and `optimizers` and has its own training step.
+    """One method in training or in use. A subclass creates networks and optimizers and has its own training step.
 
-    Everything that decides the next steps lives in the parameters and buffers of `networks`, in `optimizers` and in
-    torch's global random state, so that a checkpoint of these three resumes bit for bit.
+    Everything that decides the next steps lies in the parameters and buffers of `networks`, in `optimizers`, in
+    `average` and in torch's global random state, so that a checkpoint of these resumes bit for bit.
     """
 
-    networks: dict[str, nn.Module]
+    needs_poses: ClassVar[bool] = True  # whether it can be trained only where the pose of every image is known
+    networks: dict[str, nn.Module]  # each is also an attribute: networks["encoder"] is self.encoder
     optimizers: dict[str, torch.optim.Optimizer]
-    device: torch.device
-    precision: Literal["bf16", "fp32"]
-    ranks: Ranks = ALONE  # the processes that train it together; `Ranks.join` sets it
+    average: Average | None = None  # of the weights, where the run asks for it
+    ranks: Ranks = ALONE  # the processes that train it together; set by `join`
     image_size: int  # side of the images that `encode` takes; also a property of the method's settings
 
+    def __init__(
+        self,
+        settings: Any,
+        shape: DataShape,
+        device: str,
+        precision: Literal["bf16", "fp32"],
+        plan: Plan = CONSTANT,
+    ) -> None:
+        self.settings, self.shape, self.plan = settings, shape, plan
+        self.image_size = settings.image_size
+        self.device, self.precision = torch.device(device), precision
+        self.networks = self.create_networks()
+        for name, network in self.networks.items():
+            setattr(self, name, network.to(device))
+        self.optimizers = self.create_optimizers()
+        self._step_sizes = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimizers.items()}
+        if plan.average > 0:
+            self.average = Average(self.networks, plan.average)
+
     @abc.abstractmethod
-    def train_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Take optimisation step `step` (from 1) and return every loss that was computed, unweighted, and "total".
+    def create_networks(self) -> dict[str, nn.Module]:
+        """The networks by name, of `settings` and `shape`. Raises ValueError where these contradict each other."""
 
-        Raises FloatingPointError, before stepping, when a loss is not finite (`check_finite`).
-        """
+    @abc.abstractmethod
+    def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Optimizers by name, with their full step sizes."""
 
-    def start_from_pretrained(self) -> None:  # noqa: B027
-        """Copy the weights of the file that the settings name, where they name one, into the encoder.
-
-        For the beginning of a run: afterwards they are in its checkpoints, and the file may be gone. Raises as
-        `learn3d.networks.resnet.load_pretrained`.
-        """
+    @abc.abstractmethod
+    def learn(self, batch: Batch, step: int) -> dict[str, float]:
+        """The method's own part of `train_step`: losses, and `descend` for the optimizers that are to step."""
 
     @abc.abstractmethod
     def encode(self, images: Tensor) -> Tensor:
@@ -85,9 +94,62 @@ class Method(abc.ABC):
     def decode(self, codes: Tensor) -> Meshes | Grids:
         """The shapes of codes [B, C], on the CPU."""
 
-    def backward(self, loss: Tensor) -> None:
-        """Gradients of this process's share of a loss, whose mean over the processes is that of the whole batch."""
-        (loss if self.ranks.alone else self.ranks.share * loss).backward()
+    @property
+    def weights(self) -> Mapping[str, float]:
+        """Weights of the losses by name; a loss that is not listed has the weight 1."""
+        return {}
+
+    def estimate(self, images: Tensor) -> Estimate:
+        """Codes of images as `encode` takes them, and the poses, by methods that estimate them."""
+        return Estimate(self.encode(images))
+
+    def start_from_pretrained(self) -> None:  # noqa: B027
+        """Copy the weights of the file that the settings name, where they name one, into the encoder.
+
+        For the beginning of a run: afterwards they are in its checkpoints, and the file may be gone. Raises as
+        `learn3d.networks.resnet.load_pretrained`.
+        """
+
+    def train_step(self, batch: Batch, step: int) -> dict[str, float]:
+        """Take optimisation step `step` (from 1) and return every loss that was computed, unweighted, and "total".
+
+        Raises FloatingPointError, before stepping, when a loss is not finite.
+        """
+        factor = self.plan.factor(step)
+        for name, optimizer in self.optimizers.items():
+            for group, step_size in zip(optimizer.param_groups, self._step_sizes[name], strict=True):
+                group["lr"] = factor * step_size
+        self._clear_gradients()  # here, too, so that the forward pass has their memory
+        values = self.learn(batch, step)
+        if self.average is not None:
+            self.average.update(step)
+        return values
+
+    def descend(self, losses: Mapping[str, Tensor], step: int, *names: str) -> dict[str, float]:
+        """Backpropagate the weighted sum of the losses and let the optimizers `names` step; see `backpropagate`."""
+        self._clear_gradients()
+        values = backpropagate(losses, self.weights, step, self.ranks)
+        for name in names:
+            self.optimizers[name].step()
+        return values
+
+    def _clear_gradients(self) -> None:
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad(set_to_none=True)
+
+    def join(self, ranks: Ranks) -> None:
+        """Learn from batches that are divided among processes: gradients are summed, batch norms see all rows."""
+        self.ranks = ranks
+        if ranks.alone:
+            return
+        for network in self.networks.values():
+            use_whole_batch(network, ranks)
+        for optimizer in self.optimizers.values():
+            optimizer.register_step_pre_hook(sum_gradients)
+
+    def averaged(self) -> contextlib.AbstractContextManager[None]:
+        """Within it the networks have their averaged weights, where there are any: for evaluation and pictures."""
+        return contextlib.nullcontext() if self.average is None else self.average.in_place()
 
     def autocast(self) -> torch.autocast:
         """Context in which the networks run at the method's precision."""
@@ -104,56 +166,40 @@ class Method(abc.ABC):
             network.train(training)
 
 
-def adam(network: nn.Module, learning_rate: float, betas: tuple[float, float] = (0.9, 0.999)) -> torch.optim.Adam:
-    """Adam for one network, fused (13 ms a step instead of 91 on two cores)."""
-    parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
-    return torch.optim.Adam(parameters, lr=learning_rate, betas=betas, fused=True)
+class MeshMethod(Method):
+    """A method with an encoder of images and a generator of meshes, which learns from rendered silhouettes."""
 
+    encoder: nn.Module
+    generator: MeshGenerator
 
-def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
-    """Apply a network so that gradients reach its inputs but not its parameters, and its buffers stay as they are."""
-    state = {name: parameter.detach() for name, parameter in network.named_parameters()}
-    state |= {name: buffer.clone() for name, buffer in network.named_buffers()}
-    return torch.func.functional_call(network, state, inputs)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.faces, self.edges = self.generator.faces.cpu(), self.generator.edges.cpu()  # for the renderer
 
+    def encode(self, images: Tensor) -> Tensor:
+        with self.autocast():
+            return self.encoder(network_input(images, self.device, self.image_size)).float()
 
-def descend(losses: dict[str, Tensor], weights: dict[str, float], step: int, ranks: Ranks = ALONE) -> dict[str, float]:
-    """Backpropagate the sum of the losses, each times its weight (1 where none is given); return them, and "total".
+    def decode(self, codes: Tensor) -> Meshes:
+        with self.autocast():
+            return Meshes(self.generator(codes).cpu(), self.faces)
 
-    Losses are those of this process's rows; what is returned is of the whole batch, and so is the sum of the gradients
-    over the processes. They may lie on the CPU and on the networks' device: each is added up and goes back where it is,
-    and what lies on the device is read with one copy. Raises FloatingPointError, with no gradient computed yet, when
-    one is not finite.
-    """
-    totals: dict[torch.device, Tensor] = {}
-    for name, loss in losses.items():
-        weight = weights.get(name, 1.0)
-        term = loss if weight == 1.0 else weight * loss
-        totals[loss.device] = totals[loss.device] + term if loss.device in totals else term
-    values = ranks.means(read_back(losses))
-    values["total"] = sum(weights.get(name, 1.0) * value for name, value in values.items())
-    check_finite(values, step)
-    torch.autograd.backward([total if ranks.alone else ranks.share * total for total in totals.values()])
-    return values
+    def predict(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Codes float32 [B, C] and vertices float32 [B, V, 3] of stored images, on the method's device."""
+        with self.autocast():
+            codes = self.encoder(network_input(images, self.device, self.image_size))
+            vertices = self.generator(codes)
+        return codes.float(), vertices
 
+    def render(self, vertices: Tensor, poses: Poses) -> Tensor:
+        """Silhouettes float32 [B, 64, 64] of vertices [B, V, 3]. Rendering runs on the CPU."""
+        return nmr.render_silhouette(vertices, self.faces, poses.cameras(), image_size=MASK_SIZE)
 
-def read_back(losses: dict[str, Tensor]) -> dict[str, float]:
-    """The values of scalar losses; one copy for all that lie on one device."""
-    by_device: dict[torch.device, list[str]] = {}
-    for name, loss in losses.items():
-        by_device.setdefault(loss.device, []).append(name)
-    copies = {
-        device: Download(torch.stack([losses[name].detach().float() for name in names]))
-        for device, names in by_device.items()
-    }
-    found = {}
-    for device, names in by_device.items():
-        found |= dict(zip(names, copies[device].finish().tolist(), strict=True))
-    return {name: found[name] for name in losses}
-
-
-def check_finite(losses: dict[str, float], step: int) -> None:
-    """Raise FloatingPointError naming the losses when one of them is not finite."""
-    if not all(math.isfinite(value) for value in losses.values()):
-        listed = ", ".join(f"{name} {value:g}" for name, value in losses.items())
-        raise FloatingPointError(f"the loss is not finite at iteration {step} ({listed})")
+    def surface_losses(self, vertices: Tensor) -> dict[str, Tensor]:
+        """The losses on the surface alone, smoothness and inflation, where they have a weight."""
+        losses = {}
+        if self.weights.get("smoothness", 0.0) > 0:
+            losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.edges)
+        if self.weights.get("inflation", 0.0) > 0:
+            losses["inflation"] = nmr.losses.inflation_loss(vertices, self.faces)
+        return losses

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import functools
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
-from learn3d.data.batch import Batch, Whole
+from learn3d.data.batch import Batch, StepViews
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
 from learn3d.device import autocast, upload
-from learn3d.methods.method import DataShape, Grids, Method, adam, check_finite, frozen
+from learn3d.methods.method import Estimate, Method
+from learn3d.methods.optimization import adam, frozen
+from learn3d.methods.surfaces import Grids
 from learn3d.networks import network_input
 from learn3d.networks.projection import ViewCircle, project
 from learn3d.networks.voxel_gan import (
@@ -75,32 +78,42 @@ class PrGAN(Method):
     image was taken from is never used, only that views come from the circle, each as often as any other.
     """
 
-    def __init__(
-        self, settings: PrGANSettings, shape: DataShape, device: str, precision: Literal["bf16", "fp32"]
-    ) -> None:
-        self.settings, self.image_size = settings, settings.image_size
-        self.device, self.precision = torch.device(device), precision
-        self.views = ViewCircle(
-            shape.num_views, settings.elevation_deg, settings.distance, settings.half_fov_deg, settings.perspective
-        )
-        self.generator = VoxelGenerator(settings.generator_channels)
-        self.discriminator = SilhouetteDiscriminator(settings.discriminator_channels)
-        self.encoder = InverseEncoder()
-        self.networks = {"generator": self.generator, "discriminator": self.discriminator, "encoder": self.encoder}
-        for network in self.networks.values():
-            network.to(device)
-        self.optimizers = {
+    settings: PrGANSettings
+
+    def create_networks(self) -> dict[str, nn.Module]:
+        settings = self.settings
+        return {
+            "generator": VoxelGenerator(settings.generator_channels),
+            "discriminator": SilhouetteDiscriminator(settings.discriminator_channels),
+            "encoder": InverseEncoder(),
+        }
+
+    def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        settings = self.settings
+        return {
             "generator": adam(self.generator, settings.generator_learning_rate, BETAS),
             "generator_statistics": adam(self.generator, settings.generator_learning_rate, BETAS),
             "discriminator": adam(self.discriminator, settings.discriminator_learning_rate, BETAS),
             "encoder": adam(self.encoder, settings.encoder_learning_rate),
         }
 
-    def encode(self, images: Tensor) -> Tensor:
-        """Shape codes [B, 200] of the mask channel alone; the view that the encoder also estimates is left out."""
+    @functools.cached_property
+    def views(self) -> ViewCircle:
+        """The K views that silhouettes are projected to."""
+        own = self.settings
+        return ViewCircle(self.shape.num_views, own.elevation_deg, own.distance, own.half_fov_deg, own.perspective)
+
+    def estimate(self, images: Tensor) -> Estimate:
+        """Shape codes [B, 200] of the mask channel alone, and the pose of the view that the encoder sees them from."""
         masks = network_input(images, self.device, self.image_size)[:, 3]
         with self.autocast():
-            return self.encoder(masks)[:, :SHAPE_CODE].float()
+            z = self.encoder(masks).float()
+        azimuth = self.views.azimuth_deg(self.view_ids(z.cpu()))
+        poses = LookAtPoses(azimuth, self.views.elevation_deg, self.views.distance, self.views.half_fov_deg)
+        return Estimate(z[:, :SHAPE_CODE], poses)
+
+    def encode(self, images: Tensor) -> Tensor:
+        return self.estimate(images).codes
 
     def decode(self, codes: Tensor) -> Grids:
         return Grids((self.generator(codes) * TAU).cpu(), self.settings.occupancy_threshold)
@@ -120,57 +133,56 @@ class PrGAN(Method):
         with autocast(self.device, "fp32"):
             return project(self.generator(codes), self.view_ids(z), self.views, TAU)
 
-    def train_step(self, batch: Batch, step: int) -> dict[str, float]:
+    def learn(self, batch: Batch, step: int) -> dict[str, float]:
         """A step of the GAN before `encoder_from_step`, of the encoder from there on.
 
         Raises ValueError where the batch's cameras are not those of the K views.
         """
         check_views(batch.poses, batch.view_ids, self.views)
-        for optimizer in self.optimizers.values():
-            optimizer.zero_grad(set_to_none=True)
+        views = batch.step_views
         if step >= self.settings.encoder_from_step:
-            return self._encoder_step(batch.whole, step)
-        return self._gan_step(upload(batch.masks, self.device), batch.whole, step)
+            return self._encoder_step(views, step)
+        z = self.sample_z(len(views))[views.rows]
+        return self._gan_step(upload(batch.masks, self.device), z, step)
 
-    def _gan_step(self, real: Tensor, whole: Whole, step: int) -> dict[str, float]:
+    def _gan_step(self, real: Tensor, z: Tensor, step: int) -> dict[str, float]:
         """Discriminator (where its accuracy at the start is at most 0.8), then generator, then generator once more: on
         the statistics of the discriminator's first layer. One z serves all three, as in the published code.
         """
-        z = self.sample_z(len(whole))[whole.rows]
-        losses = {"accuracy": self.accuracy(real, z)}
+        values = {"accuracy": self.accuracy(real, z)}
         self.set_training(True)
 
+        def descend(name: str, loss: Tensor) -> None:
+            values[name] = self.descend({name: loss}, step, name)[name]
+
         fake = self.generate(z)
-        if losses["accuracy"] <= self.settings.accuracy_margin:
+        if values["accuracy"] <= self.settings.accuracy_margin:
             with self.autocast():
                 of_real, of_fake = self.discriminator(real).float(), self.discriminator(fake.detach()).float()
-            self._take_step("discriminator", _bce(of_real, 1.0) + _bce(of_fake, 0.0), losses, step)
+            descend("discriminator", _bce(of_real, 1.0) + _bce(of_fake, 0.0))
 
         with self.autocast():
-            generation = _bce(frozen(self.discriminator, fake).float(), 1.0)
-        self._take_step("generator", generation, losses, step)
+            logits = frozen(self.discriminator, fake).float()
+        descend("generator", _bce(logits, 1.0))
 
         with self.autocast():
             first = self.discriminator.first
             of_real, of_fake = (frozen(first, images[:, None]).float() for images in (real, self.generate(z)))
-        self._take_step("generator_statistics", statistics_loss(of_real, of_fake, self.ranks), losses, step)
-        losses["total"] = sum(losses.get(name, 0.0) for name in self.optimizers)
-        return losses
+        descend("generator_statistics", statistics_loss(of_real, of_fake, self.ranks))
+        values["total"] = sum(values.get(name, 0.0) for name in self.optimizers)
+        return values
 
-    def _encoder_step(self, whole: Whole, step: int) -> dict[str, float]:
+    def _encoder_step(self, views: StepViews, step: int) -> dict[str, float]:
         """The encoder learns z of fresh samples of the generator, which stays as it is (evaluation mode)."""
         self.set_training(False)
-        z = self.sample_z(len(whole))[whole.rows]
+        z = self.sample_z(len(views))[views.rows]
         with torch.no_grad():
             images = self.generate(z)
         with self.autocast():
             estimate = self.encoder(images)
-        losses: dict[str, float] = {}
         difference = estimate.float() - upload(z, self.device)
-        # A sum over the batch: that over the own rows stands for a part of it only.
-        self._take_step("encoder", difference.square().sum() / self.ranks.share, losses, step)
-        losses["total"] = losses["encoder"]
-        return losses
+        # A sum over the batch, not a mean: this process has only its share of it.
+        return self.descend({"encoder": difference.square().sum() / self.ranks.share}, step, "encoder")
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> float:
@@ -180,13 +192,6 @@ class PrGAN(Method):
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
         accuracy = float((of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2)
         return self.ranks.means({"accuracy": accuracy})["accuracy"]
-
-    def _take_step(self, name: str, loss: Tensor, losses: dict[str, float], step: int) -> None:
-        losses |= self.ranks.means({name: float(loss.detach())})
-        check_finite(losses, step)
-        self.backward(loss)
-        self.optimizers[name].step()
-        self.optimizers[name].zero_grad(set_to_none=True)
 
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor, ranks: Ranks = ALONE) -> Tensor:

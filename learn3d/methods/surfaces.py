@@ -1,9 +1,38 @@
-"""From occupancy grids to triangle meshes."""
+"""Predicted shapes, meshes or occupancy grids, and the surface of a grid."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import numpy as np
 import torch
+import torch.nn.functional as F
+from skimage.measure import marching_cubes
 from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Meshes:
+    """Predicted surfaces, on the CPU."""
+
+    vertices: Tensor  # float32 [B, V, 3], object frame
+    faces: Tensor  # int64 [F, 3]
+    colors: Tensor | None = None  # float32 [B, V, 3] in [0, 1]: R, G, B of each vertex; None: no colours are predicted
+
+
+@dataclass(frozen=True, eq=False)
+class Grids:
+    """Predicted volumes, on the CPU."""
+
+    occupancy: Tensor  # float32 [B, s, s, s] in [0, 1]; axes (x, y, z) of the object frame over the box [-0.5, 0.5]
+    threshold: float = 0.5  # occupied above it
+
+    def occupied(self, size: int) -> Tensor:
+        """Bool [B, size, size, size]: where the mean over the cell is above the threshold; s is a multiple of size."""
+        factor, rest = divmod(self.occupancy.shape[-1], size)
+        if rest or factor < 1:
+            raise ValueError(f"a grid of {self.occupancy.shape[-1]} cells cannot be pooled to {size}")
+        return F.avg_pool3d(self.occupancy[:, None], factor)[:, 0] > self.threshold
 
 
 def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -13,9 +42,6 @@ def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> tuple
     is above `level`. Cells at the border are closed. The faces are wound as `nmr.icosphere`'s (normals outwards by the
     right-hand rule in these axes).
     """
-    import numpy as np
-    from skimage.measure import marching_cubes
-
     size = grid.shape[-1]
     padded = np.pad(grid.detach().cpu().float().numpy(), 1)
     if not padded.max() > level:

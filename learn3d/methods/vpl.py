@@ -16,23 +16,19 @@ from pydantic import Field
 from torch import Tensor, nn
 
 import nmr
-from learn3d.data.batch import Batch, Whole
+from learn3d.data.batch import Batch, StepViews
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
 from learn3d.device import Download, upload
 from learn3d.losses import silhouette_pyramid_loss
-from learn3d.methods.method import DataShape, Meshes, Method, adam, descend, frozen
-from learn3d.networks import ENCODERS, GENERATORS, network_input
-from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
+from learn3d.methods.method import DataShape, MeshMethod
+from learn3d.methods.optimization import adam, frozen
+from learn3d.networks import ENCODERS, GENERATORS, GeneratorName, MeshGenerator, Symmetry
+from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
 from learn3d.networks.flat_resnet import FlatResNet18
-from learn3d.networks.gradient_reversal import reverse_gradient
-from learn3d.networks.preact_resnet import PreactResNet18, grey_background
+from learn3d.networks.layers import reverse_gradient
+from learn3d.networks.preact_resnet import PreactResNet18
 from learn3d.networks.resnet import check_pretrained, load_pretrained
-from learn3d.networks.view_discriminators import (
-    OneHotViewDiscriminator,
-    PatchDiscriminator,
-    SpectralPatchDiscriminator,
-)
 from learn3d.settings import Channels, FilePath, Pixels, Positive, Weight, checked
 
 MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object where alpha is at least this
@@ -53,10 +49,12 @@ class VPLSettings:
     stay frozen then. None: random weights. The encoder gets natural colours, however the data set stores them."""
     image_size: Pixels = 64
     """Side of the input images in pixels."""
-    generator: Literal["sphere", "cube-conv", "cube-fc"] = "sphere"
-    """sphere: 642 free vertices. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or not."""
-    symmetric: bool = False
-    """Cube generators only: mirror the shape at z = 0."""
+    generator: GeneratorName = "sphere"
+    """sphere: 642 free vertices. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or not. The
+    others: see PoseInvariantSettings."""
+    symmetry: Symmetry | None = None
+    """Mirror shapes at a vertical plane: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
+    it (0 is x = 0). None: shapes are free."""
     vertex_scale: Positive = 0.01
     """Cube generators only: s, the factor of the last layer's output."""
     object_scale: Positive = 0.5
@@ -83,7 +81,7 @@ class VPLSettings:
     silhouette_loss: Literal["iou", "pyramid"] = "iou"
     """iou: 1 - soft IoU. pyramid: squared distance of normalised images at five resolutions."""
     learning_rate: Positive = 1e-4
-    """Adam's step size, the same for the three networks and constant."""
+    """Adam's step size, the same for the three networks."""
     adam_beta1: Annotated[float, Field(ge=0, lt=1)] = 0.9
     """Adam's decay of the mean gradient (of its square: 0.999)."""
     lambda_smooth: Weight = 0.001
@@ -99,106 +97,83 @@ class VPLSettings:
         return self.lambda_discriminator > 0 and (self.discriminator == "dcgan" or self.other_views == "random")
 
 
-class VPL(Method):
+class VPL(MeshMethod):
     """Encoder, mesh generator and, unless it is the baseline, a discriminator of silhouettes and their views."""
 
-    def __init__(
-        self, settings: VPLSettings, shape: DataShape, device: str, precision: Literal["bf16", "fp32"]
-    ) -> None:
-        _check(settings, shape)
-        self.settings, self.device, self.precision = settings, torch.device(device), precision
-        self.image_size = settings.image_size
-        self.encoder = _create_encoder(settings, shape)
-        self.generator = _create_generator(settings)
-        self.networks = {"encoder": self.encoder, "generator": self.generator}
+    settings: VPLSettings
+
+    def create_networks(self) -> dict[str, nn.Module]:
+        settings = self.settings
+        _check(settings, self.shape)
+        networks = {"encoder": _create_encoder(settings, self.shape), "generator": _create_generator(settings)}
         if settings.lambda_discriminator > 0:
-            self.networks["discriminator"] = self.discriminator = _create_discriminator(settings, shape)
-        self.faces, self.edges = self.generator.faces, self.generator.edges  # for the renderer, on the CPU
-        self.weights = {
+            networks["discriminator"] = _create_discriminator(settings, self.shape)
+        networks["encoder"].to(memory_format=torch.channels_last)
+        return networks
+
+    def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        rate, betas = self.settings.learning_rate, (self.settings.adam_beta1, 0.999)
+        return {name: adam(network, rate, betas) for name, network in self.networks.items()}
+
+    @property
+    def weights(self) -> dict[str, float]:
+        settings = self.settings
+        return {
             "smoothness": settings.lambda_smooth,
             "inflation": settings.lambda_inflation,
             "adversarial": settings.lambda_discriminator,
         }
-        for network in self.networks.values():
-            network.to(device)
-        self.encoder.to(memory_format=torch.channels_last)
-        betas = (settings.adam_beta1, 0.999)
-        self.optimizers = {n: adam(network, settings.learning_rate, betas) for n, network in self.networks.items()}
 
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:
             load_pretrained(self.encoder.resnet, self.settings.pretrained)
 
-    def encode(self, images: Tensor) -> Tensor:
-        with self.autocast():
-            return self.encoder(self._encoder_input(images)).float()
+    def learn(self, batch: Batch, step: int) -> dict[str, float]:
+        """In every step encoder and generator descend projection + smoothness + inflation.
 
-    def decode(self, codes: Tensor) -> Meshes:
-        with self.autocast():
-            return Meshes(self.generator(codes).cpu(), self.faces)
-
-    def train_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Iterations count from 1. In every one encoder and generator descend projection + smoothness + inflation.
-
-        With a discriminator D each shape is also rendered at another view. Alternating: in odd iterations D descends
+        With a discriminator D each shape is also rendered at another view. Alternating: in odd steps D descends
         softplus(-D(input view)) + softplus(D(other view)) on silhouettes that are constants for it; in even ones
         encoder and generator descend lambda_D softplus(-D(other view)), while D gets neither gradient nor step. (Its
-        batch norms then use the batch's statistics, too, and leave their running means alone.) Reversal: in every
-        iteration D descends that loss, and encoder and generator climb it with lambda_D times its gradient.
+        batch norms use the batch's statistics then, too, and leave their running means alone.) Reversal: in every step
+        D descends that loss, and encoder and generator climb it with lambda_D times its gradient.
 
         Raises ValueError where the batch is too small to have another view.
         """
         settings = self.settings
-        for optimizer in self.optimizers.values():
-            optimizer.zero_grad(set_to_none=True)
-        if settings.lambda_discriminator > 0:
-            whole = batch.whole
-            others = other_views(whole, settings.other_views)[whole.rows]
+        if settings.lambda_discriminator == 0:
+            vertices = self._vertices(batch)
+            silhouettes = self.render(vertices, batch.poses)
+            losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
+            return self.descend(losses, step, "encoder", "generator")
 
-        with self.autocast():
-            vertices = self.generator(self.encoder(self._encoder_input(batch.images)))
-
-        # Rendering runs on the CPU: the vertices move there, and their gradient comes back.
-        vertices, faces = Download(vertices).wait(), self.faces
-        if settings.lambda_discriminator > 0:  # both views of each shape in one call
-            views = whole.poses[torch.cat([whole.rows, others])]
-            silhouettes, elsewhere = self._render(torch.cat([vertices, vertices]), faces, views).chunk(2)
-        else:
-            silhouettes = self._render(vertices, faces, batch.poses)
-
-        losses = {"projection": self._projection_loss(silhouettes, batch)}
-        if settings.lambda_smooth > 0:
-            losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.edges)
-        if settings.lambda_inflation > 0:
-            losses["inflation"] = nmr.losses.inflation_loss(vertices, faces)
-
-        if settings.lambda_discriminator > 0 and settings.adversary == "reversal":
+        views = batch.step_views
+        others = other_views(views, settings.other_views)[views.rows]
+        vertices = self._vertices(batch)
+        both = views.poses[torch.cat([views.rows, others])]  # both views of each shape in one call
+        silhouettes, elsewhere = self.render(torch.cat([vertices, vertices]), both).chunk(2)
+        losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
+        if settings.adversary == "reversal":
             reverse = settings.lambda_discriminator
             real, fake = reverse_gradient(silhouettes, reverse), reverse_gradient(elsewhere, reverse)
-            losses["discrimination"] = self._discrimination_loss(real, fake, others, whole)
-        elif settings.lambda_discriminator > 0 and step % 2 == 1:
+            losses["discrimination"] = self._discrimination_loss(real, fake, others, views)
+        elif step % 2 == 1:
             real, fake = silhouettes.detach(), elsewhere.detach()
-            losses["discrimination"] = self._discrimination_loss(real, fake, others, whole)
-        elif settings.lambda_discriminator > 0:
-            logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, whole)
+            losses["discrimination"] = self._discrimination_loss(real, fake, others, views)
+        else:
+            logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, views)
             losses["adversarial"] = F.softplus(-logits).mean()
+        trained = ["encoder", "generator"] + ["discriminator"] * ("discrimination" in losses)
+        return self.descend(losses, step, *trained)
 
-        values = descend(losses, self.weights, step, self.ranks)
-        self.optimizers["encoder"].step()
-        self.optimizers["generator"].step()
-        if "discrimination" in losses:
-            self.optimizers["discriminator"].step()
-        return values
+    def _vertices(self, batch: Batch) -> Tensor:
+        return Download(self.predict(batch.images)[1]).wait()
 
-    def _encoder_input(self, images: Tensor) -> Tensor:
-        prepared = network_input(images, self.device, self.image_size)
-        return grey_background(prepared) if self.settings.encoder == "preact-resnet18" else prepared
-
-    def _render(self, vertices: Tensor, faces: Tensor, poses: Poses) -> Tensor:
+    def render(self, vertices: Tensor, poses: Poses) -> Tensor:
+        """Silhouettes float32 [B,s,s] as the settings have them."""
         settings = self.settings
         return nmr.render_silhouette(
             vertices,
-            faces,
+            self.faces,
             poses.cameras(),
             image_size=settings.silhouette_size,
             anti_aliasing=settings.anti_aliasing,
@@ -213,26 +188,28 @@ class VPL(Method):
             return silhouette_pyramid_loss(silhouettes, masks)
         return nmr.losses.soft_iou_loss(silhouettes, masks)
 
-    def _discrimination_loss(self, real: Tensor, fake: Tensor, others: Tensor, whole: Whole) -> Tensor:
+    def _discrimination_loss(self, real: Tensor, fake: Tensor, others: Tensor, views: StepViews) -> Tensor:
         """Binary cross-entropy of logits x: softplus(-x) for the target 1, softplus(x) for 0; scalar."""
-        real_logits = self._discriminate(self.discriminator, real, whole.rows, whole)
-        fake_logits = self._discriminate(self.discriminator, fake, others, whole)
+        real_logits = self._discriminate(self.discriminator, real, views.rows, views)
+        fake_logits = self._discriminate(self.discriminator, fake, others, views)
         return F.softplus(-real_logits).mean() + F.softplus(fake_logits).mean()
 
-    def _discriminate(self, network: Callable[..., Tensor], images: Tensor, views: Tensor, whole: Whole) -> Tensor:
-        """Logits for silhouettes [b,S,S] of the shapes of the own rows, seen at the views of `views`."""
-        images = upload(images, self.device)
+    def _discriminate(
+        self, network: Callable[..., Tensor], silhouettes: Tensor, seen_at: Tensor, views: StepViews
+    ) -> Tensor:
+        """Logits for silhouettes [b,S,S] of the shapes of this process's rows, seen at the views `seen_at`."""
+        silhouettes = upload(silhouettes, self.device)
         if self.settings.discriminator == "dcgan":
             with self.autocast():
-                return network(images, upload(whole.view_ids[views], self.device)).float()
+                return network(silhouettes, upload(views.view_ids[seen_at], self.device)).float()
         # In float32: spectral normalisation mixes types otherwise.
-        conditions = [upload(whole.poses[views].features(), self.device)]
+        conditions = [upload(views.poses[seen_at].features(), self.device)]
         if self.settings.class_conditional:
-            conditions.append(upload(whole.class_ids[whole.rows], self.device))
-        return network(images, *conditions)
+            conditions.append(upload(views.class_ids[views.rows], self.device))
+        return network(silhouettes, *conditions)
 
 
-def other_views(batch: Batch | Whole, choice: Literal["random", "reversed", "next"]) -> Tensor:
+def other_views(batch: Batch | StepViews, choice: Literal["random", "reversed", "next"]) -> Tensor:
     """For each sample of a batch the sample whose view serves as its other one, int64 [B]; see VPLSettings.other_views.
 
     "random" asks torch's global generator, and takes any sample where all have one view class. Over a data set in which
@@ -270,11 +247,11 @@ def _create_encoder(settings: VPLSettings, shape: DataShape) -> nn.Module:
     return encoder
 
 
-def _create_generator(settings: VPLSettings) -> nn.Module:
-    if settings.generator == "sphere":
-        return GENERATORS["sphere"]()
-    kind = {"cube-conv": ConvCubeGenerator, "cube-fc": LinearCubeGenerator}[settings.generator]
-    return kind(settings.vertex_scale, settings.object_scale, settings.symmetric)
+def _create_generator(settings: VPLSettings) -> MeshGenerator:
+    scales = {}
+    if settings.generator.startswith("cube"):
+        scales = {"scale": settings.vertex_scale, "object_scale": settings.object_scale}
+    return GENERATORS[settings.generator](symmetry=settings.symmetry, **scales)
 
 
 def _create_discriminator(settings: VPLSettings, shape: DataShape) -> nn.Module:
@@ -300,8 +277,6 @@ def _check(settings: VPLSettings, shape: DataShape) -> None:
             f"({settings.image_size}), got {settings.silhouette_size}"
         )
     check_pretrained(settings.pretrained, settings.encoder)
-    if settings.symmetric and settings.generator == "sphere":
-        raise ValueError("symmetric needs a cube generator (cube-conv or cube-fc), got generator 'sphere'")
     if settings.class_conditional and settings.discriminator != "spectral-patch":
         raise ValueError(f"class_conditional needs discriminator 'spectral-patch', got {settings.discriminator!r}")
     if settings.class_conditional and shape.num_classes < 2:

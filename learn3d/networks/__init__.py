@@ -1,8 +1,12 @@
 """Networks: encoders, generators, discriminators; each file has one kind, and names for the settings to choose by."""
 
+from typing import Literal
+
+from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
 from learn3d.networks.discriminators import PoseDiscriminator
 from learn3d.networks.encoders import CODE_SIZE, ENCODERS, EncoderName, create_encoder, network_input
-from learn3d.networks.generators import GENERATORS, GeneratorName
+from learn3d.networks.generators import BoundedGenerator, SmallSphereGenerator, SphereGenerator
+from learn3d.networks.mesh_generator import MeshGenerator, Symmetry
 
 __all__ = [
     "CODE_SIZE",
@@ -10,7 +14,18 @@ __all__ = [
     "GENERATORS",
     "EncoderName",
     "GeneratorName",
+    "MeshGenerator",
     "PoseDiscriminator",
+    "Symmetry",
     "create_encoder",
     "network_input",
 ]
+
+GeneratorName = Literal["sphere", "sphere-small", "bounded", "cube-conv", "cube-fc"]
+GENERATORS: dict[str, type[MeshGenerator]] = {
+    "sphere": SphereGenerator,
+    "sphere-small": SmallSphereGenerator,
+    "bounded": BoundedGenerator,
+    "cube-conv": ConvCubeGenerator,
+    "cube-fc": LinearCubeGenerator,
+}

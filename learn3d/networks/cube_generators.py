@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-import nmr
 from learn3d.networks.encoders import CODE_SIZE
-from learn3d.networks.initialization import initialize_he
+from learn3d.networks.layers import initialize_he, linear_layers
+from learn3d.networks.mesh_generator import MeshGenerator, Symmetry
 
 GRID_SIZE = 16  # vertices along an edge of the cube
 INITIAL_RADIUS = 0.5
@@ -38,36 +38,27 @@ def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
     return points, patches, torch.cat(faces)
 
 
-class CubeGenerator(nn.Module):
+class CubeGenerator(MeshGenerator):
     """What both have in common: vertices = object_scale * 1.2 * tanh(base + scale * bias), float32 [B,1352,3].
 
     `base`, learned, starts as the sphere of radius 0.5 (times object_scale); `bias` is what a subclass computes of the
-    codes. `symmetric` mirrors the shape at z = 0 as published: z becomes |z|, each vertex the mean of itself and its
-    mirror image, and z gets the sign back that the vertex has on the cube. (The vertices are then symmetric exactly;
-    the diagonals that divide the cube's squares into faces are not, as published.)
-
-    `faces` int64 [2700,3] and `edges` int64 [4050,4] (the table of `nmr.edge_table`) describe the fixed topology.
+    codes. With `symmetry`, as published: z becomes |z|, each vertex the mean of itself and its mirror image, and z gets
+    the sign back that the vertex has on the cube. (The vertices are then symmetric exactly; the diagonals that divide
+    the cube's squares into faces are not, as published.)
     """
 
-    faces: Tensor
-    edges: Tensor
-    mirror: Tensor  # int64 [V]: the vertex on the other side of z = 0
     signs: Tensor  # float32 [V,3]: (1, 1, -1) where z < 0 on the cube, else 1
 
-    def __init__(self, scale: float, object_scale: float, symmetric: bool) -> None:
-        super().__init__()
-        points, self.patches, faces = cube_surface()
-        self.scale, self.object_scale, self.symmetric = scale, object_scale, symmetric
+    def __init__(self, scale: float, object_scale: float, symmetry: Symmetry | None) -> None:
+        points, patches, faces = cube_surface()
+        super().__init__(2 * points - (GRID_SIZE - 1), faces, symmetry)
+        self.patches, self.scale, self.object_scale = patches, scale, object_scale
         centred = 2 * points.double() / (GRID_SIZE - 1) - 1
         sphere = centred / centred.norm(dim=1, keepdim=True)
         self.base = nn.Parameter(torch.atanh(INITIAL_RADIUS * sphere / BOUND).float())
-        mirrored = points * torch.tensor([1, 1, -1]) + torch.tensor([0, 0, GRID_SIZE - 1])
-        order = {tuple(point): number for number, point in enumerate(points.tolist())}
-        mirror = torch.tensor([order[tuple(point)] for point in mirrored.tolist()])
         signs = torch.ones(len(points), 3)
         signs[points[:, 2] < GRID_SIZE / 2, 2] = -1
-        for name, table in (("faces", faces), ("edges", nmr.edge_table(faces)), ("mirror", mirror), ("signs", signs)):
-            self.register_buffer(name, table, persistent=False)
+        self.register_buffer("signs", signs, persistent=False)
 
     def bias(self, codes: Tensor) -> Tensor:
         """What the codes [B,512] add to the base, [B,V,3]."""
@@ -75,11 +66,11 @@ class CubeGenerator(nn.Module):
 
     def forward(self, codes: Tensor) -> Tensor:
         points = self.base + self.scale * self.bias(codes).float()
-        if self.symmetric:
+        if self.mirror is not None:
             points = torch.cat([points[..., :2], points[..., 2:].abs()], dim=-1)
             points = (points + points[:, self.mirror]) / 2
         vertices = self.object_scale * BOUND * torch.tanh(points)
-        return vertices * self.signs if self.symmetric else vertices
+        return vertices if self.mirror is None else self.place(vertices * self.signs)
 
 
 class ConvCubeGenerator(CubeGenerator):
@@ -93,9 +84,9 @@ class ConvCubeGenerator(CubeGenerator):
     shares: Tensor  # float32 [V,3,1]: their weights: 1, 1/2 or 1/3, and 0 for the filling
 
     def __init__(
-        self, scale: float = 0.01, object_scale: float = 0.5, symmetric: bool = False, channels: int = 512
+        self, symmetry: Symmetry | None = None, scale: float = 0.01, object_scale: float = 0.5, channels: int = 512
     ) -> None:
-        super().__init__(scale, object_scale, symmetric)
+        super().__init__(scale, object_scale, symmetry)
         self.sides = nn.ModuleList(_side_decoder(channels) for _ in self.patches)
         places: list[list[int]] = [[] for _ in self.base]
         for place, vertex in enumerate(self.patches.flatten().tolist()):
@@ -135,16 +126,10 @@ class LinearCubeGenerator(CubeGenerator):
     """Linear layers 512-4096-4096-1352*3 with ReLU (Pascal3D+)."""
 
     def __init__(
-        self, scale: float = 0.1, object_scale: float = 1.0, symmetric: bool = True, channels: int = 4096
+        self, symmetry: Symmetry | None = None, scale: float = 0.1, object_scale: float = 1.0, channels: int = 4096
     ) -> None:
-        super().__init__(scale, object_scale, symmetric)
-        self.layers = nn.Sequential(
-            nn.Linear(CODE_SIZE, channels),
-            nn.ReLU(),
-            nn.Linear(channels, channels),
-            nn.ReLU(),
-            nn.Linear(channels, self.base.numel()),
-        )
+        super().__init__(scale, object_scale, symmetry)
+        self.layers = linear_layers(CODE_SIZE, channels, channels, self.base.numel())
         initialize_he(self)
 
     def bias(self, codes: Tensor) -> Tensor:

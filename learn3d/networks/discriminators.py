@@ -1,10 +1,23 @@
-"""Discriminators."""
+"""Discriminators: of views from shape codes, and of silhouettes and their views (view prior learning).
+
+The latter answer: was a silhouette rendered from the view that the shape was predicted from? Each takes silhouettes
+float [B,S,S] and what tells the view, and returns logits: positive for "this is the input view".
+"""
 
 from __future__ import annotations
 
+import itertools
+
+import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.utils.parametrizations import spectral_norm
 
 from learn3d.networks.encoders import CODE_SIZE
+from learn3d.networks.layers import initialize_he, linear_layers
+
+SLOPE = 0.2  # of the leaky ReLUs
+BATCH_NORM_EPS = 2e-5  # published code
 
 
 class PoseDiscriminator(nn.Module):
@@ -12,13 +25,109 @@ class PoseDiscriminator(nn.Module):
 
     def __init__(self, num_views: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(CODE_SIZE, 256),
-            nn.ReLU(),
-            nn.Linear(256, 128),
-            nn.ReLU(),
-            nn.Linear(128, num_views),
-        )
+        self.layers = linear_layers(CODE_SIZE, 256, 128, num_views)
 
     def forward(self, codes: Tensor) -> Tensor:
         return self.layers(codes)
+
+
+class OneHotViewDiscriminator(nn.Module):
+    """DCGAN's discriminator on a silhouette and K planes, 1 in the plane of its view and 0 in the others -> [B].
+
+    Four 4x4 convolutions of stride 2 with c, 2c, 4c, 8c channels, batch norm on the last three, leaky ReLUs, and a
+    linear layer; c = 128 in the published code of Peng et al. 2020 for S = 64.
+    """
+
+    def __init__(self, num_views: int, channels: int = 128, silhouette_size: int = 64) -> None:
+        super().__init__()
+        self.num_views = num_views
+        widths = [channels, 2 * channels, 4 * channels, 8 * channels]
+        layers: list[nn.Module] = [nn.Conv2d(1 + num_views, channels, 4, stride=2, padding=1), nn.LeakyReLU(SLOPE)]
+        for before, after in itertools.pairwise(widths):
+            layers += [
+                nn.Conv2d(before, after, 4, stride=2, padding=1),
+                nn.BatchNorm2d(after),
+                nn.LeakyReLU(SLOPE),
+            ]
+        self.layers = nn.Sequential(*layers, nn.Flatten(), nn.Linear(widths[-1] * (silhouette_size // 16) ** 2, 1))
+
+    def forward(self, silhouettes: Tensor, view_ids: Tensor) -> Tensor:
+        planes = F.one_hot(view_ids, self.num_views).to(silhouettes)[:, :, None, None]
+        planes = planes.expand(-1, -1, *silhouettes.shape[1:])
+        return self.layers(torch.cat([silhouettes.unsqueeze(1), planes], dim=1)).squeeze(1)
+
+
+class SpectralPatchDiscriminator(nn.Module):
+    """ "shapenet_patch" of Kato and Harada 2019: one logit per patch, [B,S/64,S/64] rounded up (4x4 for S = 224).
+
+    5x5 convolutions of stride 2 with c, 2c, 4c, 8c, 8c channels (c = 32), each with spectral normalisation, batch norm
+    without gain and leaky ReLU; after the first one the view's features (through a linear layer with the same three)
+    are appended as c more channels; a last 5x5 convolution gives the logits. With `num_classes` the class is told by
+    projection (Miyato and Koyama 2018): the product of a learned vector of the class with the last features.
+    """
+
+    def __init__(self, view_features: int, channels: int = 32, num_classes: int | None = None) -> None:
+        super().__init__()
+        widths = [2 * channels, 2 * channels, 4 * channels, 8 * channels, 8 * channels]
+        self.first = nn.Sequential(_spectral_conv(1, channels), *_centred(nn.BatchNorm2d(channels)))
+        self.view = nn.Sequential(
+            spectral_norm(nn.Linear(view_features, channels, bias=False)), *_centred(nn.BatchNorm1d(channels))
+        )
+        layers: list[nn.Module] = []
+        for before, after in itertools.pairwise(widths):
+            layers += [_spectral_conv(before, after), *_centred(nn.BatchNorm2d(after))]
+        self.layers = nn.Sequential(*layers)
+        self.last = _spectral_conv(widths[-1], 1, bias=True)
+        self.num_classes = num_classes
+        if num_classes is not None:
+            self.classes = spectral_norm(nn.Linear(num_classes, widths[-1], bias=False))
+
+    def forward(self, silhouettes: Tensor, views: Tensor, class_ids: Tensor | None = None) -> Tensor:
+        """`views` float [B,C]; `class_ids` int64 [B], wanted if and only if the discriminator knows classes."""
+        features = self.layers(_append(self.first(silhouettes.unsqueeze(1)), self.view(views)))
+        logits = self.last(features).squeeze(1)
+        if self.num_classes is None:
+            return logits
+        # One-hot vectors through the normalised layer, and not an embedding: that is what the norm is taken of.
+        classes = self.classes(F.one_hot(class_ids, self.num_classes).to(features))
+        product = torch.einsum("bc,bchw->bhw", classes, features)
+        return logits + product[:, ::2, ::2]
+
+
+class PatchDiscriminator(nn.Module):
+    """ "pascal_patch" of Kato and Harada 2019: one logit per patch, [B,h,w]; no normalisation of any kind.
+
+    4x4 convolutions with c (stride 2), 2c (2), 4c (2), 8c (1) and 1 (1) channels (c = 64), leaky ReLUs; after the first
+    one the view's features (linear layer, leaky ReLU) are appended as c more channels. He's initial weights.
+    """
+
+    def __init__(self, view_features: int, channels: int = 64) -> None:
+        super().__init__()
+        self.first = nn.Sequential(nn.Conv2d(1, channels, 4, stride=2, padding=2), nn.LeakyReLU(SLOPE))
+        self.view = nn.Sequential(nn.Linear(view_features, channels), nn.LeakyReLU(SLOPE))
+        layers: list[nn.Module] = []
+        for width, stride in ((2, 2), (4, 2), (8, 1)):
+            layers += [nn.Conv2d(max(2, width // 2) * channels, width * channels, 4, stride=stride, padding=2)]
+            layers += [nn.LeakyReLU(SLOPE)]
+        self.layers = nn.Sequential(*layers, nn.Conv2d(8 * channels, 1, 4, padding=2))
+        initialize_he(self)
+
+    def forward(self, silhouettes: Tensor, views: Tensor) -> Tensor:
+        """`views` float [B,C]."""
+        return self.layers(_append(self.first(silhouettes.unsqueeze(1)), self.view(views))).squeeze(1)
+
+
+def _append(features: Tensor, view: Tensor) -> Tensor:
+    """[B,C,H,W] and [B,D] -> [B,C+D,H,W]."""
+    return torch.cat([features, view[:, :, None, None].expand(-1, -1, *features.shape[2:])], dim=1)
+
+
+def _spectral_conv(before: int, after: int, bias: bool = False) -> nn.Module:
+    return spectral_norm(nn.Conv2d(before, after, 5, stride=2, padding=2, bias=bias))
+
+
+def _centred(norm: nn.BatchNorm1d | nn.BatchNorm2d) -> list[nn.Module]:
+    """Batch norm with an offset but no gain (it would undo the spectral normalisation), and leaky ReLU."""
+    norm.eps = BATCH_NORM_EPS
+    norm.weight.requires_grad_(False)
+    return [norm, nn.LeakyReLU(SLOPE)]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from learn3d.device import upload
+from learn3d.networks.layers import linear_layers
 from learn3d.networks.resnet import ResNet18Encoder
 
 CODE_SIZE = 512
@@ -20,21 +22,8 @@ class ConvEncoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.convolutions = nn.Sequential(
-            nn.Conv2d(4, 64, 5, stride=2, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(64, 128, 5, stride=2, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(128, 256, 5, stride=2, padding=2),
-            nn.ReLU(),
-        )
-        self.layers = nn.Sequential(
-            nn.Linear(256 * (self.image_size // 8) ** 2, 1024),
-            nn.ReLU(),
-            nn.Linear(1024, 1024),
-            nn.ReLU(),
-            nn.Linear(1024, CODE_SIZE),
-        )
+        self.convolutions = _convolutions(64, 128, 256)
+        self.layers = linear_layers(256 * (self.image_size // 8) ** 2, 1024, 1024, CODE_SIZE)
 
     def forward(self, images: Tensor) -> Tensor:
         # The last ReLU after the change of layout, not before: its gradient would meet values in another layout than
@@ -58,19 +47,16 @@ class SmallConvEncoder(ConvEncoder):
 
     def __init__(self) -> None:
         nn.Module.__init__(self)
-        self.convolutions = nn.Sequential(
-            nn.Conv2d(4, 16, 5, stride=2, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(16, 32, 5, stride=2, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(32, 64, 5, stride=2, padding=2),
-            nn.ReLU(),
-        )
-        self.layers = nn.Sequential(
-            nn.Linear(64 * (self.image_size // 8) ** 2, 256),
-            nn.ReLU(),
-            nn.Linear(256, CODE_SIZE),
-        )
+        self.convolutions = _convolutions(16, 32, 64)
+        self.layers = linear_layers(64 * (self.image_size // 8) ** 2, 256, CODE_SIZE)
+
+
+def _convolutions(*channels: int) -> nn.Sequential:
+    """5x5 convolutions of stride 2 with ReLU, from four channels to those given."""
+    layers: list[nn.Module] = []
+    for before, after in itertools.pairwise((4, *channels)):
+        layers += [nn.Conv2d(before, after, 5, stride=2, padding=2), nn.ReLU()]
+    return nn.Sequential(*layers)
 
 
 EncoderName = Literal["conv", "conv-small", "conv-relu", "resnet18"]
@@ -85,8 +71,8 @@ ENCODERS: dict[str, type[nn.Module]] = {
 def create_encoder(name: EncoderName, *, inverted: bool) -> nn.Module:
     """The encoder `name` for images whose colours are stored as 255 - colour, or as they are.
 
-    Only resnet18 cares, whose normalisation and pretrained weights are those of natural colours; the others learn from
-    scratch, and, as published, on whatever is stored.
+    It matters to resnet18 alone, whose normalisation and pretrained weights are for natural colours. The others learn
+    from scratch, as published, on the colours as they are stored.
     """
     return ResNet18Encoder(inverted) if name == "resnet18" else ENCODERS[name]()
 

@@ -1,15 +1,14 @@
-"""Mesh generators: shape codes -> vertices of a surface of fixed topology."""
+"""Mesh generators that deform a sphere: shape codes -> vertices of an icosphere."""
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 import nmr
 from learn3d.networks.encoders import CODE_SIZE
+from learn3d.networks.layers import linear_layers
+from learn3d.networks.mesh_generator import MeshGenerator, Symmetry
 
 OBJECT_SCALE = 0.5
 
@@ -23,33 +22,53 @@ def deform_sphere(sphere: Tensor, displacement: Tensor) -> Tensor:
     return OBJECT_SCALE * (sphere + displacement)
 
 
-class SphereGenerator(nn.Module):
-    """Shape code [B,512] -> vertices float32 [B,642,3] of a deformed icosphere, in the object frame (y up).
+class SphereGenerator(MeshGenerator):
+    """Free vertices float32 [B,642,3]: a displacement for each vertex of the sphere.
 
-    `faces` int64 [1280,3] and `edges` int64 [1920,4] (the table of `nmr.edge_table`) describe the fixed topology.
+    With `symmetry` 979 numbers are predicted instead of 1926 (published code of Peng et al. 2020 for Pascal3D+): x and
+    y of the 32 vertices on the plane z = 0, which stay on it, and x, y, z of the 305 with z > 0; the other 305 are
+    their mirror images.
     """
 
-    sphere: Tensor
-    faces: Tensor
-    edges: Tensor
+    sphere: Tensor  # float32 [642,3]
+    source: Tensor  # int64 [642,3]: which output each coordinate is; the one after the last stands for 0
+    sign: Tensor  # float32 [642,3]: -1 where it is the opposite of the output
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, symmetry: Symmetry | None = None) -> None:
         sphere, faces = nmr.icosphere(3)
+        super().__init__(sphere, faces, symmetry)
         self.register_buffer("sphere", sphere.float(), persistent=False)
-        self.register_buffer("faces", faces, persistent=False)
-        self.register_buffer("edges", nmr.edge_table(faces), persistent=False)
-        self.layers = nn.Sequential(
-            nn.Linear(CODE_SIZE, 1024),
-            nn.ReLU(),
-            nn.Linear(1024, 2048),
-            nn.ReLU(),
-            nn.Linear(2048, sphere.shape[0] * 3),
-        )
+        self.outputs = sphere.numel()
+        if symmetry is not None:
+            self._share_outputs()
+        self.layers = linear_layers(CODE_SIZE, 1024, 2048, self.outputs)
+
+    def _share_outputs(self) -> None:
+        middle, right = (torch.nonzero(where)[:, 0] for where in (self.sphere[:, 2] == 0, self.sphere[:, 2] > 0))
+        self.outputs = 2 * len(middle) + 3 * len(right)
+        source, sign = torch.full(self.sphere.shape, self.outputs), torch.ones_like(self.sphere)
+        source[middle, :2] = torch.arange(2 * len(middle)).reshape(-1, 2)
+        source[right] = torch.arange(2 * len(middle), self.outputs).reshape(-1, 3)
+        source[self.mirror[right]] = source[right]
+        sign[self.mirror[right], 2] = -1
+        self.register_buffer("source", source, persistent=False)
+        self.register_buffer("sign", sign, persistent=False)
 
     def forward(self, codes: Tensor) -> Tensor:
-        displacement = self.layers(codes).float().reshape(codes.shape[0], -1, 3)
-        return deform_sphere(self.sphere, displacement)
+        displacement = self.layers(codes).float()
+        if self.mirror is None:
+            displacement = displacement.reshape(len(codes), -1, 3)
+        else:
+            displacement = nn.functional.pad(displacement, (0, 1))[:, self.source] * self.sign
+        return self.place(deform_sphere(self.sphere, displacement))
+
+
+class SmallSphereGenerator(SphereGenerator):
+    """The same input and output with one hidden layer of 512: for small data sets and quick experiments; no paper's."""
+
+    def __init__(self, symmetry: Symmetry | None = None) -> None:
+        super().__init__(symmetry)
+        self.layers = linear_layers(CODE_SIZE, 512, self.outputs)
 
 
 def deform_bounded_sphere(sphere: Tensor, bias: Tensor, centroid: Tensor) -> Tensor:
@@ -64,92 +83,28 @@ def deform_bounded_sphere(sphere: Tensor, bias: Tensor, centroid: Tensor) -> Ten
     return 0.5 * (center + stretch * (1 - base.sign() * center))
 
 
-class BoundedGenerator(nn.Module):
-    """Shape code [B,512] -> vertices float32 [B,642,3] in [-0.5, 0.5], each in its octant about a learnt centroid.
+class BoundedGenerator(MeshGenerator):
+    """Vertices float32 [B,642,3] in [-0.5, 0.5], each in its octant about a learnt centroid.
 
-    Kato et al. 2018: 512-1024-2048, and from there the bias of every vertex and, times 0.1, the centroid.
-    `faces` and `edges` as in `SphereGenerator`.
+    Kato et al. 2018: 512-1024-2048, and from there the bias of every vertex and, times 0.1, the centroid. With
+    `symmetry` the vertices with z < 0 have the bias of their mirror images, and the centroid lies on the plane.
     """
 
-    sphere: Tensor
-    faces: Tensor
-    edges: Tensor
+    sphere: Tensor  # float32 [642,3]
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, symmetry: Symmetry | None = None) -> None:
         sphere, faces = nmr.icosphere(3)
+        super().__init__(sphere, faces, symmetry)
         self.register_buffer("sphere", sphere.float(), persistent=False)
-        self.register_buffer("faces", faces, persistent=False)
-        self.register_buffer("edges", nmr.edge_table(faces), persistent=False)
-        self.layers = nn.Sequential(nn.Linear(CODE_SIZE, 1024), nn.ReLU(), nn.Linear(1024, 2048), nn.ReLU())
-        self.bias = nn.Linear(2048, sphere.shape[0] * 3)
+        self.layers = linear_layers(CODE_SIZE, 1024, 2048).append(nn.ReLU())
+        self.bias = nn.Linear(2048, sphere.numel())
         self.centroid = nn.Linear(2048, 3)
 
     def forward(self, codes: Tensor) -> Tensor:
         features = self.layers(codes)
-        bias = self.bias(features).float().reshape(codes.shape[0], -1, 3)
-        return deform_bounded_sphere(self.sphere, bias, 0.1 * self.centroid(features).float())
-
-
-class SymmetricSphereGenerator(nn.Module):
-    """Shape code [B,512] -> vertices float32 [B,642,3] that are exactly mirror-symmetric about z = 0.
-
-    Of the 642 vertices 32 lie on z = 0 and stay there (x and y are predicted), 305 have z > 0 (x, y and z are), and 305
-    are their mirror images: 64 + 915 = 979 outputs (published code of Peng et al. 2020 for Pascal3D+).
-    `faces`, `edges` as in `SphereGenerator`.
-    """
-
-    sphere: Tensor
-    faces: Tensor
-    edges: Tensor
-    middle: Tensor  # int64 [32]: vertices with z = 0
-    right: Tensor  # int64 [305]: vertices with z > 0
-    left: Tensor  # int64 [305]: the mirror image of each of them
-    order: Tensor  # int64 [642]: where each vertex stands in [middle, right, left]
-
-    def __init__(self) -> None:
-        super().__init__()
-        sphere, faces = nmr.icosphere(3)
-        middle, right = (torch.nonzero(where)[:, 0] for where in (sphere[:, 2] == 0, sphere[:, 2] > 0))
-        mirror = torch.tensor([1.0, 1.0, -1.0])
-        mirrored = sphere[right] * mirror.to(sphere)
-        left = torch.cdist(mirrored.double(), sphere.double()).argmin(dim=1)
-        if not torch.equal(sphere[left], mirrored):
-            raise RuntimeError("the icosphere is not symmetric about z = 0")
-        buffers = {"sphere": sphere.float(), "faces": faces, "edges": nmr.edge_table(faces)}
-        buffers |= {"middle": middle, "right": right, "left": left}
-        buffers |= {"order": torch.cat([middle, right, left]).argsort(), "mirror": mirror}
-        for name, value in buffers.items():
-            self.register_buffer(name, value, persistent=False)
-        self.layers = nn.Sequential(
-            nn.Linear(CODE_SIZE, 1024),
-            nn.ReLU(),
-            nn.Linear(1024, 2048),
-            nn.ReLU(),
-            nn.Linear(2048, len(middle) * 2 + len(right) * 3),
-        )
-
-    def forward(self, codes: Tensor) -> Tensor:
-        outputs = self.layers(codes).float()
-        count = len(self.middle)
-        middle = F.pad(outputs[:, : 2 * count].reshape(-1, count, 2), (0, 1))
-        right = outputs[:, 2 * count :].reshape(-1, len(self.right), 3)
-        left = right * self.mirror
-        return deform_sphere(self.sphere, torch.cat([middle, right, left], dim=1)[:, self.order])
-
-
-class SmallSphereGenerator(SphereGenerator):
-    """The same input and output with one hidden layer of 512: for small data sets and quick experiments; no paper's."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(CODE_SIZE, 512), nn.ReLU(), nn.Linear(512, self.sphere.shape[0] * 3))
-
-
-GeneratorName = Literal["sphere", "sphere-small", "symmetric", "bounded"]
-GENERATORS: dict[str, type[nn.Module]] = {
-    "sphere": SphereGenerator,
-    "sphere-small": SmallSphereGenerator,
-    "symmetric": SymmetricSphereGenerator,
-    "bounded": BoundedGenerator,
-}
+        bias = self.bias(features).float().reshape(len(codes), -1, 3)
+        centroid = 0.1 * self.centroid(features).float()
+        if self.mirror is not None:
+            bias = torch.where(self.sphere[:, 2:] < 0, bias[:, self.mirror], bias)
+            centroid = centroid * torch.tensor([1.0, 1.0, 0.0], device=centroid.device)
+        return self.place(deform_bounded_sphere(self.sphere, bias, centroid))

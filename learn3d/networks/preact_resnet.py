@@ -5,13 +5,13 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from learn3d.networks.encoders import CODE_SIZE
-from learn3d.networks.initialization import initialize_he
+from learn3d.networks.layers import initialize_he
 
 BATCH_NORM_EPS = 2e-5  # published code
 
 
 class PreactResNet18(nn.Module):
-    """Colours [B,3,S,S] in [-1,1] on a background of 0 -> shape code [B,512], unbounded.
+    """Images [B,4,S,S] in [0,1], laid over grey -> shape code [B,512], unbounded.
 
     As published: 7x7 convolution of stride 2, batch norm, ReLU, 3x3 maximum of stride 2; four stages of two blocks with
     64, 128, 256, 512 channels, in which batch norm and ReLU come before each convolution; batch norm, ReLU; a linear
@@ -42,7 +42,7 @@ class PreactResNet18(nn.Module):
         self.code = nn.Linear(widths[-1] * (image_size // 32) ** 2, CODE_SIZE)
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.code(self.layers(images))
+        return self.code(self.layers(grey_background(images)))
 
 
 class _Block(nn.Module):
@@ -71,6 +71,6 @@ class _Block(nn.Module):
 def grey_background(images: Tensor) -> Tensor:
     """RGB and mask [B,4,S,S] in [0,1] -> colours [B,3,S,S] in [-1,1], 0 (grey) where the mask is 0.
 
-    Inverted colours (Kato's files) come out with the other sign, which is nothing to a network trained from scratch.
+    Inverted colours (Kato's files) come out with the other sign. To a network trained from scratch that is the same.
     """
     return (2 * images[:, :3] - 1) * images[:, 3:]

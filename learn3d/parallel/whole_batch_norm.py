@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
-if TYPE_CHECKING:
-    from learn3d.parallel.ranks import Ranks
+from learn3d.parallel.ranks import Ranks
 
 BatchNorm = nn.BatchNorm1d | nn.BatchNorm2d | nn.BatchNorm3d
 
@@ -17,8 +15,8 @@ BatchNorm = nn.BatchNorm1d | nn.BatchNorm2d | nn.BatchNorm3d
 def use_whole_batch(network: nn.Module, ranks: Ranks) -> None:
     """Let the batch norms of a network take mean and variance over the rows of all processes, in place.
 
-    `nn.SyncBatchNorm` would do so on CUDA devices only, and for parts of equal size. The modules stay, with their
-    names, so that checkpoints and everyone who holds one of them know no difference.
+    `nn.SyncBatchNorm` would do so on CUDA devices only, and for parts of equal size. The modules keep their names, so
+    that checkpoints stay the same.
     """
     for module in network.modules():
         if isinstance(module, BatchNorm):

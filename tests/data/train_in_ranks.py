@@ -20,7 +20,8 @@ import nmr
 from learn3d.config import config_from_dict
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.methods import pose_invariant, prgan, vpl
-from learn3d.parallel.ranks import ALONE, Ranks, start
+from learn3d.parallel.launch import start
+from learn3d.parallel.ranks import ALONE, Ranks
 from learn3d.runs import checkpoint
 from learn3d.training import load_splits, train
 
@@ -56,7 +57,7 @@ def inject(fault: str, stack: contextlib.ExitStack) -> None:
 
 def evaluate_last(folder: Path, ranks: Ranks = ALONE) -> Evaluation:
     method, config, _ = checkpoint.load_method(folder / "last.safetensors")
-    ranks.join(method)
+    method.join(ranks)
     return evaluate(method, load_splits(config)[1], batch_size=5, paper_mmd=True)
 
 

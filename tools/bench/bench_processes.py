@@ -29,7 +29,9 @@ from learn3d.data.sampling import shuffled_epochs
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.interrupt import Stop
 from learn3d.methods import DataShape, create_method
-from learn3d.parallel import ranks as distributed
+from learn3d.methods import method as method_module
+from learn3d.parallel.launch import start
+from learn3d.parallel.ranks import Ranks
 from learn3d.presets import PRESETS
 from learn3d.terminal import in_a_sentence
 
@@ -48,7 +50,7 @@ class Options:
     """Arithmetic of the networks."""
 
 
-def measure_steps(options: Options, ranks: distributed.Ranks) -> tuple[float, float, float, float]:
+def measure_steps(options: Options, ranks: Ranks) -> tuple[float, float, float, float]:
     """Milliseconds: median step, fastest step; of a step what the sums of gradients take, waiting included; and the
     processor's time for a step of this process, which hardly depends on what else the machine does.
     """
@@ -59,22 +61,22 @@ def measure_steps(options: Options, ranks: distributed.Ranks) -> tuple[float, fl
     method = create_method(
         PRESETS["peng2020-kato"].settings, DataShape(kato.NUM_VIEWS), device=options.device, precision=precision, seed=0
     )
-    summing, sum_gradients = [0.0], distributed.sum_gradients
+    summing, sum_gradients = [0.0], method_module.sum_gradients
 
     def timed(optimizer: Optimizer, *arguments: object) -> None:
-        start = time.perf_counter()
+        began = time.perf_counter()
         sum_gradients(optimizer, *arguments)
-        summing[0] += time.perf_counter() - start
+        summing[0] += time.perf_counter() - began
 
-    distributed.sum_gradients = timed
-    ranks.join(method)
+    method_module.sum_gradients = timed
+    method.join(ranks)
     steps, sums, busy = [], [], []
     for step in range(1, options.repeats + 3):
-        summing[0], start, before = 0.0, time.perf_counter(), time.process_time()
+        summing[0], began, before = 0.0, time.perf_counter(), time.process_time()
         method.train_step(dataset.batch(shuffled_epochs(len(dataset), options.batch, 0, step), ranks.rows), step)
         ranks.stopped_by(Stop())
         if step > 2:
-            steps.append(1e3 * (time.perf_counter() - start))
+            steps.append(1e3 * (time.perf_counter() - began))
             sums.append(1e3 * summing[0])
             busy.append(1e3 * (time.process_time() - before))
     return median(steps), min(steps), median(sums), median(busy)
@@ -108,7 +110,7 @@ def bench_processes(repeats: int) -> None:
 @in_a_sentence()
 def main() -> int:
     options = tyro.cli(Options, description=__doc__)
-    with distributed.start(options.device) as ranks:
+    with start(options.device) as ranks:
         step, fastest, summing, busy = measure_steps(options, ranks)
         if not ranks.alone:
             summing = float(ranks.gather([torch.tensor([summing])], torch.tensor([ranks.rank]), ranks.world).min())

@@ -120,13 +120,14 @@ class Stopwatch:
         draw = self.timed("rendering", nmr.render_silhouette)
         transform = lambda camera, vertices: self.timed("camera", camera.transform)(vertices)  # noqa: E731
         stack.enter_context(mock.patch.object(nmr, "render_silhouette", render))
-        module = sys.modules[type(method).__module__]
+        module, base = (sys.modules[kind.__module__] for kind in (type(method), Method))
         for owner, name, part in (
             (nmr.losses, "soft_iou_loss", "projection loss"),
             (module, "silhouette_pyramid_loss", "projection loss"),
             (nmr.losses, "smoothness_loss", "smoothness"),
             (nmr.losses, "inflation_loss", "inflation"),
             (module, "network_input", "images to floats"),
+            (base, "network_input", "images to floats"),
             (module, "gaussian_prior_loss", "losses on codes and logits"),
             (module, "pose_classification_loss", "losses on codes and logits"),
             (module, "domain_confusion_loss", "losses on codes and logits"),
@@ -189,7 +190,7 @@ def prepare(options: StepOptions) -> tuple[TrainConfig, ViewDataset, dict[str, T
 
 
 def build(config: TrainConfig, dataset: ViewDataset, tensors: dict[str, Tensor] | None, precision: Precision) -> Method:
-    shape = DataShape(dataset.num_views, dataset.num_classes, dataset.poses.num_features)
+    shape = DataShape(dataset.num_views, dataset.num_classes, dataset.pose_features)
     method = create_method(config.settings, shape, device="cpu", precision=precision, seed=0)
     if tensors is not None:
         checkpoint.restore_networks(method, tensors, Path("the checkpoint"))

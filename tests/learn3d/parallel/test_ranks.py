@@ -25,8 +25,9 @@ from train_in_ranks import evaluate_last, linear_optimizer
 
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.data import augment as augmentation
-from learn3d.parallel import ranks as distributed
-from learn3d.parallel.ranks import ALONE, LostPeerError, Ranks, all_agree, label, start
+from learn3d.parallel import launch
+from learn3d.parallel.launch import all_agree, label, start
+from learn3d.parallel.ranks import ALONE, LostPeerError, Ranks
 from learn3d.parallel.whole_batch_norm import use_whole_batch
 from learn3d.training import train
 
@@ -93,8 +94,8 @@ def test_parts_of_a_batch_are_changed_as_the_whole_is(tiny_set, names: tuple[str
         assert torch.equal(part.images, whole.images[rows])
         assert torch.equal(part.masks, whole.masks[rows])
         assert torch.equal(part.poses.azimuth_deg, whole.poses.azimuth_deg[rows])
-        assert torch.equal(part.whole.poses.azimuth_deg, whole.poses.azimuth_deg)
-        assert torch.equal(part.whole.view_ids, whole.view_ids)
+        assert torch.equal(part.step_views.poses.azimuth_deg, whole.poses.azimuth_deg)
+        assert torch.equal(part.step_views.view_ids, whole.view_ids)
 
 
 def test_without_torchrun_there_is_one_process(monkeypatch) -> None:
@@ -118,7 +119,7 @@ def test_processes_that_do_not_meet_say_where_and_what_to_look_for(monkeypatch) 
     port = free_port()
     for name, value in {"RANK": 1, "WORLD_SIZE": 2, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}.items():
         monkeypatch.setenv(name, str(value))
-    monkeypatch.setattr(distributed, "TIMEOUT", timedelta(seconds=1))
+    monkeypatch.setattr(launch, "TIMEOUT", timedelta(seconds=1))
     said = rf"the 2 processes of the run did not find each other by 127.0.0.1:{port} \(.*\); one of them has ended"
     with pytest.raises(LostPeerError, match=said), start("cpu"):
         pass
@@ -130,23 +131,23 @@ def test_a_lost_machine_that_kept_the_store_is_a_lost_process(monkeypatch) -> No
 
     monkeypatch.setattr(torch.distributed, "all_reduce", fail)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    monkeypatch.setattr(distributed, "LAST_WORDS", 0)
+    monkeypatch.setattr(launch, "GRACE_SECONDS", 0)
     with pytest.raises(LostPeerError) as lost:
         Ranks(1, 2).any(True)
-    distributed._announce(mock.Mock(check=fail), lost.value)
+    launch._announce(mock.Mock(check=fail), lost.value)
     said = "another process of the run failed, was killed or does not answer ([pair.cc:537] Connection reset by peer)"
     assert str(lost.value) == said
 
 
 def test_what_all_processes_say_is_said_once_on_each_machine(monkeypatch) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    monkeypatch.setattr(distributed, "LAST_WORDS", 0)
+    monkeypatch.setattr(launch, "GRACE_SECONDS", 0)
     monkeypatch.setenv("WORLD_SIZE", "4")
     store, silent = torch.distributed.HashStore(), []
     for rank, machine in enumerate((0, 0, 1, 1)):
         monkeypatch.setenv("RANK", str(rank))
         monkeypatch.setenv("GROUP_RANK", str(machine))
-        silent.append(distributed._announce(store, ValueError("there is no such folder")))
+        silent.append(launch._announce(store, ValueError("there is no such folder")))
     assert silent == [False, True, False, True]
 
 
@@ -208,7 +209,7 @@ class Processes:
         return [process.returncode for process in self.processes], said
 
 
-def launch(*command: object, world: int = 2) -> Processes:
+def start_processes(*command: object, world: int = 2) -> Processes:
     """Start processes as torchrun does, but without it: that saves a third of the time."""
     common = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "OMP_NUM_THREADS": "1"}
     common |= dict.fromkeys(("WORLD_SIZE", "LOCAL_WORLD_SIZE"), str(world))
@@ -219,7 +220,7 @@ def launch(*command: object, world: int = 2) -> Processes:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable[..., TrainConfig]) -> Iterator[Path]:
-    """Folder of one/<name> and two/<name>: the same runs in one and in two processes, which take a single launch."""
+    """Folder of one/<name> and two/<name>: the same runs in one and in two processes, which take one start."""
     root = tmp_path_factory.mktemp("ranks")
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -240,7 +241,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable[..., Tr
     with linear_optimizer():
         train(config("two/one-then-two", iterations=2, **plain))
         (root / "tasks.json").write_text(json.dumps(tasks, default=lambda c: config_to_dict(c)))
-        processes = launch(TASKS, root / "tasks.json")
+        processes = start_processes(TASKS, root / "tasks.json")
         for name, (options, _, _) in RUNS.items():
             train(config(f"one/{name}", **options))
         codes, said = processes.wait()
@@ -308,7 +309,7 @@ def test_the_error_of_one_process_ends_all(tiny_config, tmp_path) -> None:
     options = {"iterations": 1000, "validate_every": 1000} | SMALL
     task = {"config": config_to_dict(tiny_config(tmp_path / "run", **options)), "fault": "error"}
     (tmp_path / "tasks.json").write_text(json.dumps([task]))
-    codes, said = launch(TASKS, tmp_path / "tasks.json").wait()
+    codes, said = start_processes(TASKS, tmp_path / "tasks.json").wait()
     assert 0 not in codes
     cause = "the cat is on the keyboard"
     assert f"RuntimeError: {cause}" in said[1]
@@ -325,7 +326,7 @@ def test_two_processes_share_a_gpu(tiny_config, tmp_path) -> None:
         config = tiny_config(tmp_path / "two" / name, **options)
         tasks.append({"config": config_to_dict(config), "linear": True})
     (tmp_path / "tasks.json").write_text(json.dumps(tasks))
-    codes, said = launch(TASKS, tmp_path / "tasks.json").wait()
+    codes, said = start_processes(TASKS, tmp_path / "tasks.json").wait()
     assert codes == [0, 0], said
     for name in ("proposed", "vpl"):
         assert distance(tmp_path / "one" / name, tmp_path / "two" / name) < 1e-3, name
@@ -357,7 +358,7 @@ def wait_for_steps(run_folder: Path, process: subprocess.Popen) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals to other processes")
 def test_a_signal_to_one_stops_all_and_a_killed_one_ends_all(tiny_folder, run_folder) -> None:
-    started = launch(*command(tiny_folder, run_folder))
+    started = start_processes(*command(tiny_folder, run_folder))
     wait_for_steps(run_folder, started.processes[0])
     started.processes[1].send_signal(signal.SIGTERM)
     codes, said = started.wait()
@@ -367,7 +368,7 @@ def test_a_signal_to_one_stops_all_and_a_killed_one_ends_all(tiny_folder, run_fo
     saved = load_file(run_folder / "last.safetensors")
 
     (run_folder / "metrics.jsonl").unlink()
-    resumed = launch(TRAIN, "--output", run_folder, "--resume")
+    resumed = start_processes(TRAIN, "--output", run_folder, "--resume")
     wait_for_steps(run_folder, resumed.processes[0])
     resumed.processes[1].kill()
     codes, said = resumed.wait(timeout=60)
@@ -389,7 +390,7 @@ def test_torchrun_reports_what_went_wrong_once(tmp_path) -> None:
 
 RESTARTED = """
 import os, time
-from learn3d.parallel.ranks import start
+from learn3d.parallel.launch import start
 first, rank = os.environ["TORCHELASTIC_RESTART_COUNT"] == "0", os.environ["RANK"]
 if not first and rank == "1":
     time.sleep(2)  # the other one would find the address that this one had

@@ -1,0 +1,136 @@
+"""How weights follow their gradients: optimizers, step sizes over a run, averaged weights, and the way back from losses.
+
+A method creates its optimizers; all the rest is the same for every method and stands here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from learn3d.device import Download
+from learn3d.parallel.ranks import ALONE, Ranks
+
+Schedule = Literal["constant", "cosine", "linear", "step"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a method must know about the run that it is trained in."""
+
+    iterations: int = 1  # steps of the whole run
+    schedule: Schedule = "constant"  # how the step size changes after the warm-up
+    warmup_steps: int = 0  # steps in which it grows from nothing to its full size
+    average: float = 0.0  # decay of the average of the weights, 0: there is none
+
+    def __post_init__(self) -> None:
+        if 0 < self.iterations <= self.warmup_steps:
+            raise ValueError(f"warmup_steps must be below the {self.iterations} iterations, got {self.warmup_steps}")
+
+    def factor(self, step: int) -> float:
+        """The step size of step `step` (from 1), as a share of the full one.
+
+        A warm-up of w steps: 1/w, 2/w .. 1. Then constant: 1. linear: from 1 down towards 0. cosine: the same along
+        half a cosine. step: 1, and 0.1 in the last 5 % of all iterations (Kato et al. 2018).
+        """
+        if step <= self.warmup_steps:
+            return step / self.warmup_steps
+        done = (step - 1 - self.warmup_steps) / max(1, self.iterations - self.warmup_steps)  # 0 .. below 1
+        if self.schedule == "linear":
+            return 1 - done
+        if self.schedule == "cosine":
+            return (1 + math.cos(math.pi * done)) / 2
+        return 0.1 if self.schedule == "step" and 20 * step > 19 * self.iterations else 1.0
+
+
+CONSTANT = Plan()  # full step sizes, no average
+
+
+class Average:
+    """An exponential moving average of all weights of some networks (EMA), and of their batch norms' statistics.
+
+    After step t: average = d * average + (1 - d) * weights, where d is the `decay`, but at most (1 + t) / (10 + t), so
+    that the initial weights are soon forgotten.
+    """
+
+    def __init__(self, networks: Mapping[str, nn.Module], decay: float) -> None:
+        self.decay = decay
+        self._own = {f"{n}.{k}": v for n, net in networks.items() for k, v in net.state_dict(keep_vars=True).items()}
+        self.tensors = {name: value.detach().clone() for name, value in self._own.items()}
+
+    @torch.no_grad()
+    def update(self, step: int) -> None:
+        """Take in the weights that step `step` (from 1) arrived at."""
+        new = 1 - min(self.decay, (1 + step) / (10 + step))
+        for name, average in self.tensors.items():
+            if average.is_floating_point():
+                average.lerp_(self._own[name].detach(), new)
+            else:  # a number of batches
+                average.copy_(self._own[name])
+
+    @contextlib.contextmanager
+    def in_place(self) -> Iterator[None]:
+        """Within, the networks have the averaged weights. Nothing may be trained meanwhile."""
+        self._swap()
+        try:
+            yield
+        finally:
+            self._swap()
+
+    def _swap(self) -> None:
+        for name, own in self._own.items():
+            own.data, self.tensors[name] = self.tensors[name], own.data
+
+
+def adam(network: nn.Module, learning_rate: float, betas: tuple[float, float] = (0.9, 0.999)) -> torch.optim.Adam:
+    """Adam for one network, fused (13 ms a step instead of 91 on two cores)."""
+    parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    return torch.optim.Adam(parameters, lr=learning_rate, betas=betas, fused=True)
+
+
+def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
+    """Apply a network so that gradients reach its inputs but not its parameters, and its buffers stay as they are."""
+    state = {name: parameter.detach() for name, parameter in network.named_parameters()}
+    state |= {name: buffer.clone() for name, buffer in network.named_buffers()}
+    return torch.func.functional_call(network, state, inputs)
+
+
+def backpropagate(
+    losses: Mapping[str, Tensor], weights: Mapping[str, float], step: int, ranks: Ranks = ALONE
+) -> dict[str, float]:
+    """Backpropagate the sum of the losses, each times its weight (1 where none is given); return them, and "total".
+
+    Losses are those of this process's rows; what is returned is of the whole batch, and so is the sum of the gradients
+    over the processes. Losses may lie on the CPU and on the networks' device; there is one sum for each of the two.
+    Raises FloatingPointError, with no gradient computed yet, when a loss is not finite.
+    """
+    totals: dict[torch.device, Tensor] = {}
+    for name, loss in losses.items():
+        weight = weights.get(name, 1.0)
+        term = loss if weight == 1.0 else weight * loss
+        totals[loss.device] = totals[loss.device] + term if loss.device in totals else term
+    values = ranks.means(read_back(losses))
+    values["total"] = sum(weights.get(name, 1.0) * value for name, value in values.items())
+    if not all(math.isfinite(value) for value in values.values()):
+        listed = ", ".join(f"{name} {value:g}" for name, value in values.items())
+        raise FloatingPointError(f"the loss is not finite at iteration {step} ({listed})")
+    torch.autograd.backward([total if ranks.alone else ranks.share * total for total in totals.values()])
+    return values
+
+
+def read_back(losses: Mapping[str, Tensor]) -> dict[str, float]:
+    """The values of scalar losses; one copy for all that lie on one device."""
+    by_device: dict[torch.device, list[str]] = {}
+    for name, loss in losses.items():
+        by_device.setdefault(loss.device, []).append(name)
+    copies = [Download(torch.stack([losses[n].detach().float() for n in names])) for names in by_device.values()]
+    found: dict[str, float] = {}
+    for names, copy in zip(by_device.values(), copies, strict=True):
+        found |= zip(names, copy.finish().tolist(), strict=True)
+    return {name: found[name] for name in losses}

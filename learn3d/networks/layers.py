@@ -1,0 +1,45 @@
+"""Small parts that several networks share: linear layers with ReLU, initial weights, the reversal of gradients."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+def linear_layers(*sizes: int) -> nn.Sequential:
+    """Linear layers from the first size to the last, with ReLU between them."""
+    layers: list[nn.Module] = []
+    for before, after in itertools.pairwise(sizes):
+        layers += [nn.Linear(before, after), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def initialize_he(network: nn.Module) -> None:
+    """He's normal distribution for the weights of all convolutions and linear layers, 0 for their biases."""
+    for module in network.modules():
+        if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
+            nn.init.kaiming_normal_(module.weight)
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+
+
+class _ReverseGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, factor: float) -> Tensor:
+        ctx.factor = factor
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        return -ctx.factor * grad, None
+
+
+def reverse_gradient(values: Tensor, factor: float) -> Tensor:
+    """The values as they are; their gradient times -factor (Ganin and Lempitsky 2015).
+
+    The networks behind it descend a loss, those in front of it climb the same loss, `factor` times as fast.
+    """
+    return _ReverseGradient.apply(values, factor)

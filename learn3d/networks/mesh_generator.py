@@ -1,0 +1,59 @@
+"""What all mesh generators share: the faces of a fixed topology, and mirror symmetry about a vertical plane."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+import nmr
+
+Symmetry = Literal["x", "z"] | float
+"""x, z: mirrored at x = 0 or z = 0. A number: at the vertical plane that a camera of this azimuth (degrees) looks
+along; x = 0 is 0, z = 0 is 90."""
+
+
+class MeshGenerator(nn.Module):
+    """Shape code [B,512] -> vertices float32 [B,V,3] in the object frame (y up).
+
+    A subclass computes vertices that are symmetric about z = 0 where `symmetry` is not None, and hands them to
+    `place`, which turns them about the vertical axis until that plane is the one asked for.
+    """
+
+    faces: Tensor  # int64 [F,3]
+    edges: Tensor  # int64 [E,4]: the table of `nmr.edge_table`
+    mirror: Tensor | None  # int64 [V]: the vertex on the other side of z = 0 (itself, on the plane); None: no symmetry
+    rotation: Tensor | None  # float32 [3,3]: takes the plane z = 0 to the one asked for; None: it is that plane
+
+    def __init__(self, points: Tensor, faces: Tensor, symmetry: Symmetry | None) -> None:
+        super().__init__()
+        mirror = None if symmetry is None else mirror_images(points)
+        rotation = None if symmetry in (None, "z") else _rotation(0.0 if symmetry == "x" else float(symmetry))
+        tables = {"faces": faces, "edges": nmr.edge_table(faces), "mirror": mirror, "rotation": rotation}
+        for name, table in tables.items():
+            self.register_buffer(name, table, persistent=False)
+
+    def place(self, vertices: Tensor) -> Tensor:
+        """Vertices that are symmetric about z = 0, turned so that they are about the plane asked for."""
+        if self.rotation is None:
+            return vertices
+        return (vertices[..., None] * self.rotation).sum(-2)  # not a matrix product, which autocast would round to bf16
+
+
+def mirror_images(points: Tensor) -> Tensor:
+    """For each of the points [V,3] the one that is its mirror image at z = 0, int64 [V]."""
+    mirrored = points * torch.tensor([1.0, 1.0, -1.0]).to(points)
+    found = torch.cdist(mirrored.double(), points.double()).argmin(dim=1)
+    if not torch.equal(points[found], mirrored):
+        raise RuntimeError("the base mesh is not symmetric about z = 0")
+    return found
+
+
+def _rotation(azimuth_deg: float) -> Tensor:
+    """The rotation about y that takes the plane z = 0 to the one that a camera of this azimuth looks along."""
+    angle = math.radians(azimuth_deg)
+    sine, cosine = round(math.sin(angle), 12), round(math.cos(angle), 12)  # quarter turns are exact
+    # In (x, z) the eye stands in direction (sin a, -cos a): that is where the x axis goes.
+    return torch.tensor([[sine, 0.0, -cosine], [0.0, 1.0, 0.0], [cosine, 0.0, sine]])
