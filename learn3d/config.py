@@ -15,7 +15,8 @@ from learn3d.data.sampling import Sampling
 from learn3d.files import limits
 from learn3d.files.findings import DamagedFile
 from learn3d.files.reading import parse_json, read_bytes
-from learn3d.presets import PRESETS, Settings
+from learn3d.methods import Plan, Schedule, Settings
+from learn3d.presets import PRESETS
 from learn3d.settings import Count, FilePath, Items, Step, checked
 
 DEFAULT_PRESET = next(iter(PRESETS))
@@ -58,6 +59,14 @@ class TrainConfig:
     """Number of training steps. None: the preset's."""
     batch_size: Annotated[int, Field(ge=1, le=65_536)] | None = None
     """Images per step. None: the preset's."""
+    schedule: Schedule | None = None
+    """How the step size changes over the run. linear, cosine: it falls to 0. step: to a tenth in the last 5 % of all
+    iterations. None: the preset's, constant for most."""
+    warmup_steps: Annotated[int, Field(ge=0, le=10**9)] = 0
+    """Steps at the beginning in which the step size grows from 0 to its full size."""
+    average: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Also keep an exponential moving average of all weights, with this decay a step, such as 0.999. Validation, the
+    best checkpoint, evaluation and reconstruction use it. 0: no average."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial weights and of the order of the images."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -84,7 +93,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         preset = PRESETS[self.preset]
-        for name in ("settings", "layout", "view_bins", "sampling", "augment", "iterations", "batch_size"):
+        for name in ("settings", "layout", "view_bins", "sampling", "augment", "iterations", "batch_size", "schedule"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(preset, name))
         if type(self.settings) is not type(preset.settings):
@@ -104,11 +113,17 @@ class TrainConfig:
             raise ValueError(
                 f"sampling 'pairs' takes two views of each object: batch_size must be even, got {self.batch_size}"
             )
+        self.plan  # noqa: B018 (it checks itself)
         if getattr(self.settings, "encoder_from_step", 0) > self.iterations:
             raise ValueError(
                 f"encoder_from_step={self.settings.encoder_from_step} lies beyond the {self.iterations} iterations: "
                 f"the encoder would never be trained; give a step such as {self.iterations // 2 + 1}"
             )
+
+    @property
+    def plan(self) -> Plan:
+        """What the method must know about the run."""
+        return Plan(self.iterations, self.schedule, self.warmup_steps, self.average)
 
 
 #: Options that a resumed run may change: they say where and how long to compute and what to report, not what to learn.
@@ -155,7 +170,8 @@ def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
     return [
         f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"
         for name in dict.fromkeys([*old, *new])
-        if name not in RESUME_MAY_CHANGE and old.get(name) != new.get(name)
+        if (name not in RESUME_MAY_CHANGE or (name == "iterations" and config.schedule != "constant"))
+        and old.get(name) != new.get(name)
     ]
 
 

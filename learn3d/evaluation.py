@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -21,8 +21,12 @@ from learn3d.methods import Grids, Meshes, Method
 from learn3d.methods.surfaces import grid_surface
 from learn3d.parallel.ranks import ALONE, Ranks
 
+Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]
+"""What brings the predicted shapes of a batch to the true ones before they are compared; see `evaluate`."""
+
 CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
+YAW_STEPS = 24
 F_SCORE_DISTANCE = 0.05  # units of the object frame, where the longest side is 1 (Pascal3D+: up to 2)
 
 
@@ -107,6 +111,7 @@ def evaluate(
     max_images: int | None = None,
     paper_mmd: bool = False,
     surfaces: bool = False,
+    align: Literal["yaw"] | Align | None = None,
     batch_size: int = 256,
 ) -> Evaluation:
     """Voxel IoU of every image of a split, and the mean MMD over all pairs of view classes.
@@ -118,12 +123,18 @@ def evaluate(
     where the data set has no points, the truth is the surface of its voxels, which limits them to about 1/32.
 
     Where the data set has no voxels, meshes are seen by the camera of another image of the object instead (of the only
-    one where there is no other) and compared with that image's mask: the IoU of silhouettes.
+    one where there is no other) and compared with that image's mask: the IoU of silhouettes. Without voxels and poses
+    there is nothing to compare with.
+
+    `align` is for methods whose shapes may stand otherwise than the true ones: a function of the predicted shapes, the
+    batch and the data set that returns the shapes to be compared. "yaw": the best of 24 rotations about the vertical
+    axis, see `align_yaw`.
 
     Where several processes train the method, all of them call this; they share the work, and all return the result that
     one process gives with these networks. Raises ValueError for `surfaces` there: they are measured in one process.
     """
     ranks = method.ranks
+    align = align_yaw if align == "yaw" else align
     if surfaces and not ranks.alone:
         raise ValueError("surfaces are measured in one process; evaluate the run when it has ended")
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
@@ -139,14 +150,16 @@ def evaluate(
     try:
         for chosen in chunks[ranks.rank :: ranks.world]:
             batch = dataset.batch(chosen)
-            code = method.encode(batch.images)
+            code = method.estimate(batch.images).codes
             shapes = method.decode(code)
+            if align is not None:
+                shapes = align(shapes, batch, dataset)
             for name in ious:
                 ious[name].append(nmr.metrics.voxel_iou(occupancy(shapes, dataset, name), batch.voxels))
             if truth is not None:
                 points = _surface_points(shapes, generator)
                 distances += [_compare(a, truth[b]) for a, b in zip(points, batch.object_ids.tolist(), strict=True)]
-            if dataset.voxels is None and isinstance(shapes, Meshes):
+            if dataset.voxels is None and dataset.poses is not None and isinstance(shapes, Meshes):
                 silhouettes.append(_silhouette_ious(shapes, dataset.batch(others[chosen])))
             codes.append(code.float().cpu())
     finally:
@@ -177,6 +190,27 @@ def occupancy(shapes: Meshes | Grids, dataset: ViewDataset, definition: Definiti
     if dataset.convention.box != 1.0:
         raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {dataset.convention.name} voxels")
     return dataset.convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))
+
+
+def align_yaw(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset) -> Meshes | Grids:
+    """Each mesh turned about the vertical axis by that multiple of 15 degrees at which its voxel IoU is the best.
+
+    The first of equals is taken, so that a shape without a better rotation stays as it is. Raises ValueError for grids,
+    and where the data set has no voxels.
+    """
+    if not isinstance(shapes, Meshes) or batch.voxels is None:
+        raise ValueError("align 'yaw' turns meshes and compares them with voxels; leave it out for grids, or without")
+    best = torch.full((len(shapes.vertices),), -1.0)
+    aligned = shapes.vertices
+    for k in range(YAW_STEPS):
+        angle = 2 * math.pi * k / YAW_STEPS
+        x, y, z = shapes.vertices.unbind(-1)
+        sine, cosine = math.sin(angle), math.cos(angle)
+        turned = torch.stack([cosine * x + sine * z, y, cosine * z - sine * x], dim=-1)
+        iou = nmr.metrics.voxel_iou(dataset.voxelize(turned, shapes.faces), batch.voxels).nan_to_num(nan=-1.0)
+        better = iou > best
+        best, aligned = best.maximum(iou), torch.where(better[:, None, None], turned, aligned)
+    return replace(shapes, vertices=aligned)
 
 
 def _other_images(object_ids: np.ndarray) -> Tensor:

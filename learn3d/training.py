@@ -90,7 +90,9 @@ def _train(config: TrainConfig, resume: bool, overwrite: bool, ranks: Ranks) -> 
     # A run goes on as it began, also one from before encoders could turn colours back.
     inverted = train_set.inverted if saved is None else saved.shape.inverted
     shape = DataShape(train_set.num_views, train_set.num_classes, train_set.pose_features, inverted)
-    method = create_method(config.settings, shape, device=config.device, precision=precision, seed=config.seed)
+    method = create_method(
+        config.settings, shape, device=config.device, precision=precision, seed=config.seed, plan=config.plan
+    )
     if saved is None:
         method.start_from_pretrained()
     progress = Progress(object_share=object_share(train_set))

@@ -33,7 +33,8 @@ def validate(
 
     It is the IoU of voxels; where no true shapes are known that of silhouettes, at cameras that were not the input's.
     """
-    result = evaluate(method, val_set, max_images=config.max_val_images)
+    with method.averaged():
+        result = evaluate(method, val_set, max_images=config.max_val_images)
     log.metrics(progress.step, config.val_split, {k: v for k, v in result.summary().items() if v is not None})
     mmd = "" if result.mmd is None else f", MMD {result.mmd:.3f}"
     without = f"; {result.without_mmd}" if result.mmd is None else ""
@@ -49,14 +50,16 @@ def validate(
     if better:
         progress.best_iou, progress.best_step = iou, progress.step
         metadata = checkpoint.method_metadata(shape, config) | dataclasses.asdict(progress)
-        check_networks(method)
-        if method.ranks.main:
-            checkpoint.save(config.output / BEST, checkpoint.network_tensors(method), metadata)
+        with method.averaged():
+            check_networks(method)
+            if method.ranks.main:
+                checkpoint.save(config.output / BEST, checkpoint.network_tensors(method), metadata)
 
 
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
     """Write pictures/<step>.png: the same few validation images every time, of different objects and views."""
-    grid = figures.picture_grid(method, val_set, picture_samples(val_set, PICTURE_ROWS))
+    with method.averaged():
+        grid = figures.picture_grid(method, val_set, picture_samples(val_set, PICTURE_ROWS))
     folder = config.output / PICTURES
     try:
         folder.mkdir(exist_ok=True)

@@ -17,12 +17,12 @@ Augmentation = Literal["flip", "flip-image", "channels", "crop"]
 def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -> Batch:
     """The batch with the named changes, each drawn for every sample on its own, in the order of the names.
 
-    "flip": image, mask and pose (where it is known) mirrored left-right with probability 1/2 (Kato and Harada 2019). "flip-image": the
-    colours of the input image alone, while every mask stays with its pose (published code of both papers on Pascal3D+;
-    it works because the mesh is symmetric). "channels": a random permutation of the three colours. "crop": the colours
-    cut anew from the original image, each side of the padded box moved by up to 15 % of the box, uniformly (Pascal3D+,
-    both papers); it comes first, and masks stay as they are. Of a part of a batch, each view is changed as it is in the
-    whole.
+    "flip": image, mask and, where it is known, pose mirrored left-right with probability 1/2 (Kato and Harada 2019).
+    "flip-image": the colours of the input image alone, while every mask stays with its pose (published code of both
+    papers on Pascal3D+; it works because the mesh is symmetric). "channels": a random permutation of the three colours.
+    "crop": the colours cut anew from the original image, each side of the padded box moved by up to 15 % of the box,
+    uniformly (Pascal3D+, both papers); it comes first, and masks stay as they are. Where processes share a step, each
+    view is changed as in one process.
 
     Raises ValueError for an unknown name, for "crop" where the data set has no original images, or not first.
     """

@@ -1,4 +1,4 @@
-"""How weights follow their gradients: optimizers, step sizes over a run, averaged weights, and the way back from losses.
+"""How weights follow from losses: gradients, optimizers, step sizes over a run, averages of the weights.
 
 A method creates its optimizers; all the rest is the same for every method and stands here.
 """

@@ -87,7 +87,7 @@ class BoundedGenerator(MeshGenerator):
     """Vertices float32 [B,642,3] in [-0.5, 0.5], each in its octant about a learnt centroid.
 
     Kato et al. 2018: 512-1024-2048, and from there the bias of every vertex and, times 0.1, the centroid. With
-    `symmetry` the vertices with z < 0 have the bias of their mirror images, and the centroid lies on the plane.
+    `symmetry` the vertices with z < 0 are the mirror images of the others, and the centroid lies on the plane.
     """
 
     sphere: Tensor  # float32 [642,3]
@@ -104,7 +104,9 @@ class BoundedGenerator(MeshGenerator):
         features = self.layers(codes)
         bias = self.bias(features).float().reshape(len(codes), -1, 3)
         centroid = 0.1 * self.centroid(features).float()
-        if self.mirror is not None:
-            bias = torch.where(self.sphere[:, 2:] < 0, bias[:, self.mirror], bias)
-            centroid = centroid * torch.tensor([1.0, 1.0, 0.0], device=centroid.device)
-        return self.place(deform_bounded_sphere(self.sphere, bias, centroid))
+        if self.mirror is None:
+            return deform_bounded_sphere(self.sphere, bias, centroid)
+        x, y, _ = centroid.unbind(1)
+        vertices = deform_bounded_sphere(self.sphere, bias, torch.stack([x, y, torch.zeros_like(x)], dim=1))
+        mirrored = torch.cat([vertices[..., :2], -vertices[..., 2:]], dim=2)[:, self.mirror]
+        return self.place(torch.where(self.sphere[:, 2:] < 0, mirrored, vertices))

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 import nmr
 
-Symmetry = Literal["x", "z"] | float
-"""x, z: mirrored at x = 0 or z = 0. A number: at the vertical plane that a camera of this azimuth (degrees) looks
-along; x = 0 is 0, z = 0 is 90."""
+#: x, z: mirrored at x = 0 or z = 0. A number: at the vertical plane that a camera of this azimuth in degrees looks
+#: along (x = 0 is 0, z = 0 is 90).
+Symmetry = Literal["x", "z"] | Annotated[float, Field(ge=-360, le=360)]
 
 
 class MeshGenerator(nn.Module):

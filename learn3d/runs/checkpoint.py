@@ -167,6 +167,26 @@ def network_tensors(method: Method) -> dict[str, Tensor]:
     }
 
 
+def average_tensors(method: Method) -> dict[str, Tensor]:
+    """The averages of the same tensors, named average.<encoder|generator|...>.<parameter>; {} without an average."""
+    return {f"average.{name}": tensor for name, tensor in method.average.tensors.items()} if method.average else {}
+
+
+def restore_average(method: Method, tensors: dict[str, Tensor], source: Path) -> None:
+    """Copy the averages of a checkpoint into a method that keeps some, or raise a ValueError."""
+    if method.average is not None:
+        with method.averaged():
+            restore_networks(method, _averaged(tensors, required=True), source)
+
+
+def _averaged(tensors: dict[str, Tensor], *, required: bool = False) -> dict[str, Tensor]:
+    """The tensors of a checkpoint, where the averages take the place of the networks' own weights, if there are any."""
+    averages = {name: tensor for name, tensor in tensors.items() if name.startswith("average.")}
+    if not averages and not required:
+        return tensors
+    return {"network." + name.removeprefix("average."): tensor for name, tensor in averages.items()}
+
+
 def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path) -> None:
     """Copy the parameters of a checkpoint into the networks of a method of the same shape, or raise a ValueError."""
     for name, network in method.networks.items():
@@ -254,7 +274,7 @@ def load_method(
             precision=resolve_precision(precision, device),
             seed=0,
         )
-    restore_networks(method, tensors, path)
+    restore_networks(method, _averaged(tensors), path)
     method.set_training(False)
     for network in method.networks.values():
         network.requires_grad_(False)

@@ -69,7 +69,9 @@ def save_last(
     Raises FloatingPointError, with nothing written, for values that are not finite, as they could not be resumed from.
     """
     check_networks(method)
-    tensors = checkpoint.network_tensors(method) | {"random.cpu": torch.get_rng_state()}
+    tensors = (
+        checkpoint.network_tensors(method) | checkpoint.average_tensors(method) | {"random.cpu": torch.get_rng_state()}
+    )
     if config.device == "cuda":
         tensors["random.cuda"] = torch.cuda.get_rng_state()
     for name, optimizer in method.optimizers.items():
@@ -148,6 +150,7 @@ def restore(saved: Saved, config: TrainConfig, conditions: Conditions, method: M
     check_resume(config, before)
     _check_conditions(conditions, recorded, config.data)
     checkpoint.restore_networks(method, tensors, saved.path)
+    checkpoint.restore_average(method, tensors, saved.path)
     for name, optimizer in method.optimizers.items():
         checkpoint.restore_optimizer(name, optimizer, tensors, saved.path)
     for field in dataclasses.fields(Progress):

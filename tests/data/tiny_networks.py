@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from learn3d.networks import ENCODERS, GENERATORS
+from learn3d.networks import ENCODERS, GENERATORS, Symmetry
 from learn3d.networks.encoders import CODE_SIZE, SmallConvEncoder
 from learn3d.networks.generators import SmallSphereGenerator
+from learn3d.networks.layers import linear_layers
 
 
 class TinyEncoder(SmallConvEncoder):
@@ -18,9 +19,9 @@ class TinyEncoder(SmallConvEncoder):
 
 
 class TinyGenerator(SmallSphereGenerator):
-    def __init__(self) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(CODE_SIZE, 16), nn.ReLU(), nn.Linear(16, self.sphere.shape[0] * 3))
+    def __init__(self, symmetry: Symmetry | None = None) -> None:
+        super().__init__(symmetry)
+        self.layers = linear_layers(CODE_SIZE, 16, self.outputs)
         with torch.no_grad():
             for parameter in self.layers[-1].parameters():
                 parameter.mul_(0.1)  # nearly a sphere, whatever the codes are

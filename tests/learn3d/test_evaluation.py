@@ -28,7 +28,13 @@ class Constant(Method):
         self.networks, self.optimizers, self.device, self.precision = {}, {}, torch.device("cpu"), "fp32"
         self.shape = shape
 
-    def train_step(self, batch, step):
+    def create_networks(self):
+        raise NotImplementedError
+
+    def create_optimizers(self):
+        raise NotImplementedError
+
+    def learn(self, batch, step):
         raise NotImplementedError
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:

@@ -7,7 +7,7 @@ import torch
 
 from learn3d import device
 from learn3d.device import Download, upload
-from learn3d.methods.method import descend, read_back
+from learn3d.methods.optimization import backpropagate, read_back
 
 CPU = torch.device("cpu")
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -65,7 +65,7 @@ def test_the_gradient_of_an_upload_comes_back(monkeypatch: pytest.MonkeyPatch) -
 
 def test_losses_are_weighted_added_up_and_returned_in_their_order() -> None:
     x = torch.tensor(3.0, requires_grad=True)
-    values = descend({"b": x.square(), "a": 2 * x, "c": -x}, {"a": 0.5, "c": 0.0}, step=1)
+    values = backpropagate({"b": x.square(), "a": 2 * x, "c": -x}, {"a": 0.5, "c": 0.0}, step=1)
     assert list(values.items()) == [("b", 9.0), ("a", 6.0), ("c", -3.0), ("total", 12.0)]
     assert x.grad == 7.0
 
@@ -75,7 +75,7 @@ def test_a_loss_that_is_not_finite_stops_before_any_gradient(name: str) -> None:
     x = torch.tensor(1.0, requires_grad=True)
     losses = {"projection": x, "prior": x, name: x * torch.inf}
     with pytest.raises(FloatingPointError, match=rf"iteration 7 .*{name} inf"):
-        descend(losses, {"prior": 1e-3}, step=7)
+        backpropagate(losses, {"prior": 1e-3}, step=7)
     assert x.grad is None
 
 
@@ -102,6 +102,6 @@ def test_there_and_back_on_a_gpu() -> None:
 @needs_cuda
 def test_losses_on_both_sides_on_a_gpu() -> None:
     x = torch.tensor(3.0, device="cuda", requires_grad=True)
-    values = descend({"far": x.square(), "near": Download(x).wait() * 2}, {"near": 0.5}, step=1)
+    values = backpropagate({"far": x.square(), "near": Download(x).wait() * 2}, {"near": 0.5}, step=1)
     assert values == {"far": 9.0, "near": 6.0, "total": 12.0}
     assert x.grad == 7.0

@@ -32,7 +32,13 @@ class Ellipsoids(Method):
         self.device, self.precision, self.image_size = torch.device("cpu"), "fp32", 64
         self.scale, self.depth_of_red = scale, depth_of_red
 
-    def train_step(self, batch, step):
+    def create_networks(self):
+        raise NotImplementedError
+
+    def create_optimizers(self):
+        raise NotImplementedError
+
+    def learn(self, batch, step):
         raise NotImplementedError
 
     def encode(self, images: Tensor) -> Tensor:

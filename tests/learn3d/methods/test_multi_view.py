@@ -12,8 +12,10 @@ from torch import nn
 import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.poses import LookAtPoses
+from learn3d.methods.adam import SparseGradientAdam
 from learn3d.methods.method import DataShape
-from learn3d.methods.multi_view import MultiView, MultiViewSettings, SparseGradientAdam, check_pairs
+from learn3d.methods.multi_view import MultiView, MultiViewSettings, check_pairs
+from learn3d.methods.optimization import Plan
 from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.networks.generators import deform_bounded_sphere
 from learn3d.presets import PRESETS
@@ -34,7 +36,7 @@ def make_batch(objects: list[int]) -> Batch:
 @pytest.fixture(scope="module")
 def method() -> MultiView:
     torch.manual_seed(0)
-    return MultiView(MultiViewSettings(decay_at_step=10), DataShape(24), "cpu", "fp32")
+    return MultiView(MultiViewSettings(encoder="conv-small"), DataShape(24), "cpu", "fp32", Plan(200, "step"))
 
 
 def test_bounded_rule() -> None:
@@ -119,11 +121,11 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> N
 
 def test_step_size_decays_once_and_is_smaller_for_the_centroid(method: MultiView) -> None:
     rates = {}
-    for step in (10, 11):
+    for step in (190, 191):
         method.train_step(make_batch([0, 0]), step)
         rates[step] = {name: optimizer.param_groups[0]["lr"] for name, optimizer in method.optimizers.items()}
-    assert rates[10] == pytest.approx({"encoder": 1e-4, "generator": 1e-4, "centroid": 1e-5})
-    assert rates[11] == pytest.approx({"encoder": 1e-5, "generator": 1e-5, "centroid": 1e-6})
+    assert rates[190] == pytest.approx({"encoder": 1e-4, "generator": 1e-4, "centroid": 1e-5})
+    assert rates[191] == pytest.approx({"encoder": 1e-5, "generator": 1e-5, "centroid": 1e-6})
 
 
 @pytest.mark.parametrize("objects", [[0, 1, 1, 0], [0, 1, 0]])
@@ -144,7 +146,7 @@ def slow_adam(weight: float, grads: list[float], rate: float, skip: bool) -> flo
 
 
 def test_zero_gradients_leave_weights_and_moments_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learn3d.methods.multi_view.CHUNK", 4)  # several pieces
+    monkeypatch.setattr("learn3d.methods.adam.CHUNK", 4)  # several pieces
     rng = np.random.default_rng(0)
     grads = rng.normal(size=(6, 5, 3)) * (rng.random((6, 5, 3)) < 0.6)
     grads[:, 0] = 0
@@ -180,5 +182,5 @@ def test_preset_is_the_published_schedule() -> None:
     preset = PRESETS["kato2018-kato"]
     assert isinstance(preset.settings, MultiViewSettings)
     assert preset.sampling == "pairs"
-    assert preset.settings.decay_at_step == 0.95 * preset.iterations
+    assert preset.schedule == "step"
     assert PRESETS["gadelha2017-kato"].settings.encoder_from_step == PRESETS["gadelha2017-kato"].iterations // 2 + 1

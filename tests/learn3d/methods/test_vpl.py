@@ -22,6 +22,7 @@ from learn3d.methods import create_method
 from learn3d.methods import vpl as vpl_module
 from learn3d.methods.method import DataShape
 from learn3d.methods.vpl import VPL, VPLSettings, other_views
+from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
 from learn3d.networks.preact_resnet import PreactResNet18
 from learn3d.presets import PRESETS
@@ -57,10 +58,10 @@ class NarrowEncoder(nn.Module):
 @pytest.fixture(autouse=True)
 def narrow_networks(monkeypatch) -> None:
     """The published widths are tested in test_networks_*; a step takes a second with them."""
-    monkeypatch.setitem(vpl_module.ENCODERS, "conv", NarrowEncoder)
+    monkeypatch.setitem(ENCODERS, "conv", NarrowEncoder)
     monkeypatch.setattr(vpl_module, "PreactResNet18", partial(PreactResNet18, channels=8))
-    monkeypatch.setattr(vpl_module, "ConvCubeGenerator", partial(ConvCubeGenerator, channels=64))
-    monkeypatch.setattr(vpl_module, "LinearCubeGenerator", partial(LinearCubeGenerator, channels=128))
+    monkeypatch.setitem(GENERATORS, "cube-conv", partial(ConvCubeGenerator, channels=64))
+    monkeypatch.setitem(GENERATORS, "cube-fc", partial(LinearCubeGenerator, channels=128))
 
 
 def make_batch(image_size: int, count: int = 2, rotations: bool = False) -> Batch:
@@ -211,7 +212,7 @@ def test_reversal_gives_shapes_minus_lambda_times_and_the_discriminator_all() ->
     batch = make_batch(32)
     plain = create(SHAPENET)
     images = batch.images.float() / 255
-    vertices = plain.generator(plain.encoder((2 * images[:, :3] - 1) * images[:, 3:]))
+    vertices = plain.generator(plain.encoder(images))
     renderer = {"anti_aliasing": False, "gradient": "local"}
     silhouettes = [
         nmr.render_silhouette(vertices, plain.generator.faces, poses.cameras(), image_size=64, **renderer)
@@ -273,7 +274,7 @@ def test_input_mask_is_the_target_at_its_size() -> None:
     assert losses[0] == losses[1]
     faint = replace(batch, images=torch.where(batch.images == 0, 25, batch.images))  # 25 / 255 is below 0.1
     method = create(settings)
-    method._encoder_input = lambda images: VPL._encoder_input(method, batch.images)
+    method.predict = lambda images: VPL.predict(method, batch.images)
     assert method.train_step(faint, 1)["projection"] == losses[0]
 
 
@@ -307,7 +308,6 @@ def test_presets_of_vpl() -> None:
         (VPLSettings(image_size=224), {}, "encoder 'conv' takes images of 64 pixels, got image_size 224"),
         (VPLSettings(silhouette_size=128), {}, r"silhouette_size must be 64, .* or image_size \(64\), got 128"),
         (VPLSettings(pretrained="weights.pth"), {}, "weights are for the encoder 'resnet18', got encoder 'conv'"),
-        (VPLSettings(symmetric=True), {}, "symmetric needs a cube generator"),
         (
             VPLSettings(class_conditional=True),
             {},

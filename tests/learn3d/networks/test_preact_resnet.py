@@ -27,7 +27,7 @@ def test_layers_are_the_published_ones() -> None:
 @pytest.mark.parametrize("size", [32, 96, 224])
 def test_codes_of_any_multiple_of_32_pixels(size: int) -> None:
     network = PreactResNet18(size, channels=4).eval()
-    codes = network(torch.rand(2, 3, size, size))
+    codes = network(torch.rand(2, 4, size, size))
     assert codes.shape == (2, 512)
     assert (codes < 0).any()
 
@@ -44,7 +44,7 @@ def test_shortcut_carries_what_convolutions_do_not_change() -> None:
         nn.init.zeros_(block.residual[-1].weight)
     seen = []
     network.layers[5].register_forward_hook(lambda _, inputs, output: seen.append((inputs[0], output)))
-    network(torch.rand(2, 3, 32, 32))
+    network(torch.rand(2, 4, 32, 32))
     assert torch.equal(*seen[0])
 
 

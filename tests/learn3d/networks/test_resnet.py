@@ -138,7 +138,7 @@ def test_a_method_starts_from_pretrained_weights(tmp_path: Path) -> None:
     weights = random_weights()
     torch.save(weights, tmp_path / "weights.pth")
     settings = PoseInvariantSettings(
-        encoder="resnet18", generator="symmetric", pretrained=str(tmp_path / "weights.pth")
+        encoder="resnet18", symmetry="z", pretrained=str(tmp_path / "weights.pth")
     )
     assert settings.pretrained == tmp_path / "weights.pth"
     method = PoseInvariant(settings, DataShape(3, pose_features=9), "cpu", "fp32")

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import nn
 
-from learn3d.networks.gradient_reversal import reverse_gradient
-from learn3d.networks.view_discriminators import (
+from learn3d.networks.discriminators import (
     OneHotViewDiscriminator,
     PatchDiscriminator,
     SpectralPatchDiscriminator,
 )
+from learn3d.networks.layers import reverse_gradient
 
 
 def convolutions(network: nn.Module) -> list[tuple]:
