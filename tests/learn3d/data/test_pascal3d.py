@@ -378,7 +378,7 @@ def test_the_presets_are_the_papers() -> None:
     assert weights == [0.001, 1, 0.01, 0.01]
     assert (settings.encoder, settings.generator, PRESETS["peng2020-pascal"].iterations) == (
         "resnet18",
-        "symmetric",
+        "sphere",
         40_000,
     )
     assert not PRESETS["peng2020-pascal-vanilla"].settings.uses_discriminator
