@@ -167,11 +167,14 @@ def load_config(path: Path) -> TrainConfig:
 def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
     """What makes `config` another run than `saved`: one line per option that a resumed run may not change."""
     old, new = (_flat(c) for c in (saved, config))
+    allowed = RESUME_MAY_CHANGE
+    if config.schedule != "constant":  # the step size of every step depends on the number of steps
+        allowed -= {"iterations"}
     return [
         f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"
+        + f" (the schedule {config.schedule} depends on it)" * (name == "iterations")
         for name in dict.fromkeys([*old, *new])
-        if (name not in RESUME_MAY_CHANGE or (name == "iterations" and config.schedule != "constant"))
-        and old.get(name) != new.get(name)
+        if name not in allowed and old.get(name) != new.get(name)
     ]
 
 

@@ -30,7 +30,7 @@ __all__ = [
 
 Settings = PoseInvariantSettings | MultiViewSettings | VPLSettings | PrGANSettings
 
-METHODS: dict[type, type[Method]] = {
+_METHODS: dict[type, type[Method]] = {
     PoseInvariantSettings: PoseInvariant,
     MultiViewSettings: MultiView,
     VPLSettings: VPL,
@@ -52,7 +52,7 @@ def create_method(
     Raises ValueError where the device is absent, and where the method does not go with the data.
     """
     check_device(device)
-    kind = METHODS[type(settings)]
+    kind = _METHODS[type(settings)]
     if kind.needs_poses and shape.pose_features == 0:
         raise ValueError(
             f"{kind.__name__} learns from images whose camera poses are known, but this data set has no poses; take "
