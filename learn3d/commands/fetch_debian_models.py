@@ -7,17 +7,14 @@ Examples:
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
-from learn3d.commands.parsing import names, parse
+from learn3d.commands.parsing import parse
 from learn3d.make_data.debian.models import FetchConfig, fetch_debian_models
 from learn3d.terminal import say
 
 
 def run(arguments: Sequence[str]) -> int:
     """Fetch the models, and say how many there are."""
-    config = parse(FetchConfig, arguments, name="fetch-debian-models", about=__doc__)
-    config = dataclasses.replace(config, category=names(",".join(config.category)))
-    say(fetch_debian_models(config).summary())
+    say(fetch_debian_models(parse(FetchConfig, arguments, name="fetch-debian-models", about=__doc__)).summary())
     return 0

@@ -25,7 +25,7 @@ def make_row(rgb: np.ndarray, alpha: np.ndarray, voxels: np.ndarray) -> list[np.
     rgb uint8 [n, S, S, 3] over white, alpha uint8 [n, S, S], voxels bool [32, 32, 32] with axes (x, y, z), z = away.
     """
     thickness = voxels.sum(axis=2).T[::-1]
-    ink = thickness / max(1, thickness.max()) * 215 + 40 * (thickness > 0)
+    ink = np.where(thickness > 0, 60 + 195 * thickness / max(1, thickness.max()), 15)  # the grid's own square is grey
     grey = [255 - alpha[0], 255 - ink.astype(np.uint8)]
     pictures = [*(rgb[view] for view in _shown(len(rgb))), *(np.repeat(g[..., None], 3, axis=-1) for g in grey)]
     return [np.asarray(Image.fromarray(p).resize((CELL, CELL), Image.Resampling.BOX)) for p in pictures]

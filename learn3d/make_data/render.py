@@ -5,22 +5,21 @@ Here meshes are chosen, split, scaled and coloured; `viewpoints` has the cameras
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
-from learn3d.data.layouts import Layout
 from learn3d.data.poses import Poses
 from learn3d.data.readers import kato
 from learn3d.files.writing import write_json
 from learn3d.make_data import meshes
+from learn3d.make_data.config import DatasetConfig
 from learn3d.make_data.contact_sheet import draw_sheet, make_row
 from learn3d.make_data.folders import check_room, existing, publish
 from learn3d.make_data.report import DatasetReport, lacking
@@ -29,32 +28,8 @@ from learn3d.make_data.writers import RenderedObject, Writer, writer_of
 from learn3d.make_data.writers.pictures import write_png
 from learn3d.terminal import plain
 
-Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-KEPT_ROWS = 60  # of each split: the contact sheet shows some of them
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
-
-
-@dataclass(frozen=True)
-class DatasetConfig:
-    """What to make a data set from, and how."""
-
-    output: Path  # folder for the files; other categories may live in it too
-    category: str  # name of the category; Kato's 13 names become synset ids in the file names
-    layout: Layout = "kato"  # whose files and viewpoints
-    views: int | None = None  # per object; default kar 20, r2n2 24, pascal3d 8, photos 12; kato and dvr have 24
-    source: Path | None = None  # folder of meshes (searched recursively) or a mesh pack (.npz); not with --procedural
-    procedural: int = 0  # make this many shapes with the procedural generator instead of reading meshes
-    # part of the meshes for the test split: a share below 1 (then at least 4 of them), or a count; default 0.2;
-    # pascal3d is tested on val and has none
-    test: float | None = None
-    val: float | None = None  # the same for the validation split, 0 for none; default 0.1; pascal3d 0.2, r2n2 none
-    augment: int = 0  # copies of each training mesh, besides itself, with every axis scaled by a random 0.75 .. 1.25
-    up: Axis = "y"  # mesh axis that points up
-    front: Axis | None = None  # mesh axis that faces the camera of view 0; default x (y where up is x), procedural z
-    color: Literal["random", "mesh"] = "random"  # a random light colour per object, or the mesh's own where it has one
-    max_faces: int = 1_000_000  # skip meshes with more faces
-    seed: int = 0  # of the split, the scales, the colours, the views and the procedural shapes; same seed, same bytes
-    overwrite: bool = False  # replace files of this category that are already in the folder
+KEPT_ROWS = 60  # of each split: the contact sheet shows some of them
 
 
 def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, np.ndarray]:
@@ -110,42 +85,49 @@ def render_object(
 def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
     """Make the data set that `config` describes and return what was done; meshes that cannot be used are skipped.
 
-    Writes the files of the layout (see its module in `learn3d.make_data.writers`) for every split that is not empty and
-    `{synset}_card.json` (settings, splits), `{synset}_report.json`, `{synset}_report.txt`, `{synset}_contact.png`
-    (see `contact_sheet.LEGEND`).
-    Files appear under their names only when all of them are complete.
+    Writes the files of the layout (see its module in `learn3d.make_data.writers`) for every split that is not empty,
+    `{synset}_card.json` (settings, splits), `{synset}_report.json`, `{synset}_report.txt` and `{synset}_contact.png`
+    (see `contact_sheet.LEGEND`). Files appear under their names only when all of them are complete.
 
     Raises ValueError (settings that do not fit, no usable mesh), FileNotFoundError (no such source), FileExistsError
     (files of the category are there and `overwrite` is off), OSError (folder not writable, disk too full).
     """
-    config = _complete(config)
-    writer_class, prefix = writer_of(config.layout), kato.synset_of(config.category)
+    config = config.complete()
+    prefix, writer_class = kato.synset_of(config.category), writer_of(config.layout)
     sources, ignored = _list_sources(config)
+    names = meshes.object_names(sources)
     splits = split_objects(len(sources), config.test, config.val, config.seed)
-    copies = {split: 1 + (config.augment if split == "train" else 0) for split in splits}
-    total = sum(len(splits[s]) * copies[s] for s in splits)
-    _prepare_folder(config, writer_class, total)
+    copies = {"train": 1 + config.augment, "val": 1, "test": 1}
+    _prepare_folder(config, writer_class, sum(len(splits[split]) * copies[split] for split in copies))
 
     done = _Done()
     with (
         tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=config.output) as temporary,
-        _progress_bar(total, config.category, progress) as bar,
+        tqdm(total=len(sources), desc=config.category, unit="mesh", disable=not progress, dynamic_ncols=True) as bar,
     ):
         folder, trash = Path(temporary) / "new", Path(temporary) / "old"
         folder.mkdir()
         writer = writer_class(folder, config.category)
-        names = meshes.object_names(sources)
-        for split in ("train", "val", "test"):
-            chosen = [(int(number), sources[number], names[number]) for number in splits[split]]
-            _render_split(config, writer, chosen, split, copies[split], done, bar)
-        bar.close()
-        objects = writer.finish(config.output, done.objects) if done.objects.get("train") else {}
-        if not objects.get("train"):
+        for split in copies:
+            most = len(splits[split]) * copies[split]
+            writer.start(split, most)
+            for number in splits[split].tolist():
+                try:
+                    mesh = meshes.checked(sources[number].read(), config.max_faces)
+                    own = [names[number], *(f"{names[number]}-{copy}" for copy in range(1, copies[split]))]
+                    items = [_render(config, writer, mesh, number, k, name, split) for k, name in enumerate(own)]
+                except ValueError as error:  # it cannot be read, rendered or seen: the others go on
+                    done.skipped.append({"name": sources[number].name, "split": split, "reason": str(error)})
+                else:
+                    done.add(writer, sources[number].name, mesh, items, every=math.ceil(most / KEPT_ROWS))
+                bar.update()
+        if not done.objects["train"]:
             bad = [mesh for mesh in done.skipped if mesh["split"] == "train"]
             raise ValueError(
                 f"none of the {len(bad)} meshes to train on can be used; the first reasons: "
                 + "; ".join(f"{mesh['name']}: {mesh['reason']}" for mesh in bad[:3])
             )
+        objects = writer.finish(config.output, done.objects)
         for split, written in objects.items():  # some layouts decide on the splits at the end
             for name in written:
                 done.mesh_of[name]["split"] = split
@@ -170,45 +152,23 @@ class _Done:
 
     used: list[dict] = field(default_factory=list)
     skipped: list[dict] = field(default_factory=list)
-    objects: dict[str, list[str]] = field(default_factory=dict)  # names per split
+    objects: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  # names per split
     mesh_of: dict[str, dict] = field(default_factory=dict)  # entry of `used` per object name
     rows: dict[str, list[np.ndarray]] = field(default_factory=dict)  # of the contact sheet: some objects' pictures
 
-
-def _render_split(
-    config: DatasetConfig,
-    writer: Writer,
-    chosen: list[tuple[int, meshes.MeshSource, str]],
-    split: str,
-    copies: int,
-    done: _Done,
-    bar,
-) -> None:
-    """Render and write the chosen meshes (number, mesh, name) of one split, `copies` objects each."""
-    writer.start(split, len(chosen) * copies)
-    for number, source, name in chosen:
-        items = []
-        try:
-            mesh = meshes.checked(source.read(), config.max_faces)
-            for copy in range(copies):
-                items.append(_render(config, writer, mesh, number, copy, f"{name}-{copy}" if copy else name, split))
-                bar.update()
-        except ValueError as error:  # it cannot be read, rendered or seen: the others go on
-            done.skipped.append({"name": source.name, "split": split, "reason": str(error)})
-            bar.update(copies - len(items))
-            continue
+    def add(self, writer: Writer, name: str, mesh: meshes.RawMesh, items: list[RenderedObject], every: int) -> None:
+        """Write the objects made from one mesh; every `every`-th object of the split is kept for the contact sheet."""
         size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
         watertight = meshes.is_watertight(mesh.vertices, mesh.faces)
-        entry = {"name": source.name, "split": split, **size, "watertight": watertight}
-        done.used.append(entry)
+        entry = {"name": name, "split": items[0].split, **size, "watertight": watertight}
+        self.used.append(entry)
         for item in items:
             writer.write(item)
-            names = done.objects.setdefault(split, [])
-            if len(names) % math.ceil(len(chosen) * copies / KEPT_ROWS) == 0:
+            self.objects[item.split].append(item.name)
+            self.mesh_of[item.name] = entry
+            if len(self.objects[item.split]) % every == 1 % every:
                 grid = writer.convention.to_object(torch.from_numpy(item.voxels)[None])[0].numpy()
-                done.rows[item.name] = make_row(item.rgb, item.alpha, grid)
-            names.append(item.name)
-            done.mesh_of[item.name] = entry
+                self.rows[item.name] = make_row(item.rgb, item.alpha, grid)
 
 
 def _render(
@@ -220,7 +180,7 @@ def _render(
     color = random_color(rng)
     if config.color == "mesh" and mesh.face_colors is not None:
         color = np.where(np.isnan(mesh.face_colors), color, mesh.face_colors)
-    vertices = mesh.vertices @ kato.mesh_to_object(config.up, _front(config)).T
+    vertices = mesh.vertices @ kato.mesh_to_object(config.up, config.facing).T
     fitted = meshes.fit_to_box(meshes.fit_to_box(vertices) * (scale if copy else 1.0))
     placed = writer.place(fitted)
     rng = np.random.default_rng([config.seed, 2, number, copy])
@@ -230,36 +190,6 @@ def _render(
     rgb, alpha = render_object(vertices, faces, color, poses, writer.image_size, writer.turn)
     voxels = writer.voxelize(vertices, faces)
     return RenderedObject(name, split, vertices, faces, poses, rgb, alpha, voxels, rng)
-
-
-def _front(config: DatasetConfig) -> str:
-    return config.front or ("z" if config.procedural else "y" if config.up.endswith("x") else "x")
-
-
-def _complete(config: DatasetConfig) -> DatasetConfig:
-    """The settings with the layout's own where none were given; ValueError where they do not fit."""
-    if (config.source is None) == (config.procedural == 0):
-        raise ValueError("give either a source (a folder of meshes or a mesh pack .npz) or procedural > 0, not both")
-    if config.procedural < 0 or config.augment < 0 or config.max_faces < 1 or config.seed < 0:
-        raise ValueError(
-            "procedural, augment and seed must not be negative and max_faces must be positive, got "
-            f"{config.procedural}, {config.augment}, {config.seed}, {config.max_faces}"
-        )
-    if config.color not in ("random", "mesh"):
-        raise ValueError(f"color must be random or mesh, got {config.color!r}")
-    kato.mesh_to_object(config.up, _front(config))
-    kato.synset_of(config.category)
-    writer = writer_of(config.layout)
-    defaults = {"views": writer.default_views, "test": writer.default_test, "val": writer.default_val}
-    config = dataclasses.replace(config, **{k: v for k, v in defaults.items() if getattr(config, k) is None})
-    if config.views < 1 or (writer.fixed_views and config.views != writer.default_views):
-        allowed = f"exactly {writer.default_views}" if writer.fixed_views else "at least 1"
-        raise ValueError(f"the layout {config.layout} has {allowed} views per object, got {config.views}")
-    for split, default in (("test", writer.default_test), ("val", writer.default_val)):
-        if default == 0 and getattr(config, split) != 0:
-            raise ValueError(f"the layout {config.layout} has no {split} split; leave {split} at 0")
-    writer.check(config.output, config.category, config.test, config.augment)
-    return config
 
 
 def _list_sources(config: DatasetConfig) -> tuple[list[meshes.MeshSource], Counter[str]]:
@@ -305,15 +235,9 @@ def _card(config: DatasetConfig, writer: Writer, objects: dict[str, int], used: 
         **({} if config.layout == "kato" else {"layout": config.layout}),
         **writer.card(),
         "objects_fill": writer.objects_fill,
-        "object_from_mesh": (writer.turn @ kato.mesh_to_object(config.up, _front(config))).tolist(),
+        "object_from_mesh": (writer.turn @ kato.mesh_to_object(config.up, config.facing)).tolist(),
         "settings": settings,
         "objects": objects,
         "augmented": f"in train, each mesh is followed by its {config.augment} scaled copies",
         "splits": {split: [mesh["name"] for mesh in used if mesh["split"] == split] for split in objects},
     }
-
-
-def _progress_bar(total: int, name: str, show: bool):
-    from tqdm import tqdm
-
-    return tqdm(total=total, desc=name, unit="object", disable=not show, dynamic_ncols=True)

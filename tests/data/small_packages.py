@@ -101,4 +101,4 @@ def entry(name: str, stem: str, **more: str) -> dict:
 
 def fetch(folder: Path, debs: Path | None, **more: object) -> Report:
     """The recipe on a folder of packages."""
-    return fetch_debian_models(FetchConfig(output=folder, packages_dir=debs, progress=False, **more))
+    return fetch_debian_models(FetchConfig(output=folder, packages_dir=debs, **more), progress=False)

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated
 
 import numpy as np
 import trimesh
@@ -33,8 +33,7 @@ from learn3d.make_data.debian.furniture import FURNITURE_PACKAGES, furniture_mod
 from learn3d.make_data.mesh_cleaning import clean_mesh, overlap, surface_grid
 from learn3d.settings import FilePath, checked
 
-Category = Literal["airplane", "chair", "table", "cabinet", "sofa", "lamp"]
-CATEGORIES: tuple[Category, ...] = get_args(Category)
+CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side when surfaces are compared
 Overlap = Annotated[float, Field(gt=0, le=1)]
 Grids = tuple[np.ndarray, np.ndarray]  # in proportion, and stretched to a cube
@@ -46,8 +45,8 @@ class FetchConfig:
 
     output: FilePath
     """Folder to write."""
-    category: Annotated[tuple[Category, ...], Field(min_length=1, strict=False)] = CATEGORIES
-    """Which of the six categories."""
+    category: str = ",".join(CATEGORIES)
+    """Which of the six categories, separated by commas."""
     packages_dir: FilePath | None = None
     """Folder with the .deb files. None: they are downloaded with apt-get."""
     root: FilePath | None = None
@@ -58,12 +57,16 @@ class FetchConfig:
     """Two surfaces whose overlap is greater are one model; 1 keeps all."""
     stretched_iou: Overlap = 0.85
     """The same with both boxes stretched to cubes; 1 keeps stretched copies."""
-    progress: bool = True
-    """Draw progress bars."""
 
     def __post_init__(self) -> None:
+        if not self.categories or set(self.categories) - set(CATEGORIES):
+            raise ValueError(f"category must be some of {','.join(CATEGORIES)}; got {self.category!r}")
         if self.packages_dir is not None and self.root is not None:
             raise ValueError("give either --packages-dir or --root, not both")
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        return tuple(name.strip() for name in self.category.split(",") if name.strip())
 
 
 @dataclass(frozen=True)
@@ -115,7 +118,7 @@ class Report:
         return "\n".join([*lines, *self.notes, f"written to {self.output}"])
 
 
-def fetch_debian_models(config: FetchConfig) -> Report:
+def fetch_debian_models(config: FetchConfig, progress: bool = True) -> Report:
     """Write the meshes that `config` names into its output folder; the folder appears at once or not at all.
 
     Raises ValueError (a sentence that says what to do) for an output that is there already, a package that cannot be
@@ -132,7 +135,7 @@ def fetch_debian_models(config: FetchConfig) -> Report:
         written, downloads = Path(scratch, "models"), Path(scratch, "packages")
         written.mkdir()
         downloads.mkdir()
-        report = _write_all(config, written, downloads)
+        report = _write_all(config, written, downloads, progress)
         with stop_on_signal():  # not between the two
             if output.exists():
                 os.replace(output, Path(scratch, "old"))
@@ -140,16 +143,16 @@ def fetch_debian_models(config: FetchConfig) -> Report:
     return report
 
 
-def _write_all(config: FetchConfig, folder: Path, downloads: Path) -> Report:
+def _write_all(config: FetchConfig, folder: Path, downloads: Path, progress: bool) -> Report:
     """The body of `fetch_debian_models`: models, tables and copyright files into `folder`."""
-    common = {"licences": folder / "licences", "progress": config.progress}
+    common = {"licences": folder / "licences", "progress": progress}
     readers = {}
-    if set(config.category) - {"airplane"}:
-        readers = dict.fromkeys(FURNITURE_PACKAGES, partial(furniture_models, categories=config.category, **common))
-    if "airplane" in config.category:
+    if set(config.categories) - {"airplane"}:
+        readers = dict.fromkeys(FURNITURE_PACKAGES, partial(furniture_models, categories=config.categories, **common))
+    if "airplane" in config.categories:
         readers[AIRCRAFT_PACKAGE] = partial(aircraft_models, **common)
     found, notes, models, dropped, ignored = [], [], [], [], 0
-    for name in tqdm(readers, desc="finding packages", disable=not config.progress, leave=False):
+    for name in tqdm(readers, desc="finding packages", disable=not progress, leave=False):
         try:
             found.append(_locate(name, config, downloads))
         except packages.PackageMissing as missing:

@@ -325,11 +325,11 @@ def test_errors_of_settings_and_folders(tmp_path, folder, monkeypatch):
     (tmp_path / "nothing").mkdir()
     with pytest.raises(ValueError, match="no mesh file"):
         make(tmp_path / "data", tmp_path / "nothing")
-    with pytest.raises(ValueError, match="not both"):
+    with pytest.raises(ValueError, match="either --source"):
         make(tmp_path / "data", folder, procedural=3)
-    with pytest.raises(ValueError, match="not both"):
+    with pytest.raises(ValueError, match="either --source"):
         make(tmp_path / "data", None)
-    with pytest.raises(ValueError, match="must not be negative"):
+    with pytest.raises(ValueError, match="augment must be at least 0"):
         make(tmp_path / "data", folder, augment=-1)
     with pytest.raises(ValueError, match="color"):
         make(tmp_path / "data", folder, color="blue")

@@ -89,9 +89,9 @@ def test_r2n2_moves_objects_between_splits_where_meshes_are_skipped(tmp_path, fo
 
 def test_errors_of_settings(tmp_path, folder):
     cases = [
-        ({"layout": "coco"}, "layout must be one of kato, dvr"),
-        ({"layout": "kato", "views": 12}, "exactly 24 views"),
-        ({"layout": "kar", "views": 0}, "at least 1 views"),
+        ({"layout": "coco"}, "layout must be .*kato"),
+        ({"layout": "kato", "views": 12}, "24 views"),
+        ({"layout": "kar", "views": 0}, "views must be at least 1"),
         ({"layout": "r2n2", "val": 1, "test": None}, "no val split"),
         ({"layout": "r2n2", "augment": 2, "test": None}, "first 80 %"),
         ({"layout": "r2n2", "test": 0.5}, "first 80 %"),

@@ -21,7 +21,7 @@ def test_members_that_point_outside_write_nothing_there(debs: Path, tmp_path: Pa
     notice = "../../../../usr/share/doc/sweethome3d-furniture/copyright"
     sh3f = catalogue([entry("Chair", "chair")], {"m/chair.obj": CHAIR})
     deb(debs, "sweethome3d-furniture", {notice: b"licence", "/usr/../../evil.sh3f": sh3f})
-    report = fetch(tmp_path / "out", debs, category=("chair",))
+    report = fetch(tmp_path / "out", debs, category="chair")
     assert [model.source for model in report.models] == ["evil.sh3f!/m/chair.obj"]
     assert (tmp_path / "out/licences/sweethome3d-furniture.copyright").read_bytes() == b"licence"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["debs", "out"]
@@ -32,7 +32,7 @@ def test_members_that_point_outside_write_nothing_there(debs: Path, tmp_path: Pa
 
 def test_oversized_models_are_left_out(debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(limits, "CATALOGUE_MEMBER_BYTES", len(CHAIR) - 1)
-    reasons = [drop.reason for drop in fetch(tmp_path / "out", debs, category=("chair",)).dropped]
+    reasons = [drop.reason for drop in fetch(tmp_path / "out", debs, category="chair").dropped]
     assert len(reasons) == 3 and all("at most" in reason for reason in reasons)
 
 
@@ -41,7 +41,7 @@ def test_damaged_packages(debs: Path, tmp_path: Path, content: bytes | None):
     file = next(debs.glob("flightgear*"))
     file.write_bytes(file.read_bytes()[:-200] if content is None else content)
     with pytest.raises(ValueError, match="cannot be read as a Debian package"):
-        fetch(tmp_path / "out", debs, category=("airplane",))
+        fetch(tmp_path / "out", debs, category="airplane")
 
 
 def test_without_dpkg_deb(debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -85,7 +85,7 @@ def test_download_finds_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_archives_that_lead_astray_are_refused(debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def refused(message: str) -> None:
         with pytest.raises(ValueError, match=message):
-            fetch(tmp_path / "out", debs, category=("chair",))
+            fetch(tmp_path / "out", debs, category="chair")
 
     file = deb(debs, "sweethome3d-furniture", {"usr/x.sh3f": catalogue([], {})})
     monkeypatch.setattr(limits, "PACKAGE_MEMBERS", 0)
@@ -113,7 +113,7 @@ def test_a_tar_header_that_unpacks_to_very_much_is_not_kept(debs: Path, tmp_path
     file.write_bytes(content[:start] + f"{'data.tar.xz':<48}{len(packed):<10}`\n".encode() + packed)
     assert len(packed) < 100_000
     with at_most(2**25), pytest.raises(ValueError, match="unpacks to more than its headers say"):
-        fetch(tmp_path / "out", debs, category=("chair",))
+        fetch(tmp_path / "out", debs, category="chair")
 
 
 @pytest.mark.parametrize("kind", ["gz", "bz2", "xz"])

@@ -1,0 +1,79 @@
+"""What to make a data set from, and how."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from learn3d.data.layouts import Layout
+from learn3d.data.readers import kato
+from learn3d.make_data.writers import writer_of
+from learn3d.settings import Count, FilePath, Weight, checked
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+Amount = Annotated[int, Field(ge=0)]
+
+
+@checked
+class DatasetConfig:
+    """One category of a data set: its meshes, its layout and its splits. The same settings give the same bytes."""
+
+    output: FilePath
+    """Folder for the files. Other categories may live in it, too."""
+    category: str
+    """Name of the category. Kato's 13 names become synset ids in the names of files."""
+    layout: Layout = "kato"
+    """Whose files and viewpoints."""
+    views: Count | None = None
+    """Views of each object. None: 20 for kar, 24 for r2n2, 8 for pascal3d, 12 for photos. kato and dvr have 24."""
+    source: FilePath | None = None
+    """Folder of meshes (searched with all folders in it), or a mesh pack (.npz)."""
+    procedural: Amount = 0
+    """Make so many shapes with the procedural generator instead of reading meshes."""
+    test: Weight | None = None
+    """Part of the meshes for the test split: a share below 1 (then at least 4 meshes), or their number. None: 0.2;
+    pascal3d has no test split."""
+    val: Weight | None = None
+    """The same for the validation split, 0 for none. None: 0.1, for pascal3d 0.2; r2n2 has no validation split."""
+    augment: Amount = 0
+    """Copies of each mesh to train on, besides itself, with every axis scaled by a random 0.75 .. 1.25."""
+    up: Axis = "y"
+    """Axis of the mesh files that points up."""
+    front: Axis | None = None
+    """Axis of the mesh files that faces the camera of view 0. None: x (y where up is x), for procedural shapes z."""
+    color: Literal["random", "mesh"] = "random"
+    """Colour every object in one random light colour, or as its file says where it says something."""
+    max_faces: Count = 1_000_000
+    """Skip meshes with more faces."""
+    seed: Amount = 0
+    """Seed of the splits, scales, colours, views and procedural shapes."""
+    overwrite: bool = False
+    """Replace files of this category that are already in the folder."""
+
+    def __post_init__(self) -> None:
+        if (self.source is None) == (self.procedural == 0):
+            raise ValueError(
+                "give either --source (a folder of meshes or a mesh pack .npz) or --procedural (a number of shapes)"
+            )
+        kato.synset_of(self.category)
+        kato.mesh_to_object(self.up, self.facing)
+
+    @property
+    def facing(self) -> str:
+        """The axis that faces the camera of view 0."""
+        return self.front or ("z" if self.procedural else "y" if self.up.endswith("x") else "x")
+
+    def complete(self) -> DatasetConfig:
+        """The same with the layout's own numbers where none are given; ValueError where they do not go with it."""
+        writer = writer_of(self.layout)
+        defaults = {"views": writer.default_views, "test": writer.default_test, "val": writer.default_val}
+        config = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
+        if writer.fixed_views and config.views != writer.default_views:
+            raise ValueError(f"the layout {self.layout} has {writer.default_views} views per object, not {self.views}")
+        for split in ("test", "val"):
+            if defaults[split] == 0 and getattr(config, split) != 0:
+                raise ValueError(f"the layout {self.layout} has no {split} split; leave {split} at 0")
+        writer.check(config.output, config.category, config.test, config.augment)
+        return config
