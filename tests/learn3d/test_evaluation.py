@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import math
 
 import numpy as np
 import pytest
 import torch
 
 import nmr
+from learn3d.data.batch import Batch
 from learn3d.data.conventions import PASCAL3D
+from learn3d.data.dataset import ViewDataset
 from learn3d.evaluation import codes_per_view, evaluate, mean_mmd, spread_samples
 from learn3d.experiments.evaluation_report import COLUMNS, _class_means, evaluate_runs, format_table
 from learn3d.losses import mmd
@@ -278,3 +281,41 @@ def test_mean_is_over_classes_not_over_runs() -> None:
 
 def test_versions_name_torch() -> None:
     assert versions()["torch"] == torch.__version__
+
+
+def turned(vertices: torch.Tensor, degrees: float) -> torch.Tensor:
+    angle = math.radians(degrees)
+    turn = torch.tensor([[math.cos(angle), 0, -math.sin(angle)], [0, 1, 0], [math.sin(angle), 0, math.cos(angle)]])
+    return vertices @ turn
+
+
+def test_shapes_may_be_aligned_before_they_are_compared(tiny_set) -> None:
+    sphere, faces = nmr.icosphere(2)
+    vertices = sphere * torch.tensor([0.45, 0.3, 0.15])
+    dataset = with_truth(tiny_set, vertices, faces)
+    method = Constant(Meshes(turned(vertices, 60.0), faces))
+    aside = evaluate(method, dataset, max_images=4)
+    back = evaluate(method, dataset, max_images=4, align="yaw", surfaces=True)
+    assert aside.voxel_iou < 0.7
+    assert back.voxel_iou > 0.95
+    assert back.chamfer_l1.max() < 0.05
+    upright = evaluate(Constant(Meshes(vertices, faces)), dataset, max_images=4, align="yaw")
+    assert upright.voxel_iou == 1  # what fits stays as it is
+
+    def own(shapes: Meshes, batch: Batch, of: ViewDataset) -> Meshes:
+        assert of is dataset and len(batch) == len(shapes.vertices)
+        return dataclasses.replace(shapes, vertices=turned(shapes.vertices, -60.0))
+
+    assert evaluate(method, dataset, max_images=4, align=own).voxel_iou > 0.99
+    with pytest.raises(ValueError, match="align 'yaw' turns meshes"):
+        evaluate(Constant(Grids(torch.zeros(1, 32, 32, 32))), dataset, max_images=4, align="yaw")
+
+
+def test_without_poses_voxels_are_compared_and_silhouettes_are_not(tiny_set) -> None:
+    sphere, faces = nmr.icosphere(2)
+    known = with_truth(tiny_set, 0.3 * sphere, faces)
+    unknown = dataclasses.replace(known, poses=None)
+    method = Constant(Meshes(0.3 * sphere, faces))
+    assert evaluate(method, unknown).summary() == evaluate(method, known).summary()
+    nothing = evaluate(method, dataclasses.replace(unknown, voxels=None))
+    assert (nothing.voxel_iou, nothing.silhouette_iou) == (None, None)

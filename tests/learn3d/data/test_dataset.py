@@ -9,11 +9,14 @@ import pytest
 import torch
 
 import nmr
+from learn3d.data.augment import augment
 from learn3d.data.conventions import KATO
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.poses import LookAtPoses, RotationPoses, wrap_deg
 from learn3d.data.sampling import sample_indices
 from learn3d.data.view_bins import AngleBins
+from learn3d.methods import DataShape, create_method
+from learn3d.presets import PRESETS
 
 
 def continuous(objects: int = 3, views: int = 4, category: str = "cup", seed: int = 0) -> ViewDataset:
@@ -225,3 +228,28 @@ def test_poses_of_wrong_shape() -> None:
         LookAtPoses(np.zeros(2), 0.0, np.zeros(3), 15.0)
     with pytest.raises(ValueError, match=r"rotation must be \[M, 3, 3\]"):
         RotationPoses(torch.eye(3))
+
+
+def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
+    unknown = dataclasses.replace(tiny_set, poses=None)
+    assert (tiny_set.pose_features, unknown.pose_features) == (3, 0)
+    assert unknown.digest() != tiny_set.digest()
+    assert concatenate([unknown, unknown]).poses is None
+    assert unknown.select(np.array([0, 1])).poses is None
+    indices = torch.tensor([1, 30])
+    for rows in (None, torch.tensor([0])):
+        batch = augment(unknown.batch(indices, rows), ("flip",), 0, 1)
+        known = augment(tiny_set.batch(indices, rows), ("flip",), 0, 1)
+        assert batch.poses is None
+        assert batch.step_views.poses is None
+        assert torch.equal(batch.images, known.images)
+    with pytest.raises(ValueError, match="no poses"):
+        unknown.with_bins(AngleBins.parse("15x20"))
+    with pytest.raises(ValueError, match="different kinds"):
+        concatenate([unknown, tiny_set])
+
+
+@pytest.mark.parametrize("preset", ["peng2020-kato", "kato2018-kato", "peng2020-kato-vpl", "gadelha2017-kato"])
+def test_methods_that_need_poses_say_so(preset: str) -> None:
+    with pytest.raises(ValueError, match="has no poses"):
+        create_method(PRESETS[preset].settings, DataShape(1, pose_features=0), device="cpu", precision="fp32", seed=0)

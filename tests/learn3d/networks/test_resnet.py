@@ -137,9 +137,7 @@ def test_it_sees_natural_colours_of_every_layout(kind: str, inverted: bool) -> N
 def test_a_method_starts_from_pretrained_weights(tmp_path: Path) -> None:
     weights = random_weights()
     torch.save(weights, tmp_path / "weights.pth")
-    settings = PoseInvariantSettings(
-        encoder="resnet18", symmetry="z", pretrained=str(tmp_path / "weights.pth")
-    )
+    settings = PoseInvariantSettings(encoder="resnet18", symmetry="z", pretrained=str(tmp_path / "weights.pth"))
     assert settings.pretrained == tmp_path / "weights.pth"
     method = PoseInvariant(settings, DataShape(3, pose_features=9), "cpu", "fp32")
     method.start_from_pretrained()
