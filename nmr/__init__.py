@@ -7,16 +7,16 @@ render_silhouette   meshes -> anti-aliased silhouettes, differentiable with NMR'
 render_rgb          meshes -> colour images, with the same gradient
 render_depth        meshes -> depth images, with their true derivative
 render_normals      meshes -> normals in world space
-render_fragments    meshes -> Fragments: face, weights and depth at each pixel, to shade by yourself
+render_fragments    meshes -> Fragments: face, weights and depth at each pixel, for shading of your own
 render_face_index   meshes -> which face is nearest at each pixel
-VertexColors, FaceColors, TextureCubes, UVTexture   colours of meshes; any object with sample(fragments) is, too: Colors
+VertexColors, FaceColors, TextureCubes, UVTexture   colours of meshes; Colors: the interface for a class of your own
 Lights              ambient and directional lights, flat or smooth
 LookAt, Look, Pinhole, Orthographic, Camera   cameras: world space -> renderer space; ``nmr.cameras`` converts them
 voxelize            meshes -> filled occupancy grids (kato18 or kato19, the published voxel IoU)
-icosphere, edge_table, unique_edges, losses   meshes to deform, and what to minimise
+icosphere, edge_table, unique_edges, losses   a sphere to deform, its edges, loss functions
 metrics             points on surfaces, Chamfer distance, F-score, IoU of grids
 face_normals, vertex_normals    unit normals, differentiable
-neural_renderer     the interface of neural_renderer_pytorch 1.1.3, to be imported by itself
+neural_renderer     the interface of neural_renderer_pytorch 1.1.3; import it explicitly
 
 Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]`` with faces ``[F, 3]`` or
 ``[B, F, 3]``, or lists of ``[V_b, 3]`` and ``[F_b, 3]``. In renderer space x points right, y up, both in [-1, 1] across

@@ -1,4 +1,4 @@
-"""Batches of meshes as the operators take them: meshes of one size stacked, meshes of many sizes packed end to end."""
+"""Batches of meshes as the operators take them: stacked if they have one size, else packed end to end."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ._validate import check_faces, check_vertices, describe
 
-Values = Tensor | tuple[Tensor, ...]  # of check_values: with a batch axis, or one tensor per mesh
+Values = Tensor | tuple[Tensor, ...]  # result of check_values: a tensor with a batch axis, or one tensor per mesh
 
 
 class MeshBatch(NamedTuple):
@@ -36,7 +36,7 @@ class MeshBatch(NamedTuple):
         return torch.tensor(self.face_counts, dtype=torch.int32, device=self.faces.device).view(-1, 1, 1)
 
     def first_faces(self, value_batch: int) -> int | Tensor:
-        """Where the faces of each image begin when per-face values ``[value_batch, F, ...]`` are laid end to end."""
+        """First face of each image, when per-face values ``[value_batch, F, ...]`` are laid end to end."""
         if self.starts is not None:
             return self.starts[:-1, 1].to(self.faces.device).view(-1, 1, 1)
         if value_batch == 1:
@@ -44,7 +44,7 @@ class MeshBatch(NamedTuple):
         return torch.arange(value_batch, device=self.faces.device).view(-1, 1, 1) * self.faces.shape[-2]
 
     def spread(self, rows: Tensor) -> Tensor:
-        """A row per image, ``[B | 1, C]``, given to each of its faces: ``[B | 1, 1, C]``, packed ``[M | 1, C]``."""
+        """Expands one row per image, ``[B | 1, C]``, to its faces: ``[B | 1, 1, C]``, packed ``[M | 1, C]``."""
         if self.starts is None:
             return rows.unsqueeze(1)
         if len(rows) == 1:
@@ -66,50 +66,50 @@ class MeshBatch(NamedTuple):
     def values(self, values: Values, name: str, per: str | None = None) -> Tensor:
         """Values in the layout of these meshes, ``[B | 1, n, ...]`` or packed ``[sum of n_b, ...]``.
 
-        ``per`` says what must have one row each, ``"vertex"`` or ``"face"``; None is any number of rows.
+        ``per``: "vertex" or "face" if each of them needs one row; None allows any number of rows.
         """
         if self.starts is None:
             values = torch.stack(self._one_size(values, name)) if isinstance(values, tuple) else values
             if values.shape[0] not in (1, self.batch):
                 sizes = "1" if self.batch == 1 else f"1 or {self.batch}"
-                raise ValueError(f"{name} must have batch size {sizes} as the images, got {describe(values)}")
+                raise ValueError(f"{name} must have batch size {sizes}, that of the images, got {describe(values)}")
             wanted = {"vertex": self.vertices.shape[1], "face": self.faces.shape[-2], None: values.shape[1]}[per]
             if values.shape[1] != wanted:
-                raise ValueError(f"{name} must have one row per {per}, {wanted} of them, got {describe(values)}")
+                raise ValueError(f"{name} must have one row per {per} ({wanted}), got {describe(values)}")
             return values.to(self.vertices)
         rows = tuple(len(part) for part in self._one_per_mesh(values, name))
         wanted = {"vertex": self.vertex_counts, "face": self.face_counts, None: rows}[per]
         if rows != wanted:
-            raise ValueError(f"{name} must have one row per {per}, {list(wanted)} in the meshes, got {list(rows)}")
+            raise ValueError(f"{name} must have one row per {per} (the meshes have {list(wanted)}), got {list(rows)}")
         return torch.cat(values).to(self.vertices)
 
     def corners(self, corners: object, attributes: Values, name: str) -> tuple[Tensor, Tensor | None]:
-        """Faces that count rows of attributes instead of vertices, as (corners, starts) of the operators."""
+        """Checks faces that index rows of attributes; returns (corners, starts) as the operators take them."""
         device = self.faces.device
         if self.starts is None:
             if is_list(corners):
                 corners = torch.stack(self._one_size([check_faces(part, 1, device, name) for part in corners], name))
             corners = check_faces(corners, self.batch, device, name)
             if corners.shape[-2] != self.faces.shape[-2]:
-                raise ValueError(
-                    f"{name} must have one row per face, {self.faces.shape[-2]} of them, got {describe(corners)}"
-                )
+                raise ValueError(f"{name} must have one row per face ({self.faces.shape[-2]}), got {describe(corners)}")
             return corners, None
         parts = [check_faces(part, 1, device, name) for part in self._one_per_mesh(corners, name)]
         rows = tuple(part.shape[0] for part in parts)
         if rows != self.face_counts or any(part.ndim != 2 for part in parts):
-            raise ValueError(f"{name} must have one row [3] per face, {list(self.face_counts)}, got {list(rows)}")
+            raise ValueError(
+                f"{name} must have one row [3] per face (the meshes have {list(self.face_counts)}), got {list(rows)}"
+            )
         return torch.cat(parts), _starts([len(part) for part in attributes], rows)
 
     def _one_size(self, parts: Sequence[Tensor], name: str) -> tuple[Tensor, ...]:
         if len({part.shape for part in parts}) != 1:
-            raise ValueError(f"the meshes have one size, {name} has several: {[list(p.shape) for p in parts]}")
+            raise ValueError(f"{name} must have one size, as the meshes do, got {[list(p.shape) for p in parts]}")
         return tuple(parts)
 
     def _one_per_mesh(self, parts: object, name: str) -> Sequence[Tensor]:
         if not is_list(parts) or len(parts) != self.batch:
             got = f"{len(parts)}" if is_list(parts) else describe(parts)
-            raise ValueError(f"{name} must be a list as the meshes are, of {self.batch} tensors, got {got}")
+            raise ValueError(f"{name} must be a list of {self.batch} tensors, one per mesh, got {got}")
         return parts
 
 
@@ -135,7 +135,7 @@ def pack_meshes(vertices: object, faces: object) -> MeshBatch:
             if (part.dtype, part.device) != (vertices[0].dtype, vertices[0].device):
                 raise ValueError(
                     "the meshes of a list must have one dtype and device, "
-                    f"got {part.dtype} on {part.device} beside {vertices[0].dtype} on {vertices[0].device}"
+                    f"got {vertices[0].dtype} on {vertices[0].device} and {part.dtype} on {part.device}"
                 )
     else:
         vertices = check_vertices(vertices).unbind(0)
@@ -144,7 +144,7 @@ def pack_meshes(vertices: object, faces: object) -> MeshBatch:
     if not is_list(faces) or len(faces) != len(vertices) or not len(vertices):
         got = f"of {len(faces)}" if is_list(faces) else describe(faces)
         raise ValueError(
-            "a list of meshes needs faces for each, and at least one mesh; "
+            "a list of meshes must hold at least one mesh, and faces for each; "
             f"got vertices of {len(vertices)} meshes and faces {got}"
         )
     faces = [check_faces(part, 1, vertices[0].device) for part in faces]

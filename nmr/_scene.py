@@ -1,4 +1,4 @@
-"""What the rendering functions share: checked arguments in renderer space, and what the operators make of them."""
+"""Shared by the rendering functions: checks the arguments, applies the camera, calls the operators."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def shade(
     background: float | Sequence[float] | Tensor,
     interpolation_gradient: bool,
 ) -> Tensor:
-    """The raster ``[B, R, R, C]``, background filled in."""
+    """The shaded raster ``[B, R, R, C]``, with the background filled in."""
     if not interpolation_gradient:
         fragments = replace(fragments, weights=fragments.weights.detach())
     shape, covered = fragments.owner.shape, fragments.covered.unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""Checks that the public functions share. Each error says what was wanted, what came and what to do."""
+"""Checks shared by the public functions. Each error says what was wanted, what came and what to do."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def describe(value: object) -> str:
 
 
 def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
-    """``vertices`` as ``[B, V, 3]`` float32 or float64; ``otherwise`` tells in the error what else is taken."""
+    """``vertices`` as ``[B, V, 3]`` float32 or float64; ``otherwise``: what else is accepted, for the error."""
     if not isinstance(vertices, Tensor):
         raise TypeError(
             f"vertices must be a float tensor [B, V, 3] or [V, 3]{otherwise}, got {describe(vertices)}; "
@@ -56,33 +56,35 @@ def check_faces(faces: object, batch: int, device: torch.device, name: str = "fa
 
 
 def check_camera(camera: object, packed: bool) -> None:
-    """Something with ``transform(vertices)``; for lists of meshes with ``transform(vertices, starts)``."""
+    """A camera must have ``transform(vertices)``; for lists of meshes ``transform(vertices, starts)``."""
     if isinstance(camera, type):
-        raise TypeError(f"camera must be a camera, got the class {camera.__name__}; make one: {camera.__name__}(...)")
+        raise TypeError(
+            f"camera must be an instance, got the class {camera.__name__}; create one: {camera.__name__}(...)"
+        )
     if not callable(getattr(camera, "transform", None)):
         raise TypeError(f"camera must have a method transform(vertices), as nmr.LookAt does, got {describe(camera)}")
     if packed and "starts" not in inspect.signature(camera.transform).parameters:
         raise TypeError(
             f"for a list of meshes, {type(camera).__name__}.transform must take (vertices [N, 3], starts [B + 1, 2]), "
-            "as that of nmr.LookAt; it takes vertices alone"
+            "as nmr.LookAt.transform does; it takes only vertices"
         )
 
 
 def check_transformed(vertices: object, world: Tensor, packed: bool) -> None:
-    """What a camera made of the vertices ``world``: of their shape (one mesh may have become B) and type."""
+    """The vertices that a camera returned must have type, device and shape of ``world`` (one mesh may become B)."""
     like = isinstance(vertices, Tensor) and (vertices.dtype, vertices.device) == (world.dtype, world.device)
     grown = not packed and world.shape[0] == 1
     if not like or vertices.ndim != world.ndim or vertices.shape[int(grown) :] != world.shape[int(grown) :]:
         shape = ["B", *world.shape[1:]] if grown else list(world.shape)
         wanted = f"{str(world.dtype).removeprefix('torch.')} [{', '.join(map(str, shape))}]"
         raise ValueError(
-            f"camera.transform must return {'packed ' if packed else ''}vertices {wanted}, as it gets them, "
+            f"camera.transform must return {'packed ' if packed else ''}vertices {wanted}, like those it receives, "
             f"got {describe(vertices)}"
         )
 
 
 def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor, ...]:
-    """Float values of meshes: a tensor with the axes (or those behind a batch axis), or one such per mesh.
+    """Float values of meshes: a tensor with these axes, with or without a batch axis, or a list of one per mesh.
 
     Returns the tensor with its batch axis, or a tuple of tensors without one. ``axes`` is like ``"V, C"``.
     """
@@ -93,7 +95,7 @@ def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor,
             if not isinstance(value, Tensor) or value.dtype not in _FLOATS:
                 raise TypeError(f"{wanted}; the list holds {describe(value)}")
             if value.ndim != ndim or value.shape[-1] != values[0].shape[-1] or value.dtype != values[0].dtype:
-                raise ValueError(f"{wanted}; the list holds {describe(value)} beside {describe(values[0])}")
+                raise ValueError(f"{wanted}; the list holds {describe(values[0])} and {describe(value)}")
         return tuple(values)
     if not isinstance(values, Tensor) or values.dtype not in _FLOATS:
         raise TypeError(f"{wanted}, got {describe(values)}; use torch.as_tensor() and .float()")
@@ -105,7 +107,7 @@ def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor,
 def as_numbers(value: object, name: str, wanted: str) -> Tensor:
     """A number, nested sequences of numbers or tensors, an array or a tensor, as a tensor; numbers become float64.
 
-    Tensors keep their gradient, those in sequences, too.
+    Gradients reach tensors, also those inside sequences.
     """
     try:
         tensor = _joined(value)
@@ -119,14 +121,14 @@ def as_numbers(value: object, name: str, wanted: str) -> Tensor:
 def _joined(value: object) -> Tensor:
     if isinstance(value, Tensor):
         return value
-    # torch.as_tensor would cut the tensors in a sequence from their graph.
+    # torch.as_tensor would detach the tensors in a sequence.
     if isinstance(value, list | tuple) and any(isinstance(part, Tensor | np.ndarray | list | tuple) for part in value):
         return torch.stack([_joined(part) for part in value])
     return torch.as_tensor(value, dtype=torch.float64)
 
 
 def as_floats(value: object, name: str, wanted: str) -> Tensor:
-    """As :func:`as_numbers`, but a tensor must be of floats already."""
+    """As :func:`as_numbers`, but a tensor must already have a float dtype."""
     tensor = as_numbers(value, name, wanted)
     if not tensor.is_floating_point():
         raise TypeError(f"{name} must be {wanted} of floats, got {describe(tensor)}; call .float()")
@@ -145,13 +147,13 @@ def check_size(value: object, name: str, largest: int) -> int:
 
 
 def check_choice(value: object, name: str, choices: tuple[str, ...]) -> None:
-    """One of the words."""
+    """``value`` must be one of ``choices``."""
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} must be {' or '.join(map(repr, choices))}, got {value!r}")
 
 
 def check_number(value: object, name: str) -> float:
-    """A number, also of NumPy or in a tensor of one element."""
+    """A Python or NumPy number, or a tensor with one element, as float."""
     try:
         return float(value)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -166,7 +168,7 @@ def check_depth_range(near: float, far: float) -> None:
 
 
 def check_eps(eps: float, dtype: torch.dtype) -> None:
-    """Positive in the dtype, and finite."""
+    """eps must be finite, and positive when rounded to the dtype."""
     eps = check_number(eps, "eps")
     if not torch.finfo(dtype).tiny <= eps < float("inf"):
         raise ValueError(f"eps must be positive in {dtype} and finite, got {eps}")

@@ -1,4 +1,4 @@
-"""Fragments: what the rasterizer knows of each pixel, and what one needs to shade it."""
+"""Fragments: the nearest face at each pixel, with what is needed to shade it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .mesh import _unit
 if TYPE_CHECKING:
     from .cameras import Camera
 
-# Products of three coordinates up to here are finite.
+# Products of three coordinates up to this size are finite in float32.
 _LARGEST = 1e12
 
 
@@ -25,21 +25,21 @@ _LARGEST = 1e12
 class Fragments:
     """The nearest face at each centre of the raster, made by :func:`nmr.render_fragments`.
 
-    R is the image size S, or 2 S with anti-aliasing. Row 0 is the top. To shade by yourself, compute an image
-    ``[B, R, R, C]`` from these and call :meth:`resolve`, which averages and gives vertices NMR's gradient.
+    R is the image size S, or 2 S with anti-aliasing. Row 0 is the top. For shading of your own, compute an image
+    ``[B, R, R, C]`` from these and call :meth:`resolve`, which averages pixels and gives the vertices NMR's gradient.
 
     Attributes
     ----------
     owner : int32 Tensor [B, R, R]
         ``owner[b, y, x] = f``: face f is nearest and seen from its front; ``F + f``: from its back; -1: background.
     weights : Tensor [B, R, R, 3]
-        Perspective-correct barycentric weights of the face's vertices in their own order; sum 1, on background 0.
-        Differentiable in the vertices (at fixed owner); use ``weights.detach()`` for NMR's definition, where colour
-        moves vertices by edges only.
+        Perspective-correct barycentric weights of the face's vertices in their own order; their sum is 1. 0 on
+        background. Differentiable in the vertices (at fixed owner). Use ``weights.detach()`` for NMR's definition, in
+        which colours move vertices only through edges.
     depth : Tensor [B, R, R]
         z of the nearest point, ``far`` on background. Differentiable in the vertices (at fixed owner).
     vertices, faces
-        The meshes in renderer space, ``[B, V, 3]``; of a list of meshes ``[N, 3]``, end to end.
+        The meshes in renderer space, ``[B, V, 3]``; for a list of meshes ``[N, 3]``, one mesh after the other.
     """
 
     owner: Tensor
@@ -81,7 +81,7 @@ class Fragments:
         ----------
         attributes : float Tensor [V, C] or [B, V, C]; for a list of meshes a list of [V_b, C]
         corners : integer Tensor [F, 3] or [B, F, 3] (or a list), optional
-            Rows of attributes at the corners of each face, where they are not its vertices: a texture with seams.
+            Row of attributes at each corner of each face, if there is not one row per vertex: a texture with seams.
 
         Differentiable in attributes, and in weights.
         """
@@ -104,7 +104,7 @@ class Fragments:
         return self._per_side(self.mesh.values(check_values(values, name, "F, C"), name, "face"))
 
     def _per_side(self, front: Tensor, back: Tensor | None = None) -> Tensor:
-        """Values of faces, ``[B | 1, F, C]`` or packed ``[M, C]``, at each pixel; back: where the normal is turned."""
+        """Values of faces, ``[B | 1, F, C]`` or packed ``[M, C]``, at each pixel; ``back``: for turned normals."""
         rows = front.reshape(-1, front.shape[-1])
         index = self.face_index.long() + self.mesh.first_faces(len(front))
         if back is not None:
@@ -113,16 +113,16 @@ class Fragments:
             rows = torch.cat([rows, back.reshape(-1, back.shape[-1])])
         rows = torch.cat([rows, rows.new_zeros(1, rows.shape[1])])
         index = torch.where(self.covered, index, len(rows) - 1)
-        # embedding: its backward sums in a fixed order, that of indexing does not.
+        # embedding, not indexing: its backward pass sums in a fixed order.
         return F.embedding(index, rows, padding_idx=len(rows) - 1)
 
     def normals(self, smooth: bool = False) -> Tensor:
         """Unit normals in world space of the side that is seen, ``[B, R, R, 3]``, 0 on background.
 
-        Flat: of the face. Smooth: those of its vertices (means of the faces around, by area) interpolated. The side
-        that is seen is told by the camera: where it shows the world without mirroring it (as LookAt does), the front of
-        face (v0, v1, v2) has the normal ``(v0 - v1) x (v2 - v1)``, as in the published renderer. Differentiable in the
-        world-space vertices and, where smooth, in weights.
+        Flat: the normal of the face. Smooth: the normals of its vertices (means over the adjacent faces, weighted by
+        area), interpolated. If the camera does not mirror the world (LookAt does not), the front of face (v0, v1, v2)
+        has the normal ``(v0 - v1) x (v2 - v1)``, as in the published renderer; otherwise the opposite one.
+        Differentiable in the world-space vertices and, if smooth, in weights.
         """
         if not smooth:
             front = self._face_normals()
@@ -132,15 +132,15 @@ class Fragments:
         sums = sums.scatter_add(0, rows.reshape(-1, 1).expand(-1, 3), across.repeat_interleave(3, dim=0))
         at_vertices = _unit(sums).view(world.vertices.shape)
         normals = ops.interpolate(at_vertices, self.faces, self.owner, self.weights, self.mesh.starts)
-        normals = F.normalize(normals, dim=-1, eps=1e-5)  # opposite ones that cancel stay short, and so do gradients
+        normals = F.normalize(normals, dim=-1, eps=1e-5)  # normals that nearly cancel stay short: finite gradients
         turned = self.is_back != self._mirrored()
         return torch.where(turned.unsqueeze(-1), -normals, normals)
 
     def _face_normals(self) -> Tensor:
         """``(v0 - v1) x (v2 - v1)`` in world space, of unit length: ``[B | 1, F, 3]``, packed ``[M, 3]``.
 
-        However small the face: in the published renderer normals of products below 1e-5 stay short, and small meshes
-        dark. A face without area has none (0).
+        Small faces have unit normals, too. (In the published renderer the normal is short where the product is below
+        1e-5, which makes small meshes dark.) A face without area has the normal 0.
         """
         world, across, _ = self._across()
         return _unit(across).view(*world.vertices.shape[:-2], self.faces.shape[-2], 3)
@@ -154,9 +154,9 @@ class Fragments:
         return world, torch.linalg.cross(v0 - v1, v2 - v1, dim=-1), rows
 
     def _mirrored(self) -> bool | Tensor:
-        """Whether the way from world to renderer space is a reflection: bool ``[B, 1, 1]``.
+        """Whether the camera mirrors the world: bool ``[B, 1, 1]``.
 
-        The camera is asked for the image of a small right-angled corner in the middle of each mesh.
+        Tested by transforming three short perpendicular edges in the middle of each mesh.
         """
         if self.camera is None:
             return False
@@ -183,9 +183,9 @@ class Fragments:
     def resolve(self, image: Tensor) -> Tensor:
         """The image ``[B, S, S, C]`` of a shaded raster ``[B, R, R, C]``, with NMR's gradient.
 
-        The mean of 2x2 pixels with anti-aliasing, else the image as it is. Its gradient goes back to the raster, and by
-        NMR's rule to x and y of the vertices: every visible edge is pulled by the pixels that would come closer to what
-        the loss wants if the edge moved over them. All C channels decide together. No second derivative.
+        The mean of 2x2 pixels with anti-aliasing, else the image itself. The gradient goes back to the raster and, by
+        NMR's definition, to x and y of the vertices: every visible edge is pulled by those pixels whose loss would fall
+        if the edge moved over them. The change of the loss is summed over all C channels. No second derivative.
 
         Raises
         ------
@@ -193,12 +193,14 @@ class Fragments:
             If image is not a float tensor [B, R, R, C] of the dtype of the vertices.
         """
         if not isinstance(image, Tensor) or image.dtype != self.vertices.dtype:
-            raise TypeError(f"image must be a tensor of {self.vertices.dtype} as the vertices, got {describe(image)}")
+            raise TypeError(
+                f"image must be a tensor of {self.vertices.dtype}, as the vertices are, got {describe(image)}"
+            )
         if image.ndim != 4 or image.shape[:3] != self.owner.shape:
             raise ValueError(f"image must have shape {[*self.owner.shape, 'C']}, got {describe(image)}")
         return ops.resolve(image, *self.mesh[:3], self.owner, self.anti_aliasing, self.eps)
 
 
 def _usable(points: Tensor) -> Tensor:
-    """Points that are not finite, or so far that a product overflows, are put at the origin and get no gradient."""
+    """Puts points that are not finite, or so large that a product overflows, at the origin, without gradient."""
     return torch.where((points.abs() < _LARGEST).all(-1, keepdim=True), points, torch.zeros_like(points))

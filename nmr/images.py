@@ -1,4 +1,4 @@
-"""What a rendering of several outputs holds."""
+"""The result of :func:`nmr.render`: several images."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ OUTPUTS = ("rgb", "alpha", "depth", "normals", "fragments")
 
 
 class Images:
-    """What :func:`render` returns: the outputs asked for, as attributes and, in the order asked, by unpacking.
+    """The outputs of :func:`render`, as attributes; unpacking gives them in the requested order.
 
     ``rgb [B, S, S, C]``, ``alpha [B, S, S]``, ``depth [B, S, S]``, ``normals [B, S, S, 3]``, ``fragments``
-    (:class:`Fragments`). Others raise an AttributeError.
+    (:class:`Fragments`). Outputs that were not requested raise an AttributeError.
     """
 
     rgb: Tensor
@@ -30,7 +30,7 @@ class Images:
 
     def __getattr__(self, name: str) -> Tensor | Fragments:
         if name in OUTPUTS:
-            raise AttributeError(f"{name} was not rendered; ask for it: outputs={(*self.__dict__, name)}")
+            raise AttributeError(f"{name} was not rendered; request it with outputs={(*self.__dict__, name)}")
         raise AttributeError(f"Images has no attribute {name!r}; it has {', '.join(self.__dict__)}")
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -21,12 +21,12 @@ Numbers = float | Sequence | Tensor
 
 @dataclass(frozen=True, eq=False)
 class Lights:
-    """Ambient light and L directional lights: what colours are multiplied with.
+    """Ambient light and L directional lights. Colours are multiplied by the light.
 
     ``light = ambient * ambient_color + sum over l of directional_l * directional_color_l * relu(n . direction_l)``,
-    n the unit normal in world space of the side that is seen (:meth:`Fragments.normals`). Flat (the normal of the face)
-    as in the published renderer, whose defaults these are; or ``smooth``, with the normals of the vertices
-    interpolated at each pixel.
+    where n is the unit normal in world space of the side that is seen (:meth:`Fragments.normals`). n is the normal of
+    the face, as in the published renderer, or, if ``smooth``, the interpolated normal of the vertices. The defaults are
+    the published ones.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class Lights:
     directional : number, or Tensor [], [L] or [B, L]
         Intensity of each light with a direction.
     direction : [3], [L, 3] or [B, L, 3]
-        World-space direction towards the light. It is not normalised: its length multiplies.
+        World-space direction towards the light. It is not normalised: a longer vector gives more light.
     ambient_color : [3] or [B, 3]
     directional_color : [3], [L, 3] or [B, L, 3]
     smooth : bool
@@ -45,8 +45,8 @@ class Lights:
     Raises
     ------
     TypeError, ValueError
-        For what are not floats, wrong shapes, and numbers of lights that do not fit each other; when drawn, for values
-        per image that are not as many as the images.
+        For values that are not floats, for wrong shapes, and if the numbers of lights differ; when drawn, also if
+        values per image do not match the number of images.
 
     Examples
     --------
@@ -80,12 +80,12 @@ class Lights:
         counts.add(_per_light(self.directional, 0).shape[1])
         if len(counts - {1}) > 1:
             raise ValueError(
-                "directional, direction and directional_color must be of one number of lights (or of one light), got "
+                "directional, direction and directional_color must have the same number of lights (or one light), got "
                 f"{describe(self.directional)}, {describe(self.direction)} and {describe(self.directional_color)}"
             )
 
     def shade(self, fragments: Fragments) -> Tensor:
-        """The light that falls on each pixel, ``[B, R, R, 3]``; of no meaning on background."""
+        """The light on each pixel, ``[B, R, R, 3]``; undefined on background."""
         rows = {
             "ambient": self.ambient.reshape(-1, 1),
             "ambient_color": self.ambient_color.reshape(-1, 3),
@@ -96,7 +96,9 @@ class Lights:
         batch = fragments.mesh.batch
         for name, value in rows.items():
             if value.shape[0] not in (1, batch):
-                raise ValueError(f"{name} is for {value.shape[0]} images, but {batch} are drawn; give one or as many")
+                raise ValueError(
+                    f"{name} is given for {value.shape[0]} images, but {batch} are drawn; give one or {batch}"
+                )
             rows[name] = value.to(fragments.weights)
         ambient = rows["ambient"] * rows["ambient_color"]
         colors, directions = torch.broadcast_tensors(rows["directional"] * rows["directional_color"], rows["direction"])
@@ -111,7 +113,7 @@ class Lights:
 def _light(
     normals: Tensor, ambient: Tensor, directional: list[tuple[Tensor, Tensor]], spread: Callable[[Tensor], Tensor]
 ) -> Tensor:
-    """The formula; ``spread`` brings rows ``[B or 1, 3]`` to where the normals are."""
+    """The formula of :class:`Lights`; ``spread`` expands rows ``[B or 1, 3]`` to the shape of the normals."""
     light = spread(ambient)
     for color, direction in directional:
         light = light + (normals * spread(direction)).sum(-1, keepdim=True).relu() * spread(color)

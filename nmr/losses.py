@@ -1,7 +1,7 @@
 """Losses on silhouettes and meshes.
 
-Those on meshes take a table of the mesh's topology that is made once: ``edges = nmr.edge_table(faces)`` serves them
-all; :func:`nmr.unique_edges` is enough for those that do not look at faces, and knows open and non-manifold meshes.
+The losses on meshes take a table of edges, which is made once per mesh. ``edges = nmr.edge_table(faces)`` works for
+all of them. Losses that do not use faces also take :func:`nmr.unique_edges`, which accepts any mesh.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     Returns
     -------
     scalar Tensor
-        0 where all pairs agree and are binary. A pair that is empty on both sides counts as agreement (the published
-        code returns NaN); its gradient is 0.
+        0 if all pairs are binary and equal. A pair of two empty images counts as equal (the published code returns
+        NaN); its gradient is 0.
 
     Raises
     ------
     TypeError, ValueError
-        If the shapes differ, or there is nothing to compare.
+        If the shapes differ, or the batch is empty.
 
     Examples
     --------
@@ -52,12 +52,12 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     """
     if not isinstance(prediction, Tensor) or not isinstance(target, Tensor) or not prediction.is_floating_point():
         raise TypeError(
-            "prediction and target must be tensors, and prediction one of floats, "
+            "prediction and target must be tensors, and prediction a float tensor, "
             f"got {describe(prediction)} and {describe(target)}"
         )
     if prediction.shape != target.shape or prediction.ndim < 2 or prediction.shape[0] == 0:
         raise ValueError(
-            "prediction and target must have one shape [B, ...] with B >= 1, "
+            "prediction and target must have the same shape [B, ...] with B >= 1, "
             f"got {describe(prediction)} and {describe(target)}"
         )
     prediction, target = prediction.flatten(1), target.flatten(1)
@@ -115,7 +115,7 @@ def laplacian_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     Returns
     -------
     scalar Tensor
-        Differentiable in ``vertices``. Vertices without edges count nothing.
+        Differentiable in ``vertices``. Vertices without edges contribute 0.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def edge_length_loss(vertices: Tensor, edges: Tensor, target: float | None = Non
     Returns
     -------
     scalar Tensor
-        Differentiable in ``vertices``; an edge of length 0 passes no gradient.
+        Differentiable in ``vertices``; an edge of length 0 has no gradient.
 
     Raises
     ------
@@ -181,8 +181,8 @@ def edge_length_loss(vertices: Tensor, edges: Tensor, target: float | None = Non
 def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     """How much neighbouring faces differ in direction: mean over meshes and edges of ``1 - cos(n, n')``.
 
-    n and n' are the normals of the two faces at an edge, both seen from one side of the surface, whatever the order of
-    the faces' vertices. 0 when flat. This is PyTorch3D's definition (``mesh_normal_consistency``) for meshes whose
+    n and n' are the normals of the two faces at an edge, both on the same side of the surface: the order of the faces'
+    vertices does not matter. 0 when flat. This is PyTorch3D's definition (``mesh_normal_consistency``) for meshes whose
     edges have one face or two.
 
     Parameters
@@ -193,7 +193,7 @@ def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     Returns
     -------
     scalar Tensor
-        Differentiable in ``vertices``. An edge at a face without area counts 1 and passes no gradient.
+        Differentiable in ``vertices``. An edge at a face without area contributes 1 and has no gradient.
 
     Raises
     ------
@@ -223,9 +223,9 @@ def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
 def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
     """A pressure from inside: mean over meshes of ``sum over faces f and their corners k |v_k + n_f - v_k|``.
 
-    The first v_k and the unit normal n_f are constants for the gradient. The value is thus 3 for every face; what
-    matters is the gradient, ``-n_f`` for each corner: a step against it moves every vertex outwards. From the code of
-    Kato and Harada 2019 (view prior learning).
+    For the gradient, the first v_k and the unit normal n_f are constants. The value is therefore 3 for every face. The
+    gradient is ``-n_f`` at each corner, so that gradient descent moves every vertex outwards. From the code of Kato and
+    Harada 2019 (view prior learning).
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     scalar Tensor
-        Its gradient in ``vertices`` is as said, and not the derivative of the value. Faces without area count nothing.
+        Its gradient in ``vertices`` is the one above, not the derivative of the value. Faces without area contribute 0.
 
     Raises
     ------
@@ -254,7 +254,7 @@ def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def _batch_last(vertices: Tensor) -> Tensor:
-    """[B, V, 3] as [V, 3, B]: a row is then long enough to be copied and summed at the speed of memory."""
+    """[B, V, 3] as [V, 3, B]: long rows are copied and summed at the speed of memory."""
     return vertices.permute(1, 2, 0).contiguous()
 
 

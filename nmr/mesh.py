@@ -1,4 +1,4 @@
-"""Meshes: the sphere to deform, which faces meet at which edge, normals."""
+"""Meshes: spheres, tables of edges, normals."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def unique_edges(faces: Tensor) -> Tensor:
     Returns
     -------
     int64 Tensor [E, 2]
-        Row ``(v0, v1)``: an edge, v0 < v1. Rows are sorted. (A face that names a vertex twice has no edge there.)
+        Row ``(v0, v1)``: an edge, v0 < v1. Rows are sorted. A side from a vertex to itself is no edge.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
     ----------
     faces : integer Tensor [F, 3]
     open_mesh : bool
-        Leave out the edges at a border, which have one face, instead of refusing them.
+        Leave out border edges, which have one face. By default they are an error.
 
     Returns
     -------
@@ -116,7 +116,7 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
     edges, edge_of_side, counts = torch.unique(sides, dim=0, return_inverse=True, return_counts=True)
     if open_mesh:
         wrong, wanted = counts > 2, "at most two faces"
-        remedy = "remove the faces beyond, and those that name a vertex twice"
+        remedy = "remove the extra faces, and faces that use a vertex twice"
     else:
         wrong, wanted = counts != 2, "exactly two faces (a closed mesh)"
         remedy = "close the mesh first (for example with trimesh.repair.fill_holes) or pass open_mesh=True"
@@ -124,7 +124,7 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
     if len(bad):
         v0, v1 = edges[bad[0]].tolist()
         raise ValueError(
-            f"every edge must have two ends and {wanted}, but {len(bad)} of {len(edges)} have not: "
+            f"every edge must have two different vertices and {wanted}, but {len(bad)} of {len(edges)} edges do not: "
             f"edge ({v0}, {v1}) has {int(counts[bad[0]])}; {remedy}"
         )
     inner = counts[edge_of_side] == 2
@@ -170,7 +170,7 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     Tensor [B, F, 3], or [F, 3] for vertices [V, 3]
-        Of length 1; 0 for a face without area. Differentiable in ``vertices`` (a face without area passes no gradient).
+        Of length 1; 0 for a face without area. Differentiable in ``vertices`` (a face without area has no gradient).
 
     Raises
     ------
@@ -218,7 +218,7 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def _face_cross(corners: Tensor) -> Tensor:
-    """Normals twice as long as the faces' areas, [..., F, 3]."""
+    """Normals [..., F, 3], each with twice the area of its face as its length."""
     p0, p1, p2 = corners.unbind(-2)
     return torch.linalg.cross(p1 - p0, p2 - p0)
 
@@ -247,7 +247,7 @@ def _sides(faces: Tensor) -> Tensor:
 
 
 def _check_indices(indices: Tensor, num_vertices: int, name: str = "faces") -> None:
-    """Every number in 0..V-1. (In a compiled graph, which has no values to look at, gathering them reports it.)"""
+    """Every index must lie in 0..V-1. (In a compiled graph values are unknown; there gathering raises the error.)"""
     if torch.compiler.is_compiling() or indices.numel() == 0:
         return
     low, high = (int(x) for x in indices.aminmax())
@@ -264,7 +264,7 @@ def _expanded(indices: Tensor, batch: int) -> Tensor:
 
 
 def _gather(rows: Tensor, indices: Tensor) -> Tensor:
-    """Rows ``[B, N, 3]`` of ``[B, V, 3]``. The fastest of torch's ways on a CPU, in both directions."""
+    """Rows ``[B, N, 3]`` of ``[B, V, 3]``. On a CPU, torch.gather is the fastest way, forward and backward."""
     return torch.gather(rows, 1, _expanded(indices, rows.shape[0]))
 
 

@@ -1,8 +1,8 @@
-"""How near a shape is to another: points on surfaces, Chamfer distance, F-score, IoU of grids.
+"""How close two shapes are: points on surfaces, Chamfer distance, F-score, IoU of grids.
 
-Nearest points are found by SciPy's k-d tree where SciPy is installed and the points lie in host memory, else by
-comparing all pairs, in chunks. Both are exact: they differ in speed alone (10,000 points with 10,000: 7 ms and 0.3 s on
-two cores), and in which of several equally near points they name.
+Nearest points are found by SciPy's k-d tree if SciPy is installed and the points lie in host memory, otherwise by
+comparing all pairs in chunks. Both are exact. They differ in speed (7 ms and 0.3 s for 10,000 and 10,000 points on two
+cores), and may choose different points among equally near ones.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ try:
 except ImportError:
     cKDTree = None
 
-_CHUNK = 1 << 19  # distances that are in memory at once, where there is no tree
+_CHUNK = 1 << 19  # distances held in memory at once, without SciPy
 
 
 class SurfacePoints(NamedTuple):
@@ -49,7 +49,7 @@ def sample_surface(
     count : int
         N, points per mesh.
     generator : torch.Generator, optional
-        Where the random numbers come from, on the device of the vertices; by default torch's own.
+        Source of the random numbers, on the device of the vertices; by default torch's global generator.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def sample_surface(
     total = area.sum(1)
     bad = (~(total.isfinite() & (total > 0))).nonzero()
     if len(bad):
-        raise ValueError(f"every mesh must have a finite area above 0 to draw points from, mesh {int(bad[0])} has not")
+        raise ValueError(f"every mesh must have a finite area above 0, mesh {int(bad[0])} does not")
     face_index = torch.multinomial(area, count, replacement=True, generator=generator)
     random = torch.rand(2, *face_index.shape, 1, generator=generator, dtype=batched.dtype, device=batched.device)
     r, s = random[0].sqrt(), random[1]
@@ -96,7 +96,7 @@ def chamfer_distance(points_a: Tensor, points_b: Tensor, form: Literal["squared"
 
     - "squared": ``mean_a d(a, B)^2 + mean_b d(b, A)^2``, the usual loss (PyTorch3D's default);
     - "l1": ``(mean_a d(a, B) + mean_b d(b, A)) / 2``, the "Chamfer-L1" of Occupancy Networks: mean of accuracy and
-      completeness, in the unit of the points (of Euclidean distances, in spite of the name).
+      completeness, in the unit of the points. (Despite its name it uses Euclidean distances.)
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def chamfer_distance(points_a: Tensor, points_b: Tensor, form: Literal["squared"
     Returns
     -------
     Tensor [B], or a scalar for points [N, 3]
-        Differentiable in both sets: each point is pulled to its nearest one (not at all where the distance is 0).
+        Differentiable in both sets: each point is pulled to its nearest one (the gradient is 0 at distance 0).
 
     Raises
     ------
@@ -133,7 +133,7 @@ def chamfer_distance(points_a: Tensor, points_b: Tensor, form: Literal["squared"
 
 @torch.no_grad()
 def f_score(points_a: Tensor, points_b: Tensor, threshold: float) -> Tensor:
-    """How many points have one of the other set near: ``2 P R / (P + R)``, precision P and recall R at a distance.
+    """Share of points that are close to the other set: ``2 P R / (P + R)`` with precision P and recall R.
 
     P is the share of the points a that are nearer than the threshold to some b, R the share of the points b that are
     nearer than the threshold to some a (Tatarchenko et al. 2019).
@@ -185,7 +185,7 @@ def voxel_iou(prediction: Tensor, target: Tensor) -> Tensor:
     Raises
     ------
     TypeError, ValueError
-        If they are no bool tensors, or differ in shape.
+        If they are not bool tensors, or their shapes differ.
 
     Examples
     --------
@@ -201,14 +201,15 @@ def voxel_iou(prediction: Tensor, target: Tensor) -> Tensor:
             )
     if prediction.shape != target.shape or prediction.ndim < 2:
         raise ValueError(
-            f"prediction and target must have one shape [B, ...], got {describe(prediction)} and {describe(target)}"
+            "prediction and target must have the same shape [B, ...], "
+            f"got {describe(prediction)} and {describe(target)}"
         )
     both = _count(prediction & target)
     return both / (_count(prediction) + _count(target) - both)
 
 
 def _count(grids: Tensor) -> Tensor:
-    """How many cells of each grid are set, float64 [B]. NumPy counts a row of bytes fifty times as fast as torch."""
+    """Number of set cells of each grid, float64 [B]. NumPy counts bytes fifty times as fast as torch."""
     counts = [np.count_nonzero(grid) for grid in grids.flatten(1).cpu().numpy()]
     return torch.tensor(counts, dtype=torch.float64, device=grids.device)
 
@@ -230,7 +231,7 @@ def _check_points(a: object, b: object) -> tuple[Tensor, Tensor]:
         or 0 in (a.numel(), b.numel())
     ):
         raise ValueError(
-            "points_a and points_b must be [B, N, 3] and [B, M, 3], or [N, 3] and [M, 3], of one type and with at "
+            "points_a and points_b must be [B, N, 3] and [B, M, 3], or [N, 3] and [M, 3], with the same dtype and at "
             f"least one point each, got {describe(a)} and {describe(b)}"
         )
     if not (a.isfinite().all() and b.isfinite().all()):
@@ -239,7 +240,7 @@ def _check_points(a: object, b: object) -> tuple[Tensor, Tensor]:
 
 
 def _to_nearest(a: Tensor, b: Tensor) -> Tensor:
-    """From each point of a [B, N, 3] to the nearest one of b [B, M, 3]. Differentiable in both at a fixed choice."""
+    """Vectors from each point of a [B, N, 3] to its nearest point of b [B, M, 3]. Differentiable in both."""
     return _gather(b, _nearest(a.detach(), b.detach())) - a
 
 
@@ -248,7 +249,7 @@ def _length(vectors: Tensor) -> Tensor:
 
 
 def _nearest(a: Tensor, b: Tensor) -> Tensor:
-    """Number [B, N] of the point of b [B, M, 3] that is nearest to each point of a [B, N, 3]."""
+    """Index [B, N] of the point of b [B, M, 3] nearest to each point of a [B, N, 3]."""
     search = _search_tree if cKDTree is not None and a.device.type == "cpu" else _search_all
     return torch.stack([search(x, y) for x, y in zip(a, b, strict=True)])
 
@@ -259,7 +260,7 @@ def _search_tree(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _search_all(a: Tensor, b: Tensor) -> Tensor:
-    # The fast formula |x|^2 - 2 x.y + |y|^2 loses the digits that tell near points apart.
+    # Not the fast formula |x|^2 - 2 x.y + |y|^2: it is too inexact to tell near points apart.
     exact = "donot_use_mm_for_euclid_dist"
     chunks = a.split(max(1, _CHUNK // len(b)))
     return torch.cat([torch.cdist(chunk, b, compute_mode=exact).argmin(1) for chunk in chunks])

@@ -1,7 +1,7 @@
-"""The renderer's definition in plain torch: slow and clear, for tests and for reading. One image, no shortcuts.
+"""The definition of the renderer in plain torch, for tests and for reading: slow, clear, one image at a time.
 
-Every face is tested against every pixel, every sweep visits every pixel of its line, and ``fill_back`` really appends
-the reversed faces, as the published kernels do. Works in the dtype of its input.
+Every face is tested at every pixel, every sweep visits every pixel of its line, and ``fill_back`` appends the reversed
+faces, as the published kernels do. Works in the dtype of its input.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def with_back_faces(faces: Tensor, fill_back: bool) -> Tensor:
 
 
 def _cross(p: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """The two products whose order tells on which side of the line a -> b the points p lie."""
+    """Two products; which one is larger tells on which side of the line a -> b the points p lie."""
     return (p[..., 1] - a[1]) * (b[0] - a[0]), (p[..., 0] - a[0]) * (b[1] - a[1])
 
 
@@ -117,7 +117,7 @@ def texture_color(texture: Tensor, weights: Tensor, eps: float) -> Tensor:
 
 
 def _raster_gradient(grad_resolved: Tensor, anti_aliasing: bool) -> Tensor:
-    """The gradient ``[R, R, ...]``, row 0 = bottom, of raster pixels by that ``[S, S, ...]`` of the resolved image."""
+    """Gradient ``[R, R, ...]`` of the raster, row 0 = bottom, from that ``[S, S, ...]`` of the image, row 0 = top."""
     if anti_aliasing:
         grad_resolved = (grad_resolved / 4).repeat_interleave(2, 0).repeat_interleave(2, 1)
     return grad_resolved.flip(0)
@@ -192,11 +192,11 @@ def _sweep_edge(
         if min(inner, outer) < 0 or max(inner, outer) > R - 1:
             continue
         m = torch.arange(R)
-        # Outside: what changes if a pixel takes the value of the inner one.
+        # Outside: change of the loss if a pixel gets the value of the inner pixel.
         beyond = m >= outer if direction > 0 else m <= outer
         outside = ((image[n] - image[n, inner]) * grad[n]).sum(-1)
         outside = torch.where(beyond & (lines[n, inner] == f), outside, torch.zeros_like(outside))
-        # Inside: what changes if an own pixel takes the value of the outer one.
+        # Inside: change of the loss if a pixel of this face gets the value of the outer pixel.
         limit = _height(p, o, n) if (n - p[0]) * (n - o[0]) < 0 else _height(q, o, n)
         limit = 0 if math.isnan(limit) else max(min(limit, R), -1)
         limit = math.ceil(limit) if direction > 0 else math.floor(limit)
@@ -241,7 +241,7 @@ def local_gradient(
 
 
 def _one_pixel_moves(image: Tensor, grad: Tensor, eps: float) -> Tensor:
-    """d loss / d coordinate along the rows of each pixel's point, ``[R, R]``."""
+    """d loss / d (coordinate along the rows) of the point seen in each pixel, ``[R, R]``."""
     per_pixel = image.shape[1] / 2
     step = image[:, 1:] - image[:, :-1]
     right, left = step * grad[:, 1:] * per_pixel, -step * grad[:, :-1] * per_pixel  # the image moves by a pixel

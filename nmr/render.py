@@ -1,4 +1,4 @@
-"""Rendering functions: validate, document, call the operators."""
+"""The public rendering functions."""
 
 from __future__ import annotations
 
@@ -42,32 +42,32 @@ def render(
     vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, eps
         As :func:`render_silhouette`.
     outputs : sequence of "rgb", "alpha", "depth", "normals", "fragments"
-        What to draw; the names of the attributes of the result.
+        What to draw. These are also the names of the attributes of the result.
     colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
         For rgb. Without them the meshes are white.
     lights : Lights, optional
-        What colours are multiplied with. Without them colours appear as they are.
+        Colours are multiplied by the light. Without lights they are drawn unchanged.
     background : number, [C], or Tensor [B, C]
-        Colour where there is no face.
+        Colour of pixels without a face.
     smooth_normals : bool
-        For normals: those of the vertices, interpolated, instead of those of the faces.
+        For the output "normals": interpolated normals of the vertices instead of normals of the faces.
     interpolation_gradient : bool
-        Adds, for rgb, the true derivative of interpolated colours by where on the face a pixel lies: a texture that
-        slides under the pixels moves vertices. The published definition does not have it: there colour moves vertices
-        by edges only.
+        For rgb, adds the true derivative of interpolated colours with respect to the position of a pixel on its face,
+        so that vertices also move to shift colours under the pixels. The published renderer does not have this: there
+        colours move vertices only through edges.
 
     Returns
     -------
     Images
         ``images.rgb[b, y, x]`` is the colour [C] of the pixel in row y from the top, mean of 2x2 with anti-aliasing
-        (background mixed in at edges); alpha, depth, normals as of :func:`render_silhouette`, :func:`render_depth` and
+        (background mixed in at edges); alpha, depth, normals as in :func:`render_silhouette`, :func:`render_depth` and
         :func:`render_normals`; fragments at the resolution of the raster (2 S with anti-aliasing).
 
     Notes
     -----
-    Differentiable in vertices and camera: rgb and alpha by NMR's edges (if both are asked for, all their channels
-    decide together which pixels pull, as in the published renderer), depth and normals by their true derivatives at
-    fixed coverage. Differentiable in colours, background and the parameters of lights exactly. No second derivatives.
+    In vertices and camera, rgb and alpha have NMR's edge gradient (if both are outputs, it sums the change of the loss
+    over all their channels, as the published renderer does); depth and normals have their true derivatives at fixed
+    coverage. Colours, background and the parameters of lights have true derivatives. There are no second derivatives.
 
     Raises
     ------
@@ -82,9 +82,9 @@ def render(
     """
     listed = is_list(outputs) and all(name in OUTPUTS for name in outputs)
     if not listed or not outputs or len(set(outputs)) != len(outputs):
-        raise ValueError(f"outputs must be different names out of {OUTPUTS}, at least one, in a tuple; got {outputs!r}")
+        raise ValueError(f"outputs must be a tuple of one or more different names out of {OUTPUTS}, got {outputs!r}")
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, eps)
-    images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the order asked
+    images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the requested order
     if "alpha" in images and "rgb" not in images:
         images["alpha"], owner = scene.silhouette(anti_aliasing, fill_back, near, far, eps)
     else:
@@ -173,57 +173,60 @@ def render_silhouette(
     Parameters
     ----------
     vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        Without a camera in renderer space: x right, y up, both in [-1, 1] across the image, z = depth. With one, in
-        the space that the camera transforms from. One mesh and a camera with B poses give B images. The meshes of
-        a list may have different sizes; they are laid end to end, without padding, and drawn as one by one.
+        With a camera: world coordinates. Without: coordinates in renderer space (x right, y up, both in [-1, 1] across
+        the image, z = depth). One mesh and a camera with B poses give B images. The meshes of a list may have different
+        sizes; they are not padded, and each is drawn as if it were alone.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices; counter-clockwise on the screen is the front.
+        Vertex indices. A face is seen from its front where its vertices run counter-clockwise on the screen.
     camera : Camera, optional
         For example :class:`nmr.LookAt`.
     image_size : int
         S, pixels per side.
     anti_aliasing : bool
-        Raster at 2S x 2S and average 2x2 pixels.
+        Render 2S x 2S pixels and average 2x2 of them.
     fill_back : bool
-        Draw faces from behind, too. Without it only faces that are counter-clockwise on the screen are drawn; a camera
-        that mirrors the world (LookAt, Look, Orthographic) turns the outside of mesh files clockwise.
+        Also draw faces that are seen from behind (clockwise on the screen). LookAt, Look and Orthographic show mesh
+        files mirrored, so that their outsides are clockwise.
     near, far : float
         A pixel is covered only where near < depth < far. Faces are not clipped.
     eps : float
         In NMR's gradient, added to the distance between an edge and a pixel (in units of [-1, 1]). In the local one,
-        directions that lower the loss at rates less than this apart tie. Both are absolute, and as published.
+        the gradient is 0 if the two directions lower the loss at rates that differ by less than eps. Both as published.
     gradient : "nmr" or "local"
-        Which gradient; the images are the same.
+        The definition of the gradient. The images are the same.
 
     Returns
     -------
     Tensor [B, S, S], dtype and device of ``vertices``
-        ``alpha[b, y, x]`` is the covered share (0, 1/4, ... 1 with anti-aliasing) of the pixel in row y from the top.
+        ``alpha[b, y, x]`` is the covered part (0 or 1; with anti-aliasing 0, 1/4, ... 1) of the pixel in row y from the
+        top.
 
     Notes
     -----
-    Differentiable in x and y of ``vertices`` (and through the camera); z in renderer space gets 0. The gradient is
-    defined, not derived (Kato et al. 2018, section 3): every raster line that crosses an edge of a visible face lets
-    each pixel m whose change would lower the loss by D pull the edge's two vertices with D / (travel that brings the
-    edge to m). The values equal those of the published kernels in float32; ``docs/conventions.md`` lists the
-    departures. Results do not depend on the number of threads or on the batch size. There are no second derivatives.
+    Differentiable in x and y of ``vertices`` (and through the camera); z in renderer space gets 0. NMR's gradient is a
+    definition, not the derivative of the image (Kato et al. 2018, section 3). On each raster line that crosses an edge
+    of a visible face, every pixel m whose change would lower the loss by D pulls the two vertices of the edge with
+    D / d, where d is how far the vertex must move until the edge reaches m. The values equal those of the published
+    kernels in float32; ``docs/conventions.md`` lists the differences. Results do not depend on the number of threads or
+    on the batch size. There are no second derivatives.
 
-    The local gradient is that of Kato and Harada 2019 (view prior learning), described anew here. With I the coverage
-    of raster pixels (0 or 1), g the gradient of the loss by it (with anti-aliasing a quarter of that by the image
-    pixel: raster and R = 2S, else R = S), and i, j neighbours, j to the right::
+    The local gradient is that of Kato and Harada 2019 (view prior learning). I is the coverage (0 or 1) of pixels of
+    the raster of R x R pixels (R = 2S with anti-aliasing, else S). g is the gradient of the loss with respect to I
+    (with anti-aliasing a quarter of the gradient of the image pixel). i and j are neighbours, j to the right of i::
 
-        right(i, j) = -(I_i - I_j) g_j R / 2    the rate at which the loss falls if what i shows moves onto j
-        left(i, j)  = -(I_j - I_i) g_i R / 2    ... if what j shows moves onto i
+        right(i, j) = -(I_i - I_j) g_j R / 2    rate at which the loss falls if the content of i moves to j
+        left(i, j)  = -(I_j - I_i) g_i R / 2    rate at which the loss falls if the content of j moves to i
 
-    A covered pixel sums each over its pairs with the left and the right neighbour; a pair within an object (or beyond
-    the border of the image) gives nothing. With ``right`` and ``left`` these sums, d loss / d x of the point seen in
-    the pixel is 0 if neither is positive or they differ by less than ``eps``, -right if right > left, else +left. The
-    corners of the pixel's face receive it in the shares of their weights on the screen at the pixel's centre (clamped
-    to [0, 1], normalised, taken as constant). The same upwards for y. So only pixels at the rim of an object pull, and
-    only by what is wrong at the rim: a target out of a pixel's reach moves nothing.
+    For each covered pixel, ``right`` and ``left`` are summed over its pairs with the left and the right neighbour.
+    Pairs of two covered pixels, and pairs across the border of the image, contribute 0. The derivative of the loss with
+    respect to x of the point seen in the pixel is then -right if right > left, and +left otherwise; it is 0 if neither
+    sum is positive, or if they differ by less than ``eps``. It is distributed to the corners of the pixel's face by
+    their screen-space weights at the pixel's centre (clamped to [0, 1], normalised, treated as constants). y is treated
+    in the same way, upwards. So only pixels at the rim of an object have a gradient, and a target that is farther than
+    one pixel from the rim has no effect.
 
-    No mesh gives a NaN: faces with a non-finite corner draw nothing and get no gradient. (A loss whose own gradient is
-    not finite passes that on.)
+    No mesh gives a NaN: faces with a corner that is not finite draw nothing and get no gradient. (A gradient of the
+    loss that is not finite is passed on.)
 
     Raises
     ------
@@ -260,12 +263,12 @@ def render_depth(
     -------
     Tensor [B, S, S]
         ``depth[b, y, x]`` is z of the nearest face at the pixel in row y from the top, ``far`` where there is none.
-        With anti-aliasing the mean of 2x2, far mixed in at edges, as published; without it z is exact.
+        With anti-aliasing it is the mean of 2x2 pixels, so that edges mix in ``far``, as published; else z is exact.
 
     Notes
     -----
     Differentiable in x, y and z of the vertices (and through the camera): the true derivative of z at each pixel.
-    Coverage is fixed: edges are not moved by depth. No second derivative.
+    Coverage is treated as fixed: depth does not move edges. There is no second derivative.
 
     Raises
     ------
@@ -299,14 +302,14 @@ def render_normals(
     Returns
     -------
     Tensor [B, S, S, 3]
-        ``normals[b, y, x]`` is the unit normal, on the side that is seen (:meth:`Fragments.normals`), at the pixel in
-        row y from the top; of the face, or with ``smooth`` interpolated between those of its vertices. 0 where there is
-        no face. With anti-aliasing the mean of 2x2: shorter than 1 at edges.
+        ``normals[b, y, x]`` is the unit normal of the side that is seen (:meth:`Fragments.normals`) at the pixel in row
+        y from the top: the normal of the face or, with ``smooth``, the interpolated normal of its vertices. 0 where
+        there is no face. With anti-aliasing it is the mean of 2x2 pixels, and shorter than 1 at edges.
 
     Notes
     -----
-    Differentiable in the vertices: the true derivative at fixed coverage. (For edges moved by normals, shade by
-    yourself: ``fragments.resolve(fragments.normals())``.)
+    Differentiable in the vertices: the true derivative at fixed coverage. ``fragments.resolve(fragments.normals())``
+    is the same image with NMR's edge gradient.
 
     Raises
     ------
@@ -336,16 +339,16 @@ def render_fragments(
     far: float = 100.0,
     eps: float = 1e-4,
 ) -> Fragments:
-    """Face, weights and depth at each pixel, to shade by yourself; arguments as of :func:`render_silhouette`.
+    """Face, weights and depth at each pixel, for shading of your own; arguments as in :func:`render_silhouette`.
 
     Returns
     -------
     Fragments
-        At S x S pixels; with ``anti_aliasing`` at the 2S x 2S of the raster, which :meth:`Fragments.resolve` averages.
+        S x S pixels; with ``anti_aliasing`` 2S x 2S pixels, which :meth:`Fragments.resolve` averages.
 
     Notes
     -----
-    weights and depth have true derivatives by the vertices, :meth:`Fragments.resolve` has NMR's.
+    In the vertices, weights and depth have true derivatives; :meth:`Fragments.resolve` has NMR's gradient.
 
     Raises
     ------
@@ -378,8 +381,8 @@ def render_face_index(
     Returns
     -------
     int32 Tensor [B, S, S]
-        ``face_index[b, y, x] = f`` means face f is nearest there (seen from either side); -1 is background. Row 0 =
-        top. Of equally near faces the first wins. Not differentiable.
+        ``face_index[b, y, x] = f`` means face f is nearest there (seen from either side); -1 is background. Row 0 is
+        the top. Of equally near faces the first one is taken. Not differentiable.
 
     Raises
     ------

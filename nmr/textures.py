@@ -1,6 +1,6 @@
-"""Colours of meshes: per vertex, per face, cubes of texels, images with uv coordinates; or your own.
+"""Colours of meshes: per vertex, per face, cubes of texels, images with uv coordinates, or a class of your own.
 
-Whatever has ``sample(fragments) -> [B, R, R, C]`` is a colour: write a class with that method to shade as you like.
+Any object with ``sample(fragments) -> [B, R, R, C]`` can be used as colours: see :class:`Colors`.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ __all__ = ["Colors", "FaceColors", "TextureCubes", "UVTexture", "VertexColors"]
 
 
 class Colors(Protocol):
-    """Anything that colours fragments."""
+    """The interface of colours: write a class with this method for shading of your own."""
 
     def sample(self, fragments: Fragments) -> Tensor:
-        """``[B, R, R, C]`` in the dtype of the vertices; what it says of the background is not used."""
+        """``[B, R, R, C]`` in the dtype of the vertices; values on the background are ignored."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class VertexColors:
-    """A colour per vertex, interpolated over faces in perspective.
+    """A colour per vertex, interpolated over faces with perspective correction.
 
     Parameters
     ----------
@@ -99,8 +99,8 @@ class TextureCubes:
     """A cube of texels per face, as in the Neural Mesh Renderer.
 
     The point with barycentric weights (b0, b1, b2) has the colour at ``(ts - 1) (b0, b1, b2)`` in the cube of its face,
-    interpolated between the eight texels around. Texel [ts - 1, 0, 0] is the colour of the face's first vertex. As
-    published, colour does not move vertices through the weights, not even with ``interpolation_gradient``.
+    interpolated between the eight nearest texels. Texel [ts - 1, 0, 0] is the colour of the face's first vertex. As in
+    the published renderer, colours do not move vertices through the weights, even with ``interpolation_gradient``.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class TextureCubes:
 
 @dataclass(frozen=True, eq=False)
 class UVTexture:
-    """An image wrapped around the mesh by uv coordinates, bilinear.
+    """An image mapped onto the mesh by uv coordinates, with bilinear interpolation.
 
     Parameters
     ----------
@@ -150,12 +150,12 @@ class UVTexture:
         Row 0 is the top; any number of channels. Differentiable.
     uv : float Tensor [T, 2] or [B, T, 2]; for a list of meshes a list of [T_b, 2]
         (0, 0) is the bottom left corner of the image, (1, 1) its top right one; texel centres are at half texels.
-        Differentiable where texels differ. What is not finite or beyond 1e6 counts as 0.
+        Differentiable. Coordinates that are not finite, or larger than 1e6, count as 0.
     uv_faces : integer Tensor [F, 3] or [B, F, 3], or a list; optional
-        Rows of uv at the corners of each face. Without it there is one uv per vertex. A seam is where faces that
-        share a vertex have different rows.
+        Row of uv at each corner of each face. Without it there is one uv per vertex. At a seam, faces that share a
+        vertex have different rows.
     wrap : "repeat", "clamp" or "mirror"
-        What lies beyond the image.
+        How the image continues outside [0, 1].
 
     Raises
     ------
@@ -203,15 +203,15 @@ class UVTexture:
             for dx, share_x in ((0, 1 - right), (1, right)):
                 index = line + _wrapped(column.long() + dx, width, self.wrap)
                 index = torch.where(fragments.covered, index, nothing)
-                # embedding: its backward sums in a fixed order, that of indexing does not.
+                # embedding, not indexing: its backward pass sums in a fixed order.
                 colors = colors + share_y * share_x * F.embedding(index, texels, padding_idx=nothing)
         return colors
 
     def _texels(self, fragments: Fragments) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """All texels ``[., C]`` and a row of zeros; where each image begins, its height and width ``[B | 1, 1, 1]``."""
+        """All texels ``[., C]`` and a row of zeros; first texel, height and width of each image ``[B | 1, 1, 1]``."""
         image, batch = check_values(self.image, "image", "H, W, C"), fragments.mesh.batch
         if len(image) not in (1, batch):
-            raise ValueError(f"image must be one for all or {batch} as the images drawn, got {len(image)}")
+            raise ValueError(f"image must be one for all {batch} images drawn, or one for each, got {len(image)}")
         sizes = torch.tensor([part.shape[:2] for part in image], device=fragments.owner.device)
         height, width = sizes.T.reshape(2, -1, 1, 1)
         first = torch.cumsum(height * width, 0) - height * width
@@ -221,7 +221,7 @@ class UVTexture:
 
 
 def _wrapped(index: Tensor, size: Tensor, wrap: str) -> Tensor:
-    """Texel numbers beyond 0..size - 1 taken back into the image."""
+    """Maps texel indices outside 0..size - 1 back into the image."""
     if wrap == "repeat":
         return index % size
     if wrap == "clamp":

@@ -15,18 +15,19 @@ def voxelize(
 ) -> Tensor:
     """Filled occupancy grids, in one of the two definitions behind the published voxel IoU figures.
 
-    A cell is occupied if it is on the surface, or cannot be reached from the border of the grid through 6-connected
-    cells that are not. A shape that leaves the grid is open, hence hollow. On the surface is, in the definition
+    A cell is occupied if it belongs to the surface, or if it cannot be reached from the border of the grid through
+    6-connected cells that do not. A shape that reaches beyond the grid is open there, and its inside stays empty. The
+    definitions differ in which cells belong to the surface:
 
-    - "kato18" (Kato et al. 2018): a cell in which a ray along an axis through one of its four corner lines (integer
-      coordinates) meets a face, or which holds a vertex;
-    - "kato19" (Kato and Harada 2019): every cell that a face touches, both closed, so that a face in the plane between
-      two cells touches both. By a separating axis test of triangle and cube, in which cells are larger by 1e-9 on each
-      side, lest rounding decide what touches.
+    - "kato18" (Kato et al. 2018): cells that contain a vertex, and cells of which an edge meets a face (tested by rays
+      along the three axes through integer coordinates);
+    - "kato19" (Kato and Harada 2019): every cell that a face touches. A face in the plane between two cells touches
+      both. This is a separating axis test of triangle and cube; cells are enlarged by 1e-9 on each side, so that the
+      result does not depend on rounding.
 
-    Of a mesh within the grid the second contains the first. A surface seldom passes through a cell without crossing one
-    of its edges, so that they differ in few cells, except where faces lie in the planes between cells: there kato18
-    takes the upper side alone, and leaves out a face at coordinate 1.
+    For a mesh within the grid, kato19 contains kato18. The results differ in few cells, because a surface seldom passes
+    through a cell without crossing one of its edges. The exception are faces in the planes between cells: kato18 marks
+    only the cells on the upper side, so it leaves out a face at coordinate 1.
 
     Parameters
     ----------
@@ -40,8 +41,8 @@ def voxelize(
         First fit the batch into the grid: subtract the least coordinate per axis, divide by the largest extent times
         s / (s - 1), and centre each axis. Minimum and extent are those of the whole batch, as published.
     definition : "kato18" or "kato19"
-        Of the surface. In kato19 a face with a corner that is not finite, or farther than 2^20 cells from 0 on an axis,
-        touches nothing (the published code fills the grid for a NaN).
+        Definition of the surface. In kato19 a face touches nothing if a corner is not finite or farther than 2^20 cells
+        from 0 on an axis (the published code fills the whole grid for a NaN).
 
     Returns
     -------
@@ -57,7 +58,7 @@ def voxelize(
     --------
     >>> vertices, faces = nmr.icosphere(3)
     >>> nmr.voxelize(0.4 * vertices + 0.5, faces).float().mean()  # close to 4/3 pi 0.4^3
-    >>> nmr.voxelize(0.4 * vertices + 0.5, faces, definition="kato19").float().mean()  # not less
+    >>> nmr.voxelize(0.4 * vertices + 0.5, faces, definition="kato19").float().mean()  # at least as much
     """
     check_size(size, "size", 512)
     check_choice(definition, "definition", ("kato18", "kato19"))

@@ -1,10 +1,10 @@
-"""Cameras from and to the conventions of OpenCV, OpenGL and PyTorch3D. Differentiable; results are float64.
+"""Converts cameras from and to the conventions of OpenCV, OpenGL and PyTorch3D. Differentiable; results are float64.
 
-Those worlds are right-handed, and a camera that comes from one of them shows the same picture here, not mirrored.
+Worlds of these libraries are right-handed. Their cameras, converted to nmr, show the same picture, not mirrored.
 :class:`nmr.LookAt`, :class:`nmr.Look` and :class:`nmr.Orthographic` treat the world as left-handed, as the published
-renderer does, so that what they see is the mirror image of what a right-handed look-at sees. Converted, they still put
-every vertex on the same pixel, and so their rotation has determinant -1. Where a proper rotation is needed, give the
-other renderer mirrored vertices ``v * (1, 1, -1)`` and ``R @ diag(1, 1, -1)`` (PyTorch3D: ``diag(1, 1, -1) @ R``).
+renderer does: they show the mirror image of what a right-handed look-at camera shows. Converted to another library,
+they put every vertex on the same pixel, so that their rotation has determinant -1. If you need a proper rotation, give
+the other renderer mirrored vertices ``v * (1, 1, -1)`` and ``R @ diag(1, 1, -1)`` (PyTorch3D: ``diag(1, 1, -1) @ R``).
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def from_opencv(
     Raises
     ------
     TypeError, ValueError
-        For what are not numbers, other shapes, also those of OpenCV's longer distortion models.
+        For values that are not numbers, and wrong shapes, including those of OpenCV's longer distortion models.
     """
     height, width = height_and_width((height, width), "height and width")
     K = batched(as_parameter(K, "K", 3, 3), torch.float64, 3, 3)
@@ -144,7 +144,7 @@ def from_opengl(view: Numbers, projection: Numbers) -> Projection:
     Raises
     ------
     TypeError, ValueError
-        For what are not numbers, other shapes, or matrices that no camera of this form has.
+        For values that are not numbers, wrong shapes, or matrices of another form.
     """
     view = batched(as_parameter(view, "view", 4, 4), torch.float64, 4, 4)
     clip = batched(as_parameter(projection, "projection", 4, 4), torch.float64, 4, 4)
@@ -157,7 +157,7 @@ def from_opengl(view: Numbers, projection: Numbers) -> Projection:
     offset, shear = (clip[:, :2, 3], clip[:, :2, 2]) if perspective else (clip[:, :2, 2], clip[:, :2, 3])
     if offset.any():
         column = 3 if perspective else 2
-        raise ValueError(f"projection[0:2, {column}] must be 0: x and y of the image would depend on z in a second way")
+        raise ValueError(f"projection[0:2, {column}] must be 0: nmr's cameras have no such term")
     third = -shear if perspective else shear
     intrinsics = torch.stack([clip[:, :2, 0], -clip[:, :2, 1], third], dim=-1)
     return Projection(_OPENGL_AXES * view[:, :3], intrinsics, perspective=perspective)
@@ -232,7 +232,7 @@ def from_pytorch3d(
     Raises
     ------
     TypeError, ValueError
-        For what are not numbers, other shapes, or a missing or impossible image_size.
+        For values that are not numbers, wrong shapes, or a missing or impossible image_size.
     """
     R, T = (
         batched(as_parameter(R, "R", 3, 3), torch.float64, 3, 3),
@@ -246,7 +246,7 @@ def from_pytorch3d(
     if not in_ndc:
         focal, centre = focal * (2 / shorter), -(centre - size / 2) * (2 / shorter)
     focal, centre = focal * (shorter / size), centre * (shorter / size)
-    # x = -x_ndc here; X of the camera axes is turned likewise, so that only the principal point shows it.
+    # x = -x_ndc, and X of the camera axes changes its sign, too: the signs cancel but in the principal point.
     intrinsics = torch.stack([_row(focal[:, 0], 0, -centre[:, 0]), _row(0, -focal[:, 1], centre[:, 1])], dim=1)
     return Projection(_PYTORCH3D_AXES * matrix, intrinsics, perspective=not orthographic)
 
@@ -282,7 +282,7 @@ def to_pytorch3d(
     Raises
     ------
     TypeError, ValueError
-        For what is not a camera of nmr, a camera with distortion or skew, or a missing or impossible image_size.
+        For anything but a camera of nmr, a camera with distortion or skew, or a missing or impossible image_size.
     """
     camera = _without_distortion(camera, "PyTorch3D")
     height, width = _image_size(image_size, in_ndc)

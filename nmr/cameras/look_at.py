@@ -1,4 +1,4 @@
-"""Cameras given by where they are and where they look: LookAt, Look, Orthographic."""
+"""Cameras given by a position and a direction: LookAt, Look, Orthographic."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ Scalars = float | Sequence[float] | Tensor
 
 # Camera axes have y down, renderer space has y up.
 _Y_UP = torch.tensor([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]])
-_NARROWEST_DEG = 1e-9  # there float still holds what is divided by the tangent
+_NARROWEST_DEG = 1e-9  # float32 can still represent 1 / tan of this angle
 
 
 def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: Scalars) -> Tensor:
     """Points on a sphere around the origin: ``(d cos e sin a, d sin e, -d cos e cos a)``, ``[3]`` or ``[B, 3]``.
 
-    Numbers, sequences and tensors of one length broadcast; other lengths raise a ValueError, and what are not numbers a
-    TypeError. At azimuth 0 and
-    elevation 0 the point is ``(0, 0, -d)``.
+    Single numbers and sequences or tensors of one length broadcast; different lengths raise a ValueError, values that
+    are not numbers a TypeError. At azimuth 0 and elevation 0 the point is ``(0, 0, -d)``.
     """
     d, e, a = (
         x if x.is_floating_point() else x.double()
@@ -47,7 +46,7 @@ def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: S
 def _scalar(value: Scalars, name: str, low: float, high: float, wanted: str) -> float | Tensor:
     """A number, or a float tensor [] or [B], strictly between low and high."""
     if isinstance(value, (int, float)):
-        inside = low < value < high  # torch.compile reads no tensors
+        inside = low < value < high  # no tensor: torch.compile could not read its value
     else:
         value = as_parameter(value, name)
         inside = ((low < value) & (value < high)).all()
@@ -95,13 +94,13 @@ class LookAt(ProjectingCamera):
     """A perspective camera at ``eye`` that looks at ``at``.
 
     A vertex v maps to ``u = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at - eye)``, then to
-    ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``; n(v) = v / max(abs(v), 1e-5), so that an eye on the up axis is
-    degenerate (x = y = 0) and no error. The world is left-handed (x right, y up, z away), as the published renderer's.
+    ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``; n(v) = v / max(abs(v), 1e-5). An eye straight above or below ``at``
+    gives x = y = 0, not an error. The world is left-handed (x right, y up, z away), as in the published renderer.
 
     Parameters
     ----------
     eye, at, up : [3] or [B, 3], tensors or sequences, world units
-        A pose that is not finite, or farther away than 1e15, sees nothing.
+        A camera whose pose is not finite, or farther away than 1e15, sees nothing.
     half_fov_deg : float, or Tensor [] or [B]
         a: half of the field of view, in degrees, horizontal = vertical (the published ``viewing_angle``).
 
@@ -110,7 +109,7 @@ class LookAt(ProjectingCamera):
     Raises
     ------
     TypeError, ValueError
-        For what are not numbers, a shape other than those, batch sizes that differ, or half_fov_deg outside (0, 90).
+        For values that are not numbers, wrong shapes, different batch sizes, or half_fov_deg outside (0, 90).
 
     Examples
     --------
@@ -178,7 +177,7 @@ class Orthographic(ProjectingCamera):
     Raises
     ------
     TypeError, ValueError
-        For what are not numbers, a wrong shape, batch sizes that differ, or a scale that is not positive and finite.
+        For values that are not numbers, wrong shapes, different batch sizes, or a scale not positive and finite.
 
     Examples
     --------

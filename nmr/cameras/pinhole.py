@@ -29,16 +29,16 @@ class Pinhole(ProjectingCamera):
     R : [3, 3] or [B, 3, 3]
     t : [3], [B, 3] or [B, 1, 3]
     dist_coeffs : [5] or [B, 5], optional
-        k1, k2, p1, p2, k3. The r^2 of the polynomial is computed without a root: the gradient is finite on the axis.
-    orig_size : number or (height, width), by name
-        The image that K belongs to. It is mapped onto the whole rendered square, stretched if it is not one.
+        k1, k2, p1, p2, k3. The gradient is finite also on the optical axis.
+    orig_size : number or (height, width), keyword only
+        The image that K belongs to. It is mapped onto the whole rendered square, and stretched if it is not square.
 
     All but orig_size are tensors or sequences, and differentiable if tensors.
 
     Raises
     ------
     TypeError, ValueError
-        For what are not numbers, other shapes, batch sizes that differ, or an orig_size that is not positive.
+        For values that are not numbers, wrong shapes, different batch sizes, or an orig_size that is not positive.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What every camera comes down to: a rigid (or any affine) motion, a perspective division, and the way to the image."""
+"""The general camera: an affine motion, a perspective division, and the map to the image."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Numbers = float | Sequence | np.ndarray | Tensor
 
 @runtime_checkable
 class Camera(Protocol):
-    """Anything that takes vertices into renderer space, differentiably.
+    """The interface of cameras: any object that takes vertices to renderer space, differentiably.
 
-    A camera of your own that has only ``transform(vertices)`` serves for batches ``[B, V, 3]``; packed batches need
-    ``starts``, too.
+    For batches ``[B, V, 3]``, a camera of your own needs only ``transform(vertices)``. For lists of meshes of different
+    sizes, ``transform`` must also take ``starts``.
     """
 
     def transform(self, vertices: Tensor, starts: Tensor | None = None) -> Tensor:
@@ -33,7 +33,7 @@ class Camera(Protocol):
 
 
 class ProjectingCamera:
-    """A camera that is defined by its :meth:`projection`; it brings :meth:`transform`."""
+    """Base class of cameras that define :meth:`projection`; it provides :meth:`transform`."""
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         """The camera in its general form, computed in ``dtype`` in host memory; differentiable in its parameters."""
@@ -58,7 +58,7 @@ class ProjectingCamera:
         Notes
         -----
         Differentiable in the vertices and in the camera's parameters; there are no second derivatives. Results do not
-        depend on the number of threads or on the batch. Nothing becomes NaN that was not NaN in the upstream gradient.
+        depend on the number of threads or on the batch. Gradients are NaN only where the upstream gradient is NaN.
 
         Raises
         ------
@@ -80,7 +80,7 @@ class ProjectingCamera:
 
 @dataclass(frozen=True, eq=False)
 class Projection(ProjectingCamera):
-    """The general camera, which all others come down to.
+    """The general camera; every other camera is computed as one of these.
 
     ``u = A (v - origin) + t``; ``p = (u_x, u_y) / u_z``, distorted; ``(x, y) = intrinsics (p / extent, 1)``; the depth
     is ``u_z``. The camera axes are OpenCV's: x right, y down, z away from the viewer. A batch of 1 serves every image;
@@ -91,14 +91,14 @@ class Projection(ProjectingCamera):
     matrix : Tensor [B, 3, 4]
         ``[A | t]``, world to camera axes.
     intrinsics : Tensor [B, 2, 3]
-        From p to renderer space, so that its second row usually turns y up.
+        Maps p to renderer space. Its second row usually changes the sign of y, which is up there.
     distortion : Tensor [B, 5], optional
         OpenCV's k1, k2, p1, p2, k3. Not used without perspective.
     perspective : bool
         False: ``p = (u_x, u_y)``.
     origin : Tensor [B, 3], optional
-        Where the camera is; 0 by default. It could be part of t, and ``extent`` of the intrinsics: they stand apart so
-        that a look-at camera subtracts and divides, and rounds, as the published one does.
+        Position of the camera; 0 by default. It could be part of t, and ``extent`` part of the intrinsics. They are
+        separate so that look-at cameras round as the published ones do.
     extent : Tensor [B], optional
         Half the width of the image at depth 1; 1 by default.
 
@@ -186,12 +186,12 @@ def as_parameter(value: Numbers, name: str, *shape: int) -> Tensor:
 
 
 def batched(tensor: Tensor, dtype: torch.dtype, *shape: int) -> Tensor:
-    """A parameter as ``[B, *shape]`` in host memory, where the few numbers of a camera are dealt with."""
+    """A parameter as ``[B, *shape]`` in host memory, where cameras are computed."""
     return tensor.to("cpu", dtype).reshape(-1, *shape)
 
 
 def height_and_width(value: object, name: str) -> tuple[float, float]:
-    """(height, width) of an image, given so or by one number for both."""
+    """(height, width) of an image, from a pair or from one number for both."""
     pair = value.tolist() if isinstance(value, (Tensor, np.ndarray)) else value
     pair = pair if isinstance(pair, (tuple, list)) else (pair, pair)
     try:

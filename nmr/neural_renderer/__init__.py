@@ -1,7 +1,7 @@
 """The interface of neural_renderer_pytorch 1.1.3, on the CPU: ``import nmr.neural_renderer as nr``.
 
-Names, arguments, their order and defaults are those published; the images and gradients, too, but for defects that are
-put right (``docs/from-neural-renderer.md`` lists them). Everything is drawn by the operators of :mod:`nmr`. Images are
+Names, arguments, their order and defaults are the published ones. So are images and gradients, except for defects that
+are corrected here (``docs/from-neural-renderer.md`` lists them). The operators of :mod:`nmr` do the work. Images are
 ``[B, 3, S, S]`` and ``[B, S, S]`` with row 0 at the top; vertices ``[B, V, 3]``, faces ``[B, F, 3]``, textures
 ``[B, F, ts, ts, ts, 3]``.
 """
@@ -38,6 +38,6 @@ __all__ = [
     "vertices_to_faces",
 ]
 
-# Of the interface; scripts ask for it.
+# The version of the interface; some scripts check it.
 __version__ = "1.1.3"
 name = "neural_renderer_pytorch"

@@ -1,4 +1,4 @@
-"""What scripts pass as points, colours, sizes and faces, as tensors and numbers."""
+"""Converts what scripts pass as points, colours, sizes and faces to tensors and numbers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Numbers = float | Sequence | np.ndarray | Tensor
 
 
 def like(value: object, name: str, reference: Tensor) -> Tensor:
-    """A number, list, tuple, array or tensor with the dtype and device of ``reference``; tensors keep their graph."""
+    """A number, list, tuple, array or tensor with the dtype and device of ``reference``; gradients reach tensors."""
     value = value if isinstance(value, Tensor) else as_floats(value, name, "numbers in a list, tuple, array or tensor")
     return value.to(device=reference.device, dtype=reference.dtype)
 
@@ -30,7 +30,7 @@ def check_batch(vertices: object) -> Tensor:
 def integer_faces(faces: object, batch: int) -> Tensor:
     """``faces`` as int64 ``[B, F, 3]``, or as ``[F, 3]`` if all meshes share them.
 
-    Whole numbers in a float tensor or in an array are taken, too.
+    Whole numbers in a float tensor or in an array are accepted, too.
     """
     if isinstance(faces, np.ndarray):
         faces = torch.from_numpy(faces)

@@ -7,23 +7,23 @@ import os
 import numpy as np
 
 _PILLOW = (
-    "images of textures are read and written by Pillow, which is not installed; run `pip install pillow`, or install "
+    "reading and writing texture images needs Pillow, which is not installed; run `pip install pillow`, or install "
     "nmr-learn3d[data]"
 )
 
 
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "TGA", "WEBP", "GIF", "PPM")
-_MOST_PIXELS = 2**26  # 8192 x 8192; each takes some 30 bytes
+_MOST_PIXELS = 2**26  # 8192 x 8192; reading takes about 30 bytes per pixel
 
 
 def read_image(filename: str) -> np.ndarray:
-    """Colours ``[H, W, 3]`` float32 in [0, 1], row 0 = top: grey becomes RGB, alpha is left out, 16 bits stay."""
+    """Colours ``[H, W, 3]`` float32 in [0, 1], row 0 = top: grey becomes RGB, alpha is dropped, 16 bits are kept."""
     try:
         from PIL import Image
     except ImportError as error:
         raise ImportError(_PILLOW) from error
     if os.path.exists(filename) and not os.path.isfile(filename):
-        raise ValueError(f"the image {filename} is no plain file")
+        raise ValueError(f"the image {filename} is not a regular file")
     try:
         with Image.open(filename, formats=_FORMATS) as image:
             if image.width * image.height > _MOST_PIXELS:
@@ -34,7 +34,7 @@ def read_image(filename: str) -> np.ndarray:
             return np.asarray(image.convert("RGB"), dtype=np.float32) / 255
     except FileNotFoundError:
         raise
-    except Exception as error:  # Pillow's decoders raise whatever a damaged file leads them to
+    except Exception as error:  # Pillow raises errors of many types for damaged files
         raise ValueError(f"the image {filename} cannot be read: {error}") from error
 
 

@@ -16,8 +16,8 @@ def get_points_from_angles(
 ) -> tuple[float, float, float] | Tensor:
     """Points ``(d cos e sin a, d sin e, -d cos e cos a)``: see :func:`nmr.cameras.points_from_angles`.
 
-    Three numbers give a tuple of three floats; where tensors, lists or arrays of B are among them the result is a
-    tensor ``[B, 3]``, which carries the gradients of the tensors. ``degrees=False`` takes the angles in radians.
+    Three numbers give a tuple of three floats. If any argument is a tensor, list or array, the result is a tensor
+    ``[B, 3]``, and gradients reach the tensors. ``degrees=False`` takes the angles in radians.
 
     >>> renderer.eye = nr.get_points_from_angles(2.732, 30, 45)
     """

@@ -19,7 +19,7 @@ def face_light(
 ) -> Tensor:
     """Light ``[B, F, 3]`` on faces with corners ``[B, F, 3, 3]``: ``ia ca + id cd max(0, n . direction)``.
 
-    ``n = (v0 - v1) x (v2 - v1)``, scaled to length 1; a face without area gets the ambient light alone.
+    ``n = (v0 - v1) x (v2 - v1)``, scaled to length 1; a face without area gets only the ambient light.
     """
     ambient, directional, direction = (
         _per_image(value, name, faces)
@@ -57,7 +57,7 @@ def lighting(
     color_directional: Numbers = (1, 1, 1),
     direction: Numbers = (0, 1, 0),
 ) -> Tensor:
-    """Textures under ambient and directional light; the argument ``textures`` itself stays as it is.
+    """Textures under ambient and directional light; the argument ``textures`` is not changed.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def lighting(
     color_ambient, color_directional : [3] or [B, 3]
         ca, cd: lists, tuples, arrays or tensors.
     direction : [3] or [B, 3]
-        Towards the light, used as it comes: it is not scaled to length 1.
+        Towards the light. It is not normalised: a longer vector gives more light.
 
     Returns
     -------

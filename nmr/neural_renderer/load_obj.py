@@ -12,7 +12,7 @@ from torch import Tensor
 from ._images import read_image
 
 WRAPPINGS = ("REPEAT", "MIRRORED_REPEAT", "CLAMP_TO_EDGE", "CLAMP_TO_BORDER")
-_GREY = 0.5  # of faces without a material
+_GREY = 0.5  # colour of faces without a material
 _LARGEST = float(np.finfo(np.float32).max)
 _MOST_BYTES = 2**30  # of an .obj or .mtl file; reading one takes some 30 times its size
 
@@ -47,7 +47,7 @@ def load_obj(
     texture_size : int
         ts, texels along each axis of a texture cube.
     load_texture : bool
-        Read the materials (``Kd``, ``map_Kd``) and the images, too. Needs Pillow where there are images.
+        Also read the materials (``Kd``, ``map_Kd``) and their images. Images need Pillow.
     texture_wrapping : {"REPEAT", "MIRRORED_REPEAT", "CLAMP_TO_EDGE", "CLAMP_TO_BORDER"}
         What texture coordinates outside [0, 1] mean: see :func:`bake_textures`.
     use_bilinear : bool
@@ -84,8 +84,8 @@ def load_obj(
         vertices = vertices - vertices.amax(0) / 2
     if not vertices.isfinite().all():
         raise ValueError(
-            f"{filename_obj}: its vertices have no box that could be scaled, or are not finite; normalization=False "
-            "leaves them as they are, if they are finite numbers of float32"
+            f"{filename_obj}: the vertices must be finite in float32 and, to be normalised, not all at one point; "
+            "normalization=False keeps finite vertices unchanged"
         )
     if not load_texture:
         return vertices, faces
@@ -124,9 +124,9 @@ def _read_obj(filename: str) -> _Obj:
 
 
 def _check_file(filename: str) -> None:
-    """Refuse a pipe, which would be waited for, and what is too large; that it is missing, `open` tells."""
+    """Refuses pipes (reading one would wait) and files that are too large. `open` reports a missing file."""
     if os.path.exists(filename) and not os.path.isfile(filename):
-        raise ValueError(f"{filename} is no plain file")
+        raise ValueError(f"{filename} is not a regular file")
     if os.path.exists(filename) and os.path.getsize(filename) > _MOST_BYTES:
         raise ValueError(f"{filename} has {os.path.getsize(filename)} bytes; at most {_MOST_BYTES} are read")
 
@@ -152,7 +152,7 @@ def _add_polygon(obj: _Obj, corners: list[str], material: str) -> None:
 
 
 def _index(text: str, count: int) -> int:
-    """From 1 for the first; negative numbers count back from the last one read."""
+    """Index from 0. In the file 1 is the first element, and negative numbers count back from the last one read."""
     index = int(text)
     if index == 0 or index < -count:
         raise ValueError(f"there is no element {index}")
@@ -203,7 +203,7 @@ def _textures(filename_obj: str, obj: _Obj, texture_size: int, wrapping: str, bi
         chosen = np.array(faces)[(uv_faces[faces] >= 0).all(1)]
         if name in images and len(chosen):
             path = os.path.join(folder, images[name])
-            if not os.path.exists(path):  # map_Kd may have options before the name
+            if not os.path.exists(path):  # map_Kd may have options before the file name
                 path = os.path.join(folder, (images[name].split() or [""])[-1])
             uv = np.array(obj.uv, dtype=np.float32)[uv_faces[chosen]]
             textures[chosen] = bake_textures(read_image(path), uv, texture_size, wrapping, bilinear)
@@ -242,7 +242,7 @@ def _wrap(uv: np.ndarray, wrapping: str) -> np.ndarray:
         return uv.clip(0, 1)
     if wrapping == "MIRRORED_REPEAT":
         return 1 - np.abs(np.mod(uv, 2) - 1)
-    # The copy of the image that holds the whole face, if one does; else each corner by itself.
+    # If one copy of the image holds the whole face, use that copy; else wrap each corner by itself.
     low, high = uv.min(1, keepdims=True), uv.max(1, keepdims=True)
     copy = np.minimum(np.floor(low), np.maximum(np.ceil(high) - 1, 0))
     return np.where(high <= copy + 1, uv - copy, np.mod(uv, 1))

@@ -12,8 +12,8 @@ from ._convert import Numbers, check_batch
 def look(vertices: Tensor, eye: Numbers, direction: Numbers = (0, 1, 0), up: Numbers | None = None) -> Tensor:
     """Vertices in the axes of a camera at ``eye`` that looks along ``direction``: x right, y up, z forward.
 
-    As :func:`look_at`, with ``z = n(direction)``. ``up`` is (0, 1, 0) unless given; the default direction, which is
-    published so, is then degenerate: give another one.
+    As :func:`look_at`, with ``z = n(direction)``. ``up`` is (0, 1, 0) unless given. The default direction is the
+    published one; it equals ``up`` and gives x = y = 0, so pass another direction.
 
     >>> nr.perspective(nr.look(vertices, [0, 0, -3], [0, 0, 1]))
     """

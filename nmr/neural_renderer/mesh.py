@@ -12,7 +12,7 @@ from .load_obj import load_obj
 class Mesh:
     """Vertices ``[V, 3]``, faces ``[F, 3]`` and textures ``[F, ts, ts, ts, 3]`` of one mesh.
 
-    Without textures it makes a Parameter of small random numbers, as the start of an optimization.
+    Without textures, a Parameter of small random numbers is made, to start an optimization from.
     """
 
     def __init__(self, vertices: Tensor, faces: Tensor, textures: Tensor | None = None, texture_size: int = 4) -> None:

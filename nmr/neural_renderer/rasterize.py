@@ -39,8 +39,8 @@ class _Cubes:
             return colors
         if self.light.shape[0] not in (1, batch):
             raise ValueError(f"light for {self.light.shape[0]} images, but {batch} are drawn; give [3] or [{batch}, 3]")
-        # A face seen from behind has a number and a light of its own: to this operator it is one face more, all of
-        # whose corners have the same value.
+        # Faces seen from behind have numbers and lights of their own. For this operator they are further faces; the
+        # three corners of a face have the same value.
         corners = torch.arange(self.light.shape[1], device=owner.device)[:, None].expand(-1, 3)
         return colors * ops.interpolate(self.light, corners, owner, weights, None)
 
@@ -60,7 +60,7 @@ def draw(
     fill_back: bool = False,
     light: Tensor | None = None,
 ) -> dict[str, Tensor | None]:
-    """The wanted ``outputs`` of "rgb", "alpha", "depth" of meshes in renderer space; the others are None."""
+    """Draws ``outputs`` out of "rgb", "alpha", "depth" of meshes in renderer space; the others are None."""
     if isinstance(image_size, (np.generic, Tensor)) and image_size.ndim == 0:
         image_size = image_size.item()
     images = render(
@@ -83,7 +83,7 @@ def draw(
 
 
 def _soup(faces: object) -> tuple[Tensor, Tensor]:
-    """Corners ``[B, F, 3, 3]`` as vertices ``[B, 3F, 3]`` and the faces that refer to them."""
+    """Corners ``[B, F, 3, 3]`` as vertices ``[B, 3F, 3]`` and faces."""
     if not isinstance(faces, Tensor) or faces.ndim != 4 or faces.shape[2:] != (3, 3):
         raise ValueError(f"faces must be corners [B, F, 3, 3] (see vertices_to_faces), got {describe(faces)}")
     if faces.dtype not in (torch.float32, torch.float64):
@@ -120,7 +120,7 @@ def rasterize_rgbad(
     near, far : float
         A pixel is covered only where near < depth < far; depth is ``far`` elsewhere.
     eps : float
-        Added to distances in the gradient, and kept from the last texel.
+        Added to distances in the gradient; texture coordinates are clamped to at most ts - 1 - eps.
     background_color : [3] or [B, 3]
         List, tuple, array or tensor.
     return_rgb, return_alpha, return_depth : bool
@@ -132,8 +132,8 @@ def rasterize_rgbad(
 
     Notes
     -----
-    rgb and alpha move x and y of the corners by NMR's sweeps, over the returned channels together; depth moves x, y and
-    z by its derivative where a face is; textures (and a background that is a tensor) have true derivatives.
+    rgb and alpha have NMR's gradient in x and y of the corners, summed over the returned channels. depth has its true
+    derivative in x, y and z at fixed coverage. Textures (and a background that is a tensor) have true derivatives.
 
     Raises
     ------

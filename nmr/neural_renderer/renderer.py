@@ -20,7 +20,7 @@ _MODES = ("projection", "look_at", "look", "none")
 
 
 class Renderer(torch.nn.Module):
-    """Draws meshes with the settings that are its attributes; all of them may be changed at any time.
+    """Draws meshes. All settings are attributes and may be changed at any time.
 
     Parameters
     ----------
@@ -29,15 +29,15 @@ class Renderer(torch.nn.Module):
     anti_aliasing : bool
         Average 2x2 pixels of a raster of 2S x 2S.
     background_color : [3] or [B, 3]
-        Of RGB images. Colours, like everything below that is not one number, are lists, tuples, arrays or tensors;
-        gradients reach tensors.
+        Background of RGB images. Colours and vectors, here and below, are lists, tuples, arrays or tensors; gradients
+        reach tensors.
     fill_back : bool
-        Draw faces from behind, too.
+        Also draw faces that are seen from behind.
     camera_mode : {"projection", "look_at", "look", "none"}
-        Which of the functions of that name takes vertices to the screen. "none" (also "None", None): vertices are in
-        renderer space already. "projection" without any of K, R, t is "look_at", which was the Chainer default.
+        The function of that name takes vertices to renderer space. "none" (also "None", None): vertices are already
+        in renderer space. "projection" without K, R and t means "look_at", as in the Chainer version.
     K, R, t, dist_coeffs, orig_size
-        Camera of "projection": see :func:`projection`. The methods may be given others.
+        Camera of "projection": see :func:`projection`. The methods take others for one call.
     perspective : bool
         With "look_at" and "look": divide by the depth.
     viewing_angle : float
@@ -54,9 +54,9 @@ class Renderer(torch.nn.Module):
     Attributes
     ----------
     eye : [3] or [B, 3]
-        Position of the camera of "look_at" and "look"; (0, 0, -(1 / tan(viewing_angle) + 1)) at first.
+        Position of the camera of "look_at" and "look"; (0, 0, -(1 / tan(viewing_angle) + 1)) by default.
     rasterizer_eps : float
-        1e-3 at first.
+        1e-3 by default.
 
     Examples
     --------
@@ -114,14 +114,14 @@ class Renderer(torch.nn.Module):
         self.rasterizer_eps = 1e-3
 
     def __setattr__(self, name: str, value: object) -> None:
-        # An eye (or a matrix) that was a Parameter may become a list: torch would insist on a Parameter.
+        # An attribute that was a Parameter may be set to a list; torch itself would require a Parameter.
         self.__dict__.get("_parameters", {}).pop(name, None)
         super().__setattr__(name, value)
 
     def forward(
         self, vertices, faces, textures=None, mode=None, K=None, R=None, t=None, dist_coeffs=None, orig_size=None
     ):
-        """:meth:`render` for ``mode=None``, else :meth:`render_rgb`, "silhouettes" or "depth": see there."""
+        """:meth:`render` for ``mode=None``, else the method that ``mode`` names: "rgb", "silhouettes" or "depth"."""
         camera = (K, R, t, dist_coeffs, orig_size)
         if mode is None:
             return self.render(vertices, faces, textures, *camera)

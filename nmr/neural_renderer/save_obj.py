@@ -45,7 +45,7 @@ def create_texture_image(textures: Tensor, texture_size_out: int = 16) -> tuple[
     texels = _blend(textures.detach().cpu().float().numpy(), weights.reshape(-1, 3))
     tiles = np.zeros((rows * columns, size, size, 3), dtype=np.float32)
     tiles[:num_faces] = texels.reshape(num_faces, size, size, 3)
-    # Below the diagonal is the next column's rim: it repeats the triangle's, so that blending does not bleed.
+    # The pixels next to the diagonal repeat it, so that interpolation at this edge mixes in no other colour.
     rim = np.arange(size - 1)
     tiles[:, rim, rim + 1] = tiles[:, rim, rim]
     image = tiles.reshape(rows, columns, size, size, 3).swapaxes(1, 2).reshape(rows * size, columns * size, 3)
@@ -82,7 +82,7 @@ def _one_mesh(textures: Tensor) -> Tensor:
 
 
 def save_obj(filename: str | os.PathLike, vertices: Tensor, faces: Tensor, textures: Tensor | None = None) -> None:
-    """Write a mesh; with textures also ``name.mtl`` and the image ``name.png`` beside ``name.obj``.
+    """Writes a mesh; with textures also ``name.mtl`` and the image ``name.png``, in the folder of ``name.obj``.
 
     Parameters
     ----------

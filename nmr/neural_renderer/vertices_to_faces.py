@@ -12,7 +12,7 @@ def vertices_to_faces(vertices: Tensor, faces: Tensor) -> Tensor:
     """Corners ``[B, F, 3, 3]``: ``corners[b, f, k] = vertices[b, faces[b, f, k]]``.
 
     ``vertices [B, V, 3]``; ``faces [B, F, 3]`` (or ``[1, F, 3]``, ``[F, 3]`` for all meshes), whole numbers of any
-    type. Differentiable in ``vertices``. :class:`Renderer` does not need it: the kernels read vertices and faces.
+    type. Differentiable in ``vertices``. :class:`Renderer` does not use this: the kernels read vertices and faces.
 
     Raises
     ------
@@ -29,5 +29,5 @@ def vertices_to_faces(vertices: Tensor, faces: Tensor) -> Tensor:
         )
     batch = faces.shape[0] if faces.ndim == 3 else vertices.shape[0]
     first = vertices.shape[1] * torch.arange(batch, device=faces.device)
-    # embedding: its backward sums in a fixed order, that of indexing does not.
+    # embedding, not indexing: its backward pass sums in a fixed order.
     return torch.nn.functional.embedding(faces + first[:, None, None], vertices.expand(batch, -1, -1).flatten(0, 1))

@@ -1,7 +1,7 @@
 """The torch operators behind the public functions: forward, fake, set-up and backward of each stand together.
 
-The kernels take NumPy views of the tensors (zero-copy on the CPU). Tensors of other devices are staged through the
-host and the results go back to the device. Arguments are trusted here; the public functions validate.
+The kernels take NumPy views of the tensors (zero-copy on the CPU). Tensors on other devices are copied to the CPU, and
+the results are copied back. Arguments are not checked here, but in the public functions.
 
 A batch of meshes is ``vertices [B, V, 3]`` with ``faces [F, 3]`` or ``[B, F, 3]`` and ``starts=None``, or packed:
 ``vertices [N, 3]``, ``faces [M, 3]`` (vertex numbers count from the mesh's own first vertex) and ``starts`` int64

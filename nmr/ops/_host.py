@@ -1,4 +1,4 @@
-"""What every operator shares: NumPy views of tensors, batch sizes, and the error for second derivatives."""
+"""Shared by all operators: NumPy views of tensors, batch sizes, and the error for second derivatives."""
 
 import torch
 from torch import Tensor
@@ -7,8 +7,8 @@ try:
     from .. import _C
 except ImportError as error:
     raise ImportError(
-        "the compiled part of nmr is missing: this is the source folder, or the installation failed; "
-        "run `pip install .` in the repository and start Python elsewhere, or use `pip install -e .`"
+        "the compiled part of nmr is missing: Python imports the source folder, or the installation failed; "
+        "run `pip install .` in the repository and start Python in another folder, or use `pip install -e .`"
     ) from error
 
 __all__ = ["_C", "batch_size", "host_array", "no_second_derivative", "num_threads"]
@@ -29,11 +29,11 @@ def batch_size(vertices: Tensor, starts) -> int:
 
 
 def no_second_derivative(name: str):
-    """A backward for operators that are gradients themselves: raises a RuntimeError that names the public function."""
+    """Backward pass of operators that compute gradients: a RuntimeError that names the public function."""
 
     def backward(ctx, *grads):
         raise RuntimeError(
-            f"{name} has no second derivative: its gradient is computed by a kernel that is not differentiable itself; "
+            f"{name} has no second derivative: its gradient is computed by a kernel that is not differentiable; "
             "call backward() without create_graph=True"
         )
 

@@ -29,7 +29,7 @@ def resolve(
 ) -> Tensor:
     """The image ``[B, S, S, C]`` of raster pixels ``[B, R, R, C]``: the mean of 2x2 with anti-aliasing, else a copy.
 
-    Its gradient in ``image`` is the mean's; that in x and y of ``vertices`` is NMR's, of all C channels together.
+    The gradient in ``image`` is that of the mean. That in x and y of ``vertices`` is NMR's, summed over channels.
     """
     resolved = torch.empty(_image_shape(image, anti_aliasing), dtype=image.dtype)
     _C.resolve_forward(host_array(image), resolved.numpy(), anti_aliasing, num_threads())

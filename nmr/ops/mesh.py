@@ -62,7 +62,7 @@ smoothness_backward.register_autograd(no_second_derivative("smoothness_loss"))
 def voxels(vertices: Tensor, faces: Tensor, size: int, touched: bool = False) -> Tensor:
     """Filled occupancy grids ``[B, s, s, s]`` (bool) of meshes in [0, 1]^3; not differentiable.
 
-    The surface is that of kato18, or, if ``touched``, of kato19: every cell that a face touches.
+    The surface is defined by kato18 or, if ``touched``, by kato19 (every cell that a face touches).
     """
     grid = torch.empty((vertices.shape[0], size, size, size), dtype=torch.bool)
     _C.voxelize(host_array(vertices), host_array(faces), grid.numpy(), size, touched, num_threads())

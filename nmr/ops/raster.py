@@ -56,7 +56,7 @@ def silhouette(
 ) -> tuple[Tensor, Tensor]:
     """Silhouettes ``alpha [B, S, S]`` and the owner map ``[B, R, R]`` of meshes in renderer space.
 
-    The gradient is :func:`silhouette_backward`, or if ``local`` :func:`local_gradient`.
+    Its gradient is :func:`silhouette_backward` or, if ``local``, :func:`local_gradient`.
     """
     raster_size = image_size * (2 if anti_aliasing else 1)
     owner = _owner_map(vertices, faces, starts, raster_size, fill_back, near, far)
@@ -131,7 +131,7 @@ def local_gradient(
     anti_aliasing: bool,
     eps: float,
 ) -> Tensor:
-    """Kato and Harada's silhouette gradient, of one pixel's reach, of the shape of ``vertices``; zero in z."""
+    """Kato and Harada's silhouette gradient, which reaches one pixel; of the shape of ``vertices``, zero in z."""
     return _gradient(_C.local_gradient, vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps)
 
 

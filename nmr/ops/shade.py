@@ -90,7 +90,7 @@ def interpolate(
     """``values[b, y, x] = sum_k weights[b, y, x, k] attributes[b, corners[f, k]]`` ``[B, R, R, C]``; 0 on background.
 
     attributes are ``[B or 1, N, C]``, packed ``[N, C]``; corners ``[F, 3]``, ``[B, F, 3]`` or packed ``[M, 3]`` are
-    rows of them, counted from the mesh's first; packed, ``starts`` are first row and first face of each mesh.
+    rows of them, counted from the first of the mesh; ``starts`` (packed) are first row and first face of each mesh.
     """
     values = torch.empty((*owner.shape, attributes.shape[-1]), dtype=attributes.dtype)
     arrays = attributes, corners, owner, weights, starts
@@ -127,7 +127,7 @@ def interpolate_backward(
     of_attributes: bool,
     of_weights: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Gradients of :func:`interpolate` in attributes and weights; one that is not asked for is empty."""
+    """Gradients of :func:`interpolate` in attributes and weights; a gradient that is not requested is empty."""
     grad_attributes = torch.empty(attributes.shape if of_attributes else 0, dtype=attributes.dtype)
     grad_weights = torch.empty(weights.shape if of_weights else 0, dtype=attributes.dtype)
     arrays = attributes, corners, owner, weights, starts, grad_values

@@ -129,7 +129,7 @@ def test_everything_has_true_derivatives(smooth):
         (lambda: nmr.Lights(ambient_color=0.5), r"ambient_color must have shape \[3\] or \[B, 3\]"),
         (lambda: nmr.Lights(direction=torch.zeros(0, 3)), r"got float32 \[0, 3\]"),
         (lambda: nmr.Lights(directional_color="white"), r"directional_color must be \[3\].*, got str"),
-        (lambda: nmr.Lights(directional=[0.5, 0.5], direction=torch.rand(3, 3)), "one number of lights"),
+        (lambda: nmr.Lights(directional=[0.5, 0.5], direction=torch.rand(3, 3)), "same number of lights"),
     ],
 )
 def test_errors_say_what_was_wanted(make, words):
@@ -155,5 +155,5 @@ def test_tensors_in_a_list_keep_their_gradient():
     ],
 )
 def test_lights_for_other_images(lights, name):
-    with pytest.raises(ValueError, match=f"^{name} is for 3 images, but 2 are drawn"):
+    with pytest.raises(ValueError, match=f"^{name} .* 3 images, but 2 are drawn"):
         nmr.render_rgb(*bumpy_sphere(), CAMERA, lights=lights, **SIZE)

@@ -138,10 +138,10 @@ def test_soft_iou_of_empty_images():
 
 def test_soft_iou_error():
     for a, b in (((1, 4, 4), (1, 5, 4)), ((0, 4, 4), (0, 4, 4)), ((4,), (4,))):
-        with pytest.raises(ValueError, match=r"one shape \[B, \.\.\.\] with B >= 1, got float32"):
+        with pytest.raises(ValueError, match=r"same shape \[B, \.\.\.\] with B >= 1, got float32"):
             soft_iou_loss(torch.zeros(a), torch.zeros(b))
     for prediction in (torch.ones(2, 3, dtype=torch.bool), torch.ones(2, 3, dtype=torch.uint8)):
-        with pytest.raises(TypeError, match=r"prediction one of floats, got (bool|uint8)"):
+        with pytest.raises(TypeError, match=r"prediction a float tensor, got (bool|uint8)"):
             soft_iou_loss(prediction, prediction)
     with pytest.raises(TypeError, match="must be tensors"):
         soft_iou_loss([0.0], torch.zeros(1, 1))

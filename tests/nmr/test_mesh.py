@@ -45,7 +45,7 @@ def test_edge_table_finds_edges_on_any_side_of_a_face():
 
 def test_edge_table_wants_a_closed_mesh():
     _, faces = nmr.icosphere(0)
-    with pytest.raises(ValueError, match=r"3 of 30 have not: edge .* has 1.*fill_holes"):
+    with pytest.raises(ValueError, match=r"3 of 30 edges do not: edge .* has 1.*fill_holes"):
         nmr.edge_table(faces[:-1])
     with pytest.raises(ValueError, match="faces of one mesh"):
         nmr.edge_table(faces[None])
@@ -62,13 +62,13 @@ def test_edge_table_of_an_open_mesh_holds_the_inner_edges():
     part, whole = (set(map(tuple, nmr.edge_table(f, open_mesh=True).tolist())) for f in (faces[1:], faces))
     assert len(whole - part) == 3 and part < whole
     for fin in ([[0, 2, 4]], [[0, 0, 1]]):
-        with pytest.raises(ValueError, match=r"at most two faces, but [12] of \d have not: edge .* has .*beyond"):
+        with pytest.raises(ValueError, match=r"at most two faces, but [12] of .* edge .* has .*extra faces"):
             nmr.edge_table(torch.cat([square, torch.tensor(fin)]), open_mesh=True)
 
 
 def test_edge_table_refuses_faces_that_name_a_vertex_twice():
     tetrahedron = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2], [0, 0, 1], [0, 0, 1]])
-    with pytest.raises(ValueError, match=r"two ends and exactly two faces.*edge \(0, 0\) has 2"):
+    with pytest.raises(ValueError, match=r"exactly two faces.*edge \(0, 0\) has 2"):
         nmr.edge_table(tetrahedron)
 
 

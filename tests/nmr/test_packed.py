@@ -173,7 +173,7 @@ class Short:
     "vertices, faces, camera, error, words",
     [
         (VERTICES, FACES[:2], None, ValueError, "faces for each.*got vertices of 3 meshes and faces of 2"),
-        ([], [], None, ValueError, "at least one mesh; got vertices of 0 meshes"),
+        ([], [], None, ValueError, "at least one mesh.*got vertices of 0 meshes"),
         (VERTICES, 5, None, ValueError, "got vertices of 3 meshes and faces int"),
         ([VERTICES[0], 3.0], FACES[:2], None, TypeError, "tensors .V_b, 3., it holds float; use torch.as_tensor"),
         (
@@ -200,20 +200,20 @@ def test_errors_say_what_was_wanted(vertices, faces, camera, error, words):
 @pytest.mark.parametrize(
     "colors, words",
     [
-        (nmr.VertexColors(uniform(846, 3)), "colors must be a list as the meshes are, of 3 tensors, got float32"),
-        (nmr.VertexColors([uniform(162, 3)] * 2), "of 3 tensors, got 2"),
+        (nmr.VertexColors(uniform(846, 3)), "colors must be a list of 3 tensors.*got float32"),
+        (nmr.VertexColors([uniform(162, 3)] * 2), "of 3 tensors.*got 2"),
         (
             nmr.VertexColors([uniform(162, 3)] * 3),
-            r"one row per vertex, \[162, 42, 642\] in the meshes, got \[162, 162",
+            r"one row per vertex .*\[162, 42, 642\].* got \[162, 162",
         ),
-        (nmr.FaceColors([uniform(162, 3)] * 3), r"one row per face, \[320, 80, 1280\]"),
+        (nmr.FaceColors([uniform(162, 3)] * 3), r"one row per face .*\[320, 80, 1280\]"),
         (
             nmr.UVTexture([uniform(4, 4, 3)] * 2, [v[:, :2] for v in VERTICES]),
-            "image must be one for all or 3 .*, got 2",
+            "image must be .*3 images.* got 2",
         ),
         (
             nmr.UVTexture(uniform(4, 4, 3), [v[:, :2] for v in VERTICES], [FACES[0]] * 3),
-            r"uv_faces must have one row \[3\] per face, \[320, 80, 1280\], got \[320, 320, 320\]",
+            r"uv_faces must have one row .*\[320, 80, 1280\].* got \[320, 320, 320\]",
         ),
     ],
 )

@@ -251,13 +251,13 @@ def test_errors_say_what_was_wanted(make, error, words):
 @pytest.mark.parametrize(
     "colors, words",
     [
-        (nmr.VertexColors(uniform(5, 3)), r"colors must have one row per vertex, 4 of them, got float64 \[1, 5, 3\]"),
-        (nmr.VertexColors(uniform(2, 4, 3)), r"colors must have batch size 1 as the images"),
-        (nmr.FaceColors(uniform(3, 3)), "colors must have one row per face, 2 of them"),
-        (nmr.TextureCubes(uniform(3, 2, 2, 2, 3)), "textures must have one row per face, 2 of them"),
-        (nmr.UVTexture(uniform(4, 4, 3), uniform(3, 2)), "uv must have one row per vertex, 4 of them"),
-        (nmr.UVTexture(uniform(3, 4, 4, 3), CORNERS), "image must be one for all or 1 as the images drawn, got 3"),
-        (nmr.UVTexture(uniform(4, 4, 3), CORNERS, torch.zeros(3, 3).long()), "uv_faces must have one row per face, 2"),
+        (nmr.VertexColors(uniform(5, 3)), r"colors must have one row per vertex .4., got float64 \[1, 5, 3\]"),
+        (nmr.VertexColors(uniform(2, 4, 3)), r"colors must have batch size 1"),
+        (nmr.FaceColors(uniform(3, 3)), "colors must have one row per face .2"),
+        (nmr.TextureCubes(uniform(3, 2, 2, 2, 3)), "textures must have one row per face .2"),
+        (nmr.UVTexture(uniform(4, 4, 3), uniform(3, 2)), "uv must have one row per vertex .4"),
+        (nmr.UVTexture(uniform(3, 4, 4, 3), CORNERS), "image must be .* got 3"),
+        (nmr.UVTexture(uniform(4, 4, 3), CORNERS, torch.zeros(3, 3).long()), "uv_faces must have one row per face .2"),
         (nmr.UVTexture(uniform(4, 4, 3), CORNERS, torch.full((2, 3), 4)), "refer to"),
     ],
 )
