@@ -233,7 +233,7 @@ def _card(config: DatasetConfig, writer: Writer, objects: dict[str, int], used: 
     settings["source"] = None if config.source is None else Path(config.source).name
     return {
         **({} if config.layout == "kato" else {"layout": config.layout}),
-        **writer.card(),
+        **writer.card,
         "objects_fill": writer.objects_fill,
         "object_from_mesh": (writer.turn @ kato.mesh_to_object(config.up, config.facing)).tolist(),
         "settings": settings,

@@ -11,8 +11,10 @@ has determinant 1, and `camera_mat_k` to [-1, 1] across the image (y down): diag
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
+import torch
 
 import nmr
 from learn3d.data import conventions
@@ -20,7 +22,7 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import kato
 from learn3d.make_data import viewpoints
 from learn3d.make_data.writers.pictures import write_png
-from learn3d.make_data.writers.writer import RenderedObject, Writer, make_generator
+from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer
 
 NUM_POINTS = 10_000
 
@@ -33,6 +35,12 @@ class DvrWriter(Writer):
     fixed_views = True
     bytes_per_view = 4 * kato.IMAGE_SIZE**2 + 24 * NUM_POINTS // kato.NUM_VIEWS
     convention = conventions.KATO  # for the contact sheet
+    card: ClassVar = {
+        "images": "PNG 64 x 64 over white; masks: grey, anti-aliased",
+        "points": f"pointcloud.npz: {NUM_POINTS} points and normals on the surface, in world coordinates",
+        "views": "azimuth -15 k, elevation 30, distance 2.732, half field of view 15 degrees",
+        "cameras": "cameras.npz: world_mat_k [4, 4], world to camera axes (x right, y down, z away); camera_mat_k",
+    }
 
     @classmethod
     def paths(cls, category: str) -> tuple[str, ...]:
@@ -47,29 +55,16 @@ class DvrWriter(Writer):
             write_png(folder / "image" / f"{k:04d}.png", rgb)
             write_png(folder / "mask" / f"{k:04d}.png", alpha)
         np.savez(folder / "cameras.npz", **_camera_arrays(item.poses))
-        points = nmr.metrics.sample_surface(item.vertices, item.faces, NUM_POINTS, make_generator(item.rng))
-        world = world_from_object().astype(np.float32)
-        normals = points.normals.numpy() @ world.T
-        np.savez(folder / "pointcloud.npz", points=points.points.numpy() @ world.T, normals=normals)
+        generator = torch.Generator().manual_seed(int(item.rng.integers(2**62)))
+        points, normals, *_ = nmr.metrics.sample_surface(item.vertices, item.faces, NUM_POINTS, generator)
+        turn = WORLD_FROM_OBJECT.T.astype(np.float32)
+        np.savez(folder / "pointcloud.npz", points=points.numpy() @ turn, normals=normals.numpy() @ turn)
 
     def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
         for split, names in objects.items():
             listing = "".join(f"{name}\n" for name in names)
             (self.folder / kato.synset_of(self.category) / f"softras_{split}.lst").write_text(listing)
         return objects
-
-    def card(self) -> dict[str, str]:
-        return {
-            "images": "PNG 64 x 64 over white; masks: grey, anti-aliased",
-            "points": f"pointcloud.npz: {NUM_POINTS} points and normals on the surface, in world coordinates",
-            "views": "azimuth -15 k, elevation 30, distance 2.732, half field of view 15 degrees",
-            "cameras": "cameras.npz: world_mat_k [4, 4], world to camera axes (x right, y down, z away); camera_mat_k",
-        }
-
-
-def world_from_object() -> np.ndarray:
-    """ShapeNet's coordinates (right-handed, y up, front x) of points in the object frame: [3, 3], determinant -1."""
-    return kato.mesh_to_object("y", "x").T
 
 
 def _camera_arrays(poses: LookAtPoses) -> dict[str, np.ndarray]:
@@ -79,7 +74,7 @@ def _camera_arrays(poses: LookAtPoses) -> dict[str, np.ndarray]:
     for k, matrix in enumerate(poses.cameras().projection().plain().matrix.numpy()):
         world = np.eye(4)
         world[:3] = matrix
-        world[:3, :3] = matrix[:, :3] @ world_from_object().T
+        world[:3, :3] = matrix[:, :3] @ WORLD_FROM_OBJECT.T
         arrays |= {f"world_mat_{k}": world, f"world_mat_inv_{k}": np.linalg.inv(world)}
         arrays |= {f"camera_mat_{k}": camera, f"camera_mat_inv_{k}": np.linalg.inv(camera)}
     return arrays

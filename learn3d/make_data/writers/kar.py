@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from scipy.io import savemat
@@ -31,9 +32,8 @@ from learn3d.files import limits
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.files.writing import write_json
 from learn3d.make_data import viewpoints
-from learn3d.make_data.writers.dvr import world_from_object
 from learn3d.make_data.writers.pictures import write_png
-from learn3d.make_data.writers.writer import RenderedObject, Writer
+from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer
 
 DEEPEST = 240  # value of the farthest point of an object in depth_{i}.png
 NOTHING = 255
@@ -47,6 +47,11 @@ class KarWriter(Writer):
     bytes_per_view = 5 * 224**2
     convention = conventions.KAR
     shared = ("splits.json",)
+    card: ClassVar = {
+        "images": "RGBA 224 x 224; depth: 8-bit grey, 255 = nothing, 0 .. 240 over 1.8 units around the centre",
+        "voxels": "Volume [32, 32, 32], axes (-z, y, x) of the object frame",
+        "views": "view.txt: azimuth, elevation, 0, distance; half field of view 14.9314 degrees",
+    }
 
     @classmethod
     def paths(cls, category: str) -> tuple[str, ...]:
@@ -76,13 +81,6 @@ class KarWriter(Writer):
         write_json(self.folder / "splits.json", _read_splits(output) | {synset_of(self.category): entry})
         return objects
 
-    def card(self) -> dict[str, str]:
-        return {
-            "images": "RGBA 224 x 224; depth: 8-bit grey, 255 = nothing, 0 .. 240 over 1.8 units around the centre",
-            "voxels": "Volume [32, 32, 32], axes (-z, y, x) of the object frame",
-            "views": "view.txt: azimuth, elevation, 0, distance; half field of view 14.9314 degrees",
-        }
-
 
 def _depth_images(item: RenderedObject) -> np.ndarray:
     """uint8 [n, 224, 224]: 0 .. 240 where the centre of the pixel sees the object, 255 elsewhere."""
@@ -100,7 +98,7 @@ def _depth_images(item: RenderedObject) -> np.ndarray:
 def _write_cameras(folder: Path, poses: LookAtPoses) -> None:
     cameras = poses.cameras().projection().plain()
     for i, matrix in enumerate(cameras.matrix.numpy()):
-        rotation = matrix[:, :3] @ world_from_object().T
+        rotation = matrix[:, :3] @ WORLD_FROM_OBJECT.T
         focal = KarWriter.image_size / 2 / np.tan(np.deg2rad(viewpoints.KAR_HALF_FOV_DEG))
         center = KarWriter.image_size / 2
         _write_mat(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,6 +23,11 @@ class KatoWriter(Writer):
     fixed_views = True
     bytes_per_view = 4 * kato.IMAGE_SIZE**2
     convention = conventions.KATO
+    card: ClassVar = {
+        "images": "uint8 [N, 24, 4, 64, 64]: RGB = 255 - composite over white, alpha",
+        "voxels": "bool [N, 32, 32, 32], axes (y, x, -z) of the object frame",
+        "views": "azimuth -15 k, elevation 30, distance 2.732, half field of view 15 degrees",
+    }
 
     def __init__(self, folder: Path, category: str) -> None:
         super().__init__(folder, category)
@@ -49,13 +55,6 @@ class KatoWriter(Writer):
     def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
         self._save()
         return objects
-
-    def card(self) -> dict[str, str]:
-        return {
-            "images": "uint8 [N, 24, 4, 64, 64]: RGB = 255 - composite over white, alpha",
-            "voxels": "bool [N, 32, 32, 32], axes (y, x, -z) of the object frame",
-            "views": "azimuth -15 k, elevation 30, distance 2.732, half field of view 15 degrees",
-        }
 
     def _save(self) -> None:
         if self._done:

@@ -17,6 +17,7 @@ is 1: then no rotation takes them out of [-1, 1].
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from PIL import Image
@@ -25,9 +26,8 @@ from learn3d.data import conventions
 from learn3d.data.poses import RotationPoses
 from learn3d.data.readers.pascal3d import class_name
 from learn3d.make_data import viewpoints
-from learn3d.make_data.writers.dvr import world_from_object
 from learn3d.make_data.writers.pictures import photo_background
-from learn3d.make_data.writers.writer import RenderedObject, Writer
+from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer
 
 FILES = ("train", "imagenet", "val")
 HEIGHTS, WIDTHS = (160, 300), (200, 400)  # of the pictures, in pixels
@@ -43,8 +43,13 @@ class Pascal3dWriter(Writer):
     default_val = 0.2
     bytes_per_view = 4 * 224**2 + 3 * 300 * 400 + 32**3
     convention = conventions.PASCAL3D
-    turn = world_from_object()
+    turn = WORLD_FROM_OBJECT
     objects_fill = "box centred at the origin, half its diagonal 1"
+    card: ClassVar = {
+        "images": "uint8 [H, W, 3] of all sizes; images_ref uint8 [N, 224, 224, 4]: what [-1, 1]^3 spans, mask",
+        "voxels": "bool [N, 32, 32, 32] over [-1, 1], axes (-x, -z, -y) of the object frame",
+        "views": "rotation_matrices: R v has x to the left, y up, z away; parallel rays",
+    }
 
     def __init__(self, folder: Path, category: str) -> None:
         super().__init__(folder, category)
@@ -88,13 +93,6 @@ class Pascal3dWriter(Writer):
             path = self.folder / self.paths(self.category)[FILES.index(name)]
             np.savez_compressed(path, images=images, **stacked)
         return objects
-
-    def card(self) -> dict[str, str]:
-        return {
-            "images": "uint8 [H, W, 3] of all sizes; images_ref uint8 [N, 224, 224, 4]: what [-1, 1]^3 spans, mask",
-            "voxels": "bool [N, 32, 32, 32] over [-1, 1], axes (-x, -z, -y) of the object frame",
-            "views": "rotation_matrices: R v has x to the left, y up, z away; parallel rays",
-        }
 
 
 def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,6 +31,10 @@ class PhotosWriter(Writer):
     default_views = 12
     bytes_per_view = 4 * 256**2
     convention = conventions.KATO  # for the contact sheet
+    card: ClassVar = {
+        "images": "RGB 256 x 256 with a background; masks: grey, anti-aliased",
+        "views": "poses.csv: azimuth, elevation, distance, field of view, object and split of every picture",
+    }
 
     def __init__(self, folder: Path, category: str) -> None:
         super().__init__(folder, category)
@@ -57,9 +62,3 @@ class PhotosWriter(Writer):
         with open(self.folder / self.category / "poses.csv", "w", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows([COLUMNS, *self._rows])
         return objects
-
-    def card(self) -> dict[str, str]:
-        return {
-            "images": "RGB 256 x 256 with a background; masks: grey, anti-aliased",
-            "views": "poses.csv: azimuth, elevation, distance, field of view, object and split of every picture",
-        }

@@ -16,9 +16,11 @@ longest side of the bounding box; its corner and side, in ShapeNet's coordinates
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from torch import Tensor
+from trimesh.voxel.runlength import dense_to_rle
 
 from learn3d.data import conventions
 from learn3d.data.poses import LookAtPoses
@@ -40,6 +42,11 @@ class R2n2Writer(Writer):
     bytes_per_view = 4 * 137**2
     convention = conventions.R2N2
     objects_fill = "box centred at the origin, its diagonal 1"
+    card: ClassVar = {
+        "images": "RGBA 137 x 137",
+        "voxels": "model.binvox [32, 32, 32], axes (x, y, z) of ShapeNet, (-z, y, -x) of the object frame",
+        "views": "rendering_metadata.txt: azimuth, elevation, 0, distance / 1.75, 25; half field of view 24.57",
+    }
 
     def __init__(self, folder: Path, category: str) -> None:
         super().__init__(folder, category)
@@ -88,26 +95,12 @@ class R2n2Writer(Writer):
             raise ValueError("the layout r2n2 needs at least two objects, one to train on and one for test")
         return {"train": self._written[:first], "test": self._written[first:]}
 
-    def card(self) -> dict[str, str]:
-        return {
-            "images": "RGBA 137 x 137",
-            "voxels": "model.binvox [32, 32, 32], axes (x, y, z) of ShapeNet, (-z, y, -x) of the object frame",
-            "views": "rendering_metadata.txt: azimuth, elevation, 0, distance / 1.75, 25; half field of view 24.57",
-        }
-
 
 def binvox_bytes(voxels: np.ndarray, translate: list[float], scale: float) -> bytes:
     """A binvox file of a grid bool [D, D, D] with axes x, y, z: y runs fastest, then z, then x; runs of up to 255."""
-    cells = np.ascontiguousarray(voxels.transpose(0, 2, 1)).reshape(-1)
-    ends = np.flatnonzero(np.append(cells[1:] != cells[:-1], True)) + 1
-    runs = bytearray()
-    for start, end in zip(np.append(0, ends[:-1]), ends, strict=True):
-        full, rest = divmod(int(end - start), 255)
-        value = int(cells[start])
-        runs += bytes([value, 255]) * full + (bytes([value, rest]) if rest else b"")
-    size = " ".join(map(str, voxels.shape))
-    corner = " ".join(f"{value:.9g}" for value in translate)
-    return f"#binvox 1\ndim {size}\ntranslate {corner}\nscale {scale:.9g}\ndata\n".encode() + bytes(runs)
+    size, corner = " ".join(map(str, voxels.shape)), " ".join(f"{value:.9g}" for value in translate)
+    header = f"#binvox 1\ndim {size}\ntranslate {corner}\nscale {scale:.9g}\ndata\n"
+    return header.encode() + dense_to_rle(voxels.transpose(0, 2, 1).reshape(-1), dtype=np.uint8).tobytes()
 
 
 def _longest_side(vertices: Tensor) -> float:

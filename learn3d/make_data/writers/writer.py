@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from learn3d.data.conventions import VoxelConvention
 from learn3d.data.poses import Poses
+from learn3d.data.readers import kato
+
+#: From the object frame to ShapeNet's coordinates (right-handed, y up, front x): [3, 3], determinant -1.
+WORLD_FROM_OBJECT = kato.mesh_to_object("y", "x").T
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +55,14 @@ class Writer(ABC):
     image_size: ClassVar[int]
     default_views: ClassVar[int]  # views per object unless the user asks for another number
     fixed_views: ClassVar[bool] = False  # the protocol knows that number only
-    default_test: ClassVar[float] = (
-        0.2  # what the splits get unless the user says; 0 where the layout has no such split
-    )
+    default_test: ClassVar[float] = 0.2  # shares of the splits unless the user says; 0 where there is no such split
     default_val: ClassVar[float] = 0.1
     bytes_per_view: ClassVar[int]  # an upper estimate for the check of the disk
     convention: ClassVar[VoxelConvention]
     shared: ClassVar[tuple[str, ...]] = ()  # files with entries of all categories of the folder
     turn: ClassVar[np.ndarray] = np.eye(3)  # from the frame of `mesh_to_object` to the layout's object frame
     objects_fill: ClassVar[str] = "box centred at the origin, longest side 1"
+    card: ClassVar[dict[str, str]]  # what is in the files, for people
 
     def __init__(self, folder: Path, category: str) -> None:
         self.folder = folder
@@ -102,12 +104,3 @@ class Writer(ABC):
         Returns the names per split as readers of the layout will see them.
         """
         return objects
-
-    @abstractmethod
-    def card(self) -> dict[str, str]:
-        """What is in the files, for people."""
-
-
-def make_generator(rng: np.random.Generator) -> torch.Generator:
-    """A generator of torch that continues a generator of numpy."""
-    return torch.Generator().manual_seed(int(rng.integers(2**62)))
