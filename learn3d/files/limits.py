@@ -46,7 +46,6 @@ MESH_SECONDS = 300.0  # for reading one mesh file; one of 100 MB takes 20
 POLYGON_CORNERS = 2000  # of one polygon of a text format: cutting ears takes the square of it, or its cube
 
 # Debian packages
-PACKAGE_FILE_BYTES = 512 * MIB  # one file of a package; the largest wanted today is a 61 MB catalogue
 PACKAGE_BYTES = 16 * GIB  # all files of a package, read past or not; FlightGear's have 0.4
 PACKAGE_MEMBERS = 1_000_000
 PACKAGE_WANTED_BYTES = 2 * GIB  # its catalogues, or models, held at a time; FlightGear's have less than 0.4

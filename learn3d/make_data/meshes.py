@@ -33,12 +33,9 @@ class MeshSource:
 def folder_sources(folder: Path) -> tuple[list[MeshSource], Counter[str]]:
     """The mesh files below a folder, sorted by relative path, and how many files of which other extension it ignored.
 
-    Raises ValueError where the folder holds no mesh file, or folders within folders beyond what Python can follow.
+    Raises ValueError where the folder holds no mesh file.
     """
-    try:
-        files = sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.relative_to(folder).as_posix())
-    except RecursionError:
-        raise ValueError(f"the folders below {folder} are nested too deeply; give a folder further down") from None
+    files = sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.relative_to(folder).as_posix())
     meshes = [path for path in files if path.suffix.lower() in EXTENSIONS]
     ignored = Counter(p.suffix.lower() or "(none)" for p in files if p.suffix.lower() not in EXTENSIONS + SIDECARS)
     if not meshes:
@@ -54,16 +51,17 @@ def pack_sources(path: Path) -> list[MeshSource]:
 
     Raises ValueError where the file is no such pack.
     """
-    wanted = "an npz file with n, v0, f0, v1, f1, ... and no pickled objects"
+    wanted = "an npz file with n (how many), v0, f0, v1, f1, ... and no pickled objects"
     try:
         pack = npz.open_npz(path)
         there = set(npz.keys(pack))
-        count = _count(npz.read(pack, "n", max_bytes=8)) if "n" in there else -1
+        number = npz.read(pack, "n", max_bytes=8) if "n" in there else np.array(None)
     except ValueError as error:
         raise ValueError(f"cannot read the mesh pack {path}: {error}; it must be {wanted}. {AGAIN}") from error
-    missing = [key for i in range(count) for key in (f"v{i}", f"f{i}") if key not in there][:4]
+    count = int(number.reshape(())) if number.size == 1 and number.dtype.kind in "iu" else -1
+    missing = [key for i in range(min(count, len(there))) for key in (f"v{i}", f"f{i}") if key not in there][:4]
     if count < 1 or missing:
-        raise ValueError(f"{path} is no mesh pack: it must be {wanted}; n is {count}, missing keys: {missing}")
+        raise ValueError(f"{path} is no mesh pack: it must be {wanted}; n is {number}, missing keys: {missing}")
     width = len(str(count - 1))
 
     def read(i: int) -> RawMesh:
@@ -71,14 +69,6 @@ def pack_sources(path: Path) -> list[MeshSource]:
         return RawMesh(vertices, npz.read(pack, f"f{i}", max_bytes=24 * limits.MESH_FACES))
 
     return [MeshSource(f"{i:0{width}d}", lambda i=i: read(i)) for i in range(count)]
-
-
-def _count(n: np.ndarray) -> int:
-    """The number of meshes of a pack; ValueError where it is none."""
-    if n.size != 1 or n.dtype.kind not in "iu" or not 0 <= int(n.reshape(())) <= limits.ZIP_MEMBERS // 2:
-        most = limits.ZIP_MEMBERS // 2
-        raise ValueError(f"n must be the number of meshes, at most {most}, got {n.dtype} {n.reshape(-1)[:4].tolist()}")
-    return int(n.reshape(()))
 
 
 def procedural_sources(category: str, count: int, seed: int) -> list[MeshSource]:

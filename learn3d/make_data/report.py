@@ -46,7 +46,7 @@ def lacking(writer: Writer | type[Writer], objects: dict[str, int]) -> list[str]
         return []
     again = "make the set again (--overwrite) from 3 meshes or more, without --val 0 and --test 0"
     if not {"val", "test"} & objects.keys():
-        what = "tools/train.py cannot validate, nor tools/evaluate.py measure, on data of its own"
+        what = "training cannot be validated, nor a model measured, on objects that it has not seen"
         return [f"no {' and no '.join(missing)} split: {what}; {again}"]
     instead = "train with --val-split test" if missing == ["val"] else "evaluate with --split val"
     return [f"no {missing[0]} split: {instead}, or {again}"]

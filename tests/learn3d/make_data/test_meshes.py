@@ -2,27 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
-import sys
-
 import numpy as np
 import pytest
 import trimesh
 
 from learn3d.make_data import meshes
 from learn3d.make_data.render import DatasetConfig, make_dataset
-
-
-def test_folders_within_folders(tmp_path):
-    path = tmp_path.joinpath(*["d"] * 400)
-    path.mkdir(parents=True)
-    before = sys.getrecursionlimit()
-    sys.setrecursionlimit(len(inspect.stack()) + 200)
-    try:
-        with pytest.raises(ValueError, match=r"no mesh file|nested too deeply"):  # which one is up to Python's version
-            meshes.folder_sources(tmp_path)
-    finally:
-        sys.setrecursionlimit(before)
 
 
 def test_names_of_objects_fit_into_names_of_files_however_many_are_alike():
@@ -38,10 +23,10 @@ def test_names_of_objects_fit_into_names_of_files_however_many_are_alike():
 
 
 PACKS = {
-    "n": ({"n": 10**9}, "n must be the number of meshes, at most 200000"),
-    "a fraction": ({"n": 1.5}, r"n must be the number of meshes, at most 200000, got float64 \[1.5\]"),
-    "negative": ({"n": -1}, "n must be the number of meshes"),
-    "long": ({"n": np.arange(9)}, "would unpack|n must be the number"),
+    "n": ({"n": 10**9}, "n is 1000000000, missing keys"),
+    "a fraction": ({"n": 1.5}, "n is 1.5"),
+    "negative": ({"n": -1}, "n is -1"),
+    "long": ({"n": np.arange(9)}, "no mesh pack|would unpack"),
     "objects": ({"n": np.array([{}], dtype=object)}, "pickled objects"),
     "missing": ({"n": 2}, "missing keys: .*v1"),
 }
@@ -63,10 +48,14 @@ def test_meshes_without_faces_and_broken_files_are_skipped_and_listed(tmp_path):
         trimesh.creation.box(extents=(1, 1 + k, 2)).export(source / f"box{k}.ply")
     (source / "empty.off").write_text("OFF\n0 0 0\n")
     (source / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    (source / "cut.ply").write_bytes((source / "box0.ply").read_bytes()[:120])
-    report = make_dataset(DatasetConfig(tmp_path / "data", "chair", source=source, test=1, val=0), progress=False)
+    box = (source / "box0.ply").read_bytes()
+    (source / "cut.ply").write_bytes(box[:120])
+    (source / "huge.ply").write_bytes(box.replace(b"vertex 8", b"vertex 9999999999"))
+    report = make_dataset(
+        DatasetConfig(output=tmp_path / "data", category="chair", source=source, test=1, val=0), progress=False
+    )
     reasons = {mesh["name"]: mesh["reason"] for mesh in report.skipped}
-    assert set(reasons) == {"empty.off", "points.obj", "cut.ply"} and len(report.used) == 3
+    assert set(reasons) == {"empty.off", "points.obj", "cut.ply", "huge.ply"} and len(report.used) == 3
     assert "no faces" in reasons["empty.off"] and "no faces" in reasons["points.obj"] and reasons["cut.ply"]
     text = (tmp_path / "data" / "03001627_report.txt").read_text()
     assert all(f"skipped {name} (" in text for name in reasons)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from collections import namedtuple
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +15,7 @@ import torch
 import trimesh
 
 import nmr
+from learn3d.commands import main
 from learn3d.data.readers import kato
 from learn3d.data.readers.kato import mesh_to_object
 from learn3d.make_data import meshes, render
@@ -361,7 +360,7 @@ def test_a_data_set_without_training_objects_is_not_made(tmp_path, folder):
 @pytest.mark.parametrize(
     ("objects", "said"),
     [
-        ({"train": 2}, "no val and no test split: tools/train.py cannot validate, nor"),
+        ({"train": 2}, "no val and no test split: training cannot be validated"),
         ({"train": 2, "test": 1}, "no val split: train with --val-split test, or make the set again"),
         ({"train": 2, "val": 1}, "no test split: evaluate with --split val, or make the set again"),
         ({"train": 2, "val": 1, "test": 1}, None),
@@ -378,7 +377,7 @@ def test_splits_that_the_layout_has_not_are_no_warning():
         == lacking(writer_of("r2n2"), {"train": 2, "test": 1})
         == []
     )
-    assert lacking(writer_of("pascal3d"), {"train": 2})[0].startswith("no val split: tools/train.py cannot validate")
+    assert lacking(writer_of("pascal3d"), {"train": 2})[0].startswith("no val split: training cannot be validated")
 
 
 def test_two_meshes_end_with_a_warning(tmp_path):
@@ -411,10 +410,8 @@ def test_render_object_refuses_what_cannot_be_seen():
         render_object(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.ones(3), kato_views(), 64, np.eye(3))
 
 
-def test_command_line(tmp_path, folder):
-    tool = Path(__file__).parents[3] / "tools" / "make_dataset.py"
-    command = [sys.executable, str(tool), "--output", str(tmp_path / "data"), "--category", "chair"]
-    done = subprocess.run([*command, "--source", str(folder)], capture_output=True, text=True)
-    assert done.returncode == 0 and "6 meshes used" in done.stdout, done.stderr
-    again = subprocess.run([*command, "--source", str(folder)], capture_output=True, text=True)
-    assert again.returncode == 1 and again.stderr.startswith("error: ") and "Traceback" not in again.stderr
+def test_command_line(tmp_path, folder, monkeypatch, capsys):
+    command = ["make-dataset", "--output", str(tmp_path / "data"), "--category", "chair", "--source", str(folder)]
+    monkeypatch.setattr("sys.argv", ["learn3d", *command])
+    assert main() == 0 and "6 meshes used" in capsys.readouterr().out
+    assert main() == 1 and capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
