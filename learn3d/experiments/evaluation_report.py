@@ -1,4 +1,4 @@
-"""The report of tools/evaluate.py: trained runs measured on a split, as JSON and as a text table."""
+"""The report of `learn3d evaluate`: trained runs measured on a split, as JSON and as a text table."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from learn3d.config import config_from_dict
 from learn3d.data.layouts import load_dataset, require_folder
-from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS, evaluate
+from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS, Evaluation, evaluate
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint, checkpoint_checks
 from learn3d.runs.versions import versions
@@ -23,15 +23,17 @@ COLUMNS = {
     "mmd": "MMD",
     "mmd_paper": "MMD (printed formula)",
 }
-#: What each of them is, for people.
+#: What each of them is. They are means over the images, each on its own, then over the classes.
 MEANINGS = {
     "voxel_iou_kato18": "of predicted and true 32^3 grids, by the voxeliser of Kato et al. 2018, as in the paper",
     "voxel_iou_kato19": "the same by that of Kato and Harada 2019: every cell that a face touches; not comparable",
-    "chamfer_l1": f"mean distance of {SURFACE_POINTS} points of either surface to the other, units of the object frame",
-    "f_score": f"of the shares of these points that lie within {F_SCORE_DISTANCE} of the other surface (harmonic mean)",
+    "chamfer_l1": f"mean distance of {SURFACE_POINTS} points of either surface to the other, units of the object frame; "
+    "none for an empty prediction, which is left out",
+    "f_score": f"of the shares of these points that lie within {F_SCORE_DISTANCE} of the other surface (harmonic mean); "
+    "0 for an empty prediction",
     "silhouette_iou": "for data without voxels: with the mask of another image of the object, at its camera",
-    "mmd": "of the shape codes of two views, mean over all pairs of views, by the published code: five kernels, no "
-    "root; the smaller, the less a code tells of the view",
+    "mmd": f"of the shape codes of two views, up to {CODES_PER_VIEW} each, mean over all pairs of views, by the "
+    "published code: five kernels, no root; the smaller, the less a code tells of the view",
     "mmd_paper": "the same by the formula that the paper prints: one kernel, square root",
 }
 
@@ -73,15 +75,8 @@ def evaluate_runs(
                 config.layout, folder, name, split, image_size=method.image_size, view_bins=config.view_bins
             )
             result = evaluate(method, dataset, definitions=("kato18", "kato19"), paper_mmd=True, surfaces=True)
-            if result.undefined:
-                report_progress(f"warning: {result.undefined} images have no IoU (both shapes empty); left out")
-            if result.without_mmd:
-                report_progress(f"warning: {result.without_mmd}")
-            if result.without_distance:
-                report_progress(
-                    f"warning: {result.without_distance} images have no Chamfer distance, as the predicted surface is "
-                    "empty; left out of its mean (their F-score is 0)"
-                )
+            for warning in _warnings(result):
+                report_progress(f"warning: {warning}")
             about = {
                 "checkpoint": str(file),
                 "category": name,
@@ -93,19 +88,17 @@ def evaluate_runs(
                 "trained_by": metadata.get("versions"),
             }
             results.append(about | result.summary())
-    protocol = {
-        "split": split,
-        "checkpoint": which,
-        "precision": precision,
-        "views": "all views of all objects, each image on its own",
-        "voxels": "32^3, filled surface voxels, mean over images, then over classes; kato18 and kato19 are the two "
-        "published voxelisers of predictions, not comparable with each other",
-        "surfaces": f"{SURFACE_POINTS} points each, object frame; F-score at a distance of {F_SCORE_DISTANCE}",
-        "silhouettes": "data without voxels: IoU with the mask of another image of the object, at its camera",
-        "mmd": f"mean over all pairs of views, up to {CODES_PER_VIEW} codes each; five kernels, no root",
-        "mmd_paper": "the same with the paper's printed formula: one kernel, square root",
-    }
+    protocol = {"split": split, "checkpoint": which, "precision": precision, **MEANINGS}
     return {"protocol": protocol, "versions": versions(), "results": results, "means": _class_means(results)}
+
+
+def _warnings(result: Evaluation) -> list[str]:
+    """What is not in the means."""
+    found = [f"{result.undefined} images have no IoU (both shapes are empty)"] if result.undefined else []
+    found += [result.without_mmd] if result.without_mmd else []
+    if result.without_distance:
+        found.append(f"{result.without_distance} images have no Chamfer distance (the predicted surface is empty)")
+    return found
 
 
 def _check(file: Path, data: Path | None) -> None:
@@ -131,23 +124,21 @@ def format_table(report: dict[str, Any]) -> str:
 
 def _class_means(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Mean over classes of each method's figures; runs of the same class are averaged first."""
-    methods = dict.fromkeys((r["method"], r["preset"]) for r in results)
     means = []
-    for method, preset in methods:
-        mine = [r for r in results if (r["method"], r["preset"]) == (method, preset)]
-        classes = sorted({r["category"] for r in mine})
+    for method, preset in dict.fromkeys((r["method"], r["preset"]) for r in results):
+        classes: dict[str, list[dict[str, Any]]] = {}
+        for r in results:
+            if (r["method"], r["preset"]) == (method, preset):
+                classes.setdefault(r["category"], []).append(r)
         row: dict[str, Any] = {"method": method, "preset": preset, "classes": len(classes)}
-        for key in COLUMNS:
-            per_class = [_mean([r.get(key) for r in mine if r["category"] == name]) for name in classes]
-            row[key] = _mean(per_class)
+        row |= {key: _mean([_mean([r.get(key) for r in of_one]) for of_one in classes.values()]) for key in COLUMNS}
         means.append(row)
     return means
 
 
 def _mean(values: list[float | None]) -> float | None:
     """Plain mean, or None when a value is missing."""
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known and len(known) == len(values) else None
+    return None if None in values else sum(values) / len(values)
 
 
 def _number(value: float | None) -> str:

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from learn3d.experiments.formats import check_page, embed, to_text, write_report
-from learn3d.experiments.plan import Options, Run, State, found_runs, plan_runs, read_results, read_state
-from learn3d.experiments.pool import WORKER, Outcome, carry_out_all, share_of_cores
+from learn3d.experiments.plan import Options, Run, plan_runs
+from learn3d.experiments.pool import WORKER, carry_out_all, share_of_cores
 from learn3d.experiments.report import make_report
+from learn3d.experiments.state import State, found_runs, read_results, read_state
 from learn3d.experiments.tables import TABLES
-from learn3d.presets import PRESETS
 from learn3d.terminal import INTERRUPTED, note, say
+
+_STAGES = {"done": "are done", "trained": "only need testing", "unfinished": "go on", "new": "are new"}
 
 
 @dataclass(frozen=True)
@@ -43,80 +45,60 @@ def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
     if call.report_only and call.overwrite:
         raise ValueError("--report-only trains nothing and --overwrite trains anew; give one of them")
     if call.report_only and call.options.changes:
-        raise ValueError(
-            "--report-only reports the runs that are there with whatever settings they have; leave --set out"
-        )
+        raise ValueError("--report-only reports runs with whatever settings they have; leave --set out")
     if call.page is not None:
         check_page(call.page, call.table)
-    table, outcomes = TABLES[call.table], []
+    table, failed = TABLES[call.table], {}
     if call.report_only:
         runs = found_runs(table, call.options)
     else:
         threads = call.options.threads or share_of_cores(call.jobs)
         runs = plan_runs(table, dataclasses.replace(call.options, threads=threads))
-        outcomes = _complete(runs, table.name, call, threads, worker)
+        failed = _complete(runs, call, threads, worker)
     report = make_report(table, call.options, runs, read_results(runs), beside_code=call.beside_code)
     paths = write_report(call.options.output, report)
     if call.page is not None:
         embed(call.page, report)
     say(to_text(report))
     note("report: " + ", ".join(map(str, paths)))
-    return _conclude(outcomes, [] if call.report_only else report["missing"])
+    for name, tail in failed.items():
+        note(f"\nFAILED {name}; the end of its log:\n{tail}")
+    if failed:
+        note(f"\n{len(failed)} of {len(runs)} runs failed; the same command tries them again")
+        return 1
+    if report["missing"] and not call.report_only:
+        note("stopped; the same command goes on")
+        return INTERRUPTED
+    return 0
 
 
-def _complete(runs: Sequence[Run], table: str, call: Call, threads: int, worker: Sequence[str]) -> list[Outcome]:
+def _complete(runs: Sequence[Run], call: Call, threads: int, worker: Sequence[str]) -> dict[str, str]:
     """Train and measure what is not done yet; runs with other options are an error, or replaced."""
-    states, conflicts = _read_states(runs)
+    states, conflicts = {}, {}
+    for run in runs:
+        try:
+            states[run.folder] = read_state(run).stage
+        except ValueError as error:
+            conflicts[run.folder], states[run.folder] = error, State("new").stage
     if conflicts and not call.overwrite:
         advice = "ask for the same options, choose another --output, or give --overwrite"
         raise ValueError("\n  ".join([*map(str, conflicts.values()), advice]))
-    missing = [run for run, state in zip(runs, states, strict=True) if state.stage != "done"]
-    note(f"{table}: {len(runs)} runs, of which {_count(states)}; {call.jobs} at a time, {threads} threads each")
+    stages = list(states.values())
+    counts = ", ".join(f"{stages.count(stage)} {text}" for stage, text in _STAGES.items() if stage in stages)
+    note(f"{call.table}: {len(runs)} runs, of which {counts}; {call.jobs} at a time, {threads} threads each")
+    missing = [run for run in runs if states[run.folder] != "done"]
     fresh = [run for run in runs if run.folder in conflicts]
     return carry_out_all(missing, jobs=call.jobs, threads=threads, fresh=fresh, worker=worker)
 
 
 def describe_tables() -> str:
-    """What --list prints: every table with its methods, and whether their presets are there."""
+    """What --list prints: every table with its methods."""
     lines = []
     for table in TABLES.values():
         lines.append(f"{table.name}: {table.title}")
         lines.append(f"  layout {table.layout}, {len(table.categories)} categories, seeds {table.seeds}")
         for row in table.rows:
-            if row.variant is None:
-                lines.append(f"  {row.label}: quoted")
-                continue
-            changes = "".join(f", {name}={value}" for name, value in row.variant.changes.items())
-            absent = "" if row.variant.preset in PRESETS else " (not in this version)"
-            lines.append(f"  {row.label}: {row.variant.name}, preset {row.variant.preset}{changes}{absent}")
+            changes = "".join(f", {name}={value}" for name, value in row.variant.changes.items()) if row.variant else ""
+            what = f"{row.variant.name}, preset {row.variant.preset}{changes}" if row.variant else "quoted"
+            lines.append(f"  {row.label}: {what}")
     return "\n".join(lines)
-
-
-def _read_states(runs: Sequence[Run]) -> tuple[list[State], dict[Path, ValueError]]:
-    """How far every run has come, and the conflicts by folder; a run in conflict counts as new."""
-    states, conflicts = [], {}
-    for run in runs:
-        try:
-            states.append(read_state(run))
-        except ValueError as error:
-            conflicts[run.folder] = error
-            states.append(State("new"))
-    return states, conflicts
-
-
-def _count(states: Sequence[State]) -> str:
-    names = {"done": "are done", "trained": "only need testing", "unfinished": "go on", "new": "are new"}
-    return ", ".join(f"{n} {text}" for s, text in names.items() if (n := sum(state.stage == s for state in states)))
-
-
-def _conclude(outcomes: Sequence[Outcome], missing: Sequence[str]) -> int:
-    failed = [outcome for outcome in outcomes if outcome.status == "failed"]
-    for outcome in failed:
-        note(f"\nFAILED {outcome.run.name}; the end of its log:\n{outcome.tail}")
-    if failed:
-        note(f"\n{len(failed)} of {len(outcomes)} runs failed; the same command tries them again")
-        return 1
-    if missing:
-        note("stopped; the same command goes on")
-        return INTERRUPTED
-    return 0

@@ -7,23 +7,15 @@ import html
 import io
 import re
 from collections.abc import Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
+
+import jinja2
 
 from learn3d.experiments.report import MEAN
 from learn3d.files import writing
 from learn3d.terminal import align
-
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 75rem; margin: 2rem auto; padding: 0 1rem }
-h1 { font-size: 1.4rem } h2 { font-size: 1.1rem; margin-top: 2rem }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; display: block; overflow-x: auto }
-th, td { padding: .2rem .6rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap }
-th:first-child, td:first-child, th:nth-child(2), td:nth-child(2) { text-align: left }
-th { border-bottom: 2px solid #888 } tr.first td { border-top: 2px solid #bbb } td.ours { font-weight: 600 }
-td .small { font-weight: 400 } td { vertical-align: top }
-code { font-size: .85em; overflow-wrap: anywhere } .small { color: #555; font-size: .9em }
-"""
 
 Cells = list[list[str]]
 
@@ -67,8 +59,8 @@ def _around(page: Path, table: str) -> tuple[str, str]:
 def to_csv(report: dict[str, Any]) -> str:
     """One line per run."""
     out = io.StringIO()
-    names = list(report["runs"][0]) if report["runs"] else ["run"]
-    writer = csv.DictWriter(out, [name for name in names if name != "general_command"], extrasaction="ignore")
+    names = [name for name in report["runs"][0] if name != "general_command"] if report["runs"] else ["run"]
+    writer = csv.DictWriter(out, names, extrasaction="ignore")
     writer.writeheader()
     writer.writerows(report["runs"])
     return out.getvalue()
@@ -105,26 +97,14 @@ def to_text(report: dict[str, Any]) -> str:
 
 def to_html(report: dict[str, Any]) -> str:
     """A page of its own, with the style in it."""
-    body = [f"<h1>{html.escape(report['title'])}</h1>", _html_table(main_table(report))]
-    body += [f"<p class='small'>{html.escape(note)}</p>" for note in _notes(report)]
-    if len(versus := baseline_table(report)) > 1:
-        body += [f"<h2>Against {html.escape(report['baseline'])}</h2>", _html_table(versus)]
-    if report["runs"]:
-        body += ["<h2>What was run</h2>", _html_table(run_table(report))]
-        body += ["<h2>Commands</h2>", *(f"<p><code>{html.escape(command)}</code></p>" for command in commands(report))]
-    body += ["<h2>Measures</h2><dl>"]
-    body += [f"<dt>{name}</dt><dd class='small'>{html.escape(text)}</dd>" for name, text in report["protocol"].items()]
-    title = html.escape(report["title"])
-    return (
-        f"<!doctype html>\n<html lang='en'><head><meta charset='utf-8'><title>{title}</title>"
-        f"<meta name='viewport' content='width=device-width'><style>{_STYLE}</style></head>\n<body>\n"
-        + "\n".join(body)
-        + "</dl>\n</body></html>\n"
-    )
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    page = environment.from_string(resources.files("learn3d.experiments").joinpath("report.html").read_text("utf-8"))
+    tables = {"main": main_table(report), "versus": baseline_table(report), "runs": run_table(report)}
+    return page.render(report=report, notes=_notes(report), commands=commands(report), **tables)
 
 
 def main_table(report: dict[str, Any]) -> Cells:
-    """Per method a line with the paper's figures, one with ours and one with the differences; first the header."""
+    """Per method a line with the paper's figures, for reference, and one with ours; first the header."""
     columns = [*report["categories"], MEAN]
     table = [["method", "", *columns]]
     for row in report["rows"]:
@@ -143,8 +123,6 @@ def main_table(report: dict[str, Any]) -> Cells:
             for metric in metrics:
                 table.append([label, f"here ({metric})", *(_ours_text(cell, metric) for cell in cells)])
                 label = ""
-        if any("difference" in cell for cell in cells):
-            table.append(["", "here - paper", *(_signed(cell.get("difference")) for cell in cells)])
     return table
 
 
@@ -283,22 +261,3 @@ def _markdown_table(table: Cells) -> str:
 def _markdown_cell(text: str) -> str:
     """In one line, without HTML: names in results may be a stranger's."""
     return html.escape(" ".join(text.splitlines()), quote=False).replace("|", "\\|")
-
-
-def _html_table(table: Cells) -> str:
-    header, *rows = table
-    grouped = any(not row[0] for row in rows)  # several lines belong to one label
-    lines = ["<table><thead><tr>" + "".join(f"<th>{html.escape(c)}</th>" for c in header) + "</tr></thead><tbody>"]
-    for row in rows:
-        ours = " class=ours" if row[1].startswith("here (") else ""
-        cells = "".join(f"<td{ours if i > 1 else ''}>{_html_cell(cell)}</td>" for i, cell in enumerate(row))
-        lines.append(f"<tr{' class=first' if grouped and row[0] else ''}>{cells}</tr>")
-    return "\n".join(lines) + "</tbody></table>"
-
-
-def _html_cell(text: str) -> str:
-    """A value, its intervals small in a line below."""
-    value, _, intervals = text.partition(" ")
-    if not re.match(r"[±\[]", intervals):
-        return html.escape(text)
-    return f"{html.escape(value)}<br><span class=small>{html.escape(intervals)}</span>"

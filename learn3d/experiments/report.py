@@ -1,4 +1,7 @@
-"""A table from stored results: the paper's figures beside ours, differences, confidence intervals; plain values."""
+"""A table from stored results: the paper's figures beside ours, confidence intervals; plain values.
+
+The paper's figures are of other meshes, so no difference to them is taken.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS
 from learn3d.experiments import published
+from learn3d.experiments.evaluation_report import MEANINGS
 from learn3d.experiments.plan import Options, Run, command_line, selected_rows
 from learn3d.experiments.published import CATEGORIES, PublishedRow
 from learn3d.experiments.results import object_sums
@@ -27,16 +30,9 @@ MEASURES = {
 }
 IOUS = ("kato18", "kato19")
 
-PROTOCOL = {
-    "kato18": "voxel IoU of 32^3 grids, mean over images, then over categories; by the voxeliser of Kato et al. 2018, "
-    "with which the paper's own figures were measured",
-    "kato19": "that of Kato and Harada 2019 (every cell that a face touches); not comparable with kato18",
-    "mmd": f"mean over all pairs of view classes, up to {CODES_PER_VIEW} codes each; five kernels, no root (the "
-    "published code, and the paper's table)",
-    "mmd_paper": "the same by the printed formula: one kernel, square root",
-    "chamfer_l1": f"between {SURFACE_POINTS} points of each surface, units of the object frame; an empty "
-    "prediction has none and is left out",
-    "f_score": f"of the same points at {F_SCORE_DISTANCE} of the longest side; 0 for an empty prediction",
+Results = dict[str, dict[int, dict[str, Any]]]  # by category and seed
+
+PROTOCOL = {name: MEANINGS[key] for name, key in MEASURES.items()} | {
     "interval_seeds": f"{LEVEL:.0%} interval of the mean over seeds (Student's t)",
     "interval_objects": f"{LEVEL:.0%} interval over test objects: {RESAMPLES} resamples of objects, not images; the "
     "differences to the baseline are paired",
@@ -63,6 +59,8 @@ def make_report(
     if beside_code:
         for row in made:
             _add_code(table, row, categories)
+    # With --report-only what is there may have been trained for another time than was asked for.
+    asked = {"iterations": options.iterations, "batch_size": options.batch_size}
     return {
         "table": table.name,
         "title": table.title,
@@ -75,54 +73,38 @@ def make_report(
         "protocol": PROTOCOL,
         "rows": made,
         "runs": [_run(run, records[run.folder]) for run in runs if run.folder in records],
-        "asked": _asked(options),
+        "asked": {name: value for name, value in asked.items() if value is not None},
         "missing": [run.name for run in runs if run.folder not in records],
     }
 
 
-def _asked(options: Options) -> dict[str, int]:
-    """What was asked for of how long to train; with --report-only what is there may have been trained otherwise."""
-    asked = {"iterations": options.iterations, "batch_size": options.batch_size}
-    return {name: value for name, value in asked.items() if value is not None}
-
-
-def _records_of(
-    row: Row, categories: list[str], runs: Sequence[Run], records: Mapping[Path, dict]
-) -> dict[str, dict[int, dict]]:
+def _records_of(row: Row, categories: list[str], runs: Sequence[Run], records: Mapping[Path, dict]) -> Results:
     """Results of a row by category and seed."""
     mine = [run for run in runs if row.variant and run.variant.name == row.variant.name and run.folder in records]
     return {c: {run.seed: records[run.folder] for run in mine if run.category == c} for c in categories}
 
 
-def _row(
-    table: Table,
-    row: Row,
-    categories: list[str],
-    results: dict[str, dict[int, dict]],
-    baseline: dict[str, dict[int, dict]] | None,
-) -> dict[str, Any]:
-    metric = "mmd" if table.metric == "mmd" else row.published.metric if row.published else "kato18"
-    is_baseline = row.label == table.baseline
-    cells = {}
+def _row(table: Table, row: Row, categories: list[str], results: Results, baseline: Results | None) -> dict[str, Any]:
+    main, cells = "mmd" if table.metric == "mmd" else "kato18", {}
     for column, names in [*((c, [c]) for c in categories), (MEAN, categories)]:
-        ours = [results[name] for name in names]
+        ours, theirs = (
+            [found[name] for name in names] for found in (results, baseline or {name: {} for name in names})
+        )
         cell = _cell(ours) if all(ours) else {}
-        if cell and baseline and not is_baseline and all(baseline[name] for name in names):
-            main, theirs = "mmd" if table.metric == "mmd" else "kato18", [baseline[name] for name in names]
-            if main in cell["values"] and main in _cell(theirs)["values"]:
-                cell["to_baseline"] = _difference(main, ours, theirs)
-        cell |= _paper(row.published, column, categories)
-        if "paper" in cell and metric in cell.get("values", {}):
-            cell["difference"] = cell["values"][metric] - cell["paper"]
-        cells[column] = cell
+        if cell and row.label != table.baseline and all(theirs):
+            other = _cell(theirs)
+            if main in cell["values"] and main in other["values"]:
+                cell["to_baseline"] = _difference(main, cell, other) | _paired_bootstrap(main, ours, theirs)
+        cells[column] = cell | _paper(row.published, column, categories)
+    variant, published_row = row.variant, row.published
     return {
         "label": row.label,
-        "variant": row.variant.name if row.variant else None,
-        "preset": row.variant.preset if row.variant else None,
-        "checkpoint": row.variant.checkpoint if row.variant else None,
-        "metric": metric,
-        "quoted_from": row.published.quoted_from if row.published else None,
-        "published_note": row.published.note if row.published else None,
+        "variant": variant and variant.name,
+        "preset": variant and variant.preset,
+        "checkpoint": variant and variant.checkpoint,
+        "metric": "mmd" if table.metric == "mmd" else published_row.metric if published_row else "kato18",
+        "quoted_from": published_row and published_row.quoted_from,
+        "published_note": published_row and published_row.note,
         "cells": cells,
     }
 
@@ -163,24 +145,22 @@ def _cell(ours: list[dict[int, dict]]) -> dict[str, Any]:
     }
 
 
-def _difference(metric: str, ours: list[dict[int, dict]], theirs: list[dict[int, dict]]) -> dict[str, Any]:
-    """Ours minus the baseline's, with its interval over seeds (paired: the difference of each seed); for IoU also with
-    that of a paired bootstrap over the same objects."""
-    key = MEASURES[metric]
-    a, b = (
-        float(np.mean([np.mean([r[key] for r in results.values()]) for results in side])) for side in (ours, theirs)
-    )
+def _difference(metric: str, ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
+    """One cell minus the baseline's, with its interval over seeds (paired: the difference of each seed)."""
+    a, b = ours["values"][metric], theirs["values"][metric]
     difference: dict[str, Any] = {"metric": metric, "value": a - b}
-    mine, other = _cell(ours), _cell(theirs)
-    if mine["seeds"] == other["seeds"]:
-        pairs = zip(mine["by_seed"][metric], other["by_seed"][metric], strict=True)
+    if ours["seeds"] == theirs["seeds"]:
+        pairs = zip(ours["by_seed"][metric], theirs["by_seed"][metric], strict=True)
         if interval := t_interval([x - y for x, y in pairs]):
             difference["interval_seeds"] = interval
-    if metric == "mmd":
-        return difference | ({"ratio": a / b} if b else {})
-    if [_names(results) for results in ours] == [_names(results) for results in theirs]:
-        difference["interval_objects"] = percentile_interval(_resampled(metric, ours) - _resampled(metric, theirs))
-    return difference
+    return difference | ({"ratio": a / b} if metric == "mmd" and b else {})
+
+
+def _paired_bootstrap(metric: str, ours: list[dict[int, dict]], theirs: list[dict[int, dict]]) -> dict[str, Any]:
+    """The interval of the difference of two IoUs over the same objects."""
+    if metric == "mmd" or [_names(results) for results in ours] != [_names(results) for results in theirs]:
+        return {}
+    return {"interval_objects": percentile_interval(_resampled(metric, ours) - _resampled(metric, theirs))}
 
 
 def _resampled(metric: str, ours: list[dict[int, dict]]) -> np.ndarray:
@@ -223,11 +203,6 @@ def _run(run: Run, record: dict[str, Any]) -> dict[str, Any]:
     about |= {name: record.get(key) for name, key in MEASURES.items()}
     trained, tested = record.get("trained_by") or {}, record.get("tested_by") or {}
     about |= {"commit": trained.get("commit"), "tested_at": tested.get("commit"), "torch": trained.get("torch")}
-    general = command_line(
-        config,
-        data="DATA",
-        category="CATEGORY",
-        seed="SEED",
-        output=f"OUTPUT/runs/CATEGORY/{run.variant.name}-seedSEED",
-    )
+    output = f"OUTPUT/runs/CATEGORY/{run.variant.name}-seedSEED"
+    general = command_line(config, data="DATA", category="CATEGORY", seed="SEED", output=output)
     return about | {"command": record["command"], "general_command": general}

@@ -1,22 +1,30 @@
-"""The measurement of one finished run on its test split, kept in a file that reports need no network to read."""
+"""The measurement of one finished run on its test split, kept in a file that reports need no network to read.
+
+The file may be a stranger's: it is checked when it is read.
+"""
 
 from __future__ import annotations
 
 import zlib
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import BaseModel, Field, ValidationError
 
 from learn3d.config import config_to_dict
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
 from learn3d.evaluation import evaluate
-from learn3d.experiments.plan import RESULT_FILE, Run, command_line
-from learn3d.files import writing
+from learn3d.experiments.plan import Run, command_line
+from learn3d.files import limits, writing
+from learn3d.files.reading import parse_json, read_bytes
 from learn3d.runs import checkpoint
 from learn3d.runs.versions import versions
+from learn3d.settings import MOST, Step
 
+RESULT_FILE = "test.json"  # in a run's folder
 DEFINITIONS = ("kato18", "kato19")
 SPLIT = "test"
 DIGITS = 5  # of stored values
@@ -64,6 +72,61 @@ def measure(run: Run, *, check_data: bool) -> dict[str, Any]:
     record |= summary | tables
     writing.write_json(run.folder / RESULT_FILE, record)
     return record
+
+
+Number = Annotated[float, Field(ge=-MOST, le=MOST)] | None
+Amount = Annotated[int, Field(ge=0, le=10**9)]
+
+
+class _Objects(BaseModel, strict=True):
+    names: list[str]
+    defined: list[Amount]
+    kato18: list[Number]
+    kato19: list[Number]
+
+
+class _Versions(BaseModel, strict=True):
+    commit: str | None = None
+
+
+class _Result(BaseModel, strict=True):
+    """What a report needs of a result."""
+
+    config: dict[str, Any]
+    command: str
+    data: str
+    checkpoint: str
+    iterations: Step
+    images: Amount
+    objects: _Objects
+    step: Amount = 0
+    seconds: Number = None
+    voxel_iou_kato18: Number = None
+    voxel_iou_kato19: Number = None
+    mmd: Number = None
+    mmd_paper: Number = None
+    chamfer_l1: Number = None
+    f_score: Number = None
+    conditions: dict[str, Any] | None = None
+    trained_by: _Versions | None = None
+    tested_by: _Versions | None = None
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """What `measure` wrote. A file that is damaged, or holds something else, is a ValueError that names it."""
+    content = read_bytes(path, limits.JSON_BYTES, "the measurement of a run as JSON")
+    try:
+        result = parse_json(content)
+        objects = _Result.model_validate(result).objects
+        if len({len(objects.names), len(objects.defined), len(objects.kato18), len(objects.kato19)}) > 1:
+            raise ValueError("the lists of its objects differ in length")
+    except ValidationError as error:
+        first = error.errors()[0]
+        what = f"{'.'.join(map(str, first['loc'])) or 'it'}: {first['msg']}"
+        raise ValueError(f"{path} is no measurement of a run ({what}); remove it, and it is made again") from None
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be used: {error}; remove it, and it is made again") from None
+    return result
 
 
 def object_sums(record: dict[str, Any], definition: str) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,13 +15,10 @@ Interval = tuple[float, float]
 
 def t_interval(values: Sequence[float]) -> Interval | None:
     """95 % confidence interval of the mean of independent values, by Student's t; None for fewer than two."""
-    n = len(values)
-    if n < 2:
+    if len(values) < 2:
         return None
-    mean = sum(values) / n
-    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / (n - 1))
-    half = float(stats.t.ppf((1 + LEVEL) / 2, n - 1)) * deviation / math.sqrt(n)
-    return mean - half, mean + half
+    half = float(stats.t.ppf((1 + LEVEL) / 2, len(values) - 1) * stats.sem(values))
+    return float(np.mean(values)) - half, float(np.mean(values)) + half
 
 
 def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray], *, seed: int = 0) -> np.ndarray:
@@ -32,7 +28,7 @@ def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray], *,
     images of an object are not independent of each other, so objects are drawn, with replacement, within each category;
     the mean over the images of each category is taken, then that over categories. The draws depend on the seed and the
     numbers of objects alone: two results of the same objects have the same ones and can be subtracted, which makes the
-    bootstrap of their difference a paired one.
+    bootstrap of their difference a paired one. (scipy.stats.bootstrap knows neither strata nor weights.)
     """
     rng = np.random.default_rng(seed)
     total = np.zeros(RESAMPLES)

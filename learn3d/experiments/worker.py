@@ -6,18 +6,20 @@ whatever reason, the worker sees the end of the file and stops as at Ctrl-C, its
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
 import sys
 import threading
-from typing import Any
 
 from learn3d.config import config_from_dict, config_to_dict
-from learn3d.experiments import plan
+from learn3d.experiments import results
 from learn3d.experiments.plan import Run
+from learn3d.experiments.state import State, read_state
 from learn3d.experiments.tables import Variant
 from learn3d.runs.folder import sole_use
+from learn3d.training import train
 
 LOCK = ".experiment.lock"  # of a worker, also while it measures; training has its own
 STOPPED = 75  # exit status of a run that was stopped and can go on (sysexits' EX_TEMPFAIL)
@@ -25,30 +27,21 @@ STOPPED = 75  # exit status of a run that was stopped and can go on (sysexits' E
 
 def request_of(run: Run, *, fresh: bool = False) -> str:
     """The line that asks a worker for a run; `fresh` replaces whatever the folder holds."""
-    variant = {"name": run.variant.name, "preset": run.variant.preset, "checkpoint": run.variant.checkpoint}
-    values = {"variant": variant, "category": run.category, "seed": run.seed, "fresh": fresh}
-    return json.dumps(values | {"config": config_to_dict(run.config)})
-
-
-def run_of(request: dict[str, Any]) -> Run:
-    """The run that a request asks for."""
-    config = config_from_dict(request["config"], source="the request")
-    return Run(Variant(**request["variant"]), request["category"], request["seed"], config)
+    variant = dataclasses.asdict(run.variant) | {"changes": {}}  # they are in the configuration
+    request = {"variant": variant, "category": run.category, "seed": run.seed, "config": config_to_dict(run.config)}
+    return json.dumps(request | {"fresh": fresh})
 
 
 def carry_out(run: Run, *, fresh: bool) -> bool:
     """Train and measure; False when a signal stopped the training. Raises what `train` and `measure` raise."""
-    from learn3d.experiments.results import measure
-    from learn3d.training import train
-
-    state = plan.State("new") if fresh else plan.read_state(run)
+    state = State("new") if fresh else read_state(run)
     if state.stage in ("new", "unfinished"):
-        (run.folder / plan.RESULT_FILE).unlink(missing_ok=True)
+        (run.folder / results.RESULT_FILE).unlink(missing_ok=True)
         resume = state.stage == "unfinished"
         if not train(run.config, resume=resume, overwrite=not resume).finished:
             return False
     if state.stage != "done":
-        record = measure(run, check_data=state.stage == "trained")
+        record = results.measure(run, check_data=state.stage == "trained")
         print(f"tested: voxel IoU {record['voxel_iou_kato18']:.4f} (kato18)", flush=True)
     return True
 
@@ -69,16 +62,16 @@ def _stop_with_parent() -> None:
 def main() -> int:
     request = json.loads(sys.stdin.readline())
     _stop_with_parent()
-    run = run_of(request)
+    config = config_from_dict(request["config"], source="the request")
+    run = Run(Variant(**request["variant"]), request["category"], request["seed"], config)
     try:
         with sole_use(run.folder, LOCK):
-            finished = carry_out(run, fresh=request["fresh"])
+            return 0 if carry_out(run, fresh=request["fresh"]) else STOPPED
     except (ValueError, OSError, FloatingPointError) as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         return 1
     except KeyboardInterrupt:  # before or after the training, which saves by itself
         return STOPPED
-    return 0 if finished else STOPPED
 
 
 if __name__ == "__main__":

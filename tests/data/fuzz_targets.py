@@ -22,8 +22,7 @@ from learn3d.config import TrainConfig, config_from_dict, config_to_dict, load_c
 from learn3d.data.framing import read_photo
 from learn3d.data.readers import READERS
 from learn3d.data.readers.photo_table import read_table, split_objects
-from learn3d.experiments.results import object_sums
-from learn3d.experiments.stored import read_result
+from learn3d.experiments.results import object_sums, read_result
 from learn3d.figures.curves import read_metrics
 from learn3d.files.reading import parse_json
 from learn3d.make_data.render import DatasetConfig, make_dataset

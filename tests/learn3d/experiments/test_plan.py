@@ -13,7 +13,8 @@ import pytest
 from learn3d.commands import train
 from learn3d.experiments import published
 from learn3d.experiments.experiment import Call, run_experiment
-from learn3d.experiments.plan import Options, State, command_line, is_current, plan_runs, read_results, read_state
+from learn3d.experiments.plan import Options, command_line, plan_runs
+from learn3d.experiments.state import State, is_current, read_results, read_state
 from learn3d.experiments.tables import TABLES
 from learn3d.presets import PRESETS
 
@@ -86,12 +87,6 @@ def test_several_whole_numbers_are_numbers(options) -> None:
 def test_wrong_requests_are_named(given, message, options) -> None:
     with pytest.raises(ValueError, match=message):
         plan_runs(TABLES["kato"], options(**given))
-
-
-def test_a_method_whose_preset_is_absent_is_named(monkeypatch, options) -> None:
-    monkeypatch.delitem(PRESETS, "peng2020-kato-vanilla")
-    with pytest.raises(ValueError, match=r"method 'vanilla' .* needs the preset 'peng2020-kato-vanilla'.*--methods"):
-        plan_runs(TABLES["kato"], options())
 
 
 @pytest.mark.parametrize("table", ["kato", "ablation", "bins", "prgan"])

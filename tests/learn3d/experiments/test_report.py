@@ -15,7 +15,8 @@ import pytest
 
 from learn3d.experiments import formats
 from learn3d.experiments.experiment import Call, run_experiment
-from learn3d.experiments.plan import Options, found_runs, read_results
+from learn3d.experiments.plan import Options
+from learn3d.experiments.state import found_runs, read_results
 from learn3d.experiments.tables import TABLES
 
 
@@ -24,7 +25,7 @@ def test_report_has_the_papers_figures_beside_ours(report) -> None:
     cell = proposed["cells"]["airplane"]
     assert cell["values"]["kato18"] == pytest.approx(0.45)  # objects .40 to .48, seeds + 0, .01, .02
     assert (cell["paper"], cell["seeds"], cell["objects"], cell["images"]) == (0.565, [0, 1, 2], 5, 120)
-    assert cell["difference"] == pytest.approx(0.45 - 0.565)
+    assert "difference" not in cell, "the paper's figures are of other data"
     half = 4.302653 * 0.01 / math.sqrt(3)
     assert cell["interval_seeds"]["kato18"] == pytest.approx([0.45 - half, 0.45 + half])
     assert cell["interval_objects"]["kato18"][0] < 0.45 < cell["interval_objects"]["kato18"][1]
@@ -69,7 +70,6 @@ def test_mmd_is_compared_by_ratio(tmp_path, stub, options) -> None:
     run_experiment(Call("mmd", options()), worker=stub)
     proposed = json.loads((tmp_path / "out" / "mmd.json").read_text())["rows"][1]
     assert proposed["cells"]["airplane"]["to_baseline"]["ratio"] == pytest.approx(0.6 / 0.7)
-    assert proposed["cells"]["airplane"]["difference"] == pytest.approx(0.6 - 0.272)
     assert "(x 0.86)" in (tmp_path / "out" / "mmd.md").read_text()
 
 
@@ -186,7 +186,7 @@ def test_a_page_without_a_place_is_noticed_before_anything_is_trained(tmp_path, 
 def test_a_damaged_result_is_named(tmp_path, stub, options) -> None:
     run_experiment(Call("kato", options()), worker=stub)
     (tmp_path / "out/runs/airplane/vanilla-seed0/test.json").write_text("{")
-    with pytest.raises(ValueError, match=r"vanilla-seed0/test.json is not valid JSON .* remove it"):
+    with pytest.raises(ValueError, match=r"vanilla-seed0/test.json .* remove it"):
         run_experiment(Call("kato", options(), report_only=True), worker=stub)
 
 

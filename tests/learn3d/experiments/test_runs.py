@@ -15,8 +15,7 @@ import time
 import numpy as np
 import pytest
 
-from learn3d import training
-from learn3d.experiments import pool, results
+from learn3d.experiments import pool, results, worker
 from learn3d.experiments.experiment import Call, run_experiment
 from learn3d.experiments.plan import Options, plan_runs
 from learn3d.experiments.pool import NOT_FROM_HERE
@@ -118,7 +117,7 @@ def test_a_worker_resumes_or_starts_anew(made_by_hand, monkeypatch, iterations, 
         calls.append(how)
         return Summary(config.output, 5, False, 0.0, 0, 0.0, 0.0)
 
-    monkeypatch.setattr(training, "train", train)
+    monkeypatch.setattr(worker, "train", train)
     monkeypatch.setattr(results, "measure", lambda *_, **__: pytest.fail("a stopped run is not measured"))
     assert not carry_out(made_by_hand(iterations=iterations), fresh=fresh)
     assert calls == [{"resume": resume, "overwrite": overwrite}]
