@@ -27,9 +27,9 @@ COLUMNS = {
 MEANINGS = {
     "voxel_iou_kato18": "of predicted and true 32^3 grids, by the voxeliser of Kato et al. 2018, as in the paper",
     "voxel_iou_kato19": "the same by that of Kato and Harada 2019: every cell that a face touches; not comparable",
-    "chamfer_l1": f"mean distance of {SURFACE_POINTS} points of either surface to the other, units of the object frame; "
+    "chamfer_l1": f"mean distance of {SURFACE_POINTS} points of either surface to the other, units of the object; "
     "none for an empty prediction, which is left out",
-    "f_score": f"of the shares of these points that lie within {F_SCORE_DISTANCE} of the other surface (harmonic mean); "
+    "f_score": f"of the shares of these points within {F_SCORE_DISTANCE} of the other surface (harmonic mean), "
     "0 for an empty prediction",
     "silhouette_iou": "for data without voxels: with the mask of another image of the object, at its camera",
     "mmd": f"of the shape codes of two views, up to {CODES_PER_VIEW} each, mean over all pairs of views, by the "

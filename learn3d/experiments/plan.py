@@ -15,8 +15,6 @@ from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.experiments.tables import Row, Table, Variant
 from learn3d.presets import PRESETS
 
-#: Settings that are steps of the schedule, as the presets have them, for any number of iterations.
-_SCHEDULES = {"encoder_from_step": lambda n: n // 2 + 1, "decay_at_step": lambda n: n * 95 // 100}
 _SHOWN = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")  # in every command line
 _OWN_OPTIONS = (*_SHOWN, "settings", "layout")
 
@@ -128,7 +126,8 @@ def _configure(
     changes = dict(variant.changes) | given
     setting_names = {field.name for field in dataclasses.fields(preset.settings)}
     iterations = options.iterations or preset.iterations
-    settings = {name: step_of(iterations) for name, step_of in _SCHEDULES.items() if name in setting_names}
+    # PrGAN's encoder is trained in the second half, however long it is.
+    settings = {"encoder_from_step": iterations // 2 + 1} if "encoder_from_step" in setting_names else {}
     settings |= {name: value for name, value in changes.items() if name in setting_names}
     return TrainConfig(
         data=options.data,

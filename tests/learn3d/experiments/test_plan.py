@@ -37,11 +37,8 @@ def test_bins_are_a_training_option(tmp_path) -> None:
 
 
 def test_schedules_follow_the_number_of_iterations(tmp_path, options) -> None:
-    settings = [
-        plan_runs(TABLES[table], options(methods=(name,), iterations=2000))[0].config.settings
-        for table, name in (("prgan", "prgan"), ("multi-view", "multi-view"))
-    ]
-    assert (settings[0].encoder_from_step, settings[1].decay_at_step) == (1001, 1900)
+    (run,) = plan_runs(TABLES["prgan"], options(methods=("prgan",), iterations=2000))
+    assert run.config.settings.encoder_from_step == 1001
     for table in TABLES.values():
         for run in plan_runs(table, Options(tmp_path, tmp_path, ("chair",), seeds=1)):
             usual = PRESETS[run.variant.preset].settings
