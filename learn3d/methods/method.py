@@ -16,9 +16,9 @@ from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
 from learn3d.device import autocast
-from learn3d.methods.optimization import CONSTANT, Average, Plan, backpropagate
+from learn3d.methods.optimization import CONSTANT, Average, Plan, adam, backpropagate
 from learn3d.methods.surfaces import Grids, Meshes
-from learn3d.networks import MeshGenerator, network_input
+from learn3d.networks import GENERATORS, MeshGenerator, create_encoder, network_input
 from learn3d.parallel.ranks import ALONE, Ranks, sum_gradients
 from learn3d.parallel.whole_batch_norm import use_whole_batch
 
@@ -167,7 +167,11 @@ class Method(abc.ABC):
 
 
 class MeshMethod(Method):
-    """A method with an encoder of images and a generator of meshes, which learns from rendered silhouettes."""
+    """A method with an encoder of images and a generator of meshes, which learns from rendered silhouettes.
+
+    Networks and optimizers are those of its settings `encoder`, `generator`, `symmetry` and `learning_rate`, where a
+    subclass has no others.
+    """
 
     encoder: nn.Module
     generator: MeshGenerator
@@ -175,6 +179,14 @@ class MeshMethod(Method):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.faces, self.edges = self.generator.faces.cpu(), self.generator.edges.cpu()  # for the renderer
+
+    def create_networks(self) -> dict[str, nn.Module]:
+        encoder = create_encoder(self.settings.encoder, inverted=self.shape.inverted)
+        generator = GENERATORS[self.settings.generator](symmetry=self.settings.symmetry)
+        return {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
+
+    def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        return {name: adam(network, self.settings.learning_rate) for name, network in self.networks.items()}
 
     def encode(self, images: Tensor) -> Tensor:
         with self.autocast():

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import torch
-from torch import nn
 
 import nmr
 from learn3d.data.batch import Batch
 from learn3d.device import Download
 from learn3d.methods.adam import SparseGradientAdam
 from learn3d.methods.method import MeshMethod
-from learn3d.networks import ENCODERS, GENERATORS, EncoderName, GeneratorName, Symmetry, create_encoder
+from learn3d.networks import ENCODERS, EncoderName, GeneratorName, Symmetry
 from learn3d.settings import Positive, Weight, checked
 
 CENTROID_LEARNING_RATE = 0.1  # of the centroid's layer, relative to all others
@@ -42,11 +41,6 @@ class MultiView(MeshMethod):
     """Encoder and mesh generator, trained on pairs of views: batches [a_1 .. a_n, b_1 .. b_n], sampling "pairs"."""
 
     settings: MultiViewSettings
-
-    def create_networks(self) -> dict[str, nn.Module]:
-        encoder = create_encoder(self.settings.encoder, inverted=self.shape.inverted)
-        generator = GENERATORS[self.settings.generator](symmetry=self.settings.symmetry)
-        return {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         rate = self.settings.learning_rate

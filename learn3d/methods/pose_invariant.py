@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-import torch
 from torch import Tensor, nn
 
 import nmr
@@ -12,16 +11,8 @@ from learn3d.data.batch import Batch
 from learn3d.device import Download, upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod
-from learn3d.methods.optimization import adam, frozen
-from learn3d.networks import (
-    ENCODERS,
-    GENERATORS,
-    EncoderName,
-    GeneratorName,
-    PoseDiscriminator,
-    Symmetry,
-    create_encoder,
-)
+from learn3d.methods.optimization import frozen
+from learn3d.networks import ENCODERS, EncoderName, GeneratorName, PoseDiscriminator, Symmetry
 from learn3d.networks.resnet import check_pretrained, load_pretrained
 from learn3d.settings import FilePath, Positive, Weight, checked
 
@@ -81,18 +72,10 @@ class PoseInvariant(MeshMethod):
     settings: PoseInvariantSettings
 
     def create_networks(self) -> dict[str, nn.Module]:
-        settings = self.settings
-        networks = {
-            "encoder": create_encoder(settings.encoder, inverted=self.shape.inverted),
-            "generator": GENERATORS[settings.generator](symmetry=settings.symmetry),
-        }
-        if settings.uses_discriminator:
+        networks = super().create_networks()
+        if self.settings.uses_discriminator:
             networks["discriminator"] = PoseDiscriminator(self.shape.num_views)
-        networks["encoder"].to(memory_format=torch.channels_last)
         return networks
-
-    def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        return {name: adam(network, self.settings.learning_rate) for name, network in self.networks.items()}
 
     @property
     def weights(self) -> dict[str, float]:

@@ -96,6 +96,19 @@ class VPLSettings:
         """Whether training depends on the view classes."""
         return self.lambda_discriminator > 0 and (self.discriminator == "dcgan" or self.other_views == "random")
 
+    def __post_init__(self) -> None:
+        size = self.image_size
+        if self.encoder == "conv" and size != ENCODERS["conv"].image_size:
+            raise ValueError(f"encoder 'conv' takes images of 64 pixels, got image_size {size}")
+        if self.silhouette_size not in (MASK_SIZE, size):
+            raise ValueError(
+                f"silhouette_size must be {MASK_SIZE}, the size of the data's masks, or image_size ({size}), got "
+                f"{self.silhouette_size}"
+            )
+        check_pretrained(self.pretrained, self.encoder)
+        if self.class_conditional and self.discriminator != "spectral-patch":
+            raise ValueError(f"class_conditional needs discriminator 'spectral-patch', got {self.discriminator!r}")
+
 
 class VPL(MeshMethod):
     """Encoder, mesh generator and, unless it is the baseline, a discriminator of silhouettes and their views."""
@@ -103,12 +116,13 @@ class VPL(MeshMethod):
     settings: VPLSettings
 
     def create_networks(self) -> dict[str, nn.Module]:
-        settings = self.settings
-        _check(settings, self.shape)
-        networks = {"encoder": _create_encoder(settings, self.shape), "generator": _create_generator(settings)}
+        settings, shape = self.settings, self.shape
+        if settings.class_conditional and shape.num_classes < 2:
+            raise ValueError("class_conditional needs data of several categories, got one")
+        encoder = _create_encoder(settings, shape).to(memory_format=torch.channels_last)
+        networks = {"encoder": encoder, "generator": _create_generator(settings)}
         if settings.lambda_discriminator > 0:
-            networks["discriminator"] = _create_discriminator(settings, self.shape)
-        networks["encoder"].to(memory_format=torch.channels_last)
+            networks["discriminator"] = _create_discriminator(settings, shape)
         return networks
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
@@ -238,13 +252,7 @@ def _create_encoder(settings: VPLSettings, shape: DataShape) -> nn.Module:
         return PreactResNet18(settings.image_size)
     if settings.encoder == "resnet18":
         return FlatResNet18(settings.image_size, settings.pretrained is not None, shape.inverted)
-    encoder = ENCODERS[settings.encoder]()
-    if settings.image_size != encoder.image_size:
-        raise ValueError(
-            f"encoder {settings.encoder!r} takes images of {encoder.image_size} pixels, got image_size "
-            f"{settings.image_size}"
-        )
-    return encoder
+    return ENCODERS[settings.encoder]()
 
 
 def _create_generator(settings: VPLSettings) -> MeshGenerator:
@@ -267,17 +275,3 @@ def _create_discriminator(settings: VPLSettings, shape: DataShape) -> nn.Module:
     return SpectralPatchDiscriminator(
         shape.pose_features, channels, shape.num_classes if settings.class_conditional else None
     )
-
-
-def _check(settings: VPLSettings, shape: DataShape) -> None:
-    """Raise a ValueError for settings that contradict each other or the data."""
-    if settings.silhouette_size not in (MASK_SIZE, settings.image_size):
-        raise ValueError(
-            f"silhouette_size must be {MASK_SIZE}, the size of the data's masks, or image_size "
-            f"({settings.image_size}), got {settings.silhouette_size}"
-        )
-    check_pretrained(settings.pretrained, settings.encoder)
-    if settings.class_conditional and settings.discriminator != "spectral-patch":
-        raise ValueError(f"class_conditional needs discriminator 'spectral-patch', got {settings.discriminator!r}")
-    if settings.class_conditional and shape.num_classes < 2:
-        raise ValueError("class_conditional needs data of several categories, got one")

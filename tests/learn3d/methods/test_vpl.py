@@ -303,23 +303,24 @@ def test_presets_of_vpl() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "shape", "message"),
+    ("settings", "message"),
     [
-        (VPLSettings(image_size=224), {}, "encoder 'conv' takes images of 64 pixels, got image_size 224"),
-        (VPLSettings(silhouette_size=128), {}, r"silhouette_size must be 64, .* or image_size \(64\), got 128"),
-        (VPLSettings(pretrained="weights.pth"), {}, "weights are for the encoder 'resnet18', got encoder 'conv'"),
-        (
-            VPLSettings(class_conditional=True),
-            {},
-            "class_conditional needs discriminator 'spectral-patch', got 'dcgan'",
-        ),
-        (SHAPENET_CLASS, {"num_classes": 1}, "class_conditional needs data of several categories, got one"),
-        (VPLSettings(), {"num_views": 1}, "tells views by their class and needs at least 2, got 1"),
+        ({"image_size": 224}, "encoder 'conv' takes images of 64 pixels, got image_size 224"),
+        ({"silhouette_size": 128}, r"silhouette_size must be 64, .* or image_size \(64\), got 128"),
+        ({"pretrained": "weights.pth"}, "weights are for the encoder 'resnet18', got encoder 'conv'"),
+        ({"class_conditional": True}, "class_conditional needs discriminator 'spectral-patch', got 'dcgan'"),
     ],
 )
-def test_contradictions_are_refused(settings: VPLSettings, shape: dict[str, int], message: str) -> None:
+def test_settings_that_contradict_each_other_are_refused(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        create(settings, **shape)
+        VPLSettings(**settings)
+
+
+def test_settings_that_contradict_the_data_are_refused() -> None:
+    with pytest.raises(ValueError, match="needs data of several categories, got one"):
+        create(SHAPENET_CLASS, num_classes=1)
+    with pytest.raises(ValueError, match="tells views by their class and needs at least 2, got 1"):
+        create(VPLSettings(), num_views=1)
 
 
 def test_one_image_has_no_other_view() -> None:

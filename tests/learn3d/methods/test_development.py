@@ -1,0 +1,51 @@
+"""The method of docs/development.md, taken from the page, is trained, resumed and evaluated."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from learn3d import methods, presets
+from learn3d.config import TrainConfig
+from learn3d.evaluation import evaluate
+from learn3d.runs import checkpoint
+from learn3d.training import load_splits, train
+
+PAGE = Path(__file__).parents[3] / "docs" / "development.md"
+
+
+def test_the_method_of_the_page_works(tiny_names, tiny_folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module_text, preset_text = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S)
+    (tmp_path / "mirror_of_the_page.py").write_text(module_text)
+    monkeypatch.syspath_prepend(tmp_path)
+    page = importlib.import_module("mirror_of_the_page")
+    monkeypatch.setitem(methods._METHODS, page.MirrorSettings, page.Mirror)
+    names = vars(presets) | vars(page)
+    for name, preset in eval("{" + preset_text + "}", names).items():
+        monkeypatch.setitem(presets.PRESETS, name, preset)
+
+    settings = page.MirrorSettings(encoder="conv-small", generator="sphere-small", learning_rate=1e-3)
+    where = {"data": tiny_folder, "category": "airplane", "output": tmp_path / "run"}
+    options = {"preset": "mirror", "settings": settings, "batch_size": 4, "max_val_images": 4, "log_every": 1}
+    train(TrainConfig(**where, **options, iterations=2))
+    summary = train(TrainConfig(**where, **options, iterations=4), resume=True)
+    assert summary.finished
+    method, config, _ = checkpoint.load_method(tmp_path / "run" / "last.safetensors")
+    assert type(method) is page.Mirror
+    assert config.settings == settings
+    assert evaluate(method, load_splits(config)[1], max_images=4).voxel_iou > 0
+    lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert lines[0].keys() >= {"projection", "smoothness", "mirror", "total"}
+
+
+def test_the_rooms_of_the_page_are_there() -> None:
+    table = PAGE.read_text().split("| room |")[1].split("\n\n")[0]
+    rooms = [name for line in table.splitlines() for name in re.findall(r"`([\w/.*]+)`", line.split("|")[1])]
+    package = PAGE.parents[1] / "learn3d"
+    missing = [name for name in rooms if "*" not in name and not (package / name).exists()]
+    assert not missing
+    assert len(rooms) > 10
