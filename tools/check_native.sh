@@ -1,22 +1,22 @@
 #!/usr/bin/env bash
-# Checks of the kernels (csrc/) alone, in builds of their own under build/native. Usage: bash tools/check_native.sh CHECK...
-#   tests         the C++ tests, and the fuzz target over its corpus
+# Checks the kernels (csrc/) without Python, in separate builds under build/native. Usage: bash tools/check_native.sh CHECK...
+#   tests         the C++ tests, and the fuzz target on its stored inputs
 #   asan          the same under AddressSanitizer and UndefinedBehaviorSanitizer (CXX: g++ or clang++)
-#   tsan          the same under ThreadSanitizer, with a small OpenMP of our own that it can see through (g++)
-#   tsan-clang    the same with LLVM's OpenMP, which tells the sanitizer what it does (clang++)
+#   tsan          the same under ThreadSanitizer, with a small OpenMP replacement that it understands (g++)
+#   tsan-clang    the same with LLVM's OpenMP, which reports its synchronisation to the sanitizer (clang++)
 #   fuzz SECONDS  libFuzzer (clang++); findings: build/native/fuzz/finding-*; inputs: build/native/corpus
-#   keep          adds to tests/csrc/corpus.hex what reaches code that nothing in it reaches
-#   count         instructions of workload W1 under callgrind, against tests/csrc/instructions.json
-#   variants      the same bits from every compiler and instruction set at hand
-#   coverage      lines and branches of csrc/ and nmr/ that the C++ and Python tests reach
-# Exit status 77 and a line that says why: the machine has not got what the check needs. PYTHON: an interpreter that has cmeel-eigen
+#   keep          adds to tests/csrc/corpus.hex the inputs that reach new code
+#   count         instructions of workload W1 under callgrind, compared with tests/csrc/instructions.json
+#   variants      whether every available compiler and instruction set gives the same bits
+#   coverage      coverage of csrc/ and nmr/ by the C++ and Python tests (lines and branches)
+# Exit status 77: a tool that the check needs is missing; a message names it. PYTHON: an interpreter that has cmeel-eigen
 # (for coverage also the test extra); default .venv/bin/python.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 python=${PYTHON:-$PWD/.venv/bin/python}
 PATH=$(dirname "$python"):$PATH # cmake and ninja of the test extra
-export OMP_WAIT_POLICY=passive # more threads than cores: do not spin
+export OMP_WAIT_POLICY=passive # there may be more threads than cores: do not spin
 sanitize="-O1 -g -fno-omit-frame-pointer -fno-sanitize-recover=all -DNMR_FRESH_SCRATCH"
 address="$sanitize -fsanitize=address,undefined,float-cast-overflow -D_GLIBCXX_ASSERTIONS"
 
@@ -25,8 +25,8 @@ skip() {
     exit 77
 }
 
-want() { # program, what for
-    command -v "$1" >/dev/null || skip "no $1 on this machine, which $2 needs"
+want() { # program, which check needs it
+    command -v "$1" >/dev/null || skip "$2 needs $1, which is not installed"
 }
 
 build() { # name, compiler, flags, targets, further cmake arguments
@@ -47,7 +47,7 @@ run_tests() { # name of the build
 }
 
 check_tests() {
-    build plain "${CXX:-c++}" -O3 "tests fuzz" -DNMR_MULTIVERSION=ON # as it is shipped
+    build plain "${CXX:-c++}" -O3 "tests fuzz" -DNMR_MULTIVERSION=ON # with the flags of the package
     run_tests plain
 }
 
@@ -66,10 +66,10 @@ check_tsan() {
 check_tsan_clang() {
     want clang++ "the ThreadSanitizer check with LLVM's OpenMP"
     build tsan-clang clang++ "$sanitize -fsanitize=thread" "tests fuzz"
-    # The OpenMP library itself is not instrumented; archer reports its synchronisation instead, or there is no check.
+    # The OpenMP library is not instrumented. Archer reports its synchronisation; without it the check is not possible.
     local archer
     archer=$(clang++ -print-resource-dir)/../../libarcher.so
-    [ -f "$archer" ] || skip "no libarcher.so beside LLVM's OpenMP"
+    [ -f "$archer" ] || skip "LLVM's OpenMP has no libarcher.so"
     export TSAN_OPTIONS=ignore_noninstrumented_modules=1 OMP_TOOL_LIBRARIES=$archer ARCHER_OPTIONS=verbose=1
     run_tests tsan-clang
 }
@@ -84,7 +84,7 @@ check_fuzz() {
 }
 
 check_keep() {
-    [ -x build/native/fuzz/fuzz ] || skip "nothing was fuzzed yet"
+    [ -x build/native/fuzz/fuzz ] || skip "there is no fuzz build yet; run check_native.sh fuzz SECONDS first"
     rm -rf build/native/kept
     mkdir build/native/kept
     build/native/fuzz/fuzz -set_cover_merge=1 -use_counters=0 build/native/kept build/native/corpus 2>&1 | tail -1
@@ -93,7 +93,7 @@ check_keep() {
 
 check_count() {
     want valgrind "the instruction count"
-    [ "$(uname -m)" = x86_64 ] || skip "the bound is one of x86-64-v3"
+    [ "$(uname -m)" = x86_64 ] || skip "the stored bound is for x86-64-v3"
     build count "${CXX:-c++}" "-O3 -g -march=x86-64-v3" workload
     "$python" tests/csrc/count.py build/native/count/workload "${CXX:-c++}" "$@"
 }
@@ -136,7 +136,7 @@ check_coverage() {
     build coverage g++ "-O0 -g --coverage" "tests fuzz"
     find build/native/coverage -name '*.gcda' -delete
     run_tests coverage
-    # The package beside the build: Python tests run with the instrumented kernels and their bindings.
+    # A copy of the package, so that the Python tests run with the instrumented kernels and bindings.
     local package=build/native/coverage-package
     mkdir -p $package
     rm -rf $package/nmr
@@ -148,7 +148,7 @@ check_coverage() {
         cmake --build $package/build --parallel "${JOBS:-2}" >>build/native/coverage-package.log 2>&1 ||
         { cat build/native/coverage-package.log; exit 1; }
     find $package/build -name '*.gcda' -delete
-    # Started there, so that it is this package that is imported; but not by the tests that start an isolated interpreter.
+    # Run pytest in that folder, so that it imports this package. Tests that start an isolated interpreter would not, and are left out.
     local root=$PWD
     export COVERAGE_FILE=$root/build/native/coverage-python
     (cd $package && "$python" -m pytest -q --rootdir="$root" -c "$root/pyproject.toml" "$root/tests/nmr" --cov=nmr --cov-branch \
@@ -170,5 +170,5 @@ shift
 case $check in
 tests | asan | tsan | count | variants | coverage | fuzz | keep) "check_$check" "$@" ;;
 tsan-clang) check_tsan_clang ;;
-*) echo "no check of that name: $check"; exit 2 ;;
+*) echo "unknown check: $check"; exit 2 ;;
 esac

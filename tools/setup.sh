@@ -1,5 +1,6 @@
 # Sourced by quickstart.sh and test.sh: checks the machine, makes a virtual environment in .venv and installs the package.
-# Usage: . tools/setup.sh; setup EXTRA      afterwards $python is the environment's interpreter and the folder is the repository's.
+# Usage: . tools/setup.sh; setup EXTRA
+# Sets $python to the environment's interpreter. The current folder must be the repository.
 
 fail() {
     printf 'error: %s\n' "$*" >&2
@@ -10,7 +11,7 @@ step() {
     printf '\n== %s\n' "$*"
 }
 
-check_machine() { # gigabytes of free disk wanted
+check_machine() { # free disk space needed, in GB
     base=${PYTHON:-python3}
     command -v "$base" >/dev/null || fail "no $base found; install Python 3.10 or newer, or set PYTHON to its path"
     "$base" -c 'import sys; sys.exit(sys.version_info < (3, 10))' ||
@@ -18,7 +19,7 @@ check_machine() { # gigabytes of free disk wanted
     "$base" -c 'import venv, ensurepip' 2>/dev/null ||
         fail "$base cannot make virtual environments; install its venv package (on Debian: apt-get install python3-venv)"
     if [ -n "${CXX:-}" ]; then
-        command -v "$CXX" >/dev/null || fail "the C++ compiler that CXX names, $CXX, is not there; unset CXX or correct it"
+        command -v "$CXX" >/dev/null || fail "CXX is set to $CXX, which is not there; unset CXX or set it to a C++ compiler"
     else
         command -v c++ >/dev/null || command -v g++ >/dev/null || command -v clang++ >/dev/null ||
             fail "no C++ compiler found; install one (on Debian: apt-get install g++), or set CXX to its path"
@@ -27,12 +28,12 @@ check_machine() { # gigabytes of free disk wanted
     check_room "$PWD" "$1" ""
 }
 
-check_room() { # folder, gigabytes wanted, what else could be done
+check_room() { # folder, free disk space needed in GB, further advice
     free=$(df -Pk "$1" | awk 'NR == 2 {print int($4 / 1048576)}')
     [ "$free" -ge "$2" ] || fail "only $free GB free on the disk of $1, $2 GB are needed; free some space$3"
 }
 
-setup() { # extra of the package: train or test
+setup() { # extra of the package to install: train or test
     check_machine 4
     python=$PWD/.venv/bin/python
     if ! "$python" -c '' 2>/dev/null; then
@@ -41,6 +42,6 @@ setup() { # extra of the package: train or test
     fi
     step "Installing the package and compiling the renderer (torch takes most of the time)"
     "$python" -m pip install --quiet --disable-pip-version-check --constraint constraints.txt ".[$1]" ||
-        fail "the installation failed; the messages above say why (no network, no compiler, no disk space?)"
+        fail "the installation failed; see the messages above (often: no network, no compiler or no disk space)"
     "$python" -I -c 'import nmr' || fail "the package was installed but cannot be imported"
 }

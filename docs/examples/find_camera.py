@@ -1,4 +1,4 @@
-"""Finds the camera that saw a silhouette: eight guesses around a chair move until they see it, too.
+"""Finds the camera of a silhouette: eight guesses around a chair move until they see the same silhouette.
 
 python docs/examples/find_camera.py --output pictures
 """
@@ -16,12 +16,12 @@ from learn3d.make_data.shapes import make_shape
 
 
 def main(output: Path = Path("output"), steps: int = 120, image_size: int = 160, seed: int = 2) -> tuple[float, float]:
-    """Writes OUTPUT/find_camera.gif and .png: what each guess sees, in front of the silhouette (orange) to be matched.
+    """Writes OUTPUT/find_camera.gif and .png: what each guess sees, in front of the target silhouette (orange).
 
-    Returns how far the guess that ends best is from the true camera, before and after; the chair has length 1.
+    Returns the distance of the best guess from the true camera, before and after; the chair has length 1.
     """
     chair = make_shape("chair", np.random.default_rng(seed))
-    # Mesh files are right-handed; the world of LookAt is left-handed, as the published renderer's.
+    # Mesh files are right-handed; the world of LookAt is left-handed, as in the published renderer.
     vertices = torch.tensor(chair.vertices, dtype=torch.float32) * torch.tensor([1.0, 1.0, -1.0])
     faces = torch.tensor(chair.faces)
     colors = nmr.FaceColors(torch.tensor([0.4, 0.62, 0.9]).expand(len(faces), 3))
@@ -30,7 +30,7 @@ def main(output: Path = Path("output"), steps: int = 120, image_size: int = 160,
         return nmr.render_silhouette(vertices, faces, nmr.LookAt(eyes, half_fov_deg=13.0), image_size=image_size)
 
     def draw(eyes: Tensor) -> Tensor:
-        """What eight guesses see, in two rows: uint8 [height, width, 3]."""
+        """The images of eight guesses, in two rows: uint8 [height, width, 3]."""
         camera = nmr.LookAt(eyes, half_fov_deg=13.0)
         lights = nmr.Lights(0.4, 0.7, torch.nn.functional.normalize(eyes, dim=1).unsqueeze(1))  # at the camera
         rgb, alpha = nmr.render(
@@ -66,4 +66,4 @@ def main(output: Path = Path("output"), steps: int = 120, image_size: int = 160,
 
 
 if __name__ == "__main__":
-    print("the best guess was {:.2f} from the true camera and is {:.4f} from it now".format(*tyro.cli(main)))
+    print("distance of the best guess from the true camera: {:.2f} before, {:.4f} after".format(*tyro.cli(main)))

@@ -1,4 +1,4 @@
-"""Fits meshes of different sizes in one batch: a list of meshes takes the place of a tensor, without padding.
+"""Fits meshes of different sizes in one batch: a list of meshes replaces the tensor, without padding.
 
 python docs/examples/fit_packed.py --output pictures
 """
@@ -28,15 +28,15 @@ def draw(vertices: list[Tensor], faces: list[Tensor], color: list[float]) -> Ten
 
 
 def main(output: Path = Path("output"), steps: int = 250, image_size: int = 64) -> tuple[float, float]:
-    """Writes OUTPUT/fit_packed.png: targets above; below, what became of spheres of 162 and 642 vertices.
+    """Writes OUTPUT/fit_packed.png: targets above; below the results, from spheres of 162 and 642 vertices.
 
     Returns 1 - IoU of the silhouettes, before and after.
     """
     goals = [make_shape(category, np.random.default_rng(seed)) for category, seed in SHAPES]
-    # Mesh files are right-handed; the world of LookAt is left-handed, as the published renderer's.
+    # Mesh files are right-handed; the world of LookAt is left-handed, as in the published renderer.
     goal_vertices = [torch.tensor(g.vertices, dtype=torch.float32) * torch.tensor([1.0, 1.0, -1.0]) for g in goals]
     goal_faces = [torch.tensor(g.faces) for g in goals]
-    # One pose for each image: every mesh from all views, the meshes one after the other.
+    # One pose per image: all views of the first mesh, then all views of the second.
     azimuths = [360 / VIEWS * k for k in range(VIEWS)] * len(goals)
     camera = nmr.LookAt.from_angles(2.732, [0.0, 35.0] * (len(azimuths) // 2), azimuths, half_fov_deg=12.0)
 

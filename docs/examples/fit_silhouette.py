@@ -1,4 +1,4 @@
-"""Deforms a sphere until its silhouettes are those of an airplane, which is seen from sixteen sides.
+"""Deforms a sphere until its silhouettes match those of an airplane, seen from sixteen sides.
 
 python docs/examples/fit_silhouette.py --output pictures
 """
@@ -27,12 +27,12 @@ def draw(vertices: Tensor, faces: Tensor, azimuths_deg: list[float], color: list
 
 
 def main(output: Path = Path("output"), steps: int = 200, image_size: int = 96, seed: int = 7) -> tuple[float, float]:
-    """Writes OUTPUT/fit_silhouette.gif, the progress, and fit_silhouette.png: the target, and below it the result.
+    """Writes OUTPUT/fit_silhouette.gif (the progress) and fit_silhouette.png (the target; below it the result).
 
     Returns 1 - IoU of the silhouettes, before and after.
     """
     airplane = make_shape("airplane", np.random.default_rng(seed))
-    # Mesh files are right-handed; the world of LookAt is left-handed, as the published renderer's.
+    # Mesh files are right-handed; the world of LookAt is left-handed, as in the published renderer.
     goal = torch.tensor(airplane.vertices, dtype=torch.float32) * torch.tensor([1.0, 1.0, -1.0])
     goal_faces = torch.tensor(airplane.faces)
     camera = nmr.LookAt.from_angles(2.732, [-30.0, 30.0] * 8, [22.5 * k for k in range(16)], half_fov_deg=12.0)
@@ -40,8 +40,8 @@ def main(output: Path = Path("output"), steps: int = 200, image_size: int = 96, 
 
     sphere, faces = nmr.icosphere(3)
     edges = nmr.edge_table(faces)
-    # What is optimised is (1 + 10 L) vertices, L the Laplacian: a pull on one vertex moves the region around it, and
-    # the surface stays smooth (Nicolet et al. 2021, Large Steps in Inverse Rendering of Geometry).
+    # The variable is (1 + 10 L) vertices, where L is the Laplacian. A gradient at one vertex then moves the region
+    # around it, and the surface stays smooth (Nicolet et al. 2021, Large Steps in Inverse Rendering of Geometry).
     neighbours = torch.zeros(len(sphere), len(sphere))
     neighbours[edges[:, :2], edges[:, :2].flip(1)] = 1
     stiffness = torch.eye(len(sphere)) + 10 * (torch.diag(neighbours.sum(1)) - neighbours)

@@ -1,4 +1,4 @@
-"""Finds the texture of a vase from pictures of it: every pixel tells the texels that it shows what they should be.
+"""Finds the texture of a vase from pictures of it. The error of every pixel gives a gradient to the texels it shows.
 
 python docs/examples/fit_texture.py --output pictures
 """
@@ -40,9 +40,9 @@ def painting(height: int, width: int) -> Tensor:
 
 
 def main(output: Path = Path("output"), steps: int = 60, views: int = 12, size: int = 128) -> tuple[float, float]:
-    """Writes OUTPUT/fit_texture.png: views that were not used, of the vase and of the one found; then both textures.
+    """Writes OUTPUT/fit_texture.png: unused views of the vase, of the result, and both textures.
 
-    Returns the mean error of the colours in these views before and after.
+    Returns the mean error of the colours in these views, before and after.
     """
     vertices, faces, uv = vase()
     lights = nmr.Lights(0.7, 0.4, [0.4, 0.5, -0.8], smooth=True)
@@ -76,4 +76,4 @@ def main(output: Path = Path("output"), steps: int = 60, views: int = 12, size: 
 
 
 if __name__ == "__main__":
-    print("mean error in views that were not used: {:.4f} before, {:.4f} after".format(*tyro.cli(main)))
+    print("mean error in unused views: {:.4f} before, {:.4f} after".format(*tyro.cli(main)))
