@@ -129,6 +129,7 @@ _VPL_PRESETS: dict[str, Preset] = {
     ),
 }
 
+
 def _vanilla(preset: Preset, source: str) -> Preset:
     """The same without the losses on codes."""
     none = dict.fromkeys(("lambda_classification", "lambda_adversarial", "lambda_prior"), 0.0)

@@ -1,6 +1,6 @@
 """Meshes -> a data set in any layout: shaded views, masks, cameras and voxels of every object, by our renderer.
 
-Here meshes are chosen, split, scaled and coloured; `viewpoints` has the cameras, `writers` the layouts.
+Here meshes are chosen, split, scaled and coloured; `writers` has the cameras and files of each layout.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
     folder, findings = Path(folder), Findings()
     ids = findings.attempt(object_ids, folder, category, split)
     if ids is not None:
-        lists = _read_splits(folder)[synset_of(category)]
+        lists = read_splits(folder)[synset_of(category)]
         others = {other: lists[other] for other in SPLITS if other != split and other in lists}
         warn_of_repeats(findings, folder / "splits.json", f"{category} {split}", ids, others)
     yield from findings.problems
@@ -123,7 +123,7 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """The categories (synset ids) that are listed and whose renders are there, and the splits of each."""
-    lists = _read_splits(Path(folder))
+    lists = read_splits(Path(folder))
     return {
         synset: tuple(split for split in SPLITS if entry.get(split))
         for synset, entry in sorted(lists.items())
@@ -140,7 +140,7 @@ def object_ids(folder: Path | str, category: str, split: str) -> list[str]:
     """The ids of a split in the order of splits.json, without those whose renders are known to be broken."""
     check_split(split)
     path, synset = Path(folder) / "splits.json", synset_of(category)
-    lists = _read_splits(Path(folder))
+    lists = read_splits(Path(folder))
     if synset not in lists:
         raise DamagedFile(path, f"has no entry {synset} ({category}); it has: {', '.join(sorted(lists)) or 'none'}")
     ids = [name for name in lists[synset].get(split, []) if name not in BROKEN]
@@ -161,7 +161,7 @@ def renders_of(folder: Path) -> int:
     return min(max(files, rows), NUM_RENDERS) or NUM_RENDERS
 
 
-def _read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
+def read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
     path = folder / "splits.json"
     wanted = 'expected {synset: {"name": .., "train": [id, ..], "val": [..], "test": [..]}}'
     if not path.exists():

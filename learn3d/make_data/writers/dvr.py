@@ -20,7 +20,6 @@ import nmr
 from learn3d.data import conventions
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import kato
-from learn3d.make_data import viewpoints
 from learn3d.make_data.writers.pictures import write_png
 from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer
 
@@ -47,7 +46,7 @@ class DvrWriter(Writer):
         return (kato.synset_of(category),)
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        return viewpoints.kato_views()
+        return kato.view_poses(torch.arange(count))
 
     def write(self, item: RenderedObject) -> None:
         folder = self.folder / kato.synset_of(self.category) / item.name

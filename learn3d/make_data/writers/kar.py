@@ -27,14 +27,15 @@ import nmr
 from learn3d.data import conventions
 from learn3d.data.dataset import SPLITS
 from learn3d.data.poses import LookAtPoses
+from learn3d.data.readers.kar import read_splits
 from learn3d.data.readers.kato import synset_of
-from learn3d.files import limits
-from learn3d.files.reading import parse_json, read_bytes
 from learn3d.files.writing import write_json
-from learn3d.make_data import viewpoints
+from learn3d.make_data.viewpoints import distances, uniform
 from learn3d.make_data.writers.pictures import write_png
 from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer
 
+HALF_FOV_DEG = 14.9314  # 60 mm lens, 32 mm sensor
+ELEVATIONS_DEG = (-20.0, 40.0)
 DEEPEST = 240  # value of the farthest point of an object in depth_{i}.png
 NOTHING = 255
 
@@ -59,10 +60,17 @@ class KarWriter(Writer):
 
     @classmethod
     def check(cls, output: Path, category: str, test: float, augment: int) -> None:
-        _read_splits(output)
+        _splits_of_others(output)
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        return viewpoints.kar_views(count, float(np.linalg.norm(vertices, axis=1).max()), rng)
+        """Azimuths in -180 .. 180, elevations in -20 .. 40; the whole object is seen.
+
+        The distances of Kar's own files are not published; these fill the image about as much as theirs do.
+        """
+        azimuth_deg = uniform(rng, (-180.0, 180.0), count)
+        elevation_deg = uniform(rng, ELEVATIONS_DEG, count)
+        distance = distances(rng, vertices, np.full(count, HALF_FOV_DEG))
+        return LookAtPoses(azimuth_deg, elevation_deg, distance, HALF_FOV_DEG)
 
     def write(self, item: RenderedObject) -> None:
         renders, volumes = (self.folder / path for path in self.paths(self.category))
@@ -78,8 +86,13 @@ class KarWriter(Writer):
 
     def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
         entry = {"name": self.category} | {split: objects.get(split, []) for split in SPLITS}
-        write_json(self.folder / "splits.json", _read_splits(output) | {synset_of(self.category): entry})
+        write_json(self.folder / "splits.json", _splits_of_others(output) | {synset_of(self.category): entry})
         return objects
+
+
+def _splits_of_others(output: Path) -> dict[str, dict]:
+    """What splits.json of the folder holds now, which other categories share; ValueError where it is damaged."""
+    return read_splits(output) if (output / "splits.json").exists() else {}
 
 
 def _depth_images(item: RenderedObject) -> np.ndarray:
@@ -99,7 +112,7 @@ def _write_cameras(folder: Path, poses: LookAtPoses) -> None:
     cameras = poses.cameras().projection().plain()
     for i, matrix in enumerate(cameras.matrix.numpy()):
         rotation = matrix[:, :3] @ WORLD_FROM_OBJECT.T
-        focal = KarWriter.image_size / 2 / np.tan(np.deg2rad(viewpoints.KAR_HALF_FOV_DEG))
+        focal = KarWriter.image_size / 2 / np.tan(np.deg2rad(HALF_FOV_DEG))
         center = KarWriter.image_size / 2
         _write_mat(
             folder / f"camera_{i}.mat",
@@ -115,15 +128,3 @@ def _write_mat(path: Path, **arrays: np.ndarray) -> None:
     savemat(content, arrays)
     header = b"MATLAB 5.0 MAT-file".ljust(116)
     path.write_bytes(header + content.getvalue()[116:])
-
-
-def _read_splits(output: Path) -> dict[str, dict]:
-    """What splits.json of the folder holds now; ValueError where it is damaged."""
-    path = output / "splits.json"
-    try:
-        splits = parse_json(read_bytes(path, limits.JSON_BYTES, "the lists of objects")) if path.exists() else {}
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}, which other categories share: {error}; repair or remove it") from error
-    if not isinstance(splits, dict):
-        raise ValueError(f"{path} must hold {{synset: {{name, train, val, test}}}}; repair or remove it")
-    return splits

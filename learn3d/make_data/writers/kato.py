@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import torch
 
 from learn3d.data import conventions
 from learn3d.data.dataset import SPLITS
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import kato
-from learn3d.make_data import viewpoints
 from learn3d.make_data.writers.writer import RenderedObject, Writer
 
 
@@ -38,7 +38,7 @@ class KatoWriter(Writer):
         return tuple(path.name for split in SPLITS for path in kato.split_paths("", category, split))
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        return viewpoints.kato_views()
+        return kato.view_poses(torch.arange(count))
 
     def start(self, split: str, most: int) -> None:
         self._save()

@@ -20,16 +20,20 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import torch
 from PIL import Image
 
+import nmr
 from learn3d.data import conventions
 from learn3d.data.poses import RotationPoses
 from learn3d.data.readers.pascal3d import class_name
-from learn3d.make_data import viewpoints
+from learn3d.make_data.viewpoints import uniform
 from learn3d.make_data.writers.pictures import photo_background
 from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer
 
 FILES = ("train", "imagenet", "val")
+ELEVATIONS_DEG = (-10.0, 40.0)
+TILTS_DEG = (-15.0, 15.0)
 HEIGHTS, WIDTHS = (160, 300), (200, 400)  # of the pictures, in pixels
 SHARES = (0.5, 0.9)  # of the picture's shorter side that the cube takes
 
@@ -64,7 +68,16 @@ class Pascal3dWriter(Writer):
         return super().place(vertices) * (2 / np.linalg.norm(np.ptp(vertices, axis=0)))
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> RotationPoses:
-        return RotationPoses(viewpoints.pascal3d_views(count, rng) @ self.turn.T)
+        """Cameras as photographers hold them: any azimuth, elevations in -10 .. 40, tilted by up to 15 degrees."""
+        azimuth_deg, elevation_deg, tilt_deg = (
+            uniform(rng, limits, count) for limits in ((-180.0, 180.0), ELEVATIONS_DEG, TILTS_DEG)
+        )
+        look = nmr.LookAt.from_angles(1.0, torch.from_numpy(elevation_deg), torch.from_numpy(azimuth_deg))
+        upright = look.projection(torch.float64).matrix[:, :, :3].numpy() * np.array([[1.0], [-1.0], [1.0]])
+        cos, sin = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
+        roll = np.tile(np.eye(3), (count, 1, 1))
+        roll[:, 0, 0], roll[:, 0, 1], roll[:, 1, 0], roll[:, 1, 1] = cos, -sin, sin, cos
+        return RotationPoses(roll @ upright @ self.turn.T)  # rows: the right, up and away of the image
 
     def write(self, item: RenderedObject) -> None:
         for rgba, rotation in zip(item.rgba(), item.poses.rotation.numpy(), strict=True):

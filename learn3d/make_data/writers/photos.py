@@ -17,10 +17,12 @@ import numpy as np
 
 from learn3d.data import conventions
 from learn3d.data.poses import LookAtPoses
-from learn3d.make_data import viewpoints
+from learn3d.make_data.viewpoints import distances, uniform
 from learn3d.make_data.writers.pictures import photo_background, write_png
 from learn3d.make_data.writers.writer import RenderedObject, Writer
 
+ELEVATIONS_DEG = (-10.0, 50.0)
+HALF_FOVS_DEG = (12.0, 25.0)  # lenses of 84 .. 38 mm on a square of 36 mm
 COLUMNS = ("file", "azimuth_deg", "elevation_deg", "distance", "fov_deg", "object", "split")
 
 
@@ -45,7 +47,11 @@ class PhotosWriter(Writer):
         return (category,)
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        return viewpoints.photo_views(count, float(np.linalg.norm(vertices, axis=1).max()), rng)
+        """Any azimuth, elevations in -10 .. 50, another lens for every picture; the whole object is seen."""
+        azimuth_deg = uniform(rng, (-180.0, 180.0), count)
+        elevation_deg = uniform(rng, ELEVATIONS_DEG, count)
+        half_fov_deg = uniform(rng, HALF_FOVS_DEG, count)
+        return LookAtPoses(azimuth_deg, elevation_deg, distances(rng, vertices, half_fov_deg), half_fov_deg)
 
     def write(self, item: RenderedObject) -> None:
         size = self.image_size

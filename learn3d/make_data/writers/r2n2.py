@@ -25,11 +25,15 @@ from trimesh.voxel.runlength import dense_to_rle
 from learn3d.data import conventions
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers.kato import synset_of
-from learn3d.make_data import viewpoints
+from learn3d.make_data.viewpoints import uniform
 from learn3d.make_data.writers.pictures import write_png
 from learn3d.make_data.writers.writer import RenderedObject, Writer
 
 TRAIN_SHARE = 0.8
+HALF_FOV_DEG = float(np.rad2deg(np.arctan(16 / 35)))  # 35 mm lens, 32 mm sensor: focal length 2.1875
+DISTANCE = 1.75  # the distance of ratio 1
+ELEVATIONS_DEG = (25.0, 30.0)
+RATIOS = (0.65, 0.95)
 
 
 class R2n2Writer(Writer):
@@ -68,7 +72,14 @@ class R2n2Writer(Writer):
         return vertices / np.linalg.norm(np.ptp(vertices, axis=0))
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        return viewpoints.r2n2_views(count, rng)
+        """Azimuths in (-360, 0], elevations in [25, 30), distances 1.75 * [0.65, 0.95).
+
+        R2N2 counts the azimuth the other way round: its azimuth a is -a here.
+        """
+        azimuth_deg = -uniform(rng, (0.0, 360.0), count)
+        elevation_deg = uniform(rng, ELEVATIONS_DEG, count)
+        distance = uniform(rng, RATIOS, count).astype(np.float64) * DISTANCE
+        return LookAtPoses(azimuth_deg, elevation_deg, distance.astype(np.float32), HALF_FOV_DEG)
 
     def voxelize(self, vertices: Tensor, faces: Tensor) -> np.ndarray:
         return super().voxelize(vertices / _longest_side(vertices), faces)
@@ -81,8 +92,7 @@ class R2n2Writer(Writer):
             write_png(renderings / "rendering" / f"{k:02d}.png", rgba)
         poses = zip(item.poses.azimuth_deg, item.poses.elevation_deg, item.poses.distance, strict=True)
         rows = [
-            f"{-azimuth:.4f} {elevation:.4f} 0 {distance / viewpoints.R2N2_DISTANCE:.4f} 25\n"
-            for azimuth, elevation, distance in poses
+            f"{-azimuth:.4f} {elevation:.4f} 0 {distance / DISTANCE:.4f} 25\n" for azimuth, elevation, distance in poses
         ]
         (renderings / "rendering" / "rendering_metadata.txt").write_text("".join(rows))
         volumes.mkdir(parents=True)

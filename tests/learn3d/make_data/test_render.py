@@ -22,7 +22,6 @@ from learn3d.make_data import meshes, render
 from learn3d.make_data.contact_sheet import draw_sheet, make_row
 from learn3d.make_data.render import DatasetConfig, make_dataset, render_object, split_objects
 from learn3d.make_data.report import lacking
-from learn3d.make_data.viewpoints import kato_views
 from learn3d.make_data.writers import writer_of
 
 
@@ -407,7 +406,9 @@ def test_voxels_on_the_contact_sheet_do_not_touch():
 
 def test_render_object_refuses_what_cannot_be_seen():
     with pytest.raises(ValueError, match="no view shows"):
-        render_object(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.ones(3), kato_views(), 64, np.eye(3))
+        render_object(
+            np.zeros((3, 3)), np.array([[0, 1, 2]]), np.ones(3), kato.view_poses(torch.arange(24)), 64, np.eye(3)
+        )
 
 
 def test_command_line(tmp_path, folder, monkeypatch, capsys):

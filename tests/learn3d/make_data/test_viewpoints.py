@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 
 import nmr
-from learn3d.make_data import viewpoints
+from learn3d.data.poses import Poses
+from learn3d.make_data.writers import writer_of
+
+
+def views(layout: str, radius: float, count: int, seed: int) -> Poses:
+    """The cameras of a layout around an object of that radius."""
+    writer = writer_of(layout)(Path("unused"), "chair")
+    return writer.views(np.array([[radius, 0.0, 0.0]]), count, np.random.default_rng(seed))
 
 
 def test_ranges_and_decimals():
-    rng = np.random.default_rng(0)
-    kar, r2n2, photos = (
-        viewpoints.kar_views(4000, 0.7, rng),
-        viewpoints.r2n2_views(4000, rng),
-        viewpoints.photo_views(4000, 0.7, rng),
-    )
+    kar, r2n2, photos = (views(layout, 0.7, 4000, 0) for layout in ("kar", "r2n2", "photos"))
     for poses, azimuths, elevations in (
         (kar, (-180, 180), (-20, 40)),
         (r2n2, (-360, 0), (25, 30)),
@@ -35,16 +39,16 @@ def test_ranges_and_decimals():
 
 def test_the_whole_object_is_seen():
     vertices, faces = nmr.icosphere(3)
-    rng = np.random.default_rng(1)
-    for poses in (viewpoints.kar_views(30, 0.8, rng), viewpoints.photo_views(30, 0.8, rng)):
+    for poses in (views("kar", 0.8, 30, 1), views("photos", 0.8, 30, 1)):
         alpha = nmr.render_silhouette(0.8 * vertices, faces, poses.cameras(), image_size=64)
         assert not alpha[:, [0, -1]].any() and not alpha[:, :, [0, -1]].any()
         assert (alpha.mean((1, 2)) > 0.3).all()  # and not from afar
 
 
 def test_pascal3d_rotations_are_upright_but_for_the_tilt():
-    rotations = viewpoints.pascal3d_views(500, np.random.default_rng(2))
-    np.testing.assert_allclose(np.linalg.det(rotations), 1)
+    in_object_frame = views("pascal3d", 0.8, 500, 2).rotation.double().numpy()
+    rotations = in_object_frame @ writer_of("pascal3d").turn
+    np.testing.assert_allclose(np.linalg.det(rotations), 1, rtol=1e-6)
     np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (500, 1, 1)), atol=1e-6)
     up = rotations[:, :, 1]  # the object's y in the picture: right, up, away
     tilt = np.rad2deg(np.arctan2(up[:, 0], up[:, 1]))
