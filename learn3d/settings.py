@@ -59,6 +59,8 @@ _WORDS = {
 def _sentence(error: Any, cls: type) -> str:
     """What one error of pydantic's says, as part of a sentence: the field, what was wanted, what came."""
     name = error["loc"][0] if error["loc"] else ""
+    if isinstance(name, int):  # given by position
+        name = fields(cls)[name].name
     if error["type"] == "missing":
         return f"the option {name} is missing"
     if error["type"] == "unexpected_keyword_argument":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -30,6 +30,9 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -
     views = batch.step_views
     count, rows = len(views), views.rows
     for position, name in enumerate(names):
+        if name not in get_args(Augmentation):
+            raise ValueError(f"augmentation must be {', '.join(get_args(Augmentation))}, got {name!r}")
+        images, colors = batch.images, batch.images[:, :3]
         if name == "crop":
             if position > 0:
                 raise ValueError(
@@ -41,27 +44,18 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -
                     "leave it out"
                 )
             colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))[rows.numpy()]))
-            batch = dataclasses.replace(batch, images=torch.cat([colors, batch.images[:, 3:]], dim=1))
-        elif name == "flip":
-            mirrored = torch.from_numpy(rng.random(count) < 0.5)
-            chosen = mirrored[rows]
-            if views.poses is not None:
-                batch = batch.with_poses(views.poses.mirrored(mirrored))
-            batch = dataclasses.replace(
-                batch,
-                images=torch.where(chosen[:, None, None, None], batch.images.flip(3), batch.images),
-                masks=torch.where(chosen[:, None, None], batch.masks.flip(2), batch.masks),
-            )
-        elif name == "flip-image":
-            chosen = torch.from_numpy(rng.random(count) < 0.5)[rows]
-            colors = batch.images[:, :3]
-            colors = torch.where(chosen[:, None, None, None], colors.flip(3), colors)
-            batch = dataclasses.replace(batch, images=torch.cat([colors, batch.images[:, 3:]], dim=1))
         elif name == "channels":
-            order = np.argsort(rng.random((count, 3)), axis=1)
-            order = torch.from_numpy(np.concatenate([order, np.full((count, 1), 3)], axis=1))[rows]
-            images = torch.gather(batch.images, 1, order[:, :, None, None].expand_as(batch.images))
-            batch = dataclasses.replace(batch, images=images)
+            order = torch.from_numpy(np.argsort(rng.random((count, 3)), axis=1))[rows]
+            colors = torch.gather(colors, 1, order[:, :, None, None].expand_as(colors))
         else:
-            raise ValueError(f"augmentation must be flip, flip-image, channels or crop, got {name!r}")
+            mirrored = torch.from_numpy(rng.random(count) < 0.5)
+            chosen = mirrored[rows][:, None, None, None]
+            colors = torch.where(chosen, colors.flip(3), colors)
+            if name == "flip":
+                images = torch.where(chosen, images.flip(3), images)
+                masks = torch.where(chosen[:, 0], batch.masks.flip(2), batch.masks)
+                batch = dataclasses.replace(batch, masks=masks)
+                if batch.poses is not None:
+                    batch = batch.with_poses(batch.step_views.poses.mirrored(mirrored))
+        batch = dataclasses.replace(batch, images=torch.cat([colors, images[:, 3:]], dim=1))
     return batch

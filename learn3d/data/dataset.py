@@ -174,18 +174,18 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
             raise ValueError(f"{other.category} and {first.category} differ in view classes or image size")
         if (other.voxels is None) != (first.voxels is None) or (other.masks is None) != (first.masks is None):
             raise ValueError(f"only one of {other.category} and {first.category} has voxels (or masks)")
+    def joined(name: str) -> np.ndarray | None:
+        parts = [getattr(d, name) for d in datasets]
+        return None if any(part is None for part in parts) else np.concatenate(parts)
+
     starts = np.cumsum([0] + [d.num_objects for d in datasets])[:-1]
     return dataclasses.replace(
         first,
         category=",".join(d.category for d in datasets),
-        images=np.concatenate([d.images for d in datasets]),
-        masks=None if first.masks is None else np.concatenate([d.masks for d in datasets]),
+        **{name: joined(name) for name in ("images", "masks", "view_ids", "voxels", "points")},
         poses=_join_poses([d.poses for d in datasets]),
-        view_ids=np.concatenate([d.view_ids for d in datasets]),
         object_ids=np.concatenate([d.object_ids + start for d, start in zip(datasets, starts, strict=True)]),
         object_names=tuple(name for d in datasets for name in d.object_names),
-        voxels=None if first.voxels is None else np.concatenate([d.voxels for d in datasets]),
-        points=None if any(d.points is None for d in datasets) else np.concatenate([d.points for d in datasets]),
         crops=None if any(d.crops is None for d in datasets) else join([d.crops for d in datasets]),
         class_ids=np.repeat(np.arange(len(datasets)), [d.num_objects for d in datasets]),
         class_names=tuple(d.category for d in datasets),
@@ -201,11 +201,9 @@ def _join_poses(poses: list[Poses | None]) -> Poses | None:
     joined = {}
     for field in dataclasses.fields(kind):
         values = [getattr(p, field.name) for p in poses]
-        if not any(isinstance(v, Tensor) for v in values) and len(set(values)) == 1:
-            joined[field.name] = values[0]
-            continue
-        columns = [
-            v if isinstance(v, Tensor) else torch.full((len(p),), float(v)) for v, p in zip(values, poses, strict=True)
-        ]
-        joined[field.name] = torch.cat(columns)
+        if any(isinstance(v, Tensor) for v in values) or len(set(values)) > 1:  # else one number for all
+            parts = [torch.as_tensor(v, dtype=torch.float32) for v in values]
+            parts = [v if v.ndim else v.expand(len(p)) for v, p in zip(parts, poses, strict=True)]
+            values = [torch.cat(parts)]
+        joined[field.name] = values[0]
     return kind(**joined)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.files import limits
+from learn3d.settings import Positive, checked
 
 
-@dataclass(frozen=True)
+@checked
 class AngleBins:
     """Cells of equal width in azimuth and elevation, K = azimuth cells x elevation cells (paper, table of bins).
 
@@ -21,25 +22,18 @@ class AngleBins:
     beyond the upper end count as the last cell.
     """
 
-    azimuth_width_deg: float
-    elevation_width_deg: float
-    elevation_low_deg: float = -20.0  # Kar's range of elevations is -20 .. 40
-    elevation_high_deg: float = 40.0
+    azimuth_width_deg: Annotated[float, Field(gt=0, le=360)]
+    elevation_width_deg: Positive
+    elevation_low_deg: Annotated[float, Field(ge=-90, le=90)] = -20.0  # Kar's range of elevations is -20 .. 40
+    elevation_high_deg: Annotated[float, Field(ge=-90, le=90)] = 40.0
 
     def __post_init__(self) -> None:
-        numbers = (self.azimuth_width_deg, self.elevation_width_deg, self.elevation_low_deg, self.elevation_high_deg)
-        if not all(map(math.isfinite, numbers)):
-            raise ValueError(f"widths and elevations of bins must be finite, got {numbers}")
-        if not (0 < self.azimuth_width_deg <= 360 and 0 < self.elevation_width_deg):
-            raise ValueError(
-                "bin widths must be positive and the azimuth's at most 360 degrees, got "
-                f"{self.azimuth_width_deg} x {self.elevation_width_deg}"
-            )
-        if not self.elevation_low_deg < self.elevation_high_deg:
+        span = self.elevation_high_deg - self.elevation_low_deg
+        if span <= 0:
             raise ValueError(
                 f"elevations must go from low to high, got {self.elevation_low_deg} .. {self.elevation_high_deg}"
             )
-        cells = 360 / self.azimuth_width_deg * ((self.elevation_high_deg - self.elevation_low_deg) / numbers[1])
+        cells = 360 / self.azimuth_width_deg * (span / self.elevation_width_deg)
         if cells > limits.VIEW_CLASSES:
             raise ValueError(f"there would be {cells:.0f} bins; at most {limits.VIEW_CLASSES} are possible")
 

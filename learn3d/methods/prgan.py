@@ -217,24 +217,18 @@ def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
     )
     if not isinstance(poses, LookAtPoses):
         raise ValueError(f"{wanted}; this data set gives rotations. Take data in Kato's layout")
-    checks = (
-        ("azimuth", wrap_deg(poses.azimuth_deg - views.azimuth_deg(view_ids)).abs(), 0.5, poses.azimuth_deg),
-        ("elevation", _off(poses.elevation_deg, views.elevation_deg), 0.5, poses.elevation_deg),
-        ("distance", _off(poses.distance, views.distance), 0.005 * views.distance, poses.distance),
-        ("half field of view", _off(poses.half_fov_deg, views.half_fov_deg), 0.1, poses.half_fov_deg),
-    )
-    for name, off, allowed, values in checks:
-        if bool((off > allowed).any()):
-            worst = int(off.argmax())
-            value = float(values[worst]) if isinstance(values, Tensor) else values
-            raise ValueError(
-                f"{wanted}; a camera of view {int(view_ids[worst])} has {name} {value:g}. Take data in Kato's layout, "
-                "or give the data set's own elevation_deg, distance and half_fov_deg"
-            )
-
-
-def _off(values: Tensor | float, wanted: float) -> Tensor:
-    return (torch.as_tensor(values, dtype=torch.float32) - wanted).abs()
+    found = [torch.as_tensor(v).expand(len(poses)) for v in (poses.elevation_deg, poses.distance, poses.half_fov_deg)]
+    found = torch.stack([poses.azimuth_deg, *found]).T
+    off = found - torch.tensor([0.0, views.elevation_deg, views.distance, views.half_fov_deg])
+    off[:, 0] = wrap_deg(off[:, 0] - views.azimuth_deg(view_ids))
+    wrong = (off.abs() > torch.tensor([0.5, 0.5, 0.005 * views.distance, 0.1])).any(1)
+    if bool(wrong.any()):
+        first = int(wrong.nonzero()[0])
+        numbers = "azimuth {:g}, elevation {:g}, distance {:g}, half field of view {:g}".format(*found[first].tolist())
+        raise ValueError(
+            f"{wanted}; a camera of view {int(view_ids[first])} has {numbers}. Take data in Kato's layout, or give "
+            "the data set's own elevation_deg, distance and half_fov_deg"
+        )
 
 
 def _bce(logits: Tensor, target: float) -> Tensor:

@@ -37,7 +37,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "lacking": ({"data": "d", "category": "chair"}, "the option output is missing"),
     "many bins": (BASE | {"view_bins": "1e-9x1"}, "there would be 21600000000000 bins; at most 100000"),
-    "endless bins": (BASE | {"view_bins": "15x5:-inf:30"}, "widths and elevations of bins must be finite"),
+    "endless bins": (BASE | {"view_bins": "15x5:-inf:30"}, "elevation_low_deg must be a finite number"),
     "seed": (BASE | {"seed": 2**64}, "seed must be less than"),
     "true seed": (BASE | {"seed": True}, "seed must be a whole number"),
     "iterations": (BASE | {"iterations": "abc"}, "iterations must be a whole number, got 'abc'"),
