@@ -1,5 +1,5 @@
-// Work on an owner map in blocks of raster rows, and sums over blocks that do not depend on the number of threads: the blocks
-// are fixed by the sizes alone, each block sums on its own, and the sums are added up in the order of the blocks.
+// Work on an owner map in blocks of raster rows, with sums that do not depend on the number of threads: the blocks depend only on
+// the sizes, each block has its own sum, and the sums are added in the order of the blocks.
 #pragma once
 
 #include <algorithm>
@@ -12,13 +12,13 @@
 
 namespace nmr {
 
-// The rows of one image, in blocks. An even number of rows each, so that no 2x2 mean crosses two blocks.
+// The rows of one image, in blocks. Each has an even number of rows, so that every 2x2 mean lies in one block.
 struct RowBlocks {
   int64_t raster_size;  // R
   int64_t rows;         // per block
   int64_t count;
 
-  // A block has at least 2^14 pixels and, as every block looks once at every face's mark, a quarter as many as faces.
+  // A block has at least 2^14 pixels, and at least a quarter as many pixels as there are faces, because it reads every face's mark.
   RowBlocks(int64_t R, int64_t num_faces) : raster_size(R) {
     const int64_t pixels = std::max<int64_t>(int64_t(1) << 14, num_faces / 2);
     rows = (pixels + R - 1) / R;
@@ -27,19 +27,19 @@ struct RowBlocks {
   }
   int64_t first(int64_t block) const { return block * rows; }
   int64_t last(int64_t block) const { return std::min(first(block) + rows, raster_size); }
-  // Most faces (originals and copies) that can own a pixel of one block.
+  // Largest number of faces (originals and copies) that can own a pixel of one block.
   int64_t most_visible(int64_t num_faces) const { return std::min(2 * num_faces, rows * raster_size); }
 };
 
 // The faces that own a pixel, numbered from 1 in ascending order; the background is number 0.
 struct VisibleFaces {
-  std::vector<int32_t> slots;  // [2 F + 1] number of owner entry id at [id + 1]; only the entries of visible faces mean anything
+  std::vector<int32_t> slots;  // [2 F + 1] number of owner entry id at [id + 1]; defined only for visible faces
   std::vector<int32_t> ids;    // [count] owner entries; ids[0] = -1
   int64_t count;
 
   void reserve_for(int64_t num_faces, int64_t most_visible) {
     reserve(slots, 2 * num_faces + 1);
-    reserve(ids, most_visible + 2);  // the search writes one entry beyond the last that it keeps
+    reserve(ids, most_visible + 2);  // the search may write one entry after the last one
   }
 
   NMR_INLINE void find(const int32_t* owner, int64_t pixels, int64_t num_faces) {
@@ -72,9 +72,9 @@ NMR_INLINE void covered_range(const int32_t* owner, int64_t R, int64_t& first, i
   while (last > first && owner[last - 1] < 0) --last;
 }
 
-// Calls produce(b, block, result) for every block of every image, on several threads, and consume(b, result) for each of them:
-// those that add to the same output one after the other in ascending order of (b, block). Images add to outputs of their own,
-// unless they share them. block_count(b) is the number of blocks of image b.
+// Calls produce(b, block, result) for every block of every image, on several threads, and then consume(b, result) for each block.
+// Blocks that add to the same output are consumed one after the other, in ascending order of (b, block). Each image has its own
+// output, unless the images share one. block_count(b) is the number of blocks of image b.
 template <class Result, class BlockCount, class Produce, class Consume>
 void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& block_count, const Produce& produce,
                 const Consume& consume) {
@@ -88,7 +88,7 @@ void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& b
     });
     return;
   }
-  // Some blocks at a time are produced, by all threads together, and then consumed in order.
+  // All threads produce a group of blocks, which are then consumed in order.
   std::vector<Result>& results = thread_scratch<std::vector<Result>>();
   std::vector<std::pair<int64_t, int64_t>>& tasks = thread_scratch<std::vector<std::pair<int64_t, int64_t>>>();
   tasks.clear();
@@ -117,7 +117,7 @@ struct FaceGradients {
   int64_t count;
 };
 
-// Adds them to the vertices of one image (faces [F, 3]).
+// Adds these gradients to the vertices of one image (faces [F, 3]).
 template <class T>
 void scatter_face_gradients(const FaceGradients<T>& gradients, const int64_t* faces, int64_t num_faces, T* grad_vertices) {
   const T* value = gradients.values.data();

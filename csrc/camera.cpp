@@ -1,4 +1,4 @@
-// World space to renderer space, forward and backward: what the published renderer does in a chain of tensor operations.
+// World space to renderer space, forward and backward. (The published renderer uses a chain of tensor operations.)
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -10,12 +10,12 @@
 namespace nmr {
 namespace {
 
-constexpr int kLanes = 16;       // vertices side by side, and partial sums per gradient; the same on every processor
+constexpr int kLanes = 16;       // vertices processed together, and partial sums per gradient; the same on every processor
 constexpr int64_t kChunk = 512;  // vertices per task: sums are taken per chunk, then over chunks
 constexpr int kSums = 12 + 6 + 5;        // sums over vertices per camera: gradients of matrix, intrinsics, distortion
-constexpr int kTotals = kSums + 3 + 1;   // and what follows from them: gradients of origin, extent
+constexpr int kTotals = kSums + 3 + 1;   // plus the gradients of origin and extent, which follow from the sums
 
-// Beyond this a derivative, or a gradient multiplied with it, counts as infinite; small enough that sums cannot overflow.
+// Derivatives, and gradients multiplied by them, count as infinite beyond this limit. It is small enough that sums cannot overflow.
 template <class T> constexpr T kLimit = T(1e200);
 template <> constexpr float kLimit<float> = 1e30f;
 
@@ -54,20 +54,20 @@ NMR_INLINE bool is_finite(T value) {
   return std::abs(value) <= std::numeric_limits<T>::max();
 }
 
-// Where a vertex is seen. Without an image (the vertex not finite, in the plane of the eye, or so near to it that x / z^2
-// overflows) `size` is not finite and the rest is without meaning. (One number and one comparison: loops over `&&` stay scalar.)
+// The image of a vertex. If there is none (the vertex is not finite, in the plane of the eye, or so close to it that x / z^2
+// overflows), `size` is not finite and all else is undefined. (One number, because compilers do not vectorize loops over `&&`.)
 template <class T>
 struct Sight {
   T inverse_z;
   T px, py;    // before the distortion
   T qx, qy;    // after it, divided by the extent
   T x, y, z;   // in renderer space
-  T slope;     // bounds the derivative of extent q to the vertex in camera axes, but for a factor below 10
+  T slope;     // bound of the derivative of extent q by the vertex in camera axes, up to a factor below 10
   T size;      // |x| + |y| + |z|
 };
 
-// x, y, z are relative to the origin. The image divides, and so rounds as the published one; derivatives (kExact false) take one
-// reciprocal instead, a third of their time.
+// x, y, z are relative to the origin. Images use divisions, which round as the published ones. Derivatives (kExact false) use one
+// reciprocal instead, which saves time.
 template <class T, bool kPerspective, bool kDistorted, bool kExact>
 NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
   Sight<T> s;
@@ -109,8 +109,8 @@ NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T*
   }
 }
 
-// Adds the gradient of kLanes vertices to grad_vertices, and that of the camera to the partial sums. A vertex without an image
-// gets and gives exactly 0; so does one whose gradient would overflow. (An upstream NaN is passed on.)
+// Adds the gradient of kLanes vertices to grad_vertices, and that of the camera to the partial sums. A vertex without an image, or
+// whose gradient would overflow, gets gradient 0 and contributes 0 to the camera. (An upstream NaN is passed on.)
 template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
 NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, const T* __restrict grad_points,
                                T* __restrict grad_vertices, T (*__restrict sums)[kLanes]) {
@@ -126,7 +126,7 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
     const T bound = ((std::abs(gx) + std::abs(gy)) * reach + std::abs(gz)) * c.largest_a *
                     larger(larger(larger(std::abs(x), std::abs(y)), std::abs(z)), T(1));
     const bool keep = is_finite(bound >= kLimit<T> ? std::numeric_limits<T>::infinity() : s.size);
-    // What is left out is replaced before it enters a product, so that nothing becomes 0 * inf.
+    // Values of skipped vertices are set to 0 before they are multiplied, so that no product is 0 * inf.
     x = keep ? x : T(0), y = keep ? y : T(0), z = keep ? z : T(0);
     gx = keep ? gx : T(0), gy = keep ? gy : T(0), gz = keep ? gz : T(0);
     s.px = keep ? s.px : T(0), s.py = keep ? s.py : T(0);
@@ -174,12 +174,12 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
   }
 }
 
-// A run of vertices of one image: first rows of the vertices and of the points.
+// Consecutive vertices of one image: their first row in the vertices and in the points.
 struct Run {
   int64_t image, vertices, points, count;
 };
 
-// The last, partial group of a run passes through padded copies, in which the vertices without an owner are NaN: no image.
+// The last, incomplete group of a run is copied and padded with NaN vertices, which have no image.
 template <class T>
 struct Padded {
   T vertices[3 * kLanes], grad_points[3 * kLanes], out[3 * kLanes];
@@ -248,7 +248,7 @@ NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, con
                        double(lens.k[4]) * t[16]) / double(lens.extent);
 }
 
-// total: kTotals gradients of the camera over this run, or nullptr.
+// total: kTotals gradients of the camera, summed over this run, or nullptr.
 template <class T>
 NMR_INLINE void backward_run_body(const Project<T>& args, const Run& run, T* grad_vertices, double* total) {
   const Lens<T> lens(args, run.image);
@@ -280,7 +280,7 @@ struct ProjectScratch {
   std::vector<double> totals;
 };
 
-// All runs, image after image.
+// The runs of all images, in order.
 template <class T>
 const std::vector<Run>& runs_of(const Project<T>& args, ProjectScratch& scratch) {
   scratch.runs.clear();
@@ -318,7 +318,7 @@ void project_backward(const Project<T>& args) {
 
   if (args.batch == 0 && args.grad_vertices) std::fill_n(args.grad_vertices, 3 * args.vertex_batch * args.num_vertices, T(0));
 
-  // Vertices that all images share are owned by the task of their chunk, which visits the images in order.
+  // If all images share the vertices, each chunk of vertices belongs to one task, which visits the images in order.
   const bool shared = !args.starts && args.vertex_batch == 1 && args.batch > 1;
   const int64_t images = shared ? args.batch : 1, tasks = num_runs / images;
   parallel_for(tasks, args.num_threads, [&](int64_t task) {

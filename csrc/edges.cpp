@@ -1,8 +1,8 @@
-// NMR's gradient of an image of any channels: for every edge of a visible face and every raster line that crosses it, with c the
-// crossing, `in` the pixel just inside and `out` the one just outside,
+// NMR's gradient of an image with any number of channels. For every edge of a visible face and every raster line that crosses it, let
+// c be the crossing, `in` the pixel just inside and `out` the pixel just outside:
 //   outside: if the face owns `in`, each pixel m from `out` to the border would become I(in) if the edge moved out to it;
-//   inside:  each own pixel m would become I(out) if the edge moved in past it.
-// Where that lowers the loss, D = sum over channels of (I(m) - I(in or out)) g(m) > 0, both ends of the edge are pulled by
+//   inside:  each pixel m of the face would become I(out) if the edge moved in past it.
+// If this lowers the loss, D = sum over channels of (I(m) - I(in or out)) g(m) > 0, then m pulls both ends of the edge with
 // D / (distance they must travel). Lines of constant x (axis 0) move y, lines of constant y (axis 1) move x.
 #include <algorithm>
 #include <cmath>
@@ -48,16 +48,16 @@ void resolve_backward(const Resolve<T>& args) {
 
 namespace {
 
-constexpr int64_t kWidth = 16;      // pixels handled together
+constexpr int64_t kWidth = 16;      // pixels processed together
 constexpr int64_t kTile = 16;       // lines listed together
 constexpr int64_t kFaceChunk = 32;  // faces swept together
 
-// The pixels of every line of one axis whose gradient is not zero, in ascending order. The others cannot pull.
+// The pixels with a non-zero gradient on every line of one axis, in ascending order. Others cannot pull.
 template <class T>
 struct LineLists {
   std::vector<T> values;        // [R, 1 + 2 C, stride] position on the line; image; gradient
   std::vector<int32_t> owner;   // [R, stride]
-  std::vector<int32_t> before;  // [R, R + 1] how many listed pixels of the line lie before each pixel
+  std::vector<int32_t> before;  // [R, R + 1] number of listed pixels of the line before each pixel
 };
 
 template <class T>
@@ -67,13 +67,13 @@ struct EdgeScratch {
   FaceGradients<T> gradients;
 };
 
-// What the sweeps along one axis read of one image. Pixel m of line n is column n, row m from the bottom for axis 0, and
+// Input of the sweeps along one axis for one image. Pixel m of line n is column n, row m from the bottom for axis 0, and
 // column m, row n from the bottom for axis 1.
 template <class T>
 struct Lines {
   int64_t R, C, stride;
   int axis;
-  int64_t first, last;     // lines with a covered pixel lie in [first, last); no other line pulls
+  int64_t first, last;     // all lines with a covered pixel lie in [first, last)
   T eps;
   const int32_t* owner;    // [R, R], row 0 = top
   const T *image, *grad;   // [R, R, C]
@@ -82,7 +82,7 @@ struct Lines {
   NMR_INLINE int64_t pixel(int64_t n, int64_t m) const { return axis == 0 ? (R - 1 - m) * R + n : (R - 1 - n) * R + m; }
 };
 
-// Lists pixel m of line n, if it can pull, as number `count` of its line.
+// Adds pixel m of line n to the list, as number `count` of its line, if it can pull.
 template <int64_t kChannels, class T>
 NMR_INLINE void list_pixel(const Lines<T>& lines, int64_t n, int64_t m, int32_t& count) {
   const int64_t C = kChannels ? kChannels : lines.C, stride = lines.stride, pixel = lines.pixel(n, m);
@@ -100,7 +100,7 @@ NMR_INLINE void list_pixel(const Lines<T>& lines, int64_t n, int64_t m, int32_t&
   lines.lists->before[n * (lines.R + 1) + m + 1] = count;
 }
 
-// kChannels is the number of channels, or 0 if it is not known beforehand.
+// kChannels is the number of channels, or 0 if it is known only at run time.
 template <int64_t kChannels, class T>
 NMR_INLINE void list_lines(const Lines<T>& lines, int64_t first) {
   const int64_t R = lines.R, last = std::min(first + kTile, lines.last);
@@ -125,12 +125,12 @@ NMR_INLINE void list_tile_body(const Lines<T>& lines, int64_t first) {
   }
 }
 
-// How an edge P-Q, crossed at t = c by line n, moves with each of its ends.
+// How the crossing c of an edge P-Q and line n moves with each end of the edge.
 template <class T>
 struct Lever {
   T crossing;         // c
-  T p, q;             // travel of P in [-1, 1] that moves the crossing by one pixel: 2 / R (Qs - Ps) / (Qs - n); that of Q
-  bool p_acts, q_acts;  // false where the line passes through the other end, or the factor overflows
+  T p, q;             // distance in [-1, 1] that P must travel to move c by one pixel: 2 / R (Qs - Ps) / (Qs - n); the same of Q
+  bool p_acts, q_acts;  // false if the line passes through the other end, or p or q overflows
 };
 
 // Pulls of an edge on its ends, in lanes.
@@ -139,7 +139,7 @@ struct Pulls {
   T p[kWidth], q[kWidth];
 };
 
-// Adds the pulls of the listed pixels [first, last) of line n, of those that face `id` owns if kOwn, against a reference color.
+// Adds the pulls of the listed pixels [first, last) of line n (if kOwn, only those that face `id` owns), given the reference colour.
 template <class T, bool kOwn>
 NMR_INLINE void pull_listed(const Lines<T>& lines, int64_t n, int32_t first, int32_t last, int32_t id, const T* reference,
                             const Lever<T>& lever, Pulls<T>& pulls) {
@@ -176,14 +176,14 @@ NMR_INLINE T sum_pulls(const T* lanes) {
 // Both sweeps of edge P-Q (O is the third corner). s is the scan coordinate, t the sweep coordinate, in pixels.
 template <class T>
 NMR_INLINE void sweep_edge(const Lines<T>& lines, int32_t id, T ps, T pt, T qs, T qt, T os, T ot, T& grad_p, T& grad_q) {
-  if (ps == qs) return;  // the edge lies along the scan line: neither end can move its crossing
+  if (ps == qs) return;  // the edge is parallel to the scan line: neither end can move a crossing
   const int64_t R = lines.R;
   const T top = static_cast<T>(R - 1), scale = 2 / static_cast<T>(R);
   const int64_t d = ((ps < qs) == (lines.axis == 0)) ? -1 : 1;  // outward
   const T low = std::max(std::min(ps, qs), T(0)), high = std::min(std::max(ps, qs), top);
   if (!(low <= top)) return;
   const int64_t n_first = std::max(static_cast<int64_t>(std::ceil(low)), lines.first);
-  // Truncation towards zero, as published: an edge that ends in (-1, 0) is extrapolated onto line 0.
+  // Truncation towards zero, as published: an edge that ends in (-1, 0) is extrapolated to line 0.
   const int64_t n_last = std::min(high > -1 ? static_cast<int64_t>(high) : -1, lines.last - 1);
   if (n_first > n_last) return;
   const T slope = (qt - pt) / (qs - ps);
@@ -223,7 +223,7 @@ NMR_INLINE void sweep_edge(const Lines<T>& lines, int32_t id, T ps, T pt, T qs, 
   grad_q += sum_pulls(pulls.q);
 }
 
-// The faces [first, last) among the visible ones.
+// Visible faces [first, last).
 template <class T>
 NMR_INLINE void sweep_faces_body(const Lines<T>& lines, const T* vertices, const int64_t* faces, int64_t num_faces, int64_t first,
                                  int64_t last, FaceGradients<T>& gradients) {
@@ -291,7 +291,7 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
   int64_t first_line[2], last_line[2];
   covered_box(owner, R, first_line, last_line);
 
-  // One axis after the other, in the same memory.
+  // Both axes use the same memory, one after the other.
   const int64_t stride = R + kWidth;
   const T *image = args.image + b * R * R * C, *grad = args.grad_image + b * R * R * C;
   reserve(scratch.lists.values, R * (1 + 2 * C) * stride);
@@ -314,7 +314,7 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
 
 template <class T>
 void edges_backward(const EdgesBackward<T>& args) {
-  // Few images: all threads share the lines and the faces of one. Each face sums on its own, so the result is the same.
+  // Few images: all threads share the lines and faces of one image. Each face has its own sum, so the result is the same.
   const bool share_images = args.mesh.batch < args.num_threads;
   parallel_for(args.mesh.batch, share_images ? 1 : args.num_threads,
                [&](int64_t b) { edges_backward_image(args, b, share_images ? args.num_threads : 1); });

@@ -1,5 +1,5 @@
-// Barycentric weights and depth of the owner at each pixel. The owner map is given: at each of its pixels the owner's weights
-// and depth are computed again, by the same expressions as in the rasterizer.
+// Barycentric weights and depth of the owner at each pixel. They are computed from the owner map, by the same expressions as in the
+// rasterizer.
 //
 // With w_k the normalised screen weights and q = sum_k w_k / z_k: depth z = 1 / q, perspective-correct weights b_k = z w_k / z_k.
 // Moving corner k by (dX, dY) pixels changes the weights at a fixed pixel by dw_m = -w_k (M_m0 dX + M_m1 dY), M as in geometry.h.
@@ -19,7 +19,7 @@ namespace {
 constexpr int64_t kWidth = 16;  // faces set up together
 constexpr int64_t kEntry = 16;  // numbers per face in the table: columns 0, 1, 2 of M and the depths, each padded to four
 
-// What is known of the covered pixels of one row, from the first one on. Written in whole vectors: rows are padded.
+// Values of the covered pixels of one row, from the first covered pixel on. Rows are padded to whole vectors.
 template <class T>
 struct PixelRow {
   T* raw;      // [R + kWidth, 8] clamped weights and depths of the corners, each padded to four
@@ -32,7 +32,7 @@ struct FragmentScratch {
   VisibleFaces visible;
   std::vector<T> table;  // [visible, kEntry]
   std::vector<T> row;    // [13, R + kWidth] PixelRow
-  std::vector<T> terms;  // [R, 12] what each pixel adds to its face
+  std::vector<T> terms;  // [R, 12] contribution of each pixel to its face
   std::vector<T> sums;   // [visible, 12]
 
   void reserve_for(int64_t num_faces, const RowBlocks& blocks) {
@@ -123,7 +123,7 @@ NMR_INLINE void evaluate_row(const Block<T>& block, int64_t j, int64_t first, in
   for (int64_t i = first; i < last; ++i, raw += 8) {
     const T* entry = table + slots[owner[i]] * kEntry;
     const T x = static_cast<T>(i);
-    T pixel[8];  // local, so that the compiler may use vectors of four without a fear of overlaps
+    T pixel[8];  // a local array cannot overlap others, so the compiler can use vectors of four
     for (int k = 0; k < 4; ++k) pixel[k] = clamp_weight(entry[k] * x + entry[4 + k] * y + entry[8 + k]);
     for (int k = 0; k < 4; ++k) pixel[4 + k] = entry[12 + k];
     for (int k = 0; k < 8; ++k) raw[k] = pixel[k];
@@ -200,8 +200,8 @@ NMR_INLINE void fragments_block_body(const Fragments<T>& args, const Block<T>& b
 
 // --- backward
 
-// dq/d(X, Y, z) of a face's corners, but for the weight of the pixel: 1 / z_m^2 and M_m / z_m. Those that come near to an
-// overflow count as 0: a corner in the plane of the eye gets no gradient, and spoils none.
+// dq/d(X, Y, z) of a face's corners, without the weight of the pixel: 1 / z_m^2 and M_m / z_m. Values close to an overflow count as
+// 0: a corner in the plane of the eye gets no gradient, and does not change others.
 template <class T>
 NMR_INLINE T moderate_or_zero(T value) {
   return std::abs(value) < std::sqrt(std::numeric_limits<T>::max()) ? value : T(0);
@@ -348,7 +348,7 @@ NMR_DEFINE_BLOCKS(float)
 NMR_DEFINE_BLOCKS(double)
 #undef NMR_DEFINE_BLOCKS
 
-// Blocks of an image are cut by its own number of faces, so that an image does not depend on its neighbours in a packed batch.
+// The blocks of an image depend only on its own number of faces, so that results do not depend on other images of a packed batch.
 template <class Args, class T = std::remove_pointer_t<decltype(Args::depth)>>
 void forward(const Args& args, int64_t R) {
   const MeshBatch<T>& mesh = args.mesh;

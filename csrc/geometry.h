@@ -1,5 +1,5 @@
-// Screen geometry: pixel coordinates, facing, barycentric weights. Every expression is evaluated in the order written, in T,
-// without contraction: the order of operations is part of the definition (it decides pixels that lie on an edge).
+// Screen geometry: pixel coordinates, facing, barycentric weights. Every expression is evaluated in the written order, in T, without
+// fused multiply-adds: rounding decides which face owns a pixel on an edge, so the order of operations is part of the definition.
 #pragma once
 
 #include <cmath>
@@ -39,8 +39,8 @@ NMR_INLINE Triangle<T> load_triangle(const T* vertices, const int64_t* face, boo
   return t;
 }
 
-// Faces with a non-finite x or y, a NaN depth, or no area are not drawn. The area is computed in double, which is all but exact
-// for float coordinates: the inclusive edge tests of a face that is collinear would otherwise pass along its whole line.
+// Faces with a non-finite x or y, a NaN depth, or no area are not drawn. The area is computed in double, which is almost exact for
+// float coordinates. Otherwise the inclusive edge tests of a collinear face could pass along its whole line.
 template <class T>
 NMR_INLINE bool is_drawable(const Triangle<T>& t) {
   bool finite = true;
@@ -76,14 +76,14 @@ NMR_INLINE T clamp_weight(T w) {
   return w < 1 ? w : T(1);
 }
 
-// Height of the infinite line A-B over the scan coordinate n; s is the scan coordinate, t the other one.
+// Coordinate t of the infinite line A-B at the scan coordinate s = n.
 template <class T>
 NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
   return (bt - at) / (bs - as) * (n - as) + at;
 }
 
-// The last pixel that a sweep into a face visits, at most one beyond [0, R): where it leaves the face again, towards t = -infinity if
-// d > 0 and +infinity if d < 0. Rounded and converted as published: truncated, saturated, NaN to 0.
+// The last pixel of a sweep into a face: where it leaves the face, in the direction of t = -infinity if d > 0 and of +infinity if
+// d < 0; at most one pixel outside [0, R). Rounded and converted as published: truncated, saturated, NaN to 0.
 template <class T>
 NMR_INLINE int64_t sweep_limit(T far_side, int64_t d, int64_t R) {
   const T t = d > 0 ? std::ceil(far_side) : std::floor(far_side);

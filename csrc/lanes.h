@@ -1,6 +1,6 @@
-// Eight values handled together. With GCC and Clang these are their vector types, which become one or more registers of
-// whatever the processor has; elsewhere a struct of loops. Every operation acts on each lane by itself, so results do not depend
-// on the width of the registers.
+// Eight values that are processed together (lanes). With GCC and Clang these are vector types, which become one or more registers of
+// the processor; elsewhere a struct with loops. Every operation treats each lane separately, so results do not depend on the width
+// of the registers.
 #pragma once
 
 #include <cstdint>
@@ -47,7 +47,7 @@ template <class M, class V>
 NMR_INLINE V select(M mask, V yes, V no) {
   return mask ? yes : no;
 }
-// A mask over lanes of T as one over 32-bit lanes, and back.
+// Converts a mask over lanes of T to one over 32-bit lanes, and back.
 template <class M>
 NMR_INLINE Lanes32 narrow_mask(M mask) {
   return __builtin_convertvector(mask, Lanes32);
@@ -68,7 +68,7 @@ NMR_INLINE Lanes32 truncate(V v) {
 
 #else
 
-// The same by loops, for other compilers.
+// The same with loops, for other compilers.
 template <class E>
 struct LaneArray {
   E lane[kLanes];

@@ -1,11 +1,11 @@
-// The silhouette's gradient of Kato and Harada 2019, which reaches one pixel: where the object ends between two pixels, the loss
-// tells whether the end should move, and the point that is seen in the covered one of the two moves.
+// The silhouette gradient of Kato and Harada 2019, which reaches one pixel: where the object ends between two pixels, the loss decides
+// whether the border should move, and the point seen in the covered pixel moves.
 //
-// With I the coverage (0 or 1) and g the gradient of the loss by it, both at raster resolution, and i, j neighbours in a row, j to
-// the right: if what is seen moves right by a pixel (2 / R), I_j becomes I_i, and the loss falls at the rate
+// I is the coverage (0 or 1), g the gradient of the loss with respect to I, both on the raster; i and j are neighbours in a row, j to
+// the right. If the content moves right by a pixel (2 / R), I_j becomes I_i, and the loss falls at the rate
 //     right = -(I_i - I_j) g_j R / 2;      if it moves left, I_i becomes I_j:      left = -(I_j - I_i) g_i R / 2.
-// A covered pixel sums both rates over its two pairs, goes the better way or none, and hands that to the corners of its face by
-// their weights at its centre, which are taken as constant. Rows upwards likewise, for y. z gets nothing.
+// A covered pixel sums both rates over its two pairs and takes the better direction, or none. The result is distributed to the corners
+// of its face by their weights at its centre, which are treated as constants. y is treated in the same way, upwards. z gets nothing.
 #include <algorithm>
 #include <cmath>
 
@@ -30,7 +30,7 @@ struct LocalImage {
 
   bool covered(int64_t row, int64_t column) const { return owner[row * R + column] >= 0; }
 
-  // A 2x2 mean shares its gradient in quarters.
+  // With a 2x2 mean each raster pixel gets a quarter of the image's gradient.
   T grad(int64_t row, int64_t column) const {
     return anti_aliasing ? grad_alpha[row / 2 * S + column / 2] / 4 : grad_alpha[row * S + column];
   }
@@ -41,7 +41,7 @@ template <class T>
 struct Rates {
   T up = 0, down = 0;
 
-  // The end of the object towards the upper (lower) neighbour, which is background: `own` and `other` are the gradients of the two.
+  // A border of the object: the upper (lower) neighbour is background. `own` and `other` are the gradients of the two pixels.
   void add_upper_end(T own, T other) {
     up -= other;
     down += own;
@@ -51,7 +51,7 @@ struct Rates {
     down -= other;
   }
 
-  // d loss / d coordinate: that of the better direction, if it is any good and clearly better. A NaN stays one.
+  // d loss / d coordinate of the better direction, or 0 if it does not lower the loss or is not clearly better. NaN is kept.
   T gradient(T per_pixel, T eps) const {
     const T u = up * per_pixel, d = down * per_pixel;
     if (!(u - d == u - d)) return u - d;
@@ -60,8 +60,8 @@ struct Rates {
   }
 };
 
-// Screen weights of a face's corners at the centre of a pixel, in the order in which it is drawn; as in the rasterizer. False if it
-// has none: no rasterizer makes such a face an owner.
+// Screen weights of a face's corners at the centre of a pixel, in the order in which it is drawn, computed as in the rasterizer. False
+// if they are not defined; the rasterizer never makes such a face an owner.
 template <class T>
 bool screen_weights(const Triangle<T>& t, int64_t row, int64_t column, int64_t R, T (&w)[3]) {
   const BarycentricMatrix<T> matrix = barycentric_matrix(t, static_cast<T>(R));
@@ -79,7 +79,7 @@ void pull_pixel(const LocalImage<T>& image, int64_t row, int64_t column, T* grad
   Rates<T> x, y;
   bool at_end = false;
   const auto neighbour = [&](int64_t r, int64_t c, auto add) {
-    if (r < 0 || r > end || c < 0 || c > end || image.covered(r, c)) return;  // beyond the border nothing is known
+    if (r < 0 || r > end || c < 0 || c > end || image.covered(r, c)) return;  // no gradient across the border of the image
     at_end = true;
     add(image.grad(r, c));
   };
@@ -104,7 +104,7 @@ void pull_pixel(const LocalImage<T>& image, int64_t row, int64_t column, T* grad
 
 }  // namespace
 
-// Images in parallel; the pixels of one in a fixed order, because they share vertices.
+// Images in parallel; the pixels of an image in a fixed order, because they share vertices.
 template <class T>
 void local_gradient(const SilhouetteBackward<T>& args) {
   const int64_t S = args.image_size, R = args.anti_aliasing ? 2 * S : S;

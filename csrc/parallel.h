@@ -1,4 +1,4 @@
-// The one parallel loop, per-thread scratch, and the choice of instruction set.
+// The parallel loop, scratch memory per thread, and the choice of instruction set.
 #pragma once
 
 #include <cstdint>
@@ -7,9 +7,9 @@
 #include <type_traits>
 #include <vector>
 
-// A function marked NMR_CLONES is compiled for three levels of x86-64 and the loader picks one. Only code inlined into it
-// is cloned with it, so what it calls in its loops is marked NMR_INLINE. Elsewhere the macro is empty: other processors, other
-// compilers, GCC before 12 (which does not know the levels), C libraries other than glibc (which cannot choose at load time).
+// A function marked NMR_CLONES is compiled for three levels of x86-64, and the loader chooses one. Only code that is inlined into it
+// is compiled with it, so functions called in its loops are marked NMR_INLINE. The macro is empty on other processors, with other
+// compilers, with GCC before 12 (which does not know the levels), and without glibc (which makes the choice at load time).
 #if defined(NMR_MULTIVERSION) && defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && __GNUC__ >= 12
 #define NMR_CLONES __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4")))
 #else
@@ -24,7 +24,7 @@
 
 namespace nmr {
 
-// Calls body(i) for i in [0, count), each i on one thread. Iterations must be independent: then the result does not
+// Calls body(i) for i in [0, count), each i on one thread. Iterations must be independent, so that the result does not
 // depend on num_threads. An exception (std::bad_alloc) reaches the caller after all threads have stopped.
 template <class Body>
 void parallel_for(int64_t count, int num_threads, const Body& body) {
@@ -53,8 +53,8 @@ Scratch& thread_scratch() {
   return scratch;
 }
 
-// Grows a buffer (never shrinks it) and returns its storage. With NMR_FRESH_SCRATCH (sanitizer builds) it is a new one of exactly
-// this size, full of rubbish: what reads beyond it, or reads what it has not written, cannot go unseen.
+// Grows a buffer (never shrinks it) and returns its storage. With NMR_FRESH_SCRATCH (sanitizer builds) the buffer is new, has exactly
+// this size, and is filled with garbage: sanitizers and tests then notice reads beyond it and reads of unwritten values.
 template <class T>
 T* reserve(std::vector<T>& buffer, size_t size) {
 #ifdef NMR_FRESH_SCRATCH

@@ -1,5 +1,5 @@
-// The pose of a camera that looks along a direction, forward and backward: one call in place of a chain of some twenty tensor
-// operations, and one place that keeps poses that are not finite out of every product.
+// The pose of a camera that looks along a direction, forward and backward: one call instead of about twenty tensor operations. Poses
+// that are not finite are handled here.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -16,11 +16,11 @@ using Vec3 = Eigen::Matrix<T, 3, 1>;
 template <class T>
 using Matrix34 = Eigen::Matrix<T, 3, 4, Eigen::RowMajor>;
 
-constexpr double kShortest = 1e-5;  // as published: a shorter vector is divided by this and stays short, which is no error
-constexpr double kLargest = 1e15;   // up to here neither lengths nor their derivatives overflow, in float either
+constexpr double kShortest = 1e-5;  // as published: a shorter vector is divided by this, and stays short
+constexpr double kLargest = 1e15;   // up to this size lengths and their derivatives do not overflow, even in float
 
-// Lengths and cross products round as the published chain's do, which were compiled with fused multiply-adds: the only ones of
-// this library, written out so that every processor gives the same bits.
+// Lengths and cross products round as the published ones, which were compiled with fused multiply-adds. These are the only fused
+// multiply-adds in this library; they are written explicitly, so that every processor gives the same bits.
 template <class T>
 T length(const Vec3<T>& v) {
   return std::sqrt(std::fma(v[2], v[2], std::fma(v[1], v[1], v[0] * v[0])));
@@ -77,7 +77,7 @@ void pose_forward(const Pose<T>& args) {
   }
 }
 
-// In double, where the divisions by as little as 1e-5 cannot overflow for float.
+// In double: for float inputs, divisions by numbers as small as 1e-5 then cannot overflow.
 template <class T>
 void pose_backward(const Pose<T>& args) {
   const double largest = std::numeric_limits<T>::max();

@@ -1,4 +1,4 @@
-// What the sweeps of a silhouette's gradient read: on every row and column of an image, the pixels that can pull.
+// Input of the sweeps of the silhouette gradient: the pixels of every row and column of an image that can pull.
 #pragma once
 
 #include <algorithm>
@@ -11,11 +11,11 @@
 
 namespace nmr {
 
-// Along the lines of one axis: which pixels can pull. Positions are in pixels along the line.
+// The pixels that can pull, for the lines of one axis. Positions are in pixels along the line.
 template <class T>
 struct PullLines {
   std::vector<T> position, weight;        // [R, R + lanes] background pixels with gradient < 0, ascending, and -gradient; 0 after
-  std::vector<int32_t> count;             // [R] how many
+  std::vector<int32_t> count;             // [R] their number
   std::vector<T> first, last;             // [R + lanes] the first and last of them; +-infinity if there is none
   std::vector<T> gain_first, gain_last;   // [R + lanes] bounds of the covered pixels with gradient > 0
 
@@ -26,7 +26,7 @@ struct PullLines {
   }
 };
 
-// What the sweeps read of one image.
+// Input of the sweeps for one image.
 template <class T>
 struct SweepImage {
   const T* vertices;
@@ -38,15 +38,15 @@ struct SweepImage {
   const int32_t* owner;  // row 0 = top; pixel (column i, row j from the bottom) is owner[(R - 1 - j) R + i]
   const T* grad_alpha;
   PullLines<T>* lines;
-  T largest_lever;  // above it, or with a tiny eps, the product of two travels could leave the range of T
+  T largest_lever;  // above this, or with a tiny eps, the product of two distances could overflow or underflow
 
-  // Gradient of raster pixel (column i, row j): the image is flipped, and a 2x2 mean shares its gradient in quarters.
+  // Gradient of raster pixel (column i, row j from the bottom). With a 2x2 mean each pixel gets a quarter of the image's gradient.
   NMR_INLINE T grad(int64_t i, int64_t j) const {
     return anti_aliasing ? grad_alpha[(S - 1 - j / 2) * S + i / 2] / 4 : grad_alpha[(S - 1 - j) * S + i];
   }
 };
 
-// Gradients of one row of raster pixels, from the bottom, with lanes of zeros after.
+// Gradients of one row of raster pixels (counted from the bottom), followed by lanes of zeros.
 template <class T>
 NMR_INLINE void expand_row(const SweepImage<T>& image, int64_t j, T* row) {
   if (image.anti_aliasing) {
@@ -87,7 +87,7 @@ NMR_INLINE void finish_lines(PullLines<T>& lines, int64_t stride, int64_t first,
   }
 }
 
-// A part of both sets of lines: rows [row_first, row_last) and columns [column_first, column_last), the latter from all rows.
+// A part of both sets of lines: rows [row_first, row_last), and columns [column_first, column_last) over all rows.
 struct LineRange {
   int64_t row_first, row_last, column_first, column_last;
 };

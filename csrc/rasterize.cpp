@@ -1,12 +1,12 @@
 // Which face is nearest at each pixel of each image.
 //
-// Three steps per image. Set-up: for each face, which vertex orders face the camera, its box of pixels, bounds of its depth. Fill:
-// face after face (all originals, then all reversed copies), mark the pixels inside. The published depth takes sixteen divisions per
-// pixel and its rounding decides who is nearer, so it is computed only where bounds do not tell. Copy: into the owner map.
-// One image can be shared by several threads: set-up by chunks of faces, fill by bands of rows.
+// Three steps per image. Set-up: for each face, the vertex orders that face the camera, its box of pixels, bounds of its depth. Fill:
+// for each face (all originals, then all reversed copies), mark the pixels inside. Copy: to the owner map. The published depth needs
+// sixteen divisions per pixel, and its rounding decides which face is nearer; it is computed only where the bounds do not decide.
+// Several threads can share one image: set-up by chunks of faces, fill by bands of rows.
 //
-// Bounds are kept of q = 1 / depth, which is linear on the screen: near a pixel (i, j) inside a face, q is slope_x i + slope_y j +
-// level, give or take `margin`. See `bound_depth`.
+// The bounds are those of q = 1 / depth, which is linear on the screen: at a pixel (i, j) inside a face, q differs from
+// slope_x i + slope_y j + level by at most `margin`. See `bound_depth`.
 #include <algorithm>
 #include <cstring>
 #include <limits>
@@ -21,17 +21,17 @@ namespace nmr {
 namespace {
 
 constexpr int64_t kChunk = 2048;    // faces that one thread sets up together
-constexpr int64_t kBlock = 8;       // pixels per side of a block whose farthest depth is known in the second pass
+constexpr int64_t kBlock = 8;       // pixels per side of a block; the second pass knows the farthest depth of each block
 
-// What the fill needs of each face; arrays over faces.
+// Data of each face for the fill; arrays over faces.
 template <class T>
 struct FaceTable {
   std::vector<T> x[3], y[3];                     // corners, in the face's own order
   std::vector<T> slope_x, slope_y, level;        // of q = 1 / depth
-  std::vector<T> margin;                         // infinity: q is not bounded at all
+  std::vector<T> margin;                         // infinity: no bounds
   std::vector<T> nearest;                        // largest q at any pixel
   std::vector<int32_t> column_first, column_last, row_first, row_last;  // pixels inside the bounding box
-  std::vector<int32_t> front, back;              // per chunk: the faces drawn as they are, and reversed, in ascending order
+  std::vector<int32_t> front, back;              // per chunk: faces drawn in their own order, and reversed; ascending
   std::vector<int32_t> num_front, num_back;      // [chunks]
   std::vector<T> front_sum, back_sum;            // [chunks] sums of `nearest` over them
 
@@ -66,14 +66,14 @@ struct Image {
   FaceTable<T>* table;
 };
 
-// What the depth of a face at any pixel is computed from.
+// The numbers from which the depth of a face is computed at any pixel.
 template <class T>
 struct FacePlane {
   BarycentricMatrix<T> weights;
   T z[3];
 };
 
-// Of face `id`, a reversed copy if id >= num_faces.
+// Those of face `id`, which is a reversed copy if id >= num_faces.
 template <class T>
 NMR_INLINE FacePlane<T> face_plane(const Image<T>& image, int32_t id) {
   const bool reversed = id >= image.num_faces;
@@ -95,15 +95,15 @@ NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T r
   return T(1) / (w[0] / sum / plane.z[0] + w[1] / sum / plane.z[1] + w[2] / sum / plane.z[2]);
 }
 
-// Pixels along one axis whose centres lie in [lo, hi]: a face covers no centre outside its bounding box. (NMR itself tests every
-// pixel, and paints stray ones for slivers that are collinear up to rounding.)
+// Pixels along one axis whose centres lie in [lo, hi]: a face covers no centre outside its bounding box. (The published kernels test
+// every pixel, and draw wrong pixels for very thin faces.)
 template <class T>
 NMR_INLINE void pixel_range(T lo, T hi, T size, int32_t& first, int32_t& last) {
   const T from = to_pixel(lo, size), to = to_pixel(hi, size);
   const int32_t f = static_cast<int32_t>(from > -2 ? (from < size + 1 ? from : size + 1) : T(-2));
   const int32_t l = static_cast<int32_t>(to > -2 ? (to < size + 1 ? to : size + 1) : T(-2));
   const int32_t n = static_cast<int32_t>(size);
-  // to_pixel is off by much less than one pixel: compare the two centres around it
+  // the error of to_pixel is much less than one pixel: compare the two centres around it
   const auto centre = [n, size](int32_t i) { return static_cast<T>(2 * i + 1 - n) / size; };
   const int32_t a = f + (centre(f) < lo) + (centre(f + 1) < lo);
   const int32_t b = l - 1 + (centre(l) <= hi) + (centre(l + 1) <= hi);
@@ -111,22 +111,23 @@ NMR_INLINE void pixel_range(T lo, T hi, T size, int32_t& first, int32_t& last) {
   last = b < n - 1 ? b : n - 1;
 }
 
-// Bounds of q = 1 / depth of one face: level + slope_x i + slope_y j +- margin at any pixel (i, j) that is inside, and `nearest`.
+// Bounds of q = 1 / depth of one face: level + slope_x i + slope_y j +- margin at any pixel (i, j) inside it, and `nearest`.
 template <class T>
 struct DepthBound {
   T slope_x, slope_y, level, margin, nearest;
 };
 
-// Of a face with corners (x, y, z), whose depths lie in [lo, hi], lo > 0, on a raster of `size` pixels.
+// For a face with corners (x, y, z), whose depths lie in [lo, hi], lo > 0, on a raster of `size` pixels.
 //
-// Published are weights by the inverse of a matrix, clamped and normalised: q' = sum w_k / z_k. With u the unit roundoff, D twice the
-// area in pixels and M the largest pixel coordinate (R / 2 at least), to first order: the determinant is off by 12 u M L, L <= 2 M the longest side,
-// the same for all three weights; each weight besides by 32 u M^2 / D; a pixel that passes the edge test may lie outside by 48 u M^2 / D
-// in terms of weights. So the weights before they are normalised are off by E = 110 u M^2 / D at most, all together after it by 7.1 E
-// (if E is small), q' by half of that times the range of q at the corners, and by 8 u q for its own rounding. The plane below adds
-// 80 u M^2 / D times the range and 8 u q: its coefficients are computed in double and rounded. The margin has more than that:
-// 640 u M^2 / D times the range, and 32 u q, so that faces told apart by it have depths that differ even after rounding.
-// Where E could be large, and for double, the bounds are those of the corners: q' is a weighted mean of their q.
+// The published weights come from the inverse of a matrix, clamped and normalised: q' = sum w_k / z_k. Let u be the unit roundoff, D
+// twice the area in pixels and M the largest pixel coordinate (R / 2 at least). To first order, the errors are:
+// - of the determinant 12 u M L, with L <= 2 M the longest side, the same for all three weights; of each weight 32 u M^2 / D more;
+// - a pixel that passes the edge test may lie outside by 48 u M^2 / D in terms of weights;
+// - so each weight before normalisation is off by at most E = 110 u M^2 / D, and all weights together after it by 7.1 E (if E is small);
+// - q' is off by half of that times the range of q at the corners, and by 8 u q for its own rounding;
+// - the plane below adds 80 u M^2 / D times the range and 8 u q, because its coefficients are computed in double and rounded.
+// The margin is larger than the sum: 640 u M^2 / D times the range, and 32 u q. If the bounds of two faces are disjoint, their depths
+// differ even after rounding. If E could be large, and for double, the bounds are those of the corners: q' is a weighted mean of their q.
 template <class T>
 NMR_INLINE DepthBound<T> bound_depth(const T (&x)[3], const T (&y)[3], const T (&z)[3], T lo, T hi, T size) {
   constexpr T eps = std::numeric_limits<T>::epsilon();
@@ -134,7 +135,7 @@ NMR_INLINE DepthBound<T> bound_depth(const T (&x)[3], const T (&y)[3], const T (
   DepthBound<T> bound{0, 0, (most + least) / 2, range / 2 + rounding, most + rounding};
   if constexpr (sizeof(T) < sizeof(double)) {
     double X[3], Y[3], q[3];
-    T M = size / 2;  // pixel coordinates come from sums of this size, however small they are
+    T M = size / 2;  // even small pixel coordinates come from sums of this size
     for (int k = 0; k < 3; ++k) {
       const T px = to_pixel(x[k], size), py = to_pixel(y[k], size);
       M = max3(M, std::abs(px), std::abs(py));
@@ -194,7 +195,7 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
     for (int64_t n = 0; n < kGroup; ++n) {
       const T x0 = x[0][n], x1 = x[1][n], x2 = x[2][n], y0 = y[0][n], y1 = y[1][n], y2 = y[2][n];
       const T z0 = z[0][n], z1 = z[1][n], z2 = z[2][n];
-      // Counter-clockwise as it is, and reversed: for slivers the test is not antisymmetric in floating point.
+      // Both orders are tested: for very thin faces, rounding can make both or neither counter-clockwise.
       const bool ccw = !((y2 - y0) * (x1 - x0) < (y1 - y0) * (x2 - x0));
       const bool cw = !((y0 - y2) * (x1 - x2) < (y1 - y2) * (x0 - x2));
       const T largest = max3(max3(std::abs(x0), std::abs(x1), std::abs(x2)), max3(std::abs(y0), std::abs(y1), std::abs(y2)), T(1));
@@ -202,11 +203,11 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
                           (std::abs(y0) < infinity) & (std::abs(y1) < infinity) & (std::abs(y2) < infinity) & (z0 == z0) &
                           (z1 == z1) & (z2 == z2);
       const T lo = min3(z0, z1, z2), hi = max3(z0, z1, z2);
-      // Only a face so thin that all three weights could round to nothing has no bounds, and one near the limits of T or of depth.
+      // No bounds for faces so thin that all three weights could round to 0, or close to the limits of T or of depth.
       const T det = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0);
       const bool bounded = (std::abs(det) >= resolution * largest * largest) & (largest * size < moderate) & (near >= 0) &
                            (lo * (1 - 16 * eps) > near) & (hi * (1 + 16 * eps) < far) & (lo > smallest) & (hi < 1 / smallest);
-      // Without bounds, those of some ordinary triangle are computed and not used.
+      // For faces without bounds, those of an ordinary triangle are computed and not used.
       const auto checked = [bounded](T value, T ordinary) { return bounded ? value : ordinary; };
       const DepthBound<T> bound = bound_depth<T>({checked(x0, 0), checked(x1, 1), checked(x2, 0)},
                                                  {checked(y0, 0), checked(y1, 0), checked(y2, 1)},
@@ -260,8 +261,8 @@ struct Band {
   int32_t* owner;
 };
 
-// Which of eight pixels of a row face `id` wins from their owners by exact depth, of those that are contested. Of equally near faces
-// the first one wins, whatever the order in which they are filled.
+// For eight pixels of a row: which of the contested ones face `id` wins from their owners by exact depth. Of equally near faces the
+// first one wins, in whichever order they are filled.
 template <class T>
 NMR_INLINE LaneMask<T> contest(const Image<T>& image, int32_t id, const FacePlane<T>& plane, LaneMask<T> contested, int64_t i, int64_t j,
                                const int32_t* owner_at) {
@@ -298,7 +299,7 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
   const T y0 = table.y[k0][f], y1 = table.y[1][f], y2 = table.y[k2][f];
   const T dx0 = x1 - x0, dx1 = x2 - x1, dx2 = x0 - x2;
   const T dy0 = y1 - y0, dy1 = y2 - y1, dy2 = y0 - y2;
-  FacePlane<T> plane;  // made when it is needed
+  FacePlane<T> plane;  // computed when first needed
   bool has_plane = false;
   const Lanes32 ids = splat32(id);
 
@@ -349,7 +350,7 @@ NMR_INLINE void bound_blocks(const Band<T>& band, int64_t blocks, T* block_least
     }
 }
 
-// Whether every pixel of the face's box already has a nearer owner.
+// True if every pixel of the face's box already has a nearer owner.
 template <class T>
 NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& band, int64_t blocks, const T* block_least) {
   const int64_t j_first = std::max<int64_t>(table.row_first[f], band.row_first) - band.row_first;
@@ -368,7 +369,7 @@ NMR_INLINE void fill_band(const Image<T>& image, const Band<T>& band, int64_t bl
   for (T* q : {band.most, band.least}) std::fill_n(q, rows * band.stride, -std::numeric_limits<T>::infinity());
   std::fill_n(band.owner, rows * band.stride, -1);
   const int64_t chunks = (image.num_faces + kChunk - 1) / kChunk;
-  // The nearer of the two lists first: then most of the other one is hidden.
+  // Draw the nearer of the two lists first, so that most faces of the other one are hidden.
   T front_sum = 0, back_sum = 0;
   int64_t num_front = 0, num_back = 0;
   for (int64_t c = 0; c < chunks; ++c) {
@@ -406,7 +407,7 @@ NMR_CLONES void fill(const Image<double>& image, const Band<double>& band, int64
 template <class T>
 void rasterize(const Rasterize<T>& args) {
   const int64_t R = args.settings.raster_size, batch = args.mesh.batch;
-  // Many images: one thread each. Few: all threads share one image after the other.
+  // Many images: one thread per image. Few images: all threads share one image at a time.
   const bool share = batch < args.num_threads;
   const int64_t bands = share ? std::min<int64_t>(args.num_threads * 4, (R + 2 * kBlock - 1) / (2 * kBlock)) : 1;
   parallel_for(batch, share ? 1 : args.num_threads, [&](int64_t b) {

@@ -1,5 +1,5 @@
 // Colours from texture cubes, and interpolation of values given at the corners of faces. Both read the owner map and the
-// perspective-correct weights, in the vertex order of the original face: a reversed copy needs no other treatment.
+// perspective-correct weights, in the vertex order of the original face, so that reversed copies are not special.
 #include <algorithm>
 #include <type_traits>
 #include <utility>
@@ -12,7 +12,7 @@
 namespace nmr {
 namespace {
 
-constexpr int64_t kRows = 8;  // raster rows handled together in forward passes
+constexpr int64_t kRows = 8;  // raster rows processed together in forward passes
 
 // Calls body(b, row) for every row of every raster.
 template <class Body>
@@ -24,7 +24,7 @@ void for_rows(int64_t batch, int64_t R, int num_threads, const Body& body) {
   });
 }
 
-// Calls body(c) with the number of channels as a constant where it is 1, 3 or 4, and with 0 for any other number.
+// Calls body(c) with c the number of channels as a compile-time constant if it is 1, 3 or 4, and with c = 0 for other numbers.
 template <class Body>
 void with_channels(int64_t channels, const Body& body) {
   switch (channels) {
@@ -53,7 +53,7 @@ NMR_INLINE Texels<T> texels_of(const T* weights, int64_t texture_size, T eps) {
     T t = weights[k] * last;
     t = t > 0 ? t : T(0);  // also NaN
     t = t < limit ? t : limit;
-    cell[k] = std::max(std::min(static_cast<int64_t>(t), ts - 2), int64_t(0));  // eps may vanish beside ts - 1
+    cell[k] = std::max(std::min(static_cast<int64_t>(t), ts - 2), int64_t(0));  // ts - 1 - eps may round to ts - 1
     fraction[k] = t - static_cast<T>(cell[k]);
   }
   Texels<T> texels;
@@ -66,7 +66,7 @@ NMR_INLINE Texels<T> texels_of(const T* weights, int64_t texture_size, T eps) {
   return texels;
 }
 
-// color = sum over the corners of weight texel; kChannels is the number of channels, or 0 if it is not known beforehand.
+// color = sum over the corners of weight texel; kChannels is the number of channels, or 0 if it is known only at run time.
 template <int64_t kChannels, class T>
 NMR_INLINE void blend(const Texels<T>& texels, const T* texture, int64_t channels, T* color) {
   if constexpr (kChannels > 0) {
@@ -134,13 +134,13 @@ void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first
 
 }  // namespace
 
-// Every texel sums over images and pixels in ascending order, on one thread. Where images share their textures, or are fewer than
-// threads, each thread reads all pixels and keeps those of its own range of faces.
+// Every texel is summed on one thread, over images and pixels in ascending order. If images share their textures, or if there are
+// fewer images than threads, each thread reads all pixels and uses those of its own range of faces.
 template <class T>
 void texture_cubes_backward(const TextureCubes<T>& args) {
   const int64_t ts = args.texture_size, cube = ts * ts * ts * args.channels;
   const bool shared = !args.starts && args.texture_batch == 1;
-  const int64_t sets = shared ? 1 : args.batch, images = shared ? args.batch : 1;  // of textures; of each set
+  const int64_t sets = shared ? 1 : args.batch, images = shared ? args.batch : 1;  // sets of textures; images of each set
   const int64_t parts = sets >= args.num_threads ? 1 : 2 * static_cast<int64_t>(args.num_threads);
   parallel_for(sets * parts, args.num_threads, [&](int64_t task) {
     const int64_t set = task / parts, part = task % parts;
@@ -155,7 +155,7 @@ void texture_cubes_backward(const TextureCubes<T>& args) {
 
 namespace {
 
-// Where image b finds its rows and its corners.
+// The attribute rows and corners of image b.
 template <class T>
 struct ImageAttributes {
   int64_t first_row;       // of attributes
@@ -215,7 +215,7 @@ void interpolate_block_backward(const Interpolate<T>& args, const ImageAttribute
 template <class T>
 void scatter_corner_sums(const Interpolate<T>& args, const ImageAttributes<T>& image, const CornerSums<T>& sums) {
   const int64_t C = args.channels, F = image.num_faces;
-  const T* value = sums.values.data() + 3 * C;  // not the background's
+  const T* value = sums.values.data() + 3 * C;  // skips the background's
   for (int64_t n = 1; n < sums.visible.count; ++n) {
     const int64_t id = sums.visible.ids[n];
     const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);

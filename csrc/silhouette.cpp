@@ -1,5 +1,5 @@
-// Coverage, and NMR's gradient of it: for every edge of a visible face and every raster line that crosses it, pixels that
-// would change if the edge moved pull on its two vertices, each with strength (change of the loss) / (distance to move).
+// Coverage, and NMR's gradient: on every raster line that crosses an edge of a visible face, the pixels that would change if the edge
+// moved pull its two vertices, each with strength (change of the loss) / (distance to move).
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -47,7 +47,7 @@ struct RowScratch {
   std::vector<T> grad_row;  // [R + lanes]
 };
 
-// How an edge P-Q, crossed at t = c by a line, moves with each of its ends.
+// How the crossing c of an edge P-Q and a line moves with each end of the edge.
 template <class T>
 struct Lever {
   T crossing;  // c
@@ -56,28 +56,28 @@ struct Lever {
   T eps;
 };
 
-// Travel that brings the crossing by `offset` pixels, kept away from zero by eps.
+// How far the end must travel to move the crossing by `offset` pixels; eps keeps it away from zero.
 template <class T>
 NMR_INLINE T travel(T factor, T offset, T eps) {
   const T h = factor * offset;
   return h > 0 ? h + eps : h - eps;
 }
 
-// One pixel's pull, for pixels inside the face and for levers of extreme size. An end whose lever is not finite stays.
+// The pull of one pixel, for pixels inside the face and for levers of extreme size. An end without a finite lever does not move.
 template <class T>
 NMR_INLINE void pull(T weight, T offset, const Lever<T>& lever, T& grad_p, T& grad_q) {
   if (std::isfinite(lever.factor_p)) grad_p -= weight / travel(lever.factor_p, offset, lever.eps);
   if (std::isfinite(lever.factor_q)) grad_q -= weight / travel(lever.factor_q, offset, lever.eps);
 }
 
-// Adds up, per lane, the pulls of the listed pixels at or beyond `out` in direction d. The two quotients w / h_p and w / h_q share
-// one division: w / (h_p h_q) times h_q and h_p.
+// Sums, per lane, the pulls of the listed pixels from `out` on in direction d. The quotients w / h_p and w / h_q share one division:
+// w / (h_p h_q) times h_q and h_p.
 template <class T>
 NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, T out, T d, const Lever<T>& lever, Lanes<T>& pulls_p,
                             Lanes<T>& pulls_q) {
-  // All offsets have the sign of d, so both travels have one sign throughout.
+  // All offsets have the sign of d, so the signs of both distances are constant.
   const T eps_p = lever.factor_p * d > 0 ? lever.eps : -lever.eps, eps_q = lever.factor_q * d > 0 ? lever.eps : -lever.eps;
-  const Lanes<T> aside = splat(out - lever.crossing);  // for pixels that do not count
+  const Lanes<T> aside = splat(out - lever.crossing);  // for unused lanes
   int32_t start = 0;
   if (d > 0)
     while (position[start + kLanes - 1] < out) start += kLanes;
@@ -94,15 +94,15 @@ NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, T
   }
 }
 
-// Up to eight neighbouring lines that cross an edge P-Q: what their sweeps need. s is the scan coordinate, t the sweep coordinate:
-// (x, y) for axis 0, (y, x) for axis 1, all in pixels.
+// The sweeps of up to eight neighbouring lines that cross an edge P-Q. s is the scan coordinate and t the sweep coordinate, in pixels:
+// (s, t) is (x, y) for axis 0 and (y, x) for axis 1.
 template <class T>
 struct Sweep {
   int32_t face;      // number in the list of visible faces
   int32_t id;        // in the owner map
   int32_t edge;      // 0-2: edges 01, 12, 20 crossed by columns (axis 0); 3-5: the same by rows (axis 1)
   int32_t start;     // the first line
-  int32_t outward;   // 1: outward is towards larger t; -1
+  int32_t outward;   // 1 if outward is towards larger t, else -1
   uint32_t pulled;   // bit: the face owns the inner pixel, and pixels beyond the outer one may pull
   uint32_t gains;    // bit: the outer pixel is background, and inner pixels may gain
   uint32_t regular;  // bit: levers of ordinary size
@@ -110,7 +110,7 @@ struct Sweep {
   int32_t inner[kLanes];
 };
 
-// The work of one chunk of faces: all lines are prepared before any is swept, so that the processor need not guess.
+// The work of one chunk of faces. All lines are prepared before the first is swept, which avoids mispredicted branches.
 constexpr int64_t kSweeps = 128;
 
 template <class T>
@@ -138,7 +138,7 @@ NMR_INLINE void run_sweep(const SweepImage<T>& image, const Sweep<T>& sweep, T* 
   T grad_p = 0, grad_q = 0;
   Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
 
-  // Outside: pixels from the outer one to the border that should be covered. They gain if the edge moves out to them.
+  // Outside: pixels from the outer one to the border that should be covered. The loss falls if the edge moves out to them.
   for (uint32_t bits = sweep.pulled; bits; bits &= bits - 1) {
     const int64_t k = lowest_bit(bits), n = sweep.start + k;
     const Lever<T> lever{sweep.crossing[k], sweep.factor_p[k], sweep.factor_q[k], image.eps};
@@ -155,7 +155,7 @@ NMR_INLINE void run_sweep(const SweepImage<T>& image, const Sweep<T>& sweep, T* 
   grad_p -= sum_lanes(pulls_p);
   grad_q -= sum_lanes(pulls_q);
 
-  // Inside: own pixels that should be background. They gain if the edge moves in past them.
+  // Inside: pixels of the face that should be background. The loss falls if the edge moves in past them.
   if (sweep.gains) {
     T X[3], Y[3];
     corner_pixels(image, sweep.id, X, Y);
@@ -188,11 +188,11 @@ NMR_INLINE void run_sweeps(const SweepImage<T>& image, const Sweep<T>* sweeps, i
   for (int64_t n = 0; n < count; ++n) run_sweep(image, sweeps[n], grad);
 }
 
-// Prepares the sweeps of one face; runs those of the scratch whenever it is full. Returns how many wait in it.
+// Prepares the sweeps of one face, and runs all prepared sweeps when the scratch is full. Returns how many are prepared.
 template <class T>
 NMR_INLINE int64_t prepare_face(const SweepImage<T>& image, int32_t face, int32_t id, Sweep<T>* sweeps, int64_t count, T* grad) {
   const int64_t R = image.R;
-  if (R == 1) return count;  // no line has two pixels for a crossing to lie between
+  if (R == 1) return count;  // a crossing lies between two pixels of a line; here there is only one
   const T raster_size = static_cast<T>(R), top = raster_size - 1;
   T X[3], Y[3];
   corner_pixels(image, id, X, Y);
@@ -202,12 +202,12 @@ NMR_INLINE int64_t prepare_face(const SweepImage<T>& image, int32_t face, int32_
   const LaneMask<T> ascending = ps < qs;
   const Lanes<T> least = select(ascending, ps, qs), most = select(ascending, qs, ps);
   const Lanes<T> low = select(least > T(0), least, splat(T(0))), high = select(most < top, most, splat(top));
-  // An edge along the scan line (least == most) is left out: neither end can move its crossing.
+  // Edges parallel to the scan line (least == most) are left out: neither end can move a crossing.
   const LaneMask<T> in_reach = (least < most) & (low <= top) & (high > T(-1));
   const Lanes<T> from = select(in_reach, low, splat(T(1))), to = select(in_reach, high, splat(T(0)));
   Lanes<T> first = to_values<T>(truncate(from));
   first = select(first < from, first + T(1), first);
-  // Truncation towards zero, as published: an edge that ends in (-1, 0) is extrapolated onto line 0.
+  // Truncation towards zero, as published: an edge that ends in (-1, 0) is extrapolated to line 0.
   const Lanes<T> last = to_values<T>(truncate(to));
   T ps_at[kLanes], pt_at[kLanes], qs_at[kLanes], slope_at[kLanes], scale_at[kLanes];
   int32_t first_at[kLanes], last_at[kLanes];
@@ -244,7 +244,7 @@ NMR_INLINE int64_t prepare_face(const SweepImage<T>& image, int32_t face, int32_
       const LaneMask<T> valid = on_screen & (in >= T(0)) & (in <= top) & (out >= T(0)) & (out <= top);
       const LaneMask<T> pulled = (load_lanes<Lanes<T>>(pulls + start) - out) * direction >= T(0);
       const LaneMask<T> gained = (load_lanes<Lanes<T>>(gains + start) - in) * direction <= T(0);
-      // Owners of the pixels on both sides; a lane that does not count reads some pixel of the last line.
+      // Owners of the pixels on both sides; unused lanes read a pixel of the last line.
       const Lanes32 inner = truncate(select(valid, in, splat(d > 0 ? T(0) : T(1))));
       int32_t offset[kLanes];
       store_lanes(offset, select(number < last_number, number, last_number) * step_s + inner * step_t);
@@ -299,7 +299,7 @@ NMR_CLONES void sweep(const SweepImage<double>& image, const int32_t* ids, int64
   sweep_faces(image, ids, first, last, sweeps, grad);
 }
 
-// The faces that own a pixel: all others get exactly zero.
+// The faces that own a pixel. All others have gradient 0.
 NMR_CLONES void find_visible(const int32_t* owner, int64_t pixels, int64_t num_faces, VisibleFaces& visible) {
   visible.find(owner, pixels, num_faces);
 }
@@ -309,7 +309,7 @@ NMR_CLONES void find_visible(const int32_t* owner, int64_t pixels, int64_t num_f
 template <class T>
 void silhouette_backward(const SilhouetteBackward<T>& args) {
   const int64_t S = args.image_size, R = args.anti_aliasing ? 2 * S : S, batch = args.mesh.batch;
-  // Many images: one thread each. Few: all threads share one image after the other.
+  // Many images: one thread per image. Few images: all threads share one image at a time.
   const bool share = batch < args.num_threads;
   const int threads = share ? args.num_threads : 1;
   parallel_for(batch, share ? 1 : args.num_threads, [&](int64_t b) {
@@ -318,7 +318,7 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
                               args.anti_aliasing, args.eps, args.owner + b * R * R, args.grad_alpha + b * S * S, scratch.lines,
                               args.eps > T(1e-15) ? T(1e15) : T(0)};
     for (PullLines<T>& lines : scratch.lines) lines.reserve_lines(R);
-    // Shared: bands of columns, then bands of rows, each of whole vectors, so that no two threads write the same one.
+    // Shared image: bands of columns, then bands of rows. Bands consist of whole vectors, so that no two threads write the same vector.
     const int64_t band = share ? std::max<int64_t>(R / threads / kLanes * kLanes, 64) : R, bands = (R + band - 1) / band;
     parallel_for(share ? 2 * bands : 1, threads, [&](int64_t n) {
       T* grad_row = reserve(thread_scratch<RowScratch<T>>().grad_row, R + kLanes);

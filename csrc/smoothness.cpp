@@ -1,9 +1,9 @@
-// Smoothness loss: sum over edges of (1 + cos(theta))^2, theta the angle between the two faces at the edge (-1 when flat), in
-// Kato's guarded form. theta is measured between the heights that the faces' other corners have over the edge.
+// Smoothness loss: sum over edges of (1 + cos(theta))^2, where theta is the angle between the two faces at the edge (cos = -1 when
+// flat), with Kato's guards against division by zero. theta is the angle between the heights of the two faces over the edge.
 //
-// All meshes share the edges, so kLanes meshes are handled together, one per lane: their vertices are interleaved first, and every
-// load and every sum of the gradient is then a whole vector. What remains of the batch takes kLanes edges of one mesh together.
-// A mesh's edges are summed in their order either way, so its bits do not depend on which.
+// All meshes share the edges, so kLanes meshes are processed together, one per lane: their vertices are interleaved first, and every
+// load and every sum of the gradient is a whole vector. The remaining meshes are processed one by one, kLanes edges at a time. Both
+// ways sum a mesh's edges in the same order, and give the same bits.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -40,7 +40,7 @@ NMR_INLINE T dot(const Vec3<T>& a, const Vec3<T>& b) {
   return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
-// The edge a, and what both heights over it need.
+// The edge a, with values that both heights over it use.
 template <class T>
 struct Base {
   Vec3<T> a;
@@ -84,7 +84,7 @@ NMR_INLINE Height<T> height(const Base<T>& base, const Vec3<T>& b) {
 template <class T>
 NMR_INLINE void height_backward(const Base<T>& base, const Vec3<T>& b, const Height<T>& h, const Vec3<T>& grad_vector,
                                 T grad_length, Vec3<T>& grad_a, Vec3<T>& grad_b) {
-  const T inverse_length = 1 / h.length;  // its products with |b| and sin are 1 / sin and 1 / |b|
+  const T inverse_length = 1 / h.length;  // times |b| it is 1 / sin, times sin it is 1 / |b|
   const T grad_cos = -grad_length * h.length_b * h.cos * (inverse_length * h.length_b);
   const T grad_q = -grad_cos * h.cos * h.inverse_q;
   const T grad_along = -dot(base.a, grad_vector);
@@ -103,7 +103,7 @@ NMR_INLINE T edge_loss(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>&
   return (1 + cos) * (1 + cos);
 }
 
-// The gradient with respect to end, left and right; that of origin is minus their sum.
+// The gradients of end, left and right; that of origin is minus their sum.
 template <class T>
 NMR_INLINE void edge_backward(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>& left, const Vec3<T>& right, T grad_loss,
                               Vec3<T>& grad_end, Vec3<T>& grad_left, Vec3<T>& grad_right) {
@@ -155,7 +155,7 @@ NMR_INLINE void add(const T* __restrict values, T* __restrict sums) {
   for (int64_t n = 0; n < count; ++n) sums[n] += values[n];
 }
 
-// kLanes meshes from image b on: [V * 3] of each <-> [V * 3, kLanes].
+// Converts kLanes meshes, from image b on: [V * 3] of each <-> [V * 3, kLanes].
 template <class T>
 NMR_INLINE void interleave(const T* from, int64_t rows, T* to) {
   for (int64_t r = 0; r < rows; ++r)
@@ -204,7 +204,7 @@ NMR_INLINE void meshes_backward_body(const Smoothness<T>& args, int64_t b, T* ve
   separate(grad, rows, args.grad_vertices + b * rows);
 }
 
-// kLanes edges of one mesh, the last one repeated where there are not as many.
+// kLanes edges of one mesh; if there are fewer, the last one is repeated.
 template <class T>
 NMR_INLINE void gather(const T* vertices, const int64_t* edges, int64_t count, T (&points)[kCoordinates][kLanes]) {
   for (int64_t l = 0; l < kLanes; ++l) {
@@ -255,7 +255,7 @@ NMR_CLONES void mesh_forward(const Smoothness<double>& args, int64_t b) { mesh_f
 NMR_CLONES void mesh_backward(const Smoothness<float>& args, int64_t b) { mesh_backward_body(args, b); }
 NMR_CLONES void mesh_backward(const Smoothness<double>& args, int64_t b) { mesh_backward_body(args, b); }
 
-// Calls meshes(b) for groups of kLanes images from b on, and mesh(b) for what remains.
+// Calls meshes(b) for groups of kLanes images from b on, and mesh(b) for each remaining image.
 template <class Meshes, class Mesh>
 void for_groups(int64_t batch, int num_threads, const Meshes& meshes, const Mesh& mesh) {
   const int64_t groups = batch / kLanes;

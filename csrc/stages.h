@@ -1,6 +1,6 @@
-// The argument struct of each stage: what goes in, what comes out, sizes, settings. Raw arrays only, row-major. Every image has
-// row 0 at the top. Stages in the order of a render: camera, rasterize, then whatever is wanted of the owner map: silhouette,
-// fragments, depth, shading, resolve.
+// The argument struct of each stage: inputs, outputs, sizes, settings. Raw arrays only, row-major. Every image has row 0 at the top.
+// Stages in the order of a render: camera, rasterize, then those that use the owner map: silhouette, fragments, depth, shading,
+// resolve.
 #pragma once
 
 #include <cstdint>
@@ -27,8 +27,8 @@ struct MeshBatch {
 };
 
 // The pose of a camera that looks along `forward` (pose.cpp): rows x, -y, z of A (camera axes: x right, y down, z forward);
-// z = n(forward), x = n(up x z), y = n(z x x), n(v) = v / max(|v|, 1e-5). All NaN where a number is not finite or beyond 1e15;
-// such a pose gets no gradient.
+// z = n(forward), x = n(up x z), y = n(z x x), n(v) = v / max(|v|, 1e-5). If an input is not finite or beyond 1e15, the whole pose is
+// NaN and gets no gradient.
 template <class T>
 struct Pose {
   const T* forward;      // [B, 3]
@@ -44,10 +44,9 @@ struct Pose {
 //   perspective:   p = (u_x / u_z, u_y / u_z), distorted as OpenCV does; q = p / extent; out = (K00 q_x + K01 q_y + K02, K10 q_x + ...,
 //                  u_z), K = intrinsics
 //   orthographic:  the same with p = (u_x, u_y), without distortion.
-// Origin and extent are arguments of their own because a look-at camera subtracts and divides; its images and gradients are then
-// the published ones bit for bit. A vertex without a finite image (it is not finite itself, in the plane of the eye, x / z^2
-// overflows, or the camera is not finite) gets out = (inf, inf, any finite number), so that its faces are not drawn, and exactly
-// 0 as its gradient.
+// Origin and extent are separate arguments so that look-at cameras round as the published ones: images and gradients then have the
+// same bits. A vertex has no finite image if it is not finite itself, if it lies in the plane of the eye, if x / z^2 overflows, or
+// if the camera is not finite. It then gets out = (inf, inf, any finite number), so that its faces are not drawn, and gradient 0.
 template <class T>
 struct Project {
   const T* vertices;     // [B or 1, V, 3], or packed [N, 3]
@@ -90,7 +89,7 @@ struct Rasterize {
   int num_threads;
 };
 
-// Coverage of an owner map, and NMR's gradient of it (silhouette.cpp) or that of Kato and Harada 2019 (local_gradient.cpp).
+// Coverage of an owner map, with NMR's gradient (silhouette.cpp) or that of Kato and Harada 2019 (local_gradient.cpp).
 template <class T>
 struct SilhouetteForward {
   const int32_t* owner;  // [B, R, R]
@@ -106,7 +105,7 @@ struct SilhouetteBackward {
   MeshBatch<T> mesh;
   int64_t image_size;
   bool anti_aliasing;
-  T eps;                // NMR's: keeps the distance to an edge away from zero; local: directions that differ by less tie
+  T eps;                // NMR's: keeps the distance to an edge away from zero; local: if rates differ by less, the gradient is 0
   const int32_t* owner; // [B, R, R]
   const T* grad_alpha;  // [B, S, S]
   T* grad_vertices;     // out, like mesh.vertices; z gets 0
@@ -196,7 +195,7 @@ struct Resolve {
   int num_threads;
 };
 
-// NMR's gradient of an image of any channels (edges.cpp): every visible edge is moved by the pixels that moving it would improve.
+// NMR's gradient of an image with any channels (edges.cpp): pixels pull every visible edge whose motion over them lowers the loss.
 template <class T>
 struct EdgesBackward {
   MeshBatch<T> mesh;
@@ -214,7 +213,7 @@ struct EdgesBackward {
 struct Voxelize {
   MeshBatch<float> mesh;  // vertices in [0, 1]^3
   int64_t size;           // s
-  bool touched;           // the surface is every cell that a face touches (kato19); else that of rays and vertices (kato18)
+  bool touched;           // surface cells: all that a face touches (kato19); else those of rays and vertices (kato18)
   bool* voxels;           // out [B, s, s, s]
   int num_threads;
 };

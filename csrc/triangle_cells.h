@@ -1,6 +1,6 @@
-// Which unit cells a triangle touches: the separating axis test of a triangle and a box. Both are closed, so that a triangle in the
-// plane between two cells touches both; to be sure of that whatever rounding does, the cells are larger by kSlack on each side. Of the
-// 13 axes the box's three are the bounds of the search; the others are below. All in double.
+// The unit cells that a triangle touches, by the separating axis test of a triangle and a box. Both include their borders: a triangle
+// in the plane between two cells touches both. Cells are enlarged by kSlack on each side, so that this does not depend on rounding. Of
+// the 13 axes, the three of the box are the bounds of the search; the others are below. All in double.
 #pragma once
 
 #include <algorithm>
@@ -15,10 +15,10 @@ class TriangleCells {
  public:
   // A face with a corner that is not finite, or farther than this from the first cell on some axis, touches nothing.
   static constexpr double kFarthest = 1048576;
-  // More than rounding can do to coordinates within kFarthest, less than float coordinates of a grid's size can be apart.
+  // Larger than the rounding error of coordinates within kFarthest, smaller than the distance of neighbouring float coordinates.
   static constexpr double kSlack = 1e-9;
 
-  // Corners in cells. Their order does not matter, to the last bit: it is made one of size first.
+  // Corners in units of cells. They are sorted first, so that their order does not change any bit.
   TriangleCells(const Eigen::Vector3f (&corners)[3], int64_t size) {
     Eigen::Vector3d v[3];
     for (int k = 0; k < 3; ++k) {
@@ -39,7 +39,7 @@ class TriangleCells {
     const Eigen::Vector3d e = v[1] - v[0], f = v[2] - v[0];
     origin_ = v[0];
     normal_ = Eigen::Vector3d(e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0]);
-    // Thinner than this, and rounding may have turned it: such a face is a segment, for which the other axes suffice.
+    // Rounding may have changed the direction of the normal of a very thin face. Treated as a segment: the other axes suffice.
     if (normal_.cwiseAbs().maxCoeff() <= 1e-10 * e.cwiseAbs().maxCoeff() * f.cwiseAbs().maxCoeff()) normal_.setZero();
     for (double n : normal_) {
       (n > 0 ? plane_low_ : plane_high_) -= n;
@@ -50,8 +50,8 @@ class TriangleCells {
       if (std::abs(normal_[a]) > std::abs(normal_[inner_])) inner_ = a;
   }
 
-  // Calls visit(i, j, k) for each touched cell of [0, size)^3. The columns of cells run along the normal's largest component, where
-  // the plane leaves few of a column's cells to be looked at.
+  // Calls visit(i, j, k) for each touched cell of [0, size)^3. Cells are visited in columns along the largest component of the normal:
+  // there the plane meets few cells of each column.
   template <class Visit>
   void for_each(const Visit& visit) const {
     const int p = (inner_ + 1) % 3, q = (inner_ + 2) % 3;
@@ -103,7 +103,7 @@ class TriangleCells {
     return plane_low_ <= at && at <= plane_high_;
   }
 
-  // The cells of a column that can meet the plane, and one more on either side for what the division rounds.
+  // The cells of a column that can meet the plane, and one more on either side because the division rounds.
   void plane_range(int64_t c_p, int64_t c_q, int64_t& first, int64_t& last) const {
     first = first_[inner_];
     last = last_[inner_];

@@ -1,6 +1,6 @@
-// Occupancy grids: surface cells, then everything that is not reached from the border of the grid through empty cells. The surface
-// in the definition of Kato et al. 2018 ("kato18"), the one behind most published voxel IoU figures, or of Kato and Harada 2019
-// ("kato19"): every cell that a face touches.
+// Occupancy grids: the surface cells, and all cells that cannot be reached from the border of the grid through empty cells. Surface
+// cells are those of Kato et al. 2018 ("kato18", used for most published voxel IoU) or of Kato and Harada 2019 ("kato19"): every cell
+// that a face touches.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -23,7 +23,7 @@ struct VoxelScratch {
   std::vector<int32_t> frontier;
 };
 
-// The cells of the grid within a shell of outside cells: nothing that looks at neighbours need ask where the grid ends.
+// The cells of the grid, surrounded by a layer of outside cells, so that code that visits neighbours needs no test for the border.
 struct Grid {
   uint8_t* cells;
   int64_t size;
@@ -54,8 +54,8 @@ void lattice_range(float lo, float hi, int64_t size, int64_t& first, int64_t& la
   last = static_cast<int64_t>(std::floor(std::min(std::max(hi, -1.f), end - 1)));
 }
 
-// Rays along `axis` through the integer lattice of the other two axes (p, q): each hit marks the cell of its depth in the four
-// columns of cells that meet at (p, q).
+// Rays along `axis` through the integer points (p, q) of the other two axes. Each hit marks the four cells around the ray at the
+// depth of the hit.
 void mark_ray_hits(const Vec3f (&v)[3], int axis, Grid& grid) {
   const int pa = (axis + 1) % 3, qa = (axis + 2) % 3;
   const float p0 = v[0][pa], p1 = v[1][pa], p2 = v[2][pa], q0 = v[0][qa], q1 = v[1][qa], q2 = v[2][qa];

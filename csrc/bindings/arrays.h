@@ -1,5 +1,5 @@
-// What every binding shares: NumPy arrays as raw pointers, shapes and indices checked once more than in the Python layer, so that
-// no call can read or write outside an array. The files of this folder are the only ones that know Python.
+// Shared by all bindings: NumPy arrays as raw pointers. Shapes and indices are checked again after the Python layer, so that no call
+// can read or write outside an array. Only the files in this folder know Python.
 #pragma once
 
 #include <optional>

@@ -94,7 +94,7 @@ void project_forward_py(const Array<T>& vertices, const Array<T>& matrix, const 
   project_forward(args);
 }
 
-// Where a gradient of this shape is wanted: its storage.
+// The storage of a gradient of this shape, or nullptr if the gradient is not wanted.
 template <class T>
 T* optional_out(Optional<T>& grad, const char* name, const std::vector<int64_t>& shape) {
   if (!grad) return nullptr;

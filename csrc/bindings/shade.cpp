@@ -25,7 +25,7 @@ TextureCubes<T> texture_args(const Array<T>& textures, const Array<int32_t>& own
   const int64_t ts = textures.shape(lead), channels = textures.shape(lead + 3), num_faces = textures.shape(lead - 1);
   require(ts >= 1 && textures.shape(lead + 1) == ts && textures.shape(lead + 2) == ts && channels >= 1,
           "textures must be cubes of the same size in all three directions, with channels, got " + shape_of(textures));
-  // Textures have no rows: whatever number of them starts ends with is right.
+  // Textures have no rows, so the number of rows at the end of starts is not checked.
   if (starts) require_starts(*starts, starts->ndim() == 2 && starts->size() >= 2 ? starts->data()[starts->size() - 2] : 0, num_faces);
   require_fragments(owner, weights, starts, num_faces, num_threads);
   const int64_t texture_batch = starts ? 1 : textures.shape(0);
