@@ -174,6 +174,7 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
             raise ValueError(f"{other.category} and {first.category} differ in view classes or image size")
         if (other.voxels is None) != (first.voxels is None) or (other.masks is None) != (first.masks is None):
             raise ValueError(f"only one of {other.category} and {first.category} has voxels (or masks)")
+
     def joined(name: str) -> np.ndarray | None:
         parts = [getattr(d, name) for d in datasets]
         return None if any(part is None for part in parts) else np.concatenate(parts)

@@ -28,22 +28,14 @@ def check_room(folder: Path, needed: int, what: str) -> None:
         )
 
 
-def publish(new: Path, folder: Path, paths: list[str], stale: list[str], trash: Path) -> None:
-    """Move files and folders from `new` to `folder`, where they replace what has their names, and take `stale` away.
+def publish(new: Path, folder: Path, paths: list[str], old: list[str], trash: Path) -> None:
+    """Move the files and folders `paths` from `new` to `folder`, and those in `old` from there to `trash` before.
 
-    All three on one file system. What is replaced or stale goes to `trash`, which the caller removes: a folder of many
-    files is there or not, never half. An interruption waits until all is in place: files of two data sets do not go
-    together.
+    All on one file system, so that nothing is copied. The caller removes `trash`. An interruption waits until all is in
+    place: files of two data sets do not go together.
     """
     with stop_on_signal():
-        for path in stale:
-            _move(folder / path, trash / "stale" / path)
-        for path in paths:
-            if (folder / path).is_dir():
-                _move(folder / path, trash / "replaced" / path)
-            _move(new / path, folder / path)
-
-
-def _move(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    os.replace(source, target)
+        moves = [(folder / path, trash / path) for path in old] + [(new / path, folder / path) for path in paths]
+        for source, target in moves:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(source, target)

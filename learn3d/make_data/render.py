@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from learn3d.data.poses import Poses
 from learn3d.data.readers import kato
 from learn3d.files.writing import write_json
 from learn3d.make_data import meshes
@@ -54,32 +53,6 @@ def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, n
     order = np.random.default_rng(seed).permutation(count)
     bounds = np.cumsum([sizes["test"], sizes["val"]])
     return dict(zip(("test", "val", "train"), np.split(order, bounds), strict=True))
-
-
-def random_color(rng: np.random.Generator) -> np.ndarray:
-    """One light, slightly tinted grey: float32 [3] in [0.35, 1]."""
-    return np.clip(rng.uniform(0.55, 0.9) + rng.uniform(-0.2, 0.2, size=3), 0.35, 1.0).astype(np.float32)
-
-
-def render_object(
-    vertices: torch.Tensor,
-    faces: torch.Tensor,
-    face_colors: np.ndarray,
-    poses: Poses,
-    image_size: int,
-    turn: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """All views of one object: rgb uint8 [n, S, S, 3] over white and alpha uint8 [n, S, S].
-
-    vertices float32 [V, 3] in the object frame of the poses; faces int64 [F, 3]; face_colors float [3] or [F, 3]; turn
-    [3, 3] from the frame of `kato.mesh_to_object`, in which the light stays where it is. The alpha is exactly that of
-    `nmr.render_silhouette`. Raises ValueError where no view shows anything.
-    """
-    light = tuple((turn @ KEY_LIGHT).tolist())
-    rgb, alpha = shade_mesh(vertices, faces, face_colors, poses.cameras(), image_size=image_size, light=light)
-    if not alpha.any():
-        raise ValueError("no view shows any of it (all faces have no area, or are smaller than a pixel)")
-    return rgb, alpha
 
 
 def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
@@ -141,8 +114,8 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
         write_json(folder / f"{prefix}_card.json", _card(config, writer, counts, done.used))
         write_json(folder / f"{prefix}_report.json", asdict(report))
         (folder / f"{prefix}_report.txt").write_text(plain(report.text()) + "\n", encoding="utf-8")
-        stale = set(existing(config.output, _own_paths(writer_class, config.category))) - set(files)
-        publish(folder, config.output, files, sorted(stale), trash)
+        old = existing(config.output, [*_own_paths(writer_class, config.category), *writer.shared])
+        publish(folder, config.output, files, old, trash)
     return report
 
 
@@ -177,7 +150,7 @@ def _render(
     """Object `copy` of mesh `number`: scaled, coloured, placed, looked at."""
     rng = np.random.default_rng([config.seed, 1, number, copy])
     scale = rng.uniform(*SCALE_RANGE, size=3)
-    color = random_color(rng)
+    color = np.clip(rng.uniform(0.55, 0.9) + rng.uniform(-0.2, 0.2, size=3), 0.35, 1.0).astype(np.float32)  # light grey
     if config.color == "mesh" and mesh.face_colors is not None:
         color = np.where(np.isnan(mesh.face_colors), color, mesh.face_colors)
     vertices = mesh.vertices @ kato.mesh_to_object(config.up, config.facing).T
@@ -187,7 +160,10 @@ def _render(
     poses = writer.views(placed, config.views, rng)
     vertices = torch.as_tensor(np.ascontiguousarray(placed, dtype=np.float32))
     faces = torch.as_tensor(np.ascontiguousarray(mesh.faces, dtype=np.int64))
-    rgb, alpha = render_object(vertices, faces, color, poses, writer.image_size, writer.turn)
+    light = tuple((writer.turn @ KEY_LIGHT).tolist())
+    rgb, alpha = shade_mesh(vertices, faces, color, poses.cameras(), image_size=writer.image_size, light=light)
+    if not alpha.any():
+        raise ValueError("no view shows any of it (all faces have no area, or are smaller than a pixel)")
     voxels = writer.voxelize(vertices, faces)
     return RenderedObject(name, split, vertices, faces, poses, rgb, alpha, voxels, rng)
 

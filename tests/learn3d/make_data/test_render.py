@@ -20,7 +20,7 @@ from learn3d.data.readers import kato
 from learn3d.data.readers.kato import mesh_to_object
 from learn3d.make_data import meshes, render
 from learn3d.make_data.contact_sheet import draw_sheet, make_row
-from learn3d.make_data.render import DatasetConfig, make_dataset, render_object, split_objects
+from learn3d.make_data.render import DatasetConfig, make_dataset, split_objects
 from learn3d.make_data.report import lacking
 from learn3d.make_data.writers import writer_of
 
@@ -165,10 +165,10 @@ def test_bad_meshes_are_reported_and_the_others_made(tmp_path, folder):
 
 
 def test_our_own_mistakes_are_not_taken_for_bad_meshes(tmp_path, folder, monkeypatch):
-    def fail(*_):
+    def fail(*_, **__):
         raise IndexError("a slip in the renderer")
 
-    monkeypatch.setattr(render, "render_object", fail)
+    monkeypatch.setattr(render, "shade_mesh", fail)
     with pytest.raises(IndexError, match="a slip in the renderer"):
         make(tmp_path / "data", folder)
 
@@ -306,10 +306,10 @@ def test_refuses_to_overwrite_and_removes_what_is_stale(tmp_path, folder):
 
 
 def test_nothing_is_left_behind_when_it_fails(tmp_path, folder, monkeypatch):
-    def interrupt(*_):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(render, "render_object", interrupt)
+    monkeypatch.setattr(render, "shade_mesh", interrupt)
     with pytest.raises(KeyboardInterrupt):
         make(tmp_path / "data", folder)
     assert list((tmp_path / "data").iterdir()) == []
@@ -404,11 +404,10 @@ def test_voxels_on_the_contact_sheet_do_not_touch():
     assert (column[:64] == 0).all() and (column[64:68] > 0).all() and (column[68:132] == 0).all()
 
 
-def test_render_object_refuses_what_cannot_be_seen():
-    with pytest.raises(ValueError, match="no view shows"):
-        render_object(
-            np.zeros((3, 3)), np.array([[0, 1, 2]]), np.ones(3), kato.view_poses(torch.arange(24)), 64, np.eye(3)
-        )
+def test_a_mesh_that_cannot_be_seen_is_skipped(tmp_path, folder):
+    (folder / "line.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
+    (skipped,) = make(tmp_path / "data", folder).skipped
+    assert skipped["name"] == "line.obj" and "no view shows" in skipped["reason"]
 
 
 def test_command_line(tmp_path, folder, monkeypatch, capsys):
