@@ -309,7 +309,7 @@ def render_normals(
     Notes
     -----
     Differentiable in the vertices: the true derivative at fixed coverage. ``fragments.resolve(fragments.normals())``
-    is the same image with NMR's edge gradient.
+    is the same image, with NMR's edge gradient in addition.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Converts cameras from and to the conventions of OpenCV, OpenGL and PyTorch3D. Differentiable; results are float64.
 
-Worlds of these libraries are right-handed. Their cameras, converted to nmr, show the same picture, not mirrored.
+The worlds of these libraries are right-handed. Their cameras, converted to nmr, show the same picture.
 :class:`nmr.LookAt`, :class:`nmr.Look` and :class:`nmr.Orthographic` treat the world as left-handed, as the published
 renderer does: they show the mirror image of what a right-handed look-at camera shows. Converted to another library,
 they put every vertex on the same pixel, so that their rotation has determinant -1. If you need a proper rotation, give
@@ -246,7 +246,7 @@ def from_pytorch3d(
     if not in_ndc:
         focal, centre = focal * (2 / shorter), -(centre - size / 2) * (2 / shorter)
     focal, centre = focal * (shorter / size), centre * (shorter / size)
-    # x = -x_ndc, and X of the camera axes changes its sign, too: the signs cancel but in the principal point.
+    # x = -x_ndc, and X of the camera axes also changes its sign: only the principal point needs a minus.
     intrinsics = torch.stack([_row(focal[:, 0], 0, -centre[:, 0]), _row(0, -focal[:, 1], centre[:, 1])], dim=1)
     return Projection(_PYTORCH3D_AXES * matrix, intrinsics, perspective=not orthographic)
 
