@@ -10,13 +10,13 @@ import numpy as np
 import skimage.transform
 import torch
 import trimesh
-from torch import Tensor
 
 from learn3d import figures
 from learn3d.data.crops import Crops
 from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
 from learn3d.data.readers.kato import mesh_to_object
+from learn3d.figures import Surface
 from learn3d.files import limits, writing
 from learn3d.methods import Method
 from learn3d.runs import checkpoint
@@ -78,22 +78,26 @@ def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
 
 
 @torch.no_grad()
-def reconstruct(method: Method, images: np.ndarray) -> list[tuple[Tensor, Tensor]]:
-    """Meshes (vertices float32 [V,3] in the object frame, faces [F,3]) of images uint8 [B,4,S,S] as stored."""
+def reconstruct(method: Method, images: np.ndarray) -> list[Surface]:
+    """Meshes, in the object frame, of images uint8 [B,4,S,S] as stored."""
     return figures.as_meshes(method.decode(method.encode(torch.from_numpy(images))))
 
 
-def export_mesh(path: Path, vertices: Tensor, faces: Tensor) -> None:
-    """Write a mesh [V,3], [F,3] of the object frame as OBJ, GLB or PLY (by the file's ending), y up, right-handed.
+def export_mesh(path: Path, surface: Surface) -> None:
+    """Write a mesh of the object frame as OBJ, GLB or PLY (by the file's ending), y up, right-handed.
 
     The object frame is left-handed; the reflection back turns the faces, whose normals point outwards in the file.
+    GLB and PLY keep the colours of the vertices; a GLB's node has the file's name.
     """
     kind = path.suffix.lower().lstrip(".")
     if kind not in ("obj", "glb", "ply"):
         raise ValueError(f"mesh files are written as .obj, .glb or .ply, not '{path.name}'")
-    points = vertices.detach().cpu().double().numpy() @ mesh_to_object()
-    mesh = trimesh.Trimesh(points, faces.cpu().numpy()[:, ::-1], process=False)
-    content = mesh.export(file_type=kind)
+    points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
+    mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)
+    if surface.colors is not None and kind != "obj":
+        mesh.visual.vertex_colors = (surface.colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    scene = trimesh.Scene({path.stem: mesh}) if kind == "glb" else mesh
+    content = scene.export(file_type=kind)
     writing.write_bytes(path, content.encode() if isinstance(content, str) else content)
 
 
@@ -110,31 +114,27 @@ def check_pictures(frames: int = 36, image_size: int = 256) -> None:
 def save_reconstruction(
     folder: Path,
     name: str,
-    image: np.ndarray,
-    vertices: Tensor,
-    faces: Tensor,
+    picture: np.ndarray,
+    surface: Surface,
     *,
     mesh_format: Literal["obj", "glb", "ply"] = "glb",
     frames: int = 36,
     image_size: int = 256,
-    inverted: bool = True,
 ) -> list[Path]:
     """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input and six views); returns the three paths.
 
-    inverted: the image's colours are stored as 255 - colour, see `ViewDataset.inverted`.
+    picture: the input, uint8 [S,S,3].
     """
     check_pictures(frames, image_size)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png")]
-    export_mesh(paths[0], vertices, faces)
-    turn = figures.turntable(vertices, faces, frames=frames, image_size=image_size)
-    figures.save_gif(paths[1], turn)
-    views = figures.draw_mesh(
-        vertices, faces, [-60.0 * k - 15 for k in range(6)], elevation_deg=20, image_size=STRIP_SIZE, fit=True
-    )
-    strip = figures.tile([[figures.natural_colors(image, inverted=inverted), *views]], tile_size=STRIP_SIZE)
-    figures.save_png(paths[2], strip)
+    export_mesh(paths[0], surface)
+    figures.save_gif(paths[1], figures.turntable(surface, frames=frames, image_size=image_size))
+    azimuths = [-15 - 60 * k for k in range(6)]
+    views = figures.draw_around(surface, azimuths, image_size=STRIP_SIZE)
+    titles = ["input", *(f"azimuth {azimuth % 360}°" for azimuth in azimuths)]
+    figures.save_png(paths[2], figures.tile([[picture, *views]], titles, tile_size=STRIP_SIZE))
     return paths
 
 
@@ -164,8 +164,7 @@ def reconstruct_files(
     names = [Path(image).stem for image in images]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]
-    options["inverted"] = LAYOUTS[config.layout].inverted
-    return _save_all(method, folder, names, np.stack(prepared), options)
+    return _save_all(method, folder, names, np.stack(prepared), LAYOUTS[config.layout].inverted, options)
 
 
 def reconstruct_dataset(
@@ -194,8 +193,7 @@ def reconstruct_dataset(
     names = [f"{dataset.category}_{split}_object{number:04}_view{view:02}" for number, view in numbers]
     if len(set(names)) < len(names):
         names = [f"{dataset.category}_{split}_image{index:06}" for index in indices]
-    options["inverted"] = dataset.inverted
-    return _save_all(method, folder, names, batch.images.numpy(), options)
+    return _save_all(method, folder, names, batch.images.numpy(), dataset.inverted, options)
 
 
 def _check(options: dict[str, Any]) -> None:
@@ -203,10 +201,13 @@ def _check(options: dict[str, Any]) -> None:
     check_pictures(**{name: options[name] for name in ("frames", "image_size") if name in options})
 
 
-def _save_all(method: Method, folder: Path, names: list[str], images: np.ndarray, options: dict) -> list[Path]:
+def _save_all(
+    method: Method, folder: Path, names: list[str], images: np.ndarray, inverted: bool, options: dict[str, Any]
+) -> list[Path]:
     written = []
-    for name, image, (vertices, faces) in zip(names, images, reconstruct(method, images), strict=True):
-        written += save_reconstruction(folder, name, image, vertices, faces, **options)
+    pictures = figures.natural_colors(images, inverted=inverted)
+    for name, picture, surface in zip(names, pictures, reconstruct(method, images), strict=True):
+        written += save_reconstruction(folder, name, picture, surface, **options)
     return written
 
 

@@ -112,8 +112,6 @@ class Curves(Drawn):
 class Polar(Measured):
     """IoU by the azimuth of the input view, and agreement of the shapes from different views (PNG, SVG, JSON)."""
 
-    values: Path | None = None
-    """Draw these values, a JSON that this command wrote, instead of measuring --runs."""
     voxels: Literal["kato18", "kato19"] = "kato18"
     """Voxeliser of the shapes."""
 
@@ -154,10 +152,6 @@ def run(arguments: Sequence[str]) -> int:
     where, runs = command.output, command.runs
     if name == "curves":
         paths = paper.save_curves(runs, where, labels=command.labels)
-    elif name == "polar" and (command.values is None) == (not runs):
-        raise ValueError("give either --runs to measure, or --values to draw")
-    elif name == "polar" and command.values is not None:
-        paths = paper.redraw_polar(command.values, where)
     elif name == "polar":
         paths = paper.save_polar(command.open(), where, definition=command.voxels)
     elif name == "tsne":

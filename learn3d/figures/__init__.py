@@ -11,7 +11,7 @@ from learn3d.figures.drawing import (
     as_meshes,
     azimuths_deg,
     common_zoom,
-    draw_mesh,
+    draw_around,
     draw_surface,
     natural_colors,
     orbit,
@@ -23,29 +23,3 @@ from learn3d.figures.drawing import (
 from learn3d.figures.grids import GRID_COLUMNS, comparison_grid, picture_grid
 from learn3d.figures.interpolation import interpolation_strip, morph
 from learn3d.make_data.sheets import HEADER, MARGIN, TILE, tile
-
-__all__ = [
-    "CLAY",
-    "GRID_COLUMNS",
-    "HEADER",
-    "MARGIN",
-    "TILE",
-    "Surface",
-    "as_meshes",
-    "azimuths_deg",
-    "common_zoom",
-    "comparison_grid",
-    "draw_mesh",
-    "draw_surface",
-    "drawing",
-    "interpolation_strip",
-    "morph",
-    "natural_colors",
-    "orbit",
-    "picture_grid",
-    "save_gif",
-    "save_png",
-    "tile",
-    "to_uint8",
-    "turntable",
-]

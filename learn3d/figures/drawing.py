@@ -15,7 +15,7 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.poses import LookAtPoses, Poses
-from learn3d.data.readers.kato import DISTANCE, HALF_FOV_DEG
+from learn3d.data.readers.kato import DISTANCE
 from learn3d.files import writing
 from learn3d.make_data.shading import shade_mesh
 from learn3d.make_data.sheets import HEADER, font
@@ -32,12 +32,14 @@ class Surface(NamedTuple):
 
     vertices: Tensor  # float32 [V, 3], object frame
     faces: Tensor  # int64 [F, 3]; F = 0 is an empty shape, of which nothing is drawn
+    colors: Tensor | None = None  # float32 [V, 3] in [0, 1], R, G, B of each vertex; None: clay
 
 
 def as_meshes(shapes: Meshes | Grids) -> list[Surface]:
     """The predicted shapes one by one as triangles; grids by marching cubes at their threshold."""
     if isinstance(shapes, Meshes):
-        return [Surface(vertices, shapes.faces) for vertices in shapes.vertices]
+        colors = [None] * len(shapes.vertices) if shapes.colors is None else shapes.colors
+        return [Surface(vertices, shapes.faces, color) for vertices, color in zip(shapes.vertices, colors, strict=True)]
     return [Surface(*grid_surface(grid, level=shapes.threshold)) for grid in shapes.occupancy]
 
 
@@ -99,22 +101,24 @@ def common_zoom(shapes: Sequence[tuple[Surface, nmr.LookAt | nmr.Orthographic]],
 
 
 def draw_surface(surface: Surface, cameras: nmr.LookAt | nmr.Orthographic, *, image_size: int) -> np.ndarray:
-    """One shape as plain clay on white, as each of N cameras sees it: uint8 [N,S,S,3].
+    """One shape on white, in its colours or as plain clay, as each of N cameras sees it: uint8 [N,S,S,3].
 
     The light goes with the camera (from above its left shoulder), so that no side of the shape lies in the dark.
     """
     eyes, ups = (torch.as_tensor(v, dtype=torch.float64).reshape(-1, 3) for v in (cameras.eye, cameras.up))
     if len(surface.faces) == 0:
         return np.full((len(eyes), image_size, image_size, 3), 255, np.uint8)
-    pictures = []
+    pictures, colors = [], np.asarray(CLAY)
+    if surface.colors is not None:
+        colors = surface.colors.detach()[surface.faces].mean(dim=1).numpy()  # of each face
     for eye, up in zip(eyes, ups.expand_as(eyes), strict=True):  # one at a time: the fine images take memory
         if isinstance(cameras, nmr.LookAt):
             camera = nmr.LookAt(eye[None], up=up, half_fov_deg=cameras.half_fov_deg)
         else:
             camera = nmr.Orthographic(eye[None], up=up, scale=cameras.scale)
         light = tuple(_camera_axes(eye, up).T @ torch.tensor(_LIGHT, dtype=torch.float64))
-        clay = np.asarray(CLAY)
-        rgb, _ = shade_mesh(*surface, clay, camera, image_size=image_size, supersample=4, ambient=0.4, light=light)
+        fine = {"image_size": image_size, "supersample": 4, "ambient": 0.4, "light": light}
+        rgb, _ = shade_mesh(surface.vertices, surface.faces, colors, camera, **fine)
         pictures.append(rgb)
     return np.concatenate(pictures)
 
@@ -127,33 +131,19 @@ def _camera_axes(eye: Tensor, up: Tensor) -> Tensor:
     return torch.stack([x, torch.linalg.cross(z, x), z])
 
 
-def draw_mesh(
-    vertices: Tensor,
-    faces: Tensor,
-    azimuths_deg: Sequence[float],
-    *,
-    elevation_deg: float,
-    image_size: int,
-    fit: bool = False,
+def draw_around(
+    surface: Surface, azimuths_deg: Sequence[float], *, elevation_deg: float = 20.0, image_size: int
 ) -> np.ndarray:
-    """One mesh [V,3] in the object frame as plain clay on white, from several azimuths: uint8 [N,S,S,3].
-
-    The camera has Kato's distance and field of view, or with `fit` one that just holds the mesh at every azimuth.
-    """
-    half_fov_deg = HALF_FOV_DEG
-    if fit:
-        radius = float(vertices.norm(dim=1).max())
-        half_fov_deg = max(1.0, math.degrees(math.asin(min(1.03 * radius / DISTANCE, 0.9))))
+    """One shape from several azimuths, by a camera that just holds it at each of them: uint8 [N,S,S,3]."""
+    radius = float(surface.vertices.norm(dim=1).max()) if len(surface.vertices) else 0.0
+    half_fov_deg = max(1.0, math.degrees(math.asin(min(1.03 * radius / DISTANCE, 0.9))))
     cameras = nmr.LookAt.from_angles(DISTANCE, elevation_deg, list(azimuths_deg), half_fov_deg=half_fov_deg)
-    return draw_surface(Surface(vertices, faces), cameras, image_size=image_size)
+    return draw_surface(surface, cameras, image_size=image_size)
 
 
-def turntable(
-    vertices: Tensor, faces: Tensor, *, frames: int = 36, image_size: int = 256, elevation_deg: float = 20.0
-) -> np.ndarray:
-    """One full turn around a mesh [V,3] in the object frame: uint8 [frames,S,S,3]."""
-    azimuths = [-360.0 * frame / frames for frame in range(frames)]
-    return draw_mesh(vertices, faces, azimuths, elevation_deg=elevation_deg, image_size=image_size, fit=True)
+def turntable(surface: Surface, *, frames: int = 36, image_size: int = 256) -> np.ndarray:
+    """One full turn around a shape: uint8 [frames,S,S,3]."""
+    return draw_around(surface, [-360.0 * frame / frames for frame in range(frames)], image_size=image_size)
 
 
 def natural_colors(images: np.ndarray, *, inverted: bool = True) -> np.ndarray:

@@ -17,8 +17,7 @@ from learn3d.figures.drawing import azimuths_deg, beside, save_gif, save_png, st
 from learn3d.figures.grids import comparison_grid, spread_views
 from learn3d.figures.interpolation import AZIMUTHS_DEG, interpolation_strip, morph, typical_views
 from learn3d.figures.runs import Run, by_dataset, encode, name_runs, title_of
-from learn3d.files import limits, writing
-from learn3d.files.reading import parse_json, read_bytes
+from learn3d.files import writing
 
 IMAGES = 6  # rows of a grid of one category
 IMAGES_PER_CATEGORY = 2  # rows of each of several categories
@@ -120,23 +119,6 @@ def save_polar(runs: Sequence[Run], output: Path, *, definition: Definition = "k
     path = with_ending(_in_folder(output), ".json")
     writing.write_json(path, {"voxels": definition, "profiles": [p.to_json() for p in profiles]})
     return [*plots.save_figure(polar.plot_profiles(profiles), output), path]
-
-
-def redraw_polar(values: Path, output: Path) -> list[Path]:
-    """The plot of `save_polar` from the JSON that it wrote."""
-    what = "give the .json that 'polar' wrote beside its picture"
-    try:
-        content = read_bytes(values, limits.JSON_BYTES, "the figures of a plot")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"there is no {values}; {what}") from None
-    try:
-        stored = parse_json(content)["profiles"]
-        if not isinstance(stored, list) or not stored:
-            raise TypeError
-    except (ValueError, KeyError, TypeError):
-        raise ValueError(f"{values} holds no profiles; {what}") from None
-    profiles = [polar.ViewProfile.from_json(value, source=str(values)) for value in stored]
-    return plots.save_figure(polar.plot_profiles(profiles), _in_folder(output))
 
 
 def save_all(

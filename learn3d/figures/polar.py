@@ -45,23 +45,6 @@ class ViewProfile:
         rows = {name: [_plain(x) for x in getattr(self, name)] for name in ("azimuths_deg", "iou", "agreement")}
         return {"label": self.label, **rows, "mean_iou": _plain(self.mean_iou), "consistency": _plain(self.consistency)}
 
-    @classmethod
-    def from_json(cls, values: dict[str, Any], source: str = "the file") -> ViewProfile:
-        """The inverse of `to_json`. Raises ValueError, naming what is missing."""
-        try:
-            rows = {name: np.array(values[name], np.float64) for name in ("azimuths_deg", "iou", "agreement")}
-            single = {
-                name: float("nan" if values[name] is None else values[name]) for name in ("mean_iou", "consistency")
-            }
-            profile = cls(label=str(values["label"]), **rows, **single)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"{source} holds no profile over views ({type(error).__name__}: {error})") from None
-        if not profile.azimuths_deg.shape == profile.iou.shape == profile.agreement.shape:
-            raise ValueError(f"{source} holds a profile whose azimuths and values differ in number")
-        if profile.azimuths_deg.ndim != 1 or not np.isfinite(profile.azimuths_deg).all():
-            raise ValueError(f"{source} holds a profile whose azimuths are no list of finite numbers")
-        return profile
-
 
 def directions(azimuths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which direction each image counts to: (int64 [M] in 0 .. D-1, the directions' azimuths float64 [D]).

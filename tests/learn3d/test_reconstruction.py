@@ -11,6 +11,7 @@ from PIL import Image
 import nmr
 from learn3d.data.crops import Crops
 from learn3d.data.readers.kato import mesh_to_object
+from learn3d.figures import Surface
 from learn3d.reconstruction import _read, export_mesh, prepare_image, reconstruct_dataset, reconstruct_files
 
 
@@ -135,7 +136,7 @@ def test_read_image_with_transparency_or_mask(tmp_path) -> None:
 def test_mesh_files_are_right_handed_with_normals_outwards(tmp_path, kind: str) -> None:
     sphere, faces = nmr.icosphere(2)
     vertices = sphere * torch.tensor([0.5, 0.3, 0.2]) + torch.tensor([0.1, 0.2, 0.3])
-    export_mesh(tmp_path / f"a.{kind}", vertices, faces)
+    export_mesh(tmp_path / f"a.{kind}", Surface(vertices, faces))
     mesh = trimesh.load(tmp_path / f"a.{kind}", force="mesh")
     assert (len(mesh.vertices), len(mesh.faces)) == (162, 320)
     assert mesh.is_watertight
@@ -145,9 +146,23 @@ def test_mesh_files_are_right_handed_with_normals_outwards(tmp_path, kind: str) 
     assert np.allclose(mesh.extents, [0.4, 0.6, 1.0], atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["glb", "ply"])
+def test_colours_of_vertices_are_kept(tmp_path, kind: str) -> None:
+    vertices, faces = nmr.icosphere(1)
+    colors = (vertices - vertices.min()) / (vertices.max() - vertices.min())
+    export_mesh(tmp_path / f"chair.{kind}", Surface(vertices, faces, colors))
+    mesh = trimesh.load(tmp_path / f"chair.{kind}", force="mesh", process=False)
+    assert np.abs(mesh.visual.vertex_colors[:, :3] / 255 - colors.numpy()).max() < 0.01
+
+
+def test_the_node_of_a_glb_has_the_objects_name(tmp_path) -> None:
+    export_mesh(tmp_path / "chair.glb", Surface(*nmr.icosphere(1)))
+    assert list(trimesh.load(tmp_path / "chair.glb").geometry) == ["chair"]
+
+
 def test_unknown_mesh_format(tmp_path) -> None:
     with pytest.raises(ValueError, match=r"\.obj, \.glb or \.ply, not 'a.fbx'"):
-        export_mesh(tmp_path / "a.fbx", *nmr.icosphere(0))
+        export_mesh(tmp_path / "a.fbx", Surface(*nmr.icosphere(0)))
 
 
 def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_path) -> None:

@@ -48,10 +48,6 @@ def test_all_figures_of_a_run(call, finished_run, tmp_path, monkeypatch) -> None
     assert stored["mean_iou"] == pytest.approx(evaluate(method, run.dataset).voxel_iou, abs=1e-6)
     assert stored["label"] == "Proposed" and config.seed == 0
 
-    again = ("polar", "--values", tmp_path / "out" / "polar.json", "--output", tmp_path / "again.png")
-    assert call(*again)[0] == 0
-    assert (tmp_path / "again.svg").read_bytes() == (tmp_path / "out" / "polar.svg").read_bytes()
-
 
 def test_what_cannot_be_drawn_is_said_before_anything_is(call, finished_run, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("learn3d.commands.figures.find_spec", lambda package: None)
@@ -94,8 +90,7 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
     for arguments, message in (
         (("grid",), "at least one run folder or checkpoint"),
         (("curves",), "at least one run folder"),
-        (("polar",), "either --runs to measure, or --values to draw"),
-        (("polar", "--runs", finished_run, "--values", tmp_path / "x.json"), "either --runs"),
+        (("polar",), "at least one run folder or checkpoint"),
         (("grid", "--runs", tmp_path / "nowhere"), "nowhere"),
         (("grid", "--runs", finished_run, "--labels", "a", "b"), "there are 1 runs but 2 labels"),
         (("grid", "--runs", finished_run, "--images", 0), "has 24 images, 0 were asked for"),

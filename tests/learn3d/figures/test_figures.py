@@ -13,7 +13,7 @@ from PIL import Image
 import nmr
 from learn3d import figures
 from learn3d.data.poses import LookAtPoses, RotationPoses
-from learn3d.methods import DataShape, Grids, Method, create_method
+from learn3d.methods import DataShape, Grids, Meshes, Method, create_method
 from learn3d.presets import PRESETS
 
 
@@ -114,6 +114,15 @@ def test_the_light_goes_with_the_camera() -> None:
     assert pictures[0][10:16].mean() > pictures[0][16:22].mean() + 8  # and it comes from above
 
 
+def test_shapes_are_drawn_in_their_colours() -> None:
+    vertices, faces = nmr.icosphere(3)
+    red = torch.tensor([1.0, 0.0, 0.0]).expand_as(vertices)
+    cameras = figures.orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 25.0), [0])
+    (surface,) = figures.as_meshes(Meshes(vertices[None], faces, red[None]))
+    middle = figures.draw_surface(surface, cameras, image_size=32)[0, 16, 16]
+    assert middle[0] > 120 and middle[1:].max() < 10
+
+
 def test_grids_are_drawn_where_their_cells_are() -> None:
     occupancy = torch.zeros(2, 16, 16, 16)
     occupancy[0, 2:6, 8:14, 15:] = 1.0  # touches the far end of z
@@ -189,7 +198,7 @@ def test_endings_are_replaced_only_where_they_are_those_of_pictures() -> None:
 
 
 def test_turntable_turns(egg) -> None:
-    frames = figures.turntable(*egg, frames=4, image_size=48)
+    frames = figures.turntable(figures.Surface(*egg), frames=4, image_size=48)
     assert frames.shape == (4, 48, 48, 3)
     widths = [(frame < 250).any(axis=(0, 2)).sum() for frame in frames]
     assert widths[0] > 1.5 * widths[1]
@@ -200,7 +209,7 @@ def test_turntable_turns(egg) -> None:
 
 
 def test_png_and_gif_can_be_read_back(tmp_path, egg) -> None:
-    frames = figures.turntable(*egg, frames=3, image_size=32)
+    frames = figures.turntable(figures.Surface(*egg), frames=3, image_size=32)
     figures.save_png(tmp_path / "a.png", frames[0])
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), frames[0])
     figures.save_gif(tmp_path / "a.gif", frames, frames_per_second=10)
