@@ -1,7 +1,7 @@
 """Measure the renderer and what belongs to it, beside other programs in the same run (compare within one run only).
 
   bench.py all: every row of the table, as Markdown; exit code 1 if a target is missed
-  bench.py w1: 64 spheres, 64x64 anti-aliased; also deodr, and the slow definition
+  bench.py w1: 64 spheres, 64x64 anti-aliased; also deodr
   bench.py w2: one mesh of 81,920 faces, 512x512
   bench.py w3: one mesh of 1,280 faces, 1024x1024
   bench.py w4: w1 with depth, and with alpha + depth in one pass, instead of silhouettes
@@ -13,7 +13,6 @@
   bench.py memory: bytes per image and per raster pixel, in fresh processes
   bench.py processes: steps of the proposed method, one batch of 128 shared by 1, 2, 4 ... processes
   bench.py scaling: w1, w2, w3 at 1, 2, 4, 8, 16 threads, as far as there are cores
-  bench.py count: the work in w1 (faces, pixels, sweeps, divisions, bytes) and the floor it sets
 
 Medians over repeats that alternate between the programs, and the fastest. Freed memory is kept for all of them, as in
 training (learn3d/device.py). `pip install deodr` for the comparison.
@@ -32,7 +31,6 @@ from typing import Literal, NamedTuple
 import bench_peers as peers
 import torch
 import tyro
-from bench_count import count
 from bench_memory import bench_memory
 from bench_processes import bench_processes
 from bench_step import StepOptions, bench_evaluation, bench_step
@@ -64,7 +62,7 @@ class Target(NamedTuple):
     source: str
 
 
-MESHES = 64  # of w1, w4 and count
+MESHES = 64  # of w1 and w4
 _TWO_CORES = "measured on two Zen 4 cores"
 TARGETS = {
     "w1, 64": Target(8, "ms", f"half of B = 128; deodr in two processes took 27.8, {_TWO_CORES}"),
@@ -77,26 +75,16 @@ TARGETS = {
     "evaluation": Target(3, "% of the run", "what a run may spend on looking at itself"),
 }
 
-# Operations on eight lanes that one item of bench_count takes at the least, as far as we know; without its divisions.
-LANE_OPERATIONS = {
-    "raster pixels, by eight": 20,  # cleared, copied, averaged, searched for visible faces and for pixels that pull
-    "faces set up": 8,  # 60 scalar ones: facing, box, range of depths
-    "rows of eight tested": 12,  # three edges, depth and owner: compared, chosen, written
-    "exact depths": 5,  # 40 scalar ones
-    "crossings prepared, by eight": 30,  # crossing, rounding, owners on both sides, levers, masks
-    "pulls outside, by eight": 12,
-}
-
 
 @dataclass(frozen=True)
 class Options:
     workload: tyro.conf.Positional[
         Literal["all", "w1", "w2", "w3", "w4", "smoothness", "cameras", "voxels", "step", "evaluation"]
-        | Literal["memory", "processes", "scaling", "count"]
+        | Literal["memory", "processes", "scaling"]
     ] = "w1"
     """What to measure."""
     batch: int | None = None
-    """Meshes of w1, w4 and count, by default 64 (all measures w1 with 64 and with 128); images of a step, by default
+    """Meshes of w1 and w4, by default 64 (all measures w1 with 64 and with 128); images of a step, by default
     the preset's."""
     preset: str = DEFAULT_PRESET
     """step, evaluation: what is trained, on silhouettes of spheres."""
@@ -109,8 +97,6 @@ class Options:
     """Threads of ours and of torch. deodr has none: it gets one process, and as many as these."""
     repeats: int = 15
     """Timed runs of each program."""
-    definition: bool = True
-    """w1: also time the slow definition (nmr/reference.py) on one image, once, scaled to the batch."""
     json: Path | None = None
     """Also write the figures here."""
 
@@ -145,8 +131,6 @@ def bench_render(name: str, options: Options, batch: int) -> Result:
     rows = measure(programs, options.repeats)
     if processes:
         processes.close()
-    if name == "w1" and options.definition and options.workload == "w1":
-        rows.append(milliseconds("slow definition (1 image x batch)", [peers.run_definition(workload, targets)]))
     loss = "the mean squared difference" if name == "w4" else "1 - soft IoU"
     key = f"{name}, {batch}" if name in ("w1", "w4") else name
     return Result(key, f"{title}, forward + backward of {loss}", rows, about)
@@ -223,21 +207,6 @@ def bench_scaling(options: Options) -> list[Result]:
     return results
 
 
-def bench_count(options: Options) -> None:
-    """The work, and its floor at 3 GHz: two operations a cycle; divisions, eight in five cycles; memory for free."""
-    title, workload = render_workload("w1", options.batch or MESHES)
-    counts = count(workload)
-    print(f"{title}: work per image (mean), forward + backward of 1 - soft IoU")
-    for name, value in counts.items():
-        print(f"{name:<34}{value:>14,.1f}")
-    cycles = sum(k * counts[name] for name, k in LANE_OPERATIONS.items()) / 2
-    divisions = 5 / 8 * (counts["divisions forward"] + counts["divisions backward"])
-    images = (options.batch or MESHES) / options.threads / 3e6
-    print(f"{'floor of its operations':<34}{cycles * images:>14.2f} ms for {options.batch or MESHES} images")
-    print(f"{'floor of its divisions':<34}{divisions * images:>14.2f} ms, beside them")
-    print(f"({bench_count.__doc__} {options.threads} threads)")
-
-
 # --- the table
 
 
@@ -306,9 +275,6 @@ def main() -> int:
         bench_processes(options.repeats)
         return 0
     keep_freed_memory()
-    if options.workload == "count":
-        bench_count(options)
-        return 0
     if options.workload == "all":
         results = bench_all(options)
     elif options.workload == "scaling":

@@ -1,4 +1,4 @@
-"""Other programs for the same work: deodr, the slow definition, and chains of torch calls."""
+"""Other programs for the same work: deodr, and chains of torch calls."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from bench_work import Program, Timing, Workload, run_chain
 from torch import Tensor
 
 import nmr
-from nmr import reference
 
 FAR = 100.0  # nmr.render_depth's default
 
@@ -163,22 +162,6 @@ def deodr_programs(
         if processes:
             programs[f"deodr, {num_processes} processes{where}"] = lambda pooled=pooled: processes(pooled)
     return programs, processes
-
-
-# --- the slow definition
-
-
-def run_definition(workload: Workload, targets: tuple[Tensor, ...]) -> Timing:
-    """nmr/reference.py on the silhouette of the first mesh, times the batch."""
-    vertices = workload.camera.transform(workload.vertices)[0]
-    aa, batch = workload.anti_aliasing, len(workload.vertices)
-    start = time.perf_counter()
-    index = reference.face_index(vertices, workload.faces, workload.raster_size)
-    alpha = reference.silhouette(index, aa).requires_grad_()
-    forward = time.perf_counter()
-    nmr.losses.soft_iou_loss(alpha[None], targets[0][:1]).backward()
-    reference.silhouette_gradient(vertices, workload.faces, index, alpha.grad, aa)
-    return batch * (forward - start), batch * (time.perf_counter() - start)
 
 
 # --- chains of torch calls
