@@ -178,7 +178,7 @@ def prepare(options: StepOptions) -> tuple[TrainConfig, ViewDataset, dict[str, T
         where = (config.layout, config.data, config.category, "train")
         dataset = load_dataset(*where, views_per_object=config.views_per_object, **size)
     else:
-        tensors, config = None, TrainConfig(data="", category="spheres", output="", preset=options.preset)
+        tensors, config = None, TrainConfig(data="-", category="spheres", output="-", preset=options.preset)
         conditional = getattr(config.settings, "class_conditional", False)
         size = config.settings.image_size
         dataset = sphere_dataset(48 if size == 64 else 8, size, 2 if conditional else 1)
