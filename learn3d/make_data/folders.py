@@ -1,4 +1,4 @@
-"""The folder that a data set is written into: what is there, is there room, and the move to the final names."""
+"""The folder that a data set is written to: what is there, whether there is room, and the move to the final names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes as they come: from a folder of files, from a mesh pack (npz) or from the procedural generator.
+"""Where meshes come from: a folder of files, a mesh pack (npz) or the procedural generator.
 
 Every source is a list of `MeshSource`, in an order that does not depend on the file system. Reading one raises
 ValueError where the file cannot be read, and `checked` where a mesh cannot be used, each with the reason.

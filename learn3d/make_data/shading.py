@@ -1,4 +1,4 @@
-"""Plain lit pictures of meshes through the renderer's index map, for data sets and figures; not differentiable."""
+"""Pictures of meshes with flat shading, for data sets and figures; not differentiable."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def shade_mesh(
     covered = index >= 0
     view, row, column = np.nonzero(covered)
     face = index[view, row, column]
-    ink = np.zeros((*index.shape, 3), dtype=np.float32)  # 1 - colour: what to take away from white paper
+    ink = np.zeros((*index.shape, 3), dtype=np.float32)  # 1 - colour, 0 on the white background
     lit = np.clip(colors, 0.0, 1.0)
     ink[view, row, column] = 1.0 - (lit if lit.ndim == 1 else lit[face]) * intensity[view, face, None]
     rgb = 255.0 * (1.0 - _pool(ink, image_size, supersample))

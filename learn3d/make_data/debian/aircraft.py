@@ -58,7 +58,7 @@ def without_effects(parts: list[Part]) -> list[Part]:
 
     A disc (or the square it is drawn on) is a part whose depth along the flight direction x is under 3 % of its
     diameter, of round or square outline, and wider than DISC_DIAMETER of the whole. A lone quadrilateral is a part of
-    one or two triangles with no corner within DETACHED of the whole of another part's, twins at its place aside.
+    one or two triangles that no other part comes near (DETACHED), except its own other side at the same place.
     """
     corners = [part.vertices[np.unique(part.faces)] for part in parts]
     size = np.ptp(np.concatenate(corners), axis=0).max()
@@ -71,7 +71,7 @@ def without_effects(parts: list[Part]) -> list[Part]:
         if flat and max(y, z) > DISC_DIAMETER * size:
             continue
         if len(part.faces) <= 2 and len(parts) > 1:
-            middle = corners[index].mean(axis=0)  # a twin at the same place, its other side, does not count
+            middle = corners[index].mean(axis=0)  # its other side, at the same place, does not count
             others = [points for points in corners if np.abs(points.mean(axis=0) - middle).max() > DETACHED * size]
             gaps = [np.linalg.norm(points[:, None] - corners[index], axis=2).min() for points in others]
             if gaps and min(gaps) > DETACHED * size:

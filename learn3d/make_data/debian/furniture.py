@@ -48,7 +48,7 @@ FURNITURE_SECTIONS_LEFT_OUT = ("Characters", "Doors and windows", "Staircases", 
 def furniture_category(name: str, section: str = "") -> str | None:
     """Category of a catalogue entry from its English name and the section it is listed in; None if it has none.
 
-    Nor has one whose name is above 200 characters: some patterns take the square of its length.
+    Names of over 200 characters have none: some patterns take the square of the length.
     """
     if section in FURNITURE_SECTIONS_LEFT_OUT or len(name) > limits.NAME_LENGTH:
         return None

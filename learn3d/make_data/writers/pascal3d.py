@@ -39,7 +39,7 @@ SHARES = (0.5, 0.9)  # of the picture's shorter side that the cube takes
 
 
 class Pascal3dWriter(Writer):
-    """Pictures are kept in memory until all are made. Every second one to train on is "imagenet"."""
+    """Pictures are kept in memory until all are made. Every second picture to train on goes to "imagenet"."""
 
     image_size = 224
     default_views = 8

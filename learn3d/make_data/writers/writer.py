@@ -1,4 +1,4 @@
-"""What the maker of data sets asks of a layout, and what it hands over: one rendered object at a time."""
+"""What every layout's writer has in common: it is given one rendered object at a time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORLD_FROM_OBJECT = kato.mesh_to_object("y", "x").T
 
 @dataclass(frozen=True, eq=False)
 class RenderedObject:
-    """One object, n times looked at."""
+    """One object, rendered from n cameras."""
 
     name: str  # unique in the category, fit for a file name
     split: str
@@ -30,15 +30,15 @@ class RenderedObject:
     rgb: np.ndarray  # uint8 [n, S, S, 3], shaded, over white
     alpha: np.ndarray  # uint8 [n, S, S]: 255 * `nmr.render_silhouette`
     voxels: np.ndarray  # bool [32, 32, 32], as `Writer.voxelize` returned them
-    rng: np.random.Generator  # for whatever else is random about its files (backgrounds, points)
+    rng: np.random.Generator  # for what else is random in its files (backgrounds, points)
 
     def over(self, backgrounds: np.ndarray) -> np.ndarray:
-        """The pictures over others than white, uint8 [n, S, S, 3]; the backgrounds have that shape, too."""
+        """The pictures over backgrounds instead of white; both are uint8 [n, S, S, 3]."""
         clear = 1 - self.alpha[..., None] / np.float32(255)
         return np.rint(self.rgb + (backgrounds.astype(np.float32) - 255) * clear).clip(0, 255).astype(np.uint8)
 
     def rgba(self) -> np.ndarray:
-        """Colours that are not mixed with white any more, and alpha: uint8 [n, S, S, 4]; 0 where alpha is 0."""
+        """The pictures without the white: colours and alpha, uint8 [n, S, S, 4]; colours are 0 where alpha is."""
         share = self.alpha[..., None] / np.float32(255)
         color = (self.rgb - 255 * (1 - share)) / np.maximum(share, 1 / 255)
         color = np.where(share > 0, np.rint(color).clip(0, 255), 0).astype(np.uint8)
@@ -48,13 +48,13 @@ class RenderedObject:
 class Writer(ABC):
     """One category in one layout, written below `folder` (an empty, temporary one) object by object.
 
-    The maker calls `start` and then `write` for the objects of each split in turn (train, val, test), and `finish`.
-    Everything below one of `paths(category)` or in `shared` is then moved to its final place.
+    `make_dataset` calls `start` and then `write` for the objects of each split (train, val, test), and at last `finish`.
+    Then it moves what is in `paths(category)` and `shared` to its final place.
     """
 
     image_size: ClassVar[int]
     default_views: ClassVar[int]  # views per object unless the user asks for another number
-    fixed_views: ClassVar[bool] = False  # the protocol knows that number only
+    fixed_views: ClassVar[bool] = False  # no other number is allowed
     default_test: ClassVar[float] = 0.2  # shares of the splits unless the user says; 0 where there is no such split
     default_val: ClassVar[float] = 0.1
     bytes_per_view: ClassVar[int]  # an upper estimate for the check of the disk
