@@ -3,9 +3,9 @@
 - `renders/{synset}/{id}/render_{i}.png`, RGBA 224 x 224; `depth_{i}.png`, 8-bit grey: 255 where nothing is, and
   0 .. 240 on the object (nearer is darker), so that depth < 250 is the mask; `view.txt`, one row per picture: azimuth
   (-180 .. 180), elevation, an unused 0, distance of the camera (degrees; units of the object frame).
-- `renders/{synset}/{id}/camera_{i}.mat`: K [3, 3] in pixels, extrinsic [3, 4] and its rotation as quat (w, x, y, z). The
-  published code reads neither extrinsic nor quat. Here they take ShapeNet's coordinates (right-handed, y up, front x)
-  to a camera with x right, y down, z away.
+- `renders/{synset}/{id}/camera_{i}.mat`: K [3, 3] in pixels, extrinsic [3, 4] and its rotation as quat (w, x, y, z).
+  The published code reads neither extrinsic nor quat. Here they take ShapeNet's coordinates (right-handed, y up,
+  front x) to a camera with x right, y down, z away.
 - `voxels/modelVoxels32/{synset}/{id}.mat`, key 'Volume', 32^3 in the axes of `conventions.KAR`.
 - `splits.json`: {synset: {name, train, val, test}}, all categories of the folder in one file.
 

@@ -2,7 +2,7 @@
 
 - `ShapeNetRendering/{synset}/{id}/rendering/00.png` .., RGBA 137 x 137, and `rendering_metadata.txt` beside them, one
   row per picture: azimuth, elevation, 0 (in-plane rotation), distance ratio, 25 (a field of view that nothing
-  uses: a lens of 35 mm on a sensor of 32 mm has half a field of view of 24.57 degrees). The distance is 1.75 times the ratio.
+  uses: with a lens of 35 mm on a sensor of 32 mm half of it is 24.57 degrees). The distance is 1.75 times the ratio.
 - `ShapeNetVox32/{synset}/{id}/model.binvox`, 32^3, axes x, y, z of the mesh.
 - No list of splits: readers sort the ids and take the first 80 % to train on and the rest to test on. So ids begin with
   a number that sorts the objects to train on first, there is no val split, and the share of the test split is fixed.

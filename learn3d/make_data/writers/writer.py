@@ -48,8 +48,8 @@ class RenderedObject:
 class Writer(ABC):
     """One category in one layout, written below `folder` (an empty, temporary one) object by object.
 
-    `make_dataset` calls `start` and then `write` for the objects of each split (train, val, test), and at last `finish`.
-    Then it moves what is in `paths(category)` and `shared` to its final place.
+    `make_dataset` calls `start` and then `write` for the objects of each split (train, val, test), then `finish`.
+    After that it moves what is in `paths(category)` and `shared` to its final place.
     """
 
     image_size: ClassVar[int]
