@@ -54,79 +54,70 @@ _CODE = "published code of Peng et al. 2020"
 _PAPER = "Peng et al. 2020, section 4"
 _VPL_CODE = "published code of Kato and Harada 2019"
 
-#: Kato and Harada 2019 on Kar's data, one view of each object, silhouettes only, with lambda_D = 0.1.
+#: What Kato and Harada 2019 use on both data sets.
+_VPL_ALWAYS = {
+    "image_size": 224,
+    "silhouette_size": 224,
+    "adversary": "reversal",
+    "anti_aliasing": False,
+    "renderer_gradient": "local",
+    "adam_beta1": 0.5,
+    "lambda_smooth": 0.0,
+}
+#: On Kar's data: one view of each object, silhouettes only, with lambda_D = 0.1.
 _KAR_VPL = VPLSettings(
     encoder="preact-resnet18",
-    image_size=224,
     generator="cube-conv",
     vertex_scale=0.01,
     object_scale=0.5,
     discriminator="spectral-patch",
     discriminator_channels=32,
-    adversary="reversal",
     other_views="reversed",
-    silhouette_size=224,
-    anti_aliasing=False,
-    renderer_gradient="local",
     silhouette_loss="pyramid",
     learning_rate=4e-4,
-    adam_beta1=0.5,
-    lambda_smooth=0.0,
     lambda_inflation=1e-4,
     lambda_discriminator=0.1,
+    **_VPL_ALWAYS,
 )
-#: The same authors on Pascal3D+, without its perceptual loss of colours.
+#: On Pascal3D+, without their perceptual loss of colours.
 _PASCAL_VPL = VPLSettings(
     encoder="resnet18",
-    image_size=224,
     generator="cube-fc",
     symmetry="z",
     vertex_scale=0.1,
     object_scale=1.0,
     discriminator="patch",
     discriminator_channels=64,
-    adversary="reversal",
     other_views="next",
-    silhouette_size=224,
-    anti_aliasing=False,
-    renderer_gradient="local",
     silhouette_loss="iou",
     learning_rate=2e-5,
-    adam_beta1=0.5,
-    lambda_smooth=0.0,
     lambda_inflation=3e-5,
     lambda_discriminator=0.5,
+    **_VPL_ALWAYS,
 )
 
 
 def _vpl_on_kar(label: str, iterations: int, detail: str, **changes: float | bool) -> Preset:
-    settings = replace(_KAR_VPL, **changes)
-    source = f"{_VPL_CODE}: train_shapenet.sh, {detail}"
+    settings, source = replace(_KAR_VPL, **changes), f"{_VPL_CODE}: train_shapenet.sh, {detail}"
     augment = ("flip", "channels")
     return Preset(label, settings, "kar", iterations, 64, source, "classes", augment, view_bins="15x20")
 
 
 def _vpl_on_pascal(label: str, iterations: int, detail: str, **changes: float) -> Preset:
-    settings = replace(_PASCAL_VPL, **changes)
-    source = f"{_VPL_CODE}: train_pascal.sh, {detail}, without lambda_perceptual"
+    settings, source = replace(_PASCAL_VPL, **changes), f"{_VPL_CODE}: train_pascal.sh, {detail}"
+    source += ", without lambda_perceptual"
     return Preset(label, settings, "pascal3d", iterations, 16, source, "classes", ("crop", "flip-image"))
 
 
+_CLASS = {"class_conditional": True, "lambda_discriminator": 0.2}
+_BASELINE = {"lambda_discriminator": 0.0}
 _VPL_PRESETS: dict[str, Preset] = {
     "peng2020-kato-vpl": Preset("VPL", VPLSettings(), "kato", 20_000, 128, f"{_CODE}: its VPL for Kato's data"),
     "kato2019-kar": _vpl_on_kar("VPL", 100_000, "shapenet_single_sil_nv1_uvr"),
-    "kato2019-kar-class": _vpl_on_kar(
-        "VPL (class-conditional)",
-        100_000,
-        "shapenet_single_sil_nv1_uvr_cc",
-        class_conditional=True,
-        lambda_discriminator=0.2,
-    ),
-    "kato2019-kar-baseline": _vpl_on_kar("VPL baseline", 50_000, "shapenet_single_sil_nv1", lambda_discriminator=0.0),
+    "kato2019-kar-class": _vpl_on_kar("VPL (class-conditional)", 100_000, "shapenet_single_sil_nv1_uvr_cc", **_CLASS),
+    "kato2019-kar-baseline": _vpl_on_kar("VPL baseline", 50_000, "shapenet_single_sil_nv1", **_BASELINE),
     "kato2019-pascal": _vpl_on_pascal("VPL", 80_000, "pascal_proposed_color"),
-    "kato2019-pascal-baseline": _vpl_on_pascal(
-        "VPL baseline", 5_000, "pascal_baseline_color", lambda_discriminator=0.0
-    ),
+    "kato2019-pascal-baseline": _vpl_on_pascal("VPL baseline", 5_000, "pascal_baseline_color", **_BASELINE),
 }
 
 

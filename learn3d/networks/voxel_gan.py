@@ -2,7 +2,7 @@
 
 Layers, sizes and initial weights are those of the published TensorFlow code: weights of fully connected layers from
 N(0, 0.1), of convolutions from N(0, 0.02), biases 0. Normalisations average with momentum 0.9 in TensorFlow's sense,
-which is 0.1 in torch's.
+which is 0.1 in torch's. `channels` are four numbers.
 """
 
 from __future__ import annotations
@@ -76,8 +76,6 @@ class VoxelGenerator(nn.Module):
 
     def __init__(self, channels: Sequence[int] = GENERATOR_CHANNELS) -> None:
         super().__init__()
-        if len(channels) != 4 or min(channels) < 1:
-            raise ValueError(f"generator_channels must be 4 positive numbers (at 4^3, 8^3, 16^3, 32^3), got {channels}")
         self.first = nn.Linear(SHAPE_CODE, channels[0] * 4**3)
         layers: list[nn.Module] = [nn.BatchNorm3d(channels[0]), nn.ReLU()]
         for before, after in itertools.pairwise(channels):
@@ -100,10 +98,6 @@ class SilhouetteDiscriminator(nn.Module):
 
     def __init__(self, channels: Sequence[int] = DISCRIMINATOR_CHANNELS) -> None:
         super().__init__()
-        if len(channels) != 4 or min(channels) < 1:
-            raise ValueError(
-                f"discriminator_channels must be 4 positive numbers (at 32^2, 16^2, 8^2, 4^2), got {channels}"
-            )
         layers = [
             nn.Sequential(nn.Conv2d(before, after, 5, stride=2, padding=2), nn.BatchNorm2d(after), nn.LeakyReLU(0.2))
             for before, after in itertools.pairwise((1, *channels))

@@ -70,16 +70,15 @@ class Ranks:
             rows = torch.cat([rows, rows + half])
         return dataclasses.replace(self, rows=rows, share=len(rows) / batch_size)
 
-    def sum(self, values: Tensor) -> Tensor:
-        """The sum over the processes; differentiable, where each process differentiates its share of a loss."""
-        return values if self.alone else _Sum.apply(values)
-
     def pool(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and biased variance over the whole batch, of those over this process's rows; differentiable."""
+        """Mean and biased variance over the whole batch, of those over this process's rows.
+
+        Differentiable, where each process differentiates its share of a loss.
+        """
         if self.alone:
             return mean, variance
         first = mean.double()
-        first, second = self.sum(self.share * torch.stack([first, variance.double() + first.square()]))
+        first, second = _Sum.apply(self.share * torch.stack([first, variance.double() + first.square()]))
         return first.to(mean), (second - first.square()).clamp_min(0).to(variance)
 
     def means(self, losses: Mapping[str, float]) -> dict[str, float]:

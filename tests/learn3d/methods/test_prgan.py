@@ -271,10 +271,10 @@ def test_step_sizes_are_checked() -> None:
 
 
 def test_widths_are_checked() -> None:
-    with pytest.raises(ValueError, match="generator_channels must be 4 positive numbers"):
-        VoxelGenerator((8, 4, 2))
-    with pytest.raises(ValueError, match="discriminator_channels must be 4 positive numbers"):
-        SilhouetteDiscriminator((8, 4, 0, 2))
+    with pytest.raises(ValueError, match="generator_channels"):
+        PrGANSettings(generator_channels=(8, 4, 2))
+    with pytest.raises(ValueError, match="discriminator_channels"):
+        PrGANSettings(discriminator_channels=(8, 4, 0, 2))
 
 
 def test_a_loss_that_is_not_finite_stops_the_training() -> None:
