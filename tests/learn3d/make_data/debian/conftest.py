@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,14 @@ from small_packages import AIRCRAFT, AIRPLANE, CHAIR, TABLE, ac_object, ac_text,
 
 
 @pytest.fixture
-def debs(tmp_path: Path) -> Path:
+def dpkg() -> None:
+    """Skips the test where dpkg is not installed."""
+    if shutil.which("dpkg-deb") is None:
+        pytest.skip("needs dpkg-deb")
+
+
+@pytest.fixture
+def debs(dpkg: None, tmp_path: Path) -> Path:
     """A catalogue with a chair, its copy, a stretched copy, a table, a cup; an airplane, a light and a balloon."""
     entries = [
         entry("Oak chair", "chair"),

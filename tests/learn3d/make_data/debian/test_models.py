@@ -68,7 +68,7 @@ def test_duplicates_are_kept_when_asked_for(debs: Path, tmp_path: Path):
     ]
 
 
-def test_installed_packages_are_read_below_root(tmp_path: Path):
+def test_installed_packages_are_read_below_root(dpkg: None, tmp_path: Path):
     root = tmp_path / "root"
     path = f"{AIRCRAFT}/Plane/Models/plane.ac"
     (root / path).parent.mkdir(parents=True)

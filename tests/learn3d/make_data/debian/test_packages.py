@@ -117,7 +117,7 @@ def test_a_tar_header_that_unpacks_to_very_much_is_not_kept(debs: Path, tmp_path
 
 
 @pytest.mark.parametrize("kind", ["gz", "bz2", "xz"])
-def test_packages_of_every_compression_are_read(tmp_path: Path, kind: str):
+def test_packages_of_every_compression_are_read(dpkg: None, tmp_path: Path, kind: str):
     (tmp_path / "p_1_all.deb").write_bytes(deb_bytes({"usr/a.ac": b"1" * 30_000, "usr/b.ac": b"2"}, kind))
     found = dict(packages.read_package(packages.find_package("p", tmp_path), (".ac",), tmp_path / "licences"))
     assert found == {"usr/a.ac": b"1" * 30_000, "usr/b.ac": b"2"}
