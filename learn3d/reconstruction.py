@@ -12,10 +12,10 @@ import torch
 import trimesh
 
 from learn3d import figures
+from learn3d.data.conventions import mesh_to_object
 from learn3d.data.crops import Crops
 from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
-from learn3d.data.readers.kato import mesh_to_object
 from learn3d.figures import Surface
 from learn3d.files import limits, writing
 from learn3d.methods import Method

@@ -11,7 +11,7 @@ import tyro
 from PIL import Image
 
 import nmr
-from learn3d.data.readers.kato import mesh_to_object
+from learn3d.data.conventions import mesh_to_object
 from learn3d.make_data.shading import shade_mesh
 from learn3d.make_data.shapes import make_shape
 

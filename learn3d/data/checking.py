@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from learn3d.data.categories import synset_of
 from learn3d.data.layouts import LAYOUTS
 from learn3d.data.readers import READERS
-from learn3d.data.readers.kato import synset_of
 from learn3d.files.findings import Problem
 
 

@@ -1,7 +1,9 @@
-"""Where each data set's voxels lie: one named transform per data set, from the object frame to its grid.
+"""Conventions: the object frame, Kato's 24 views, and where a data set's voxels lie.
 
-A prediction is voxelised in the object frame's axes (x, y, z) and then brought into those of the stored ground truth,
-which is never touched. Sources: the published evaluation code, see docs/methods/README.md.
+The object frame is that of the renderer, which is LEFT-handed (x right, y up, z away from the camera of view 0), while
+mesh files are right-handed: `mesh_to_object` is the one place where that reflection is made. A prediction is voxelised
+in the object frame's axes and then brought into those of the stored ground truth, which is never touched. Sources: the
+published evaluation code, see docs/methods/README.md.
 """
 
 from __future__ import annotations
@@ -9,12 +11,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+import torch
 from torch import Tensor
 
 import nmr
+from learn3d.data.poses import LookAtPoses
 
 VOXEL_SIZE = 32
 Definition = Literal["kato18", "kato19"]
+
+# The views of Kato's renderings
+NUM_VIEWS = 24
+IMAGE_SIZE = 64
+DISTANCE = 2.732
+ELEVATION_DEG = 30.0
+AZIMUTH_STEP_DEG = -15.0
+HALF_FOV_DEG = 15.0
 
 
 @dataclass(frozen=True)
@@ -51,17 +64,34 @@ class VoxelConvention:
         return self.to_axes(grid)
 
 
-_INNER = (VOXEL_SIZE - 1) / VOXEL_SIZE
-
+#: Where a grid's corner lines lie inside the box: `VoxelConvention.kato18_scale` of most data sets.
+INNER = (VOXEL_SIZE - 1) / VOXEL_SIZE
 #: Kato et al. 2018, SoftRas, the paper's table on Kato's data. Axes (y, x, -z).
-KATO = VoxelConvention("kato", swap=(1, 2), flip=(3,), kato18_scale=_INNER)
-#: Kar et al. 2017 (LSM), .mat volumes, as the paper's code reads them. Axes (-z, y, x).
-KAR = VoxelConvention("kar", swap=(1, 3), flip=(1,), kato18_scale=_INNER)
-#: Kato and Harada 2019's own packing of Kar's data. Axes (x, y, -z).
-KAR_VPL = VoxelConvention("kar-vpl", swap=None, flip=(3,))
-#: Pascal3D+ as packed by Kato and Harada 2019: the grid spans [-1, 1]. Axes (-x, -z, -y).
-PASCAL3D = VoxelConvention("pascal3d", swap=(2, 3), flip=(1, 2, 3), box=2.0)
-#: 3D-R2N2's binvox grids. binvox keeps the axes (x, y, z) of ShapeNet's mesh files (y up, right-handed), and the object
-#: frame of the renderings is (-z, y, -x) of the mesh (the same as Kato's, see `kato.mesh_to_object`). Read backwards,
-#: the grid's axes are (-z, y, -x) of the object frame. The grid spans the cube that binvox fits around the object.
-R2N2 = VoxelConvention("r2n2", swap=(1, 3), flip=(1, 3), kato18_scale=_INNER)
+KATO = VoxelConvention("kato", swap=(1, 2), flip=(3,), kato18_scale=INNER)
+
+
+def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:
+    """Matrix [3, 3] that takes right-handed mesh coordinates to the object frame: object = matrix @ mesh.
+
+    `up` is the mesh axis that points up, `front` the one that faces the camera of view 0 ("x", "-x", "y" ...). A viewer
+    in front of the mesh looks along -front and has (-front) x up = up x front on the right, so the rows are
+    [up x front, up, -front]. The determinant is -1: mesh files are right-handed, the renderer's frame is left-handed.
+    The default, (x, y, z) -> (-z, y, -x), is what Kato's rendering of ShapeNet amounts to.
+    """
+    axes = {s + a: np.float64(-1 if s else 1) * row for s in ("", "-") for a, row in zip("xyz", np.eye(3), strict=True)}
+    if up not in axes or front not in axes:
+        raise ValueError(f"up and front must be one of {sorted(axes)}, got up={up!r}, front={front!r}")
+    if up[-1] == front[-1]:
+        raise ValueError(f"up and front must be two different axes, got up={up!r}, front={front!r}")
+    return np.stack([np.cross(axes[up], axes[front]), axes[up], -axes[front]]) + 0.0
+
+
+def view_poses(view_ids: torch.Tensor) -> LookAtPoses:
+    """Poses of Kato's views, one per entry of `view_ids` (int64 [B] in 0 .. 23)."""
+    azimuth_deg = AZIMUTH_STEP_DEG * torch.as_tensor(view_ids).to(torch.float32)
+    return LookAtPoses(azimuth_deg, ELEVATION_DEG, DISTANCE, HALF_FOV_DEG)
+
+
+def view_cameras(view_ids: torch.Tensor) -> nmr.LookAt:
+    """Cameras of Kato's views, one per entry of `view_ids` (int64 [B] in 0 .. 23)."""
+    return view_poses(view_ids).cameras()

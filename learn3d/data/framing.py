@@ -12,17 +12,19 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 
-from learn3d.files import limits
-from learn3d.files.findings import DamagedFile, MissingFile
+from learn3d.files import child, limits, worker
+from learn3d.files.findings import DamagedFile
 from learn3d.files.images import PHOTOGRAPHS, open_image
 
 Framing = Literal["whole", "object"]
 OBJECT_SHARE = 0.65  # of the side of the square that the object takes with "object", about what Kato's renderings have
+_MEMORY_PER_PIXEL = 40  # bytes, for masking and framing
+_PIXELS_PER_SECOND = 2e7
 _SUPERSAMPLE = 4  # pixels, per side, that are averaged to one where the camera is turned
 
 
@@ -32,15 +34,44 @@ def read_photo(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, n
     Both are turned upright (EXIF). A mask file is its transparency where it has some, else grey: white is the object.
     Raises FileNotFoundError, and ValueError for what cannot be read, no mask at all, and sizes that differ.
     """
+    return worker.read(_read, Path(path), mask_path, wanted="a photograph")
+
+
+class Framed(NamedTuple):
+    """A photograph as a network sees it."""
+
+    image: np.ndarray  # uint8 [4, size, size], in Kato's form
+    mask: np.ndarray  # uint8 [64, 64]
+    half_fov_deg: float
+    box: tuple[int, int, int, int]  # of the mask in the photograph: left, top, right, bottom (excluded)
+    shape: tuple[int, int]  # of the photograph: height, width
+
+
+def read_framed(
+    path: Path, mask_path: Path | None, fov_deg: float, elevation_deg: float, framing: Framing, size: int, small: int
+) -> Framed:
+    """For worker processes: a photograph read, checked and framed (`frame`), and its mask at another size."""
+    colors, mask = _read(path, mask_path)
+    try:
+        check_mask(mask)
+    except ValueError as error:
+        raise DamagedFile(path, str(error)) from None
+    camera = fov_deg, elevation_deg, framing
+    image, half_fov = frame(colors, mask, *camera, size)
+    small_mask = image[3] if size == small else frame(colors, mask, *camera, small)[0][3]
+    return Framed(image, small_mask, half_fov, mask_box(mask), mask.shape)
+
+
+def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
     image = _open(path)
     if image.mode.startswith(("I", "F")):  # Pillow would make white of all that is above 255
-        raise ValueError(f"{path} has more than 8 bits a pixel and channel ({image.mode}); save it with 8")
+        raise DamagedFile(path, f"has more than 8 bits a pixel and channel ({image.mode}); save it with 8")
     if mask_path is None:
         mask = _transparency(image)
         if mask is None:
-            raise ValueError(
-                f"{path} has no transparency and no mask: give a mask image, white where the object is (reconstruct: "
-                "--masks)"
+            raise DamagedFile(
+                path,
+                "has no transparency and no mask: give a mask image, white where the object is (reconstruct: --masks)",
             )
     else:
         mask_image = _open(mask_path)
@@ -50,9 +81,10 @@ def read_photo(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, n
         if mask_image.size != image.size:
             sizes = [f"{i.size[0]}x{i.size[1]}" for i in (mask_image, image)]
             turned = mask_image.size == image.size[::-1]
-            raise ValueError(
-                f"the mask {mask_path} has {sizes[0]} pixels, {path} has {sizes[1]}"
-                + (": it lies on its side; the photo's EXIF data says how it is turned" if turned else "")
+            raise DamagedFile(
+                path,
+                f"has {sizes[1]} pixels, its mask {mask_path} has {sizes[0]}"
+                + (": it lies on its side; the photo's EXIF data says how it is turned" if turned else ""),
             )
     return np.asarray(image.convert("RGBA"))[..., :3], mask
 
@@ -166,14 +198,8 @@ def _outline(inside: np.ndarray) -> np.ndarray:
 
 def _open(path: Path) -> Image.Image:
     """The image, upright: cameras write the pixels as they lie on the sensor, and the turn into the EXIF data."""
-    try:
-        image = open_image(path, PHOTOGRAPHS, limits.IMAGE_SIDE)
-    except MissingFile:
-        raise FileNotFoundError(f"there is no image {path}") from None
-    except DamagedFile as error:
-        if isinstance(error.__cause__, UnidentifiedImageError):
-            raise ValueError(f"{path} is no image that can be read here; JPEG and PNG can, HEIC cannot") from None
-        raise
+    image = open_image(path, PHOTOGRAPHS, limits.IMAGE_SIDE)
+    child.allow(_MEMORY_PER_PIXEL * image.width * image.height, image.width * image.height / _PIXELS_PER_SECOND)
     try:
         return ImageOps.exif_transpose(image)
     except Exception:  # its EXIF data are damaged: whatever Pillow's parser raises, the picture itself is sound

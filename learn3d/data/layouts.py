@@ -1,53 +1,34 @@
-"""Data sets by the name of their layout: what sets each layout apart, and its reader, `learn3d.data.<layout>`."""
+"""Data sets by the name of their layout: `READERS` has them all."""
 
 from __future__ import annotations
 
+import functools
 import shlex
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+from learn3d.data.conventions import IMAGE_SIZE
 from learn3d.data.dataset import ViewDataset, concatenate
-from learn3d.data.readers import READERS, kato
+from learn3d.data.readers import READERS
+from learn3d.data.readers.properties import LayoutProperties
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.findings import DamagedFile, MissingFile
+from learn3d.files.worker import together
 
-Layout = Literal["kato", "dvr", "kar", "r2n2", "pascal3d", "photos"]
-
-
-@dataclass(frozen=True)
-class LayoutProperties:
-    """What is true of all data sets of a layout."""
-
-    voxels: bool  # there are true shapes, with which voxel IoU can be measured
-    inverted: bool  # colours are stored as 255 - colour over black, see `ViewDataset.inverted`
-    validation: bool = True  # there is a split "val"; without one, networks are validated on "test"
-    angles: bool = True  # cameras have azimuth and elevation, whose cells can serve as view classes
-    options: tuple[str, ...] = ()  # of `load_dataset`, beside view_bins, that the reader knows
-
-
-#: Every layout. Kato's renderings (and DVR's copy of them) are 24 views of 64x64 pixels, whatever is asked for.
-LAYOUTS: dict[str, LayoutProperties] = {
-    "kato": LayoutProperties(voxels=True, inverted=True),
-    "dvr": LayoutProperties(voxels=False, inverted=True, options=("progress",)),
-    "kar": LayoutProperties(voxels=True, inverted=False, options=("image_size", "views_per_object", "progress")),
-    "r2n2": LayoutProperties(
-        voxels=True, inverted=False, validation=False, options=("image_size", "views_per_object", "progress")
-    ),
-    "pascal3d": LayoutProperties(voxels=True, inverted=False, angles=False, options=("image_size",)),
-    "photos": LayoutProperties(voxels=False, inverted=True, options=("image_size", "progress")),
-}
+Layout = Literal[tuple(READERS)]
+LAYOUTS: dict[str, LayoutProperties] = {name: reader.PROPERTIES for name, reader in READERS.items()}
 
 
 def check_options(
-    layout: str, *, image_size: int = kato.IMAGE_SIZE, view_bins: str | None = None, views_per_object: int | None = None
+    layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str | None = None, views_per_object: int | None = None
 ) -> None:
     """Raise a ValueError for an unknown layout and for an option of `load_dataset` that does not go with it."""
     if not isinstance(layout, str) or layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
     properties = LAYOUTS[layout]
-    if "image_size" not in properties.options and image_size != kato.IMAGE_SIZE:
-        size = f"{kato.IMAGE_SIZE}x{kato.IMAGE_SIZE}"
+    if "image_size" not in properties.options and image_size != IMAGE_SIZE:
+        size = f"{IMAGE_SIZE}x{IMAGE_SIZE}"
         raise ValueError(f"images of the layout {layout!r} have {size} pixels, but {image_size} are wanted")
     if "views_per_object" not in properties.options and views_per_object is not None:
         raise ValueError(f"views_per_object cannot be chosen with the layout {layout!r}: it uses all there are")
@@ -80,7 +61,7 @@ def load_dataset(
     category: str,
     split: str,
     *,
-    image_size: int = kato.IMAGE_SIZE,
+    image_size: int = IMAGE_SIZE,
     view_bins: str | None = None,
     views_per_object: int | None = None,
     progress: bool = False,
@@ -100,11 +81,11 @@ def load_dataset(
     names = [name.strip() for name in category.split(",")]
     if len(set(names)) != len(names) or not all(names):
         raise ValueError(f"category must be one name, or different names joined by commas, got {category!r}")
-    reader = READERS[layout]
     given = {"image_size": image_size, "views_per_object": views_per_object, "progress": progress}
     options = {name: given[name] for name in LAYOUTS[layout].options}
+    load = functools.partial(READERS[layout].load, folder, split=split, **options)
     try:
-        dataset = concatenate([reader.load(folder, name, split, **options) for name in names])
+        dataset = concatenate(together([functools.partial(load, name) for name in names]))
     except (DamagedFile, FileNotFoundError) as error:
         if others := _layouts_in(Path(folder), layout):
             hint = f"this is no data set of the layout {layout!r}; add --layout {others[0]}"
@@ -116,6 +97,13 @@ def load_dataset(
             error.path, f"{error.message}. All that is wrong with the data set is listed by: {check}"
         ) from error
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
+
+
+def load_splits(
+    layout: Layout, folder: Path | str, category: str, splits: Sequence[str], **options: Any
+) -> list[ViewDataset]:
+    """Several splits as `load_dataset` reads one, at the same time: their files share the cores."""
+    return together([functools.partial(load_dataset, layout, folder, category, split, **options) for split in splits])
 
 
 def _layouts_in(folder: Path, asked: str) -> list[str]:

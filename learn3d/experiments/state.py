@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from learn3d.config import TrainConfig, config_from_dict, differences, load_config
-from learn3d.data.readers.kato import synset_of
+from learn3d.data.categories import synset_of
 from learn3d.device import resolve_precision
 from learn3d.experiments.plan import Options, Run, selected_rows
 from learn3d.experiments.results import RESULT_FILE, read_result

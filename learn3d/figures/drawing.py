@@ -14,8 +14,8 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 import nmr
+from learn3d.data.conventions import DISTANCE
 from learn3d.data.poses import LookAtPoses, Poses
-from learn3d.data.readers.kato import DISTANCE
 from learn3d.files import writing
 from learn3d.make_data.shading import shade_mesh
 from learn3d.make_data.sheets import HEADER, font

@@ -56,13 +56,19 @@ class Findings:
 
     def attempt(self, function: Callable[..., R], *arguments: Any) -> R | None:
         """The result of function(*arguments), or None with a note of why there is none."""
-        if self.strict:
-            return function(*arguments)
         try:
             return function(*arguments)
         except (DamagedFile, MissingFile) as error:
-            self.problems.append(Problem(str(error.path), error.message))
-            return None
+            return self.take(error)
+
+    def take(self, result: Any) -> Any:
+        """A result of `worker.read_all`; None with a note where it says what is wrong with its file."""
+        if not isinstance(result, (DamagedFile, MissingFile)):
+            return result
+        if self.strict:
+            raise result
+        self.problems.append(Problem(str(result.path), result.message))
+        return None
 
     def warn(self, path: Path, message: str) -> None:
         """Note something that is odd, but can be read."""

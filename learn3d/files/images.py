@@ -43,10 +43,10 @@ def open_image(path: Path, formats: Sequence[str], most_side: int) -> Image.Imag
         child.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
         try:
             image.load()
-        except (OSError, SyntaxError, ValueError, IndexError) as error:
-            raise DamagedFile(
-                path, f"cannot be decoded ({child.one_line(error)}); expected an image. {AGAIN}"
-            ) from None
+        except MemoryError:
+            raise
+        except Exception as error:  # Pillow's decoders raise whatever a damaged file leads them to
+            raise DamagedFile(path, f"cannot be decoded as an image ({child.one_line(error)}). {AGAIN}") from None
         return image
 
 

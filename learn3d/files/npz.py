@@ -1,144 +1,196 @@
-"""Arrays of numbers out of npz files, none taken into memory before the archive and the array's header agree on it."""
+"""Arrays out of npz files: functions for worker processes, which decompress straight into shared memory.
+
+Nothing is unpacked to disk, and no pickle runs code: NumPy stores an object array (images of different sizes, say) as a
+pickle, and of what a pickle may ask for only the four functions that make NumPy's arrays are given out.
+"""
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import math
+import os
+import pickle
+import struct
+import warnings
 import zipfile
-import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from learn3d.files import limits
-from learn3d.files.archives import open_zip
-from learn3d.files.reading import check_file
+from learn3d.files import child, limits
 
-_FAULTS = (OSError, EOFError, ValueError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-_PIECE = 2**20
+try:
+    from isal import isal_zlib as zlib  # twice as fast
+except ImportError:
+    import zlib
+
+_BYTES_PER_SECOND = 3e7  # ten times slower than decompression is
 
 
-@dataclass(frozen=True)
-class Header:
+class Header(NamedTuple):
     """What an array's header states."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
-    fortran: bool
-
-    @property
-    def nbytes(self) -> int:
-        """The size of its data."""
-        return math.prod(self.shape) * self.dtype.itemsize
 
     def __str__(self) -> str:
         return f"{self.dtype} {list(self.shape)}"
 
 
-def open_npz(path: Path | str, *, most: int | None = None) -> zipfile.ZipFile:
-    """Open an npz archive that unpacks to at most `most` bytes (None: 16 GiB).
+def keys(path: Path) -> list[str]:
+    """Names of the arrays in an npz file."""
+    return [name.removesuffix(".npy") for name in _archive(path).namelist()]
 
-    Raises FileNotFoundError, and ValueError for what is no zip archive or one that `archives.open_zip` refuses.
+
+def header(path: Path, key: str) -> Header:
+    """What the array `key` is, without reading it."""
+    with _archive(path).open(_member(path, key)) as file:
+        return _header(file)[0]
+
+
+def read(path: Path, key: str, most: int | None = None) -> np.ndarray:
+    """The array `key`, of numbers or bools.
+
+    most: refuse arrays above so many bytes. None: it is not known how large it may be, and then one that unpacks to
+    very many times its size is taken for a trap.
     """
-    most = limits.ARRAY_BYTES if most is None else most
-    try:
-        check_file(path, most + limits.ZIP_DIRECTORY_BYTES, "an npz file")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"there is no file {path}") from None
-    try:
-        with open(path, "rb") as file:
-            if file.read(6) == b"\x93NUMPY":
-                raise ValueError("it is a single npy array")
-        return open_zip(Path(path), most)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path} is not an npz file ({error})") from None
-
-
-def keys(archive: zipfile.ZipFile) -> list[str]:
-    """Names of the arrays in the archive."""
-    return [name.removesuffix(".npy") for name in archive.namelist()]
-
-
-def header(archive: zipfile.ZipFile, key: str) -> Header:
-    """What the array `key` is, without reading it. Raises ValueError, naming file and key, as `read` does."""
-    with open_member(archive, key, max_bytes=limits.ARRAY_BYTES) as (file, _):
-        return read_header(file)
-
-
-def read(archive: zipfile.ZipFile, key: str, *, max_bytes: int | None = None) -> np.ndarray:
-    """The array `key` of the archive, of numbers or bools.
-
-    max_bytes: refuse arrays larger than that. None: it is not known how large they may be, and then one that unpacks
-    to very many times its size is taken for a trap.
-
-    Raises ValueError, naming file and key, where the key is missing, the file damaged, or the array of another kind.
-    """
-    with open_member(archive, key, max_bytes=max_bytes) as (file, left):
-        head = read_header(file)
-        check_size(head, left - file.tell())
-        content = np.empty(head.nbytes, np.uint8)
-        rest = memoryview(content)
-        while len(rest):
-            if not (count := file.readinto(rest[:_PIECE])):
-                raise ValueError("it ends early")
-            rest = rest[count:]
-        if file.read(1):  # reading to the end is what makes zipfile compare the checksum
-            raise ValueError("bytes follow the array")
-        return from_bytes(content, head)
-
-
-@contextlib.contextmanager
-def open_member(archive: zipfile.ZipFile, key: str, *, max_bytes: int | None = None) -> Iterator[tuple[BinaryIO, int]]:
-    """The npy file of the array `key` and its size in bytes; what goes wrong in the block names file and key."""
-    try:
-        try:
-            info = archive.getinfo(f"{key}.npy")
-        except KeyError:
-            raise ValueError(f"it holds the keys {_some(keys(archive))}") from None
-        most = limits.ARRAY_BYTES if max_bytes is None else min(limits.ARRAY_BYTES, max_bytes + 1000)  # header: 128
-        if info.file_size > most:
-            raise ValueError(f"it would unpack to {info.file_size} bytes; at most {most} are read")
-        if max_bytes is None and info.file_size > max(limits.SMALL_BYTES, limits.EXPANSION * info.compress_size):
-            raise ValueError(f"it would unpack to {info.file_size / max(1, info.compress_size):.0f} times its size")
-        with archive.open(info) as file:
-            yield file, info.file_size
-    except _FAULTS as error:
-        raise ValueError(f"cannot read the array {key!r} of {archive.filename}: {error}") from error
-
-
-def read_header(file: BinaryIO) -> Header:
-    """The header of an npy file; ValueError for one that numpy does not write for plain arrays."""
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):  # others are for records with very many fields
-        raise ValueError(f"npy format {version[0]}.{version[1]} is not read here, only 1.0")
-    try:
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    except Exception as error:  # the parser of Python's literals raises whatever a strange header leads it to
-        raise ValueError(f"its header cannot be read ({type(error).__name__}: {error})") from error
-    if len(shape) > 8 or not all(type(n) is int and n >= 0 for n in shape):
-        raise ValueError(f"its header states the shape {str(shape)[:100]}")
-    return Header(dtype, shape, fortran)
-
-
-def check_size(head: Header, left: int) -> None:
-    """Raise ValueError where an array of numbers does not take exactly the `left` bytes that are there."""
+    info = _member(path, key, most)
+    with _archive(path).open(info) as file:
+        head, fortran = _header(file)
+        start = file.tell()
+    size = math.prod(head.shape) * head.dtype.itemsize
     if head.dtype.kind not in "biuf":
-        pickled = "pickled objects" if head.dtype.hasobject else str(head.dtype)
-        raise ValueError(f"its values must be numbers, got {pickled}")
-    if head.nbytes != left:
-        raise ValueError(f"{head} takes {head.nbytes} bytes, but {left} are there")
+        kind = "pickled objects" if head.dtype.hasobject else str(head.dtype)
+        raise ValueError(f"the values of {key!r} must be numbers, got {kind}")
+    if size != info.file_size - start:
+        raise ValueError(f"{key!r} is {head}, which takes {size} bytes, but {info.file_size - start} are there")
+    child.allow(seconds=size / _BYTES_PER_SECOND)
+    array = child.empty((math.prod(head.shape),), head.dtype)
+    content = array.view(np.uint8)
+    at, checksum = -start, 0
+    for piece in _pieces(path, info):
+        checksum = zlib.crc32(piece, checksum)
+        new = np.frombuffer(piece, np.uint8)[max(0, -at) :]
+        content[max(0, at) : max(0, at) + len(new)] = new  # a ValueError where there is more than promised
+        at += len(piece)
+    if at != size or checksum != info.CRC:
+        raise ValueError(f"{key!r} ends early or has another checksum than it should")
+    if head.dtype.kind == "b" and size and content.max() > 1:  # such bools compute wrongly
+        raise ValueError(f"the bools of {key!r} have values other than 0 and 1")
+    return array.reshape(head.shape, order="F" if fortran else "C")
 
 
-def from_bytes(content: np.ndarray | bytes, head: Header) -> np.ndarray:
-    """The array that `content` holds; ValueError for bools that are neither 0 nor 1, which compute wrongly."""
-    if head.dtype.kind == "b" and len(content) and np.frombuffer(content, np.uint8).max() > 1:
-        raise ValueError("its bools have values other than 0 and 1")
-    array = np.frombuffer(content, head.dtype) if isinstance(content, bytes) else content.view(head.dtype)
-    return array.reshape(head.shape, order="F" if head.fortran else "C")
+def read_those_there(path: Path, names: Iterable[str], most: int) -> dict[str, np.ndarray]:
+    """Those of the named arrays that a file has, each of at most so many bytes."""
+    there = set(keys(path))
+    return {name: read(path, name, most) for name in names if name in there}
 
 
-def _some(names: list[str]) -> str:
-    return f"{names[:8]}" + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+def read_ragged(path: Path, key: str) -> np.ndarray | tuple[np.ndarray, list[tuple[int, ...]]]:
+    """An array of numbers as it is; of an object array its uint8 arrays one after the other, flat, and their shapes."""
+    info = _member(path, key)
+    with _archive(path).open(info) as file:
+        if not _header(file)[0].dtype.hasobject:
+            return read(path, key)
+        child.allow(3 * info.file_size, 2 * info.file_size / _BYTES_PER_SECOND)
+        items = _Arrays(file, encoding="bytes").load()
+    if type(items) is not np.ndarray or items.dtype != object or items.ndim != 1:
+        raise ValueError(f"{key!r} is no list of arrays")
+    for k, item in enumerate(items):
+        if type(item) is not np.ndarray or item.dtype != np.uint8:
+            raise ValueError(f"{key}[{k}] must be an array of uint8, got {getattr(item, 'dtype', type(item).__name__)}")
+    if sum(item.nbytes for item in items) > info.file_size:
+        raise ValueError(f"the arrays of {key!r} take more bytes than the file has")  # one of them listed many times
+    flat, at = child.empty((sum(item.nbytes for item in items),), np.uint8), 0
+    for item in items:
+        flat[at : at + item.nbytes] = item.reshape(-1)
+        at += item.nbytes
+    return flat, [item.shape for item in items]
+
+
+def read_with_items(path: Path, key: str, others: dict[str, int]) -> list[Any]:
+    """`read_ragged` of an array, and other arrays with as many items of so many bytes, at most, as it has."""
+    first = read_ragged(path, key)
+    count = len(first[1] if isinstance(first, tuple) else first)
+    return [first, *(read(path, name, count * size) for name, size in others.items())]
+
+
+class _Arrays(pickle.Unpickler):
+    """Unpickles NumPy's arrays and nothing else."""
+
+    _MAKERS = {  # noqa: RUF012
+        ("numpy", "ndarray"): np.ndarray,
+        ("numpy", "dtype"): np.dtype,
+        ("_codecs", "encode"): lambda text, _: text.encode("latin-1"),  # how protocol 2 writes bytes
+    }
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module in ("numpy.core.multiarray", "numpy._core.multiarray") and name == "_reconstruct":
+            return _make
+        try:
+            return self._MAKERS[module, name]
+        except KeyError:
+            raise ValueError(f"its pickle asks for {module}.{name}, which no array needs; nothing was run") from None
+
+
+def _make(kind: type, shape: Any, code: Any) -> np.ndarray:
+    """An array to be filled by its state, as NumPy's function of the same place makes it."""
+    return np.ndarray.__new__(np.ndarray, (0,), np.uint8)
+
+
+def _archive(path: Path) -> zipfile.ZipFile:
+    status = os.stat(path)
+    return _opened(path, status.st_mtime_ns, status.st_size)
+
+
+@functools.lru_cache(maxsize=1)  # a pack of meshes is asked for one after the other
+def _opened(path: Path, time: int, size: int) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(path)
+    except (zipfile.BadZipFile, NotImplementedError, struct.error, OSError) as error:
+        raise ValueError(f"it is not an npz file: {error}") from error
+
+
+def _member(path: Path, key: str, most: int | None = None) -> zipfile.ZipInfo:
+    """The npy file of the array `key`, if it promises no more than can be."""
+    archive = _archive(path)
+    try:
+        info = archive.getinfo(f"{key}.npy")
+    except KeyError:
+        raise ValueError(f"it has no array {key!r}; it holds the keys {keys(path)[:8]}") from None
+    bound = limits.ARRAY_BYTES if most is None else most + 1000  # the header has 128
+    if info.file_size > bound:
+        raise ValueError(f"{key!r} would unpack to {info.file_size} bytes; at most {bound} are read")
+    if most is None and info.file_size > max(limits.SMALL_BYTES, limits.EXPANSION * info.compress_size):
+        raise ValueError(f"{key!r} would unpack to {info.file_size / max(1, info.compress_size):.0f} times its size")
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
+        raise ValueError(f"{key!r} is encrypted or compressed with method {info.compress_type}")
+    return info
+
+
+def _header(file: BinaryIO) -> tuple[Header, bool]:
+    """The header of an npy file, and whether its axes are in Fortran's order."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Reading `.npy`")  # Python 2's headers have numbers such as 12L
+        version = np.lib.format.read_magic(file)
+        if version != (1, 0):  # others are for records with very many fields
+            raise ValueError(f"npy format {version[0]}.{version[1]} is not read here, only 1.0")
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    if not all(type(n) is int and n >= 0 for n in shape):
+        raise ValueError(f"its header states the shape {str(shape)[:100]}")
+    return Header(dtype, shape), fortran
+
+
+def _pieces(path: Path, info: zipfile.ZipInfo) -> Iterator[bytes]:
+    """The content of a member, unpacked piece by piece."""
+    with open(path, "rb") as file:
+        file.seek(info.header_offset + 26)
+        name, extra = struct.unpack("<HH", file.read(4))
+        file.seek(name + extra, 1)
+        unpack = zlib.decompressobj(-15).decompress if info.compress_type == zipfile.ZIP_DEFLATED else bytes
+        left = info.compress_size
+        while left > 0 and (packed := file.read(min(left, 2**16))):
+            left -= len(packed)
+            yield unpack(packed)

@@ -22,7 +22,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,7 @@ def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
     """
     job, ahead = _Job(), deque()
     executor = ThreadPoolExecutor(cores())
+    _jobs.add(job)
     try:
         for group in groups:
             ahead.append(executor.submit(_run, list(group), job))
@@ -71,10 +72,23 @@ def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
         while ahead:
             yield ahead.popleft().result()
     finally:
-        job.stopped = True
+        _jobs.discard(job)
         executor.shutdown(wait=False, cancel_futures=True)
-        for worker in list(job.busy):  # after an exception or an interruption
-            worker.end()
+        job.stop()  # after an exception or an interruption; else nothing runs any more
+
+
+def together(functions: Sequence[Callable[[], Any]]) -> list[Any]:
+    """What functions that use `read_all` return, called at the same time, so that they share the cores."""
+    if len(functions) == 1:
+        return [functions[0]()]
+    with ThreadPoolExecutor(len(functions)) as executor:
+        futures = [executor.submit(function) for function in functions]
+        try:
+            return [future.result() for future in futures]
+        except BaseException:
+            for job in list(_jobs):
+                job.stop()
+            raise
 
 
 def cores() -> int:
@@ -217,9 +231,19 @@ class _Job:
         self.busy: set[_Worker] = set()
         self.stopped = False  # nobody waits for the results any more
 
+    def stop(self) -> None:
+        self.stopped = True
+        for worker in list(self.busy):
+            worker.end()
+
+
+_jobs: set[_Job] = set()  # of all threads
+
 
 def _run(calls: list[Call], job: _Job) -> list[Any]:
     """The results of calls in one worker."""
+    if job.stopped:
+        raise CancelledError
     pool, request, patience = _pool(), pickle.dumps(calls, 5), sum(map(_patience, calls))
     with pool.slots:
         worker, usable, started = pool.take(), False, time.monotonic()
@@ -240,7 +264,7 @@ def _run(calls: list[Call], job: _Job) -> list[Any]:
             pool.give_back(worker, usable)
             if worker.last:
                 worker.release()
-    if len(calls) > 1 and not job.stopped:  # one of them was it
+    if len(calls) > 1 or job.stopped:  # one of them was it
         return [_run([call], job)[0] for call in calls]
     if status == -getattr(signal, "SIGXCPU", 0):
         fault = f"reading it takes more than {calls[0].seconds:g} seconds of processor time"

@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from learn3d.data import conventions
+from learn3d.data.categories import synset_of
 from learn3d.data.layouts import Layout
-from learn3d.data.readers import kato
 from learn3d.make_data.writers import writer_of
 from learn3d.settings import Count, FilePath, Weight, checked
 
@@ -57,8 +58,8 @@ class DatasetConfig:
             raise ValueError(
                 "give either --source (a folder of meshes or a mesh pack .npz) or --procedural (a number of shapes)"
             )
-        kato.synset_of(self.category)
-        kato.mesh_to_object(self.up, self.facing)
+        synset_of(self.category)
+        conventions.mesh_to_object(self.up, self.facing)
 
     @property
     def facing(self) -> str:

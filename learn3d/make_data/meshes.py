@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from learn3d.files import limits, npz
-from learn3d.files.findings import AGAIN
+from learn3d.files import npz, worker
 from learn3d.files.meshes import EXTENSIONS, RawMesh, read_mesh
 
 SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
@@ -53,11 +52,10 @@ def pack_sources(path: Path) -> list[MeshSource]:
     """
     wanted = "an npz file with n (how many), v0, f0, v1, f1, ... and no pickled objects"
     try:
-        pack = npz.open_npz(path)
-        there = set(npz.keys(pack))
-        number = npz.read(pack, "n", max_bytes=8) if "n" in there else np.array(None)
+        there = set(worker.read(npz.keys, path, wanted=wanted))
+        number = worker.read(npz.read, path, "n", 8, wanted=wanted) if "n" in there else np.array(None)
     except ValueError as error:
-        raise ValueError(f"cannot read the mesh pack {path}: {error}; it must be {wanted}. {AGAIN}") from error
+        raise ValueError(f"cannot read the mesh pack {error}") from error
     count = int(number.reshape(())) if number.size == 1 and number.dtype.kind in "iu" else -1
     missing = [key for i in range(min(count, len(there))) for key in (f"v{i}", f"f{i}") if key not in there][:4]
     if count < 1 or missing:
@@ -65,8 +63,8 @@ def pack_sources(path: Path) -> list[MeshSource]:
     width = len(str(count - 1))
 
     def read(i: int) -> RawMesh:
-        vertices = npz.read(pack, f"v{i}", max_bytes=24 * limits.MESH_VERTICES)
-        return RawMesh(vertices, npz.read(pack, f"f{i}", max_bytes=24 * limits.MESH_FACES))
+        vertices, faces = (worker.read(npz.read, path, f"{kind}{i}", wanted=wanted) for kind in "vf")
+        return RawMesh(vertices, faces)
 
     return [MeshSource(f"{i:0{width}d}", lambda i=i: read(i)) for i in range(count)]
 

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from learn3d.data.readers import kato
+from learn3d.data import conventions
+from learn3d.data.categories import synset_of
 from learn3d.files.writing import write_json
 from learn3d.make_data import meshes
 from learn3d.make_data.config import DatasetConfig
@@ -66,7 +67,7 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
     (files of the category are there and `overwrite` is off), OSError (folder not writable, disk too full).
     """
     config = config.complete()
-    prefix, writer_class = kato.synset_of(config.category), writer_of(config.layout)
+    prefix, writer_class = synset_of(config.category), writer_of(config.layout)
     sources, ignored = _list_sources(config)
     names = meshes.object_names(sources)
     splits = split_objects(len(sources), config.test, config.val, config.seed)
@@ -153,7 +154,7 @@ def _render(
     color = np.clip(rng.uniform(0.55, 0.9) + rng.uniform(-0.2, 0.2, size=3), 0.35, 1.0).astype(np.float32)  # light grey
     if config.color == "mesh" and mesh.face_colors is not None:
         color = np.where(np.isnan(mesh.face_colors), color, mesh.face_colors)
-    vertices = mesh.vertices @ kato.mesh_to_object(config.up, config.facing).T
+    vertices = mesh.vertices @ conventions.mesh_to_object(config.up, config.facing).T
     fitted = meshes.fit_to_box(meshes.fit_to_box(vertices) * (scale if copy else 1.0))
     placed = writer.place(fitted)
     rng = np.random.default_rng([config.seed, 2, number, copy])
@@ -187,7 +188,7 @@ def _extra_files(prefix: str) -> list[str]:
 
 
 def _own_paths(writer: type[Writer], category: str) -> list[str]:
-    return [*writer.paths(category), *_extra_files(kato.synset_of(category))]
+    return [*writer.paths(category), *_extra_files(synset_of(category))]
 
 
 def _prepare_folder(config: DatasetConfig, writer: type[Writer], objects: int) -> None:
@@ -211,7 +212,7 @@ def _card(config: DatasetConfig, writer: Writer, objects: dict[str, int], used: 
         **({} if config.layout == "kato" else {"layout": config.layout}),
         **writer.card,
         "objects_fill": writer.objects_fill,
-        "object_from_mesh": (writer.turn @ kato.mesh_to_object(config.up, config.facing)).tolist(),
+        "object_from_mesh": (writer.turn @ conventions.mesh_to_object(config.up, config.facing)).tolist(),
         "settings": settings,
         "objects": objects,
         "augmented": f"in train, each mesh is followed by its {config.augment} scaled copies",

@@ -1,22 +1,20 @@
-"""ResNet-18 (He et al. 2016) as an image encoder, with the parameter names of torchvision's resnet18."""
+"""ResNet-18 (He et al. 2016) as an image encoder, with the parameter names of torchvision's resnet18.
+
+It is own code because torchvision has no build for every PyTorch that nmr is built with.
+"""
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learn3d.files import limits
-from learn3d.files.archives import open_zip
-from learn3d.files.reading import check_file, within
+from learn3d.files import weights, worker
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-_REAL = (torch.float32, torch.float64, torch.float16, torch.bfloat16)  # what weights may be stored as
-_WHOLE = (torch.int64, torch.int32)  # and numbers of batches
 
 
 class _Block(nn.Module):
@@ -96,7 +94,9 @@ def load_pretrained(encoder: nn.Module, path: Path | str) -> None:
     path = Path(path)
     if not isinstance(encoder, ResNet18Encoder):
         raise ValueError(f"pretrained weights are for the encoder resnet18, not for {type(encoder).__name__}")
-    given = {name: value for name, value in _read_weights(path).items() if not name.startswith("fc.")}
+    limits = {"memory": weights.MEMORY, "seconds": weights.SECONDS}
+    read = worker.read(weights.read_state_dict, path, wanted="weights of torchvision's resnet18", **limits)
+    given = {name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")}
     own = encoder.state_dict()
     counters = {name for name in own if name.endswith("num_batches_tracked")}  # not in files of older versions
     hint = "; it must be a state dict of torchvision's resnet18"
@@ -107,32 +107,8 @@ def load_pretrained(encoder: nn.Module, path: Path | str) -> None:
     for name, value in given.items():
         if value.shape != own[name].shape:
             raise ValueError(f"{path}: {name} is {list(value.shape)}, ResNet-18 has {list(own[name].shape)}{hint}")
-        kinds = _WHOLE if name in counters else _REAL
-        if value.dtype not in kinds or value.layout != torch.strided or value.device.type != "cpu":
-            kind = f"{value.dtype}, {value.layout}, on {value.device}"
-            raise ValueError(f"{path}: {name} must be plain numbers such as {kinds[0]}, got {kind}{hint}")
+        if value.is_floating_point() == (name in counters):
+            raise ValueError(f"{path}: {name} is {value.dtype}, ResNet-18 has {own[name].dtype}{hint}")
         if not bool(value.to(own[name].dtype).isfinite().all()):
             raise ValueError(f"{path}: {name} has values that are not finite{hint}")
     encoder.load_state_dict(given, strict=False)
-
-
-def _read_weights(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file of pretrained weights {path}")
-    try:
-        size = check_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18")
-        if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
-
-            weights = load_file(path)
-        else:
-            if zipfile.is_zipfile(path):  # what torch.save writes: stored, not compressed
-                open_zip(path, limits.WEIGHTS_BYTES).close()
-            with within(limits.WEIGHTS_SECONDS, limits.WEIGHTS_MEMORY + 4 * size):
-                weights = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # the readers raise half a dozen kinds for a damaged or a hostile file
-        raise ValueError(f"cannot read pretrained weights from {path}: {error}") from error
-    pairs = weights.items() if isinstance(weights, dict) else [(None, None)]
-    if not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in pairs):
-        raise ValueError(f"{path} must hold a state dict (names -> tensors), got {type(weights).__name__}")
-    return weights

@@ -24,10 +24,10 @@ from learn3d.data.readers import READERS
 from learn3d.data.readers.photo_table import read_table, split_objects
 from learn3d.experiments.results import object_sums, read_result
 from learn3d.figures.curves import read_metrics
+from learn3d.files import weights, worker
 from learn3d.files.reading import parse_json
 from learn3d.make_data.render import DatasetConfig, make_dataset
 from learn3d.methods import DataShape
-from learn3d.networks.resnet import _read_weights
 from learn3d.runs import checkpoint, log
 
 ERRORS = (ValueError, FileNotFoundError, OSError)  # what a reader may raise
@@ -165,7 +165,7 @@ def weights_target(tmp: Path) -> Target:
 
     def read(folder: Path) -> None:
         for name in ("a.pth", "b.pth"):
-            _read_weights(folder / name)
+            worker.read(weights.read_state_dict, folder / name, memory=weights.MEMORY)
 
     return Target(tmp, {"a.pth": m.damage_zip(), "b.pth": m.damage}, read)
 

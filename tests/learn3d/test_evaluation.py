@@ -13,8 +13,8 @@ import torch
 
 import nmr
 from learn3d.data.batch import Batch
-from learn3d.data.conventions import PASCAL3D
 from learn3d.data.dataset import ViewDataset
+from learn3d.data.readers.pascal3d import PASCAL3D
 from learn3d.evaluation import codes_per_view, evaluate, mean_mmd, spread_samples
 from learn3d.experiments.evaluation_report import COLUMNS, _class_means, evaluate_runs, format_table
 from learn3d.losses import mmd

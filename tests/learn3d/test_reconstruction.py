@@ -9,8 +9,8 @@ import trimesh
 from PIL import Image
 
 import nmr
+from learn3d.data.conventions import mesh_to_object
 from learn3d.data.crops import Crops
-from learn3d.data.readers.kato import mesh_to_object
 from learn3d.figures import Surface
 from learn3d.reconstruction import _read, export_mesh, prepare_image, reconstruct_dataset, reconstruct_files
 

@@ -24,7 +24,7 @@ from bench_step import sphere_dataset
 from bench_work import num_cores
 from torch.optim import Optimizer
 
-from learn3d.data.readers import kato
+from learn3d.data import conventions
 from learn3d.data.sampling import shuffled_epochs
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.interrupt import Stop
@@ -59,7 +59,11 @@ def measure_steps(options: Options, ranks: Ranks) -> tuple[float, float, float, 
     dataset, precision = sphere_dataset(), resolve_precision(options.precision, options.device)
     ranks = ranks.divide(options.batch, "views")
     method = create_method(
-        PRESETS["peng2020-kato"].settings, DataShape(kato.NUM_VIEWS), device=options.device, precision=precision, seed=0
+        PRESETS["peng2020-kato"].settings,
+        DataShape(conventions.NUM_VIEWS),
+        device=options.device,
+        precision=precision,
+        seed=0,
     )
     summing, sum_gradients = [0.0], method_module.sum_gradients
 

@@ -23,6 +23,7 @@ from torch import Tensor
 import nmr
 from learn3d import evaluation
 from learn3d.config import DEFAULT_PRESET, TrainConfig, config_from_dict
+from learn3d.data import conventions
 from learn3d.data.augment import augment
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
@@ -154,10 +155,10 @@ class _Terminal(io.StringIO):
 def sphere_dataset(num_objects: int = 48, image_size: int = 64, num_classes: int = 1) -> ViewDataset:
     """Silhouettes of deformed spheres as images, in Kato's views."""
     spheres = deformed_spheres(num_objects, 3, 64, True)
-    vertices = spheres.vertices.repeat_interleave(kato.NUM_VIEWS, 0)
-    cameras = kato.view_cameras(torch.arange(kato.NUM_VIEWS).repeat(num_objects))
+    vertices = spheres.vertices.repeat_interleave(conventions.NUM_VIEWS, 0)
+    cameras = conventions.view_cameras(torch.arange(conventions.NUM_VIEWS).repeat(num_objects))
     masks = (255 * nmr.render_silhouette(vertices, spheres.faces, cameras, image_size=64)).round().to(torch.uint8)
-    images = masks.view(num_objects, kato.NUM_VIEWS, 1, 64, 64).expand(-1, -1, 4, -1, -1).contiguous().numpy()
+    images = masks.view(num_objects, conventions.NUM_VIEWS, 1, 64, 64).expand(-1, -1, 4, -1, -1).contiguous().numpy()
     voxels = nmr.voxelize(spheres.vertices + 0.5, spheres.faces).numpy()
     dataset = kato.from_arrays(images, voxels, "spheres", "train")
     if image_size != 64:

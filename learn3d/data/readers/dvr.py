@@ -19,38 +19,39 @@ voxels file is not taken from beside it, because nothing says that its objects s
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 
-from learn3d.data.conventions import KATO
+from learn3d.data.conventions import AZIMUTH_STEP_DEG, IMAGE_SIZE, KATO, NUM_VIEWS, view_poses
 from learn3d.data.dataset import SPLITS, ViewDataset
 from learn3d.data.readers import kato
+from learn3d.data.readers.properties import LayoutProperties
 from learn3d.data.readers.renderings import (
+    ObjectReader,
+    ReadObject,
     category_folder,
     check_ids,
     check_split,
-    map_objects,
-    read_image,
-    read_npz,
-    split_alpha,
+    join_images,
     warn_if_empty,
     warn_of_repeats,
 )
-from learn3d.files import limits
+from learn3d.files import limits, npz, renderings
 from learn3d.files.findings import AGAIN, DamagedFile, Findings, MissingFile, Problem
 from learn3d.files.reading import read_text
+from learn3d.files.worker import Call
 
+PROPERTIES = LayoutProperties(voxels=False, inverted=True, options=("progress",))
 POINTS = 10_000  # kept of each object's point cloud, which holds 100,000
 _EYE_TOLERANCE = 0.01  # units of the object frame
 _LEAST_COSINE = 0.9995
-
-
-class _Object(NamedTuple):
-    images: np.ndarray | None  # uint8 [24, 4, 64, 64]
-    points: np.ndarray | None  # float32 [P, 3], None where the file is absent
+_MATRICES = [f"world_mat_{k}" for k in range(NUM_VIEWS)]
+_CAMERAS = "an npz file with world_mat_0 .. world_mat_23, 4x4, from the world to Kato's 24 cameras"
+_CLOUD = "an npz file with the array 'points' [P, 3]: finite, within the unit cube"
 
 
 def load(folder: Path | str, category: str, split: str, *, points: int = POINTS, progress: bool = False) -> ViewDataset:
@@ -60,22 +61,17 @@ def load(folder: Path | str, category: str, split: str, *, points: int = POINTS,
     Raises FileNotFoundError or ValueError naming the first file that is missing or not as described above.
     """
     folder, ids = Path(folder), object_ids(folder, category, split)
-    root = category_folder(folder, category)
-    images = np.empty((len(ids) * kato.NUM_VIEWS, 4, kato.IMAGE_SIZE, kato.IMAGE_SIZE), np.uint8)
-    clouds = []
-    read = map_objects(lambda name: _read(root / name, points, Findings(strict=True)), ids, category, progress)
-    for i, item in enumerate(read):
-        images[i * kato.NUM_VIEWS : (i + 1) * kato.NUM_VIEWS] = item.images
-        clouds.append(item.points)
-    view_ids = np.tile(np.arange(kato.NUM_VIEWS), len(ids))
+    objects = _Reader(category_folder(folder, category), points).read(ids, category, progress)
+    images, _, _, clouds = join_images(objects, len(ids), NUM_VIEWS, IMAGE_SIZE)
+    view_ids = np.tile(np.arange(NUM_VIEWS), len(ids))
     return ViewDataset(
         category=category,
         split=split,
         images=images,
-        poses=kato.view_poses(torch.from_numpy(view_ids)),
+        poses=view_poses(torch.from_numpy(view_ids)),
         view_ids=view_ids,
         view_names=kato.VIEW_NAMES,
-        object_ids=np.repeat(np.arange(len(ids)), kato.NUM_VIEWS),
+        object_ids=np.repeat(np.arange(len(ids)), NUM_VIEWS),
         object_names=tuple(ids),
         voxels=None,
         convention=KATO,
@@ -90,18 +86,11 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
     if ids is None:
         yield from findings.problems
         return
-    root, path = category_folder(folder, category), _list_path(folder, category, split)
+    path = _list_path(folder, category, split)
     others = {s: _read_list(_list_path(folder, category, s)) for s in _splits(folder, category) if s != split}
     warn_of_repeats(findings, path, f"{category} {split}", ids, others)
     yield from findings.problems
-
-    def examine(name: str) -> list[Problem]:
-        findings = Findings()
-        _read(root / name, POINTS, findings)
-        return findings.problems
-
-    for found in map_objects(examine, ids, f"{category} {split}", progress):
-        yield from found
+    yield from _Reader(category_folder(folder, category), POINTS).problems(ids, f"{category} {split}", progress)
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -143,50 +132,59 @@ def _splits(folder: Path, category: str) -> tuple[str, ...]:
     return tuple(split for split in SPLITS if _list_path(folder, category, split).is_file())
 
 
-def _read(root: Path, points: int, findings: Findings) -> _Object:
-    """One object; None for the parts that findings tell of."""
-    if findings.attempt(_check_folder, root) is None:
-        return _Object(None, None)
-    views = [_read_view(root, k, findings) for k in range(kato.NUM_VIEWS)]
-    to_object = findings.attempt(_fit_world, root / "cameras.npz")
-    cloud, path = None, root / "pointcloud.npz"
-    if not path.exists():
-        findings.warn(path, "is missing: without it the set has no ground-truth shape")
-    elif points and to_object is not None:
-        cloud = findings.attempt(_read_points, path, points, to_object)
-    return _Object(np.stack(views) if all(view is not None for view in views) else None, cloud)
+@dataclass(frozen=True)
+class _Reader(ObjectReader):
+    root: Path
+    points: int
+
+    def calls(self, name: str) -> list[Call]:
+        root = self.root / name
+        calls = [Call(renderings.check_folder, root, (f"the folder of an object that a list names. {AGAIN}",))]
+        if root.is_dir():
+            paths = [path for view in _view_paths(root) for path in view]
+            calls += [Call(renderings.read_exactly, path, (IMAGE_SIZE,), "a rendering") for path in paths]
+            arrays = (_MATRICES, limits.OBJECT_BYTES)
+            calls.append(Call(npz.read_those_there, root / "cameras.npz", arrays, _CAMERAS))
+            if self.points and (root / "pointcloud.npz").exists():
+                points = (("points",), limits.OBJECT_BYTES)
+                calls.append(Call(npz.read_those_there, root / "pointcloud.npz", points, _CLOUD))
+        return calls
+
+    def build(self, name: str, found: list[Any], findings: Findings) -> ReadObject:
+        root = self.root / name
+        if len(found) == 1:
+            findings.take(found[0])
+            return ReadObject([], None, None)
+        pairs = zip(found[1 : 2 * NUM_VIEWS : 2], found[2 : 2 * NUM_VIEWS + 1 : 2], strict=True)
+        views = [_view(paths, pair, findings) for paths, pair in zip(_view_paths(root), pairs, strict=True)]
+        arrays, *rest = map(findings.take, found[2 * NUM_VIEWS + 1 :])
+        to_object = None if arrays is None else findings.attempt(_fit_world, root / "cameras.npz", arrays)
+        points, path = None, root / "pointcloud.npz"
+        if not path.exists():
+            findings.warn(path, "is missing: without it the set has no ground-truth shape")
+        elif rest and rest[0] is not None and to_object is not None:
+            points = findings.attempt(_points, path, rest[0], self.points, to_object)
+        return ReadObject(views, None, points)
 
 
-def _check_folder(root: Path) -> Path:
-    if not root.is_dir():
-        raise MissingFile(root, f"is missing; expected the folder of an object that a list names. {AGAIN}")
-    return root
+def _view_paths(root: Path) -> list[tuple[Path, Path]]:
+    return [(root / "image" / f"{k:04d}.png", root / "mask" / f"{k:04d}.png") for k in range(NUM_VIEWS)]
 
 
-def _read_view(root: Path, k: int, findings: Findings) -> np.ndarray | None:
-    """View k in Kato's form: inverted colours over black and the mask, uint8 [4, 64, 64]."""
-    color, mask = (findings.attempt(_read_64, root / kind / f"{k:04d}.png") for kind in ("image", "mask"))
+def _view(paths: tuple[Path, Path], pair: tuple[Any, Any], findings: Findings) -> tuple[np.ndarray, np.ndarray] | None:
+    """A view in Kato's form, inverted colours over black and the mask, of the results of its two files."""
+    color, mask = map(findings.take, pair)
     if mask is not None:
-        warn_if_empty(findings, root / "mask" / f"{k:04d}.png", mask[..., 0])
+        warn_if_empty(findings, paths[1], mask.max())
     if color is None or mask is None:
         return None
-    return np.concatenate([255 - color.transpose(2, 0, 1), mask[None, :, :, 0]])
+    image = np.concatenate([255 - color.transpose(2, 0, 1), mask[None, :, :, 0]])
+    return image, image[3]
 
 
-def _read_64(path: Path) -> np.ndarray:
-    image = read_image(path)
-    if image.size != (kato.IMAGE_SIZE, kato.IMAGE_SIZE) or image.mode.startswith(("I", "F")):
-        raise DamagedFile(
-            path, f"is {image.width}x{image.height} pixels of the format {image.mode}; expected 64x64 of 8 bits"
-        )
-    return split_alpha(image)[0]
-
-
-def _fit_world(path: Path) -> np.ndarray:
+def _fit_world(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
     """Orthogonal [3, 3] that takes the world of cameras.npz to the object frame; DamagedFile where it does not fit."""
-    wanted = "world_mat_0 .. world_mat_23, 4x4, from the world to Kato's 24 cameras"
-    names = [f"world_mat_{k}" for k in range(kato.NUM_VIEWS)]
-    arrays = read_npz(path, names, wanted)
+    wanted, names = _CAMERAS, _MATRICES
     if missing := [name for name in names if name not in arrays]:
         raise DamagedFile(path, f"lacks {missing[0]} ({len(missing)} of {len(names)} matrices); expected {wanted}")
     if wrong := [name for name in names if arrays[name].shape not in ((4, 4), (3, 4))]:
@@ -198,7 +196,7 @@ def _fit_world(path: Path) -> np.ndarray:
     if (skew := np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))).max() > 1e-3:
         raise DamagedFile(path, f"the left 3x3 part of {names[skew.argmax()]} is no rotation; expected {wanted}")
     eyes = -np.einsum("kij,ki->kj", rotations, matrices[:, :, 3])
-    true_eyes = kato.view_poses(torch.arange(kato.NUM_VIEWS)).features().double().numpy()
+    true_eyes = view_poses(torch.arange(NUM_VIEWS)).features().double().numpy()
     u, _, v = np.linalg.svd(true_eyes.T @ eyes)
     to_object = u @ v
     off = np.linalg.norm(eyes @ to_object.T - true_eyes, axis=1)
@@ -207,7 +205,7 @@ def _fit_world(path: Path) -> np.ndarray:
         raise DamagedFile(
             path,
             f"the camera of view {k} stands {off[k]:.3g} away from where Kato's does (distance 2.732, elevation 30, "
-            f"azimuth {kato.AZIMUTH_STEP_DEG:g} degrees per view); this is another set of views, which the layout "
+            f"azimuth {AZIMUTH_STEP_DEG:g} degrees per view); this is another set of views, which the layout "
             "'dvr' has no place for",
         )
     forward = -true_eyes / np.linalg.norm(true_eyes, axis=1, keepdims=True)
@@ -220,16 +218,15 @@ def _fit_world(path: Path) -> np.ndarray:
     return to_object
 
 
-def _read_points(path: Path, count: int, to_object: np.ndarray) -> np.ndarray:
+def _points(path: Path, arrays: dict[str, np.ndarray], count: int, to_object: np.ndarray) -> np.ndarray:
     """The first `count` points in the object frame, float32 [P, 3]."""
-    wanted = "the array 'points' [P, 3]: finite, within the unit cube"
-    points = read_npz(path, ["points"], wanted).get("points")
+    points = arrays.get("points")
     if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points):
         shape = "no such array" if points is None else f"the shape {list(points.shape)}"
-        raise DamagedFile(path, f"has {shape}; expected {wanted}")
+        raise DamagedFile(path, f"has {shape}; expected {_CLOUD}")
     points = points[:count].astype(np.float64)
     if not np.abs(points).max() < 1:
-        raise DamagedFile(path, f"has coordinates up to {np.abs(points).max():.3g}; expected {wanted}")
+        raise DamagedFile(path, f"has coordinates up to {np.abs(points).max():.3g}; expected {_CLOUD}")
     return (points @ to_object.T).astype(np.float32)
 
 

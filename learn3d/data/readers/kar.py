@@ -26,39 +26,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from PIL import Image
-
-from learn3d.data.conventions import KAR, VOXEL_SIZE
+from learn3d.data.categories import synset_of
+from learn3d.data.conventions import INNER, VOXEL_SIZE, VoxelConvention
 from learn3d.data.dataset import SPLITS, ViewDataset
-from learn3d.data.readers.kato import synset_of
+from learn3d.data.readers.properties import LayoutProperties
 from learn3d.data.readers.renderings import (
+    ObjectReader,
     ReadObject,
     check_ids,
+    check_poses,
     check_split,
-    check_square,
+    check_views,
     join_objects,
-    map_objects,
-    read_image,
-    read_table,
-    shrink,
-    split_alpha,
-    warn_if_empty,
+    take_views,
     warn_of_repeats,
 )
-from learn3d.files import limits
+from learn3d.files import limits, renderings, volumes
 from learn3d.files.findings import AGAIN, DamagedFile, Findings, MissingFile, Problem
-from learn3d.files.matlab import read_matlab
 from learn3d.files.reading import parse_json, read_bytes, read_text
+from learn3d.files.worker import Call
 
+PROPERTIES = LayoutProperties(voxels=True, inverted=False, options=("image_size", "views_per_object", "progress"))
+#: The .mat volumes, as the paper's code reads them: axes (-z, y, x) of the object frame.
+KAR = VoxelConvention("kar", swap=(1, 3), flip=(1,), kato18_scale=INNER)
 NUM_RENDERS = 20
 HALF_FOV_DEG = math.degrees(math.atan(16 / 60))  # 14.9314
 VIEW_BINS = "15x20"  # K = 72
 BROKEN = frozenset(
     {"187f32df6f393d18490ad276cd2af3a4", "391fa4da294c70d0a4e97ce1d10a5ae6", "50cdaa9e33fc853ecb2a965e75be701c"}
 )
+_TABLE = "a row per render: azimuth, elevation, (unused), distance"
 
 
 def load(
@@ -78,17 +79,12 @@ def load(
     views_per_object: use the first 1 .. 20 renders of each object; None: 1 for training, all for the other splits.
     Raises FileNotFoundError or ValueError naming the first file that is missing or not as described above.
     """
-    if views_per_object is not None and not 1 <= views_per_object <= NUM_RENDERS:
-        raise ValueError(f"views_per_object must lie in 1 .. {NUM_RENDERS}, got {views_per_object}")
+    check_views(views_per_object, NUM_RENDERS)
     folder, ids = Path(folder), object_ids(folder, category, split)
     there = 1 if split == "train" else renders_of(folder / "renders" / synset_of(category) / ids[0])
     views = there if views_per_object is None else views_per_object
-    findings = Findings(strict=True)
-    read = map_objects(
-        lambda name: _read(folder, synset_of(category), name, views, image_size, findings), ids, category, progress
-    )
     return join_objects(
-        read,
+        _Reader(folder, synset_of(category), views, image_size).read(ids, category, progress),
         ids,
         views,
         image_size,
@@ -109,16 +105,9 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
         others = {other: lists[other] for other in SPLITS if other != split and other in lists}
         warn_of_repeats(findings, folder / "splits.json", f"{category} {split}", ids, others)
     yield from findings.problems
-
-    views = renders_of(folder / "renders" / synset_of(category) / ids[0]) if ids else NUM_RENDERS
-
-    def examine(name: str) -> list[Problem]:
-        findings = Findings()
-        _read(folder, synset_of(category), name, views, 64, findings)
-        return findings.problems
-
-    for found in map_objects(examine, ids or [], f"{category} {split}", progress):
-        yield from found
+    if ids is not None:
+        views = renders_of(folder / "renders" / synset_of(category) / ids[0])
+        yield from _Reader(folder, synset_of(category), views, 64).problems(ids, f"{category} {split}", progress)
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -182,82 +171,37 @@ def read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
     return lists
 
 
-def _read(folder: Path, synset: str, name: str, views: int, size: int, findings: Findings) -> ReadObject:
-    """One object; None for the parts that findings tell of."""
-    root = folder / "renders" / synset / name
-    voxels = findings.attempt(_read_voxels, folder / "voxels" / "modelVoxels32" / synset / f"{name}.mat")
-    if voxels is not None and not voxels.any():
-        findings.warn(folder / "voxels" / "modelVoxels32" / synset / f"{name}.mat", "the grid is empty")
-    if findings.attempt(_check_folder, root) is None:
-        return ReadObject([], None, voxels)
-    table = findings.attempt(_read_views, root / "view.txt", views)
-    return ReadObject([_read_view(root, k, size, findings) for k in range(views)], table, voxels)
+@dataclass(frozen=True)
+class _Reader(ObjectReader):
+    folder: Path
+    synset: str
+    views: int
+    size: int
 
+    def _paths(self, name: str) -> tuple[Path, Path]:
+        voxels = self.folder / "voxels" / "modelVoxels32" / self.synset / f"{name}.mat"
+        return voxels, self.folder / "renders" / self.synset / name
 
-def _check_folder(root: Path) -> Path:
-    if not root.is_dir():
-        raise MissingFile(root, f"is missing; expected the folder of an object that splits.json names. {AGAIN}")
-    return root
+    def calls(self, name: str) -> list[Call]:
+        voxels, root = self._paths(name)
+        calls = [
+            Call(volumes.read_matlab, voxels, ("Volume", VOXEL_SIZE), "a MATLAB file of voxels"),
+            Call(renderings.check_folder, root, (f"the folder of an object that splits.json names. {AGAIN}",)),
+        ]
+        if root.is_dir():
+            calls.append(Call(renderings.read_table, root / "view.txt", (self.views, 4, _TABLE), _TABLE))
+            for k in range(self.views):
+                files = root / f"render_{k}.png", (root / f"depth_{k}.png", self.size)
+                calls.append(Call(renderings.read_with_depth, *files, "a rendering"))
+        return calls
 
-
-def _read_views(path: Path, rows: int) -> np.ndarray:
-    """Azimuth, elevation and distance of each render, float64 [rows, 3]."""
-    wanted = "a row per render: azimuth, elevation, (unused), distance"
-    table = read_table(path, rows, 4, wanted)
-    low, high = limits.DISTANCE
-    turns = np.abs(table[:, 0]) > limits.ANGLE_DEG
-    if (bad := turns | (np.abs(table[:, 1]) >= 90) | (table[:, 3] < low) | (table[:, 3] > high)).any():
-        k = int(bad.argmax())
-        raise DamagedFile(
-            path,
-            f"row {k} has azimuth {table[k, 0]:g}, elevation {table[k, 1]:g} and distance {table[k, 3]:g}; "
-            f"expected {wanted}",
-        )
-    return table[:, [0, 1, 3]]
-
-
-def _read_view(root: Path, k: int, size: int, findings: Findings) -> tuple[np.ndarray, np.ndarray] | None:
-    pair = findings.attempt(_read_render, root, k, size)
-    if pair is None:
-        return None
-    warn_if_empty(findings, root / f"render_{k}.png", pair[1])
-    return shrink(*pair, size)
-
-
-def _read_render(root: Path, k: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colours over white and the mask of render k, at their own size."""
-    path, depth_path = root / f"render_{k}.png", root / f"depth_{k}.png"
-    image = read_image(path)
-    check_square(path, image, max(size, 64))
-    color, alpha = split_alpha(image)
-    if not depth_path.exists():
-        if alpha is None:
-            raise MissingFile(depth_path, f"is missing, and {path.name} has no alpha channel; expected the depth image")
-        return color, alpha
-    depth = read_image(depth_path)
-    if depth.size != image.size:
-        raise DamagedFile(
-            depth_path, f"is {depth.width}x{depth.height} pixels, but {path.name} is {image.width}x{image.height}"
-        )
-    return color, np.where(_grey(depth_path, depth) < 250, 255, 0).astype(np.uint8)
-
-
-def _grey(path: Path, depth: Image.Image) -> np.ndarray:
-    """Depth in 8 bits: the high byte of 16, the luminance of colours."""
-    if depth.mode.startswith("I"):
-        values = np.asarray(depth)
-        if values.min() < 0 or values.max() > 65535:
-            raise DamagedFile(path, f"has values {values.min()} .. {values.max()}; expected 8 or 16 bits")
-        return values >> 8
-    if depth.mode == "F":
-        raise DamagedFile(path, "holds floating-point numbers; expected 8 or 16 bits")
-    return np.asarray(depth.convert("L"))
-
-
-def _read_voxels(path: Path) -> np.ndarray:
-    wanted = "a MATLAB file with the array 'Volume' [32, 32, 32]"
-    volume = read_matlab(path, "Volume", wanted)
-    if volume is None or volume.shape != (VOXEL_SIZE,) * 3:
-        found = "no such array of numbers" if volume is None else f"{volume.dtype} {list(volume.shape)}"
-        raise DamagedFile(path, f"has {found}; expected {wanted}")
-    return volume != 0
+    def build(self, name: str, found: list[Any], findings: Findings) -> ReadObject:
+        path, root = self._paths(name)
+        voxels, _, *rest = map(findings.take, found[:3])
+        if voxels is not None and not voxels.any():
+            findings.warn(path, "the grid is empty")
+        poses = None
+        if rest and rest[0] is not None:
+            poses = findings.attempt(check_poses, root / "view.txt", rest[0][:, [0, 1, 3]], _TABLE)
+        paths = [root / f"render_{k}.png" for k in range(len(found) - 3)]
+        return ReadObject(take_views(findings, paths, found[3:]), poses, voxels)

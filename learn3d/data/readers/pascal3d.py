@@ -4,7 +4,7 @@ The oddities that this module hides:
 
 - Files are `{aeroplane,car,chair}_{train,val,imagenet}.npz`; training uses train and imagenet. There is no test split:
   both papers report on val, and so "test" is val here.
-- `images` is an object array of uint8 [H, W, 3], pickled by Python 2: see `safe_pickle`. The network sees the object's
+- `images` is an object array of uint8 [H, W, 3], pickled by Python 2: see `files.npz`. The network sees the object's
   box, padded by 15 % a side, clipped to the image and stretched to a square; in training each side moves by up to 15 %
   more or less (the augmentation "crop").
 - `images_ref` uint8 [N, 224, 224, 4] is the crop whose fourth channel is the silhouette to be matched; it never moves.
@@ -18,25 +18,30 @@ The oddities that this module hides:
 
 from __future__ import annotations
 
-import contextlib
+import math
 import warnings
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from learn3d.data import conventions
-from learn3d.data.conventions import VOXEL_SIZE
+from learn3d.data.conventions import VOXEL_SIZE, VoxelConvention
 from learn3d.data.crops import SMALLEST, Crops, bounds
-from learn3d.data.dataset import MASK_SIZE, SPLITS, ViewDataset
+from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import RotationPoses
-from learn3d.files import limits, npz, pickles
-from learn3d.files.findings import AGAIN, DamagedFile, Problem
+from learn3d.data.readers.properties import LayoutProperties
+from learn3d.data.readers.renderings import check_split
+from learn3d.files import npz
+from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
+from learn3d.files.worker import Call, read_all
 
+PROPERTIES = LayoutProperties(voxels=True, inverted=False, angles=False, stretched=True, options=("image_size",))
+#: The grid spans [-1, 1]; axes (-x, -z, -y) of the object frame.
+PASCAL3D = VoxelConvention("pascal3d", swap=(2, 3), flip=(1, 2, 3), box=2.0)
 IMAGE_SIZE = 224
 CATEGORIES = ("aeroplane", "car", "chair")
 FILES = {"train": ("train", "imagenet"), "val": ("val",), "test": ("val",)}
@@ -67,16 +72,19 @@ def load(folder: Path | str, category: str, split: str, *, image_size: int = IMA
 
     Raises FileNotFoundError for a missing file and ValueError for a damaged one, both named.
     """
-    if split not in SPLITS:
-        raise ValueError(f"split must be one of {', '.join(SPLITS)}; got {split!r}")
-    files = [_read(path) for path in _paths(folder, category, split)]
+    check_split(split)
+    paths = _paths(folder, category, split)
+    training_paths = () if split == "train" else _paths(folder, category, "train")
+    found = list(read_all([*([_call(path)] for path in paths), *([_rotations(path)] for path in training_paths)]))
+    files = [_file(path, arrays) for path, (arrays,) in zip(paths, found, strict=False)]
     for file in files:
         if problem := next(_severe_problems(file), None):
             raise DamagedFile(file.path, problem)
     rotations = np.concatenate([file.rotations for file in files])
     training = rotations
     if split != "train":
-        training = np.concatenate([_read_rotations(path) for path in _paths(folder, category, "train")])
+        rest = zip(training_paths, found[len(paths) :], strict=True)
+        training = np.concatenate([_checked_rotations(path, array) for path, (array,) in rest])
     view_ids, view_names = view_classes(rotations, training)
     boxes = np.concatenate([file.boxes for file in files])
     crops = Crops.from_images([image for file in files for image in file.images], boxes, image_size)
@@ -93,7 +101,7 @@ def load(folder: Path | str, category: str, split: str, *, image_size: int = IMA
         object_ids=np.arange(len(images)),
         object_names=tuple(f"{file.path.stem}/{k}" for file in files for k in range(len(file.images))),
         voxels=np.concatenate([file.voxels for file in files]),
-        convention=conventions.PASCAL3D,
+        convention=PASCAL3D,
         inverted=False,
         crops=crops,
     )
@@ -133,9 +141,10 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
     """Everything that is wrong with the files of one split."""
     for path in tqdm(_paths(folder, category, split), desc=f"{category} {split}", disable=not progress):
         try:
-            file = _read(path)
-        except (ValueError, OSError) as error:
-            yield Problem(str(path), str(error).removeprefix(f"{path}: "))
+            ((found,),) = read_all([[_call(path)]])
+            file = _file(path, found)
+        except (DamagedFile, MissingFile) as error:
+            yield Problem(str(path), error.message)
             continue
         yield from (Problem(str(path), text) for text in _severe_problems(file))
         yield from (Problem(str(path), text, "warning") for text in _slight_problems(file))
@@ -151,7 +160,9 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 def count(folder: Path | str, category: str, split: str) -> int:
     """How many photographs a split has, each an object of its own."""
-    return sum(len(_read_rotations(path)) for path in _paths(folder, category, split))
+    paths = _paths(folder, category, split)
+    found = read_all([_rotations(path)] for path in paths)
+    return sum(len(_checked_rotations(path, array)) for path, (array,) in zip(paths, found, strict=True))
 
 
 def _paths(folder: Path | str, category: str, split: str) -> list[Path]:
@@ -166,19 +177,37 @@ def class_name(category: str) -> str:
     return name
 
 
-def _read(path: Path) -> _File:
-    with _open(path) as archive:
-        images = pickles.read_member(archive, "images")
-        if isinstance(images, np.ndarray) and images.ndim != 4:  # if all have one size, they are one array
+_ITEM_BYTES = {  # the most bytes of one item
+    "images_ref": 4 * IMAGE_SIZE**2,
+    "bounding_boxes": 4 * 8,
+    "rotation_matrices": 9 * 8,
+    "voxels": 8 * VOXEL_SIZE**3,
+}
+_PHOTOGRAPHS = 200_000  # of a file; Pascal3D+ has 5,000
+_WANTED = "an npz file of Pascal3D+ as packed by the authors of view prior learning"
+
+
+def _call(path: Path) -> Call:
+    return Call(npz.read_with_items, path, ("images", _ITEM_BYTES), _WANTED)
+
+
+def _rotations(path: Path) -> Call:
+    return Call(npz.read, path, ("rotation_matrices", _PHOTOGRAPHS * _ITEM_BYTES["rotation_matrices"]), _WANTED)
+
+
+def _file(path: Path, found: Any) -> _File:
+    """A file of the result of `_call`; DamagedFile and MissingFile where its arrays do not go together."""
+    images, references, boxes, rotations, voxels = _taken(path, found)
+    if isinstance(images, np.ndarray):  # if all have one size, they are one array
+        if images.ndim != 4:
             raise DamagedFile(path, f"images must be uint8 [H, W, 3] each, got one array {list(images.shape)}")
         images = list(images)
-        count, whole = len(images), (IMAGE_SIZE, IMAGE_SIZE, 4)
-        limits = {"images_ref": 4 * IMAGE_SIZE**2, "bounding_boxes": 4 * 8, "rotation_matrices": 9 * 8}
-        limits |= {"voxels": 8 * VOXEL_SIZE**3}
-        references, boxes, rotations, voxels = (
-            pickles.read_member(archive, key, max_bytes=count * size) for key, size in limits.items()
-        )
-    _check_shape(path, "images_ref", references, (count, *whole), np.uint8)
+    else:
+        flat, shapes = images
+        ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
+        images = [flat[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
+    count = len(images)
+    _check_shape(path, "images_ref", references, (count, IMAGE_SIZE, IMAGE_SIZE, 4), np.uint8)
     _check_shape(path, "bounding_boxes", boxes, (count, 4))
     _check_shape(path, "rotation_matrices", rotations, (count, 3, 3))
     _check_shape(path, "voxels", voxels, (count, *(VOXEL_SIZE,) * 3))
@@ -187,41 +216,31 @@ def _read(path: Path) -> _File:
     return _File(path, images, references, boxes.astype(np.float64), rotations.astype(np.float64), voxels > 0)
 
 
-def _read_rotations(path: Path) -> np.ndarray:
+def _checked_rotations(path: Path, found: Any) -> np.ndarray:
     """The rotations alone, float64 [N, 3, 3]."""
-    with _open(path) as archive:
-        limit = limits.PICKLED_ARRAYS * 9 * 8
-        rotations = pickles.read_member(archive, "rotation_matrices", max_bytes=limit)
-    count = len(rotations) if isinstance(rotations, np.ndarray) and rotations.ndim else 0
-    _check_shape(path, "rotation_matrices", rotations, (count, 3, 3))
+    rotations = _taken(path, found)
+    _check_shape(path, "rotation_matrices", rotations, (len(rotations) if rotations.ndim else 0, 3, 3))
     for text in _rotation_problems(rotations):
         raise DamagedFile(path, text)
     return rotations.astype(np.float64)
 
 
-@contextlib.contextmanager
-def _open(path: Path) -> Iterator[zipfile.ZipFile]:
-    """An npz file; what is wrong with it or its arrays names it."""
-    try:
-        with npz.open_npz(path) as archive:
-            yield archive
-    except DamagedFile:
-        raise
-    except ValueError as error:
-        raise DamagedFile(path, f"{error}. {AGAIN}") from error
-    except FileNotFoundError:
+def _taken(path: Path, found: Any) -> Any:
+    """A result of a worker; what is missing is said with what the folder has."""
+    if isinstance(found, MissingFile):
         there = ", ".join(sorted(p.name for p in path.parent.glob("*.npz"))) or "no npz file"
         name = path.stem.split("_")[0]
-        raise FileNotFoundError(
-            f"there is no {path}; its folder has {there}. Pascal3D+ is {name}_train.npz, {name}_imagenet.npz and "
-            f"{name}_val.npz, as packed by the authors of view prior learning"
-        ) from None
+        raise MissingFile(
+            path,
+            f"is missing; its folder has {there}. Pascal3D+ is {name}_train.npz, {name}_imagenet.npz and "
+            f"{name}_val.npz, as packed by the authors of view prior learning",
+        )
+    return Findings(strict=True).take(found)
 
 
-def _check_shape(path: Path, key: str, array: object, shape: tuple[int, ...], dtype: type | None = None) -> None:
-    if not isinstance(array, np.ndarray) or array.shape != shape or (dtype is not None and array.dtype != dtype):
-        got = f"{array.dtype} {list(array.shape)}" if isinstance(array, np.ndarray) else "an object array"
-        wanted = f"{np.dtype(dtype)} " if dtype else ""
+def _check_shape(path: Path, key: str, array: np.ndarray, shape: tuple[int, ...], dtype: type | None = None) -> None:
+    if array.shape != shape or (dtype is not None and array.dtype != dtype):
+        wanted, got = f"{np.dtype(dtype)} " if dtype else "", f"{array.dtype} {list(array.shape)}"
         raise DamagedFile(path, f"{key} must be {wanted}{list(shape)} (as many as there are images), got {got}")
 
 

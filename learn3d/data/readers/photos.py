@@ -22,14 +22,18 @@ import torch
 from tqdm import tqdm
 
 import nmr
-from learn3d.data import conventions
+from learn3d.data.conventions import KATO
 from learn3d.data.dataset import MASK_SIZE, SPLITS, ViewDataset
-from learn3d.data.framing import check_mask, frame, mask_box, read_photo
+from learn3d.data.framing import Framed, read_framed
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers.photo_table import TABLES, Photo, find_table, read_table, split_objects
+from learn3d.data.readers.properties import LayoutProperties
+from learn3d.data.readers.renderings import check_split
 from learn3d.data.view_bins import AngleBins
-from learn3d.files.findings import DamagedFile, MissingFile, Problem
+from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
+from learn3d.files.worker import Call, read_all
 
+PROPERTIES = LayoutProperties(voxels=False, inverted=True, options=("image_size", "progress"))
 AZIMUTH_WIDTHS_DEG = (15, 20, 30, 45, 60, 90)
 ELEVATION_WIDTH_DEG = 20
 PHOTOS_PER_CLASS = 8  # on average, at least: fewer tell a discriminator nothing
@@ -49,8 +53,7 @@ def load(
 
     Raises FileNotFoundError and ValueError naming the file, the row and what was expected; `problems` lists them all.
     """
-    if split not in SPLITS:
-        raise ValueError(f"split must be one of {', '.join(SPLITS)}; got {split!r}")
+    check_split(split)
     table = find_table(folder, category)
     photos, faults = read_table(table)
     if faults:
@@ -62,7 +65,14 @@ def load(
         raise ValueError(
             f"{table} has no photograph in the split {split if not chosen else 'train'!r}; it has: {there}"
         )
-    images, masks, half_fovs, scales = _read_images(chosen, image_size, progress)
+    images = np.empty((len(chosen), 4, image_size, image_size), np.uint8)
+    masks = np.empty((len(chosen), MASK_SIZE, MASK_SIZE), np.uint8)
+    half_fovs, scales = [], []
+    for k, (photo, result) in enumerate(_read(chosen, image_size, "photographs", progress)):
+        framed = Findings(strict=True).take(result)
+        images[k], masks[k] = framed.image, framed.mask
+        half_fovs.append(framed.half_fov_deg)
+        scales.append(_scale(photo, framed))
     _check_scale(table, scales)
     poses = _poses(chosen, half_fovs)
     training = [photo for photo in photos if splits[photo.object] == "train"]
@@ -80,7 +90,7 @@ def load(
         object_ids=np.array([numbers[photo.object] for photo in chosen]),
         object_names=tuple(names),
         voxels=None,
-        convention=conventions.KATO,
+        convention=KATO,
     )
 
 
@@ -96,17 +106,15 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
     yield from (Problem(str(table), fault) for fault in faults)
     scales = []
     chosen = [photo for photo in photos if splits is None or splits[photo.object] == split]
-    for photo in tqdm(chosen, desc=f"{category} {split}", disable=not progress, dynamic_ncols=True):
-        try:
-            _, mask = _read(photo)
-        except (DamagedFile, MissingFile) as error:
-            yield Problem(str(error.path), error.message)
+    for photo, framed in _read(chosen, MASK_SIZE, f"{category} {split}", progress):
+        if isinstance(framed, (DamagedFile, MissingFile)):
+            yield Problem(str(framed.path), framed.message)
             continue
-        left, top, right, bottom = mask_box(mask)
-        if left == 0 or top == 0 or right == mask.shape[1] or bottom == mask.shape[0]:
+        left, top, right, bottom = framed.box
+        if left == 0 or top == 0 or right == framed.shape[1] or bottom == framed.shape[0]:
             message = "its object touches the border; what lies outside counts as empty"
             yield Problem(str(photo.file), message, "warning")
-        scales.append(_scale(photo, mask))
+        scales.append(_scale(photo, framed))
     try:
         _check_scale(table, scales)
     except ValueError as error:
@@ -172,41 +180,24 @@ def _poses(photos: list[Photo], half_fovs_deg: list[float]) -> LookAtPoses:
     return LookAtPoses(*(torch.tensor(column, dtype=torch.float32) for column in (*columns, half_fovs_deg)))
 
 
-def _read_images(
-    photos: list[Photo], size: int, progress: bool
-) -> tuple[np.ndarray, np.ndarray, list[float], list[float]]:
-    """Images uint8 [M, 4, size, size], masks uint8 [M, 64, 64], half fields of view, scales (`_scale`)."""
-    images = np.empty((len(photos), 4, size, size), np.uint8)
-    masks = np.empty((len(photos), MASK_SIZE, MASK_SIZE), np.uint8)
-    half_fovs, scales = [], []
-    for k, photo in enumerate(tqdm(photos, desc="photographs", disable=not progress, dynamic_ncols=True)):
-        colors, mask = _read(photo)
+def _read(photos: list[Photo], size: int, what: str, progress: bool) -> Iterator[tuple[Photo, Framed | Exception]]:
+    """Every photograph with what it is to the networks, or what is wrong with it, named with its row."""
+
+    def calls(photo: Photo) -> list[Call]:
         camera = photo.fov_deg, photo.elevation_deg, photo.framing
-        images[k], half_fov = frame(colors, mask, *camera, size)
-        masks[k] = images[k, 3] if size == MASK_SIZE else frame(colors, mask, *camera, MASK_SIZE)[0][3]
-        half_fovs.append(half_fov)
-        scales.append(_scale(photo, mask))
-    return images, masks, half_fovs, scales
+        return [Call(read_framed, photo.file, (photo.mask, *camera, size, MASK_SIZE), "a photograph")]
+
+    found = tqdm(read_all(map(calls, photos)), what, len(photos), disable=not progress, dynamic_ncols=True)
+    for photo, (item,) in zip(photos, found, strict=True):
+        if isinstance(item, (DamagedFile, MissingFile)):
+            item = type(item)(item.path, f"{item.message} ({photo.where})")
+        yield photo, item
 
 
-def _read(photo: Photo) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and mask; DamagedFile or MissingFile, which name the row, too."""
-    try:
-        colors, mask = read_photo(photo.file, photo.mask)
-        check_mask(mask)
-    except FileNotFoundError as error:
-        raise MissingFile(photo.file, f"{error} ({photo.where})") from None
-    except DamagedFile as error:
-        raise DamagedFile(error.path, f"{error.message} ({photo.where})") from None
-    except ValueError as error:
-        raise DamagedFile(photo.file, f"{error} ({photo.where})") from None
-    return colors, mask
-
-
-def _scale(photo: Photo, mask: np.ndarray) -> float:
+def _scale(photo: Photo, framed: Framed) -> float:
     """How large the object is in the photograph, over how large its distance and the field of view say it is."""
-    left, top, right, bottom = mask_box(mask)
-    share = max(right - left, bottom - top) / max(mask.shape)
+    left, top, right, bottom = framed.box
+    share = max(right - left, bottom - top) / max(framed.shape)
     return share * 2 * photo.distance * math.tan(math.radians(photo.fov_deg) / 2)
 
 

@@ -14,8 +14,9 @@ degrees (which the table's 25 comes near, if read as the half). In the mesh's fr
 d (cos e cos a, sin e, cos e sin a), as in Kato's rendering, so that in the object frame, (-z, y, -x) of the mesh, the
 azimuth of `nmr.points_from_angles` is -a.
 
-Voxels. binvox keeps the mesh's axes; see conventions.R2N2. The header says which cube of the mesh's frame the grid
-spans. The object frame of each object is scaled by that cube's side, which makes it 1 (distances are divided by it).
+Voxels. binvox keeps the axes (x, y, z) of the mesh (y up, right-handed), of which the object frame is (-z, y, -x), as
+Kato's is (`mesh_to_object`). The header says which cube of the mesh's frame the grid spans. The object frame of each
+object is scaled by that cube's side, which makes it 1 (distances are divided by it).
 The headers of the published archive are believed to read scale 1 throughout, whatever the size of the mesh that was
 rendered; if so, predictions and voxels differ in size by up to the ratio of the mesh's longest side to 1, and no figure
 of IoU on this data set should be compared with one on another.
@@ -27,35 +28,41 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from learn3d.data.conventions import R2N2, VOXEL_SIZE
+from learn3d.data.categories import synset_of
+from learn3d.data.conventions import INNER, VOXEL_SIZE, VoxelConvention
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.readers.kato import synset_of
+from learn3d.data.readers.properties import LayoutProperties
 from learn3d.data.readers.renderings import (
+    ObjectReader,
     ReadObject,
     category_folder,
+    check_poses,
     check_split,
-    check_square,
+    check_views,
     join_objects,
-    map_objects,
-    read_image,
-    read_table,
-    shrink,
-    split_alpha,
-    warn_if_empty,
+    take_views,
 )
-from learn3d.files import limits
-from learn3d.files.binvox import Binvox, read_binvox
-from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
+from learn3d.files import renderings, volumes
+from learn3d.files.findings import DamagedFile, Findings, Problem
+from learn3d.files.worker import Call
 
+PROPERTIES = LayoutProperties(
+    voxels=True, inverted=False, validation=False, options=("image_size", "views_per_object", "progress")
+)
+#: binvox's grids: axes (-z, y, -x) of the object frame, backwards. They span the cube that binvox fits to the object.
+R2N2 = VoxelConvention("r2n2", swap=(1, 3), flip=(1, 3), kato18_scale=INNER)
 NUM_RENDERS = 24
 DISTANCE = 1.75  # of the ratio 1
 HALF_FOV_DEG = math.degrees(math.atan(16 / 35))
 VIEW_BINS = "15x5:25:30"  # K = 24: elevations differ by five degrees only
 SPLITS = ("train", "test")
+_TABLE = "a row per image: azimuth, elevation, yaw 0, ratio of the distance, field of view"
 
 
 def load(
@@ -75,16 +82,11 @@ def load(
     views_per_object: use the first 1 .. 24 images of each object; None: all.
     Raises FileNotFoundError or ValueError naming the first file that is missing or not as described above.
     """
+    check_views(views_per_object, NUM_RENDERS)
     views = NUM_RENDERS if views_per_object is None else views_per_object
-    if not 1 <= views <= NUM_RENDERS:
-        raise ValueError(f"views_per_object must lie in 1 .. {NUM_RENDERS}, got {views}")
     folder, ids = Path(folder), object_ids(folder, category, split)
-    findings = Findings(strict=True)
-    read = map_objects(
-        lambda name: _read(folder, synset_of(category), name, views, image_size, findings), ids, category, progress
-    )
     return join_objects(
-        read,
+        _Reader(folder, synset_of(category), views, image_size).read(ids, category, progress),
         ids,
         views,
         image_size,
@@ -101,14 +103,8 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
     folder, findings = Path(folder), Findings()
     ids = findings.attempt(object_ids, folder, category, split)
     yield from findings.problems
-
-    def examine(name: str) -> list[Problem]:
-        findings = Findings()
-        _read(folder, synset_of(category), name, NUM_RENDERS, 64, findings)
-        return findings.problems
-
-    for found in map_objects(examine, ids or [], f"{category} {split}", progress):
-        yield from found
+    reader = _Reader(folder, synset_of(category), NUM_RENDERS, 64)
+    yield from reader.problems(ids or [], f"{category} {split}", progress)
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -134,23 +130,45 @@ def object_ids(folder: Path | str, category: str, split: str) -> list[str]:
     return chosen
 
 
-def _read(folder: Path, synset: str, name: str, views: int, size: int, findings: Findings) -> ReadObject:
-    """One object; None for the parts that findings tell of."""
-    root = folder / "ShapeNetRendering" / synset / name / "rendering"
-    path = folder / "ShapeNetVox32" / synset / name / "model.binvox"
-    grid = findings.attempt(read_binvox, path, VOXEL_SIZE)
-    if grid is not None:
-        _warn_of_grid(path, grid, findings)
-    if findings.attempt(_check_folder, root) is None:
-        return ReadObject([], None, None)
-    table = findings.attempt(_read_poses, root / "rendering_metadata.txt", views)
-    if table is not None and grid is not None:
-        table[:, 2] /= grid.scale
-    images = [_read_view(root / f"{k:02d}.png", size, findings) for k in range(views)]
-    return ReadObject(images, table, None if grid is None else grid.voxels)
+@dataclass(frozen=True)
+class _Reader(ObjectReader):
+    folder: Path
+    synset: str
+    views: int
+    size: int
+
+    def _paths(self, name: str) -> tuple[Path, Path]:
+        voxels = self.folder / "ShapeNetVox32" / self.synset / name / "model.binvox"
+        return voxels, self.folder / "ShapeNetRendering" / self.synset / name / "rendering"
+
+    def calls(self, name: str) -> list[Call]:
+        voxels, root = self._paths(name)
+        calls = [
+            Call(volumes.read_binvox, voxels, (VOXEL_SIZE,), "a voxel grid in the binvox format"),
+            Call(renderings.check_folder, root, ("the folder of an object's images",)),
+        ]
+        if root.is_dir():
+            table = root / "rendering_metadata.txt"
+            calls.append(Call(renderings.read_table, table, (self.views, 5, _TABLE), _TABLE))
+            paths = [root / f"{k:02d}.png" for k in range(self.views)]
+            calls += [Call(renderings.read_with_alpha, path, (self.size,), "a rendering") for path in paths]
+        return calls
+
+    def build(self, name: str, found: list[Any], findings: Findings) -> ReadObject:
+        path, root = self._paths(name)
+        grid, _, *rest = map(findings.take, found[:3])
+        if grid is not None:
+            _warn_of_grid(path, grid, findings)
+        poses = None
+        if rest and rest[0] is not None:
+            poses = findings.attempt(_poses, root / "rendering_metadata.txt", rest[0])
+        if poses is not None and grid is not None:
+            poses[:, 2] /= grid.scale
+        paths = [root / f"{k:02d}.png" for k in range(len(found) - 3)]
+        return ReadObject(take_views(findings, paths, found[3:]), poses, None if grid is None else grid.voxels)
 
 
-def _warn_of_grid(path: Path, grid: Binvox, findings: Findings) -> None:
+def _warn_of_grid(path: Path, grid: volumes.Binvox, findings: Findings) -> None:
     if not grid.voxels.any():
         findings.warn(path, "the grid is empty")
     centre = grid.translate + grid.scale / 2
@@ -161,38 +179,10 @@ def _warn_of_grid(path: Path, grid: Binvox, findings: Findings) -> None:
         )
 
 
-def _check_folder(root: Path) -> Path:
-    if not root.is_dir():
-        raise MissingFile(root, "is missing; expected the folder of an object's images")
-    return root
-
-
-def _read_poses(path: Path, rows: int) -> np.ndarray:
-    """Azimuth of the object frame, elevation and distance (in units of the mesh) of each image, float64 [rows, 3]."""
-    wanted = "a row per image: azimuth, elevation, yaw 0, ratio of the distance, field of view"
-    azimuth, elevation, yaw, ratio, _ = read_table(path, rows, 5, wanted).T
-    low, high = limits.DISTANCE
-    turns = np.abs(azimuth) > limits.ANGLE_DEG
-    if (bad := turns | (np.abs(elevation) >= 90) | (np.abs(yaw) > 1e-3) | (ratio < low) | (ratio > high)).any():
-        k = int(bad.argmax())
-        found = f"azimuth {azimuth[k]:g}, elevation {elevation[k]:g}, yaw {yaw[k]:g} and ratio {ratio[k]:g}"
-        raise DamagedFile(path, f"row {k} has {found}; expected {wanted}")
-    return np.stack([-azimuth, elevation, DISTANCE * ratio], axis=1)
-
-
-def _read_view(path: Path, size: int, findings: Findings) -> tuple[np.ndarray, np.ndarray] | None:
-    pair = findings.attempt(_read_render, path, size)
-    if pair is None:
-        return None
-    warn_if_empty(findings, path, pair[1])
-    return shrink(*pair, size)
-
-
-def _read_render(path: Path, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colours over white and the mask, at their own size."""
-    image = read_image(path)
-    check_square(path, image, max(size, 64))
-    color, alpha = split_alpha(image)
-    if alpha is None:
-        raise DamagedFile(path, f"has the channels {image.mode}; expected RGBA, whose alpha is the mask")
-    return color, alpha
+def _poses(path: Path, table: np.ndarray) -> np.ndarray:
+    """Azimuth of the object frame, elevation and distance (in units of the mesh) of each image, float64 [V, 3]."""
+    azimuth, elevation, yaw, ratio, _ = table.T
+    if (turned := np.abs(yaw) > 1e-3).any():
+        k = int(turned.argmax())
+        raise DamagedFile(path, f"row {k} has the yaw {yaw[k]:g}; expected {_TABLE}")
+    return check_poses(path, np.stack([-azimuth, elevation, DISTANCE * ratio], axis=1), _TABLE)

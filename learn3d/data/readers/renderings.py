@@ -1,46 +1,102 @@
-"""What the readers of folders share: images, arrays and tables with errors that name the file, many objects at once."""
+"""What the readers of folders of renderings share: many objects read at once, and the data set made of them."""
 
 from __future__ import annotations
 
-import functools
-import os
+from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 from tqdm import tqdm
 
+from learn3d.data.categories import synset_of
 from learn3d.data.conventions import VoxelConvention
 from learn3d.data.dataset import MASK_SIZE, SPLITS, ViewDataset
 from learn3d.data.poses import LookAtPoses
-from learn3d.data.readers.kato import synset_of
 from learn3d.data.view_bins import AngleBins
-from learn3d.files import limits, npz
-from learn3d.files.findings import AGAIN, DamagedFile, Findings, MissingFile
-from learn3d.files.images import RENDERINGS, open_image
-from learn3d.files.reading import read_text
-
-T = TypeVar("T")
-R = TypeVar("R")
+from learn3d.files import limits
+from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
+from learn3d.files.worker import Call, read_all
 
 
-def map_objects(function: Callable[[T], R], items: Sequence[T], what: str, progress: bool) -> Iterator[R]:
-    """function of every item, in order, computed in parallel threads; nothing more is started after an exception."""
-    executor = ThreadPoolExecutor(min(16, 2 * (os.cpu_count() or 1)))
-    try:
-        yield from tqdm(executor.map(function, items), what, len(items), disable=not progress, unit="object")
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
+class ReadObject(NamedTuple):
+    """One object as its files have it; None for the parts that findings tell of."""
+
+    views: list[tuple[np.ndarray, np.ndarray] | None]  # V images uint8 [4, S, S] with masks uint8 [64, 64]
+    poses: np.ndarray | None  # float64 [V, 3]: azimuth of the object frame, elevation (degrees), distance
+    shape: np.ndarray | None  # voxels bool [32, 32, 32], or points float32 [P, 3]
+
+
+class ObjectReader(ABC):
+    """How the files of one object are read: what worker processes are asked, and what their answers make."""
+
+    @abstractmethod
+    def calls(self, name: str) -> list[Call]:
+        """What to read of the object."""
+
+    @abstractmethod
+    def build(self, name: str, found: list[Any], findings: Findings) -> ReadObject:
+        """The object of the results of `calls`."""
+
+    def read(self, ids: Sequence[str], what: str, progress: bool) -> Iterator[ReadObject]:
+        """The objects, in order; the first thing that is wrong is raised."""
+        for name, found in self._found(ids, what, progress):
+            yield self.build(name, found, Findings(strict=True))
+
+    def problems(self, ids: Sequence[str], what: str, progress: bool) -> Iterator[Problem]:
+        """Everything that is wrong with the objects."""
+        for name, found in self._found(ids, what, progress):
+            findings = Findings()
+            self.build(name, found, findings)
+            yield from findings.problems
+
+    def _found(self, ids: Sequence[str], what: str, progress: bool) -> Iterator[tuple[str, list[Any]]]:
+        read = tqdm(read_all(map(self.calls, ids)), what, len(ids), disable=not progress, unit="object")
+        yield from zip(ids, read, strict=True)
+
+
+def take_views(
+    findings: Findings, paths: Iterable[Path], views: Iterable[Any]
+) -> list[tuple[np.ndarray, np.ndarray] | None]:
+    """Images and masks of results of `files.renderings`, with a note of empty masks."""
+    taken = []
+    for path, result in zip(paths, views, strict=True):
+        if (view := findings.take(result)) is not None:
+            warn_if_empty(findings, path, view[2])
+        taken.append(None if view is None else view[:2])
+    return taken
+
+
+def warn_if_empty(findings: Findings, path: Path, brightest: int) -> None:
+    """Note a mask in which nothing is inside, by the brightest of its values."""
+    if brightest < 128:
+        findings.warn(path, f"its mask is empty: the brightest of its values 0 .. 255 is {brightest}")
+
+
+def check_poses(path: Path, poses: np.ndarray, wanted: str) -> np.ndarray:
+    """Poses float64 [V, 3] (azimuth, elevation, distance) as they are; DamagedFile where one cannot be."""
+    low, high = limits.DISTANCE
+    azimuth, elevation, distance = poses.T
+    bad = (np.abs(azimuth) > limits.ANGLE_DEG) | (np.abs(elevation) >= 90) | (distance < low) | (distance > high)
+    if bad.any():
+        k = int(bad.argmax())
+        found = f"azimuth {azimuth[k]:g}, elevation {elevation[k]:g} and distance {distance[k]:g}"
+        raise DamagedFile(path, f"row {k} has {found}; expected {wanted}")
+    return poses
 
 
 def check_split(split: str, splits: Sequence[str] = SPLITS) -> None:
     """Raise a ValueError for a split that the layout does not have."""
     if split not in splits:
         raise ValueError(f"split must be one of {', '.join(splits)}; got {split!r}")
+
+
+def check_views(views: int | None, most: int) -> None:
+    """Raise a ValueError for a number of views per object that the layout does not have."""
+    if views is not None and not 1 <= views <= most:
+        raise ValueError(f"views_per_object must lie in 1 .. {most}, got {views}")
 
 
 def category_folder(folder: Path, category: str) -> Path:
@@ -54,6 +110,15 @@ def category_folder(folder: Path, category: str) -> Path:
     return path
 
 
+def check_ids(path: Path, ids: Sequence[str]) -> None:
+    """Raise DamagedFile where one of the ids that a list names is no plain name of a folder."""
+    for name in ids:
+        if name in ("", ".", "..") or len(name) > limits.NAME_LENGTH or set(name) & set("/\\:\0"):
+            raise DamagedFile(
+                path, f"names the object {name[:40]!r}; expected the plain name of a folder (no '/', no '..')"
+            )
+
+
 def warn_of_repeats(
     findings: Findings, path: Path, what: str, ids: Sequence[str], others: dict[str, Iterable[str]]
 ) -> None:
@@ -63,114 +128,6 @@ def warn_of_repeats(
     for split, other in others.items():
         if shared := sorted(set(ids) & set(other)):
             findings.warn(path, f"{what} shares {len(shared)} objects with {split}, such as {shared[0]}")
-
-
-def warn_if_empty(findings: Findings, path: Path, mask: np.ndarray) -> None:
-    """Note a mask, uint8 [H, W], in which nothing is inside."""
-    if mask.max() < 128:
-        findings.warn(path, f"its mask is empty: the brightest of its values 0 .. 255 is {mask.max()}")
-
-
-def read_image(path: Path) -> Image.Image:
-    """A decoded rendering of at most 2048 pixels a side, in its own mode; DamagedFile or MissingFile."""
-    return open_image(path, RENDERINGS, limits.RENDER_SIDE)
-
-
-def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None where there is none."""
-    if image.mode == "P":
-        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
-    if image.mode not in ("RGBA", "LA", "PA"):
-        return np.asarray(image.convert("RGB")), None
-    image = image.convert("RGBA")
-    alpha = image.getchannel("A")
-    white = Image.new("RGB", image.size, (255, 255, 255))
-    white.paste(image, mask=alpha)
-    return np.asarray(white), np.asarray(alpha)
-
-
-def check_square(path: Path, image: Image.Image, least: int) -> None:
-    """Raise DamagedFile for an image that is not square, smaller than `least`, or has more than 8 bits a channel."""
-    if image.width != image.height or image.width < least:
-        raise DamagedFile(
-            path, f"is {image.width}x{image.height} pixels; expected a square image of at least {least}x{least}"
-        )
-    if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
-        raise DamagedFile(path, f"has the pixel format {image.mode}; expected 8-bit grey, RGB or RGBA")
-
-
-def shrink(color: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """An image uint8 [4, size, size] and a mask uint8 [64, 64] of colours uint8 [S, S, 3] and a mask uint8 [S, S].
-
-    Each pixel becomes the mean over its area of the original; fractions of original pixels count as such.
-    """
-    planes = np.concatenate([color.transpose(2, 0, 1), mask[None]])
-    image = _shrink(planes, size)
-    return image, image[3] if size == MASK_SIZE else _shrink(planes[3], MASK_SIZE)
-
-
-def _shrink(planes: np.ndarray, size: int) -> np.ndarray:
-    if planes.shape[-1] == size:
-        return planes
-    weights = _area_weights(planes.shape[-1], size)
-    return np.rint(weights @ planes.astype(np.float32) @ weights.T).astype(np.uint8)
-
-
-@functools.cache
-def _area_weights(source: int, size: int) -> np.ndarray:
-    """Share of each of `source` pixels in each of `size` larger ones, float32 [size, source]; rows sum to 1."""
-    edges = np.arange(size + 1) * (source / size)
-    pixels = np.arange(source)
-    overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
-    return (overlap.clip(0) * (size / source)).astype(np.float32)
-
-
-def read_npz(path: Path, names: Iterable[str], wanted: str) -> dict[str, np.ndarray]:
-    """Those of the named arrays that an npz file of one object has; `wanted` says what it should hold."""
-    try:
-        with npz.open_npz(path, most=limits.OBJECT_BYTES) as archive:
-            there = set(npz.keys(archive))
-            return {name: npz.read(archive, name) for name in names if name in there}
-    except FileNotFoundError:
-        raise MissingFile(path, f"is missing; expected {wanted}") from None
-    except ValueError as error:
-        raise DamagedFile(path, f"cannot be read ({error}); expected an npz file with {wanted}. {AGAIN}") from error
-
-
-def check_ids(path: Path, ids: Sequence[str]) -> None:
-    """Raise DamagedFile where the ids that a list names are too many, or one is no plain name of a folder."""
-    if len(ids) > limits.OBJECTS:
-        raise DamagedFile(path, f"names {len(ids)} objects; at most {limits.OBJECTS} are read")
-    for name in ids:
-        if name in ("", ".", "..") or len(name) > limits.NAME_LENGTH or set(name) & set("/\\:\0"):
-            raise DamagedFile(
-                path, f"names the object {name[:40]!r}; expected the plain name of a folder (no '/', no '..')"
-            )
-
-
-def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
-    """The first `rows` rows of a table of numbers in a text file, float64 [rows, C] with C >= `columns`, all finite."""
-    text = read_text(path, limits.TABLE_BYTES, wanted)
-    lines = [line.split() for line in text.splitlines() if line.strip()]
-    if len(lines) < rows:
-        raise DamagedFile(path, f"has {len(lines)} rows, {rows} are needed; expected {wanted}. {AGAIN}")
-    table = np.empty((rows, columns))
-    for k, line in enumerate(lines[:rows]):
-        try:
-            table[k] = [float(word) for word in line[:columns]]
-        except ValueError:
-            raise DamagedFile(path, f"row {k} is {' '.join(line)!r}; expected {wanted}") from None
-        if not np.isfinite(table[k]).all():
-            raise DamagedFile(path, f"row {k} has numbers that are not finite; expected {wanted}")
-    return table
-
-
-class ReadObject(NamedTuple):
-    """One object as its files have it; None for the parts that findings tell of."""
-
-    views: list[tuple[np.ndarray, np.ndarray] | None]  # V results of `shrink`
-    poses: np.ndarray | None  # float64 [V, 3]: azimuth of the object frame, elevation (degrees), distance
-    voxels: np.ndarray | None  # bool [32, 32, 32]
 
 
 def join_objects(
@@ -189,17 +146,7 @@ def join_objects(
 
     view_bins: pose classes as `AngleBins.parse` takes them. Colours are as they are, not inverted.
     """
-    count = len(names)
-    images = np.empty((count * views, 4, image_size, image_size), np.uint8)
-    masks = None if image_size == MASK_SIZE else np.empty((count * views, MASK_SIZE, MASK_SIZE), np.uint8)
-    tables, grids = [], []
-    for i, item in enumerate(objects):
-        for row, (image, mask) in enumerate(item.views, i * views):
-            images[row] = image
-            if masks is not None:
-                masks[row] = mask
-        tables.append(item.poses)
-        grids.append(item.voxels)
+    images, masks, tables, grids = join_images(objects, len(names), views, image_size)
     poses = LookAtPoses(*np.concatenate(tables).T, half_fov_deg)
     bins = AngleBins.parse(view_bins)
     return ViewDataset(
@@ -209,10 +156,27 @@ def join_objects(
         poses=poses,
         view_ids=bins.ids(poses).numpy(),
         view_names=tuple(bins.names()),
-        object_ids=np.repeat(np.arange(count), views),
+        object_ids=np.repeat(np.arange(len(names)), views),
         object_names=tuple(names),
         voxels=np.stack(grids),
         convention=convention,
         masks=masks,
         inverted=False,
     )
+
+
+def join_images(
+    objects: Iterable[ReadObject], count: int, views: int, image_size: int
+) -> tuple[np.ndarray, np.ndarray | None, list, list]:
+    """Images uint8 [count * views, 4, S, S], masks (None where the images' are meant), poses and shapes of objects."""
+    images = np.empty((count * views, 4, image_size, image_size), np.uint8)
+    masks = None if image_size == MASK_SIZE else np.empty((count * views, MASK_SIZE, MASK_SIZE), np.uint8)
+    poses, shapes = [], []
+    for i, item in enumerate(objects):
+        for row, (image, mask) in enumerate(item.views, i * views):
+            images[row] = image
+            if masks is not None:
+                masks[row] = mask
+        poses.append(item.poses)
+        shapes.append(item.shape)
+    return images, masks, poses, shapes

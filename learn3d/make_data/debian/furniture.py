@@ -18,7 +18,6 @@ import numpy as np
 from tqdm import tqdm
 
 from learn3d.files import limits
-from learn3d.files.archives import open_zip
 from learn3d.make_data.debian.packages import Candidate, Package, read_package
 from learn3d.make_data.mesh_text import read_obj
 
@@ -105,8 +104,8 @@ def furniture_models(
     for path, content in sorted(read_package(package, (".sh3f",), licences)):
         catalogue = PurePosixPath(path).name
         try:
-            archive = open_zip(io.BytesIO(content), limits.PACKAGE_BYTES)
-        except ValueError as error:
+            archive = zipfile.ZipFile(io.BytesIO(content))
+        except (zipfile.BadZipFile, NotImplementedError, ValueError, EOFError, OSError) as error:
             raise ValueError(f"{catalogue} is refused as a zip archive: {error}; get its package again") from error
         with archive:
             general, entries = read_catalogue(_member(archive, CATALOGUE))

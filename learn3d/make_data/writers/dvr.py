@@ -18,8 +18,8 @@ import torch
 
 import nmr
 from learn3d.data import conventions
+from learn3d.data.categories import synset_of
 from learn3d.data.poses import LookAtPoses
-from learn3d.data.readers import kato
 from learn3d.make_data.writers.pictures import write_png
 from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer
 
@@ -29,10 +29,10 @@ NUM_POINTS = 10_000
 class DvrWriter(Writer):
     """Pictures, cameras and surface points of every object in a folder of its own; no voxels."""
 
-    image_size = kato.IMAGE_SIZE
-    default_views = kato.NUM_VIEWS
+    image_size = conventions.IMAGE_SIZE
+    default_views = conventions.NUM_VIEWS
     fixed_views = True
-    bytes_per_view = 4 * kato.IMAGE_SIZE**2 + 24 * NUM_POINTS // kato.NUM_VIEWS
+    bytes_per_view = 4 * conventions.IMAGE_SIZE**2 + 24 * NUM_POINTS // conventions.NUM_VIEWS
     convention = conventions.KATO  # for the contact sheet
     card: ClassVar = {
         "images": "PNG 64 x 64 over white; masks: grey, anti-aliased",
@@ -43,13 +43,13 @@ class DvrWriter(Writer):
 
     @classmethod
     def paths(cls, category: str) -> tuple[str, ...]:
-        return (kato.synset_of(category),)
+        return (synset_of(category),)
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        return kato.view_poses(torch.arange(count))
+        return conventions.view_poses(torch.arange(count))
 
     def write(self, item: RenderedObject) -> None:
-        folder = self.folder / kato.synset_of(self.category) / item.name
+        folder = self.folder / synset_of(self.category) / item.name
         for k, (rgb, alpha) in enumerate(zip(item.rgb, item.alpha, strict=True)):
             write_png(folder / "image" / f"{k:04d}.png", rgb)
             write_png(folder / "mask" / f"{k:04d}.png", alpha)
@@ -62,12 +62,12 @@ class DvrWriter(Writer):
     def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
         for split, names in objects.items():
             listing = "".join(f"{name}\n" for name in names)
-            (self.folder / kato.synset_of(self.category) / f"softras_{split}.lst").write_text(listing)
+            (self.folder / synset_of(self.category) / f"softras_{split}.lst").write_text(listing)
         return objects
 
 
 def _camera_arrays(poses: LookAtPoses) -> dict[str, np.ndarray]:
-    focal = 1 / np.tan(np.deg2rad(kato.HALF_FOV_DEG))
+    focal = 1 / np.tan(np.deg2rad(conventions.HALF_FOV_DEG))
     camera = np.diag([focal, focal, 1.0, 1.0])
     arrays = {}
     for k, matrix in enumerate(poses.cameras().projection().plain().matrix.numpy()):

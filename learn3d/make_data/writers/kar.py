@@ -6,7 +6,7 @@
 - `renders/{synset}/{id}/camera_{i}.mat`: K [3, 3] in pixels, extrinsic [3, 4] and its rotation as quat (w, x, y, z).
   The published code reads neither extrinsic nor quat. Here they take ShapeNet's coordinates (right-handed, y up,
   front x) to a camera with x right, y down, z away.
-- `voxels/modelVoxels32/{synset}/{id}.mat`, key 'Volume', 32^3 in the axes of `conventions.KAR`.
+- `voxels/modelVoxels32/{synset}/{id}.mat`, key 'Volume', 32^3 in the axes of `readers.kar.KAR`.
 - `splits.json`: {synset: {name, train, val, test}}, all categories of the folder in one file.
 
 The camera looks at the origin from `nmr.points_from_angles(distance, elevation, azimuth)` of the object frame; half of
@@ -24,11 +24,10 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 import nmr
-from learn3d.data import conventions
+from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS
 from learn3d.data.poses import LookAtPoses
-from learn3d.data.readers.kar import read_splits
-from learn3d.data.readers.kato import synset_of
+from learn3d.data.readers.kar import KAR, read_splits
 from learn3d.files.writing import write_json
 from learn3d.make_data.viewpoints import distances, uniform
 from learn3d.make_data.writers.pictures import write_png
@@ -46,7 +45,7 @@ class KarWriter(Writer):
     image_size = 224
     default_views = 20
     bytes_per_view = 5 * 224**2
-    convention = conventions.KAR
+    convention = KAR
     shared = ("splits.json",)
     card: ClassVar = {
         "images": "RGBA 224 x 224; depth: 8-bit grey, 255 = nothing, 0 .. 240 over 1.8 units around the centre",

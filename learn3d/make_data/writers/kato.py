@@ -18,10 +18,10 @@ from learn3d.make_data.writers.writer import RenderedObject, Writer
 class KatoWriter(Writer):
     """`{synset}_{split}_images.npz` and `{synset}_{split}_voxels.npz`; a split is in memory until it is complete."""
 
-    image_size = kato.IMAGE_SIZE
-    default_views = kato.NUM_VIEWS
+    image_size = conventions.IMAGE_SIZE
+    default_views = conventions.NUM_VIEWS
     fixed_views = True
-    bytes_per_view = 4 * kato.IMAGE_SIZE**2
+    bytes_per_view = 4 * conventions.IMAGE_SIZE**2
     convention = conventions.KATO
     card: ClassVar = {
         "images": "uint8 [N, 24, 4, 64, 64]: RGB = 255 - composite over white, alpha",
@@ -38,12 +38,14 @@ class KatoWriter(Writer):
         return tuple(path.name for split in SPLITS for path in kato.split_paths("", category, split))
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        return kato.view_poses(torch.arange(count))
+        return conventions.view_poses(torch.arange(count))
 
     def start(self, split: str, most: int) -> None:
         self._save()
         self._split, self._done = split, 0
-        self._images = np.empty((most, kato.NUM_VIEWS, 4, kato.IMAGE_SIZE, kato.IMAGE_SIZE), dtype=np.uint8)
+        self._images = np.empty(
+            (most, conventions.NUM_VIEWS, 4, conventions.IMAGE_SIZE, conventions.IMAGE_SIZE), dtype=np.uint8
+        )
         self._voxels = np.empty((most, *(conventions.VOXEL_SIZE,) * 3), dtype=bool)
 
     def write(self, item: RenderedObject) -> None:

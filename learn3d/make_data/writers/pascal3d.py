@@ -7,7 +7,7 @@
 - `images_ref` uint8 [N, 224, 224, 4]: the part of the picture that the cube [-1, 1]^3 projects to, and the mask
 - `rotation_matrices` [N, 3, 3]: R v has x to the LEFT and y up, both in [-1, 1] across `images_ref`, and z away; rays
   are parallel. All are proper rotations (determinant 1), so the object frame is right-handed.
-- `voxels` [N, 32, 32, 32] in the axes of `conventions.PASCAL3D`; the grid spans [-1, 1]
+- `voxels` [N, 32, 32, 32] in the axes of `readers.pascal3d.PASCAL3D`; the grid spans [-1, 1]
 
 The object frame has x to the front, y up and z to the left as seen from the front, so that objects are symmetric
 about z = 0, as the symmetric generator wants it. Objects are scaled so that half the diagonal of their bounding box
@@ -24,9 +24,8 @@ import torch
 from PIL import Image
 
 import nmr
-from learn3d.data import conventions
 from learn3d.data.poses import RotationPoses
-from learn3d.data.readers.pascal3d import class_name
+from learn3d.data.readers.pascal3d import PASCAL3D, class_name
 from learn3d.make_data.viewpoints import uniform
 from learn3d.make_data.writers.pictures import photo_background
 from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer
@@ -46,7 +45,7 @@ class Pascal3dWriter(Writer):
     default_test = 0.0
     default_val = 0.2
     bytes_per_view = 4 * 224**2 + 3 * 300 * 400 + 32**3
-    convention = conventions.PASCAL3D
+    convention = PASCAL3D
     turn = WORLD_FROM_OBJECT
     objects_fill = "box centred at the origin, half its diagonal 1"
     card: ClassVar = {

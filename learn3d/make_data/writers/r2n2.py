@@ -22,9 +22,9 @@ import numpy as np
 from torch import Tensor
 from trimesh.voxel.runlength import dense_to_rle
 
-from learn3d.data import conventions
+from learn3d.data.categories import synset_of
 from learn3d.data.poses import LookAtPoses
-from learn3d.data.readers.kato import synset_of
+from learn3d.data.readers.r2n2 import R2N2
 from learn3d.make_data.viewpoints import uniform
 from learn3d.make_data.writers.pictures import write_png
 from learn3d.make_data.writers.writer import RenderedObject, Writer
@@ -44,7 +44,7 @@ class R2n2Writer(Writer):
     default_test = 1 - TRAIN_SHARE
     default_val = 0.0
     bytes_per_view = 4 * 137**2
-    convention = conventions.R2N2
+    convention = R2N2
     objects_fill = "box centred at the origin, its diagonal 1"
     card: ClassVar = {
         "images": "RGBA 137 x 137",

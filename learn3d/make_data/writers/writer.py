@@ -10,12 +10,11 @@ from typing import ClassVar
 import numpy as np
 from torch import Tensor
 
-from learn3d.data.conventions import VoxelConvention
+from learn3d.data.conventions import VoxelConvention, mesh_to_object
 from learn3d.data.poses import Poses
-from learn3d.data.readers import kato
 
 #: From the object frame to ShapeNet's coordinates (right-handed, y up, front x): [3, 3], determinant -1.
-WORLD_FROM_OBJECT = kato.mesh_to_object("y", "x").T
+WORLD_FROM_OBJECT = mesh_to_object("y", "x").T
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,7 +52,7 @@ def test_everything_wrong_with_katos_files(tmp_path):
     report = check_folder("kato", tmp_path, ["chair"])
     found = {s.split: [(p.severity, p.message) for p in s.problems] for s in report.splits}
     for split, severity, message in [
-        ("train", "error", "cannot read the images file"),
+        ("train", "error", "cannot be read"),
         ("train", "error", "must hold bool [N, 32, 32, 32] under the key 'arr_0', got bool [2, 16, 16, 16]"),
         ("val", "error", f"no {CHAIR}_val_voxels.npz"),
         ("test", "error", "holds 3 objects but"),

@@ -12,6 +12,7 @@ from PIL import Image
 from reader_checks import cut_short, expect, silhouette_iou
 from shapenet_files import CHAIR, COLOR, box_mesh, save, shapes, swap_frames, write_dvr
 
+from learn3d.data import conventions
 from learn3d.data.readers import dvr, kato
 
 LISTS = {"train": ["b1"], "val": ["c2"], "test": ["a0"]}
@@ -44,7 +45,9 @@ def test_images_and_cameras_are_those_of_katos_files(original):
     colors = dataset.images[:, :3].transpose(0, 2, 3, 1)
     np.testing.assert_array_equal(np.unique(colors[inside], axis=0), [[255 - c for c in COLOR]])
     assert not colors[~inside].any()
-    torch.testing.assert_close(dataset.poses.features(), kato.view_poses(torch.arange(24)).features(), rtol=0, atol=0)
+    torch.testing.assert_close(
+        dataset.poses.features(), conventions.view_poses(torch.arange(24)).features(), rtol=0, atol=0
+    )
     assert silhouette_iou(dataset, *mesh(1)).min() > 0.94
 
 
@@ -137,7 +140,7 @@ FAULTS = {
     ),
     "cameras.npz: is missing": lambda root: (root / "cameras.npz").unlink(),
     "cameras.npz: cannot be read": lambda root: cut_short(root / "cameras.npz"),
-    "is not an npz file (it is a single npy array)": lambda root: (root / "pointcloud.npz").write_bytes(npy_bytes()),
+    "not an npz file": lambda root: (root / "pointcloud.npz").write_bytes(npy_bytes()),
     "lacks world_mat_7 (1 of 24 matrices)": lambda root: change_cameras(root, lambda a: a.pop("world_mat_7")),
     "world_mat_2 has the shape [3, 3]": set_matrix(2, lambda m: m[:3, :3]),
     "cameras.npz: has numbers that are not finite": set_matrix(2, lambda m: m * np.nan),

@@ -142,7 +142,7 @@ def test_photos_are_turned_upright(tmp_path: Path) -> None:
     path = save(tmp_path / "a.jpg", np.rot90(colors).copy(), exif=exif, quality=100)
     got, _ = read_photo(path, save(tmp_path / "m.png", mask))
     assert got.shape == (8, 6, 3) and got[0].min() > 200 and got[4:].max() < 60
-    with pytest.raises(ValueError, match=r"mask .*m.png has 8x6 pixels, .*a.jpg has 6x8: it lies on its side"):
+    with pytest.raises(ValueError, match=r"lies on its side"):
         read_photo(path, save(tmp_path / "m.png", np.rot90(mask).copy()))
     with pytest.raises(ValueError, match=r"mask .*m.png has 3x3 pixels, .*a.jpg has 6x8$"):
         read_photo(path, save(tmp_path / "m.png", mask[:3, :3]))
@@ -150,7 +150,7 @@ def test_photos_are_turned_upright(tmp_path: Path) -> None:
 
 def test_unreadable_photos_are_named(tmp_path: Path) -> None:
     colors = np.full((8, 6, 3), 10, np.uint8)
-    with pytest.raises(FileNotFoundError, match=r"there is no image .*a.png"):
+    with pytest.raises(FileNotFoundError, match=r"a.png: is missing"):
         read_photo(tmp_path / "a.png")
     with pytest.raises(ValueError, match=r"a.png has no transparency and no mask: give a mask image"):
         read_photo(save(tmp_path / "a.png", colors))
@@ -168,15 +168,9 @@ def test_photos_of_more_than_8_bits_are_refused(tmp_path: Path, kind: type) -> N
     """Pillow cuts their values off at 255, which leaves all white."""
     path = save(tmp_path / "a.tif", np.full((8, 6), 30_000, kind))
     mask = save(tmp_path / "m.png", np.full((8, 6), 255, np.uint8))
-    with pytest.raises(ValueError, match=r"a.tif has more than 8 bits a pixel and channel \(.*\); save it with 8"):
+    with pytest.raises(ValueError, match=r"a.tif: has more than 8 bits a pixel and channel \(.*\); save it with 8"):
         read_photo(path, mask)
     assert read_photo(mask, save(tmp_path / "m.tif", np.full((8, 6), 65_535, np.uint16)))[1].min() == 255
-
-
-def test_huge_photos_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
-    with pytest.raises(ValueError, match=r"a.png: has too many pixels .*make it smaller"):
-        read_photo(save(tmp_path / "a.png", np.zeros((9, 9, 3), np.uint8)))
 
 
 def test_wrong_masks_are_told_apart() -> None:

@@ -13,8 +13,10 @@ from PIL import Image
 from reader_checks import cut_short, expect, silhouette_iou
 from shapenet_files import CHAIR, COLOR, box_mesh, save, shapes, swap_frames, write_kar
 
-from learn3d.data.conventions import KAR, KATO, R2N2
+from learn3d.data.conventions import KATO
 from learn3d.data.readers import kar
+from learn3d.data.readers.kar import KAR
+from learn3d.data.readers.r2n2 import R2N2
 from learn3d.data.view_bins import AngleBins
 from nmr.metrics import voxel_iou
 

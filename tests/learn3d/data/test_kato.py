@@ -11,8 +11,9 @@ import torch
 
 import nmr
 from learn3d.data.batch import Batch
+from learn3d.data.categories import synset_of
+from learn3d.data.conventions import KATO, mesh_to_object
 from learn3d.data.readers import kato
-from learn3d.data.readers.kato import mesh_to_object, synset_of, voxelize
 
 
 @pytest.fixture
@@ -64,7 +65,7 @@ def test_view_k_is_seen_from_azimuth_minus_15_k_degrees(tmp_path, arrays):
 def test_voxel_axes_are_y_x_minus_z():
     vertices, faces = nmr.icosphere(1)
     centre = torch.tensor([0.3, 0.1, -0.2])
-    occupied = voxelize(0.1 * vertices + centre, faces)[0].nonzero().float().mean(0)
+    occupied = KATO.voxelize(0.1 * vertices + centre, faces)[0].nonzero().float().mean(0)
     cell = (centre * 31 / 32 + 0.5) * 32 - 0.5  # cell index of the centre along x, y, z
     np.testing.assert_allclose(occupied.numpy(), [cell[1], cell[0], 31 - cell[2]], atol=0.6)
 
@@ -103,7 +104,7 @@ def test_missing_files_are_named_with_what_is_there(tmp_path, arrays):
     with pytest.raises(FileNotFoundError, match=r"03001627_train_images.npz.*the folder holds: chair test"):
         kato.load(tmp_path, "chair", "train")
     (tmp_path / "03001627_test_voxels.npz").unlink()
-    half = r"no 03001627_test_voxels.npz .*: the images are there \(03001627_test_images.npz\), but .* needs the voxels"
+    half = r"03001627_test_voxels.npz: .*: the images are there \(03001627_test_images.npz\), but .* needs the voxels"
     with pytest.raises(FileNotFoundError, match=half) as error:
         kato.load(tmp_path, "chair", "test")
     assert "the folder holds" not in str(error.value) and "make both again" in str(error.value)
@@ -146,12 +147,12 @@ def test_foreign_truncated_and_pickled_files(tmp_path, arrays):
     empty_zip = io.BytesIO()
     zipfile.ZipFile(empty_zip, "w").close()
     cases = [
-        (whole[: len(whole) // 2], "cannot read the images file"),
-        (bytes(damaged), "cannot read the images file"),
-        (b"<html>Not found</html>", "cannot read the images file"),
-        (b"", "cannot read the images file"),
+        (whole[: len(whole) // 2], "cannot be read"),
+        (bytes(damaged), "cannot be read"),
+        (b"<html>Not found</html>", "cannot be read"),
+        (b"", "cannot be read"),
         (pickled.getvalue(), "no pickled objects"),
-        (npy.getvalue(), "single npy array"),
+        (npy.getvalue(), "not an npz file"),
         (other_key.getvalue(), r"keys \['images'\]"),
         (empty_zip.getvalue(), r"keys \[\]|cannot read"),
     ]
@@ -159,16 +160,6 @@ def test_foreign_truncated_and_pickled_files(tmp_path, arrays):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=message):
             kato.load(tmp_path, "chair", "test")
-
-
-def test_too_little_memory_is_not_called_a_damaged_file(tmp_path, arrays, monkeypatch):
-    def fail(*_, **__):
-        raise MemoryError
-
-    write(tmp_path, *arrays)
-    monkeypatch.setattr(np, "empty", fail)
-    with pytest.raises(MemoryError):
-        kato.load(tmp_path, "chair", "test")
 
 
 def test_bad_indices(tmp_path, arrays):

@@ -325,12 +325,12 @@ def test_damaged_photos_are_named_with_their_row(chairs: Path) -> None:
     Image.new("L", (320, 240)).save(mask)
     refused(r"chair001_1.jpg: its mask is empty.* \(poses.csv, line 6\)")
     mask.unlink()
-    refused(r"chair001_1.jpg has no transparency and no mask.* \(poses.csv, line 6\)")
+    refused(r"chair001_1.jpg: has no transparency and no mask.* \(poses.csv, line 6\)")
     mask.write_bytes(kept)
     image.write_bytes(image.read_bytes()[:1000])
     refused(r"chair001_1.jpg: cannot be decoded as an image.* \(poses.csv, line 6\)")
     image.unlink()
-    refused(r"there is no image .*chair001_1.jpg \(poses.csv, line 6\)", FileNotFoundError)
+    refused(r"chair001_1.jpg: is missing.* \(poses.csv, line 6\)", FileNotFoundError)
     assert [name for name, _ in scan(chairs)] == ["chair001_1.jpg"]
 
 

@@ -11,8 +11,10 @@ from PIL import Image
 from reader_checks import cut_short, expect, silhouette_iou
 from shapenet_files import CHAIR, COLOR, binvox_bytes, box_mesh, save, shapes, swap_frames, write_r2n2
 
-from learn3d.data.conventions import KAR, KATO, R2N2
+from learn3d.data.conventions import KATO
 from learn3d.data.readers import r2n2
+from learn3d.data.readers.kar import KAR
+from learn3d.data.readers.r2n2 import R2N2
 from learn3d.data.view_bins import AngleBins
 from nmr.metrics import voxel_iou
 
@@ -114,8 +116,8 @@ FAULTS = {
     "rendering_metadata.txt: is missing": lambda f: (renders(f) / "rendering_metadata.txt").unlink(),
     "rendering_metadata.txt: has 23 rows, 24 are needed": rewrite_row(0, ""),
     "rendering_metadata.txt: row 0 has numbers that are not finite": rewrite_row(0, "inf 25 0 0.8 25"),
-    "row 1 has azimuth 10, elevation 27, yaw 10 and ratio 0.8": rewrite_row(1, "10 27 10 0.8 25"),
-    "row 1 has azimuth 10, elevation 27, yaw 0 and ratio -1": rewrite_row(1, "10 27 0 -1 25"),
+    "row 1 has the yaw 10": rewrite_row(1, "10 27 10 0.8 25"),
+    "row 1 has azimuth -10, elevation 27 and distance -1.75": rewrite_row(1, "10 27 0 -1 25"),
     "model.binvox: is missing": lambda f: grid(f).unlink(),
     "model.binvox: its runs fill": lambda f: cut_short(grid(f)),
     "rendering: is missing; expected the folder of an object's images": lambda f: shutil.rmtree(renders(f)),

@@ -12,8 +12,8 @@ import trimesh
 from lopsided_meshes import write_meshes
 
 import nmr
+from learn3d.data.conventions import mesh_to_object
 from learn3d.data.layouts import LAYOUTS, load_dataset
-from learn3d.data.readers.kato import mesh_to_object
 from learn3d.make_data.render import DatasetConfig, make_dataset
 
 SETTINGS = {

@@ -10,12 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from memory_checks import at_most
 from PIL import Image
 
 from learn3d.data.framing import read_photo
-from learn3d.data.readers.renderings import read_image
-from learn3d.files import limits
+from learn3d.files import limits, renderings, worker
 from learn3d.files.images import PHOTOGRAPHS, RENDERINGS, open_image
 
 
@@ -30,6 +28,10 @@ def png(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(body)
 
 
+def read_image(path: Path) -> object:
+    return worker.read(renderings.read_with_alpha, path, 64)
+
+
 def written(path: Path, content: bytes) -> Path:
     path.write_bytes(content)
     return path
@@ -39,15 +41,9 @@ def written(path: Path, content: bytes) -> Path:
 @pytest.mark.parametrize("size", [(60_000, 60_000), (10_001, 1), (1, 10_001), (9000, 9000), (2**31 - 1, 2**31 - 1)])
 def test_images_that_promise_too_many_pixels_are_not_decoded(tmp_path, size):
     path = written(tmp_path / "a.png", png(*size))
-    with at_most(2**20):
-        with pytest.raises(
-            ValueError, match=r"a\.png: (is \d+x\d+ pixels; at most|has too many pixels).*make it smaller"
-        ):
-            open_image(path, PHOTOGRAPHS, limits.IMAGE_SIDE)
-        with pytest.raises(ValueError, match="make it smaller"):
-            read_photo(path)
-        with pytest.raises(ValueError, match="make it smaller"):
-            read_image(path)
+    for read in (read_photo, read_image):
+        with pytest.raises(ValueError, match=r"a\.png: .*make it smaller"):
+            read(path)
 
 
 def test_renderings_may_be_smaller_than_photographs(tmp_path):
@@ -67,10 +63,10 @@ def test_decoders_of_other_formats_are_never_tried(tmp_path, kind):
             open_image(path, formats, 100)
 
 
-def test_large_files_and_pipes_are_not_opened(tmp_path, monkeypatch):
-    Image.new("L", (8, 8)).save(tmp_path / "a.png")
-    monkeypatch.setattr(limits, "IMAGE_FILE_BYTES", 10)
-    with pytest.raises(ValueError, match=r"a\.png: has \d+ bytes, and at most 10 are read"):
+def test_large_files_and_pipes_are_not_opened(tmp_path):
+    with open(tmp_path / "a.png", "wb") as file:
+        file.truncate(limits.IMAGE_FILE_BYTES + 1)
+    with pytest.raises(ValueError, match=r"a\.png: has \d+ bytes, and at most"):
         read_image(tmp_path / "a.png")
     if hasattr(os, "mkfifo"):
         os.mkfifo(tmp_path / "b.png")

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import time
 
-import numpy as np
 import pytest
 
 from learn3d.files import reading
-from learn3d.files.reading import check_file, parse_json, read_bytes, read_text, within
+from learn3d.files.reading import check_file, parse_json, read_bytes, read_text
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux only")
 
@@ -57,9 +54,8 @@ def test_json():
     assert parse_json("[" * 32 + "]" * 32)
     assert parse_json("[NaN, 1e999]", finite=False)[1] == float("inf")
     cases = {
-        "[" * 33 + "]" * 33: "nested more than 32 levels",
-        "[" * 1_000_000: "nested more than 32 levels",
-        '{"a":' * 100_000: "nested more than 32 levels",
+        "[" * 1_000_000: "nested too deeply",
+        '{"a":' * 100_000: "nested too deeply",
         "[NaN]": "NaN is no number of JSON",
         "[-Infinity]": "-Infinity is no number of JSON",
         "1e999": "1e999 is too large a number",
@@ -71,35 +67,3 @@ def test_json():
             parse_json(text)
     with pytest.raises(ValueError, match="utf-8"):
         parse_json(b'"\xff"')
-
-
-def test_a_block_is_stopped_in_time_whatever_it_swallows():
-    def stubborn() -> None:
-        while True:
-            try:
-                time.sleep(0.01)
-            except BaseException:  # as some parsers do, once
-                time.sleep(0.01)
-                raise
-
-    before = signal.getsignal(signal.SIGALRM)
-    with pytest.raises(ValueError, match=r"stopped after 0\.2 seconds"), within(0.2, 2**40):
-        stubborn()
-    assert signal.getsignal(signal.SIGALRM) is before and signal.getitimer(signal.ITIMER_REAL) == (0, 0)
-    with within(5, 2**40):
-        pass
-    with pytest.raises(KeyError), within(5, 2**40):
-        raise KeyError("its own errors pass")
-    assert signal.getitimer(signal.ITIMER_REAL) == (0, 0)
-
-
-@linux
-def test_a_block_is_stopped_before_it_takes_too_much_memory():
-    import resource
-
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    with pytest.raises(ValueError, match=r"takes more memory than 0\.25 GiB"), within(5, 2**28):
-        np.ones(2**30)
-    assert resource.getrlimit(resource.RLIMIT_AS) == before
-    with within(5, 2**40):
-        assert len(np.ones(2**20)) == 2**20

@@ -16,8 +16,9 @@ import trimesh
 
 import nmr
 from learn3d.commands import main
+from learn3d.data import conventions
+from learn3d.data.conventions import mesh_to_object
 from learn3d.data.readers import kato
-from learn3d.data.readers.kato import mesh_to_object
 from learn3d.make_data import meshes, render
 from learn3d.make_data.contact_sheet import draw_sheet, make_row
 from learn3d.make_data.render import DatasetConfig, make_dataset, split_objects
@@ -47,7 +48,9 @@ def load(folder, category, split):
     """What the reader makes of the files, views sorted by object."""
     dataset = kato.load(folder, category, split)
     images = dataset.images.reshape(-1, 24, 4, 64, 64)
-    return SimpleNamespace(images=images, voxels=dataset.voxels, voxelize=dataset.voxelize, cameras=kato.view_cameras)
+    return SimpleNamespace(
+        images=images, voxels=dataset.voxels, voxelize=dataset.voxelize, cameras=conventions.view_cameras
+    )
 
 
 def placed(mesh, up="y", front="x"):

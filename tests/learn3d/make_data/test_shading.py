@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import nmr
+from learn3d.data.conventions import view_cameras
 from learn3d.data.poses import RotationPoses
-from learn3d.data.readers.kato import view_cameras
 from learn3d.make_data.shading import BACK_LIGHT, shade_mesh
 
 WHITE = np.ones(3, dtype=np.float32)

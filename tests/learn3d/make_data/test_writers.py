@@ -21,8 +21,9 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 import nmr
-from learn3d.data import conventions
-from learn3d.data.readers.kato import mesh_to_object
+from learn3d.data.conventions import mesh_to_object
+from learn3d.data.readers.kar import KAR
+from learn3d.data.readers.pascal3d import PASCAL3D
 from learn3d.make_data.writers import RenderedObject
 from learn3d.make_data.writers.r2n2 import binvox_bytes
 
@@ -113,7 +114,7 @@ def test_kar(tmp_path, folder):
     for name in splits["test"] + splits["val"]:
         vertices, faces = true_mesh(folder, name)
         volume = loadmat(tmp_path / "voxels" / "modelVoxels32" / SYNSET / f"{name}.mat")["Volume"] > 0
-        wanted = conventions.KAR.voxelize(in_object_frame(vertices), faces)[0].numpy()
+        wanted = KAR.voxelize(in_object_frame(vertices), faces)[0].numpy()
         np.testing.assert_array_equal(volume, wanted)
         x, y, z = in_object_frame(vertices).T
         assert_oriented(volume, torch.stack([-z, y, x], dim=1), faces, span=1)
@@ -235,7 +236,7 @@ def test_pascal3d(tmp_path, folder):
     vertices, faces = true_mesh(folder, card["splits"]["val"][0].replace(" ", "_"))
     vertices = vertices * (2 / torch.linalg.vector_norm(vertices.amax(0) - vertices.amin(0)))
     assert torch.linalg.vector_norm(vertices, dim=1).max() <= 1 + 1e-6  # inside under any rotation
-    wanted = conventions.PASCAL3D.voxelize(vertices.float(), faces)[0].numpy()
+    wanted = PASCAL3D.voxelize(vertices.float(), faces)[0].numpy()
     for k in range(3):
         np.testing.assert_array_equal(val["voxels"][k], wanted)
         rotation = val["rotation_matrices"][k].astype(np.float64)

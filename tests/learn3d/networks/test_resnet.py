@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -182,25 +181,20 @@ def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     refused(weights | {"bn1.bias": beyond}, "w.pth: bn1.bias has values that are not finite")
     refused(weights | {5: torch.ones(1)}, r"w.pth must hold a state dict \(names -> tensors\), got ")
     refused([1, 2], r"w.pth must hold a state dict \(names -> tensors\), got list")
-    refused(weights | {"bn1.bias": Runs()}, "cannot read pretrained weights from .*w.pth: Weights only load failed")
+    refused(weights | {"bn1.bias": Runs()}, "w.pth: cannot be read .*Weights only load failed")
     assert not Path("ran").exists()
     path.write_bytes(b"no weights")
-    with pytest.raises(ValueError, match=r"cannot read pretrained weights from .*w.pth"):
+    with pytest.raises(ValueError, match="w.pth: cannot be read"):
         load_pretrained(encoder, path)
     (tmp_path / "w.safetensors").write_bytes(b"no weights")
-    with pytest.raises(ValueError, match=r"cannot read pretrained weights from .*w.safetensors"):
+    with pytest.raises(ValueError, match="w.safetensors: cannot be read"):
         load_pretrained(encoder, tmp_path / "w.safetensors")
-    with pytest.raises(FileNotFoundError, match=r"there is no file of pretrained weights .*none.pth"):
+    with pytest.raises(FileNotFoundError, match="none.pth: is missing"):
         load_pretrained(encoder, tmp_path / "none.pth")
 
 
-def test_weights_beyond_the_limits_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, encoder = tmp_path / "w.pth", ResNet18Encoder()
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:  # torch.save compresses nothing
-        archive.writestr("w/data.pkl", bytes(100_000_000))
-    monkeypatch.setattr(limits, "WEIGHTS_BYTES", 10_000_000)
-    with pytest.raises(ValueError, match=r"w\.pth: it would unpack to 100000000 bytes; at most 10000000 are read"):
-        load_pretrained(encoder, path)
-    torch.save(torch.zeros(3_000_000), path)
-    with pytest.raises(ValueError, match=r"w\.pth: has 12\d+ bytes, and at most 10000000 are read"):
-        load_pretrained(encoder, path)
+def test_weights_beyond_the_limits_are_not_read(tmp_path: Path) -> None:
+    with open(tmp_path / "w.pth", "wb") as file:
+        file.truncate(limits.WEIGHTS_BYTES + 1)
+    with pytest.raises(ValueError, match=r"w\.pth: has \d+ bytes, and at most"):
+        load_pretrained(ResNet18Encoder(), tmp_path / "w.pth")

@@ -1,13 +1,11 @@
-"""What the readers of folders share."""
-
-import threading
-import time
+"""Renderings: smaller, over white, with or without transparency."""
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from learn3d.data.readers.renderings import map_objects, read_image, shrink, split_alpha
+from learn3d.files.images import RENDERINGS, open_image
+from learn3d.files.renderings import shrink, split_alpha
 
 
 def test_shrinking_takes_the_mean_over_each_pixels_area():
@@ -39,7 +37,7 @@ def test_transparent_pixels_become_white(tmp_path, mode):
         image.info["transparency"] = image.getpixel((0, 0))
     image = image.convert(mode) if mode == "LA" else image
     image.save(tmp_path / "image.png", transparency=image.info.get("transparency"))
-    image = read_image(tmp_path / "image.png")
+    image = open_image(tmp_path / "image.png", RENDERINGS, 64)
     assert image.mode == mode
     color, alpha = split_alpha(image)
     assert color[1, 2].tolist() == [90] * 3 and color[0, 0].tolist() == [255] * 3
@@ -49,21 +47,5 @@ def test_transparent_pixels_become_white(tmp_path, mode):
 @pytest.mark.parametrize("mode", ["1", "L", "P", "RGB"])
 def test_images_without_transparency_have_no_alpha(tmp_path, mode):
     Image.fromarray(np.full((4, 4), 255, np.uint8)).convert(mode).save(tmp_path / "image.png")
-    color, alpha = split_alpha(read_image(tmp_path / "image.png"))
+    color, alpha = split_alpha(open_image(tmp_path / "image.png", RENDERINGS, 64))
     assert alpha is None and color.shape == (4, 4, 3) and (color == 255).all()
-
-
-def test_objects_keep_their_order_and_an_exception_stops_the_others():
-    assert list(map_objects(lambda i: time.sleep(0.001 * (i % 3)) or i, range(50), "test", False)) == list(range(50))
-    done, lock = [], threading.Lock()
-
-    def work(i):
-        time.sleep(0.002)
-        if i == 3:
-            raise ValueError("bad object")
-        with lock:
-            done.append(i)
-
-    with pytest.raises(ValueError, match="bad object"):
-        list(map_objects(work, range(2000), "test", False))
-    assert len(done) < 1500

@@ -1,4 +1,4 @@
-"""Voxel grids in the binvox format: a text header, then runs of (value, count) bytes."""
+"""Voxel grids out of MATLAB's and binvox's files: functions for worker processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,18 @@ from learn3d.files import limits
 from learn3d.files.findings import AGAIN, DamagedFile
 from learn3d.files.reading import read_bytes
 
-_WANTED = "a binvox file: '#binvox 1', the lines dim, translate, scale and data, then pairs of bytes"
+
+def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
+    """The array `name` of numbers [size, size, size] of a MATLAB file (version 5 to 7) as bool: where it is not 0."""
+    import scipy.io
+
+    wanted = f"a MATLAB file with the array {name!r} [{size}, {size}, {size}]"
+    read_bytes(path, limits.VOLUME_BYTES, wanted)
+    volume = scipy.io.loadmat(path, variable_names=[name]).get(name)
+    if not isinstance(volume, np.ndarray) or volume.dtype.kind not in "buif" or volume.shape != (size,) * 3:
+        found = f"{volume.dtype} {list(volume.shape)}" if isinstance(volume, np.ndarray) else "no such array of numbers"
+        raise DamagedFile(path, f"has {found}; expected {wanted}")
+    return volume != 0
 
 
 class Binvox(NamedTuple):
@@ -23,11 +34,11 @@ class Binvox(NamedTuple):
 
 
 def read_binvox(path: Path, size: int) -> Binvox:
-    """Read a grid of size^3 cells. The file keeps y fastest, then z, then x. Raises DamagedFile, MissingFile."""
-    content = read_bytes(path, limits.VOLUME_BYTES, "a voxel grid in the binvox format")
+    """A grid of size^3 cells: a text header, then runs of (value, count) bytes with y fastest, then z, then x."""
+    wanted = "a binvox file: '#binvox 1', the lines dim, translate, scale and data, then pairs of bytes"
+    content = read_bytes(path, limits.VOLUME_BYTES, wanted)
     head, found, runs = content.partition(b"\ndata\n")
-    lines = [line.split() for line in head.split(b"\n")]
-    header = {line[0]: line[1:] for line in lines if line}
+    header = {line.split()[0]: line.split()[1:] for line in head.split(b"\n") if line.strip()}
     try:
         dim = [int(word) for word in header[b"dim"]]
         translate = np.array([float(word) for word in header[b"translate"]])
@@ -35,17 +46,14 @@ def read_binvox(path: Path, size: int) -> Binvox:
     except (KeyError, ValueError):
         found = b""
     if not found or not content.startswith(b"#binvox"):
-        raise DamagedFile(path, f"has no such header; expected {_WANTED}. {AGAIN}")
+        raise DamagedFile(path, f"has no such header; expected {wanted}. {AGAIN}")
     if dim != [size] * 3:
         raise DamagedFile(path, f"holds {'x'.join(map(str, dim))} cells; expected {size}x{size}x{size}")
     low, high = limits.DISTANCE
     if translate.shape != (3,) or not (np.abs(translate) <= high).all() or not low <= scale <= high:
-        raise DamagedFile(
-            path, f"has translate {translate} and scale {scale}; expected three numbers and one of {low:g} .. {high:g}"
-        )
+        raise DamagedFile(path, f"has translate {translate} and scale {scale}; expected {low:g} .. {high:g}")
     pairs = np.frombuffer(runs[: len(runs) // 2 * 2], np.uint8).reshape(-1, 2)
-    total = int(pairs[:, 1].sum(dtype=np.int64))
-    if total != size**3:
+    if (total := int(pairs[:, 1].sum(dtype=np.int64))) != size**3:
         raise DamagedFile(path, f"its runs fill {total} cells; expected {size**3}. {AGAIN}")
     grid = np.repeat(pairs[:, 0] != 0, pairs[:, 1]).reshape(size, size, size)  # axes x, z, y
     return Binvox(np.ascontiguousarray(grid.transpose(0, 2, 1)), translate, scale)

@@ -1,0 +1,142 @@
+"""Renderings and tables of cameras of one object: functions for worker processes.
+
+A view comes back as the network's image, uint8 [4, size, size], the mask to be matched, uint8 [64, 64], and the
+brightest value of its mask at full size, which tells an empty one.
+"""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from learn3d.files import limits
+from learn3d.files.findings import AGAIN, DamagedFile, MissingFile
+from learn3d.files.images import RENDERINGS, open_image
+from learn3d.files.reading import read_text
+
+MASK_SIZE = 64
+View = tuple[np.ndarray, np.ndarray, int]
+
+
+def read_with_alpha(path: Path, size: int) -> View:
+    """A rendering whose mask is its alpha channel, colours over white."""
+    image = _read_square(path, size)
+    color, alpha = split_alpha(image)
+    if alpha is None:
+        raise DamagedFile(path, f"has the channels {image.mode}; expected RGBA, whose alpha is the mask")
+    return _shrunk(color, alpha, size)
+
+
+def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
+    """A rendering whose mask is where its depth is below 250 in 8 bits; without a depth file, its alpha channel."""
+    image = _read_square(path, size)
+    color, mask = split_alpha(image)
+    if depth_path.exists():
+        depth = open_image(depth_path, RENDERINGS, limits.RENDER_SIDE)
+        if depth.size != image.size:
+            sizes = [f"{i.width}x{i.height} pixels" for i in (depth, image)]
+            raise DamagedFile(depth_path, f"is {sizes[0]}, but {path.name} is {sizes[1]}")
+        mask = np.where(_grey(depth_path, depth) < 250, 255, 0).astype(np.uint8)
+    elif mask is None:
+        raise MissingFile(depth_path, f"is missing, and {path.name} has no alpha channel; expected the depth image")
+    return _shrunk(color, mask, size)
+
+
+def read_exactly(path: Path, size: int) -> np.ndarray:
+    """An image of exactly this size, colours over white, uint8 [size, size, 3]."""
+    image = open_image(path, RENDERINGS, limits.RENDER_SIDE)
+    if image.size != (size, size) or image.mode.startswith(("I", "F")):
+        found = f"{image.width}x{image.height} pixels of the format {image.mode}"
+        raise DamagedFile(path, f"is {found}; expected {size}x{size} of 8 bits")
+    return split_alpha(image)[0]
+
+
+def _read_square(path: Path, size: int) -> Image.Image:
+    image, least = open_image(path, RENDERINGS, limits.RENDER_SIDE), max(size, MASK_SIZE)
+    if image.width != image.height or image.width < least:
+        found = f"{image.width}x{image.height} pixels"
+        raise DamagedFile(path, f"is {found}; expected a square image of at least {least}x{least}")
+    if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
+        raise DamagedFile(path, f"has the pixel format {image.mode}; expected 8-bit grey, RGB or RGBA")
+    return image
+
+
+def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
+    """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None where there is none."""
+    if image.mode == "P":
+        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+    if image.mode not in ("RGBA", "LA", "PA"):
+        return np.asarray(image.convert("RGB")), None
+    image = image.convert("RGBA")
+    alpha = image.getchannel("A")
+    white = Image.new("RGB", image.size, (255, 255, 255))
+    white.paste(image, mask=alpha)
+    return np.asarray(white), np.asarray(alpha)
+
+
+def _grey(path: Path, depth: Image.Image) -> np.ndarray:
+    """Depth in 8 bits: the high byte of 16, the luminance of colours."""
+    if depth.mode.startswith("I"):
+        values = np.asarray(depth)
+        if values.min() < 0 or values.max() > 65535:
+            raise DamagedFile(path, f"has values {values.min()} .. {values.max()}; expected 8 or 16 bits")
+        return values >> 8
+    if depth.mode == "F":
+        raise DamagedFile(path, "holds floating-point numbers; expected 8 or 16 bits")
+    return np.asarray(depth.convert("L"))
+
+
+def _shrunk(color: np.ndarray, mask: np.ndarray, size: int) -> View:
+    return *shrink(color, mask, size), int(mask.max())
+
+
+def shrink(color: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """An image uint8 [4, size, size] and a mask uint8 [64, 64] of colours uint8 [S, S, 3] and a mask uint8 [S, S].
+
+    Each pixel becomes the mean over its area of the original; fractions of original pixels count as such.
+    """
+    planes = np.concatenate([color.transpose(2, 0, 1), mask[None]])
+    image = _shrink(planes, size)
+    return image, image[3] if size == MASK_SIZE else _shrink(planes[3], MASK_SIZE)
+
+
+def _shrink(planes: np.ndarray, size: int) -> np.ndarray:
+    if planes.shape[-1] == size:
+        return planes
+    weights = _area_weights(planes.shape[-1], size)
+    return np.rint(weights @ planes.astype(np.float32) @ weights.T).astype(np.uint8)
+
+
+@functools.cache
+def _area_weights(source: int, size: int) -> np.ndarray:
+    """Share of each of `source` pixels in each of `size` larger ones, float32 [size, source]; rows sum to 1."""
+    edges = np.arange(size + 1) * (source / size)
+    pixels = np.arange(source)
+    overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
+    return (overlap.clip(0) * (size / source)).astype(np.float32)
+
+
+def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
+    """The first `rows` rows of a table of numbers in a text file, float64 [rows, columns], all finite."""
+    text = read_text(path, limits.TABLE_BYTES, wanted)
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    if len(lines) < rows:
+        raise DamagedFile(path, f"has {len(lines)} rows, {rows} are needed; expected {wanted}. {AGAIN}")
+    table = np.empty((rows, columns))
+    for k, line in enumerate(lines[:rows]):
+        try:
+            table[k] = [float(word) for word in line[:columns]]
+        except ValueError:
+            raise DamagedFile(path, f"row {k} is {' '.join(line)!r}; expected {wanted}") from None
+        if not np.isfinite(table[k]).all():
+            raise DamagedFile(path, f"row {k} has numbers that are not finite; expected {wanted}")
+    return table
+
+
+def check_folder(path: Path, wanted: str) -> None:
+    """Raise MissingFile where there is no such folder."""
+    if not path.is_dir():
+        raise MissingFile(path, f"is missing; expected {wanted}")

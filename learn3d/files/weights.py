@@ -1,0 +1,42 @@
+"""Pretrained weights that somebody else may have made: a function for worker processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from learn3d.files import child, limits
+from learn3d.files.findings import DamagedFile
+from learn3d.files.reading import check_file
+
+MEMORY = 2**30  # bytes that importing torch may add, beside four times the file's size
+SECONDS = 30.0
+
+
+def read_state_dict(path: Path) -> dict[str, np.ndarray]:
+    """The tensors of a state dict (.safetensors, or what torch.save writes), floating-point ones as float32 or float64.
+
+    Nothing in the file is executed (weights_only). Raises DamagedFile for what is no state dict of plain numbers.
+    """
+    child.allow(4 * check_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18"))
+    import torch
+
+    if path.suffix == ".safetensors":
+        from safetensors.torch import load_file
+
+        weights = load_file(path)
+    else:
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    if not isinstance(weights, dict) or not all(
+        isinstance(name, str) and isinstance(value, torch.Tensor) for name, value in weights.items()
+    ):
+        raise DamagedFile(path, f"must hold a state dict (names -> tensors), got {type(weights).__name__}")
+    arrays = {}
+    for name, value in weights.items():
+        real = value.dtype in (torch.float32, torch.float64, torch.float16, torch.bfloat16)
+        if not (real or value.dtype in (torch.int64, torch.int32)) or value.layout != torch.strided or value.is_meta:
+            kind = f"{value.dtype}, {value.layout}, on {value.device}"
+            raise DamagedFile(path, f"{name} must be plain numbers such as torch.float32, got {kind}")
+        arrays[name] = (value.float() if real and value.dtype != torch.float64 else value).detach().numpy()
+    return arrays
