@@ -29,7 +29,8 @@ def open_image(path: Path, formats: Sequence[str], most_side: int) -> Image.Imag
     try:
         image = Image.open(path, formats=formats)
     except UnidentifiedImageError:
-        raise DamagedFile(path, f"cannot be decoded as an image of the kind {', '.join(formats)}. {AGAIN}") from None
+        hint = "Convert HEIC to JPEG" if path.suffix.lower() in (".heic", ".heif") else AGAIN
+        raise DamagedFile(path, f"cannot be decoded as an image of the kind {', '.join(formats)}. {hint}") from None
     except Image.DecompressionBombError as error:
         raise DamagedFile(path, f"has too many pixels ({error}): make it smaller") from None
     with image:

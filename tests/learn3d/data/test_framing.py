@@ -144,7 +144,7 @@ def test_photos_are_turned_upright(tmp_path: Path) -> None:
     assert got.shape == (8, 6, 3) and got[0].min() > 200 and got[4:].max() < 60
     with pytest.raises(ValueError, match=r"lies on its side"):
         read_photo(path, save(tmp_path / "m.png", np.rot90(mask).copy()))
-    with pytest.raises(ValueError, match=r"mask .*m.png has 3x3 pixels, .*a.jpg has 6x8$"):
+    with pytest.raises(ValueError, match=r"mask .*m.png has 3x3$"):
         read_photo(path, save(tmp_path / "m.png", mask[:3, :3]))
 
 
@@ -152,10 +152,10 @@ def test_unreadable_photos_are_named(tmp_path: Path) -> None:
     colors = np.full((8, 6, 3), 10, np.uint8)
     with pytest.raises(FileNotFoundError, match=r"a.png: is missing"):
         read_photo(tmp_path / "a.png")
-    with pytest.raises(ValueError, match=r"a.png has no transparency and no mask: give a mask image"):
+    with pytest.raises(ValueError, match=r"a.png: has no transparency and no mask: give a mask image"):
         read_photo(save(tmp_path / "a.png", colors))
     (tmp_path / "b.heic").write_bytes(b"\0\0\0\x18ftypheic")
-    with pytest.raises(ValueError, match=r"b.heic is no image that can be read here; JPEG and PNG can, HEIC cannot"):
+    with pytest.raises(ValueError, match=r"b.heic: .*Convert HEIC to JPEG"):
         read_photo(tmp_path / "b.heic")
     content = save(tmp_path / "c.png", np.random.default_rng(0).integers(0, 256, (90, 90, 3), np.uint8)).read_bytes()
     (tmp_path / "c.png").write_bytes(content[: len(content) // 2])

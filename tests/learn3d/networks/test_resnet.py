@@ -179,17 +179,17 @@ def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         refused(weights | {"bn1.bias": odd}, "w.pth: bn1.bias must be plain numbers such as torch.float32, got ")
     beyond = torch.full((64,), 1e300, dtype=torch.float64)
     refused(weights | {"bn1.bias": beyond}, "w.pth: bn1.bias has values that are not finite")
-    refused(weights | {5: torch.ones(1)}, r"w.pth must hold a state dict \(names -> tensors\), got ")
-    refused([1, 2], r"w.pth must hold a state dict \(names -> tensors\), got list")
+    refused(weights | {5: torch.ones(1)}, r"w.pth: must hold a state dict \(names -> tensors\), got ")
+    refused([1, 2], r"w.pth: must hold a state dict \(names -> tensors\), got list")
     refused(weights | {"bn1.bias": Runs()}, "w.pth: cannot be read .*Weights only load failed")
     assert not Path("ran").exists()
     path.write_bytes(b"no weights")
-    with pytest.raises(ValueError, match="w.pth: cannot be read"):
+    with pytest.raises(ValueError, match=r"w.pth: cannot be read"):
         load_pretrained(encoder, path)
     (tmp_path / "w.safetensors").write_bytes(b"no weights")
-    with pytest.raises(ValueError, match="w.safetensors: cannot be read"):
+    with pytest.raises(ValueError, match=r"w.safetensors: cannot be read"):
         load_pretrained(encoder, tmp_path / "w.safetensors")
-    with pytest.raises(FileNotFoundError, match="none.pth: is missing"):
+    with pytest.raises(FileNotFoundError, match=r"none.pth: is missing"):
         load_pretrained(encoder, tmp_path / "none.pth")
 
 
