@@ -15,12 +15,12 @@ longest side of the bounding box; its corner and side, in ShapeNet's coordinates
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 from torch import Tensor
-from trimesh.voxel.runlength import dense_to_rle
 
 from learn3d.data.categories import synset_of
 from learn3d.data.poses import LookAtPoses
@@ -110,7 +110,11 @@ def binvox_bytes(voxels: np.ndarray, translate: list[float], scale: float) -> by
     """A binvox file of a grid bool [D, D, D] with axes x, y, z: y runs fastest, then z, then x; runs of up to 255."""
     size, corner = " ".join(map(str, voxels.shape)), " ".join(f"{value:.9g}" for value in translate)
     header = f"#binvox 1\ndim {size}\ntranslate {corner}\nscale {scale:.9g}\ndata\n"
-    return header.encode() + dense_to_rle(voxels.transpose(0, 2, 1).reshape(-1), dtype=np.uint8).tobytes()
+    runs = bytearray()
+    for cell, run in itertools.groupby(voxels.transpose(0, 2, 1).reshape(-1).tolist()):
+        full, rest = divmod(len(list(run)), 255)
+        runs += bytes([cell, 255]) * full + (bytes([cell, rest]) if rest else b"")
+    return header.encode() + bytes(runs)
 
 
 def _longest_side(vertices: Tensor) -> float:
