@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import pytest
 import torch
 from torch import nn
 
+from learn3d.methods import vpl
 from learn3d.networks import ENCODERS, GENERATORS, Symmetry
 from learn3d.networks.encoders import CODE_SIZE, SmallConvEncoder
 from learn3d.networks.generators import SmallSphereGenerator
 from learn3d.networks.layers import linear_layers
+from learn3d.networks.preact_resnet import PreactResNet18
 
 
 class TinyEncoder(SmallConvEncoder):
@@ -27,7 +32,13 @@ class TinyGenerator(SmallSphereGenerator):
                 parameter.mul_(0.1)  # nearly a sphere, whatever the codes are
 
 
-def put_in_place() -> None:
-    """Let the names conv-small and sphere-small mean these, in this process."""
-    ENCODERS["conv-small"] = TinyEncoder
-    GENERATORS["sphere-small"] = TinyGenerator
+def put_in_place(patch: pytest.MonkeyPatch | None = None) -> None:
+    """Let the names conv, conv-small and sphere-small mean these, and preact-resnet18 be narrow.
+
+    Until `patch` is undone, or as long as this process lives.
+    """
+    patch = patch or pytest.MonkeyPatch()
+    patch.setitem(ENCODERS, "conv", TinyEncoder)
+    patch.setitem(ENCODERS, "conv-small", TinyEncoder)
+    patch.setitem(GENERATORS, "sphere-small", TinyGenerator)
+    patch.setattr(vpl, "PreactResNet18", partial(PreactResNet18, channels=4))

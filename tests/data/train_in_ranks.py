@@ -14,12 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
+import tiny_networks
 import torch
 
 import nmr
 from learn3d.config import config_from_dict
 from learn3d.evaluation import Evaluation, evaluate
-from learn3d.methods import pose_invariant, prgan, vpl
+from learn3d.methods import method, prgan, vpl
 from learn3d.parallel.launch import start
 from learn3d.parallel.ranks import ALONE, Ranks
 from learn3d.runs import checkpoint
@@ -39,7 +40,7 @@ def linear_optimizer() -> Iterator[None]:
         return torch.optim.Adam([p for p in network.parameters() if p.requires_grad], lr=3e-3 * eps, eps=eps)
 
     with contextlib.ExitStack() as stack:
-        for module in (pose_invariant, prgan, vpl):
+        for module in (method, prgan, vpl):
             stack.enter_context(mock.patch.object(module, "adam", linear))
         yield
 
@@ -80,6 +81,7 @@ def run(task: dict, ranks: Ranks) -> None:
 
 
 def main() -> None:
+    tiny_networks.put_in_place()
     tasks = json.loads(Path(sys.argv[1]).read_text())
     with start(tasks[0]["config"]["device"]) as ranks:
         for task in tasks:

@@ -19,6 +19,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+import tiny_networks
 import torch
 from safetensors.torch import load_file
 from train_in_ranks import evaluate_last, linear_optimizer
@@ -34,8 +35,9 @@ from learn3d.training import train
 TASKS = Path(__file__).parents[2] / "data" / "train_in_ranks.py"
 TRAIN = Path(__file__).parents[3] / "tools" / "train.py"
 SMALL = {"encoder": "conv-small", "generator": "sphere-small"}
-VPL = {"discriminator_channels": 4}
+VPL = {"discriminator_channels": 4, "generator": "sphere-small"}
 PATCH = {"image_size": 64, "silhouette_size": 64, "discriminator_channels": 4, "layout": "kato"}
+PATCH |= {"generator": "sphere-small", "symmetry": 45.0}
 PRGAN = {"generator_channels": (4, 4, 2, 1), "discriminator_channels": (4, 8, 8, 8), "encoder_from_step": 3}
 
 #: Runs of 4 steps by name: options, and the tolerances of weights and of losses.
@@ -222,8 +224,9 @@ def start_processes(*command: object, world: int = 2) -> Processes:
 def runs(tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable[..., TrainConfig]) -> Iterator[Path]:
     """Folder of one/<name> and two/<name>: the same runs in one and in two processes, which take one start."""
     root = tmp_path_factory.mktemp("ranks")
-    threads = torch.get_num_threads()
+    threads, patch = torch.get_num_threads(), pytest.MonkeyPatch()
     torch.set_num_threads(1)
+    tiny_networks.put_in_place(patch)
 
     def config(place: str, **options: object) -> TrainConfig:
         return tiny_config(root / place, max_val_images=24, **options)
@@ -249,6 +252,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable[..., Tr
         train(config("two/two-then-one", **plain), resume=True)
     torch.set_num_threads(threads)
     yield root
+    patch.undo()
     shutil.rmtree(root)
 
 
