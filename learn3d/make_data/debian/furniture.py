@@ -99,7 +99,7 @@ def furniture_models(
     """Models of every catalogue of a package, by catalogue and entry number; None for an entry of no wanted category.
 
     The package's copyright file goes to the folder `licences`.
-    Raises ValueError for a catalogue that is damaged, or with a member that points outside of it.
+    Raises ValueError for a catalogue that is damaged.
     """
     for path, content in sorted(read_package(package, (".sh3f",), licences)):
         catalogue = PurePosixPath(path).name
@@ -148,6 +148,8 @@ def _member(archive: zipfile.ZipFile, path: str) -> str:
         info = archive.getinfo(path)
         if info.file_size > limits.CATALOGUE_MEMBER_BYTES:
             raise ValueError(f"{info.file_size} bytes; at most {limits.CATALOGUE_MEMBER_BYTES} are read")
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ValueError(f"compressed with method {info.compress_type}; only deflate is read")
         return archive.read(info).decode("latin-1")
     except (KeyError, ValueError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise ValueError(f"{path} cannot be read from the catalogue ({error})") from error

@@ -6,6 +6,7 @@ import io
 import os
 import subprocess
 import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -19,21 +20,27 @@ from learn3d.make_data.debian import packages
 
 def test_members_that_point_outside_write_nothing_there(debs: Path, tmp_path: Path):
     notice = "../../../../usr/share/doc/sweethome3d-furniture/copyright"
-    sh3f = catalogue([entry("Chair", "chair")], {"m/chair.obj": CHAIR})
+    sh3f = catalogue([entry("Chair", "chair")], {"m/chair.obj": CHAIR, "../../evil.obj": CHAIR})
     deb(debs, "sweethome3d-furniture", {notice: b"licence", "/usr/../../evil.sh3f": sh3f})
     report = fetch(tmp_path / "out", debs, category="chair")
     assert [model.source for model in report.models] == ["evil.sh3f!/m/chair.obj"]
     assert (tmp_path / "out/licences/sweethome3d-furniture.copyright").read_bytes() == b"licence"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["debs", "out"]
-    deb(debs, "sweethome3d-furniture", {"usr/Test.sh3f": catalogue([], {"m/../../evil.obj": CHAIR})})
-    with pytest.raises(ValueError, match=r"Test\.sh3f is refused"):
-        fetch(tmp_path / "out", debs, overwrite=True)
 
 
 def test_oversized_models_are_left_out(debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(limits, "CATALOGUE_MEMBER_BYTES", len(CHAIR) - 1)
     reasons = [drop.reason for drop in fetch(tmp_path / "out", debs, category="chair").dropped]
     assert len(reasons) == 3 and all("at most" in reason for reason in reasons)
+
+
+def test_models_that_are_not_deflated_are_left_out(debs: Path, tmp_path: Path):
+    content = io.BytesIO(catalogue([entry("Chair", "chair")], {}))
+    with zipfile.ZipFile(content, "a", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("m/chair.obj", CHAIR)
+    deb(debs, "sweethome3d-furniture", {"usr/Test.sh3f": content.getvalue()})
+    (dropped,) = fetch(tmp_path / "out", debs, category="chair").dropped
+    assert "only deflate is read" in dropped.reason
 
 
 @pytest.mark.parametrize("content", [b"", b"!<arch>\n", None])
