@@ -18,6 +18,7 @@ import tiny_networks
 import torch
 
 import nmr
+from learn3d import validation
 from learn3d.config import config_from_dict
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.methods import method, prgan, vpl
@@ -82,6 +83,7 @@ def run(task: dict, ranks: Ranks) -> None:
 
 def main() -> None:
     tiny_networks.put_in_place()
+    validation.PICTURE_ROWS = 1
     tasks = json.loads(Path(sys.argv[1]).read_text())
     with start(tasks[0]["config"]["device"]) as ranks:
         for task in tasks:
