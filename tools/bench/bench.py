@@ -5,8 +5,8 @@
   bench.py w2: one mesh of 81,920 faces, 512x512
   bench.py w3: one mesh of 1,280 faces, 1024x1024
   bench.py w4: w1 with depth, and with alpha + depth in one pass, instead of silhouettes
-  bench.py smoothness: smoothness loss of 128 spheres of 1920 edges; also as a chain of torch calls
-  bench.py cameras: 64 look-at cameras; also as a chain of torch calls
+  bench.py smoothness: smoothness loss of 128 spheres of 1920 edges
+  bench.py cameras: 64 look-at cameras
   bench.py voxels: voxel IoU of 1000 predictions
   bench.py step: a whole training step by part, in bf16 and in fp32
   bench.py evaluation: validation during training, by part, and as a share of the run
@@ -42,6 +42,7 @@ from bench_work import (
     measure,
     milliseconds,
     num_cores,
+    run_chain,
     run_ours,
     save,
     settings,
@@ -70,7 +71,7 @@ TARGETS = {
     "w2": Target(12, "ms", f"deodr took 37.9, llvmpipe's forward pass alone 10, {_TWO_CORES}"),
     "w3": Target(8, "ms", f"deodr took 11.6, {_TWO_CORES}"),
     "w4, 64": Target(8, "ms", f"as w1; deodr took 51.6, {_TWO_CORES}"),
-    "smoothness": Target(3, "ms", "a chain of torch calls takes tens of ms"),
+    "smoothness": Target(3, "ms", "the same as a chain of torch calls takes tens of ms"),
     "step": Target(8, "% of the networks", "26 ms beside networks of 334 ms are 360 ms a step: 20,000 in two hours"),
     "evaluation": Target(3, "% of the run", "what a run may spend on looking at itself"),
 }
@@ -143,28 +144,18 @@ def bench_smoothness(options: Options) -> Result:
     spheres = deformed_spheres(128, 3, 64, True)
     edges = nmr.edge_table(spheres.faces)
     about = settings(options.threads, options.repeats, batch=len(spheres.vertices))
-    programs = peers.against_chain(
-        lambda vertices: nmr.losses.smoothness_loss(vertices, edges),
-        lambda vertices: peers.smoothness_chain(vertices, edges),
-        spheres.vertices,
-        1e-4,
-        options.threads,
-    )
+    ours = partial(run_chain, lambda vertices: nmr.losses.smoothness_loss(vertices, edges), spheres.vertices)
+    programs = {f"nmr, {options.threads} threads": ours}
     title = f"Smoothness loss, B = 128, {len(edges)} edges, forward + backward"
     return Result("smoothness", title, measure(programs, options.repeats), about)
 
 
 def bench_cameras(options: Options) -> Result:
     spheres = deformed_spheres(64, 3, 64, True)
-    camera = spheres.camera
     about = settings(options.threads, options.repeats, batch=len(spheres.vertices))
-    programs = peers.against_chain(
-        camera.transform,
-        lambda vertices: peers.camera_chain(vertices, camera.eye, camera.half_fov_deg),
-        spheres.vertices,
-        1e-5,
-        options.threads,
-    )
+    grad = torch.randn(spheres.vertices.shape, generator=torch.Generator().manual_seed(0))
+    ours = partial(run_chain, spheres.camera.transform, spheres.vertices, grad)
+    programs = {f"nmr, {options.threads} threads": ours}
     title = "LookAt, B = 64, 642 vertices each, forward + backward"
     return Result("cameras", title, measure(programs, options.repeats), about)
 

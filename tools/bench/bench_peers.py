@@ -1,15 +1,14 @@
-"""Other programs for the same work: deodr, and chains of torch calls."""
+"""Other programs for the same work: deodr."""
 
 from __future__ import annotations
 
 import importlib.util
-import math
 import multiprocessing
 import time
 
 import numpy as np
 import torch
-from bench_work import Program, Timing, Workload, run_chain
+from bench_work import Program, Timing, Workload
 from torch import Tensor
 
 import nmr
@@ -162,50 +161,3 @@ def deodr_programs(
         if processes:
             programs[f"deodr, {num_processes} processes{where}"] = lambda pooled=pooled: processes(pooled)
     return programs, processes
-
-
-# --- chains of torch calls
-
-
-def smoothness_chain(vertices: Tensor, edges: Tensor, e: float = 1e-6) -> Tensor:
-    """The formula of nmr.losses.smoothness_loss."""
-    v0, v1, *opposite = vertices[:, edges].unbind(2)
-    a = v1 - v0
-    a_squared, heights, lengths = a.square().sum(-1), [], []
-    for corner in opposite:
-        b = corner - v0
-        ab, b_squared = (a * b).sum(-1), b.square().sum(-1)
-        heights.append(b - a * (ab / (a_squared + e)).unsqueeze(-1))
-        cos = ab / ((a_squared + e).sqrt() * (b_squared + e).sqrt() + e)
-        lengths.append((b_squared + e).sqrt() * (1 - cos.square() + e).sqrt())
-    cos = (heights[0] * heights[1]).sum(-1) / (lengths[0] * lengths[1] + e)
-    return (1 + cos).square().sum(1).mean()
-
-
-def camera_chain(vertices: Tensor, eye: Tensor, half_fov_deg: float) -> Tensor:
-    """The formula of nmr.LookAt, looking at the origin, without its care for what is not finite."""
-
-    def unit(v: Tensor) -> Tensor:
-        return v / v.norm(dim=-1, keepdim=True).clamp_min(1e-5)
-
-    eye = eye.to(vertices)
-    z = unit(-eye)
-    x = unit(torch.linalg.cross(vertices.new_tensor([0.0, 1.0, 0.0]).expand_as(z), z, dim=-1))
-    y = unit(torch.linalg.cross(z, x, dim=-1))
-    view = (vertices - eye.unsqueeze(-2)) @ torch.stack([x, y, z], dim=-2).transpose(-1, -2)
-    depth = view[..., 2:]
-    return torch.cat([view[..., :2] / depth / math.tan(math.radians(half_fov_deg)), depth], dim=-1)
-
-
-def against_chain(ours, chain, vertices: Tensor, tolerance: float, threads: int) -> dict[str, Program]:
-    """Our function and a chain of torch calls for the same, which must agree; the gradient is by all that comes out."""
-    with torch.no_grad():
-        result, expected = ours(vertices), chain(vertices)
-    difference = float((result - expected).abs().max() / expected.abs().max())
-    if not difference <= tolerance:
-        raise SystemExit(f"nmr and the chain of torch calls differ by {difference:.1e}: the comparison is invalid")
-    grad = torch.randn(result.shape, generator=torch.Generator().manual_seed(0)) if result.ndim else None
-    return {
-        f"nmr, {threads} threads": lambda: run_chain(ours, vertices, grad),
-        f"torch calls, {threads} threads": lambda: run_chain(chain, vertices, grad),
-    }

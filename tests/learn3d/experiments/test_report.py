@@ -112,21 +112,6 @@ def test_different_lengths_of_training_are_said(tmp_path, stub, options) -> None
     )
 
 
-def test_results_of_another_length_than_asked_for_are_said(tmp_path, stub, capsys, options) -> None:
-    run_experiment(Call("kato", options(iterations=5)), worker=stub)
-    capsys.readouterr()
-    for asked, note in (
-        ({}, ""),
-        ({"iterations": 5, "batch_size": 4}, ""),
-        ({"iterations": 3}, "results of 5 iterations of batch 4, where 3 iterations were asked for"),
-        ({"iterations": 5, "batch_size": 8}, "where 5 iterations of batch 8 were asked for"),
-    ):
-        given = Options(Path("d"), tmp_path / "out", **asked)
-        assert run_experiment(Call("kato", given, report_only=True), worker=stub) == 0
-        for text in (capsys.readouterr().out, (tmp_path / "out" / "kato.md").read_text()):
-            assert note in text and ("asked for" in text) == bool(note), asked
-
-
 def test_the_table_on_the_terminal_is_aligned_and_says_how_long_ours_were_trained(stub, capsys, options) -> None:
     run_experiment(Call("kato", options(iterations=5)), worker=stub)
     header, *rows, trained = capsys.readouterr().out.splitlines()
