@@ -33,7 +33,7 @@ class TrainConfig:
     """One training run. It is saved with the run (config.json and in every checkpoint)."""
 
     data: FilePath
-    """Folder with the data set's files, such as 02691156_train_images.npz (what tools/make_dataset.py writes)."""
+    """Folder with the data set's files, such as 02691156_train_images.npz (what `learn3d make-dataset` writes)."""
     category: Annotated[str, Field(min_length=1)]
     """Object class to train on: a name such as airplane or chair, a synset id, or the file prefix of your own set.
     Several, separated by commas, are trained on together."""

@@ -97,7 +97,8 @@ def _words(hint: Any) -> str | None:
         own = [mark.metavar for mark in hint.__metadata__ if getattr(mark, "metavar", None)]
         return own[0] if own else _words(inner[0])
     if origin in (typing.Union, types.UnionType):
-        return _words(next(part for part in inner if part is not type(None)))
+        words = [_words(part) for part in inner if part is not type(None)]
+        return "|".join(dict.fromkeys(word for word in words if word)) or None
     if origin is Literal:
         return "{" + ",".join(map(str, inner)) + "}"
     if origin is tuple:

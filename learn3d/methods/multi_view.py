@@ -20,7 +20,8 @@ class MultiViewSettings:
     """Networks and weight of Kato et al. 2018; the defaults are the published code's for one category."""
 
     encoder: EncoderName = "conv-relu"
-    """conv-relu: that of Kato et al. conv: without the ReLU on the code."""
+    """conv-relu: three convolutions, on 64-pixel RGB and mask, with a ReLU on the code, as in Kato et al. conv: without
+    the ReLU. conv-small: conv with a fifteenth of the weights. resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "bounded"
     """bounded: that of Kato et al. sphere: 642 free vertices. The others: see PoseInvariantSettings."""
     symmetry: Symmetry | None = None
