@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -45,10 +46,10 @@ print("tested", flush=True)
 """
 
 
-@pytest.fixture
-def stub(tmp_path: Path) -> tuple[str, str]:
+@pytest.fixture(scope="session")
+def stub(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     """The command of that worker."""
-    path = tmp_path / "stub.py"
+    path = tmp_path_factory.mktemp("stub") / "stub.py"
     path.write_text(STUB)
     return sys.executable, str(path)
 
@@ -78,8 +79,18 @@ def made_by_hand(tmp_path, finished_run, tiny_folder, options):
     return plan
 
 
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory: pytest.TempPathFactory, stub: tuple[str, str]) -> Path:
+    """The folder of a table of two categories and three seeds. Do not change it."""
+    folder = tmp_path_factory.mktemp("reported") / "out"
+    asked = {"categories": ("airplane", "chair"), "methods": ("vanilla", "proposed"), "iterations": 6, "batch_size": 4}
+    given = Options(folder.parent / "data", folder, seeds=3, **asked)
+    assert run_experiment(Call("kato", given, jobs=2), worker=stub) == 0
+    return folder
+
+
 @pytest.fixture
-def report(tmp_path, stub, options, capsys) -> dict:
-    call = Call("kato", options(categories=("airplane", "chair"), seeds=3), jobs=2)
-    assert run_experiment(call, worker=stub) == 0
+def report(tmp_path: Path, reported: Path) -> dict:
+    """That table's report; a copy of the folder is `tmp_path / "out"`."""
+    shutil.copytree(reported, tmp_path / "out")
     return json.loads((tmp_path / "out" / "kato.json").read_text())
