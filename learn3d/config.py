@@ -24,7 +24,7 @@ DEFAULT_PRESET = next(iter(PRESETS))
 
 def _known_preset(name: str) -> str:
     if name not in PRESETS:
-        raise ValueError(f"must be one of {', '.join(PRESETS)}")
+        raise ValueError(f"must be one of {', '.join(PRESETS)}, got {name!r}")
     return name
 
 

@@ -158,7 +158,7 @@ def reconstruct_files(
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
     pairs = zip(images, masks or [None] * len(images), strict=True)
     method, config, metadata = checkpoint.load_method(checkpoint.find(run, which))
-    share = metadata.get("object_share") or OBJECT_SHARE
+    share = metadata.progress.object_share or OBJECT_SHARE
     form = {"object_share": share, "size": method.image_size, "layout": config.layout}
     prepared = [prepare_image(*_read(image, mask), crop=crop, **form) for image, mask in pairs]
     names = [Path(image).stem for image in images]

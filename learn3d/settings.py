@@ -65,17 +65,17 @@ def _sentence(error: Any, cls: type) -> str:
         return f"the option {name} is missing"
     if error["type"] == "unexpected_keyword_argument":
         return f"there is no option {name!r} (but {', '.join(field.name for field in fields(cls))})"
+    if error["type"] == "value_error":  # raised by a validator, which says what came
+        return f"{name} {error['ctx']['error']}".strip()
     said = error["msg"]
     for theirs, ours in _WORDS.items():
         said = said.replace(theirs, ours)
-    if error["type"] == "value_error":
-        said = str(error["ctx"]["error"])
-    return f"{name} {said}, got {error['input']!r:.200}" if name else said
+    return f"{name} {said}, got {error['input']!r:.200}"
 
 
 def _path(value: Any) -> Path:
     if not isinstance(value, (str, Path)) or not str(value) or "\0" in str(value):
-        raise ValueError("must be the path of a file or folder")
+        raise ValueError(f"must be the path of a file or folder, got {value!r:.200}")
     return Path(value)
 
 

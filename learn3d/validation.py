@@ -12,30 +12,25 @@ from learn3d import figures
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.evaluation import evaluate
-from learn3d.methods import DataShape, Method
-from learn3d.runs import checkpoint
-from learn3d.runs.folder import BEST, PICTURES
-from learn3d.runs.log import RunLog
-from learn3d.runs.state import Progress, check_networks
+from learn3d.methods import Method
+from learn3d.runs.checkpoint import Progress
+from learn3d.runs.folder import PICTURES
+from learn3d.runs.log import RunLog, SilentLog
+from learn3d.runs.state import Run
 
 PICTURE_ROWS = 8
 
 
-def validate(
-    config: TrainConfig,
-    method: Method,
-    shape: DataShape,
-    val_set: ViewDataset,
-    progress: Progress,
-    log: RunLog,
-) -> None:
+def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog | SilentLog) -> Progress:
     """Measure IoU and MMD on the validation images; keep the networks when their IoU is the best so far.
 
     It is the IoU of voxels; where no true shapes are known that of silhouettes, at cameras that were not the input's.
+    Returns the progress with the best IoU and its step.
     """
-    with method.averaged():
-        result = evaluate(method, val_set, max_images=config.max_val_images)
-    log.metrics(progress.step, config.val_split, {k: v for k, v in result.summary().items() if v is not None})
+    config, step = run.config, progress.step
+    with run.method.averaged():
+        result = evaluate(run.method, val_set, max_images=config.max_val_images)
+    log.metrics(step, config.val_split, {k: v for k, v in result.summary().items() if v is not None})
     mmd = "" if result.mmd is None else f", MMD {result.mmd:.3f}"
     without = f"; {result.without_mmd}" if result.mmd is None else ""
     if without and result.images < len(val_set):
@@ -44,16 +39,13 @@ def validate(
     better = iou is not None and iou > progress.best_iou
     mark = " (best so far)" if better else ""
     shown = "undefined" if iou is None else f"{iou:.4f}"
-    log.say(f"step {progress.step}: {config.val_split} {kind} {shown}{mmd}{mark}{without}")
+    log.say(f"step {step}: {config.val_split} {kind} {shown}{mmd}{mark}{without}")
     if result.undefined:
         log.say(f"warning: {result.undefined} images have no IoU (prediction and truth are both empty); left out")
     if better:
-        progress.best_iou, progress.best_step = iou, progress.step
-        metadata = checkpoint.method_metadata(shape, config) | dataclasses.asdict(progress)
-        with method.averaged():
-            check_networks(method)
-            if method.ranks.main:
-                checkpoint.save(config.output / BEST, checkpoint.network_tensors(method), metadata)
+        progress = dataclasses.replace(progress, best_iou=iou, best_step=step)
+        run.save_best(progress)
+    return progress
 
 
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:

@@ -144,6 +144,31 @@ class ViewDataset:
             crc = zlib.crc32(np.ascontiguousarray(part), crc) if part is not None else crc
         return crc
 
+    def check_masks(self) -> str:
+        """What to warn of where some images show nothing; "" for none. Raises ValueError where all of them do."""
+        masks = self.images[:, 3] if self.masks is None else self.masks
+        empty = len(masks) - int(masks.any(axis=(1, 2)).sum())
+        if empty == len(masks):
+            raise ValueError(
+                f"all {empty} {self.split} images of {self.category} have an empty mask, so that there is nothing to "
+                "learn; look at the data (learn3d check-dataset)"
+            )
+        return f"{empty} of {len(masks)} {self.split} images have an empty mask" if empty else ""
+
+    def object_share(self) -> float:
+        """Mean over the images of the larger side of the mask's bounding box, as a share of the picture's side.
+
+        Kept in checkpoints, so that photographs can be framed like the images that the networks know.
+        """
+        masks = self.images[:, 3] > 127
+        sides = []
+        for axis in (1, 2):
+            seen = masks.any(axis=axis)
+            size = seen.shape[1]
+            first, last = seen.argmax(axis=1), size - 1 - seen[:, ::-1].argmax(axis=1)
+            sides.append(np.where(seen.any(axis=1), last - first + 1, 0) / size)
+        return float(np.maximum(*sides).mean())
+
     def with_bins(self, bins: AngleBins) -> ViewDataset:
         """The same views with pose classes from cells of azimuth and elevation."""
         if not isinstance(self.poses, LookAtPoses):

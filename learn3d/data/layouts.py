@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import functools
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from learn3d.data.conventions import IMAGE_SIZE
 from learn3d.data.dataset import ViewDataset, concatenate
@@ -97,13 +96,6 @@ def load_dataset(
             error.path, f"{error.message}. All that is wrong with the data set is listed by: {check}"
         ) from error
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
-
-
-def load_splits(
-    layout: Layout, folder: Path | str, category: str, splits: Sequence[str], **options: Any
-) -> list[ViewDataset]:
-    """Several splits as `load_dataset` reads one, at the same time: their files share the cores."""
-    return together([functools.partial(load_dataset, layout, folder, category, split, **options) for split in splits])
 
 
 def _layouts_in(folder: Path, asked: str) -> list[str]:

@@ -6,11 +6,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d.config import config_from_dict
 from learn3d.data.layouts import load_dataset, require_folder
 from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS, Evaluation, evaluate
 from learn3d.presets import PRESETS
-from learn3d.runs import checkpoint, checkpoint_checks
+from learn3d.runs import checkpoint
 from learn3d.runs.versions import versions
 from learn3d.terminal import align
 
@@ -83,9 +82,9 @@ def evaluate_runs(
                 "data": str(folder),
                 "method": PRESETS[config.preset].label,
                 "preset": config.preset,
-                "iterations": metadata["step"],
+                "iterations": metadata.progress.step,
                 "seed": config.seed,
-                "trained_by": metadata.get("versions"),
+                "trained_by": metadata.versions,
             }
             results.append(about | result.summary())
     protocol = {"split": split, "checkpoint": which, "precision": precision, **MEANINGS}
@@ -104,8 +103,7 @@ def _warnings(result: Evaluation) -> list[str]:
 def _check(file: Path, data: Path | None) -> None:
     """Raise an error where a checkpoint, or the folder of its data, is not there; only its header is read."""
     metadata = checkpoint.load_metadata(file)
-    checkpoint_checks.require_run(metadata, file)
-    require_folder(data or config_from_dict(metadata["config"], source=str(file)).data)
+    require_folder(data or metadata.config.data)
 
 
 def format_table(report: dict[str, Any]) -> str:

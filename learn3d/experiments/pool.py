@@ -14,8 +14,7 @@ from pathlib import Path
 
 from learn3d.experiments.plan import Run
 from learn3d.experiments.worker import STOPPED, request_of
-from learn3d.interrupt import handled_by
-from learn3d.terminal import note
+from learn3d.terminal import handled_by, note
 
 LOG_FILE = "log.txt"
 #: Python puts the working directory first on its path, where a source folder would hide the installed package.

@@ -5,6 +5,7 @@ The file may be a stranger's: it is checked when it is read.
 
 from __future__ import annotations
 
+import dataclasses
 import zlib
 from pathlib import Path
 from typing import Annotated, Any
@@ -43,7 +44,7 @@ def measure(run: Run, *, check_data: bool) -> dict[str, Any]:
     config = run.config
     last = checkpoint.load_metadata(run.folder / "last.safetensors")
     if check_data:
-        _check_data(run, last.get("conditions", {}))
+        _check_data(run, dataclasses.asdict(last.conditions))
     method, saved, metadata = checkpoint.load_method(
         run.folder / f"{run.variant.checkpoint}.safetensors", device=config.device, precision="fp32"
     )
@@ -56,12 +57,12 @@ def measure(run: Run, *, check_data: bool) -> dict[str, Any]:
         "command": command_line(config),
         "data": str(config.data.resolve()),
         "checkpoint": run.variant.checkpoint,
-        "iterations": last["step"],
-        "step": metadata["step"],
+        "iterations": last.progress.step,
+        "step": metadata.progress.step,
         "seed": config.seed,
-        "seconds": last.get("seconds"),
-        "conditions": last.get("conditions", {}),
-        "trained_by": last.get("versions"),
+        "seconds": last.progress.seconds,
+        "conditions": dataclasses.asdict(last.conditions),
+        "trained_by": last.versions,
         "tested_by": versions(),
     }
     summary = {key: value for key, value in result.summary().items() if key != "voxel_iou"}

@@ -14,7 +14,7 @@ from learn3d.device import resolve_precision
 from learn3d.experiments.plan import Options, Run, selected_rows
 from learn3d.experiments.results import RESULT_FILE, read_result
 from learn3d.experiments.tables import Table
-from learn3d.runs import checkpoint, checkpoint_checks
+from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 
 
@@ -103,9 +103,7 @@ def _recorded(run: Run) -> tuple[TrainConfig | None, int, str | None]:
             metadata = checkpoint.load_metadata(path)
         except checkpoint.DamagedError:  # the training says so, and goes on from the one before it
             continue
-        checkpoint_checks.require(metadata, ("config", "step"), path)
-        config = config_from_dict(metadata["config"], source=str(path))
-        return config, metadata["step"], metadata.get("conditions", {}).get("precision")
+        return metadata.config, metadata.progress.step, metadata.conditions.precision
     if (path := run.folder / RESULT_FILE).is_file():
         values = read_result(path)
         precision = (values.get("conditions") or {}).get("precision")

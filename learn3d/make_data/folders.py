@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from learn3d.files.writing import check_target_folder
-from learn3d.interrupt import stop_on_signal
+from learn3d.terminal import stop_on_signal
 
 
 def existing(folder: Path, paths: Iterable[str]) -> list[str]:

@@ -6,9 +6,10 @@ import abc
 import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 import nmr
@@ -21,15 +22,16 @@ from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.networks import GENERATORS, MeshGenerator, create_encoder, network_input
 from learn3d.parallel.ranks import ALONE, Ranks, sum_gradients
 from learn3d.parallel.whole_batch_norm import use_whole_batch
+from learn3d.settings import checked
 
 
-@dataclass(frozen=True)
+@checked
 class DataShape:
     """What a method must know about its data before it builds its networks. Saved in every checkpoint."""
 
-    num_views: int  # K pose classes
-    num_classes: int = 1  # categories in the set
-    pose_features: int = 3  # size of `Poses.features()`: 3 for an eye position, 9 for a rotation; 0: unknown poses
+    num_views: Annotated[int, Field(ge=0, le=100_000)]  # K pose classes
+    num_classes: Annotated[int, Field(ge=1, le=10_000)] = 1  # categories in the set
+    pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # of a camera: eye position 3, rotation 9, unknown 0
     inverted: bool = False  # colours are stored as 255 - colour
 
 

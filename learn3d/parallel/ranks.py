@@ -19,7 +19,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from learn3d.interrupt import Stop
+from learn3d.terminal import Stop
 
 LARGE = 1 << 18  # entries of a gradient that is summed in place; smaller ones travel together
 

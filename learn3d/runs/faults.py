@@ -1,4 +1,4 @@
-"""What goes wrong in a run, said in one sentence: what happened, what is left, what to do."""
+"""What ends a run, said in one sentence: what happened, what is left, what to do."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from learn3d.runs.folder import last_good, resume_command
 
 
 @contextlib.contextmanager
-def explained(folder: Path) -> Iterator[None]:
+def with_advice(folder: Path) -> Iterator[None]:
     """Complete the errors that end a run in `folder`: where it can go on from, and how.
 
     FloatingPointError and OSError stay what they are; torch's own errors about memory become MemoryError.
@@ -19,26 +19,19 @@ def explained(folder: Path) -> Iterator[None]:
     try:
         yield
     except FloatingPointError as error:
-        advice = "try a lower learning_rate or precision fp32"
-        raise FloatingPointError(f"{error}; {last_good(folder)}; {advice}") from None
+        raise FloatingPointError(f"{error}; {last_good(folder)}; try a lower learning_rate or precision fp32") from None
     except OSError as error:
-        advice = f"repair that and continue with: {resume_command(folder)}"
-        raise OSError(f"{error} ({_room(folder)}); {last_good(folder)}; {advice}") from error
+        room = "it is not there any more"
+        with contextlib.suppress(OSError):
+            room = f"{shutil.disk_usage(folder).free / 1e6:.0f} MB free there"
+        raise OSError(
+            f"{error} ({folder}: {room}); {last_good(folder)}; repair that and continue with: {resume_command(folder)}"
+        ) from error
     except (MemoryError, RuntimeError) as error:
-        if not _is_out_of_memory(error):
+        said = str(error)  # torch has a class of its own for CUDA alone
+        if not isinstance(error, MemoryError) and "out of memory" not in said and "can't allocate memory" not in said:
             raise
-        advice = f"lower batch_size (a new run) or free some memory and continue with: {resume_command(folder)}"
-        raise MemoryError(f"out of memory ({error}); {last_good(folder)}; {advice}") from error
-
-
-def _room(folder: Path) -> str:
-    try:
-        return f"{shutil.disk_usage(folder).free / 1e6:.0f} MB free in {folder}"
-    except OSError:
-        return f"{folder} is not there any more"
-
-
-def _is_out_of_memory(error: BaseException) -> bool:
-    """torch has a class of its own for CUDA alone; on the CPU the text tells."""
-    said = str(error)
-    return isinstance(error, MemoryError) or "out of memory" in said or "can't allocate memory" in said
+        raise MemoryError(
+            f"out of memory ({error}); {last_good(folder)}; lower batch_size (a new run) or free some memory and "
+            f"continue with: {resume_command(folder)}"
+        ) from error

@@ -16,10 +16,11 @@ from __future__ import annotations
 import contextlib
 import os
 import shlex
-import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+
+import filelock
 
 from learn3d.config import load_config
 from learn3d.files import writing
@@ -29,7 +30,12 @@ CONFIG, LAST, BEST = "config.json", "last.safetensors", "best.safetensors"
 METRICS, JOURNAL, DAMAGED = "metrics.jsonl", "journal.txt", "damaged.safetensors"
 EARLIER, PICTURES, TENSORBOARD = "checkpoints", "pictures", "tensorboard"
 LOCK = ".lock"
-_PARTS = {PICTURES: "[0-9]" * 6 + "*.png", TENSORBOARD: "events.out.tfevents.*"}
+#: What a run writes, in the order in which it is removed: the options first, without which nothing is continued by
+#: mistake; the checkpoints last, by which the rest is still known as a run's.
+WRITTEN = (
+    *(CONFIG, METRICS, JOURNAL, DAMAGED, f"{PICTURES}/{'[0-9]' * 6}*.png", f"{TENSORBOARD}/events.out.tfevents.*"),
+    *(f"{EARLIER}/step-[0-9]*.safetensors", LAST, BEST),
+)
 
 
 @contextlib.contextmanager
@@ -37,18 +43,17 @@ def sole_use(folder: Path, lock: str = LOCK) -> Iterator[None]:
     """Make the folder and keep other processes from working in it while the block runs.
 
     The lock is the operating system's: it ends with its process, however that ends. Raises ValueError where `folder` is
-    a file, OSError where another process holds the lock or the folder cannot be written to. Where the system or the
-    file system has no file locks (Windows, some network drives), nothing is kept. A folder that was made and is still
-    empty at the end is removed.
+    a file, OSError where another process holds the lock or the folder cannot be written to. A folder that was made and
+    is still empty at the end is removed.
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"output {folder} is a file; give a folder for the run")
-    made = not folder.is_dir()
+    made, held = not folder.is_dir(), filelock.FileLock(folder / lock, timeout=0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = _locked(folder / lock)
-    except BlockingIOError:
+        held.acquire()
+    except filelock.Timeout:
         raise OSError(f"another process works in {folder}; wait for it, or stop it") from None
     except OSError as error:
         raise OSError(
@@ -59,29 +64,10 @@ def sole_use(folder: Path, lock: str = LOCK) -> Iterator[None]:
     finally:
         with contextlib.suppress(OSError):  # a full or read-only disk; the folder is gone
             (folder / lock).unlink()
-        os.close(file)
+        held.release()
         if made:
             with contextlib.suppress(OSError):
                 folder.rmdir()
-
-
-def _locked(path: Path) -> int:
-    """An open file that this process alone has locked. Raises BlockingIOError where another one has."""
-    while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(file)
-            raise
-        except (ImportError, OSError):  # no locks here
-            return file
-        with contextlib.suppress(FileNotFoundError):
-            if os.fstat(file).st_ino == os.stat(path).st_ino:
-                return file
-        os.close(file)  # its holder has removed it between the two calls: that is no lock any more
 
 
 def check_free(folder: Path, overwrite: bool) -> None:
@@ -90,7 +76,7 @@ def check_free(folder: Path, overwrite: bool) -> None:
     What a run that was killed before it had anything leaves behind (a lock, a half-written file) does not count. With
     `overwrite` a run may be replaced, and be put beside other files, but not where these have the names of a run's.
     """
-    present = [path for path in _files(folder) if path.exists()]
+    present = [path for pattern in WRITTEN for path in folder.glob(pattern)]
     if present and not is_run(folder):
         raise ValueError(
             f"{folder} has {present[0].relative_to(folder)}, but no run that it could belong to; choose another folder"
@@ -108,9 +94,10 @@ def check_free(folder: Path, overwrite: bool) -> None:
 def claim(folder: Path, overwrite: bool) -> None:
     """Take a folder for a new run, where `check_free` allows it: what an earlier run has written is removed."""
     check_free(folder, overwrite)
-    for path in _files(folder):
-        path.unlink(missing_ok=True)
-    for name in (*_PARTS, EARLIER):
+    for pattern in WRITTEN:
+        for path in folder.glob(pattern):
+            path.unlink()
+    for name in (EARLIER, PICTURES, TENSORBOARD):
         with contextlib.suppress(OSError):  # there is none, or something of the user's is in it
             (folder / name).rmdir()
     remove_partials(folder)
@@ -118,37 +105,20 @@ def claim(folder: Path, overwrite: bool) -> None:
 
 def is_run(folder: Path) -> bool:
     """Whether the options or a checkpoint of a run lie in the folder."""
-    try:
-        load_config(folder / CONFIG)
-        return True
-    except (ValueError, OSError):
-        pass
-    for path in (*checkpoints(folder), folder / BEST):
-        try:
-            if path.is_file():
-                checkpoint.load_metadata(path)
-                return True
-        except checkpoint.DamagedError:
-            pass
-        except ValueError:  # of a later version
+    readable = [(load_config, folder / CONFIG)]
+    readable += [(checkpoint.load_metadata, path) for path in (*checkpoints(folder), folder / BEST)]
+    for read, path in readable:
+        with contextlib.suppress(ValueError, OSError):
+            read(path)
             return True
     return False
 
 
-def _files(folder: Path) -> list[Path]:
-    """What a run writes, there or not, in the order in which it can be removed.
-
-    The options first, without which a kill in between leaves nothing that could be continued by mistake; the
-    checkpoints last, so that the rest is still known as a run's.
-    """
-    parts = [path for name, pattern in _PARTS.items() for path in (folder / name).glob(pattern)]
-    logs = [folder / name for name in (METRICS, JOURNAL, DAMAGED)]
-    return [folder / CONFIG, *logs, *parts, *checkpoints(folder), folder / BEST]
-
-
 def remove_partials(folder: Path) -> None:
-    """Remove the half-written files of a run that was killed."""
+    """Remove the half-written files of a run that was killed; safetensors has names of its own for them."""
     writing.remove_partials(folder, folder / EARLIER, folder / PICTURES)
+    for path in folder.glob(".tmp??????"):
+        path.unlink()
 
 
 def checkpoints(folder: Path) -> list[Path]:
@@ -174,7 +144,7 @@ def keep_previous(folder: Path) -> None:
     if not last.is_file():
         return
     try:
-        step = checkpoint.load_metadata(last)["step"]
+        step = checkpoint.load_metadata(last).progress.step
     except checkpoint.DamagedError:
         return
     (folder / EARLIER).mkdir(exist_ok=True)
@@ -197,12 +167,10 @@ def put_in_place(path: Path) -> None:
 
 
 def resume_command(folder: Path) -> str:
-    """The command line that continues the run in `folder`, by the program that runs now, quoted for a POSIX shell."""
-    program = ["learn3d", "train"]
-    if os.path.basename(sys.argv[0]) == "train.py":
-        found = shutil.which("python")
-        same = found is not None and os.path.samefile(found, sys.executable)
-        program = ["python" if same else sys.executable, sys.argv[0]]
+    """The command line that continues the run in `folder`, quoted for a POSIX shell: tools/train.py, where that was
+    started, and else `learn3d train`."""
+    started = sys.argv[0]
+    program = ["python", started] if os.path.basename(started) == "train.py" else ["learn3d", "train"]
     return shlex.join([*program, "--output", str(folder), "--resume"])
 
 

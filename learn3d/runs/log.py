@@ -11,25 +11,29 @@ import json
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from learn3d.files import writing
 from learn3d.runs.folder import JOURNAL, METRICS, TENSORBOARD
-from learn3d.terminal import plain
+from learn3d.terminal import note, plain
+
+MEAN_OVER = 20  # steps: those of both turns, where a method trains its networks in turns
 
 
 class RunLog:
     """Writes what a run reports; use it as a context manager. Steps after `start` of an earlier attempt are forgotten.
 
     On a terminal it shows a progress bar with the losses and the time left; elsewhere it prints a line at most every
-    `seconds_between_lines` seconds. Raises OSError where the files cannot be opened at the start; after that a full
-    disk, a broken TensorBoard or a closed terminal is a warning.
+    `seconds_between_lines` seconds. Each loss that is shown is a mean over the last steps that computed it. Raises
+    OSError where the files cannot be opened at the start; after that a full disk, a broken TensorBoard or a closed
+    terminal is a warning.
     """
 
     def __init__(self, folder: Path, *, start: int, total: int, seconds_between_lines: float = 30.0) -> None:
@@ -38,16 +42,16 @@ class RunLog:
         self.total = total
         self.seconds_between_lines = seconds_between_lines
         self._warned: set[str] = set()
+        self._recent: dict[str, deque[float]] = {}
         for name in (METRICS, JOURNAL):  # a pipe would be waited for; a link would have lines appended anywhere
             if (path := self.folder / name).is_symlink() or (path.exists() and not path.is_file()):
                 raise OSError(f"{path} is no plain file, and nothing is appended to it; move it away")
         _forget_after(self.folder / METRICS, start)
         self._metrics = _Lines(self.folder / METRICS)
         self._journal = _Lines(self.folder / JOURNAL)
-        self._terminal = _Terminal(sys.stderr)
         self._bar = None
-        if self._terminal.isatty():
-            self._bar = tqdm(total=total, initial=start, unit="step", dynamic_ncols=True, file=self._terminal)
+        if sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty():
+            self._bar = tqdm(total=total, initial=start, unit="step", dynamic_ncols=True)
         self._tensorboard = self._open_tensorboard()
         self._started = self._last_line = time.monotonic()
 
@@ -60,26 +64,36 @@ class RunLog:
         if error is not None:  # whoever catches it shows it on the terminal
             self.note(f"ended by {type(error).__name__}: {error}" if str(error) else f"ended by {type(error).__name__}")
         self.sync()
-        if self._bar is not None:
-            self._bar.close()
+        self._on_bar("close")
         self._to_tensorboard("close")
         self._metrics.close()
         self._journal.close()
 
     def step(self, step: int, losses: Mapping[str, float]) -> None:
         """Show that a step is done."""
+        for name, value in losses.items():
+            self._recent.setdefault(name, deque(maxlen=MEAN_OVER)).append(value)
         if self._bar is not None:
-            self._bar.update(step - self._bar.n)
             if step % 5 == 0:
-                self._bar.set_postfix_str(_format(losses), refresh=False)
+                self._on_bar("set_postfix_str", self._means(), refresh=False)
+            self._on_bar("update", step - self._bar.n)
             return
         now = time.monotonic()
         if now - self._last_line >= self.seconds_between_lines or step in (self.start + 1, self.total):
             self._last_line = now
             seconds_per_step = (now - self._started) / (step - self.start)
-            left = _duration(seconds_per_step * (self.total - step))
-            text = f"step {step}/{self.total}  {_format(losses)}  {1000 * seconds_per_step:.0f} ms/step, {left} left"
-            print(text, file=self._terminal, flush=True)
+            left = datetime.timedelta(seconds=round(seconds_per_step * (self.total - step)))
+            note(f"step {step}/{self.total}  {self._means()}  {1000 * seconds_per_step:.0f} ms/step, {left} left")
+
+    def _means(self) -> str:
+        names = sorted(self._recent, key=lambda name: name != "total")
+        return "  ".join(f"{name} {sum(self._recent[name]) / len(self._recent[name]):.3g}" for name in names)
+
+    def _on_bar(self, call: str, *arguments: Any, **options: Any) -> None:
+        """One call of the progress bar, if there is one; that the terminal has been closed does no harm."""
+        if self._bar is not None:
+            with contextlib.suppress(OSError, ValueError):
+                getattr(self._bar, call)(*arguments, **options)
 
     def metrics(self, step: int, split: str, values: Mapping[str, Any]) -> None:
         """Append one line to metrics.jsonl and the same numbers to TensorBoard, under `split`/."""
@@ -94,11 +108,10 @@ class RunLog:
 
     def say(self, text: str) -> None:
         """Print a line without breaking the progress bar, and note it in journal.txt."""
-        text = plain(text)
         if self._bar is not None:
-            self._bar.write(text, file=self._terminal)
+            self._on_bar("write", plain(text), file=sys.stderr)
         else:
-            print(text, file=self._terminal, flush=True)
+            note(text)
         self.note(text)
 
     def note(self, text: str) -> None:
@@ -132,7 +145,7 @@ class RunLog:
 
             return SummaryWriter(str(self.folder / TENSORBOARD), purge_step=self.start + 1)
         except ImportError:
-            print("tensorboard is not installed: metrics go to metrics.jsonl only", file=self._terminal)
+            note("tensorboard is not installed: metrics go to metrics.jsonl only")
         except Exception as error:  # whatever it says; TypeError, for one, with an unfitting protobuf
             self.warn("tensorboard does not work", error, "metrics go to metrics.jsonl only")
         return None
@@ -175,35 +188,8 @@ class _Lines:
             self._file.close()
 
 
-class _Terminal:
-    """A stream whose loss does no harm: the terminal was closed, or the reader of a pipe is gone."""
-
-    def __init__(self, stream: TextIO | None) -> None:
-        self._stream = stream  # None for a program without a console (Windows)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        with contextlib.suppress(OSError, ValueError):
-            if self._stream is not None:
-                self._stream.write(text)
-        return len(text)
-
-    def flush(self) -> None:
-        with contextlib.suppress(OSError, ValueError):
-            if self._stream is not None:
-                self._stream.flush()
-
-    def isatty(self) -> bool:
-        try:
-            return self._stream is not None and self._stream.isatty()
-        except ValueError:  # closed
-            return False
-
-
 class SilentLog:
-    """What a process that does not report has in place of a `RunLog`."""
+    """What a process that does not report has in place of a `RunLog`: every call does nothing."""
 
     def __enter__(self) -> SilentLog:
         return self
@@ -211,20 +197,8 @@ class SilentLog:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def step(self, step: int, losses: Mapping[str, float]) -> None:
-        pass
-
-    def metrics(self, step: int, split: str, values: Mapping[str, Any]) -> None:
-        pass
-
-    def picture(self, step: int, name: str, rgb: np.ndarray) -> None:
-        pass
-
-    def say(self, text: str) -> None:
-        pass
-
-    def note(self, text: str) -> None:
-        pass
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *arguments, **options: None
 
 
 def _forget_after(path: Path, step: int) -> None:
@@ -239,13 +213,3 @@ def _forget_after(path: Path, step: int) -> None:
         except (ValueError, KeyError, TypeError, RecursionError):  # not JSON, not UTF-8; JSON of another form
             continue
     writing.write_bytes(path, b"".join(kept), sync=True)
-
-
-def _format(losses: Mapping[str, float]) -> str:
-    return " ".join(f"{name[:6]} {value:.3g}" for name, value in losses.items())
-
-
-def _duration(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds:02}"

@@ -1,43 +1,32 @@
-"""The state of a run: what is saved to continue it bit for bit, and the conditions that it must find again."""
+"""A run that goes on: what is saved so that it continues bit for bit, and what it must find again as it was."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from learn3d.config import TrainConfig, check_resume, config_from_dict, load_config
+from learn3d.config import TrainConfig, check_resume, config_to_dict, load_config
+from learn3d.data.dataset import ViewDataset
+from learn3d.files import writing
 from learn3d.methods import DataShape, Method
-from learn3d.runs import checkpoint, checkpoint_checks
+from learn3d.parallel.ranks import Ranks, weights_digest
+from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
+from learn3d.runs.checkpoint import Conditions, Metadata, Progress
 from learn3d.runs.folder import BEST, CONFIG, LAST
+from learn3d.runs.log import RunLog, SilentLog
 from learn3d.runs.versions import versions
 
 
-@dataclass
-class Progress:
-    """Where a run stands."""
-
-    step: int = 0  # steps taken
-    best_iou: float = -1.0  # best validation IoU so far, see `validate`; -1 before the first validation
-    best_step: int = 0
-    seconds: float = 0.0  # spent in training, over all resumptions
-    object_share: float = 0.0  # side of the objects' bounding squares over that of the pictures, training mean
-    losses: dict[str, float] = dataclasses.field(default_factory=dict)  # of the last step
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """What decides the next steps besides the options and the saved state; a resumed run must find it as it was."""
-
-    samples: int  # training images: their number decides the order
-    images: str  # CRC-32 of the training images, as stored
-    precision: str  # bf16 or fp32: what "auto" came to
+def conditions_of(train_set: ViewDataset, precision: str) -> Conditions:
+    """The conditions of a run on these training images."""
+    return Conditions(len(train_set), f"{zlib.crc32(np.ascontiguousarray(train_set.images)):08x}", precision)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,48 +35,145 @@ class Saved:
 
     path: Path
     tensors: dict[str, Tensor]
-    metadata: dict[str, Any]
+    metadata: Metadata
     notes: tuple[str, ...] = ()  # what was wrong with newer ones
 
-    @property
-    def shape(self) -> DataShape:
-        """What the run's networks were made for."""
-        return checkpoint.data_shape(self.metadata)
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a checkpoint is made of, besides the progress."""
+
+    config: TrainConfig
+    method: Method
+    shape: DataShape
+    conditions: Conditions
+
+    ranks: Ranks
+
+    def begin(
+        self, train_set: ViewDataset, val_set: ViewDataset, *, resume: bool, overwrite: bool
+    ) -> tuple[Progress, tuple[str, ...]]:
+        """Bring networks, optimizers and random numbers to where the run stands: its start, or its last checkpoint.
+
+        Then take the folder, where nothing is left that could be wrong, and let all processes learn together. Returns
+        where the run stands, and what to warn of. A finished run stays as it is.
+        """
+        config, folder = self.config, self.config.output
+        progress, notes = Progress(object_share=train_set.object_share()), ()
+        saved = None
+        if resume:
+            with self.ranks.main_first():  # it may have to put an earlier checkpoint in place
+                saved = load_last(config, repair=self.ranks.main)
+        if saved is not None:
+            progress, notes = self._restore(saved), saved.notes
+        else:
+            self.method.start_from_pretrained()
+        if progress.step > config.iterations:
+            raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
+        if self.ranks.main and resume:
+            run_folder.remove_partials(folder)
+        if progress.step == config.iterations:
+            if self.ranks.main:
+                run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
+            return progress, notes
+        self.method.join(self.ranks)
+        self._compare_processes(progress, train_set, val_set)
+        if self.ranks.main:
+            if not resume:
+                run_folder.claim(folder, overwrite)
+            writing.write_json(folder / CONFIG, config_to_dict(config), sync=True)
+        return progress, notes
+
+    def _compare_processes(self, progress: Progress, train_set: ViewDataset, val_set: ViewDataset) -> None:
+        """Raise a ValueError naming what is not the same in all processes of the run."""
+        if self.ranks.alone:
+            return
+        options = dataclasses.replace(self.config, data=Path("-"), output=Path("-"), threads=None)
+        same = {
+            "options": config_to_dict(options),
+            "precision": self.conditions.precision,
+            "training data": (self.conditions, train_set.digest()),
+            "validation data": (len(val_set), val_set.digest()),
+            "steps taken": progress.step,
+            "weights": weights_digest(self.method.networks),
+        }
+        self.ranks.check_same(**same)
+
+    def _restore(self, saved: Saved) -> Progress:
+        """Bring everything back to the state that `save_last` wrote.
+
+        An option or a condition that differs is a ValueError that names it.
+        """
+        tensors, metadata, precision = saved.tensors, saved.metadata, saved.metadata.conditions.precision
+        if precision == self.conditions.precision:  # asked for by name or by "auto", it is the same
+            precision = self.config.precision
+        elif self.config.precision == "auto":
+            precision = metadata.config.precision
+        check_resume(self.config, dataclasses.replace(metadata.config, precision=precision))
+        _check_conditions(self.conditions, metadata.conditions, self.config.data)
+        checkpoint.restore_networks(self.method, tensors, saved.path)
+        checkpoint.restore_average(self.method, tensors, saved.path)
+        for name, optimizer in self.method.optimizers.items():
+            others = metadata.optimizers.get(name, {})
+            checkpoint.restore_optimizer(name, optimizer, tensors, others, saved.path)
+        try:
+            torch.set_rng_state(tensors["random.cpu"])
+            if self.config.device == "cuda" and "random.cuda" in tensors:
+                torch.cuda.set_rng_state(tensors["random.cuda"])
+        except (KeyError, RuntimeError, TypeError) as error:
+            raise ValueError(
+                f"{saved.path} holds no state of the random numbers that this torch can use ({error}); is it the last "
+                "checkpoint of a run?"
+            ) from None
+        return metadata.progress
+
+    def save(self, progress: Progress, log: RunLog | SilentLog) -> None:
+        """Write last.safetensors by the first process, where all have the same weights, and what was logged before."""
+        self.ranks.check_same(weights=0 if self.ranks.alone else weights_digest(self.method.networks))
+        if self.ranks.main:
+            log.sync()
+            self.save_last(progress)
+
+    def save_last(self, progress: Progress) -> None:
+        """Write last.safetensors: networks, optimizers, random state, and all of `Metadata`.
+
+        A complete file has that name at every moment; the ones before it are kept as `config.keep_checkpoints` says.
+        Raises FloatingPointError, with nothing written, for values that are not finite, as they could not be resumed.
+        """
+        folder, keep, others = self.config.output, self.config.keep_checkpoints, {}
+        self._check_networks()
+        tensors = checkpoint.network_tensors(self.method) | checkpoint.average_tensors(self.method)
+        tensors["random.cpu"] = torch.get_rng_state()
+        if self.config.device == "cuda":
+            tensors["random.cuda"] = torch.cuda.get_rng_state()
+        for name, optimizer in self.method.optimizers.items():
+            state, others[name] = checkpoint.optimizer_state(name, optimizer)
+            checkpoint.check_finite(f"optimizer of the {name}", state)
+            tensors |= state
+        if keep > 1:
+            run_folder.keep_previous(folder)
+        checkpoint.save(folder / LAST, tensors, self._metadata(progress, others))
+        run_folder.remove_old(folder, progress.step, keep)
+
+    def save_best(self, progress: Progress) -> None:
+        """Write best.safetensors by the first process: the networks, or their averages, for use."""
+        with self.method.averaged():
+            self._check_networks()
+            if self.ranks.main:
+                networks = checkpoint.network_tensors(self.method)
+                checkpoint.save(self.config.output / BEST, networks, self._metadata(progress, {}))
+
+    def _check_networks(self) -> None:
+        """Refuse to save networks that are no longer finite: the checkpoint on disk is better than they are."""
+        for name, network in self.method.networks.items():
+            checkpoint.check_finite(name, network.state_dict())
+
+    def _metadata(self, progress: Progress, optimizers: dict) -> Metadata:
+        return Metadata(self.config, self.shape, progress, self.conditions, versions(), optimizers)
 
 
-def save_last(
-    folder: Path,
-    config: TrainConfig,
-    conditions: Conditions,
-    method: Method,
-    shape: DataShape,
-    progress: Progress,
-) -> None:
-    """Write last.safetensors: networks, optimizers, random state, progress, configuration, conditions and versions.
-
-    A complete file has that name at every moment; the ones before it are kept as `config.keep_checkpoints` says.
-    Raises FloatingPointError, with nothing written, for values that are not finite, as they could not be resumed from.
-    """
-    check_networks(method)
-    tensors = (
-        checkpoint.network_tensors(method) | checkpoint.average_tensors(method) | {"random.cpu": torch.get_rng_state()}
-    )
-    if config.device == "cuda":
-        tensors["random.cuda"] = torch.cuda.get_rng_state()
-    for name, optimizer in method.optimizers.items():
-        state = checkpoint.optimizer_tensors(name, optimizer)
-        _check_finite(f"the optimizer of the {name}", state)
-        tensors |= state
-    metadata = checkpoint.method_metadata(shape, config) | dataclasses.asdict(progress)
-    metadata |= {"conditions": dataclasses.asdict(conditions), "versions": versions()}
-    if config.keep_checkpoints > 1:
-        run_folder.keep_previous(folder)
-    checkpoint.save(folder / LAST, tensors, metadata)
-    run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
-
-
-def load_last(folder: Path, config: TrainConfig, *, repair: bool = True) -> Saved | None:
-    """The newest checkpoint of the run in `folder` that is whole, or None where the run was stopped before its first.
+def load_last(config: TrainConfig, *, repair: bool = True) -> Saved | None:
+    """The newest checkpoint of a run that is whole, or None where the run was stopped before its first.
 
     A damaged last.safetensors is put aside and the one before it takes its place; `notes` say so. Without `repair`
     nothing is renamed, and a damaged one is an error: of several processes only the first one repairs, before the
@@ -95,6 +181,7 @@ def load_last(folder: Path, config: TrainConfig, *, repair: bool = True) -> Save
     `config`, DamagedError where there are checkpoints, but none of them is whole, and OSError where one cannot be
     reached.
     """
+    folder = config.output
     candidates = run_folder.checkpoints(folder)
     if not candidates and not (folder / CONFIG).is_file():
         raise ValueError(f"there is no checkpoint and no {CONFIG} in {folder}; start the run without --resume")
@@ -107,22 +194,22 @@ def load_last(folder: Path, config: TrainConfig, *, repair: bool = True) -> Save
                 raise
             notes.append(str(error))
             continue
-        checkpoint_checks.require_run(metadata, path)
         if path.name != LAST and repair:
             run_folder.put_in_place(path)
             notes.append(f"going on from the checkpoint before it, {path}; the steps since then are repeated")
         return Saved(path, tensors, metadata, tuple(notes))
+    best = _reached_by(folder / BEST)
     if candidates:
-        left = f"; {BEST} can still be evaluated" if _reached_by(folder / BEST) else ""
+        left = f"; {BEST} can still be evaluated" if best else ""
         raise checkpoint.DamagedError(
             "; ".join(notes) + f"; no checkpoint is whole: start a new run (--overwrite){left}"
         )
     began = load_config(folder / CONFIG)
     check_resume(config, began)
-    if (reached := _reached_by(folder / BEST)) > began.checkpoint_every:
+    if best > began.checkpoint_every:
         raise ValueError(
-            f"the run in {folder} came to step {reached} at least ({BEST}), but its checkpoints are missing: put "
-            f"{LAST} or one of {run_folder.EARLIER}/ back, or replace the run (--overwrite)"
+            f"the run in {folder} came to step {best} at least ({BEST}), but its checkpoints are missing: put {LAST} "
+            f"or one of {run_folder.EARLIER}/ back, or replace the run (--overwrite)"
         )
     return None
 
@@ -130,65 +217,20 @@ def load_last(folder: Path, config: TrainConfig, *, repair: bool = True) -> Save
 def _reached_by(path: Path) -> int:
     """The step of a checkpoint; 0 where there is none that can be read."""
     try:
-        return checkpoint.load_metadata(path).get("step", 0)
+        return checkpoint.load_metadata(path).progress.step
     except ValueError:
         return 0
 
 
-def restore(saved: Saved, config: TrainConfig, conditions: Conditions, method: Method, progress: Progress) -> None:
-    """Bring everything back to the state that `save_last` wrote.
-
-    An option or a condition that differs is a ValueError that names it. Conditions that an older checkpoint does not
-    record are not checked.
-    """
-    tensors, metadata = saved.tensors, saved.metadata
-    before, recorded = config_from_dict(metadata["config"], source=str(saved.path)), metadata.get("conditions", {})
-    if recorded.get("precision") == conditions.precision:  # asked for by name or by "auto", it is the same
-        before = dataclasses.replace(before, precision=config.precision)
-    elif config.precision != "auto" and recorded.get("precision") in ("bf16", "fp32"):
-        before = dataclasses.replace(before, precision=recorded["precision"])  # what its "auto" was
-    check_resume(config, before)
-    _check_conditions(conditions, recorded, config.data)
-    checkpoint.restore_networks(method, tensors, saved.path)
-    checkpoint.restore_average(method, tensors, saved.path)
-    for name, optimizer in method.optimizers.items():
-        checkpoint.restore_optimizer(name, optimizer, tensors, saved.path)
-    for field in dataclasses.fields(Progress):
-        setattr(progress, field.name, metadata.get(field.name, getattr(progress, field.name)))
-    torch.set_rng_state(checkpoint.random_state(tensors, saved.path))
-    if config.device == "cuda" and "random.cuda" in tensors:
-        torch.cuda.set_rng_state(tensors["random.cuda"])
-
-
-def _check_conditions(now: Conditions, recorded: dict[str, object], data: Path) -> None:
+def _check_conditions(now: Conditions, then: Conditions, data: Path) -> None:
     """Raise a ValueError naming what differs from the conditions that a checkpoint recorded."""
-    known = [field.name for field in dataclasses.fields(now) if field.name in recorded]
-    then = dataclasses.replace(now, **{name: recorded[name] for name in known})
     if then.precision != now.precision:
         raise ValueError(
             f"cannot resume: the run computes in {then.precision}, but precision 'auto' means {now.precision} here; "
             f"ask for precision {then.precision}"
         )
-    if then.samples != now.samples:
+    if then.samples != now.samples or then.images != now.images:
         raise ValueError(
-            f"cannot resume with other training data: {then.samples} images in the run, {now.samples} in {data}; "
-            "give the run's own data set, or start a new run"
+            f"cannot resume with other training data: {then.samples} images with the CRC-32 {then.images} in the run, "
+            f"{now.samples} with {now.images} in {data}; give the run's own data set, or start a new run"
         )
-    if then.images != now.images:
-        raise ValueError(
-            f"cannot resume with other training data: the CRC-32 of the images was {then.images}, that of {data} is "
-            f"{now.images}; give the run's own data set, or start a new run"
-        )
-
-
-def check_networks(method: Method) -> None:
-    """Refuse to save networks that are no longer finite: the checkpoint on disk is better than they are."""
-    for name, network in method.networks.items():
-        _check_finite(f"the {name}", network.state_dict())
-
-
-def _check_finite(owner: str, tensors: Mapping[str, Tensor]) -> None:
-    """What is not finite would be refused when it is read again."""
-    for name, tensor in tensors.items():
-        if not bool(tensor.isfinite().all()):
-            raise FloatingPointError(f"{owner} has values that are not finite ({name})")

@@ -16,7 +16,7 @@ import torch
 from lopsided_meshes import write_meshes
 from mutations import Target
 from PIL import Image
-from safetensors.torch import save_file
+from runs import metadata
 
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict, load_config
 from learn3d.data.framing import read_photo
@@ -27,7 +27,6 @@ from learn3d.figures.curves import read_metrics
 from learn3d.files import weights, worker
 from learn3d.files.reading import parse_json
 from learn3d.make_data.render import DatasetConfig, make_dataset
-from learn3d.methods import DataShape
 from learn3d.runs import checkpoint, log
 
 ERRORS = (ValueError, FileNotFoundError, OSError)  # what a reader may raise
@@ -119,35 +118,20 @@ def checkpoint_target(tmp: Path) -> Target:
     loss.backward()
     method.optimizers["encoder"].step()
     tensors = checkpoint.network_tensors(method) | {"random.cpu": torch.get_rng_state()}
-    tensors |= checkpoint.optimizer_tensors("encoder", method.optimizers["encoder"])
-    config = TrainConfig(data=Path("d"), category="chair", output=Path("o"))
-    about = checkpoint.method_metadata(DataShape(24), config)
-    about |= {"step": 3, "best_iou": 0.5, "best_step": 2, "seconds": 1.5, "object_share": 0.5}
-    about |= {"conditions": {"samples": 72, "images": "0a", "precision": "fp32"}, "versions": {"torch": "2"}}
-    checkpoint.save(tmp / "last.safetensors", tensors, about)
-    save_file(tensors, tmp / "old.safetensors", metadata={"learn3d": json.dumps({"format": 1, **about})})
-
-    def read_one(path: Path) -> None:
-        metadata = checkpoint.load_metadata(path)
-        assert type(metadata.get("step", 0)) is int
-        if "config" in metadata:
-            config_from_dict(metadata["config"], source=str(path))
-        tensors, _ = checkpoint.load(path)
-        fresh = StandIn()
-        checkpoint.restore_networks(fresh, tensors, path)
-        checkpoint.restore_optimizer("encoder", fresh.optimizers["encoder"], tensors, path)
-        checkpoint.random_state(tensors, path)
-        fresh.networks["encoder"](torch.ones(2, 3)).sum().backward()
-        fresh.optimizers["encoder"].step()
-        if {"shape", "num_views"} & set(metadata):
-            checkpoint.data_shape(metadata)
+    tensors |= checkpoint.optimizer_state("encoder", method.optimizers["encoder"])[0]
+    checkpoint.save(tmp / "last.safetensors", tensors, metadata())
 
     def read(folder: Path) -> None:
-        for name in ("last", "old"):  # the first has checksums, the second, of version 1, lets more through
-            read_one(folder / f"{name}.safetensors")
+        path = folder / "last.safetensors"
+        checkpoint.load_metadata(path)
+        tensors, about = checkpoint.load(path)
+        fresh = StandIn()
+        checkpoint.restore_networks(fresh, tensors, path)
+        checkpoint.restore_optimizer("encoder", fresh.optimizers["encoder"], tensors, about.optimizers, path)
+        fresh.networks["encoder"](torch.ones(2, 3)).sum().backward()
+        fresh.optimizers["encoder"].step()
 
-    names = ("last.safetensors", "old.safetensors")
-    return Target(tmp, dict.fromkeys(names, m.damage_safetensors), read)
+    return Target(tmp, {"last.safetensors": m.damage_safetensors}, read)
 
 
 class StandIn:

@@ -27,13 +27,12 @@ from torch.optim import Optimizer
 from learn3d.data import conventions
 from learn3d.data.sampling import shuffled_epochs
 from learn3d.device import keep_freed_memory, resolve_precision
-from learn3d.interrupt import Stop
 from learn3d.methods import DataShape, create_method
 from learn3d.methods import method as method_module
 from learn3d.parallel.launch import start
 from learn3d.parallel.ranks import Ranks
 from learn3d.presets import PRESETS
-from learn3d.terminal import in_a_sentence
+from learn3d.terminal import Stop, in_a_sentence
 
 
 @dataclass(frozen=True)

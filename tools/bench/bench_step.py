@@ -22,7 +22,7 @@ from torch import Tensor
 
 import nmr
 from learn3d import evaluation
-from learn3d.config import DEFAULT_PRESET, TrainConfig, config_from_dict
+from learn3d.config import DEFAULT_PRESET, TrainConfig
 from learn3d.data import conventions
 from learn3d.data.augment import augment
 from learn3d.data.dataset import ViewDataset
@@ -174,7 +174,7 @@ def prepare(options: StepOptions) -> tuple[TrainConfig, ViewDataset, dict[str, T
     """The run to be measured, its data, and the weights of its checkpoint, if it has one."""
     if options.checkpoint is not None:
         tensors, metadata = checkpoint.load(checkpoint.find(options.checkpoint, "best"))
-        config = config_from_dict(metadata["config"])
+        config = metadata.config
         size = {"image_size": config.settings.image_size, "view_bins": config.view_bins}
         where = (config.layout, config.data, config.category, "train")
         dataset = load_dataset(*where, views_per_object=config.views_per_object, **size)

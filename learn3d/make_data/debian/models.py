@@ -26,12 +26,12 @@ from tqdm import tqdm
 from learn3d.files import limits, worker
 from learn3d.files.findings import DamagedFile, MissingFile
 from learn3d.files.writing import write_bytes
-from learn3d.interrupt import stop_on_signal
 from learn3d.make_data.debian import packages
 from learn3d.make_data.debian.aircraft import AIRCRAFT_PACKAGE, aircraft_models
 from learn3d.make_data.debian.furniture import FURNITURE_PACKAGES, furniture_models
 from learn3d.make_data.mesh_cleaning import clean_mesh, overlap, surface_grid
 from learn3d.settings import FilePath, checked
+from learn3d.terminal import stop_on_signal
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side when surfaces are compared

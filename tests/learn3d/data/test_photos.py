@@ -43,7 +43,7 @@ def test_the_best_networks_are_those_with_the_best_silhouettes(made: Path, tmp_p
     measured = {line["step"]: line["silhouette_iou"] for line in lines if line["split"] == "val"}
     assert summary.best_step == max(measured, key=measured.get)
     method, _, metadata = checkpoint.load_method(tmp_path / "run" / "best.safetensors")
-    assert metadata["step"] == summary.best_step and measured[summary.best_step] == summary.best_iou
+    assert metadata.progress.step == summary.best_step and measured[summary.best_step] == summary.best_iou
     again = evaluate(method, load_dataset("photos", made, "chair", "val")).silhouette_iou
     assert float(again.mean()) == pytest.approx(summary.best_iou, abs=1e-5)
 

@@ -212,7 +212,7 @@ def test_bins_decide_the_number_of_view_classes(laboratory: Laboratory, outcomes
     counts = {}
     for row in TABLES["bins"].rows:
         metadata = checkpoint.load_metadata(laboratory.runs / f"{row.variant.name}-seed0" / "best.safetensors")
-        counts[row.label.removesuffix(" degrees")] = checkpoint.data_shape(metadata).num_views
+        counts[row.label.removesuffix(" degrees")] = metadata.shape.num_views
     assert counts == VIEW_CLASSES
     assert sorted(counts.values()) == list(counts.values()), "finer and finer"
     assert outcomes["bins"].report["missing"] == []
@@ -235,7 +235,7 @@ def test_losses_that_an_ablation_turns_off_are_not_computed(
 def test_the_precision_is_the_rows(laboratory: Laboratory, outcomes: dict[str, Outcome]) -> None:
     for row in TABLES["precision"].rows:
         metadata = checkpoint.load_metadata(laboratory.runs / f"{row.variant.name}-seed0" / "last.safetensors")
-        assert row.label.endswith(metadata["conditions"]["precision"])
+        assert row.label.endswith(metadata.conditions.precision)
     fp32, bf16 = (outcomes["precision"].cell(row.label)["values"]["kato18"] for row in TABLES["precision"].rows)
     assert fp32 != bf16
 
@@ -273,7 +273,7 @@ def test_the_class_conditional_preset_goes_from_meshes_to_meshes(laboratory: Lab
     words += [word for change in _VPL for word in f"--{change.replace('_', '-')}".split("=")]
     status, _, said = call_tool("train", *words)
     assert status == 0, said
-    assert checkpoint.data_shape(checkpoint.load_metadata(run / "last.safetensors")).num_classes == 2
+    assert checkpoint.load_metadata(run / "last.safetensors").shape.num_classes == 2
     tensors, _ = checkpoint.load(run / "last.safetensors")
     (name,) = (name for name in tensors if name.startswith("network.discriminator.classes.") and "original" in name)
     assert tensors[name].shape[1] == 2, "the discriminator is told one of two classes"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from runs import metadata
 from safetensors.torch import save_file
 
-from learn3d.config import config_from_dict
 from learn3d.methods import DataShape, create_method
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
@@ -15,52 +15,53 @@ from learn3d.runs import checkpoint
 def test_round_trip_keeps_bits_names_and_metadata(tmp_path) -> None:
     path = tmp_path / "a.safetensors"
     tensors = {"x": torch.tensor([1.0, -0.0, 1e-40]), "y.z": torch.arange(6).reshape(2, 3).T}
-    checkpoint.save(path, tensors, {"step": 3, "config": {"name": "ä"}})
-    loaded, metadata = checkpoint.load(path)
+    checkpoint.save(path, tensors, metadata(3, versions={"torch": "ä"}))
+    loaded, about = checkpoint.load(path)
     assert loaded.keys() == tensors.keys()
     assert all(torch.equal(loaded[key], tensors[key]) for key in tensors)
-    assert metadata["step"] == 3
-    assert metadata["config"] == {"name": "ä"}
+    assert about == metadata(3, versions={"torch": "ä"})
     assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
 
 
 def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch) -> None:
     path = tmp_path / "a.safetensors"
-    checkpoint.save(path, {"x": torch.zeros(1)}, {"step": 1})
+    checkpoint.save(path, {"x": torch.zeros(1)}, metadata(1))
 
-    def fail(file, tensors, metadata):
+    def fail(tensors, file, metadata):
         file.write_bytes(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(checkpoint, "_write", fail)
+    monkeypatch.setattr(checkpoint, "save_file", fail)
     with pytest.raises(OSError, match=r"cannot write the checkpoint .*a\.safetensors: disk full"):
-        checkpoint.save(path, {"x": torch.ones(1)}, {"step": 2})
-    assert checkpoint.load(path)[1]["step"] == 1
+        checkpoint.save(path, {"x": torch.ones(1)}, metadata(2))
+    assert checkpoint.load(path)[1].progress.step == 1
     assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
 
 
 def test_a_file_that_cannot_be_written_is_an_oserror(tmp_path) -> None:
     path = tmp_path / "nowhere" / "a.safetensors"
     with pytest.raises(OSError, match=r"cannot write the checkpoint .*a\.safetensors"):
-        checkpoint.save(path, {"x": torch.zeros(1)}, {"step": 1})
+        checkpoint.save(path, {"x": torch.zeros(1)}, metadata(1))
 
 
 @pytest.mark.parametrize("keep", [0, 4, 60, -1])
 def test_truncated_file(tmp_path, keep: int) -> None:
     path = tmp_path / "last.safetensors"
-    checkpoint.save(path, {"x": torch.zeros(100)}, {"step": 1})
+    checkpoint.save(path, {"x": torch.zeros(100)}, metadata(1))
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(ValueError, match="damaged or was cut short"):
         checkpoint.load(path)
 
 
-def test_missing_foreign_and_future_files(tmp_path) -> None:
+def test_missing_foreign_and_future_files(tmp_path, monkeypatch) -> None:
     with pytest.raises(ValueError, match="there is no checkpoint"):
         checkpoint.load(checkpoint.find(tmp_path))
     save_file({"x": torch.zeros(1)}, tmp_path / "foreign.safetensors")
     with pytest.raises(ValueError, match="not a checkpoint of learn3d"):
         checkpoint.load(tmp_path / "foreign.safetensors")
-    checkpoint.save(tmp_path / "future.safetensors", {}, {"format": 99})
+    monkeypatch.setattr(checkpoint, "FORMAT", 99)
+    checkpoint.save(tmp_path / "future.safetensors", {"x": torch.zeros(1)}, metadata())
+    monkeypatch.undo()
     with pytest.raises(ValueError, match="checkpoint format 99"):
         checkpoint.load(tmp_path / "future.safetensors")
 
@@ -76,7 +77,7 @@ def test_networks_of_another_shape_are_refused(tmp_path) -> None:
 
 def test_load_method_gives_the_saved_one_for_use(finished_run) -> None:
     random = torch.get_rng_state()
-    method, config, metadata = checkpoint.load_method(checkpoint.find(finished_run, "last"))
+    method, config, about = checkpoint.load_method(checkpoint.find(finished_run, "last"))
     networks = method.networks
     assert torch.equal(torch.get_rng_state(), random)
     tensors, _ = checkpoint.load(finished_run / "last.safetensors")
@@ -84,37 +85,5 @@ def test_load_method_gives_the_saved_one_for_use(finished_run) -> None:
     assert networks["discriminator"].layers[-1].out_features == 24
     assert not any(p.requires_grad for network in networks.values() for p in network.parameters())
     assert not method.training
-    assert (config.category, metadata["step"]) == ("airplane", 4)
-    assert metadata["versions"]["torch"] == torch.__version__
-
-
-FIRST_VERSION = {
-    "data": "d",
-    "category": "chair",
-    "output": "o",
-    "iterations": 9,
-    "batch_size": 4,
-    "lambda_smooth": 0.001,
-}
-
-
-@pytest.mark.parametrize(
-    ("method", "preset", "name"),
-    [
-        ("proposed", "released", "peng2020-kato"),
-        ("proposed", "paper", "peng2020-kato-printed"),
-        ("vanilla", "released", "peng2020-kato-vanilla"),
-    ],
-)
-def test_checkpoints_of_the_first_version_are_understood(tmp_path, method: str, preset: str, name: str) -> None:
-    new = create_method(PRESETS[name].settings, DataShape(24), device="cpu", precision="fp32", seed=0)
-    weights = {"lambda_classification": None, "lambda_adversarial": None, "lambda_prior": None, "learning_rate": 1e-4}
-    config = FIRST_VERSION | weights | {"method": method, "preset": preset}
-    has_discriminator = method == "proposed"
-    about = {"config": config, "has_discriminator": has_discriminator, "num_views": 24 * has_discriminator, "step": 9}
-    checkpoint.save(tmp_path / "last.safetensors", checkpoint.network_tensors(new), about)
-    old, config, _ = checkpoint.load_method(tmp_path / "last.safetensors")
-    assert (config.preset, config.settings) == (name, PRESETS[name].settings)
-    assert old.networks.keys() == new.networks.keys()
-    with pytest.raises(ValueError, match="unknown method and preset 'gan', 'released'"):
-        config_from_dict(FIRST_VERSION | {"method": "gan"})
+    assert (config.category, about.progress.step) == ("airplane", 4)
+    assert about.versions["torch"] == torch.__version__

@@ -26,7 +26,7 @@ def test_terminal_shows_a_bar_with_losses_and_time_left(tmp_path, monkeypatch) -
         log.say("half way")
     shown = terminal.getvalue()
     assert "5/10" in shown
-    assert "projec 0.25" in shown
+    assert "projection 0.25" in shown
     assert "half way" in shown
 
 
@@ -54,7 +54,7 @@ def test_elsewhere_it_prints_few_lines(tmp_path, capsys) -> None:
             log.step(step, {"projection": 0.25})
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2
-    assert lines[0].startswith("step 5/100  projec 0.25")
+    assert lines[0].startswith("step 5/100  projection 0.25")
     assert lines[1].startswith("step 100/100")
     assert lines[1].endswith("0:00:00 left")
 
@@ -84,3 +84,12 @@ def test_damaged_lines_are_dropped(tmp_path, read_metrics, line: str) -> None:
     with RunLog(tmp_path, start=1, total=2):
         pass
     assert read_metrics(tmp_path) == [{"step": 1, "split": "train"}]
+
+
+def test_losses_of_steps_that_take_turns_are_shown_as_means(tmp_path, capsys) -> None:
+    with RunLog(tmp_path, start=0, total=40) as log:
+        for step in range(1, 41):
+            turn = {"classification": 3.0} if step % 2 else {"confusion": 1.0}
+            log.step(step, {"total": 3.0 if step % 2 else 1.0} | turn)
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "total 2  classification 3  confusion 1 " in last
