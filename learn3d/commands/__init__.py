@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import metadata
 
+from learn3d.commands.packages import missing_package
 from learn3d.terminal import in_a_sentence, note, say
 
 COMMANDS = {
@@ -27,7 +28,6 @@ HELP = """usage: learn3d COMMAND [OPTIONS]
 
 learn3d COMMAND --help has the common options of a command, --help-all has all of them.
 """
-_EXTRAS = {"matplotlib": "figures", "sklearn": "figures"}  # of the optional packages; the others belong to "train"
 
 
 @in_a_sentence(MemoryError)
@@ -51,12 +51,6 @@ def main(*given: str) -> int:
             raise
         note(f"error: learn3d {name} {missing_package(package)}")
         return 1
-
-
-def missing_package(package: str) -> str:
-    """What to say about an optional package that is not installed."""
-    extra = _EXTRAS.get(package, "train")
-    return f'needs the package {package}, which is not installed; install it: pip install "nmr-learn3d[{extra}]"'
 
 
 def _command(name: str) -> Callable[[Sequence[str]], int]:

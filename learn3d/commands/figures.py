@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from learn3d.commands import missing_package
+from learn3d.commands.packages import missing_package
 from learn3d.commands.parsing import parse
 from learn3d.terminal import note, say
 
