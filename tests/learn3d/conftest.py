@@ -18,6 +18,7 @@ from learn3d import commands, validation
 from learn3d.config import DEFAULT_PRESET, TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
+from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.presets import PRESETS
 from learn3d.training import train
@@ -66,13 +67,19 @@ def run_folder(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def tiny_config(tiny_folder: Path) -> Callable[..., TrainConfig]:
-    """Makes a configuration for a few steps of batch 4 on the tiny data; options may be settings of the method."""
+    """Makes a configuration for a few steps of batch 4 on the tiny data; options may be settings of the method.
+
+    The networks are small where the preset has those of Peng et al. 2020.
+    """
 
     def make(output: Path, **options: object) -> TrainConfig:
         defaults = {"iterations": 4, "batch_size": 4, "precision": "fp32", "log_every": 1, "max_val_images": 4}
         preset = PRESETS.get(options.get("preset", DEFAULT_PRESET), PRESETS[DEFAULT_PRESET]).settings
         names = {field.name for field in dataclasses.fields(preset)} & set(options)
-        options["settings"] = dataclasses.replace(preset, **{name: options.pop(name) for name in names})
+        settings = {name: options.pop(name) for name in names}
+        if isinstance(preset, PoseInvariantSettings) and preset.encoder == "conv":
+            settings = {"encoder": "conv-small", "generator": "sphere-small"} | settings
+        options["settings"] = dataclasses.replace(preset, **settings)
         return TrainConfig(**({"data": tiny_folder, "category": "airplane", "output": output} | defaults | options))
 
     return make

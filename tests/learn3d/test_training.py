@@ -100,7 +100,8 @@ def test_vanilla_has_no_discriminator_and_no_code_losses(tiny_config, tiny_set, 
 
 
 def test_projection_loss_falls(tiny_config, tiny_set, tmp_path) -> None:
-    _, step = make_step(tiny_config(tmp_path, preset=VANILLA, learning_rate=3e-4), tiny_set)
+    networks = {"encoder": "conv", "generator": "sphere"}  # the paper's
+    _, step = make_step(tiny_config(tmp_path, preset=VANILLA, learning_rate=3e-4, **networks), tiny_set)
     values = [step(iteration)["projection"] for iteration in range(1, 7)]
     assert values[-1] < values[0] - 0.03
 

@@ -70,10 +70,11 @@ def made_by_hand(tmp_path, finished_run, tiny_folder, options):
     """The plan of a run whose folder holds one that tools/train.py would have left: four steps of batch 4."""
     (tmp_path / "out" / "runs" / "airplane").mkdir(parents=True)
     (tmp_path / "out" / "runs" / "airplane" / "proposed-seed0").symlink_to(finished_run)
-    given = {"methods": ("proposed",), "iterations": 4, "changes": ("precision=fp32",)}
+    given = {"methods": ("proposed",), "iterations": 4}
+    own = ("precision=fp32", "encoder=conv-small", "generator=sphere-small")
 
-    def plan(**more: object):
-        given_options = options(**(given | more))
+    def plan(changes: tuple[str, ...] = (), **more: object):
+        given_options = options(**(given | more), changes=own + changes)
         return plan_runs(TABLES["kato"], dataclasses.replace(given_options, data=tiny_folder))[0]
 
     return plan

@@ -123,7 +123,7 @@ def test_other_options_are_named(made_by_hand) -> None:
     with pytest.raises(ValueError, match=r"proposed-seed0 has a run with other options: batch_size: 4 .* 5 asked for"):
         read_state(made_by_hand(batch_size=5))
     with pytest.raises(ValueError, match=r"lambda_prior: 1\.0 in the run, 0\.5 asked for"):
-        read_state(made_by_hand(changes=("precision=fp32", "lambda_prior=0.5")))
+        read_state(made_by_hand(changes=("lambda_prior=0.5",)))
     with pytest.raises(ValueError, match="iterations: 4 taken by the run, 3 asked for"):
         read_state(made_by_hand(iterations=3))
 
