@@ -18,6 +18,7 @@ from learn3d.files import writing
 from learn3d.terminal import align
 
 Cells = list[list[str]]
+REFERENCE = "paper: on its own data, with its own length of training; for reference, not for comparison."
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> list[Path]:
@@ -92,7 +93,7 @@ def _code(lines: list[str]) -> str:
 def to_text(report: dict[str, Any]) -> str:
     """The table for the terminal, and how long our runs were trained."""
     trained = f"\nhere: trained for {_trained(report)}" if report["runs"] else ""
-    return align(main_table(report)) + trained
+    return f"{align(main_table(report))}\n{REFERENCE}{trained}"
 
 
 def to_html(report: dict[str, Any]) -> str:
@@ -112,10 +113,11 @@ def main_table(report: dict[str, Any]) -> Cells:
         quoted = f", quoted from {row['quoted_from']}" if row["quoted_from"] else ""
         label = row["label"]
         if any("paper" in cell or "paper_printed" in cell for cell in cells):
-            table.append([label, f"paper{quoted} ({_voxeliser(row['metric'])})", *map(_paper_text, cells)])
+            voxeliser = "voxeliser not stated" if row["metric"] == "unknown" else row["metric"]
+            table.append([label, f"paper{quoted} ({voxeliser})", *map(_paper_text, cells)])
             label = ""
         if any("code" in cell for cell in cells):
-            texts = (_number(cell.get("code"), digits=3) for cell in cells)
+            texts = (_number(cell.get("code"), ".3f") for cell in cells)
             table.append([label, "published code, same meshes", *texts])
             label = ""
         if row["variant"] is not None:
@@ -156,7 +158,7 @@ def commands(report: dict[str, Any]) -> list[str]:
 
 
 def _notes(report: dict[str, Any]) -> list[str]:
-    notes = [report["note"]] if report["note"] else []
+    notes = [REFERENCE, *([report["note"]] if report["note"] else [])]
     seeds = sorted({seed for row in report["rows"] for seed in row["cells"].get(MEAN, {}).get("seeds", [])})
     about = "Brackets: 95 % intervals, over test objects (bootstrap; objects, not images, are drawn again)"
     if len(seeds) > 1:
@@ -189,43 +191,28 @@ def _only_printed(cell: dict[str, Any]) -> bool:
 
 
 def _paper_text(cell: dict[str, Any]) -> str:
-    return f"({cell['paper_printed']:.3f})" if _only_printed(cell) else _number(cell.get("paper"), digits=3)
-
-
-def _voxeliser(metric: str) -> str:
-    return "voxeliser not stated" if metric == "unknown" else metric
+    return f"({cell['paper_printed']:.3f})" if _only_printed(cell) else _number(cell.get("paper"), ".3f")
 
 
 def _ours_text(cell: dict[str, Any], metric: str) -> str:
     """Value, half width of the interval over seeds, interval over objects."""
     if metric not in cell.get("values", {}):
         return "-"
-    text = _number(cell["values"][metric], digits=3) + _seeds_text(cell["interval_seeds"].get(metric))
-    return text + _interval_text(cell["interval_objects"].get(metric))
+    intervals = (cell["interval_seeds"].get(metric), cell["interval_objects"].get(metric))
+    return _number(cell["values"][metric], ".3f") + _intervals(*intervals, ".3f")
 
 
 def _difference_text(difference: dict[str, Any] | None) -> str:
     if difference is None:
         return "-"
-    text = _signed(difference["value"]) + _seeds_text(difference.get("interval_seeds"))
-    if "ratio" in difference:
-        return f"{text} (x {difference['ratio']:.2f})"
-    return text + _interval_text(difference.get("interval_objects"), signed=True)
+    ratio = f" (x {difference['ratio']:.2f})" if "ratio" in difference else ""
+    intervals = (difference.get("interval_seeds"), difference.get("interval_objects"))
+    return _number(difference["value"], "+.3f") + _intervals(*intervals, "+.3f") + ratio
 
 
-def _seeds_text(interval: Sequence[float] | None) -> str:
-    """Half the width of an interval over seeds."""
-    return "" if interval is None else f" ±{_number((interval[1] - interval[0]) / 2, digits=3)}"
-
-
-def _interval_text(interval: Sequence[float] | None, signed: bool = False) -> str:
-    if interval is None:
-        return ""
-    return " [" + ", ".join(_signed(end) if signed else _number(end, digits=3) for end in interval) + "]"
-
-
-def _signed(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.3f}"
+def _intervals(seeds: Sequence[float] | None, objects: Sequence[float] | None, form: str) -> str:
+    text = "" if seeds is None else f" ±{(seeds[1] - seeds[0]) / 2:.3f}"
+    return text + ("" if objects is None else f" [{_number(objects[0], form)}, {_number(objects[1], form)}]")
 
 
 def _commit_text(run: dict[str, Any]) -> str:
@@ -235,8 +222,8 @@ def _commit_text(run: dict[str, Any]) -> str:
     return f"tested at {run['tested_at'][:9]}" if run["tested_at"] else "-"
 
 
-def _number(value: float | None, digits: int = 4) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+def _number(value: float | None, form: str = ".4f") -> str:
+    return "-" if value is None else format(value, form)
 
 
 def _markdown_table(table: Cells) -> str:

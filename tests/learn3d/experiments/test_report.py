@@ -114,7 +114,8 @@ def test_different_lengths_of_training_are_said(tmp_path, stub, options) -> None
 
 def test_the_table_on_the_terminal_is_aligned_and_says_how_long_ours_were_trained(stub, capsys, options) -> None:
     run_experiment(Call("kato", options(iterations=5)), worker=stub)
-    header, *rows, trained = capsys.readouterr().out.splitlines()
+    header, *rows, reference, trained = capsys.readouterr().out.splitlines()
+    assert reference.startswith("paper: on its own data")
     assert trained == "here: trained for 5 iterations of batch 4"
     starts = [match.start() for match in re.finditer(r"\S+", header)]
     assert len(starts) == 3 and len(rows) >= 4
