@@ -21,8 +21,8 @@ from learn3d.methods import Grids, Meshes, Method
 from learn3d.methods.surfaces import grid_surface
 from learn3d.parallel.ranks import ALONE, Ranks
 
+#: What brings the predicted shapes of a batch to the true ones before they are compared; see `evaluate`.
 Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]
-"""What brings the predicted shapes of a batch to the true ones before they are compared; see `evaluate`."""
 
 CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
@@ -36,9 +36,7 @@ class Evaluation:
 
     object_ids: Tensor  # int64 [M]
     view_ids: Tensor  # int64 [M]
-    ious: dict[
-        Definition, Tensor
-    ]  # float [M] per voxeliser; NaN where prediction and truth are empty; {} without truth
+    ious: dict[Definition, Tensor]  # [M] per voxeliser; NaN where prediction and truth are empty; {} without truth
     chamfer_l1: Tensor | None  # float [M], NaN where a surface is empty; None when not asked for or without truth
     f_score: Tensor | None  # float [M], 0 where the prediction alone is empty; likewise
     silhouette_iou: Tensor | None  # float [M], where there are no voxels and shapes are meshes
@@ -199,7 +197,7 @@ def align_yaw(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset) -> Mes
     and where the data set has no voxels.
     """
     if not isinstance(shapes, Meshes) or batch.voxels is None:
-        raise ValueError("align 'yaw' turns meshes and compares them with voxels; leave it out for grids, or without")
+        raise ValueError("align 'yaw' turns meshes and compares them with voxels; leave it out for grids and without")
     best = torch.full((len(shapes.vertices),), -1.0)
     aligned = shapes.vertices
     for k in range(YAW_STEPS):
