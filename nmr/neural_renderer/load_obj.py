@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+from array import array
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,11 +23,11 @@ _MOST_BYTES = 2**30  # of an .obj or .mtl file; reading one takes some 30 times 
 class _Obj:
     """The lines of an .obj file that matter; polygons are fans of triangles, numbers count from 0."""
 
-    vertices: list = field(default_factory=list)
-    uv: list = field(default_factory=list)
-    faces: list = field(default_factory=list)  # (v0, v1, v2)
-    uv_faces: list = field(default_factory=list)  # (vt0, vt1, vt2), or (-1, -1, -1) without texture coordinates
-    materials: list = field(default_factory=list)  # of each face
+    vertices: array = field(default_factory=lambda: array("d"))  # x, y, z of each
+    uv: array = field(default_factory=lambda: array("d"))  # u, v of each
+    faces: array = field(default_factory=lambda: array("i"))  # v0, v1, v2 of each
+    uv_faces: array = field(default_factory=lambda: array("i"))  # vt0, vt1, vt2, or -1, -1, -1 without coordinates
+    materials: list = field(default_factory=lambda: [("", 0)])  # (name, the face that it begins with)
     libraries: list = field(default_factory=list)  # names of .mtl files
 
 
@@ -76,8 +78,8 @@ def load_obj(
     if texture_wrapping not in WRAPPINGS:
         raise ValueError(f"texture_wrapping must be one of {', '.join(WRAPPINGS)}, got {texture_wrapping!r}")
     obj = _read_obj(filename_obj)
-    vertices = torch.tensor(obj.vertices, dtype=torch.float32)
-    faces = torch.tensor(obj.faces, dtype=torch.int32)
+    vertices = torch.from_numpy(np.array(obj.vertices, np.float32).reshape(-1, 3))
+    faces = torch.from_numpy(np.array(obj.faces, np.int32).reshape(-1, 3))
     if normalization:
         vertices = vertices - vertices.amin(0)
         vertices = vertices / vertices.abs().max() * 2
@@ -93,33 +95,33 @@ def load_obj(
 
 
 def _read_obj(filename: str) -> _Obj:
-    obj, material = _Obj(), ""
+    obj = _Obj()
     _check_file(filename)
     with open(filename, encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
             keyword, _, rest = line.strip().partition(" ")
             try:
                 if keyword == "v":
-                    obj.vertices.append(_numbers(rest, 3))
+                    obj.vertices.extend(_numbers(rest, 3))
                 elif keyword == "vt":
-                    obj.uv.append(_numbers(rest, 2))
+                    obj.uv.extend(_numbers(rest, 2))
                 elif keyword == "f":
-                    _add_polygon(obj, rest.split(), material)
+                    _add_polygon(obj, rest)
                 elif keyword == "usemtl":
-                    material = rest.strip()
+                    obj.materials.append((rest.strip(), len(obj.faces) // 3))
                 elif keyword == "mtllib":
                     obj.libraries.append(rest.strip())
-            except (ValueError, IndexError) as error:
-                raise ValueError(f"{filename}, line {number}: {line.strip()!r} cannot be read: {error}") from None
+            except (ValueError, IndexError, OverflowError) as error:
+                raise ValueError(f"{filename}, line {number}: {line.strip()[:200]!r} cannot be read: {error}") from None
     if not obj.vertices or not obj.faces:
         missing = "vertices (lines `v x y z`)" if not obj.vertices else "faces (lines `f 1 2 3`)"
         raise ValueError(f"{filename} has no {missing}")
-    last = max(map(max, obj.faces))
-    if last >= len(obj.vertices):
-        raise ValueError(f"{filename}: a face refers to vertex {last + 1}, but there are {len(obj.vertices)}")
-    last = max(map(max, obj.uv_faces))
-    if last >= len(obj.uv):
-        raise ValueError(f"{filename}: a face refers to texture coordinate {last + 1}, but there are {len(obj.uv)}")
+    for name, numbers, count in (
+        ("vertex", obj.faces, len(obj.vertices) // 3),
+        ("texture coordinate", obj.uv_faces, len(obj.uv) // 2),
+    ):
+        if (last := max(numbers)) >= count:
+            raise ValueError(f"{filename}: a face refers to {name} {last + 1}, but there are {count}")
     return obj
 
 
@@ -138,17 +140,20 @@ def _numbers(rest: str, count: int) -> tuple[float, ...]:
     return values
 
 
-def _add_polygon(obj: _Obj, corners: list[str], material: str) -> None:
-    if len(corners) < 3:
+def _add_polygon(obj: _Obj, line: str) -> None:
+    """Adds the fan of a polygon. Of a long line the corners are taken one by one, for there may be millions of them."""
+    corners = line.split() if len(line) < 2**16 else (word[0] for word in re.finditer(r"\S+", line))
+    points, uvs, num_points, num_uvs = array("i"), array("i"), len(obj.vertices) // 3, len(obj.uv) // 2
+    for corner in corners:
+        part = corner.split("/", 2)
+        points.append(_index(part[0], num_points))
+        if len(part) > 1 and part[1]:
+            uvs.append(_index(part[1], num_uvs))
+    if len(points) < 3:
         raise ValueError("a face needs three corners")
-    parts = [corner.split("/") for corner in corners]
-    points = [_index(part[0], len(obj.vertices)) for part in parts]
-    has_uv = all(len(part) > 1 and part[1] for part in parts)
-    uvs = [_index(part[1], len(obj.uv)) for part in parts] if has_uv else [-1] * len(parts)
-    for i in range(1, len(parts) - 1):
-        obj.faces.append((points[0], points[i], points[i + 1]))
-        obj.uv_faces.append((uvs[0], uvs[i], uvs[i + 1]))
-        obj.materials.append(material)
+    for i in range(1, len(points) - 1):
+        obj.faces.extend((points[0], points[i], points[i + 1]))
+        obj.uv_faces.extend((uvs[0], uvs[i], uvs[i + 1]) if len(uvs) == len(points) else (-1, -1, -1))
 
 
 def _index(text: str, count: int) -> int:
@@ -192,21 +197,22 @@ def _textures(filename_obj: str, obj: _Obj, texture_size: int, wrapping: str, bi
             more_colors, more_images = load_mtl(os.path.join(folder, one))
             colors.update(more_colors)
             images.update(more_images)
-    uv_faces = np.array(obj.uv_faces)
+    uv_faces, uvs = np.array(obj.uv_faces).reshape(-1, 3), np.array(obj.uv, np.float32).reshape(-1, 2)
     textures = np.full((len(uv_faces), texture_size, texture_size, texture_size, 3), _GREY, dtype=np.float32)
-    faces_of: dict[str, list[int]] = {}
-    for face, name in enumerate(obj.materials):
-        faces_of.setdefault(name, []).append(face)
-    for name, faces in faces_of.items():
+    faces_of: dict[str, list[np.ndarray]] = {}
+    ends = [first for _, first in obj.materials[1:]] + [len(uv_faces)]
+    for (name, first), end in zip(obj.materials, ends, strict=True):
+        faces_of.setdefault(name, []).append(np.arange(first, end))
+    for name, runs in faces_of.items():
+        faces = np.concatenate(runs)
         if name in colors:
             textures[faces] = colors[name]
-        chosen = np.array(faces)[(uv_faces[faces] >= 0).all(1)]
+        chosen = faces[(uv_faces[faces] >= 0).all(1)]
         if name in images and len(chosen):
             path = os.path.join(folder, images[name])
             if not os.path.exists(path):  # map_Kd may have options before the file name
                 path = os.path.join(folder, (images[name].split() or [""])[-1])
-            uv = np.array(obj.uv, dtype=np.float32)[uv_faces[chosen]]
-            textures[chosen] = bake_textures(read_image(path), uv, texture_size, wrapping, bilinear)
+            textures[chosen] = bake_textures(read_image(path), uvs[uv_faces[chosen]], texture_size, wrapping, bilinear)
     return torch.from_numpy(textures)
 
 
