@@ -38,7 +38,7 @@ def prepare_image(
 
     The object is laid over white and, with `crop`, centred in a square so that its larger side takes `object_share` of
     it, as in the data set; without, the image must be framed like that already and is only made square and scaled.
-    Colours are inverted where the layout inverts them. Where its images are stretched (Pascal3D+), the background stays,
+    Colours are inverted where the layout inverts them. Where images are stretched (Pascal3D+), the background stays,
     and `crop` takes the mask's box, padded and stretched as the reader does it (`learn3d.data.crops`).
     """
     if colors.ndim != 3 or colors.shape[2] != 3 or mask.shape != colors.shape[:2]:
