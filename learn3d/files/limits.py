@@ -1,7 +1,7 @@
 """Bounds on what is read from files that somebody else may have made, where they are cheap to check and clear.
 
-Memory, time and crashes of the libraries that decode are the business of `worker`. Real data stay far below all of these
-(the comments say by how much), so none can be changed from outside.
+Memory, time and crashes of the libraries that decode are the business of `worker`. Real data stay far below all of
+these (the comments say by how much), so none can be changed from outside.
 """
 
 MIB, GIB = 2**20, 2**30
