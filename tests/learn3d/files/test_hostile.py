@@ -61,7 +61,7 @@ def bounded() -> Iterator[None]:
     assert most[0] < BYTES, f"it took {most[0] / 1e6:.0f} MB"
 
 
-def refused(read, path: Path, *arguments: object, said: str = "") -> None:
+def refused(read, path: Path, *arguments: object, said: str | None = None) -> None:
     start = time.monotonic()
     with bounded(), pytest.raises(ValueError, match=said) as error:
         read(path, *arguments)
@@ -102,7 +102,7 @@ def test_matlab_elements_of_wrong_types(tmp_path):
 
 @linux
 def test_matlab_arrays_that_unpack_to_gigabytes(tmp_path):
-    refused(read_mat, mat(tmp_path, True, np.zeros((8, 1024, 1024, 64), np.uint8)))
+    refused(read_mat, mat(tmp_path, True, np.zeros((4, 1024, 1024, 128), np.uint8)))
 
 
 def test_matlab_cells_within_cells(tmp_path):
@@ -171,7 +171,7 @@ def bomb(path: Path, name: str, size: int, header: bytes) -> Path:
 
 
 def test_npz_bomb(tmp_path):
-    size = 2**31
+    size = 2**28
     header = b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }" % size
     path = bomb(tmp_path / "a.npz", "a.npy", size, header)
     refused(lambda p: worker.read(npz.read, p, "a"), path, said="times its size")
@@ -182,7 +182,7 @@ def test_object_array_bomb(tmp_path):
     """A pickle whose marks would take a gigabyte."""
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("images.npy", npy(b"\x80\x02" + b"]" * 60_000_000 + b"."))
+        archive.writestr("images.npy", npy(b"\x80\x02" + b"]" * 30_000_000 + b"."))
     refused(lambda p: worker.read(npz.read_ragged, p, "images"), path)
 
 
