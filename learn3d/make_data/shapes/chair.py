@@ -80,23 +80,11 @@ def _jointed_chair(rng: np.random.Generator, family: str) -> list[Solid]:
     elif family == "bar":
         kind = pick(rng, {"legs": 3, "disc": 1.5, "loops": 1, "panels": 0.3})
     elif family == "lounge":
-        kind = pick(
-            rng, {"legs": 2.5, "loops": 2, "cantilever": 1, "rocker": 1, "star": 0.6, "panels": 0.7, "cross": 0.7}
-        )
+        kinds = {"legs": 2.5, "loops": 2, "cantilever": 1, "rocker": 1, "star": 0.6, "panels": 0.7, "cross": 0.7}
+        kind = pick(rng, kinds)
     else:
-        kind = pick(
-            rng,
-            {
-                "legs": 6,
-                "loops": 1,
-                "cantilever": 1,
-                "cross": 0.8,
-                "panels": 0.6,
-                "disc": 0.7,
-                "star": 0.4,
-                "rocker": 0.5,
-            },
-        )
+        kinds = {"legs": 6, "loops": 1, "cantilever": 1, "cross": 0.8, "panels": 0.6, "disc": 0.7, "star": 0.4}
+        kind = pick(rng, kinds | {"rocker": 0.5})
     under = height - thickness
     spread = 0.5 * 0.35 ** (1 / exponent)  # well inside the outline
     half_x, half_z = spread * width * (0.5 + 0.5 * taper) - 0.03, spread * depth - 0.03

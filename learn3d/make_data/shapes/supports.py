@@ -71,11 +71,10 @@ def four_legs(
     height: float,
     size: float | None = None,
     plain: bool = False,
-    shelf: bool = False,
 ) -> list[Solid]:
     """Four legs, straight or splayed, perhaps with stretchers and an apron; sometimes bent-wire (hairpin) legs.
 
-    `plain` ones are tapered and without an apron; a `shelf` takes the place of stretchers.
+    `plain` ones are tapered and without an apron.
     """
     size = rng.uniform(0.028, 0.055) if size is None else size
     splay = rng.uniform(0.02, 0.16) * height if maybe(rng, 0.55) else 0.0
@@ -102,11 +101,6 @@ def four_legs(
     stretchers = pick(rng, {"none": 3, "H": 1, "box": 1, "sides": 0.7, "X": 0.4})
     t, thick = rng.uniform(0.15, 0.5), 0.55 * size
     flip = np.array([-1.0, 1.0, 1.0])
-    if shelf:
-        stretchers = "none"
-        (x, y, z), rear_z = at(front, t), at(back, t)[2]
-        board = slab(rectangle(2 * x, z - rear_z, 0.01, 1), 0.02)
-        solids.append(board.moved(y=y, z=(z + rear_z) / 2))
     if stretchers in ("H", "box", "sides"):
         solids += both_sides(bar(at(front, t), at(back, t), thick))
     if stretchers == "H":
