@@ -230,11 +230,19 @@ class _Job:
     def __init__(self) -> None:
         self.busy: set[_Worker] = set()
         self.stopped = False  # nobody waits for the results any more
+        self.lock = threading.Lock()
 
     def stop(self) -> None:
-        self.stopped = True
-        for worker in list(self.busy):
-            worker.end()
+        with self.lock:
+            self.stopped = True
+            for worker in self.busy:
+                worker.end()
+
+    def leave(self, worker: _Worker) -> bool:
+        """Take a worker out; whether it is alive, for it may have been stopped a moment after its answer."""
+        with self.lock:
+            self.busy.discard(worker)
+            return not self.stopped
 
 
 _jobs: set[_Job] = set()  # of all threads
@@ -248,7 +256,8 @@ def _run(calls: list[Call], job: _Job) -> list[Any]:
     with pool.slots:
         worker, usable, started = pool.take(), False, time.monotonic()
         worker.deadline = started + patience
-        job.busy.add(worker)
+        with job.lock:
+            job.busy.add(worker)
         try:
             results = worker.exchange(request)
             usable = not worker.last
@@ -260,9 +269,10 @@ def _run(calls: list[Call], job: _Job) -> list[Any]:
             worker.release()
             raise
         finally:
-            job.busy.discard(worker)
-            pool.give_back(worker, usable)
-            if worker.last:
+            alive = job.leave(worker)
+            pool.give_back(worker, usable and alive)
+            if worker.last or not alive:
+                worker.end()
                 worker.release()
     if len(calls) > 1 or job.stopped:  # one of them was it
         return [_run([call], job)[0] for call in calls]
