@@ -54,20 +54,20 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
         ranks = ranks.divide(config.batch_size, config.sampling)
 
         train_set, val_set = load_splits(config)
+        found = (train_set.check_masks(), crowding(torch.get_num_threads(), ranks.local_world))
         shape = DataShape(train_set.num_views, train_set.num_classes, train_set.pose_features, train_set.inverted)
         precision = resolve_precision(config.precision, config.device)
         how = {"device": config.device, "precision": precision, "seed": config.seed, "plan": config.plan}
         method = create_method(config.settings, shape, **how)
         run = Run(config, method, shape, conditions_of(train_set, precision), ranks)
-        progress, warnings = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
+        progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:  # also after a kill between the last save and the end
             return dataclasses.replace(_summary(config, progress, started), was_finished=True)
         before = progress.seconds
 
         with with_advice(folder), stop_on_signal() as stop, _open_log(config, progress, ranks) as log:
-            for warning in (*warnings, train_set.check_masks(), crowding(torch.get_num_threads(), ranks.local_world)):
-                if warning:
-                    log.say(f"warning: {warning}")
+            for warning in filter(None, (*notes, *found)):
+                log.say(f"warning: {warning}")
             log.say(_describe(config, precision, train_set, val_set, progress, ranks))
             for step in range(progress.step + 1, config.iterations + 1):
                 indices = sample_indices(train_set, config.sampling, config.batch_size, config.seed, step)

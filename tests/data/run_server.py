@@ -56,11 +56,15 @@ def serve() -> None:
     import tiny_networks
     import torch.utils.tensorboard  # noqa: F401
 
-    from learn3d import training, validation  # noqa: F401
+    from learn3d import training, validation
+    from learn3d.config import config_from_dict
 
     tiny_networks.put_in_place()
     validation.PICTURE_ROWS = 1
+    read, sets = training.load_splits, None
     for line in sys.stdin:
+        sets = sets or read(config_from_dict(json.loads(line)["config"]))  # once, and not in every copy
+        training.load_splits = lambda config, sets=sets: sets
         print(json.dumps(_fork(json.loads(line))), flush=True)
 
 
