@@ -30,7 +30,7 @@ from learn3d.make_data.shapes.parts import (
     rectangle,
     wing,
 )
-from learn3d.make_data.shapes.sampling import maybe, pick
+from learn3d.make_data.shapes.sampling import drawn, maybe, pick
 
 
 def airliner(rng: np.random.Generator) -> list[Solid]:
@@ -86,15 +86,8 @@ def business_jet(rng: np.random.Generator) -> list[Solid]:
     """A small jet with engines at the tail."""
     radius = rng.uniform(0.052, 0.075)
     body = fuselage(radius, nose=rng.uniform(0.14, 0.24), nose_power=1.6, tail_start=0.6, upsweep=0.35, droop=0.3)
-    plan = Planform(
-        half=rng.uniform(0.4, 0.52),
-        root=rng.uniform(0.15, 0.2),
-        tip=rng.uniform(0.045, 0.07),
-        sweep_deg=rng.uniform(2, 34),
-        dihedral_deg=rng.uniform(2, 6),
-        z=rng.uniform(0.02, 0.08),
-        y=-0.75 * radius,
-    )
+    size = drawn(rng, half=(0.4, 0.52), root=(0.15, 0.2), tip=(0.045, 0.07), sweep_deg=(2, 34), dihedral_deg=(2, 6))
+    plan = Planform(**size, z=rng.uniform(0.02, 0.08), y=-0.75 * radius)
     solids = [body, surface(plan)]
     solids += tail_engines(rng, radius, rng.uniform(0.026, 0.036), z=-0.2)
     solids += tail(rng, pick(rng, {"T": 3, "cross": 1, "V": 0.4}), radius, swept=True)
@@ -110,15 +103,8 @@ def fighter(rng: np.random.Generator) -> list[Solid]:
     """A jet fighter: delta, swept or trapezoid wings, one or two fins, canards, stores under the wings."""
     radius = rng.uniform(0.05, 0.068)
     twin = maybe(rng, 0.45)
-    body = fuselage(
-        radius,
-        tall=rng.uniform(0.9, 1.15),
-        nose=rng.uniform(0.3, 0.42),
-        nose_power=rng.uniform(1.05, 1.4),
-        tail_start=0.75,
-        tail_radius=rng.uniform(0.65, 0.85),
-        exponent=rng.uniform(2.0, 3.2),
-    )
+    form = drawn(rng, tall=(0.9, 1.15), nose=(0.3, 0.42), nose_power=(1.05, 1.4), tail_start=0.75)
+    body = fuselage(radius, **form, tail_radius=rng.uniform(0.65, 0.85), exponent=rng.uniform(2.0, 3.2))
     shape = pick(rng, {"delta": 2.5, "swept": 2, "trapezoid": 2, "forward": 0.3})
     root, tip, sweep, z = {
         "delta": (rng.uniform(0.42, 0.52), rng.uniform(0.02, 0.06), rng.uniform(46, 58), 0.1),

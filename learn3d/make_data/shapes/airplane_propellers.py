@@ -28,42 +28,27 @@ from learn3d.make_data.shapes.parts import (
     tube,
     wing,
 )
-from learn3d.make_data.shapes.sampling import maybe, pick
+from learn3d.make_data.shapes.sampling import drawn, maybe, pick
 
 
 def turboprop(rng: np.random.Generator) -> list[Solid]:
     """A twin or four-engined propeller plane."""
     radius = rng.uniform(0.05, 0.075)
     high = maybe(rng, 0.55)
-    body = fuselage(
-        radius,
-        tall=rng.uniform(0.95, 1.2),
-        nose=rng.uniform(0.1, 0.2),
-        nose_power=2.0,
-        tail_start=rng.uniform(0.5, 0.66),
-        upsweep=rng.uniform(0.3, 0.8),
-        droop=0.2,
-        exponent=pick(rng, (2.0, 2.0, 2.6, 4.0)),
-    )
-    plan = Planform(
-        half=rng.uniform(0.48, 0.62),
-        root=rng.uniform(0.11, 0.16),
-        tip=rng.uniform(0.05, 0.1),
-        sweep_deg=rng.uniform(0, 6),
-        dihedral_deg=rng.uniform(0, 6),
-        z=rng.uniform(0.08, 0.18),
-        y=0.85 * radius if high else -0.65 * radius,
-    )
+    form = drawn(rng, tall=(0.95, 1.2), nose=(0.1, 0.2), nose_power=2.0, tail_start=(0.5, 0.66), upsweep=(0.3, 0.8))
+    body = fuselage(radius, **form, droop=0.2, exponent=pick(rng, (2.0, 2.0, 2.6, 4.0)))
+    size = drawn(rng, half=(0.48, 0.62), root=(0.11, 0.16), tip=(0.05, 0.1), sweep_deg=(0, 6), dihedral_deg=(0, 6))
+    plan = Planform(**size, z=rng.uniform(0.08, 0.18), y=0.85 * radius if high else -0.65 * radius)
     solids = [body, surface(plan)]
     count = 2 if maybe(rng, 0.65) else 4
-    size = rng.uniform(0.02, 0.03)
+    thick = rng.uniform(0.02, 0.03)
     blades, disc = int(rng.integers(2, 7)), rng.uniform(0.07, 0.1)
     for share in (rng.uniform(0.26, 0.34),) if count == 2 else (0.27, 0.56):
         x, y, z, chord = plan.at(share)
         long = chord + rng.uniform(0.08, 0.13)
-        pod = streamlined(size, long).moved(x, y - 0.2 * size, z - 0.5 * long + 0.075)
-        screw = propeller(rng, disc, blades, hub=0.55 * size)
-        solids += both_sides_of([pod, *all_moved(screw, x, y - 0.2 * size, z + 0.075)])
+        pod = streamlined(thick, long).moved(x, y - 0.2 * thick, z - 0.5 * long + 0.075)
+        screw = propeller(rng, disc, blades, hub=0.55 * thick)
+        solids += both_sides_of([pod, *all_moved(screw, x, y - 0.2 * thick, z + 0.075)])
     kind = pick(rng, {"T": 2, "conventional": 2, "cross": 0.7} if high else {"conventional": 3, "twin": 1.2, "T": 0.6})
     solids += tail(rng, kind, radius, swept=maybe(rng, 0.5))
     if maybe(rng, 0.2):
@@ -76,22 +61,12 @@ def light_plane(rng: np.random.Generator) -> list[Solid]:
     radius = rng.uniform(0.065, 0.085)
     high = maybe(rng, 0.55)
     pusher = maybe(rng, 0.1)
-    body = fuselage(
-        radius,
-        tall=rng.uniform(1.05, 1.35),
-        nose=rng.uniform(0.08, 0.22),
-        nose_power=rng.uniform(2.0, 3.2),
-        tail_start=rng.uniform(0.36, 0.48),
-        upsweep=rng.uniform(0.0, 0.4),
-        tail_radius=rng.uniform(0.15, 0.3),
-        exponent=rng.uniform(2.0, 4.5),
-    )
+    form = drawn(rng, tall=(1.05, 1.35), nose=(0.08, 0.22), nose_power=(2.0, 3.2), tail_start=(0.36, 0.48))
+    body = fuselage(radius, **form, **drawn(rng, upsweep=(0.0, 0.4), tail_radius=(0.15, 0.3), exponent=(2.0, 4.5)))
     tall = 1.2 * radius
+    size = drawn(rng, half=(0.5, 0.72), root=(0.14, 0.2), tip=(0.09, 0.14), sweep_deg=(0, 4))
     plan = Planform(
-        half=rng.uniform(0.5, 0.72),
-        root=rng.uniform(0.14, 0.2),
-        tip=rng.uniform(0.09, 0.14),
-        sweep_deg=rng.uniform(0, 4),
+        **size,
         dihedral_deg=rng.uniform(0, 3) if high else rng.uniform(3, 8),
         z=rng.uniform(0.16, 0.24),
         y=tall * rng.uniform(1.05, 1.2) if high else -0.7 * tall,
@@ -139,16 +114,9 @@ def glider(rng: np.random.Generator) -> list[Solid]:
     body = fuselage(
         radius, tall=1.25, nose=0.26, nose_power=1.8, tail_start=0.33, tail_power=0.75, tail_radius=0.22, upsweep=0.1
     )
-    plan = Planform(
-        half=rng.uniform(0.9, 1.35),
-        root=rng.uniform(0.085, 0.12),
-        tip=rng.uniform(0.03, 0.055),
-        sweep_deg=rng.uniform(0, 3),
-        dihedral_deg=rng.uniform(2, 6),
-        z=0.16,
-        y=rng.uniform(0.3, 0.9) * radius,
-        shape=pick(rng, ("straight", "elliptic", "kinked")),
-    )
+    size = drawn(rng, half=(0.9, 1.35), root=(0.085, 0.12), tip=(0.03, 0.055), sweep_deg=(0, 3), dihedral_deg=(2, 6))
+    y = rng.uniform(0.3, 0.9) * radius
+    plan = Planform(**size, z=0.16, y=y, shape=pick(rng, ("straight", "elliptic", "kinked")))
     solids = [body, surface(plan), canopy(1.5 * radius, 1.6 * radius, 0.26, (0, 0.75 * radius, 0.27))]
     solids += tail(rng, pick(rng, {"T": 3, "conventional": 1, "V": 0.5}), 0.9 * radius, swept=False)
     return solids + (winglets(rng, plan) if maybe(rng, 0.4) else [])
@@ -168,16 +136,9 @@ def warbird(rng: np.random.Generator) -> list[Solid]:
         tail_radius=0.15,
         upsweep=0.35,
     )
-    plan = Planform(
-        half=rng.uniform(0.5, 0.66),
-        root=rng.uniform(0.19, 0.25),
-        tip=rng.uniform(0.07, 0.12),
-        sweep_deg=rng.uniform(2, 9),
-        dihedral_deg=rng.uniform(3, 7),
-        z=rng.uniform(0.14, 0.2),
-        y=rng.uniform(-0.8, 0.2) * radius,
-        shape=pick(rng, ("elliptic", "straight", "gull")),
-    )
+    size = drawn(rng, half=(0.5, 0.66), root=(0.19, 0.25), tip=(0.07, 0.12), sweep_deg=(2, 9), dihedral_deg=(3, 7))
+    z, y = rng.uniform(0.14, 0.2), rng.uniform(-0.8, 0.2) * radius
+    plan = Planform(**size, z=z, y=y, shape=pick(rng, ("elliptic", "straight", "gull")))
     solids = [body, surface(plan)]
     solids.append(
         canopy(0.95 * radius, 1.2 * radius, rng.uniform(0.16, 0.34), (0, 1.05 * radius, rng.uniform(-0.02, 0.1)))
@@ -239,22 +200,15 @@ def twin_boom(rng: np.random.Generator) -> list[Solid]:
     pod = fuselage(
         radius, tall=1.15, nose=0.2, nose_power=1.8, tail_start=0.5, tail_radius=0.35, length=rng.uniform(0.42, 0.6)
     )
-    plan = Planform(
-        half=rng.uniform(0.55, 0.75),
-        root=rng.uniform(0.16, 0.21),
-        tip=rng.uniform(0.06, 0.11),
-        sweep_deg=rng.uniform(0, 6),
-        dihedral_deg=rng.uniform(1, 5),
-        z=0.14,
-        y=0.0,
-    )
+    size = drawn(rng, half=(0.55, 0.75), root=(0.16, 0.21), tip=(0.06, 0.11), sweep_deg=(0, 6), dihedral_deg=(1, 5))
+    plan = Planform(**size, z=0.14, y=0.0)
     solids = [pod.moved(z=0.12), surface(plan), canopy(1.1 * radius, 1.4 * radius, 0.24, (0, 0.8 * radius, 0.16))]
     _, y, z, _ = plan.at(x / plan.half)
     thick = rng.uniform(0.024, 0.036)
     front = z + (0.1 if maybe(rng, 0.7) else 0.0)
     path = [(x, y, front - s * (front + 0.5)) for s in (0, 0.04, 0.12, 0.3, 0.6, 1)]
-    size = np.array([0.3, 0.7, 1.0, 1.0, 0.6, 0.4]) * thick
-    parts = [tube(path, size, ellipse(2, 2, 10))]
+    thickness = np.array([0.3, 0.7, 1.0, 1.0, 0.6, 0.4]) * thick
+    parts = [tube(path, thickness, ellipse(2, 2, 10))]
     if front > z:
         parts += all_moved(propeller(rng, min(0.12, 0.75 * x), 3, hub=0.02), x, y, front)
     else:

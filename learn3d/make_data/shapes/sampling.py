@@ -19,3 +19,8 @@ def pick(rng: np.random.Generator, options: dict[T, float] | tuple[T, ...]) -> T
 def maybe(rng: np.random.Generator, probability: float) -> bool:
     """True with the given probability."""
     return bool(rng.random() < probability)
+
+
+def drawn(rng: np.random.Generator, **measures: float | tuple[float, float]) -> dict[str, float]:
+    """The measures, each pair (least, largest) replaced by a random number between the two."""
+    return {name: rng.uniform(*value) if isinstance(value, tuple) else value for name, value in measures.items()}
