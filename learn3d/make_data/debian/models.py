@@ -49,8 +49,6 @@ class FetchConfig:
     """Which of the six categories, separated by commas."""
     packages_dir: FilePath | None = None
     """Folder with the .deb files. None: they are downloaded with apt-get."""
-    root: FilePath | None = None
-    """Take the packages as installed below this folder ("/" for this machine)."""
     overwrite: bool = False
     """Replace an earlier output."""
     duplicate_iou: Overlap = 0.85
@@ -61,8 +59,6 @@ class FetchConfig:
     def __post_init__(self) -> None:
         if not self.categories or set(self.categories) - set(CATEGORIES):
             raise ValueError(f"category must be some of {','.join(CATEGORIES)}; got {self.category!r}")
-        if self.packages_dir is not None and self.root is not None:
-            raise ValueError("give either --packages-dir or --root, not both")
 
     @property
     def categories(self) -> tuple[str, ...]:
@@ -154,7 +150,10 @@ def _write_all(config: FetchConfig, folder: Path, downloads: Path, progress: boo
     found, notes, models, dropped, ignored = [], [], [], [], 0
     for name in tqdm(readers, desc="finding packages", disable=not progress, leave=False):
         try:
-            found.append(_locate(name, config, downloads))
+            if config.packages_dir is None:
+                found.append(packages.download_package(name, downloads))
+            else:
+                found.append(packages.find_package(name, config.packages_dir))
         except packages.PackageMissing as missing:
             if name != FURNITURE_PACKAGES[1]:
                 raise
@@ -175,14 +174,6 @@ def _write_all(config: FetchConfig, folder: Path, downloads: Path, progress: boo
     _write_table(folder / "index.csv", Model, models)
     _write_table(folder / "dropped.csv", Dropped, dropped)
     return Report(config.output, models, dropped, ignored, notes)
-
-
-def _locate(name: str, config: FetchConfig, downloads: Path) -> packages.Package:
-    if config.packages_dir is not None:
-        return packages.find_package(name, config.packages_dir)
-    if config.root is not None:
-        return packages.installed_package(name, config.root)
-    return packages.download_package(name, downloads)
 
 
 class _Kept:

@@ -1,4 +1,4 @@
-"""Files out of Debian packages, without installing them: apt-get download, .deb archives, or an installed system.
+"""Files out of Debian packages, without installing them: from .deb archives that are there, or by apt-get download.
 
 Nothing of an archive is written to disk: dpkg-deb unpacks it into a stream, and the few files wanted are read from
 there. So it does not matter where its paths and links point to.
@@ -29,12 +29,11 @@ class PackageMissing(ValueError):
 
 @dataclass(frozen=True)
 class Package:
-    """One Debian package at hand: a .deb file, or installed on a system."""
+    """One Debian package at hand."""
 
     name: str
     version: str
-    path: Path  # the file, or the system's root
-    listed: tuple[str, ...] | None = None  # below the root: the paths of its files
+    path: Path  # of its .deb file
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,9 @@ def download_package(name: str, folder: Path) -> Package:
             f"apt-get is not on this machine, so {name} cannot be downloaded; "
             "put its .deb file into a folder and name it with --packages-dir"
         )
-    result = _run("apt-get", "download", "-q", name, folder=folder)
+    command = ["apt-get", "download", "-q", name]
+    quiet = {"capture_output": True, "text": True, "errors": "replace", "stdin": subprocess.DEVNULL}
+    result = subprocess.run(command, cwd=folder, check=False, **quiet)
     if result.returncode != 0 or not any(folder.glob(f"{name}_*.deb")):
         reason = next((line for line in result.stderr.splitlines() if line.startswith("E:")), "E: no reason given")
         component = "the component non-free" if name.endswith("-nonfree") else "the component main"
@@ -84,25 +85,15 @@ def find_package(name: str, folder: Path) -> Package:
     return Package(name, unquote(found[0].stem.split("_")[1]), found[0])
 
 
-def installed_package(name: str, root: Path) -> Package:
-    """The package as installed below `root`, by dpkg's database there; else PackageMissing."""
-    _check_program("dpkg-query")
-    result = _run("dpkg-query", f"--admindir={root}/var/lib/dpkg", "-W", "-f=${Version}\n${db-fsys:Files}", name)
-    version, *listed = result.stdout.splitlines() or [""]
-    if result.returncode != 0 or not listed:
-        raise PackageMissing(f"{name} is not installed below {root}; install it, or leave --root out to download it")
-    return Package(name, version, root, tuple(line.strip().lstrip("/") for line in sorted(listed)))
-
-
 def read_package(package: Package, suffixes: tuple[str, ...], licences: Path) -> Iterator[tuple[str, bytes]]:
     """Each plain file of the package whose path ends in one of `suffixes`, as (path without leading /, content).
 
-    The order is that of the archive (or of the sorted file list). Symbolic links and devices are passed over. The
-    package's copyright file is written to LICENCES/NAME.copyright.
+    The order is that of the archive. Symbolic links and devices are passed over. The package's copyright file is
+    written to LICENCES/NAME.copyright.
     Raises ValueError for archives that cannot be read and for more than 2 GiB in all.
     """
     notice, total = f"/doc/{package.name}/copyright", 0
-    for path, size, read in _files_of_archive(package.path) if package.listed is None else _files_of_system(package):
+    for path, size, read in _files_of_archive(package.path):
         if not path.endswith((*suffixes, notice)):
             continue
         total += size
@@ -115,19 +106,10 @@ def read_package(package: Package, suffixes: tuple[str, ...], licences: Path) ->
             yield path, read()
 
 
-_Files = Iterator[tuple[str, int, Callable[[], bytes]]]  # path without leading /, bytes, and how to read them
-
-
-def _files_of_system(package: Package) -> _Files:
-    for path in package.listed:
-        file = package.path / path
-        if file.is_file() and not file.is_symlink():
-            yield path, file.stat().st_size, file.read_bytes
-
-
-def _files_of_archive(deb: Path) -> _Files:
-    """The plain files of a .deb, one after the other: each must be read before the next is asked for."""
-    _check_program("dpkg-deb")
+def _files_of_archive(deb: Path) -> Iterator[tuple[str, int, Callable[[], bytes]]]:
+    """The plain files of a .deb: path without leading /, bytes, and how to read them before the next is asked for."""
+    if shutil.which("dpkg-deb") is None:
+        raise ValueError("dpkg-deb is not on this machine; install dpkg (Debian, Ubuntu, Homebrew and others have it)")
     check_file(deb, limits.PACKAGE_BYTES, "a Debian package")
     command = ["dpkg-deb", "--fsys-tarfile", str(deb)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
@@ -167,14 +149,3 @@ class _Stream:
         if self._left < 0 or self._total < 0:
             raise OSError(f"it unpacks to more than its headers say, or than {limits.PACKAGE_BYTES} bytes")
         return content
-
-
-def _run(*command: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, errors="replace", stdin=subprocess.DEVNULL, check=False
-    )
-
-
-def _check_program(name: str) -> None:
-    if shutil.which(name) is None:
-        raise ValueError(f"{name} is not on this machine; install dpkg (Debian, Ubuntu, Homebrew and others have it)")

@@ -10,7 +10,6 @@ import pytest
 from small_packages import AIRCRAFT, AIRPLANE, ac_object, ac_text, deb, fetch
 
 from learn3d.make_data.debian.furniture import furniture_category
-from learn3d.make_data.debian.models import FetchConfig, fetch_debian_models
 
 
 def test_recipe_writes_meshes_index_and_reasons(debs: Path, tmp_path: Path):
@@ -68,29 +67,6 @@ def test_duplicates_are_kept_when_asked_for(debs: Path, tmp_path: Path):
     ]
 
 
-def test_installed_packages_are_read_below_root(dpkg: None, tmp_path: Path):
-    root = tmp_path / "root"
-    path = f"{AIRCRAFT}/Plane/Models/plane.ac"
-    (root / path).parent.mkdir(parents=True)
-    (root / path).write_text(ac_text(*AIRPLANE))
-    (root / path).with_name("plane2.ac").symlink_to("plane.ac")
-    info = root / "var/lib/dpkg/info"
-    info.mkdir(parents=True)
-    listed = [f"/{path}", f"/{path}".replace("plane.ac", "plane2.ac"), "/usr/share"]
-    (info / "flightgear-data-ai.list").write_text("\n".join(listed) + "\n")
-    fields = "Status: install ok installed\nMaintainer: A <a@b>\nArchitecture: all\nDescription: x\n"
-    (root / "var/lib/dpkg/status").write_text(
-        f"Package: other\nVersion: 9\n{fields}\nPackage: flightgear-data-ai\nVersion: 1:7-1\n{fields}"
-    )
-    config = FetchConfig(output=tmp_path / "out", category="airplane", root=root)
-    report = fetch_debian_models(config, progress=False)
-    (model,) = report.models
-    assert not report.dropped  # the symbolic link was not followed, so there is no duplicate
-    assert (model.version, model.source) == ("1:7-1", path)
-    with pytest.raises(ValueError, match="sweethome3d-furniture is not installed below"):
-        fetch_debian_models(FetchConfig(output=tmp_path / "out2", root=root), progress=False)
-
-
 def test_output_is_replaced_only_when_asked_and_ours(debs: Path, tmp_path: Path):
     out = tmp_path / "out"
     fetch(out, debs, category="chair")
@@ -115,7 +91,6 @@ def test_a_failure_leaves_nothing_behind(debs: Path, tmp_path: Path):
     [
         ({"category": "chair,car"}, "category .*car"),
         ({"category": " "}, "category must be some of"),
-        ({"root": Path("/")}, "not both"),
         ({"duplicate_iou": 0}, "duplicate_iou must be .*0"),
     ],
 )
