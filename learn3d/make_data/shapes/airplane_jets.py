@@ -112,34 +112,16 @@ def fighter(rng: np.random.Generator) -> list[Solid]:
         "trapezoid": (rng.uniform(0.28, 0.38), rng.uniform(0.06, 0.1), rng.uniform(25, 42), 0.06),
         "forward": (rng.uniform(0.22, 0.28), 0.1, rng.uniform(-28, -18), -0.08),
     }[shape]
-    half = (
-        rng.uniform(0.3, 0.4)
-        if shape != "delta"
-        else min(rng.uniform(0.28, 0.4), 0.9 * root / np.tan(np.radians(sweep)))
-    )
+    if shape == "delta":
+        half = min(rng.uniform(0.28, 0.4), 0.9 * root / np.tan(np.radians(sweep)))
+    else:
+        half = rng.uniform(0.3, 0.4)
     plan = Planform(half, root, tip, sweep, rng.uniform(-5, 2), z, rng.uniform(-0.3, 0.6) * radius, thickness=0.06)
     solids = [body, surface(plan)]
     solids.append(
         canopy(0.9 * radius, 1.1 * radius, rng.uniform(0.18, 0.28), (0, 0.8 * radius, rng.uniform(0.15, 0.22)))
     )
-    if twin:  # two engine tunnels with ramp intakes and nozzles
-        wide = rng.uniform(0.8, 1.25) * radius
-        rings = []
-        for z0, w, h, y in ((0.14, 0.9, 1.3, -0.3), (0.0, 1.0, 1.4, -0.2), (-0.3, 1.0, 1.3, 0), (-0.48, 0.8, 0.9, 0.1)):
-            outline = rectangle(w * wide, h * wide, 0.3 * wide, 2)
-            shear = 0.05 * (outline[:, 1] / wide) if z0 > 0.1 else 0.0 * outline[:, 1]
-            rings.append(np.stack([wide + outline[:, 0], y * wide + outline[:, 1], z0 + shear], 1))
-        nozzle = jet_nozzle(0.42 * wide, 0.07).moved(wide, 0.08 * wide, -0.5)
-        solids += both_sides_of([Solid(np.stack(rings)), nozzle])
-    else:
-        kind = pick(rng, ("side", "chin", "nose"))
-        if kind == "chin":
-            solids.append(box((1.2 * radius, 0.9 * radius, 0.3), (0, -0.9 * radius, 0.06), 0.02))
-        elif kind == "side":
-            side = box((0.8 * radius, 1.2 * radius, 0.34), (0.95 * radius, 0.1 * radius, 0.03), 0.02)
-            solids += both_sides(side)
-        solids.append(jet_nozzle(0.75 * radius, 0.08).moved(z=-0.52))
-    base = plan.root
+    solids += _twin_engines(rng, radius) if twin else _single_engine(rng, radius)
     if maybe(rng, 0.55) if twin else maybe(rng, 0.1):
         cant, x = rng.uniform(0, 25), rng.uniform(0.9, 1.4) * radius
         height = rng.uniform(0.13, 0.19)
@@ -160,16 +142,43 @@ def fighter(rng: np.random.Generator) -> list[Solid]:
         solids.append(surface(stabiliser))
         if maybe(rng, 0.4):  # strakes from the wing root towards the nose
             strake = wing(
-                [(0.0, plan.y, z + 0.2, base + 0.1, 0.05), (2.0 * radius, plan.y, z - 0.03, 0.7 * base, 0.05)]
+                [(0.0, plan.y, z + 0.2, root + 0.1, 0.05), (2.0 * radius, plan.y, z - 0.03, 0.7 * root, 0.05)]
             )
             solids += both_sides(strake)
+    return solids + _stores(rng, plan)
+
+
+def _twin_engines(rng: np.random.Generator, radius: float) -> list[Solid]:
+    """Two tunnels beside the fuselage, each with a slanted intake and a nozzle."""
+    wide = rng.uniform(0.8, 1.25) * radius
+    rings = []
+    for z, w, h, y in ((0.14, 0.9, 1.3, -0.3), (0.0, 1.0, 1.4, -0.2), (-0.3, 1.0, 1.3, 0), (-0.48, 0.8, 0.9, 0.1)):
+        outline = rectangle(w * wide, h * wide, 0.3 * wide, 2)
+        slant = 0.05 * (outline[:, 1] / wide) if z > 0.1 else 0.0 * outline[:, 1]
+        rings.append(np.stack([wide + outline[:, 0], y * wide + outline[:, 1], z + slant], 1))
+    nozzle = jet_nozzle(0.42 * wide, 0.07).moved(wide, 0.08 * wide, -0.5)
+    return both_sides_of([Solid(np.stack(rings)), nozzle])
+
+
+def _single_engine(rng: np.random.Generator, radius: float) -> list[Solid]:
+    """A nozzle at the rear, with an intake at the chin, on both sides, or in the nose, where it does not show."""
+    intakes = {
+        "side": both_sides(box((0.8 * radius, 1.2 * radius, 0.34), (0.95 * radius, 0.1 * radius, 0.03), 0.02)),
+        "chin": [box((1.2 * radius, 0.9 * radius, 0.3), (0, -0.9 * radius, 0.06), 0.02)],
+        "nose": [],
+    }
+    return [*intakes[pick(rng, tuple(intakes))], jet_nozzle(0.75 * radius, 0.08).moved(z=-0.52)]
+
+
+def _stores(rng: np.random.Generator, plan: Planform) -> list[Solid]:
+    """Up to three tanks or missiles under each wing, or at its tip."""
+    solids = []
     for share in sorted(set(rng.choice([0.4, 0.6, 0.8, 1.0], int(rng.integers(0, 4))))):
-        x, y, z1, chord = plan.at(float(share))
-        store = ellipsoid(
-            (0.022, 0.022, rng.uniform(0.14, 0.26)), (x, y - (0.026 if share < 1 else 0), z1 - 0.4 * chord), 8, 6
-        )
-        pylon = box((0.01, 0.03, 0.06), (x, y - 0.012, z1 - 0.45 * chord))
-        solids += both_sides_of([store, pylon] if share < 1 else [store])
+        x, y, z, chord = plan.at(float(share))
+        size, at_tip = (0.022, 0.022, rng.uniform(0.14, 0.26)), share == 1
+        store = ellipsoid(size, (x, y - (0 if at_tip else 0.026), z - 0.4 * chord), 8, 6)
+        pylon = box((0.01, 0.03, 0.06), (x, y - 0.012, z - 0.45 * chord))
+        solids += both_sides_of([store] if at_tip else [store, pylon])
     return solids
 
 
