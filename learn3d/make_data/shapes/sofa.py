@@ -67,9 +67,9 @@ def _corner_sofa(rng: np.random.Generator) -> list[Solid]:
     count = pick(rng, (2, 3))
     solids += _cushions((-half, low, back - 0.05), (inner, seat, depth), count)
     solids += _cushions((-half, seat - 0.02, back - 0.06), (inner, high + 0.03, back + 0.14), count)
-    if maybe(rng, 0.5):  # a chaise, with an arm along the long side's depth
+    if maybe(rng, 0.5):  # a chaise, open towards its end
         solids.append(between((half - 0.01, foot, 0), (half + arm, level, depth), 0.04))
-    else:  # a second side: the back goes around the corner
+    else:  # a second side, with the back around the corner
         solids.append(between((half - back, low - 0.08, 0), (half, high, reach), 0.04))
         solids.append(between((inner, foot, reach - 0.01), (half, level, reach + arm), 0.04))
     leg = slab(ellipse(0.08, 0.08, 10), foot + 0.02)
