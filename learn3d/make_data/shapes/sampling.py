@@ -1,4 +1,4 @@
-"""Two words for random decisions, so that the recipes of the shapes read as sentences."""
+"""Words for random decisions, so that the recipes of the shapes read as sentences."""
 
 from __future__ import annotations
 
