@@ -8,8 +8,8 @@
   bench.py smoothness: smoothness loss of 128 spheres of 1920 edges
   bench.py cameras: 64 look-at cameras
   bench.py voxels: voxel IoU of 1000 predictions
-  bench.py step: a whole training step by part, in bf16 and in fp32
-  bench.py evaluation: validation during training, by part, and as a share of the run
+  bench.py step: a whole training step in bf16 and in fp32, and what of it is not the networks'
+  bench.py evaluation: validation during training, as a share of the run
   bench.py memory: bytes per image and per raster pixel, in fresh processes
   bench.py processes: steps of the proposed method, one batch of 128 shared by 1, 2, 4 ... processes
   bench.py scaling: w1, w2, w3 at 1, 2, 4, 8, 16 threads, as far as there are cores
@@ -25,7 +25,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import bench_peers as peers
@@ -33,7 +32,7 @@ import torch
 import tyro
 from bench_memory import bench_memory
 from bench_processes import bench_processes
-from bench_step import StepOptions, bench_evaluation, bench_step
+from bench_step import bench_evaluation, bench_step
 from bench_work import (
     Result,
     Timing,
@@ -44,13 +43,11 @@ from bench_work import (
     num_cores,
     run_chain,
     run_ours,
-    save,
     settings,
     show,
 )
 
 import nmr
-from learn3d.config import DEFAULT_PRESET
 from learn3d.device import keep_freed_memory
 from learn3d.terminal import in_a_sentence
 
@@ -85,21 +82,11 @@ class Options:
     ] = "w1"
     """What to measure."""
     batch: int | None = None
-    """Meshes of w1 and w4, by default 64 (all measures w1 with 64 and with 128); images of a step, by default
-    the preset's."""
-    preset: str = DEFAULT_PRESET
-    """step, evaluation: what is trained, on silhouettes of spheres."""
-    checkpoint: Path | None = None
-    """step, evaluation: train this run (a folder or a checkpoint) instead, on its own data. What rendering costs
-    depends on the shapes, and those of trained networks are not spheres."""
-    clock: Literal["wall", "cpu"] = "wall"
-    """step, evaluation: cpu is for busy machines: the time of all threads of this process; take one thread then."""
+    """Meshes of w1 and w4, by default 64 (all measures w1 with 64 and with 128); images of a step, by default 128."""
     threads: int = 2
     """Threads of ours and of torch. deodr has none: it gets one process, and as many as these."""
     repeats: int = 15
     """Timed runs of each program."""
-    json: Path | None = None
-    """Also write the figures here."""
 
 
 # --- renders
@@ -240,18 +227,12 @@ def bench_all(options: Options) -> list[Result]:
     return results
 
 
-def step_options(options: Options) -> StepOptions:
-    return StepOptions(
-        options.preset, options.batch, options.checkpoint, options.threads, options.repeats, options.clock
-    )
-
-
 SINGLE: dict[str, Callable[[Options], Result]] = {
     "smoothness": bench_smoothness,
     "cameras": bench_cameras,
     "voxels": bench_voxels,
-    "step": lambda options: bench_step(step_options(options)),
-    "evaluation": lambda options: bench_evaluation(step_options(options)),
+    "step": lambda options: bench_step(options.batch, options.threads, options.repeats),
+    "evaluation": lambda options: bench_evaluation(options.batch, options.threads, options.repeats),
 }
 
 
@@ -274,8 +255,6 @@ def main() -> int:
         bench = SINGLE.get(options.workload)
         results = [bench(options) if bench else bench_render(options.workload, options, options.batch or MESHES)]
         show(results[0])
-    if options.json:
-        save(results, options.json)
     if options.workload == "all" and any(map(missed, results)):
         lines = (
             f"{r.title}: {r.rows[0].total:.2f} > {TARGETS[r.key].limit:g} ({TARGETS[r.key].source})"

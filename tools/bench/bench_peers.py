@@ -78,26 +78,23 @@ class DeodrImages(torch.autograd.Function):
         return torch.from_numpy(result).to(grad), None, None, None
 
 
-def run_deodr(workload: Workload, targets: tuple[Tensor, ...], mesh, pooled: bool) -> Timing:
-    """At the size of the image; or pooled, at the inner resolution of ours and averaged."""
+def run_deodr(workload: Workload, targets: tuple[Tensor, ...], mesh) -> Timing:
+    """At the size of the image, which is less than we draw: ours has the inner resolution of its anti-aliasing."""
     (output,) = workload.outputs
     leaf = workload.vertices.clone().requires_grad_()
     start = time.perf_counter()
-    size = workload.raster_size if pooled else workload.size
-    image = DeodrImages.apply(workload.camera.transform(leaf), size, mesh, output)
-    if pooled:
-        image = torch.nn.functional.avg_pool2d(image[:, None], 2)[:, 0]
+    image = DeodrImages.apply(workload.camera.transform(leaf), workload.size, mesh, output)
     forward = time.perf_counter()
     workload.loss((image,), targets).backward()
     return forward - start, time.perf_counter() - start
 
 
 def deodr_process(connection, workload: Workload, targets: tuple[Tensor, ...]) -> None:
-    """Serves a part of the batch: renders whenever it is asked to, pooled or not, until it gets None."""
+    """Serves a part of the batch: renders whenever it gets True, ends when it gets False."""
     torch.set_num_threads(1)
     mesh = deodr_mesh(workload.faces)
-    while (pooled := connection.recv()) is not None:
-        connection.send(run_deodr(workload, targets, mesh, pooled))
+    while connection.recv():
+        connection.send(run_deodr(workload, targets, mesh))
 
 
 class DeodrProcesses:
@@ -113,15 +110,15 @@ class DeodrProcesses:
             self.processes[-1].start()
             self.connections.append(ours)
 
-    def __call__(self, pooled: bool) -> Timing:
+    def __call__(self) -> Timing:
         for connection in self.connections:
-            connection.send(pooled)
+            connection.send(True)
         results = [connection.recv() for connection in self.connections]
         return max(r[0] for r in results), max(r[1] for r in results)
 
     def close(self) -> None:
         for connection, process in zip(self.connections, self.processes, strict=True):
-            connection.send(None)
+            connection.send(False)
             process.join()
 
 
@@ -148,16 +145,11 @@ def check_same_image(workload: Workload, mesh) -> str:
 def deodr_programs(
     workload: Workload, targets: tuple[Tensor, ...], num_processes: int
 ) -> tuple[dict[str, Program], DeodrProcesses | None]:
-    """deodr in one process, and in several; at the size of the image, and at our inner resolution."""
+    """deodr in one process, and in several."""
     mesh = deodr_mesh(workload.faces)
     print(f"images of nmr and deodr agree {check_same_image(workload, mesh)}")
-    processes = None
-    if 1 < num_processes <= len(workload.vertices):
-        processes = DeodrProcesses(workload, targets, num_processes)
-    programs = {}
-    for pooled in (False, True)[: 1 + workload.anti_aliasing]:
-        where = ", our inner resolution" if pooled else ""
-        programs[f"deodr, 1 process{where}"] = lambda pooled=pooled: run_deodr(workload, targets, mesh, pooled)
-        if processes:
-            programs[f"deodr, {num_processes} processes{where}"] = lambda pooled=pooled: processes(pooled)
-    return programs, processes
+    programs: dict[str, Program] = {"deodr, 1 process": lambda: run_deodr(workload, targets, mesh)}
+    if not 1 < num_processes <= len(workload.vertices):
+        return programs, None
+    processes = DeodrProcesses(workload, targets, num_processes)
+    return programs | {f"deodr, {num_processes} processes": processes}, processes

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 import torch
@@ -27,10 +25,6 @@ class Workload:
     size: int
     anti_aliasing: bool
     outputs: tuple[str, ...] = ("alpha",)  # of nmr.render; the loss is the sum over them
-
-    @property
-    def raster_size(self) -> int:
-        return self.size * (2 if self.anti_aliasing else 1)
 
     def images(self, vertices: Tensor) -> tuple[Tensor, ...]:
         """Our images of ``vertices``, in the order of ``outputs``."""
@@ -167,10 +161,3 @@ def show(result: Result) -> None:
         ratio = row.total / result.rows[0].total
         print(f"{row.program:<58}{forward}{row.total:>12.2f}{row.fastest:>12.2f}{ratio:>12.2f}")
     print(f"({result.unit}; medians, and the fastest total)", flush=True)
-
-
-def save(results: list[Result], path: Path) -> None:
-    """Write results as JSON, whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps([asdict(result) for result in results], indent=2) + "\n")
-    temporary.replace(path)
