@@ -4,7 +4,7 @@ Examples:
   learn3d experiment --list
   learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair --iterations 5000 --jobs 2
   learn3d experiment ablation --data DATA --output OUTPUT --category chair --set precision=fp32
-  learn3d experiment mmd --data DATA --output OUTPUT --report-only --page docs/results.md
+  learn3d experiment mmd --data DATA --output OUTPUT --category airplane,chair --iterations 5000 --report-only
 
 Tables share their runs: what is complete is skipped, what was stopped goes on, also runs that `learn3d train` made in
 OUTPUT/runs/<category>/<method>-seed<k>. Ctrl-C stops all of them; the same command continues.
@@ -62,11 +62,7 @@ class Command:
     overwrite: bool = False
     """Start runs anew that are there with other options."""
     report_only: bool = False
-    """Train nothing: report what is there."""
-    beside_code: bool = False
-    """Put the published code's figures on the meshes of docs/results.md beside ours, for the same iterations."""
-    page: Path | None = None
-    """Also put the table into this Markdown page, between its marks."""
+    """Train nothing: report what is done of the runs that are asked for."""
     list: bool = False
     """Show the tables and their methods, and end."""
 
@@ -78,7 +74,7 @@ def run(arguments: Sequence[str]) -> int:
         return 0
     command = parse(Command, arguments, name="experiment", about=__doc__, common=COMMON)
     shared = ("data", "output", "methods", "iterations", "batch_size", "seeds", "layout", "device", "threads")
-    options = {name: getattr(command, name) for name in shared}
-    options |= {"categories": names(command.category), "changes": command.set}
-    named = ("table", "jobs", "overwrite", "report_only", "page", "beside_code")
-    return run_experiment(Call(options=Options(**options), **{name: getattr(command, name) for name in named}))
+    options = Options(
+        categories=names(command.category), changes=command.set, **{name: getattr(command, name) for name in shared}
+    )
+    return run_experiment(Call(command.table, options, command.jobs, command.overwrite, command.report_only))

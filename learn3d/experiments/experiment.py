@@ -5,17 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-from learn3d.experiments.formats import check_page, embed, to_text, write_report
+from learn3d.device import cores
+from learn3d.experiments.formats import to_text, write_report
 from learn3d.experiments.plan import Options, Run, plan_runs
-from learn3d.experiments.pool import WORKER, carry_out_all, share_of_cores
+from learn3d.experiments.pool import Work, carry_out, carry_out_all
 from learn3d.experiments.report import make_report
-from learn3d.experiments.state import State, found_runs, read_results, read_state
+from learn3d.experiments.results import conflicts_with, read_results
 from learn3d.experiments.tables import TABLES
 from learn3d.terminal import INTERRUPTED, note, say
-
-_STAGES = {"done": "are done", "trained": "only need testing", "unfinished": "go on", "new": "are new"}
 
 
 @dataclass(frozen=True)
@@ -27,16 +25,13 @@ class Call:
     jobs: int = 1
     overwrite: bool = False
     report_only: bool = False
-    page: Path | None = None
-    beside_code: bool = False
 
 
-def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
+def run_experiment(call: Call, *, work: Work = carry_out) -> int:
     """Carry out a table's missing runs and write its report; the exit status: 0, 1 where a run failed, 130 if stopped.
 
     The report is written in any case, with what there is. Raises ValueError for a table, method or option that does not
-    exist, for a page without a place for the table, for runs with other options in the output folder (unless
-    `overwrite`), and for damaged files; OSError for a page that cannot be replaced.
+    exist, for runs with other options in the output folder (unless `overwrite`), and for damaged files.
     """
     if call.table not in TABLES:
         raise ValueError(f"there is no table {call.table!r}; choose one of {', '.join(TABLES)} (see --list)")
@@ -44,21 +39,13 @@ def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
         raise ValueError(f"jobs must be a number of processes, at least 1, got {call.jobs}")
     if call.report_only and call.overwrite:
         raise ValueError("--report-only trains nothing and --overwrite trains anew; give one of them")
-    if call.report_only and call.options.changes:
-        raise ValueError("--report-only reports runs with whatever settings they have; leave --set out")
-    if call.page is not None:
-        check_page(call.page, call.table)
     table, failed = TABLES[call.table], {}
-    if call.report_only:
-        runs = found_runs(table, call.options)
-    else:
-        threads = call.options.threads or share_of_cores(call.jobs)
-        runs = plan_runs(table, dataclasses.replace(call.options, threads=threads))
-        failed = _complete(runs, call, threads, worker)
-    report = make_report(table, call.options, runs, read_results(runs), beside_code=call.beside_code)
+    threads = call.options.threads or max(1, cores() // call.jobs)
+    runs = plan_runs(table, dataclasses.replace(call.options, threads=threads))
+    if not call.report_only:
+        failed = _complete(runs, call, threads, work)
+    report = make_report(table, call.options, runs, read_results(runs))
     paths = write_report(call.options.output, report)
-    if call.page is not None:
-        embed(call.page, report)
     say(to_text(report))
     note("report: " + ", ".join(map(str, paths)))
     for name, tail in failed.items():
@@ -72,23 +59,19 @@ def run_experiment(call: Call, *, worker: Sequence[str] = WORKER) -> int:
     return 0
 
 
-def _complete(runs: Sequence[Run], call: Call, threads: int, worker: Sequence[str]) -> dict[str, str]:
+def _complete(runs: Sequence[Run], call: Call, threads: int, work: Work) -> dict[str, str]:
     """Train and measure what is not done yet; runs with other options are an error, or replaced."""
-    states, conflicts = {}, {}
-    for run in runs:
-        try:
-            states[run.folder] = read_state(run).stage
-        except ValueError as error:
-            conflicts[run.folder], states[run.folder] = error, State("new").stage
+    conflicts = {run.name: text for run in runs if (text := conflicts_with(run))}
     if conflicts and not call.overwrite:
         advice = "ask for the same options, choose another --output, or give --overwrite"
-        raise ValueError("\n  ".join([*map(str, conflicts.values()), advice]))
-    stages = list(states.values())
-    counts = ", ".join(f"{stages.count(stage)} {text}" for stage, text in _STAGES.items() if stage in stages)
-    note(f"{call.table}: {len(runs)} runs, of which {counts}; {call.jobs} at a time, {threads} threads each")
-    missing = [run for run in runs if states[run.folder] != "done"]
-    fresh = [run for run in runs if run.folder in conflicts]
-    return carry_out_all(missing, jobs=call.jobs, threads=threads, fresh=fresh, worker=worker)
+        raise ValueError("\n  ".join([*conflicts.values(), advice]))
+    done = read_results([run for run in runs if run.name not in conflicts])
+    note(
+        f"{call.table}: {len(runs)} runs, of which {len(done)} are done; {call.jobs} at a time, {threads} threads each"
+    )
+    missing = [run for run in runs if run.folder not in done]
+    fresh = [run for run in runs if run.name in conflicts]
+    return carry_out_all(missing, jobs=call.jobs, fresh=fresh, work=work)
 
 
 def describe_tables() -> str:

@@ -1,11 +1,8 @@
-"""Reports as files: JSON as they are, CSV with a line per run, Markdown, and one HTML page that needs nothing else."""
+"""Reports as text for the terminal, and as files: JSON as they are, Markdown, one HTML page that needs nothing else."""
 
 from __future__ import annotations
 
-import csv
 import html
-import io
-import re
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -22,78 +19,30 @@ REFERENCE = "paper: on its own data, with its own length of training; for refere
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> list[Path]:
-    """Write <table>.json, .csv, .md and .html into `folder`; returns their paths."""
-    name = report["table"]
+    """Write <table>.json, .md and .html into `folder`; returns their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.{suffix}" for suffix in ("json", "csv", "md", "html")]
+    paths = [folder / f"{report['table']}.{suffix}" for suffix in ("json", "md", "html")]
     writing.write_json(paths[0], report)
-    for path, text in zip(paths[1:], (to_csv(report), to_markdown(report), to_html(report)), strict=True):
-        writing.write_bytes(path, text.encode())
+    writing.write_bytes(paths[1], to_markdown(report).encode())
+    writing.write_bytes(paths[2], to_html(report).encode())
     return paths
-
-
-def embed(page: Path, report: dict[str, Any]) -> None:
-    """Put the Markdown report into `page`, in place of what is between <!-- table: NAME --> and <!-- end: NAME -->.
-
-    Raises ValueError where the page does not have the two lines.
-    """
-    before, after = _around(page, report["table"])
-    writing.write_bytes(page, f"{before}\n{to_markdown(report, heading=False)}{after}".encode())
-
-
-def check_page(page: Path, table: str) -> None:
-    """Raise what `embed` would, for the beginning of long work: ValueError, or OSError for a page that is not there or
-    cannot be replaced."""
-    writing.check_target(page, "--page")
-    _around(page, table)
-
-
-def _around(page: Path, table: str) -> tuple[str, str]:
-    """What a page has before and after a table's place, the marks included."""
-    text = page.read_text()
-    start, end = f"<!-- table: {table} -->", f"<!-- end: {table} -->"
-    if text.count(start) != 1 or text.count(end) != 1 or text.index(end) < text.index(start):
-        raise ValueError(f"{page} must have the lines {start!r} and {end!r}, once each, where the table belongs")
-    return text[: text.index(start)] + start, text[text.index(end) :]
-
-
-def to_csv(report: dict[str, Any]) -> str:
-    """One line per run."""
-    out = io.StringIO()
-    names = [name for name in report["runs"][0] if name != "general_command"] if report["runs"] else ["run"]
-    writer = csv.DictWriter(out, names, extrasaction="ignore")
-    writer.writeheader()
-    writer.writerows(report["runs"])
-    return out.getvalue()
-
-
-def to_markdown(report: dict[str, Any], *, heading: bool = True) -> str:
-    """Tables and text for a page. Commands have DATA and OUTPUT in place of folders, so that no path gets in."""
-    parts = [f"## {report['title']}"] if heading else []
-    parts += [_markdown_table(main_table(report))]
-    parts += _notes(report)
-    if len(versus := baseline_table(report)) > 1:
-        parts += [f"Against {report['baseline']}:", _markdown_table(versus)]
-    if report["runs"]:
-        parts += [
-            "What was run:",
-            _markdown_table(run_table(report)),
-            _code(commands(report)),
-        ]
-    return "\n\n".join(parts) + "\n"
-
-
-def _code(lines: list[str]) -> str:
-    """A block of commands with a fence that is in none of them."""
-    longest = max((len(run) for line in lines for run in re.findall("`+", line)), default=0)
-    fence = "`" * max(3, longest + 1)
-    return "\n".join([f"{fence}sh", *lines, fence])
 
 
 def to_text(report: dict[str, Any]) -> str:
     """The table for the terminal, and how long our runs were trained."""
     trained = f"\nhere: trained for {_trained(report)}" if report["runs"] else ""
     return f"{align(main_table(report))}\n{REFERENCE}{trained}"
+
+
+def to_markdown(report: dict[str, Any]) -> str:
+    """Tables and text for a page. Commands have DATA and OUTPUT in place of folders, so that no path gets in."""
+    parts = [f"## {report['title']}", _markdown_table(main_table(report)), *_notes(report)]
+    if len(versus := baseline_table(report)) > 1:
+        parts += [f"Against {report['baseline']}:", _markdown_table(versus)]
+    if report["runs"]:
+        parts += ["What was run:", _markdown_table(run_table(report))]
+        parts += ["\n".join(["```sh", *commands(report), "```"])]
+    return "\n\n".join(parts) + "\n"
 
 
 def to_html(report: dict[str, Any]) -> str:
@@ -115,10 +64,6 @@ def main_table(report: dict[str, Any]) -> Cells:
         if any("paper" in cell or "paper_printed" in cell for cell in cells):
             voxeliser = "voxeliser not stated" if row["metric"] == "unknown" else row["metric"]
             table.append([label, f"paper{quoted} ({voxeliser})", *map(_paper_text, cells)])
-            label = ""
-        if any("code" in cell for cell in cells):
-            texts = (_number(cell.get("code"), ".3f") for cell in cells)
-            table.append([label, "published code, same meshes", *texts])
             label = ""
         if row["variant"] is not None:
             metrics = [row["metric"]] if report["metric"] == "mmd" else ["kato18", "kato19"]
@@ -148,7 +93,7 @@ def run_table(report: dict[str, Any]) -> Cells:
         counts = [str(run[key]) for key in ("iterations", "batch_size", "objects", "images")]
         measures = [_number(run[key]) for key in ("kato18", "kato19", "mmd", "mmd_paper", "chamfer_l1", "f_score")]
         minutes = "-" if run["seconds"] is None else f"{run['seconds'] / 60:.1f}"
-        table.append([run["run"], network, *counts, *measures, minutes, _commit_text(run)])
+        table.append([run["run"], network, *counts, *measures, minutes, run["commit"] or "-"])
     return table
 
 
@@ -160,11 +105,12 @@ def commands(report: dict[str, Any]) -> list[str]:
 def _notes(report: dict[str, Any]) -> list[str]:
     notes = [REFERENCE, *([report["note"]] if report["note"] else [])]
     seeds = sorted({seed for row in report["rows"] for seed in row["cells"].get(MEAN, {}).get("seeds", [])})
-    about = "Brackets: 95 % intervals, over test objects (bootstrap; objects, not images, are drawn again)"
-    if len(seeds) > 1:
-        about += f"; ±: over {len(seeds)} seeds (Student's t)"
-    about = f"Measured on the test split. {about}." if report["runs"] else ""
-    notes += [about] if about else []
+    if report["runs"]:
+        over_seeds = f"; ±: over {len(seeds)} seeds (Student's t)" if len(seeds) > 1 else ""
+        notes.append(
+            "Measured on the test split. Brackets: 95 % intervals, over test objects (bootstrap; objects, not images, "
+            f"are drawn again){over_seeds}."
+        )
     for note in dict.fromkeys(row["published_note"] for row in report["rows"] if row["published_note"]):
         labels = ", ".join(row["label"] for row in report["rows"] if row["published_note"] == note)
         notes.append(f"{labels}, paper's figures: {note}.")
@@ -215,13 +161,6 @@ def _intervals(seeds: Sequence[float] | None, objects: Sequence[float] | None, f
     return text + ("" if objects is None else f" [{_number(objects[0], form)}, {_number(objects[1], form)}]")
 
 
-def _commit_text(run: dict[str, Any]) -> str:
-    """The commit that trained a run, or where that was not recorded the one that tested it."""
-    if run["commit"]:
-        return run["commit"][:9] + ("-dirty" if run["commit"].endswith("-dirty") else "")
-    return f"tested at {run['tested_at'][:9]}" if run["tested_at"] else "-"
-
-
 def _number(value: float | None, form: str = ".4f") -> str:
     return "-" if value is None else format(value, form)
 
@@ -233,5 +172,5 @@ def _markdown_table(table: Cells) -> str:
 
 
 def _markdown_cell(text: str) -> str:
-    """In one line, without HTML: names in results may be a stranger's."""
+    """In one line, without HTML: what stands in results may be a stranger's."""
     return html.escape(" ".join(text.splitlines()), quote=False).replace("|", "\\|")

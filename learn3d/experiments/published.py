@@ -141,23 +141,3 @@ PASCAL = {
     "Baseline": PublishedRow(0.453, {"airplane": 0.423, "car": 0.672, "chair": 0.265}),
     "Proposed": PublishedRow(0.477, {"airplane": 0.458, "car": 0.695, "chair": 0.277}),
 }  # fmt: skip
-
-#: What the published code itself reaches on the meshes of docs/results.md (airplanes of FlightGear, chairs and tables
-#: of Sweet Home 3D; their splits and scalings), seed 0, batch 128: voxel IoU (kato18) and MMD on the test split, by
-#: row, category and iterations. Over three seeds the IoUs at 3,000 iterations spread by about 0.012.
-CODE_IOU = {
-    "Proposed": {
-        "airplane": {1000: 0.541, 2000: 0.564, 3000: 0.579, 4000: 0.590, 5000: 0.597},
-        "chair": {1000: 0.335, 2000: 0.352, 3000: 0.361, 4000: 0.366, 5000: 0.369},
-        "table": {1000: 0.314, 2000: 0.315, 3000: 0.302},
-    },
-    "Vanilla-AE": {
-        "airplane": {1000: 0.501, 2000: 0.533, 3000: 0.560, 4000: 0.556, 5000: 0.547},
-        "chair": {1000: 0.312, 2000: 0.321, 3000: 0.317, 4000: 0.317, 5000: 0.313},
-        "table": {1000: 0.288, 2000: 0.289, 3000: 0.303},
-    },
-}
-CODE_MMD = {
-    "Proposed": {"airplane": {5000: 0.32}, "chair": {5000: 0.17}, "table": {3000: 0.11}},
-    "Vanilla-AE": {"airplane": {5000: 1.04}, "chair": {5000: 0.57}, "table": {3000: 0.21}},
-}

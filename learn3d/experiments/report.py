@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from learn3d.experiments import published
 from learn3d.experiments.evaluation_report import MEANINGS
 from learn3d.experiments.plan import Options, Run, command_line, selected_rows
 from learn3d.experiments.published import CATEGORIES, PublishedRow
@@ -40,25 +39,12 @@ PROTOCOL = {name: MEANINGS[key] for name, key in MEASURES.items()} | {
 
 
 def make_report(
-    table: Table,
-    options: Options,
-    runs: Sequence[Run],
-    records: Mapping[Path, dict[str, Any]],
-    *,
-    beside_code: bool = False,
+    table: Table, options: Options, runs: Sequence[Run], records: Mapping[Path, dict[str, Any]]
 ) -> dict[str, Any]:
-    """The table's report from the stored results of runs, by folder; runs without one are named under "missing".
-
-    With `beside_code` the figures that the published code reaches on the meshes of docs/results.md stand beside ours,
-    where there are some for the same number of iterations.
-    """
+    """The table's report from the stored results of runs, by folder; runs without one are named under "missing"."""
     categories = list(dict.fromkeys(run.category for run in runs))
     rows = selected_rows(table, options.methods)
     done = {row.label: _records_of(row, categories, runs, records) for row in rows}
-    made = [_row(table, row, categories, done[row.label], done.get(table.baseline)) for row in rows]
-    if beside_code:
-        for row in made:
-            _add_code(table, row, categories)
     return {
         "table": table.name,
         "title": table.title,
@@ -69,7 +55,7 @@ def make_report(
         "output": str(options.output),
         "categories": categories,
         "protocol": PROTOCOL,
-        "rows": made,
+        "rows": [_row(table, row, categories, done[row.label], done.get(table.baseline)) for row in rows],
         "runs": [_run(run, records[run.folder]) for run in runs if run.folder in records],
         "missing": [run.name for run in runs if run.folder not in records],
     }
@@ -104,19 +90,6 @@ def _row(table: Table, row: Row, categories: list[str], results: Results, baseli
         "published_note": published_row and published_row.note,
         "cells": cells,
     }
-
-
-def _add_code(table: Table, row: dict[str, Any], categories: list[str]) -> None:
-    """Put the published code's figures into the cells of a row."""
-    figures = (published.CODE_MMD if table.metric == "mmd" else published.CODE_IOU).get(row["label"], {})
-    cells, found = row["cells"], []
-    for name in categories:
-        taken = cells[name].get("iterations", [])
-        if len(taken) == 1 and taken[0] in figures.get(name, {}):
-            cells[name]["code"] = figures[name][taken[0]]
-            found.append(cells[name]["code"])
-    if found and len(found) == len(categories):
-        cells[MEAN]["code"] = float(np.mean(found))
 
 
 def _cell(ours: list[dict[int, dict]]) -> dict[str, Any]:
@@ -192,14 +165,17 @@ def _paper(row: PublishedRow | None, column: str, categories: list[str]) -> dict
 
 def _run(run: Run, record: dict[str, Any]) -> dict[str, Any]:
     """One line about a run, with all that repeats it."""
-    config = run.config
-    kept = ("iterations", "step", "checkpoint", "seed", "seconds", "images", "undefined")
-    about = {"run": run.name, "variant": run.variant.name, "category": run.category}
-    about |= {name: record.get(name) for name in kept} | {"batch_size": config.batch_size}
-    about |= {"objects": len(record["objects"]["names"])}
-    about |= {name: record.get(key) for name, key in MEASURES.items()}
-    trained, tested = record.get("trained_by") or {}, record.get("tested_by") or {}
-    about |= {"commit": trained.get("commit"), "tested_at": tested.get("commit"), "torch": trained.get("torch")}
+    kept = ("iterations", "step", "checkpoint", "seed", "seconds", "images", "undefined", "command")
+    commit = (record.get("trained_by") or {}).get("commit")
     output = f"OUTPUT/runs/CATEGORY/{run.variant.name}-seedSEED"
-    general = command_line(config, data="DATA", category="CATEGORY", seed="SEED", output=output)
-    return about | {"command": record["command"], "general_command": general}
+    return {
+        "run": run.name,
+        "variant": run.variant.name,
+        "category": run.category,
+        **{name: record.get(name) for name in kept},
+        "batch_size": run.config.batch_size,
+        "objects": len(record["objects"]["names"]),
+        **{name: record.get(key) for name, key in MEASURES.items()},
+        "commit": commit and commit[:9] + "-dirty" * commit.endswith("-dirty"),
+        "general_command": command_line(run.config, data="DATA", category="CATEGORY", seed="SEED", output=output),
+    }

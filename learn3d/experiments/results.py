@@ -6,7 +6,7 @@ The file may be a stranger's: it is checked when it is read.
 from __future__ import annotations
 
 import dataclasses
-import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from pydantic import BaseModel, Field, ValidationError
 
-from learn3d.config import config_to_dict
-from learn3d.data.dataset import ViewDataset
+from learn3d.config import config_to_dict, differences, load_config
 from learn3d.data.layouts import load_dataset
 from learn3d.evaluation import evaluate
 from learn3d.experiments.plan import Run, command_line
 from learn3d.files import limits, writing
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.runs import checkpoint
+from learn3d.runs.folder import CONFIG, LAST
 from learn3d.runs.versions import versions
 from learn3d.settings import MOST, Step
 
@@ -31,24 +31,22 @@ SPLIT = "test"
 DIGITS = 5  # of stored values
 
 
-def measure(run: Run, *, check_data: bool) -> dict[str, Any]:
+def measure(run: Run) -> dict[str, Any]:
     """Evaluate a trained run in fp32 on all images of the test split and write <run>/test.json; returns what it holds.
 
     Keys: the configuration and the command that repeats it; iterations, step of the networks tested, seconds of
     training, versions at training and at testing; voxel IoU by both voxelisers, Chamfer-L1, F-score, both MMDs; and
     "objects" and "views": for each of them the number of its images, the number with a defined IoU and the mean IoU.
 
-    With `check_data` the training images of `run.config.data` are compared with those the run was trained on.
-    Raises ValueError where there is no checkpoint or the data are not the run's.
+    Raises ValueError where there is no checkpoint, or no voxels to compare with.
     """
     config = run.config
-    last = checkpoint.load_metadata(run.folder / "last.safetensors")
-    if check_data:
-        _check_data(run, dataclasses.asdict(last.conditions))
+    last = checkpoint.load_metadata(run.folder / LAST)
     method, saved, metadata = checkpoint.load_method(
         run.folder / f"{run.variant.checkpoint}.safetensors", device=config.device, precision="fp32"
     )
-    dataset = _load(run, SPLIT)
+    where = (config.layout, config.data, config.category, SPLIT)
+    dataset = load_dataset(*where, image_size=method.image_size, view_bins=config.view_bins)
     if dataset.voxels is None:
         raise ValueError(f"{config.data} has no voxels for {run.category}, {SPLIT}: IoU cannot be measured")
     result = evaluate(method, dataset, definitions=DEFINITIONS, paper_mmd=True, surfaces=True)
@@ -130,36 +128,35 @@ def read_result(path: Path) -> dict[str, Any]:
     return result
 
 
+def read_results(runs: Sequence[Run]) -> dict[Path, dict[str, Any]]:
+    """The stored results of those runs that have one of these networks on this data, by folder."""
+    found = [(run, read_result(path)) for run in runs if (path := run.folder / RESULT_FILE).is_file()]
+    return {run.folder: result for run, result in found if _is_current(run, result)}
+
+
+def _is_current(run: Run, result: dict[str, Any]) -> bool:
+    wanted = (run.config.iterations, run.variant.checkpoint, str(run.config.data.resolve()))
+    return (result["iterations"], result["checkpoint"], result["data"]) == wanted
+
+
+def conflicts_with(run: Run) -> str:
+    """In what the run in the folder differs from the one that is planned, as a sentence; "" where it can go on."""
+    if not (run.folder / CONFIG).is_file():
+        return ""
+    saved = load_config(run.folder / CONFIG)
+    changed = differences(run.config, saved)
+    if run.variant.checkpoint == "best" and run.config.val_split != saved.val_split:
+        changed.append(
+            f"val_split: {saved.val_split!r} chose the run's best networks, {run.config.val_split!r} asked for"
+        )
+    return f"{run.folder} has a run with other options: " + "; ".join(changed) if changed else ""
+
+
 def object_sums(record: dict[str, Any], definition: str) -> tuple[np.ndarray, np.ndarray]:
     """(sum of the IoUs, number of IoUs), both float64 [N], of the objects of a stored result."""
     defined = np.array(record["objects"]["defined"], np.float64)
     means = np.array([0.0 if mean is None else mean for mean in record["objects"][definition]])
     return means * defined, defined
-
-
-def _load(run: Run, split: str) -> ViewDataset:
-    config = run.config
-    return load_dataset(
-        config.layout,
-        config.data,
-        config.category,
-        split,
-        image_size=config.settings.image_size,
-        view_bins=config.view_bins,
-        views_per_object=config.views_per_object if split == "train" else None,
-    )
-
-
-def _check_data(run: Run, recorded: dict[str, Any]) -> None:
-    """Refuse to put a run's name to data that it was not trained on. Runs that did not record theirs pass."""
-    images = _load(run, "train").images
-    found = f"{zlib.crc32(np.ascontiguousarray(images)):08x}"
-    if recorded.get("images", found) != found:
-        raise ValueError(
-            f"{run.folder} was trained on other data: the CRC-32 of its {recorded.get('samples')} training images is "
-            f"{recorded['images']}, that of the {len(images)} in {run.config.data} is {found}; give the run's own data "
-            "with --data, or another --output"
-        )
 
 
 def _means_by(ids: torch.Tensor, ious: dict[str, torch.Tensor], names: tuple[str, ...]) -> dict[str, Any]:

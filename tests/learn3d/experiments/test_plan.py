@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import shlex
-import shutil
-import sys
 
 import pytest
+import stub_work
 
 from learn3d.commands import train
+from learn3d.config import config_to_dict
 from learn3d.experiments import published
-from learn3d.experiments.experiment import Call, run_experiment
+from learn3d.experiments.experiment import Call
 from learn3d.experiments.plan import Options, command_line, plan_runs
-from learn3d.experiments.state import State, is_current, read_results, read_state
+from learn3d.experiments.results import conflicts_with, read_results
 from learn3d.experiments.tables import TABLES
+from learn3d.files.writing import write_json
 from learn3d.presets import PRESETS
 
 
@@ -96,74 +96,57 @@ def test_the_command_of_a_run_gives_its_configuration(tmp_path, table: str) -> N
         assert train.read(shlex.split(command_line(run.config))[2:]).config == run.config
 
 
-def test_runs_made_by_hand_are_adopted(made_by_hand) -> None:
-    assert read_state(made_by_hand()) == State("trained", 4)
-    assert read_state(made_by_hand(iterations=9)) == State("unfinished", 4)
-    assert read_state(made_by_hand(threads=7)) == State("trained", 4), "what does not decide the result may differ"
+def test_runs_made_by_hand_are_adopted(options, tmp_path) -> None:
+    """Their config.json says what they are; what does not decide the result may differ."""
+    (run,) = plan_runs(TABLES["kato"], options(methods=("proposed",)))
+    assert conflicts_with(run) == ""
+    run.folder.mkdir(parents=True)
+    write_json(run.folder / "config.json", config_to_dict(dataclasses.replace(run.config, threads=7, iterations=3)))
+    assert conflicts_with(run) == ""
 
 
-def test_a_trained_run_whose_checkpoint_is_damaged_goes_on(made_by_hand, finished_run) -> None:
-    run = made_by_hand()
-    run.folder.unlink()
-    run.folder.mkdir()
-    last = run.folder / "last.safetensors"
-    shutil.copy(finished_run / "last.safetensors", last)
-    with open(last, "r+b") as file:
-        file.seek(-1000, os.SEEK_END)
-        file.write(b"rubbish")
-    assert read_state(run) == State("unfinished", 4), "training finds the damage and goes back to the one before"
-    (run.folder / "checkpoints").mkdir()
-    shutil.copy(finished_run / "last.safetensors", run.folder / "checkpoints" / "step-000004.safetensors")
-    last.write_bytes(b"rubbish")
-    assert read_state(run).step == 4, "the header of the one before counts"
-    shutil.rmtree(run.folder)
+def test_other_options_are_named(options) -> None:
+    (run,) = plan_runs(TABLES["kato"], options(methods=("proposed",)))
+    run.folder.mkdir(parents=True)
+    write_json(run.folder / "config.json", config_to_dict(run.config))
+    for other, words in (
+        (options(methods=("proposed",), batch_size=5), "batch_size: 4 in the run, 5 asked for"),
+        (options(methods=("proposed",), changes=("lambda_prior=0.5",)), "lambda_prior: 1.0 in the run, 0.5 asked for"),
+    ):
+        assert words in conflicts_with(plan_runs(TABLES["kato"], other)[0])
 
 
-def test_other_options_are_named(made_by_hand) -> None:
-    with pytest.raises(ValueError, match=r"proposed-seed0 has a run with other options: batch_size: 4 .* 5 asked for"):
-        read_state(made_by_hand(batch_size=5))
-    with pytest.raises(ValueError, match=r"lambda_prior: 1\.0 in the run, 0\.5 asked for"):
-        read_state(made_by_hand(changes=("lambda_prior=0.5",)))
-    with pytest.raises(ValueError, match="iterations: 4 taken by the run, 3 asked for"):
-        read_state(made_by_hand(iterations=3))
-
-
-def test_the_split_that_chose_the_best_networks_counts(made_by_hand) -> None:
-    run = made_by_hand(changes=("precision=fp32", "val_split=test"))
-    assert read_state(run) == State("trained", 4)
+def test_the_split_that_chose_the_best_networks_counts(options) -> None:
+    (run,) = plan_runs(TABLES["kato"], options(methods=("proposed",)))
+    run.folder.mkdir(parents=True)
+    write_json(run.folder / "config.json", config_to_dict(dataclasses.replace(run.config, val_split="test")))
+    assert conflicts_with(run) == ""
     best = dataclasses.replace(run, variant=dataclasses.replace(run.variant, checkpoint="best"))
-    with pytest.raises(ValueError, match="val_split: 'val' chose the run's best networks, 'test' asked for"):
-        read_state(best)
+    assert "val_split: 'test' chose the run's best networks" in conflicts_with(best)
 
 
-def test_runs_in_conflict_stop_the_table_or_are_replaced(tmp_path, stub, capsys, options) -> None:
-    run_experiment(Call("mmd", options()), worker=stub)
+def test_runs_in_conflict_stop_the_table_or_are_replaced(tmp_path, make, capsys, options) -> None:
+    make(Call("mmd", options()))
     with pytest.raises(ValueError, match=r"batch_size: 4 in the run, 8 asked for(.|\n)*--overwrite"):
-        run_experiment(Call("mmd", options(batch_size=8)), worker=stub)
-    assert run_experiment(Call("mmd", options(batch_size=8), overwrite=True), worker=stub) == 0
+        make(Call("mmd", options(batch_size=8)))
+    assert make(Call("mmd", options(batch_size=8), overwrite=True)) == 0
     log = (tmp_path / "out/runs/airplane/vanilla-seed0/log.txt").read_text()
     assert log.count("fresh False") == log.count("fresh True") == 1
 
 
-def test_finished_runs_are_skipped_and_shared(stub, capsys, options) -> None:
-    assert run_experiment(Call("kato", options()), worker=stub) == 0
-    broken = (sys.executable, "-c", "raise SystemExit('started')")
-    assert run_experiment(Call("kato", options()), worker=broken) == 0
-    assert run_experiment(Call("mmd", options()), worker=broken) == 0, "the same runs serve another table"
-    assert run_experiment(Call("kato", options(seeds=2)), worker=broken) == 1
+def test_finished_runs_are_skipped_and_shared(make, options) -> None:
+    assert make(Call("kato", options())) == 0
+    assert make(Call("kato", options()), work=stub_work.never) == 0
+    assert make(Call("mmd", options()), work=stub_work.never) == 0, "the same runs serve another table"
+    with pytest.raises(ValueError, match="started"):
+        make(Call("kato", options(seeds=2)), work=stub_work.never)
 
 
-def test_a_result_of_fewer_iterations_is_not_taken(made_by_hand) -> None:
-    """As where tools/train.py took a measured run further by hand."""
-    run = made_by_hand()
-    result = {"iterations": 3, "checkpoint": "last", "data": str(run.config.data.resolve())}
-    assert not is_current(run, result)
-    assert is_current(run, result | {"iterations": 4})
-    assert not is_current(run, result | {"iterations": 4, "checkpoint": "best"})
-
-
-def test_a_result_of_other_data_is_not_taken(tmp_path, stub, options) -> None:
-    run_experiment(Call("kato", options()), worker=stub)
-    moved = plan_runs(TABLES["kato"], dataclasses.replace(options(), data=tmp_path / "elsewhere"))
-    assert read_state(moved[0]).stage == "trained"
-    assert read_results(moved) == {}
+def test_results_of_other_networks_or_data_are_not_taken(tmp_path, make, options) -> None:
+    make(Call("kato", options()))
+    (run, _) = plan_runs(TABLES["kato"], options())
+    assert list(read_results([run])) == [run.folder]
+    for other in (options(iterations=7), dataclasses.replace(options(), data=tmp_path / "elsewhere")):
+        assert read_results(plan_runs(TABLES["kato"], other)) == {}
+    best = dataclasses.replace(run, variant=dataclasses.replace(run.variant, checkpoint="best"))
+    assert read_results([best]) == {}

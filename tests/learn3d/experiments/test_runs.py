@@ -11,22 +11,22 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
+import stub_work
 
-from learn3d.experiments import pool, results, worker
+from learn3d.experiments import pool, results
 from learn3d.experiments.experiment import Call, run_experiment
 from learn3d.experiments.plan import Options, plan_runs
-from learn3d.experiments.pool import NOT_FROM_HERE
 from learn3d.experiments.tables import TABLES
-from learn3d.experiments.worker import carry_out
 from learn3d.training import Summary
 
 
-def test_a_failing_run_does_not_stop_the_others(tmp_path, stub, capsys, options) -> None:
+def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys, options) -> None:
     call = Call("kato", options(categories=("fails", "airplane"), threads=3), jobs=2)
-    assert run_experiment(call, worker=stub) == 1
+    assert run_experiment(call, work=stub_work.work) == 1
     shown = capsys.readouterr().err
     assert "FAILED fails/vanilla-seed0; the end of its log:" in shown
     assert "error: no such data" in shown
@@ -35,46 +35,44 @@ def test_a_failing_run_does_not_stop_the_others(tmp_path, stub, capsys, options)
     assert report["missing"] == ["fails/vanilla-seed0", "fails/proposed-seed0"]
     assert report["rows"][0]["cells"]["airplane"]["values"]["kato18"] == pytest.approx(0.34)
     assert report["rows"][0]["cells"]["mean"] == {"paper_printed": 0.357}, "no mean over what is not there"
-    assert "threads 3 3" in (tmp_path / "out/runs/airplane/vanilla-seed0/log.txt").read_text()
+    assert "threads 3 " in (tmp_path / "out/runs/airplane/vanilla-seed0/log.txt").read_text()
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="POSIX signals")
 @pytest.mark.skipif(os.name != "posix", reason="a pipe without a reader ends otherwise there")
-def test_runs_go_on_where_nobody_reads_their_progress(tmp_path, stub, monkeypatch, options) -> None:
+def test_runs_go_on_where_nobody_reads_their_progress(tmp_path, monkeypatch, options) -> None:
     for name in ("stdout", "stderr"):
         reading, writing = os.pipe()
         os.close(reading)
         monkeypatch.setattr(sys, name, open(writing, "w"))
-    assert run_experiment(Call("kato", options()), worker=stub) == 0
+    assert run_experiment(Call("kato", options()), work=stub_work.work) == 0
     assert (tmp_path / "out" / "kato.md").is_file()
 
 
-def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, stub, capsys, options) -> None:
+def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, options) -> None:
     call = Call("kato", options(categories=("waits", "airplane")), jobs=2)
     logs = [tmp_path / f"out/runs/waits/{name}-seed0/log.txt" for name in ("vanilla", "proposed")]
 
     def interrupt() -> None:
-        deadline = time.monotonic() + 30
-        while not all(log.is_file() and "waiting" in log.read_text() for log in logs) and time.monotonic() < deadline:
-            time.sleep(0.05)
+        for log in logs:
+            wait_for("waiting", log)
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt).start()
-    assert run_experiment(call, worker=stub) == 130
+    assert run_experiment(call, work=stub_work.work) == 130
     assert all("saved" in log.read_text() for log in logs)
-    assert all("own session True" in log.read_text() for log in logs), "else the terminal would interrupt them too"
     assert "stopped; the same command goes on" in capsys.readouterr().err
     assert not (tmp_path / "out/runs/airplane").exists(), "nothing new is started"
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals")
 @pytest.mark.parametrize(("nohup", "status"), [(True, 0), (False, 130)])
-def test_a_closed_terminal_stops_the_runs_except_under_nohup(stub, monkeypatch, nohup, status, options) -> None:
+def test_a_closed_terminal_stops_the_runs_except_under_nohup(monkeypatch, nohup, status, options) -> None:
     start = pool._start
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN if nohup else signal.SIG_DFL)
     monkeypatch.setattr(pool, "_start", lambda *given: (signal.raise_signal(signal.SIGHUP), start(*given))[1])
     try:
-        assert run_experiment(Call("kato", options()), worker=stub) == status
+        assert run_experiment(Call("kato", options()), work=stub_work.work) == status
     finally:
         signal.signal(signal.SIGHUP, before)
 
@@ -94,43 +92,70 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, capsys) -> No
 
     (folder / "test.json").unlink()
     run = plan_runs(TABLES["kato"], given)[0]
-    assert carry_out(run, fresh=False)
+    assert pool.carry_out(run, fresh=False)
     assert json.loads((folder / "test.json").read_text())["voxel_iou_kato18"] == result["voxel_iou_kato18"]
     assert (folder / "log.txt").read_text().count("training: ") == 1, "only measured again"
 
     np.savez(tmp_path / "02691156_train_images.npz", np.zeros((3, 24, 4, 64, 64), np.uint8))
-    shutil.copy(tiny_folder / "02691156_train_voxels.npz", tmp_path)
+    for name in ("train_voxels", "val_images", "val_voxels"):
+        shutil.copy(tiny_folder / f"02691156_{name}.npz", tmp_path)
     moved = dataclasses.replace(run, config=dataclasses.replace(run.config, data=tmp_path))
-    with pytest.raises(ValueError, match=r"vanilla-seed0 was trained on other data: the CRC-32 of its 72 training"):
-        carry_out(moved, fresh=False)
+    with pytest.raises(ValueError, match="other training data"):
+        pool.carry_out(moved, fresh=False)
 
 
-@pytest.mark.parametrize(
-    ("iterations", "fresh", "resume", "overwrite"), [(9, False, True, False), (9, True, False, True)]
-)
-def test_a_worker_resumes_or_starts_anew(made_by_hand, monkeypatch, iterations, fresh, resume, overwrite) -> None:
+def test_a_run_goes_on_or_starts_anew(finished_run, tiny_folder, options, tmp_path, monkeypatch) -> None:
+    (tmp_path / "out/runs/airplane").mkdir(parents=True)
+    shutil.copytree(finished_run, tmp_path / "out/runs/airplane/proposed-seed0")
+    small = ("precision=fp32", "encoder=conv-small", "generator=sphere-small")
+    given = dataclasses.replace(options(methods=("proposed",), iterations=9, changes=small), data=tiny_folder)
+    (run,) = plan_runs(TABLES["kato"], given)
     calls = []
 
     def train(config, **how):
         calls.append(how)
         return Summary(config.output, 5, False, 0.0, 0, 0.0, 0.0)
 
-    monkeypatch.setattr(worker, "train", train)
-    monkeypatch.setattr(results, "measure", lambda *_, **__: pytest.fail("a stopped run is not measured"))
-    assert not carry_out(made_by_hand(iterations=iterations), fresh=fresh)
-    assert calls == [{"resume": resume, "overwrite": overwrite}]
+    monkeypatch.setattr(pool, "train", train)
+    monkeypatch.setattr(results, "measure", lambda run: pytest.fail("a stopped run is not measured"))
+    assert not pool.carry_out(run, fresh=False)
+    assert not pool.carry_out(run, fresh=True)
+    (run.folder / "config.json").unlink()
+    assert not pool.carry_out(run, fresh=False), "a checkpoint alone is a run, too"
+    shutil.rmtree(run.folder)
+    assert not pool.carry_out(run, fresh=False)
+    goes_on, new = {"resume": True, "overwrite": False}, {"resume": False, "overwrite": True}
+    assert calls == [goes_on, new, goes_on, new]
 
 
-@pytest.mark.parametrize("answer", [signal.SIG_DFL, signal.SIG_IGN], ids=["foreground", "background"])
-def test_a_worker_stops_when_its_parent_is_gone(answer: signal.Handlers) -> None:
-    code = "import time; from learn3d.experiments import worker; worker._stop_with_parent(); time.sleep(60)"
-    process = subprocess.Popen(
-        [sys.executable, "-c", NOT_FROM_HERE + code],
-        stdin=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, answer),
-    )
-    process.stdin.close()
-    assert b"KeyboardInterrupt" in process.stderr.read()
-    assert process.wait(timeout=30) != 0
-    process.stderr.close()
+def test_a_run_that_dies_is_a_failed_one(capsys, options) -> None:
+    assert run_experiment(Call("kato", options(categories=("dies",), methods=("vanilla",))), work=stub_work.work) == 1
+    assert "FAILED dies/vanilla-seed0" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+def test_runs_stop_when_their_parent_is_gone(tmp_path) -> None:
+    code = f"""
+import sys
+sys.path[:0] = {sys.path!r}
+from pathlib import Path
+import stub_work
+from learn3d.experiments.experiment import Call, run_experiment
+from learn3d.experiments.plan import Options
+if __name__ == "__main__":
+    given = Options(Path("data"), Path({str(tmp_path)!r}), ("waits",), ("vanilla",), 6, 4, threads=1)
+    run_experiment(Call("kato", given), work=stub_work.work)
+"""
+    (tmp_path / "parent.py").write_text(code)
+    log = tmp_path / "runs/waits/vanilla-seed0/log.txt"
+    with subprocess.Popen([sys.executable, tmp_path / "parent.py"], stderr=subprocess.DEVNULL) as parent:
+        wait_for("waiting", log)
+        parent.kill()
+    wait_for("saved", log)
+
+
+def wait_for(text: str, log: Path) -> None:
+    deadline = time.monotonic() + 30
+    while not (log.is_file() and text in log.read_text()):
+        assert time.monotonic() < deadline, f"no {text!r} in {log}"
+        time.sleep(0.05)
