@@ -81,11 +81,6 @@ class Grid(Measured):
 class Tsne(Measured):
     """Shape codes of test images in the plane, coloured by the view (PNG, SVG)."""
 
-    max_images: int = 2000
-    """Images that are laid out, at most."""
-    seed: int = 0
-    """Seed of the layout."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Interpolation(Measured):
@@ -97,10 +92,6 @@ class Interpolation(Measured):
     """Samples of the data set to use instead."""
     steps: int = 4
     """Steps from one image to the next in the strip."""
-    frames: int = 16
-    """The same in the morph."""
-    azimuths: tuple[float, ...] = (-135.0, -45.0)
-    """Viewpoints: azimuths in degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,13 +146,13 @@ def run(arguments: Sequence[str]) -> int:
     elif name == "polar":
         paths = paper.save_polar(command.open(), where, definition=command.voxels)
     elif name == "tsne":
-        paths = paper.save_tsne(command.open(), where, max_images=command.max_images, seed=command.seed)
+        paths = paper.save_tsne(command.open(), where)
     elif name == "grid":
         options = {"images": command.images, "indices": command.indices, "truth": command.truth}
         paths = [paper.save_grid(command.open(), where, **options)]
     elif name == "interpolation":
-        options = {"images": command.images, "indices": command.indices, "azimuths": command.azimuths}
-        paths = paper.save_interpolation(command.open(), where, steps=command.steps, frames=command.frames, **options)
+        options = {"images": command.images, "indices": command.indices, "steps": command.steps}
+        paths = paper.save_interpolation(command.open(), where, **options)
     else:
         paths = paper.save_all(command.open(), runs, where, labels=command.labels, without=lacking, say=note)
     for path in paths:

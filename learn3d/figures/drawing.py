@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
+from PIL import Image
 from torch import Tensor
 
 import nmr
@@ -18,7 +18,6 @@ from learn3d.data.conventions import DISTANCE
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.files import writing
 from learn3d.make_data.shading import shade_mesh
-from learn3d.make_data.sheets import HEADER, font
 from learn3d.methods import Grids, Meshes
 from learn3d.methods.surfaces import grid_surface
 
@@ -159,21 +158,6 @@ def to_uint8(values: Tensor) -> np.ndarray:
     """Grey values in [0,1], any shape -> uint8 with a last axis of 3 equal channels."""
     grey = (values.detach().cpu().float().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     return np.repeat(grey[..., None], 3, axis=-1)
-
-
-def beside(blocks: Sequence[np.ndarray], labels: Sequence[str], *, gap: int = 14) -> np.ndarray:
-    """Pictures uint8 [h,w,3] next to each other, their lower edges in line, a label above each (may be empty)."""
-    if len(blocks) != len(labels):
-        raise ValueError(f"{len(blocks)} pictures need as many labels, got {len(labels)}")
-    header = HEADER + 6 if any(labels) else 0
-    height, width = max(len(block) for block in blocks), sum(block.shape[1] for block in blocks)
-    sheet = Image.new("RGB", (width + gap * (len(blocks) - 1), header + height), (255, 255, 255))
-    draw, left = ImageDraw.Draw(sheet), 0
-    for block, label in zip(blocks, labels, strict=True):
-        sheet.paste(Image.fromarray(block), (left, header + height - len(block)))
-        draw.text((left + block.shape[1] // 2, header - 5), label, fill=(0, 0, 0), anchor="ms", font=font(15))
-        left += block.shape[1] + gap
-    return np.asarray(sheet)
 
 
 def stacked(blocks: Sequence[np.ndarray], *, gap: int = 0) -> np.ndarray:

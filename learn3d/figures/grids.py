@@ -15,7 +15,6 @@ from learn3d.figures.drawing import (
     Surface,
     as_meshes,
     azimuths_deg,
-    beside,
     common_zoom,
     draw_surface,
     magnified,
@@ -65,9 +64,8 @@ def comparison_grid(
 ) -> np.ndarray:
     """The same images through several methods, each a (label, method): uint8 [H,W,3].
 
-    Up to two methods stand side by side as in the paper's figure, a row per image: the input, then for each method its
-    shape from the input's view and from five more around the object. More stand below each other, a group of rows per
-    image. `title` stands above the inputs. All pictures are magnified alike, as far as the shapes allow.
+    A group of rows per image: the input, and a row per method with its shape from the input's view and from five more
+    around the object. `title` stands above the inputs. All pictures are magnified alike, as far as the shapes allow.
     With `truth` the objects' voxels come first, like a method of that name.
     """
     if not methods:
@@ -92,10 +90,6 @@ def comparison_grid(
         for label, of_one in shapes.items()
     }
     titles = ("input view", *(f"+{turn}°" for turn in TURNS_DEG[1:]))
-    if len(shapes) <= 2:
-        blocks = [tile([[picture] for picture in inputs], ["input"], tile_size=tile_size)]
-        blocks += [tile(rows, titles, tile_size=tile_size) for rows in drawn.values()]
-        return beside(blocks, [title, *drawn])
     rows = [
         [inputs[i] if k == 0 else None, *pictures[i]]
         for i in range(len(samples))

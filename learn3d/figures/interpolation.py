@@ -52,20 +52,21 @@ def interpolation_strip(
     *,
     steps: int = 4,
     azimuths: Sequence[float] = AZIMUTHS_DEG,
-    tile_size: int = TILE,
+    title: str = "",
 ) -> np.ndarray:
     """The way from the shape of one image to that of the next, and on: uint8 [H,W,3].
 
     Above, the images `samples` int64 [n], each over its own reconstruction; below, a row per viewpoint (azimuth in
-    degrees; elevation and distance of the first image's camera) with (n - 1) * steps + 1 shapes.
+    degrees; elevation and distance of the first image's camera) with (n - 1) * steps + 1 shapes. `title` stands before
+    the images.
     """
     batch = dataset.batch(samples)
     shapes = as_meshes(method.decode(walk(method.encode(batch.images), steps)))
-    pictures, zoom = _draw(shapes, batch.poses, batch.masks, azimuths, tile_size)
+    pictures, zoom = _draw(shapes, batch.poses, batch.masks, azimuths, TILE)
     inputs: list[np.ndarray | None] = [None] * len(shapes)
     inputs[::steps] = list(magnified(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom))
-    titles = [f"azimuth {azimuth:g}°" for azimuth in azimuths]
-    return tile([inputs, *pictures], tile_size=tile_size, row_titles=["input", *titles])
+    titles = [title or "input", *(f"azimuth {azimuth:g}°" for azimuth in azimuths)]
+    return tile([inputs, *pictures], row_titles=titles)
 
 
 @torch.no_grad()
@@ -78,14 +79,14 @@ def morph(
     azimuths: Sequence[float] = AZIMUTHS_DEG,
     image_size: int = 192,
 ) -> np.ndarray:
-    """Frames of an endless walk through the shapes of the images `samples` int64 [n], viewpoints side by side.
+    """Frames of an endless walk through the shapes of the images `samples` int64 [n].
 
-    uint8 [n * steps, S, len(azimuths) * S, 3].
+    uint8 [n * steps, len(azimuths), S, S, 3], S = `image_size`.
     """
     batch = dataset.batch(samples)
     shapes = as_meshes(method.decode(walk(method.encode(batch.images), steps, closed=True)))
     pictures, _ = _draw(shapes, batch.poses, batch.masks, azimuths, image_size)
-    return np.concatenate(list(pictures), axis=2)
+    return pictures.swapaxes(0, 1)
 
 
 def _draw(

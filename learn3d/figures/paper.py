@@ -13,16 +13,19 @@ from learn3d.config import load_config
 from learn3d.data.conventions import Definition
 from learn3d.evaluation import spread_samples
 from learn3d.figures import codes, curves, plots, polar
-from learn3d.figures.drawing import azimuths_deg, beside, save_gif, save_png, stacked, with_ending
+from learn3d.figures.drawing import azimuths_deg, save_gif, save_png, stacked, with_ending
 from learn3d.figures.grids import comparison_grid, spread_views
-from learn3d.figures.interpolation import AZIMUTHS_DEG, interpolation_strip, morph, typical_views
+from learn3d.figures.interpolation import interpolation_strip, morph, typical_views
 from learn3d.figures.runs import Run, by_dataset, encode, name_runs, title_of
 from learn3d.files import writing
+from learn3d.make_data.sheets import tile
 
 IMAGES = 6  # rows of a grid of one category
 IMAGES_PER_CATEGORY = 2  # rows of each of several categories
 TILE_SIZE = 128  # pixels
 FRAMES = 16  # of the morph from one image to the next
+MORPH_SIZE = 192  # pixels
+MOST_CODES = 2000  # images whose codes are laid out
 
 
 def save_grid(
@@ -46,56 +49,45 @@ def save_grid(
         title = dataset.category if len(groups) > 1 else ""
         methods = [(run.label, run.method) for run in group]
         blocks.append(comparison_grid(methods, dataset, samples, truth=truth, title=title, tile_size=TILE_SIZE))
-    return _written(save_png, output, ".png", stacked(blocks, gap=10))
+    path = with_ending(_in_folder(output), ".png")
+    save_png(path, stacked(blocks, gap=10))
+    return path
 
 
-def save_tsne(runs: Sequence[Run], output: Path, *, max_images: int = 2000, seed: int = 0) -> list[Path]:
+def save_tsne(runs: Sequence[Run], output: Path) -> list[Path]:
     """Shape codes of test images in the plane, coloured by the view, a map per run, as PNG and SVG."""
     maps = []
     for run in runs:
         dataset = run.dataset
-        samples = spread_samples(dataset.object_ids, dataset.view_ids, min(max_images, len(dataset)))
+        samples = spread_samples(dataset.object_ids, dataset.view_ids, min(MOST_CODES, len(dataset)))
+        shape_codes, azimuths = encode(run.method, dataset, samples).numpy(), azimuths_deg(dataset.poses[samples])
         rows = samples.numpy()
-        maps.append(
-            codes.map_codes(
-                title_of(run, runs),
-                encode(run.method, dataset, samples).numpy(),
-                azimuths_deg(dataset.poses[samples]).numpy(),
-                dataset.view_ids[rows],
-                dataset.object_ids[rows],
-                seed=seed,
-            )
-        )
+        ids = (dataset.view_ids[rows], dataset.object_ids[rows])
+        maps.append(codes.map_codes(title_of(run, runs), shape_codes, azimuths.numpy(), *ids))
     return plots.save_figure(codes.plot_maps(maps), _in_folder(output))
 
 
 def save_interpolation(
-    runs: Sequence[Run],
-    output: Path,
-    *,
-    images: int = 3,
-    indices: Sequence[int] = (),
-    steps: int = 4,
-    frames: int = FRAMES,
-    azimuths: Sequence[float] = AZIMUTHS_DEG,
+    runs: Sequence[Run], output: Path, *, images: int = 3, indices: Sequence[int] = (), steps: int = 4
 ) -> list[Path]:
     """Shapes between those of some test images: a strip per run as PNG, and an endless morph as GIF.
 
     images: how many, chosen by `typical_views` with the first run of each category; indices: samples to use instead.
-    steps: shapes from one image to the next in the strip, frames: the same in the animation.
+    steps: shapes from one image to the next in the strip.
     """
     strips, morphs, titles = [], [], []
     for group in by_dataset(runs):
         first = group[0]
         samples = torch.tensor(indices) if indices else typical_views(first.method, first.dataset, images)
         for run in group:
-            parts = (run.method, run.dataset, samples)
-            strips.append(interpolation_strip(*parts, steps=steps, azimuths=azimuths))
-            morphs.append(morph(*parts, steps=frames, azimuths=azimuths))
             titles.append(title_of(run, runs) if len(runs) > 1 else "")
-    strip = stacked([beside([s], [title]) for s, title in zip(strips, titles, strict=True)], gap=10)
-    animation = np.stack([beside(list(pictures), titles) for pictures in zip(*morphs, strict=True)])
-    return [_written(save_png, output, ".png", strip), _written(save_gif, output, ".gif", animation)]
+            strips.append(interpolation_strip(run.method, run.dataset, samples, steps=steps, title=titles[-1]))
+            morphs.append(morph(run.method, run.dataset, samples, steps=FRAMES, image_size=MORPH_SIZE))
+    frames = [tile(rows, tile_size=MORPH_SIZE, row_titles=titles) for rows in zip(*morphs, strict=True)]
+    paths = [with_ending(_in_folder(output), suffix) for suffix in (".png", ".gif")]
+    save_png(paths[0], stacked(strips, gap=10))
+    save_gif(paths[1], np.stack(frames))
+    return paths
 
 
 def save_curves(paths: Sequence[Path], output: Path, *, labels: Sequence[str] = ()) -> list[Path]:
@@ -146,7 +138,7 @@ def save_all(
     figures: dict[str, Callable[[Path], list[Path]]] = {
         "grid": lambda path: [save_grid(runs, path)],
         "tsne": lambda path: save_tsne(runs, path),
-        "interpolation": lambda path: save_interpolation(runs, path, frames=FRAMES),
+        "interpolation": lambda path: save_interpolation(runs, path),
         "curves": lambda path: save_curves(paths, path, labels=labels),
         "polar": lambda path: save_polar(runs, path),
     }
@@ -165,9 +157,3 @@ def _in_folder(output: Path) -> Path:
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)
     return output
-
-
-def _written(save: Callable[[Path, np.ndarray], None], output: Path, suffix: str, picture: np.ndarray) -> Path:
-    path = with_ending(_in_folder(output), suffix)
-    save(path, picture)
-    return path

@@ -27,6 +27,7 @@ def call(command):
 def test_all_figures_of_a_run(call, finished_run, tmp_path, monkeypatch) -> None:
     pytest.importorskip("sklearn")
     monkeypatch.setattr(paper, "FRAMES", 1)
+    monkeypatch.setattr(paper, "MORPH_SIZE", 32)
     monkeypatch.setattr(paper, "TILE_SIZE", 32)
     code, out, err = call("all", "--runs", finished_run, "--output", tmp_path / "out", "--split", "train")
     assert code == 0, err
@@ -63,13 +64,15 @@ def test_what_cannot_be_drawn_is_said_before_anything_is(call, finished_run, tmp
     assert code == 1 and "matplotlib" in err, "the package is looked for first"
 
 
-def test_the_morph_has_the_frames_that_were_asked_for(call, finished_run, tmp_path) -> None:
-    options = ("--split", "train", "--indices", 1, 30, 60, "--frames", 2, "--steps", 1, "--azimuths", 20)
+def test_the_images_of_an_interpolation_can_be_chosen(call, finished_run, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(paper, "FRAMES", 2)
+    monkeypatch.setattr(paper, "MORPH_SIZE", 32)
+    options = ("--split", "train", "--indices", 1, 30, 60, "--steps", 1)
     code, out, err = call("interpolation", "--runs", finished_run, "--output", tmp_path / "i.gif", *options)
     assert code == 0, err
     assert out.split() == [str(tmp_path / "i.png"), str(tmp_path / "i.gif")]
     with Image.open(tmp_path / "i.gif") as image:
-        assert (image.n_frames, image.size) == (6, (192, 192))
+        assert image.n_frames == 6
 
 
 def test_seeds_are_one_curve(call, finished_run, tmp_path) -> None:

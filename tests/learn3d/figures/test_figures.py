@@ -179,15 +179,8 @@ def test_a_sheet_has_titles_free_places_and_rules() -> None:
     assert len(np.unique(rule, axis=0)) == 1 and rule[0, 0] not in (0, 255)
 
 
-def test_blocks_are_put_together_with_labels() -> None:
+def test_pictures_are_put_below_each_other() -> None:
     low, high = np.zeros((10, 30, 3), np.uint8), np.zeros((20, 40, 3), np.uint8)
-    sheet = figures.drawing.beside([low, high], ["one", "two"], gap=6)
-    assert sheet.shape[1] == 30 + 6 + 40
-    assert (sheet[-10:, :30] == 0).all() and (sheet[-20:, 36:] == 0).all() and (sheet[-20:-10, :30] == 255).all()
-    assert (sheet[:-20] < 100).any()  # the labels
-    assert figures.drawing.beside([low], [""]).shape == low.shape
-    with pytest.raises(ValueError, match="2 pictures need as many labels, got 1"):
-        figures.drawing.beside([low, high], ["one"])
     both = figures.drawing.stacked([low, high], gap=4)
     assert both.shape == (34, 40, 3) and (both[10:14] == 255).all() and (both[14:] == 0).all()
 

@@ -68,28 +68,26 @@ def cell(grid: np.ndarray, row: int, column: int, *, top: int, left: int = 0) ->
     return grid[y : y + figures.TILE, x : x + figures.TILE]
 
 
-def test_two_methods_stand_side_by_side(tiny_set) -> None:
+def test_methods_are_drawn_from_the_same_views(tiny_set) -> None:
     samples, methods = torch.tensor([3, 40]), [("large", Ellipsoids()), ("small", GridEllipsoids(0.5))]
     grid = figures.comparison_grid(methods, tiny_set, samples)
-    block, top = 6 * STEP + figures.MARGIN, grid.shape[0] - 2 * STEP - figures.MARGIN
-    starts = (0, STEP + figures.MARGIN + 14, STEP + figures.MARGIN + 28 + block)
-    assert grid.shape[1] == starts[2] + block
+    top, left = figures.HEADER, grid.shape[1] - 7 * STEP - figures.MARGIN
     poses = [tiny_set.poses[samples[i : i + 1]] for i in (0, 1)]
     cameras = [figures.orbit(pose, [0, 60, 120, 180, 240, 300]) for pose in poses]
     drawn = [pair for _, method in methods for pair in zip(shapes(method, tiny_set, samples), cameras, strict=True)]
     zoom = figures.common_zoom(drawn, tiny_set.batch(samples).masks)
     assert zoom > 1
-    for k, start in enumerate(starts[1:]):
-        surface = shapes(methods[k][1], tiny_set, samples)[1]
+    for k, (_, method) in enumerate(methods):
+        surface = shapes(method, tiny_set, samples)[1]
         views = figures.draw_surface(surface, figures.orbit(poses[1], [0, 300], zoom=zoom), image_size=figures.TILE)
-        assert np.array_equal(cell(grid, 1, 0, top=top, left=start), views[0])
-        assert np.array_equal(cell(grid, 1, 5, top=top, left=start), views[1])
+        assert np.array_equal(cell(grid, 2 + k, 1, top=top, left=left), views[0])
+        assert np.array_equal(cell(grid, 2 + k, 6, top=top, left=left), views[1])
     picture = figures.drawing.magnified(figures.natural_colors(tiny_set.images[samples.numpy()]), zoom)[0]
     resized = np.asarray(Image.fromarray(picture).resize((figures.TILE,) * 2, Image.Resampling.BICUBIC))
-    assert np.array_equal(cell(grid, 0, 0, top=top), resized)
+    assert np.array_equal(cell(grid, 0, 0, top=top, left=left), resized)
 
 
-def test_more_methods_stand_below_each_other(tiny_set) -> None:
+def test_methods_stand_below_each_other(tiny_set) -> None:
     methods = [("large", Ellipsoids()), ("small", Ellipsoids(0.4)), ("nothing", Ellipsoids(0.0))]
     grid = figures.comparison_grid(methods, tiny_set, torch.tensor([3, 40]))
     left = grid.shape[1] - 7 * STEP - figures.MARGIN
@@ -112,9 +110,9 @@ def test_the_truth_is_shown_as_it_was_seen(tiny_set) -> None:
     masks = tiny_set.batch(torch.tensor([3, 30])).masks
     zoom = figures.common_zoom([*zip(true, cameras, strict=True), *zip(own, cameras, strict=True)], masks)
     views = figures.draw_surface(true[1], figures.orbit(pose, [0, 60], zoom=zoom), image_size=figures.TILE)
-    top, left = grid.shape[0] - 2 * STEP - figures.MARGIN, STEP + figures.MARGIN + 14
+    left = grid.shape[1] - 7 * STEP - figures.MARGIN
     for column in (0, 1):
-        assert np.array_equal(cell(grid, 1, column, top=top, left=left), views[column])
+        assert np.array_equal(cell(grid, 2, 1 + column, top=figures.HEADER, left=left), views[column])
     three = figures.comparison_grid([("a", Ellipsoids()), ("b", Ellipsoids())], tiny_set, torch.tensor([3]), truth=True)
     assert three.shape[0] == figures.HEADER + 3 * STEP + figures.MARGIN
     with pytest.raises(ValueError, match="different labels"):
@@ -186,7 +184,7 @@ def test_a_strip_starts_and_ends_with_the_reconstructions(tiny_set, method) -> N
 def test_a_morph_is_an_endless_loop_through_the_images(tiny_set) -> None:
     samples, method = torch.tensor([3, 30, 60]), Ellipsoids()
     frames = figures.morph(method, tiny_set, samples, steps=3, azimuths=(0.0, 90.0), image_size=40)
-    assert frames.shape == (9, 40, 80, 3)
+    assert frames.shape == (9, 2, 40, 40, 3)
     again = figures.morph(method, tiny_set, samples[[1, 2, 0]], steps=3, azimuths=(0.0, 90.0), image_size=40)
     assert np.array_equal(np.roll(frames, -3, axis=0), again)
     assert not np.array_equal(frames[0], frames[3])
