@@ -11,9 +11,7 @@ import mmap
 import os
 import pickle
 import signal
-import socket
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -47,16 +45,12 @@ class Call:
     seconds: float = SECONDS
 
 
-class _State:
-    """Of this process, where it is a worker."""
-
-    channel: socket.socket | None = None  # through which shared memory goes to the parent
-    shared: dict[int, int] = {}  # its open files by the address of the array in it  # noqa: RUF012
+_shared: dict[int, int] | None = None  # in a worker: its open files by the address of the array in it
 
 
 def allow(memory: int = 0, seconds: float = 0.0) -> None:
     """Let the call that runs now take more, once it is known to be worth it: its header gives a size we can hold."""
-    if _State.channel is None or resource is None:
+    if _shared is None or resource is None:
         return
     if memory and sys.platform == "linux":
         soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
@@ -67,40 +61,44 @@ def allow(memory: int = 0, seconds: float = 0.0) -> None:
 
 
 def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An array to be filled; a large one lies in memory that the parent shares, and reaches it without a copy."""
+    """An array to be filled; on Linux a large one lies in memory that the parent shares, so that it is not copied."""
     dtype = np.dtype(dtype)
     size = math.prod(shape) * dtype.itemsize
-    if _State.channel is None or size < LARGE:
+    if _shared is None or size < LARGE or sys.platform != "linux":
         return np.empty(shape, dtype)
-    if hasattr(os, "memfd_create"):
-        file = os.memfd_create("learn3d")
-    else:
-        with tempfile.TemporaryFile() as temporary:
-            file = os.dup(temporary.fileno())
+    file = os.memfd_create("learn3d")
     os.ftruncate(file, size)
     array = np.frombuffer(mmap.mmap(file, size), dtype).reshape(shape)
-    _State.shared[array.ctypes.data] = file
+    _shared[array.ctypes.data] = file
     return array
 
 
-def serve(channel: int) -> None:
-    """Answer requests on the standard input, lists of calls, until it is closed. channel: a socket, or -1."""
+def serve() -> None:
+    """Answer requests on the standard input, lists of calls, until it is closed."""
+    global _shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interruption ends
-    if channel >= 0:
-        _State.channel = socket.socket(fileno=channel)
+    _shared = {}
     if resource is not None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     start = _memory()
-    pickle.dump("ready", answers)
-    answers.flush()
     silence = os.open(os.devnull, os.O_RDWR)
     for stream in (1, 2):  # what libraries print is no answer, and nobody's concern
         os.dup2(silence, stream)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
-            results = [_attempt(call) for call in pickle.load(requests)]
-            _answer(results, answers, last=_memory() - start > _GROWN)
+            calls = pickle.load(requests)
+            results = [_attempt(call) for call in calls]
+            _limit(None, None)
+            data, files = _pickled(results)
+            pickle.dump((data, files, _memory() - start > _GROWN), answers)
+            answers.flush()
+            if files:
+                requests.read(1)  # the parent has opened them
+            for file in (*files, *_shared.values()):
+                os.close(file)
+            _shared.clear()
+            del results, data
 
 
 def _attempt(call: Call) -> Any:
@@ -117,8 +115,6 @@ def _attempt(call: Call) -> Any:
         return DamagedFile(call.path, f"reading it would take too much memory; expected {call.wanted}")
     except Exception as error:  # the libraries raise whatever a damaged file leads them to
         return DamagedFile(call.path, f"cannot be read ({one_line(error)}); expected {call.wanted}. {AGAIN}")
-    finally:
-        _limit(None, None)
 
 
 def one_line(error: Exception) -> str:
@@ -143,35 +139,25 @@ def _memory() -> int:
     """Bytes of private memory of this process; 0 where that cannot be told."""
     if sys.platform != "linux":
         return 0
-    with open("/proc/self/statm") as file:
+    with open("/proc/self/statm", "rb", buffering=0) as file:
         return int(file.read().split()[5]) * mmap.PAGESIZE
 
 
-def _answer(results: list[Any], answers: Any, last: bool) -> None:
-    """Send results: large arrays as open files of shared memory, all else pickled. last: this worker ends now."""
-    files, sizes = [], []
+def _pickled(results: list[Any]) -> tuple[bytes, list[int]]:
+    """Results to be sent: pickled, but for large arrays, which are open files of shared memory."""
+    files = []
 
     def in_band(buffer: pickle.PickleBuffer) -> bool:
         raw = buffer.raw()
-        if raw.nbytes < LARGE or _State.channel is None:
+        if raw.nbytes < LARGE or sys.platform != "linux":
             return True
         source = np.frombuffer(raw, np.uint8)
-        file = _State.shared.pop(source.ctypes.data, None)
+        file = _shared.pop(source.ctypes.data, None)
         if file is None or os.fstat(file).st_size != raw.nbytes:
             copy = empty((raw.nbytes,), np.uint8)
             copy[:] = source
-            file = _State.shared.pop(copy.ctypes.data)
+            file = _shared.pop(copy.ctypes.data)
         files.append(file)
-        sizes.append(raw.nbytes)
         return False
 
-    data = pickle.dumps(results, 5, buffer_callback=in_band)
-    pickle.dump((data, sizes, last), answers)
-    answers.flush()
-    for file in files:
-        socket.send_fds(_State.channel, [b"."], [file])
-    for file in (*files, *_State.shared.values()):
-        os.close(file)
-    _State.shared.clear()
-    if last:
-        raise EOFError
+    return pickle.dumps(results, 5, buffer_callback=in_band), files

@@ -98,16 +98,17 @@ def shrink(color: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, 
 
     Each pixel becomes the mean over its area of the original; fractions of original pixels count as such.
     """
-    planes = np.concatenate([color.transpose(2, 0, 1), mask[None]])
+    planes = np.empty((4, *mask.shape), np.float32)
+    planes[:3], planes[3] = color.transpose(2, 0, 1), mask
     image = _shrink(planes, size)
     return image, image[3] if size == MASK_SIZE else _shrink(planes[3], MASK_SIZE)
 
 
 def _shrink(planes: np.ndarray, size: int) -> np.ndarray:
     if planes.shape[-1] == size:
-        return planes
+        return planes.astype(np.uint8)
     weights = _area_weights(planes.shape[-1], size)
-    return np.rint(weights @ planes.astype(np.float32) @ weights.T).astype(np.uint8)
+    return np.rint(weights @ planes @ weights.T).astype(np.uint8)
 
 
 @functools.cache

@@ -14,15 +14,15 @@ import contextlib
 import mmap
 import os
 import pickle
+import queue
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ def read(
 
     Raises DamagedFile and MissingFile.
     """
-    (result,) = _run([Call(function, Path(path), arguments, wanted, memory, seconds)], _Job())
+    (result,) = _run([Call(function, Path(path), arguments, wanted, memory, seconds)])
     if isinstance(result, (DamagedFile, MissingFile)):
         raise result
     return result
@@ -61,34 +61,21 @@ def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
     A group (the files of one object, say) is read by one worker. What is wrong with a file stands in its place as a
     DamagedFile or MissingFile. Only a few groups are read ahead of the one that is asked for.
     """
-    job, ahead = _Job(), deque()
-    executor = ThreadPoolExecutor(cores())
-    _jobs.add(job)
-    try:
+    ahead = deque()
+    with ThreadPool(cores()) as threads:  # each waits for a worker; an interruption does not wait for them
         for group in groups:
-            ahead.append(executor.submit(_run, list(group), job))
+            ahead.append(threads.apply_async(_run, [list(group)]))
             if len(ahead) > 2 * cores():
-                yield ahead.popleft().result()
+                yield ahead.popleft().get()
         while ahead:
-            yield ahead.popleft().result()
-    finally:
-        _jobs.discard(job)
-        executor.shutdown(wait=False, cancel_futures=True)
-        job.stop()  # after an exception or an interruption; else nothing runs any more
+            yield ahead.popleft().get()
 
 
 def together(functions: Sequence[Callable[[], Any]]) -> list[Any]:
     """What functions that use `read_all` return, called at the same time, so that they share the cores."""
-    if len(functions) == 1:
-        return [functions[0]()]
-    with ThreadPoolExecutor(len(functions)) as executor:
-        futures = [executor.submit(function) for function in functions]
-        try:
-            return [future.result() for future in futures]
-        except BaseException:
-            for job in list(_jobs):
-                job.stop()
-            raise
+    with ThreadPool(len(functions)) as threads:
+        results = [threads.apply_async(function) for function in functions]
+        return [result.get() for result in results]
 
 
 def cores() -> int:
@@ -102,180 +89,91 @@ class _Worker:
     """A process that runs `child.serve`."""
 
     def __init__(self) -> None:
-        self.channel, theirs = socket.socketpair() if hasattr(socket, "send_fds") else (None, None)
-        number = -1 if theirs is None else theirs.fileno()
         paths = [str(Path(__file__).parents[2]), *sys.path]
-        code = f"import sys; sys.path[:] = {paths!r}; from learn3d.files import child; child.serve({number})"
+        code = f"import sys; sys.path[:] = {paths!r}; from learn3d.files import child; child.serve()"
         self.process = subprocess.Popen(
             [sys.executable, "-S", "-E", "-c", code],  # without the start-up files of site-packages
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            pass_fds=[] if theirs is None else [number],
             env={**os.environ, **_ONE_THREAD},
         )
-        if theirs is not None:
-            theirs.close()
-        self.ready, self.last, self.deadline = False, False, float("inf")
+        _workers.add(self)
 
-    def exchange(self, request: bytes) -> list[Any]:
-        """The answer to a request; EOFError or OSError where the process has died."""
-        self.process.stdin.write(request)
-        self.process.stdin.flush()
-        if not self.ready:
-            try:
-                self.ready = pickle.load(self.process.stdout) == "ready"
-            except EOFError:
-                raise RuntimeError("a process for reading files could not be started; see the error above") from None
-        data, sizes, self.last = pickle.load(self.process.stdout)
-        buffers = []
-        for size in sizes:
-            _, files, _, _ = socket.recv_fds(self.channel, 1, 1)
-            if not files:
-                raise EOFError
-            buffers.append(mmap.mmap(files[0], size))
-            os.close(files[0])
-        return pickle.loads(data, buffers=buffers)
+    def exchange(self, request: bytes, patience: float) -> tuple[list[Any], bool]:
+        """The answer to a request, and whether the process has grown too large to be kept.
 
-    def end(self) -> None:
-        """Kill the process, which keeps nothing that would have to be saved."""
+        EOFError or OSError where it has died, or has not answered after `patience` seconds.
+        """
+        timer = threading.Timer(patience, self.process.kill)
+        timer.daemon = True
+        timer.start()
+        try:
+            self.process.stdin.write(request)
+            self.process.stdin.flush()
+            data, files, grown = pickle.load(self.process.stdout)
+            buffers = [self._shared(file) for file in files]
+            if files:
+                self.process.stdin.write(b".")  # it may close them now
+                self.process.stdin.flush()
+            return pickle.loads(data, buffers=buffers), grown
+        finally:
+            timer.cancel()
+
+    def _shared(self, number: int) -> mmap.mmap:
+        """Memory that the process has made as an open file."""
+        with open(f"/proc/{self.process.pid}/fd/{number}", "r+b") as file:
+            return mmap.mmap(file.fileno(), 0)
+
+    def end(self) -> int:
+        """Kill the process, which keeps nothing that would have to be saved. Returns its exit status."""
+        _workers.discard(self)
         self.process.kill()
-
-    def release(self) -> int:
-        """Wait for the end of the process and close what is open to it. Returns its exit status."""
         status = self.process.wait()
-        self.close()
+        for stream in (self.process.stdin, self.process.stdout):
+            with contextlib.suppress(OSError):
+                stream.close()
         return status
 
-    def close(self) -> None:
-        for stream in (self.process.stdin, self.process.stdout, self.channel):
-            if stream is not None:
-                with contextlib.suppress(OSError):
-                    stream.close()
+
+def _start_afresh() -> None:
+    """Also in a copy of this process made by os.fork: the workers are those of the original."""
+    global _workers, _slots
+    _workers, _slots = set(), queue.LifoQueue()
+    for _ in range(cores()):
+        _slots.put(None)
 
 
-class _Pool:
-    """The workers of this process."""
-
-    def __init__(self) -> None:
-        self.slots = threading.Semaphore(cores())
-        self.idle: list[_Worker] = []
-        self.working: set[_Worker] = set()
-        self.lock = threading.Lock()
-        threading.Thread(target=self._watch, name="watch over reading", daemon=True).start()
-
-    def take(self) -> _Worker:
-        """A living worker."""
-        with self.lock:
-            while self.idle:
-                worker = self.idle.pop()
-                if worker.process.poll() is None:
-                    break
-                worker.release()
-            else:
-                worker = _Worker()
-            self.working.add(worker)
-            return worker
-
-    def give_back(self, worker: _Worker, usable: bool) -> None:
-        worker.deadline = float("inf")
-        with self.lock:
-            self.working.discard(worker)
-            if usable:
-                self.idle.append(worker)
-
-    def _watch(self) -> None:
-        while True:
-            time.sleep(1.0)
-            for worker in list(self.working):
-                if time.monotonic() > worker.deadline:
-                    worker.end()
-
-    def close(self) -> None:
-        for worker in (*self.idle, *self.working):
-            worker.end()
-            worker.release()
-
-
-_the_pool: _Pool | None = None
-_making = threading.Lock()
-
-
-def _pool() -> _Pool:
-    global _the_pool
-    with _making:
-        if _the_pool is None:
-            _the_pool = _Pool()
-            atexit.register(_the_pool.close)
-        return _the_pool
-
-
-def _forget() -> None:
-    """In a copy of this process made by os.fork: the workers are those of the original."""
-    global _the_pool, _making
-    _making = threading.Lock()
-    if _the_pool is not None:
-        atexit.unregister(_the_pool.close)
-        for worker in (*_the_pool.idle, *_the_pool.working):
-            worker.close()
-        _the_pool = None
-
-
+_workers: set[_Worker]  # all that are alive
+_slots: queue.LifoQueue[_Worker | None]  # one for each core: an idle worker, or None where it is to be started
+_start_afresh()
+atexit.register(lambda: [worker.end() for worker in list(_workers)])
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget)
+    os.register_at_fork(after_in_child=_start_afresh)
 
 
-class _Job:
-    """What `read_all` has under way."""
-
-    def __init__(self) -> None:
-        self.busy: set[_Worker] = set()
-        self.stopped = False  # nobody waits for the results any more
-        self.lock = threading.Lock()
-
-    def stop(self) -> None:
-        with self.lock:
-            self.stopped = True
-            for worker in self.busy:
-                worker.end()
-
-    def leave(self, worker: _Worker) -> bool:
-        """Take a worker out; whether it is alive, for it may have been stopped a moment after its answer."""
-        with self.lock:
-            self.busy.discard(worker)
-            return not self.stopped
-
-
-_jobs: set[_Job] = set()  # of all threads
-
-
-def _run(calls: list[Call], job: _Job) -> list[Any]:
+def _run(calls: list[Call]) -> list[Any]:
     """The results of calls in one worker."""
-    if job.stopped:
-        raise CancelledError
-    pool, request, patience = _pool(), pickle.dumps(calls, 5), sum(map(_patience, calls))
-    with pool.slots:
-        worker, usable, started = pool.take(), False, time.monotonic()
-        worker.deadline = started + patience
-        with job.lock:
-            job.busy.add(worker)
+    request, patience, slots = pickle.dumps(calls, 5), sum(map(_patience, calls)), _slots
+    worker, started = slots.get(), time.monotonic()
+    try:
+        if worker is not None and worker.process.poll() is not None:
+            worker.end()
+            worker = None
+        worker = worker or _Worker()
         try:
-            results = worker.exchange(request)
-            usable = not worker.last
+            results, grown = worker.exchange(request, patience)
+            if grown:
+                worker.end()
             return results
         except (EOFError, OSError, pickle.UnpicklingError):
-            status = worker.release()
+            status = worker.end()
         except BaseException:
             worker.end()
-            worker.release()
             raise
-        finally:
-            alive = job.leave(worker)
-            pool.give_back(worker, usable and alive)
-            if worker.last or not alive:
-                worker.end()
-                worker.release()
-    if len(calls) > 1 or job.stopped:  # one of them was it
-        return [_run([call], job)[0] for call in calls]
+    finally:
+        slots.put(worker)
+    if len(calls) > 1:  # one of them was it
+        return [_run([call])[0] for call in calls]
     if status == -getattr(signal, "SIGXCPU", 0):
         fault = f"reading it takes more than {calls[0].seconds:g} seconds of processor time"
     elif time.monotonic() - started > patience:

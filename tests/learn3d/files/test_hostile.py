@@ -43,9 +43,8 @@ def bounded() -> Iterator[None]:
 
     def watch() -> None:
         while not done.wait(0.01):
-            pool = worker._the_pool
-            workers = [] if pool is None else [*pool.idle, *pool.working]
-            most[0] = max(most[0], _resident("self") - before + sum(_resident(w.process.pid) for w in workers))
+            workers = sum(_resident(each.process.pid) for each in list(worker._workers))
+            most[0] = max(most[0], _resident("self") - before + workers)
 
     thread = threading.Thread(target=watch)
     start = os.times()
@@ -85,19 +84,16 @@ def mat(tmp_path: Path, compressed: bool = False, array: object = None) -> Path:
 
 
 def test_matlab_elements_of_wrong_types(tmp_path):
-    """scipy itself ends with a segmentation fault for some of these."""
+    """scipy ends with a segmentation fault for some of these."""
     path = mat(tmp_path)
     content = path.read_bytes()
-    crashes = 0
     for position in range(128, 200):
         for bit in (0, 1, 2, 4):
             path.write_bytes(content[:position] + bytes([content[position] ^ 1 << bit]) + content[position + 1 :])
             try:
                 assert read_mat(path).shape == (VOXEL_SIZE,) * 3
             except ValueError as error:
-                assert str(path) in str(error)
-                crashes += "crashed" in str(error)
-    assert crashes < 40  # which ones depends on scipy; the next file is read all the same
+                assert str(path) in str(error) and "crashed" not in str(error)
 
 
 @linux
