@@ -28,7 +28,7 @@ def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
     content = memoryview(read_bytes(path, limits.VOLUME_BYTES, wanted))
     order = {b"IM": "<", b"MI": ">"}.get(bytes(content[126:128]))
     if order is None:
-        raise DamagedFile(path, f"has no such header; expected {wanted}. {AGAIN}")
+        raise DamagedFile(path, f"cannot be read: it has no header of MATLAB; expected {wanted}. {AGAIN}")
     for kind, element in _elements(content[128:], order):
         if kind == _COMPRESSED:
             unpacked = zlib.decompressobj().decompress(element, limits.SMALL_BYTES)

@@ -174,7 +174,7 @@ FAULTS = {
     "a0.mat: is missing": lambda f: volume(f).unlink(),
     "a0.mat: cannot be read": lambda f: volume(f).write_bytes(b"MATLAB 5.0 nonsense" * 20),
     "a0.mat: has no such array": lambda f: scipy.io.savemat(volume(f), {"volume": np.ones((32, 32, 32))}),
-    "a0.mat: has float64 [16, 16, 16]": lambda f: scipy.io.savemat(volume(f), {"Volume": np.ones((16, 16, 16))}),
+    "a0.mat: has numbers [16, 16, 16]": lambda f: scipy.io.savemat(volume(f), {"Volume": np.ones((16, 16, 16))}),
     "a0: is missing; expected the folder of an object": lambda f: shutil.rmtree(renders(f)),
 }
 
