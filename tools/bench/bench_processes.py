@@ -22,13 +22,11 @@ import torch
 import tyro
 from bench_step import sphere_dataset
 from bench_work import num_cores
-from torch.optim import Optimizer
 
 from learn3d.data import conventions
 from learn3d.data.sampling import shuffled_epochs
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.methods import DataShape, create_method
-from learn3d.methods import method as method_module
 from learn3d.parallel.launch import start
 from learn3d.parallel.ranks import Ranks
 from learn3d.presets import PRESETS
@@ -49,10 +47,9 @@ class Options:
     """Arithmetic of the networks."""
 
 
-def measure_steps(options: Options, ranks: Ranks) -> tuple[float, float, float, float]:
-    """Milliseconds: median step, fastest step; of a step what the sums of gradients take, waiting included; and the
-    processor's time for a step of this process, which hardly depends on what else the machine does.
-    """
+def measure_steps(options: Options, ranks: Ranks) -> tuple[float, float, float]:
+    """Milliseconds: median step, fastest step, and the CPU time of a step in this process, which hardly depends
+    on what else the machine does."""
     keep_freed_memory()
     torch.set_num_threads(options.threads)
     dataset, precision = sphere_dataset(), resolve_precision(options.precision, options.device)
@@ -64,25 +61,16 @@ def measure_steps(options: Options, ranks: Ranks) -> tuple[float, float, float, 
         precision=precision,
         seed=0,
     )
-    summing, sum_gradients = [0.0], method_module.sum_gradients
-
-    def timed(optimizer: Optimizer, *arguments: object) -> None:
-        began = time.perf_counter()
-        sum_gradients(optimizer, *arguments)
-        summing[0] += time.perf_counter() - began
-
-    method_module.sum_gradients = timed
     method.join(ranks)
-    steps, sums, busy = [], [], []
+    steps, busy = [], []
     for step in range(1, options.repeats + 3):
-        summing[0], began, before = 0.0, time.perf_counter(), time.process_time()
+        began, before = time.perf_counter(), time.process_time()
         method.train_step(dataset.batch(shuffled_epochs(len(dataset), options.batch, 0, step), ranks.rows), step)
         ranks.stopped_by(Stop())
         if step > 2:
             steps.append(1e3 * (time.perf_counter() - began))
-            sums.append(1e3 * summing[0])
             busy.append(1e3 * (time.process_time() - before))
-    return median(steps), min(steps), median(sums), median(busy)
+    return median(steps), min(steps), median(busy)
 
 
 def ways(cores: int) -> list[tuple[int, int]]:
@@ -101,12 +89,12 @@ def bench_processes(repeats: int) -> None:
         if result.returncode:
             raise SystemExit(f"{' '.join(command)} failed")
         print(result.stdout, end="", flush=True)
-        step, fastest, summing, busy = map(float, re.findall(r"([\d.]+) ms", result.stdout))
+        step, fastest, busy = map(float, re.findall(r"([\d.]+) ms", result.stdout))
         first = first or fastest
-        cells = (f"{processes} x {threads}", f"{step:.0f}", f"{fastest:.0f}", f"{summing:.0f}", f"{busy:.0f}")
+        cells = (f"{processes} x {threads}", f"{step:.0f}", f"{fastest:.0f}", f"{busy:.0f}")
         rows.append(f"| {' | '.join(cells)} | {first / fastest:.2f} |")
-    print("\n| processes x threads | ms a step | fastest | summing gradients | CPU ms of a process | times as fast |")
-    print("|---|---|---|---|---|---|")
+    print("\n| processes x threads | ms a step | fastest | CPU ms of a process | times as fast |")
+    print("|---|---|---|---|---|")
     print("\n".join(rows))
 
 
@@ -114,13 +102,11 @@ def bench_processes(repeats: int) -> None:
 def main() -> int:
     options = tyro.cli(Options, description=__doc__)
     with start(options.device) as ranks:
-        step, fastest, summing, busy = measure_steps(options, ranks)
-        if not ranks.alone:
-            summing = float(ranks.gather([torch.tensor([summing])], torch.tensor([ranks.rank]), ranks.world).min())
+        step, fastest, busy = measure_steps(options, ranks)
     if ranks.main:
         print(
             f"{ranks.world} x {options.threads} threads, batch {options.batch}: {step:.1f} ms a step, fastest "
-            f"{fastest:.1f} ms, summing gradients {summing:.1f} ms, CPU {busy:.1f} ms"
+            f"{fastest:.1f} ms, CPU {busy:.1f} ms"
         )
     return 0
 
