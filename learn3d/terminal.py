@@ -19,12 +19,13 @@ INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 _COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-def in_a_sentence(*errors: type[Exception], label: Callable[[], str] = str) -> Callable[[Callable[P, int]], Callable]:
-    """Decorates a command's main, which returns its exit status: what stops it is a line on stderr, and no traceback.
+def without_traceback(
+    *errors: type[Exception], label: Callable[[], str] = str
+) -> Callable[[Callable[P, int]], Callable]:
+    """Decorates the main function of a command, which returns an exit status: errors are said in one line on stderr.
 
-    ValueError, OSError and the given errors: status 1 and "error: ", `label()` and what the error says. Ctrl-C: status
-    130 and that it was interrupted. Files get their names when they are complete (`files.writing`), so that neither
-    leaves half of one. Anything else is a mistake of ours, and has its traceback.
+    ValueError, OSError and the given errors end it with status 1 and the line "error: ", `label()`, the message. Ctrl-C
+    ends it with status 130. Any other error is a bug and keeps its traceback.
     """
 
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
@@ -86,9 +87,8 @@ def align(rows: Sequence[Sequence[str]]) -> str:
 
 @dataclass
 class Stop:
-    """Whether a signal asked for the end, and which."""
+    """The signal that asked for the end: its name, or "" while there was none."""
 
-    requested: bool = False
     name: str = ""
 
 
@@ -98,9 +98,9 @@ def stop_on_signal() -> Iterator[Stop]:
     stop = Stop()
 
     def handle(number: int) -> None:
-        if stop.requested and number == signal.SIGINT:
+        if stop.name and number == signal.SIGINT:
             raise KeyboardInterrupt
-        stop.requested, stop.name = True, signal.Signals(number).name
+        stop.name = signal.Signals(number).name
 
     with handled_by(handle):
         yield stop

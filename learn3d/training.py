@@ -23,7 +23,7 @@ from learn3d.parallel.ranks import ALONE, Ranks
 from learn3d.presets import PRESETS
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Progress
-from learn3d.runs.faults import with_advice
+from learn3d.runs.faults import advice_on_errors
 from learn3d.runs.log import RunLog, SilentLog
 from learn3d.runs.state import Run, conditions_of
 from learn3d.terminal import stop_on_signal
@@ -65,7 +65,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
             return dataclasses.replace(_summary(config, progress, started), was_finished=True)
         before = progress.seconds
 
-        with with_advice(folder), stop_on_signal() as stop, _open_log(config, progress, ranks) as log:
+        with advice_on_errors(folder), stop_on_signal() as stop, _open_log(config, progress, ranks) as log:
             for warning in filter(None, (*notes, *found)):
                 log.say(f"warning: {warning}")
             log.say(_describe(config, precision, train_set, val_set, progress, ranks))

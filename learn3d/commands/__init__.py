@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from importlib import metadata
 
 from learn3d.commands.packages import missing_package
-from learn3d.terminal import in_a_sentence, note, say
+from learn3d.terminal import note, say, without_traceback
 
 COMMANDS = {
     "train": "train a model that turns one image into a 3D shape",
@@ -30,7 +30,7 @@ learn3d COMMAND --help has the common options of a command, --help-all has all o
 """
 
 
-@in_a_sentence(MemoryError)
+@without_traceback(MemoryError)
 def main(*given: str) -> int:
     """Run the command that `given`, or else the command line, names; returns the exit status."""
     name, *arguments = [*given, *sys.argv[1:]] or ["--help"]

@@ -137,9 +137,9 @@ def run(arguments: Sequence[str]) -> int:
     if name in lacking:
         raise ValueError(f"the figure {name} {lacking[name]}")
     from learn3d.figures import paper
-    from learn3d.files.writing import check_target_folder
+    from learn3d.files.writing import check_target
 
-    check_target_folder(command.folder, "--output")
+    check_target(command.folder, "--output", folder=True)
     where, runs = command.output, command.runs
     if name == "curves":
         paths = paper.save_curves(runs, where, labels=command.labels)

@@ -56,10 +56,10 @@ def run(arguments: Sequence[str]) -> int:
     command = parse(Command, arguments, name="reconstruct", about=__doc__)
     if bool(command.images) == (command.data is not None):
         raise ValueError("give either image files, or --data with --indices")
-    from learn3d.files.writing import check_target_folder
+    from learn3d.files.writing import check_target
     from learn3d.reconstruction import reconstruct_dataset, reconstruct_files
 
-    check_target_folder(command.output, "--output")
+    check_target(command.output, "--output", folder=True)
     options = {"which": command.checkpoint, "mesh_format": command.format}
     options |= {"frames": command.frames, "image_size": command.image_size}
     where = (command.run, command.output)

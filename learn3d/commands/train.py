@@ -24,7 +24,7 @@ from learn3d.config import DEFAULT_PRESET, TrainConfig, load_config
 from learn3d.parallel.launch import label, start
 from learn3d.parallel.ranks import LostPeerError
 from learn3d.presets import METHODS, PRESETS, full_name
-from learn3d.terminal import in_a_sentence, say
+from learn3d.terminal import say, without_traceback
 from learn3d.training import train
 
 COMMON = ("data", "category", "output", "preset", "layout", "iterations", "batch_size", "seed", "device", "threads")
@@ -79,7 +79,7 @@ def _presets() -> str:
     return "\n".join(["Presets (--preset NAME --help-all shows the settings of one):", *lines])
 
 
-@in_a_sentence(FloatingPointError, MemoryError, LostPeerError, label=label)
+@without_traceback(FloatingPointError, MemoryError, LostPeerError, label=label)
 def run(arguments: Sequence[str]) -> int:
     """Train, and say how it ended."""
     command = read(arguments)

@@ -31,8 +31,12 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
         os.replace(temporary, path)
-        if sync:
-            sync_folder(path.parent)
+        if sync and os.name == "posix":  # Windows cannot open folders
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
     except OSError as error:
         if error.errno is not None and error.filename is None:  # a full disk does not say which file it had no room for
             error.filename = str(path)
@@ -41,49 +45,20 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def check_target(path: Path, option: str) -> None:
-    """Raise OSError where `replacing(path)` would fail for want of its folder, of permission, or of a plain file.
+def check_target(path: Path, option: str, *, folder: bool = False) -> None:
+    """Raise OSError where `path` cannot be written. For the beginning of long work; nothing is left of the attempt.
 
-    For the beginning of long work; `option` is how the command calls the path. Nothing is left of the attempt.
+    With `folder` it is a folder for files, which need not be there yet. `option` is how the command calls the path.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(
-            f"cannot write {path}: there is no folder {path.parent}; make it, or give another {option}"
-        )
-    if path.exists() and not path.is_file():
-        raise OSError(f"{path} is no plain file and is not replaced; give another {option}")
-    _try(path.parent, f"cannot write {path}", option)
-
-
-def check_target_folder(folder: Path, option: str) -> None:
-    """Raise OSError where no files can be written into a folder, which need not be there yet and is not made."""
-    there = Path(folder)
-    while not os.path.lexists(there) and there != there.parent:
-        there = there.parent
-    problem = f"cannot write into the folder {folder}"
-    if not there.is_dir():
-        raise NotADirectoryError(f"{problem}: {there} is no folder; give another {option}")
-    _try(there, problem, option)
-
-
-def _try(folder: Path, problem: str, option: str) -> None:
+    there = next(p for p in (path, *path.parents) if os.path.lexists(p)) if folder else path.parent
     try:
-        with tempfile.TemporaryFile(dir=folder):
+        if not folder and path.exists() and not path.is_file():
+            raise OSError("it is no plain file, and is not replaced")
+        with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:
-        raise OSError(f"{problem}: {error.strerror or error}; give another {option}") from error
-
-
-def sync_folder(folder: Path) -> None:
-    """Put the names in a folder on the disk; nothing where the system cannot open folders (Windows)."""
-    if os.name != "posix":
-        return
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(number)
-    finally:
-        os.close(number)
+        raise OSError(f"cannot write {path} ({there}: {error.strerror or error}); give another {option}") from error
 
 
 def remove_partials(*folders: Path) -> None:
@@ -96,17 +71,14 @@ def remove_partials(*folders: Path) -> None:
 def give_second_name(path: Path, name: Path) -> None:
     """Let a file be found under another name as well, by a hard link, or as a copy where the file system has none.
 
-    A file of that name is replaced. The content of `path` is on the disk already.
+    A file of that name is replaced.
     """
-    with replacing(name) as temporary:
+    with replacing(name, sync=True) as temporary:
         temporary.unlink(missing_ok=True)
         try:
             os.link(path, temporary)
         except OSError:
             shutil.copyfile(path, temporary)
-            with open(temporary, "rb+") as file:
-                os.fsync(file.fileno())
-    sync_folder(name.parent)
 
 
 def write_bytes(path: Path, content: bytes, *, sync: bool = False) -> None:

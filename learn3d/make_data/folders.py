@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
-from learn3d.files.writing import check_target_folder
+from learn3d.files.writing import check_target
 from learn3d.terminal import stop_on_signal
 
 
@@ -18,7 +18,7 @@ def existing(folder: Path, paths: Iterable[str]) -> list[str]:
 
 def check_room(folder: Path, needed: int, what: str) -> None:
     """Make the folder; OSError where it cannot be written into or its disk has less than `needed` bytes free."""
-    check_target_folder(folder, "--output")
+    check_target(folder, "--output", folder=True)
     folder.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(folder).free
     if free < needed:

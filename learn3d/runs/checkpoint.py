@@ -186,23 +186,13 @@ def average_tensors(method: Method) -> dict[str, Tensor]:
     return {f"average.{name}": tensor for name, tensor in method.average.tensors.items()} if method.average else {}
 
 
-def restore_average(method: Method, tensors: dict[str, Tensor], source: Path) -> None:
-    """Copy the averages of a checkpoint into a method that keeps some, or raise a ValueError."""
-    if method.average is not None:
-        with method.averaged():
-            restore_networks(method, _averaged(tensors, required=True), source)
+def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path, kind: str = "network") -> None:
+    """Copy the weights of a checkpoint, or with the kind "average" their averages, into the networks of a method.
 
-
-def _averaged(tensors: dict[str, Tensor], *, required: bool = False) -> dict[str, Tensor]:
-    """The tensors of a checkpoint, where the averages take the place of the networks' own weights, if there are any."""
-    averages = starting_with("average.", tensors)
-    return {f"network.{name}": tensor for name, tensor in averages.items()} if averages or required else tensors
-
-
-def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path) -> None:
-    """Copy the parameters of a checkpoint into the networks of a method of the same shape, or raise a ValueError."""
+    Raises ValueError where they do not fit.
+    """
     for name, network in method.networks.items():
-        state = starting_with(f"network.{name}.", tensors)
+        state = starting_with(f"{kind}.{name}.", tensors)
         try:
             for key, own in network.state_dict().items():
                 if key in state and state[key].dtype != own.dtype:
@@ -294,7 +284,7 @@ def load_method(path: Path, *, device: str = "cpu", precision: str = "fp32") -> 
     arithmetic = resolve_precision(precision, device)
     with torch.random.fork_rng(devices=[]):
         method = create_method(metadata.config.settings, metadata.shape, device=device, precision=arithmetic, seed=0)
-    restore_networks(method, _averaged(tensors), path)
+    restore_networks(method, tensors, path, "average" if starting_with("average.", tensors) else "network")
     method.set_training(False)
     for network in method.networks.values():
         network.requires_grad_(False)

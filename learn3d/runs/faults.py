@@ -11,7 +11,7 @@ from learn3d.runs.folder import last_good, resume_command
 
 
 @contextlib.contextmanager
-def with_advice(folder: Path) -> Iterator[None]:
+def advice_on_errors(folder: Path) -> Iterator[None]:
     """Complete the errors that end a run in `folder`: where it can go on from, and how.
 
     FloatingPointError and OSError stay what they are; torch's own errors about memory become MemoryError.

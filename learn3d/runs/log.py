@@ -12,7 +12,7 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -52,7 +52,11 @@ class RunLog:
         self._bar = None
         if sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty():
             self._bar = tqdm(total=total, initial=start, unit="step", dynamic_ncols=True)
-        self._tensorboard = self._open_tensorboard()
+        self._tensorboard: Any = None
+        with self._tensorboard_may_fail():
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._tensorboard = SummaryWriter(str(self.folder / TENSORBOARD), purge_step=start + 1)
         self._started = self._last_line = time.monotonic()
 
     def __enter__(self) -> RunLog:
@@ -139,26 +143,19 @@ class RunLog:
             what = f"{lines.path.name} cannot be written"
             self.warn(what, error, "training goes on, and what is missing is written when there is room again")
 
-    def _open_tensorboard(self) -> Any:
+    @contextlib.contextmanager
+    def _tensorboard_may_fail(self) -> Iterator[None]:
+        """Go on without TensorBoard where the block fails. Its thread reports errors of earlier calls, of any class."""
         try:
-            from torch.utils.tensorboard import SummaryWriter
-
-            return SummaryWriter(str(self.folder / TENSORBOARD), purge_step=self.start + 1)
-        except ImportError:
-            note("tensorboard is not installed: metrics go to metrics.jsonl only")
-        except Exception as error:  # whatever it says; TypeError, for one, with an unfitting protobuf
-            self.warn("tensorboard does not work", error, "metrics go to metrics.jsonl only")
-        return None
-
-    def _to_tensorboard(self, call: str, *arguments: Any, **options: Any) -> None:
-        """One call of the writer. Its errors may be those of earlier calls: it has a thread of its own."""
-        if self._tensorboard is None:
-            return
-        try:
-            getattr(self._tensorboard, call)(*arguments, **options)
+            yield
         except Exception as error:
             self._tensorboard = None
-            self.warn("tensorboard does not work", error, "metrics go to metrics.jsonl only from here on")
+            self.warn("tensorboard does not work", error, "metrics go to metrics.jsonl only")
+
+    def _to_tensorboard(self, call: str, *arguments: Any, **options: Any) -> None:
+        with self._tensorboard_may_fail():
+            if self._tensorboard is not None:
+                getattr(self._tensorboard, call)(*arguments, **options)
 
 
 class _Lines:

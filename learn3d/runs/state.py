@@ -112,7 +112,9 @@ class Run:
         check_resume(self.config, dataclasses.replace(metadata.config, precision=precision))
         _check_conditions(self.conditions, metadata.conditions, self.config.data)
         checkpoint.restore_networks(self.method, tensors, saved.path)
-        checkpoint.restore_average(self.method, tensors, saved.path)
+        if self.method.average is not None:
+            with self.method.averaged():
+                checkpoint.restore_networks(self.method, tensors, saved.path, "average")
         for name, optimizer in self.method.optimizers.items():
             others = metadata.optimizers.get(name, {})
             checkpoint.restore_optimizer(name, optimizer, tensors, others, saved.path)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from learn3d.commands import main
-from learn3d.terminal import align, in_a_sentence, say
+from learn3d.terminal import align, say, without_traceback
 
 TOOLS = Path(__file__).parents[2] / "tools"
 INTERRUPTED = "interrupted; what was saved before is as it was\n"
@@ -35,7 +35,7 @@ def test_an_interrupted_data_set_leaves_nothing(tmp_path) -> None:
 
 
 def test_errors_are_a_line_and_mistakes_of_ours_are_not_hidden(capsys) -> None:
-    @in_a_sentence(FloatingPointError, label=lambda: "rank 1: ")
+    @without_traceback(FloatingPointError, label=lambda: "rank 1: ")
     def main(error: Exception | None) -> int:
         if error:
             raise error
@@ -52,7 +52,7 @@ def test_errors_are_a_line_and_mistakes_of_ours_are_not_hidden(capsys) -> None:
 def test_an_output_that_was_never_open_is_no_error(monkeypatch) -> None:
     """As with `>&-` in a shell: Python has no stdout then."""
     monkeypatch.setattr(sys, "stdout", None)
-    assert in_a_sentence()(lambda: say("nobody reads this") or 0)() == 0
+    assert without_traceback()(lambda: say("nobody reads this") or 0)() == 0
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")
@@ -60,9 +60,9 @@ def test_an_output_that_was_never_open_is_no_error(monkeypatch) -> None:
 def test_a_result_that_cannot_be_written_is_an_error_and_lost_progress_is_none(call: str, status: int) -> None:
     program = f"""
 import sys
-from learn3d.terminal import in_a_sentence, {call}
+from learn3d.terminal import without_traceback, {call}
 
-@in_a_sentence()
+@without_traceback()
 def main():
     {call}("a table")
     return 0
@@ -82,9 +82,9 @@ def test_an_output_that_nobody_reads_is_no_error() -> None:
     """As with `| head`."""
     program = """
 import sys
-from learn3d.terminal import in_a_sentence, say
+from learn3d.terminal import without_traceback, say
 
-@in_a_sentence()
+@without_traceback()
 def main():
     for _ in range(10):
         say("a line of a table")
@@ -100,7 +100,7 @@ sys.exit(main())
 
 
 def test_a_pipe_that_breaks_elsewhere_is_an_error(capsys) -> None:
-    @in_a_sentence()
+    @without_traceback()
     def main() -> int:
         raise BrokenPipeError("of a worker")
 

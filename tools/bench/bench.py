@@ -49,7 +49,7 @@ from bench_work import (
 
 import nmr
 from learn3d.device import keep_freed_memory
-from learn3d.terminal import in_a_sentence
+from learn3d.terminal import without_traceback
 
 
 class Target(NamedTuple):
@@ -236,7 +236,7 @@ SINGLE: dict[str, Callable[[Options], Result]] = {
 }
 
 
-@in_a_sentence()
+@without_traceback()
 def main() -> int:
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(options.threads)

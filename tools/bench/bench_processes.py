@@ -30,7 +30,7 @@ from learn3d.methods import DataShape, create_method
 from learn3d.parallel.launch import start
 from learn3d.parallel.ranks import Ranks
 from learn3d.presets import PRESETS
-from learn3d.terminal import Stop, in_a_sentence
+from learn3d.terminal import Stop, without_traceback
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def bench_processes(repeats: int) -> None:
     print("\n".join(rows))
 
 
-@in_a_sentence()
+@without_traceback()
 def main() -> int:
     options = tyro.cli(Options, description=__doc__)
     with start(options.device) as ranks:

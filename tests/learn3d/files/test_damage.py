@@ -154,15 +154,15 @@ def test_the_library_reads_what_is_written(stopped) -> None:
     assert all(torch.equal(tensors[name], theirs[name]) for name in tensors)
 
 
-def test_every_flipped_bit_is_found(tmp_path) -> None:
+def test_a_flipped_bit_in_any_byte_is_found(tmp_path) -> None:
     path = tmp_path / "last.safetensors"
     checkpoint.save(path, {"x": torch.arange(3.0), "y": torch.tensor([True])}, metadata(3))
     content = path.read_bytes()
     for position in range(len(content)):
-        for bit in range(position % 3, 8, 3):
-            path.write_bytes(content[:position] + bytes([content[position] ^ 1 << bit]) + content[position + 1 :])
-            with pytest.raises(checkpoint.DamagedError):
-                checkpoint.load(path)
+        bit = 1 << position % 8
+        path.write_bytes(content[:position] + bytes([content[position] ^ bit]) + content[position + 1 :])
+        with pytest.raises(checkpoint.DamagedError):
+            checkpoint.load(path)
 
 
 def test_the_header_alone_is_checked_too(tmp_path) -> None:

@@ -61,31 +61,26 @@ def test_devices_and_folders_are_not_replaced(tmp_path) -> None:
 
 def test_a_target_is_checked_before_the_work(tmp_path, monkeypatch) -> None:
     writing.check_target(tmp_path / "t.json", "--json")
-    writing.check_target_folder(tmp_path / "a" / "b", "--output")
+    writing.check_target(tmp_path / "a" / "b", "--output", folder=True)
     monkeypatch.chdir(tmp_path)
     writing.check_target(Path("t.json"), "--json")
-    writing.check_target_folder(Path("a/b"), "--output")
+    writing.check_target(Path("a/b"), "--output", folder=True)
     assert list(tmp_path.iterdir()) == [], "nothing is made"
     (tmp_path / "file").touch()
-    for check, name, message in (
-        (
-            writing.check_target,
-            "a/t.json",
-            "cannot write .*t.json: there is no folder .*a; make it",
-        ),
-        (writing.check_target, ".", "is no plain file and is not replaced; give another --x"),
-        (writing.check_target, "file/t.json", "there is no folder .*file; make it"),
-        (writing.check_target_folder, "file", "into the folder .*file: .*file is no folder; give another --x"),
-        (writing.check_target_folder, "file/a/b", "into the folder .*b: .*file is no folder; give another --x"),
+    for name, folder, why in (
+        ("a/t.json", False, "a: No such file or directory"),
+        (".", False, "no plain file"),
+        ("file/t.json", False, "file: Not a directory"),
+        ("file", True, "file: Not a directory"),
+        ("file/a/b", True, "file: Not a directory"),
     ):
-        with pytest.raises(OSError, match=message):
-            check(tmp_path / name, "--x")
+        with pytest.raises(OSError, match=rf"^cannot write .*{why}.*; give another --x$"):
+            writing.check_target(tmp_path / name, "--x", folder=folder)
 
     def refuse(**_: object) -> None:
         raise PermissionError(13, "Permission denied", ".tmp8")
 
     monkeypatch.setattr(writing.tempfile, "TemporaryFile", refuse)
-    with pytest.raises(OSError, match=r"^cannot write .*t.json: Permission denied; give another --json$"):
-        writing.check_target(tmp_path / "t.json", "--json")
-    with pytest.raises(OSError, match=r"^cannot write into the folder .*a: Permission denied; give another --output$"):
-        writing.check_target_folder(tmp_path / "a", "--output")
+    for folder in (False, True):
+        with pytest.raises(OSError, match=r"^cannot write .*Permission denied\); give another --output$"):
+            writing.check_target(tmp_path / "t.json", "--output", folder=folder)
