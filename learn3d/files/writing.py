@@ -53,12 +53,14 @@ def check_target(path: Path, option: str, *, folder: bool = False) -> None:
     path = Path(path)
     there = next(p for p in (path, *path.parents) if os.path.lexists(p)) if folder else path.parent
     try:
+        if not there.is_dir():
+            raise OSError(f"there is no folder {there}")
         if not folder and path.exists() and not path.is_file():
             raise OSError("it is no plain file, and is not replaced")
         with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:
-        raise OSError(f"cannot write {path} ({there}: {error.strerror or error}); give another {option}") from error
+        raise OSError(f"cannot write {path}: {error.strerror or error}; give another {option}") from error
 
 
 def remove_partials(*folders: Path) -> None:

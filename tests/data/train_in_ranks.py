@@ -1,4 +1,4 @@
-"""One process of several: does what the tasks of a JSON file say, one after the other. Started by test_distributed.py.
+"""One process of several: does what the tasks of a JSON file say, one after the other. Started by test_ranks.py.
 
 {"config": ..., "resume": false}     train; `linear` with steps linear in the gradient, `fault`: see `inject`
 {"evaluate": folder}                 evaluate the last checkpoint of a run, in chunks of 5 images

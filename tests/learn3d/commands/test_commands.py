@@ -202,10 +202,10 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, command
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("evaluate {run} --json {tmp}/none/t.json", "there is no folder {tmp}/none; make it, or give another"),
+        ("evaluate {run} --json {tmp}/none/t.json", "there is no folder {tmp}/none; give another"),
         ("evaluate {run} {tmp}/nope", "there is no checkpoint {tmp}/nope"),
         ("evaluate {run} --data {tmp}/nope", "nope: there is no such folder"),
-        ("reconstruct --run {run} --data {data} --output {tmp}/file/x", "file is no folder"),
+        ("reconstruct --run {run} --data {data} --output {tmp}/file/x", "there is no folder {tmp}/file; give another"),
         ("reconstruct --run {run} --data {tmp}/nope --output {tmp}/x", "is with --data"),
         ("reconstruct --run {run} --data {data} --output {tmp}/x --frames 0", "frames must"),
         ("reconstruct --run {run} --output {tmp}/x {tmp}/a.png --image-size 0", "image_size must"),

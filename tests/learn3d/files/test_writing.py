@@ -68,13 +68,13 @@ def test_a_target_is_checked_before_the_work(tmp_path, monkeypatch) -> None:
     assert list(tmp_path.iterdir()) == [], "nothing is made"
     (tmp_path / "file").touch()
     for name, folder, why in (
-        ("a/t.json", False, "a: No such file or directory"),
+        ("a/t.json", False, "no folder .*a;"),
         (".", False, "no plain file"),
-        ("file/t.json", False, "file: Not a directory"),
-        ("file", True, "file: Not a directory"),
-        ("file/a/b", True, "file: Not a directory"),
+        ("file/t.json", False, "no folder .*file;"),
+        ("file", True, "no folder .*file;"),
+        ("file/a/b", True, "no folder .*file;"),
     ):
-        with pytest.raises(OSError, match=rf"^cannot write .*{why}.*; give another --x$"):
+        with pytest.raises(OSError, match=rf"^cannot write .*{why}.* give another --x$"):
             writing.check_target(tmp_path / name, "--x", folder=folder)
 
     def refuse(**_: object) -> None:
@@ -82,5 +82,5 @@ def test_a_target_is_checked_before_the_work(tmp_path, monkeypatch) -> None:
 
     monkeypatch.setattr(writing.tempfile, "TemporaryFile", refuse)
     for folder in (False, True):
-        with pytest.raises(OSError, match=r"^cannot write .*Permission denied\); give another --output$"):
+        with pytest.raises(OSError, match=r"^cannot write .*Permission denied; give another --output$"):
             writing.check_target(tmp_path / "t.json", "--output", folder=folder)
