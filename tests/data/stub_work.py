@@ -29,7 +29,7 @@ def work(run: Run, fresh: bool) -> bool:
         with stop_on_signal() as stop:
             print("waiting", flush=True)
             deadline = time.monotonic() + 60
-            while not stop.requested and time.monotonic() < deadline:
+            while not stop.name and time.monotonic() < deadline:
                 time.sleep(0.02)
             print("saved", flush=True)
         return False
