@@ -231,18 +231,16 @@ def photo_target(tmp: Path) -> Target:
 def table_target(tmp: Path) -> Target:
     row = {"file": "a.jpg", "azimuth_deg": 30, "elevation_deg": 20, "distance": 3, "fov_deg": 40, "object": "a"}
     rows = [row | {"file": f"{k}.jpg", "object": f"o{k}", "split": "train"} for k in range(4)]
-    (tmp / "poses.json").write_text(json.dumps(rows))
     lines = [",".join(rows[0]), *(",".join(map(str, r.values())) for r in rows)]
     (tmp / "poses.csv").write_text("\n".join(lines) + "\n")
 
     def read(folder: Path) -> None:
-        for name in ("poses.csv", "poses.json"):
-            photos, faults = read_table(folder / name)
-            assert all(np.isfinite([p.azimuth_deg, p.distance, p.fov_deg]).all() for p in photos)
-            assert all(isinstance(fault, str) for fault in faults)
-            split_objects(folder / name, photos)
+        photos, faults = read_table(folder / "poses.csv")
+        assert all(np.isfinite([p.azimuth_deg, p.distance, p.fov_deg]).all() for p in photos)
+        assert all(isinstance(fault, str) for fault in faults)
+        split_objects(folder / "poses.csv", photos)
 
-    return Target(tmp, {"poses.csv": m.damage_text, "poses.json": m.damage_json}, read)
+    return Target(tmp, {"poses.csv": m.damage_text}, read)
 
 
 def json_target(tmp: Path) -> Target:

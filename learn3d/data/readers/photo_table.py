@@ -1,4 +1,4 @@
-"""The table of your own photographs, poses.csv or poses.json, checked row by row; and the split of each object."""
+"""The table of your own photographs, poses.csv, checked row by row; and the split of each object."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import Any, get_args
 from learn3d.data.dataset import SPLITS
 from learn3d.data.framing import Framing
 from learn3d.files import limits
-from learn3d.files.reading import parse_json, read_bytes
+from learn3d.files.reading import read_bytes
 
-TABLES = ("poses.csv", "poses.json")
+TABLE = "poses.csv"
 NUMBERS = ("azimuth_deg", "elevation_deg", "distance", "fov_deg")
 OPTIONAL = ("object", "split", "mask", "framing")
 VAL_SHARE, TEST_SHARE = 0.1, 0.2  # of the objects, where the table does not say which split they are in
@@ -38,23 +38,19 @@ class Photo:
 
 
 def find_table(folder: Path | str, category: str) -> Path:
-    """poses.csv or poses.json of a category.
+    """poses.csv of a category.
 
-    Raises FileNotFoundError, and ValueError where there are both, or for a category that is no plain name: that
-    of a stranger's model leads nowhere else, neither to read nor, as part of the names of files, to write.
+    Raises FileNotFoundError, and ValueError for a category that is no plain name: that of a stranger's model leads
+    nowhere else, neither to read nor, as part of the names of files, to write.
     """
     if category in (".", "..") or set(category) & set("/\\") or not category.isprintable():
         raise ValueError(f"category must be the plain name of a folder such as 'mug', got {_short(category)}")
-    places = [Path(folder) / category, Path(folder)]
-    for place in places:
-        found = [place / name for name in TABLES if (place / name).is_file()]
-        if len(found) == 2:
-            raise ValueError(f"{place} has both {' and '.join(TABLES)}; remove one")
-        if found:
-            return found[0]
+    places = [Path(folder) / category / TABLE, Path(folder) / TABLE]
+    for table in places:
+        if table.is_file():
+            return table
     raise FileNotFoundError(
-        f"there is no poses.csv or poses.json in {places[0]} or {places[1]}; it must list the photographs: file, "
-        + ", ".join(NUMBERS)
+        f"there is no {places[0]} and no {places[1]}; it must list the photographs: file, {', '.join(NUMBERS)}"
     )
 
 
@@ -84,7 +80,7 @@ def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
 
 def read_table(table: Path) -> tuple[list[Photo], list[str]]:
     """The rows that can be understood, and what is wrong with the others."""
-    rows = list(_csv_rows(table) if table.suffix == ".csv" else _json_rows(table))
+    rows = list(_rows(table))
     if not rows:
         raise ValueError(f"{table} lists no photographs")
     if len(rows) > limits.OBJECTS:
@@ -105,7 +101,7 @@ def read_table(table: Path) -> tuple[list[Photo], list[str]]:
     return photos, faults
 
 
-def _csv_rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     content = read_bytes(table, limits.PHOTO_TABLE_BYTES, "the table of photographs")
     try:
         lines = content.decode("utf-8-sig").splitlines()
@@ -122,27 +118,14 @@ def _csv_rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         raise ValueError(f"{table}, line {reader.line_num} is no line of a table: {error}") from None
 
 
-def _json_rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    content = read_bytes(table, limits.PHOTO_TABLE_BYTES, "the table of photographs")
-    try:
-        rows = parse_json(content)
-    except ValueError as error:
-        raise ValueError(f"{table} is not valid JSON: {error}") from None
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise ValueError(f"{table} must be a list of records, such as [{{'file': 'a.jpg', 'azimuth_deg': 30, ...}}]")
-    for number, row in enumerate(rows, 1):
-        _check_columns(table, list(row), f", entry {number}")
-        yield f"{table.name}, entry {number}", row
-
-
-def _check_columns(table: Path, names: list[str], where: str = "") -> None:
+def _check_columns(table: Path, names: list[str]) -> None:
     missing = [name for name in ("file", *NUMBERS) if name not in names]
     unknown = [name for name in names if name not in ("file", *NUMBERS, *OPTIONAL)]
     if missing or unknown:
         wrong = [f"lacks {', '.join(missing)}"] * bool(missing)
         wrong += [f"has unknown {', '.join(unknown)[:200]}"] * bool(unknown)
         raise ValueError(
-            f"{table}{where} {' and '.join(wrong)}; the columns are file, {', '.join(NUMBERS)}, and where you like "
+            f"{table} {' and '.join(wrong)}; the columns are file, {', '.join(NUMBERS)}, and where you like "
             f"{', '.join(OPTIONAL)}"
         )
 

@@ -1,7 +1,7 @@
 """Your own photographs: a folder with images, masks and a table of where the camera stood.
 
     mug/poses.csv      one row per photograph: file, azimuth_deg, elevation_deg, distance, fov_deg, and where you like
-                       object, split, mask, framing (or poses.json: a list of such records)
+                       object, split, mask, framing
     mug/images/*.jpg   the photographs; PNG files with transparency need no mask
     mug/masks/*.png    white where the object is, named like its photograph
 
@@ -26,7 +26,7 @@ from learn3d.data.conventions import KATO
 from learn3d.data.dataset import MASK_SIZE, SPLITS, ViewDataset
 from learn3d.data.framing import Framed, read_framed
 from learn3d.data.poses import LookAtPoses
-from learn3d.data.readers.photo_table import TABLES, Photo, find_table, read_table, split_objects
+from learn3d.data.readers.photo_table import TABLE, Photo, find_table, read_table, split_objects
 from learn3d.data.readers.properties import LayoutProperties
 from learn3d.data.readers.renderings import check_split
 from learn3d.data.view_bins import AngleBins
@@ -131,7 +131,7 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())] if folder.is_dir() else []
     found = {}
     for place in places:
-        if any((place / name).is_file() for name in TABLES):
+        if (place / TABLE).is_file():
             try:
                 table = find_table(place, "")
                 photos, faults = read_table(table)

@@ -210,7 +210,7 @@ LIST_FAULTS = {
     "names the object '../../../etc'; expected the plain name": '{"03001627": {"test": ["../../../etc"]}}',
     "names the object '..'; expected the plain name": '{"03001627": {"test": [".."]}}',
     "names the object '/etc'; expected the plain name": '{"03001627": {"test": ["/etc"]}}',
-    "cannot be read as JSON (it is nested more than 32 levels deep)": "[" * 100_000,
+    "cannot be read as JSON (it is nested too deeply)": "[" * 100_000,
     "names no object for 03001627 (chair), test": '{"03001627": {"test": []}}',
 }
 

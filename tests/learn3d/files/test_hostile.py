@@ -77,9 +77,8 @@ def read_image(path: Path) -> object:
     return worker.read(renderings.read_with_alpha, path, 64)
 
 
-def mat(tmp_path: Path, compressed: bool = False, array: object = None) -> Path:
-    volume = np.zeros((VOXEL_SIZE,) * 3, np.uint8) if array is None else array
-    scipy.io.savemat(tmp_path / "a.mat", {"Volume": volume}, do_compression=compressed)
+def mat(tmp_path: Path) -> Path:
+    scipy.io.savemat(tmp_path / "a.mat", {"Volume": np.zeros((VOXEL_SIZE,) * 3, np.uint8)})
     return tmp_path / "a.mat"
 
 
@@ -98,7 +97,16 @@ def test_matlab_elements_of_wrong_types(tmp_path):
 
 @linux
 def test_matlab_arrays_that_unpack_to_gigabytes(tmp_path):
-    refused(read_mat, mat(tmp_path, True, np.zeros((4, 1024, 1024, 128), np.uint8)))
+    path = mat(tmp_path)
+    head = path.read_bytes()[:128]
+    array = struct.pack("<IIIIII", 6, 8, 6, 0, 5, 12) + struct.pack("<iiiiII", 2**10, 2**10, 2**12, 0, 1, 6)
+    array += b"Volume\0\0" + struct.pack("<II", 9, 2**31)
+    packer = zlib.compressobj()
+    content = packer.compress(struct.pack("<II", 14, 2**31 + len(array)) + array) + packer.flush(zlib.Z_FULL_FLUSH)
+    zeros = packer.compress(bytes(2**24)) + packer.flush(zlib.Z_FULL_FLUSH)
+    content += 128 * zeros + packer.flush()
+    path.write_bytes(head + struct.pack("<II", 15, len(content)) + content)
+    refused(read_mat, path)
 
 
 def test_matlab_cells_within_cells(tmp_path):
@@ -136,7 +144,7 @@ def tiff_of_strips(path: Path, rows: int) -> Path:
 @linux
 @pytest.mark.parametrize("read", [read_image, read_photo])
 def test_tiff_of_one_row_strips(tmp_path, read):
-    refused(read, tiff_of_strips(tmp_path / "a.tif", 2_000_000))
+    refused(read, tiff_of_strips(tmp_path / "a.tif", 800_000))
 
 
 def jpeg_of_scans(path: Path, scans: int) -> Path:
@@ -150,12 +158,10 @@ def jpeg_of_scans(path: Path, scans: int) -> Path:
     return path
 
 
+@linux
 def test_progressive_jpeg_of_thousands_of_scans(tmp_path):
     path = jpeg_of_scans(tmp_path / "a.jpg", 3000)
-    start = time.monotonic()
-    with bounded(), contextlib.suppress(ValueError):  # or it is read in that time
-        read_photo(path, path)
-    assert time.monotonic() - start < 6 * SECONDS
+    refused(lambda p: worker.read(renderings.read_with_alpha, p, 64, seconds=1), path, said="processor time")
 
 
 def bomb(path: Path, name: str, size: int, header: bytes) -> Path:
