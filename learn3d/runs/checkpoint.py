@@ -161,7 +161,7 @@ def _parse(path: Path, text: str) -> Metadata:
     try:
         values = parse_json(text)
         if not isinstance(values, dict):
-            raise ValueError(f"its metadata is no set of values by name, but {type(values).__name__}")
+            raise ValueError(f"its metadata must be a JSON object, got {type(values).__name__}")
         if (version := values.pop("format", None)) == FORMAT:
             return Metadata(**values)
     except ValueError as error:
@@ -173,17 +173,15 @@ def _parse(path: Path, text: str) -> Metadata:
 
 
 def network_tensors(method: Method) -> dict[str, Tensor]:
-    """Parameters and buffers of all networks, named network.<encoder|generator|...>.<parameter>."""
+    """Parameters and buffers of all networks, named network.<encoder|generator|...>.<parameter>.
+
+    Their averages have the same names with "average" in place of "network".
+    """
     return {
         f"network.{name}.{key}": tensor
         for name, network in method.networks.items()
         for key, tensor in network.state_dict().items()
     }
-
-
-def average_tensors(method: Method) -> dict[str, Tensor]:
-    """The averages of the same tensors, named average.<encoder|generator|...>.<parameter>; {} without an average."""
-    return {f"average.{name}": tensor for name, tensor in method.average.tensors.items()} if method.average else {}
 
 
 def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path, kind: str = "network") -> None:
@@ -246,8 +244,10 @@ def restore_optimizer(
                 raise ValueError(f"{index}.{key} belongs to none of the {len(parameters)} parameters")
             parameter, group = parameters[int(index)]
             if isinstance(value, Tensor):
-                if group.get("fused"):
-                    _check_moment(f"{index}.{key}", value, parameter.shape if key != "step" else torch.Size())
+                shape = parameter.shape if key != "step" else torch.Size()
+                if group.get("fused") and (value.shape, value.dtype) != (shape, torch.float32):
+                    came = f"{value.dtype} {list(value.shape)}"
+                    raise ValueError(f"{index}.{key} is {came}, wanted torch.float32 {list(shape)}")
                 like = parameter if value.shape == parameter.shape else value
                 value = torch.empty_like(like, dtype=value.dtype, device="cpu").copy_(value)
             state.setdefault(int(index), {})[key] = value
@@ -258,11 +258,6 @@ def restore_optimizer(
     except (ValueError, FloatingPointError) as error:
         raise ValueError(f"{source} does not fit the optimizer {name}: {error}") from None
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-
-
-def _check_moment(name: str, tensor: Tensor, shape: torch.Size) -> None:
-    if tensor.shape != shape or tensor.dtype != torch.float32:
-        raise ValueError(f"{name} is {tensor.dtype} {list(tensor.shape)}, wanted torch.float32 {list(shape)}")
 
 
 def check_finite(owner: str, tensors: dict[str, Tensor]) -> None:

@@ -144,7 +144,9 @@ class Run:
         """
         folder, keep, others = self.config.output, self.config.keep_checkpoints, {}
         self._check_networks()
-        tensors = checkpoint.network_tensors(self.method) | checkpoint.average_tensors(self.method)
+        tensors = checkpoint.network_tensors(self.method)
+        if self.method.average is not None:
+            tensors |= {f"average.{name}": tensor for name, tensor in self.method.average.tensors.items()}
         tensors["random.cpu"] = torch.get_rng_state()
         if self.config.device == "cuda":
             tensors["random.cuda"] = torch.cuda.get_rng_state()

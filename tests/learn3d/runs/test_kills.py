@@ -80,7 +80,7 @@ def check_whole(folder: Path) -> None:
         json.loads((folder / "config.json").read_text())
 
 
-@pytest.mark.parametrize("wanted", [12, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("wanted", [6, pytest.param(50, marks=pytest.mark.slow)])
 def test_killed_at_any_place(server, killed_config, uninterrupted, wanted: int) -> None:
     """Chains of three kills: at places that go through a whole run, then twice while it is resumed."""
     reference, _, things = uninterrupted
