@@ -32,19 +32,11 @@ class Crops:
 
     @classmethod
     def from_images(cls, images: Sequence[np.ndarray], boxes: np.ndarray, size: int) -> Crops:
-        """Keep what can be needed of the images uint8 [H, W, 3]; boxes float [M, 4].
-
-        Raises ValueError, saying which, where a box has no pixel in its image.
-        """
+        """Keep what can be needed of the images uint8 [H, W, 3]; boxes float [M, 4] have pixels in them."""
         boxes = np.asarray(boxes, np.float64)
         regions = np.empty((len(boxes), 4), np.int64)
         for k, (image, box) in enumerate(zip(images, boxes, strict=True)):
             height, width = image.shape[:2]
-            left, top, right, bottom = bounds(box, SMALLEST, width, height)
-            if not (left < right and top < bottom):
-                raise ValueError(
-                    f"box {k} (left, top, width, height: {box}) has no pixel in its {width}x{height} image"
-                )
             regions[k] = bounds(box, LARGEST, width, height)
         ends = np.cumsum((regions[:, 2] - regions[:, 0]) * (regions[:, 3] - regions[:, 1]) * 3)
         starts = np.concatenate([np.zeros(1, np.int64), ends[:-1]])[: len(boxes)]
@@ -90,9 +82,7 @@ def bounds(box: np.ndarray, shift: np.ndarray, width: int, height: int) -> tuple
 
 
 def join(parts: Sequence[Crops]) -> Crops:
-    """Several sets, one after the other; their sizes must agree."""
-    if len({part.size for part in parts}) != 1:
-        raise ValueError("crops of different sizes cannot be joined")
+    """Several sets, one after the other, of the same size."""
     offsets = np.cumsum([0] + [len(part.pixels) for part in parts])[:-1]
     return Crops(
         np.concatenate([part.pixels for part in parts]),

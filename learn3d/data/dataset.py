@@ -197,8 +197,6 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
     for other in datasets[1:]:
         if other.view_names != first.view_names or other.images.shape[1:] != first.images.shape[1:]:
             raise ValueError(f"{other.category} and {first.category} differ in view classes or image size")
-        if (other.voxels is None) != (first.voxels is None) or (other.masks is None) != (first.masks is None):
-            raise ValueError(f"only one of {other.category} and {first.category} has voxels (or masks)")
 
     def joined(name: str) -> np.ndarray | None:
         parts = [getattr(d, name) for d in datasets]

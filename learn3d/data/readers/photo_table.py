@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,12 @@ from learn3d.files import limits
 from learn3d.files.reading import read_bytes
 
 TABLE = "poses.csv"
-NUMBERS = ("azimuth_deg", "elevation_deg", "distance", "fov_deg")
+NUMBERS = {  # columns, and between what their numbers lie
+    "azimuth_deg": (-limits.ANGLE_DEG, limits.ANGLE_DEG),
+    "elevation_deg": (-90.0, 90.0),
+    "distance": (0.5, limits.DISTANCE[1]),
+    "fov_deg": limits.FOV_DEG,
+}
 OPTIONAL = ("object", "split", "mask", "framing")
 VAL_SHARE, TEST_SHARE = 0.1, 0.2  # of the objects, where the table does not say which split they are in
 
@@ -135,18 +139,7 @@ def _photo(folder: Path, where: str, row: dict[str, Any], masks: dict[str, Path]
     if None in row:  # what csv.DictReader calls the values beyond the last column
         raise ValueError(f"there are more values than columns: {', '.join(row[None])[:200]}")
     file = _inside(folder / "images", "file", row["file"])
-    values = {name: _number(name, row[name]) for name in NUMBERS}
-    if not -90 < values["elevation_deg"] < 90:
-        raise ValueError(f"elevation_deg must lie between -90 and 90, got {values['elevation_deg']:g}")
-    if abs(values["azimuth_deg"]) > limits.ANGLE_DEG:
-        most = limits.ANGLE_DEG
-        raise ValueError(f"azimuth_deg must lie between {-most:g} and {most:g}, got {values['azimuth_deg']:g}")
-    if not 0.5 < values["distance"] <= limits.DISTANCE[1]:
-        got = f"and at most {limits.DISTANCE[1]:g}, got {values['distance']:g}"
-        raise ValueError(f"distance must be above 0.5 (lengths of the longest side) {got}")
-    low, high = limits.FOV_DEG
-    if not low <= values["fov_deg"] < high:
-        raise ValueError(f"fov_deg must lie between {low:g} and {high:g}, got {values['fov_deg']:g}")
+    values = {name: _number(name, row[name], *between) for name, between in NUMBERS.items()}
     split = _choice("split", row.get("split"), SPLITS)
     framing = _choice("framing", row.get("framing"), get_args(Framing)) or "whole"
     mask = _inside(folder / "masks", "mask", row["mask"]) if row.get("mask") else masks.get(file.stem)
@@ -154,34 +147,31 @@ def _photo(folder: Path, where: str, row: dict[str, Any], masks: dict[str, Path]
     return Photo(where, file, mask, object=name, split=split, framing=framing, **values)
 
 
-def _inside(folder: Path, name: str, value: Any) -> Path:
+def _inside(folder: Path, name: str, value: str | None) -> Path:
     """A file of the folder; a table must not make us read others."""
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"{name} must be the name of a file in {folder.name}/, got {value!r}")
-    path = Path(value.strip().removeprefix(f"{folder.name}/"))
-    if path.is_absolute() or ".." in path.parts or "\0" in value:
-        raise ValueError(f"{name} must be a file in {folder.name}/, got {value!r}")
+    path = Path((value or "").strip().removeprefix(f"{folder.name}/"))
+    if not path.name or path.is_absolute() or ".." in path.parts or "\0" in value:
+        raise ValueError(f"{name} must be the name of a file in {folder.name}/, got {_short(value)}")
     return folder / path
 
 
-def _number(name: str, value: Any) -> float:
+def _number(name: str, value: str | None, low: float, high: float) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        comma = "; write a point, not a comma" if isinstance(value, str) and "," in value else ""
+    except (TypeError, ValueError):
+        comma = "; write a point, not a comma" if "," in (value or "") else ""
         raise ValueError(f"{name} must be a number, got {_short(value)}{comma}") from None
-    if not math.isfinite(number):
-        raise ValueError(f"{name} must be a finite number, got {_short(value)}")
+    if not low < number < high:
+        unit = " lengths of the longest side" if name == "distance" else ""
+        raise ValueError(f"{name} must lie between {low:g} and {high:g}{unit}, got {number:g}")
     return number
 
 
-def _choice(name: str, value: Any, choices: tuple[str, ...]) -> Any:
-    value = value.strip() if isinstance(value, str) else value
-    if value in (None, ""):
-        return None
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
-    return value
+def _choice(name: str, value: str | None, choices: tuple[str, ...]) -> Any:
+    value = (value or "").strip()
+    if value and value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {_short(value)}")
+    return value or None
 
 
 def _short(value: Any) -> str:

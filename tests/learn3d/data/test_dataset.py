@@ -102,8 +102,6 @@ def test_several_categories_become_one_set_with_classes() -> None:
     assert concatenate([cups]) is cups
     with pytest.raises(ValueError, match="jar and cup differ in view classes"):
         concatenate([cups, dataclasses.replace(jars, view_names=("a", "b"))])
-    with pytest.raises(ValueError, match="only one of jar and cup has voxels"):
-        concatenate([cups, dataclasses.replace(jars, voxels=None)])
     turned = dataclasses.replace(jars, poses=RotationPoses(torch.eye(3).expand(6, 3, 3)))
     with pytest.raises(ValueError, match="cameras of different kinds"):
         concatenate([cups, turned])

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 import nmr
 from learn3d.config import TrainConfig
 from learn3d.data.augment import augment
-from learn3d.data.crops import Crops, join
 from learn3d.data.dataset import concatenate
 from learn3d.data.layouts import load_dataset
 from learn3d.data.readers import pascal3d
@@ -245,8 +244,6 @@ def test_crops_follow_selection_and_joining(folder: Path) -> None:
     np.testing.assert_array_equal(some.crops.cut(), dataset.images[[4, 1], :3])
     both = concatenate([dataset, dataset])
     np.testing.assert_array_equal(both.crops.cut(), np.concatenate([dataset.images[:, :3]] * 2))
-    with pytest.raises(ValueError, match="different sizes"):
-        join([dataset.crops, Crops.from_images([], np.empty((0, 4)), 64)])
 
 
 def test_layouts_know_it(folder: Path) -> None:

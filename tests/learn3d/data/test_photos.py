@@ -200,19 +200,19 @@ MISTAKES = {
     "text": ("azimuth_deg", "left", "azimuth_deg must be a number, got 'left'"),
     "comma": ("azimuth_deg", "12,5", "azimuth_deg must be a number, got '12,5'; write a point, not a comma"),
     "empty": ("distance", "", "distance must be a number, got ''"),
-    "nan": ("fov_deg", "nan", "fov_deg must be a finite number, got 'nan'"),
+    "nan": ("fov_deg", "nan", "fov_deg must lie between 0.1 and 170, got nan"),
     "above": ("elevation_deg", "90", "elevation_deg must lie between -90 and 90, got 90"),
     "inside": (
         "distance",
         "0.3",
-        r"distance must be above 0.5 \(lengths of the longest side\) and at most 10000, got 0.3",
+        r"distance must lie between 0.5 and 10000 lengths of the longest side, got 0.3",
     ),
     "wide": ("fov_deg", "180", "fov_deg must lie between 0.1 and 170, got 180"),
     "split": ("split", "training", "split must be one of train, val, test, got 'training'"),
     "framing": ("framing", "crop", "framing must be one of whole, object, got 'crop'"),
     "no file": ("file", "", "file must be the name of a file in images/, got ''"),
-    "outside": ("file", "../secret.png", "file must be a file in images/, got '../secret.png'"),
-    "absolute": ("mask", "/etc/passwd", "mask must be a file in masks/, got '/etc/passwd'"),
+    "outside": ("file", "../secret.png", "file must be the name of a file in images/, got '../secret.png'"),
+    "absolute": ("mask", "/etc/passwd", "mask must be the name of a file in masks/, got '/etc/passwd'"),
     "twice": ("file", "chair000_0.jpg", "chair000_0.jpg is in poses.csv, line 2 already"),
 }
 
