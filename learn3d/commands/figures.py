@@ -36,11 +36,6 @@ class Drawn:
     labels: tuple[str, ...] = ()
     """What to call each run, if not by its preset."""
 
-    @property
-    def folder(self) -> Path:
-        """Where the files go."""
-        return self.output.parent
-
 
 @dataclass(frozen=True, kw_only=True)
 class Measured(Drawn):
@@ -111,11 +106,6 @@ class Polar(Measured):
 class All(Measured):
     """Every figure with its defaults, as far as data and runs allow; --output is a folder."""
 
-    @property
-    def folder(self) -> Path:
-        """Where the files go."""
-        return self.output
-
 
 FIGURES = {"all": All, "grid": Grid, "tsne": Tsne, "interpolation": Interpolation, "curves": Curves, "polar": Polar}
 PACKAGES = {"tsne": ("matplotlib", "sklearn"), "curves": ("matplotlib",), "polar": ("matplotlib",)}
@@ -139,8 +129,8 @@ def run(arguments: Sequence[str]) -> int:
     from learn3d.figures import paper
     from learn3d.files.writing import check_target
 
-    check_target(command.folder, "--output", folder=True)
     where, runs = command.output, command.runs
+    check_target(where if name == "all" else where.parent, "--output", folder=True)
     if name == "curves":
         paths = paper.save_curves(runs, where, labels=command.labels)
     elif name == "polar":

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d.data.layouts import load_dataset, require_folder
+from learn3d.data.layouts import require_folder
 from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, SURFACE_POINTS, Evaluation, evaluate
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
@@ -70,9 +70,7 @@ def evaluate_runs(
         folder = data or config.data
         for name in (part.strip() for part in (category or config.category).split(",")):
             report_progress(f"{file}: {PRESETS[config.preset].label} ({config.preset}) on {name}, {split}")
-            dataset = load_dataset(
-                config.layout, folder, name, split, image_size=method.image_size, view_bins=config.view_bins
-            )
+            dataset = checkpoint.load_data(config, split, data=folder, category=name)
             result = evaluate(method, dataset, definitions=("kato18", "kato19"), paper_mmd=True, surfaces=True)
             for warning in _warnings(result):
                 report_progress(f"warning: {warning}")

@@ -15,7 +15,6 @@ import torch
 from pydantic import BaseModel, Field, ValidationError
 
 from learn3d.config import config_to_dict, differences, load_config
-from learn3d.data.layouts import load_dataset
 from learn3d.evaluation import evaluate
 from learn3d.experiments.plan import Run, command_line
 from learn3d.files import limits, writing
@@ -45,8 +44,7 @@ def measure(run: Run) -> dict[str, Any]:
     method, saved, metadata = checkpoint.load_method(
         run.folder / f"{run.variant.checkpoint}.safetensors", device=config.device, precision="fp32"
     )
-    where = (config.layout, config.data, config.category, SPLIT)
-    dataset = load_dataset(*where, image_size=method.image_size, view_bins=config.view_bins)
+    dataset = checkpoint.load_data(config, SPLIT)
     if dataset.voxels is None:
         raise ValueError(f"{config.data} has no voxels for {run.category}, {SPLIT}: IoU cannot be measured")
     result = evaluate(method, dataset, definitions=DEFINITIONS, paper_mmd=True, surfaces=True)

@@ -124,16 +124,9 @@ def save_all(
 ) -> list[Path]:
     """Every figure with its defaults, into files of these names in `folder`; returns the files that were written.
 
-    runs: `paths`, opened. without: figures to leave out, and why. What cannot be drawn is said, with the reason: before
-    anything is drawn as far as it is known then.
+    runs: `paths`, opened. without: figures to leave out, and why. What cannot be drawn is said, with the reason.
     """
-    datasets = [run.dataset for run in runs]
-    reasons = dict(without)
-    if any(dataset.voxels is None for dataset in datasets):
-        reasons.setdefault("polar", "the data set has no true voxels to compare shapes with")
-    if any(len(np.unique(dataset.object_ids)) < 2 for dataset in datasets):
-        reasons.setdefault("interpolation", "the data set has a single object")
-    for name, reason in reasons.items():
+    for name, reason in without.items():
         say(f"not drawn: {name}: {reason}")
     figures: dict[str, Callable[[Path], list[Path]]] = {
         "grid": lambda path: [save_grid(runs, path)],
@@ -143,7 +136,7 @@ def save_all(
         "polar": lambda path: save_polar(runs, path),
     }
     written = []
-    for name in [name for name in figures if name not in reasons]:
+    for name in [name for name in figures if name not in without]:
         say(f"drawing {name}")
         try:
             written += figures[name](Path(folder) / name)

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from learn3d.config import TrainConfig, differences
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.layouts import load_dataset
 from learn3d.methods import Method
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
@@ -53,8 +52,7 @@ def open_runs(
         config = dataclasses.replace(config, data=data or config.data, category=category or config.category)
         key = (config.layout, config.data.resolve(), config.category, method.image_size, config.view_bins)
         if key not in datasets:
-            layout, folder, name, size, bins = key
-            datasets[key] = load_dataset(layout, folder, name, split, image_size=size, view_bins=bins)
+            datasets[key] = checkpoint.load_data(config, split)
         loaded.append((method, config, datasets[key]))
     names = name_runs([config for _, config, _ in loaded], paths, labels)
     return [Run(name, method, dataset) for name, (method, _, dataset) in zip(names, loaded, strict=True)]

@@ -21,6 +21,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from learn3d.config import TrainConfig, config_from_dict
+from learn3d.data.dataset import ViewDataset
+from learn3d.data.layouts import load_dataset
 from learn3d.device import resolve_precision
 from learn3d.files import limits, writing
 from learn3d.files.reading import check_file, parse_json
@@ -271,6 +273,18 @@ def find(path: Path, which: str = "last") -> Path:
     """The checkpoint file of a run folder (`which`: last or best), or `path` itself when it is a file."""
     path = Path(path)
     return path / f"{which}.safetensors" if path.is_dir() else path
+
+
+def load_data(config: TrainConfig, split: str, *, data: Path | None = None, category: str | None = None) -> ViewDataset:
+    """A split of the data that a run was trained on, or of another folder or category, in the form of its networks."""
+    return load_dataset(
+        config.layout,
+        data or config.data,
+        category or config.category,
+        split,
+        image_size=config.settings.image_size,
+        view_bins=config.view_bins,
+    )
 
 
 def load_method(path: Path, *, device: str = "cpu", precision: str = "fp32") -> tuple[Method, TrainConfig, Metadata]:

@@ -259,7 +259,7 @@ def test_evaluate_runs_reports_and_tabulates(finished_run) -> None:
 
 def test_a_run_on_several_categories_is_measured_on_each(finished_run, monkeypatch, tiny_set) -> None:
     monkeypatch.setattr(
-        "learn3d.experiments.evaluation_report.load_dataset",
+        "learn3d.runs.checkpoint.load_dataset",
         lambda *where, **options: dataclasses.replace(tiny_set, category=where[2]),
     )
     report = evaluate_runs([finished_run], category="airplane, chair")

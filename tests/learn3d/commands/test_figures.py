@@ -50,16 +50,17 @@ def test_all_figures_of_a_run(call, finished_run, tmp_path, monkeypatch) -> None
     assert stored["label"] == "Proposed" and config.seed == 0
 
 
-def test_what_cannot_be_drawn_is_said_before_anything_is(call, finished_run, tmp_path, monkeypatch) -> None:
+def test_what_cannot_be_drawn_is_said(call, finished_run, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("learn3d.commands.figures.find_spec", lambda package: None)
     monkeypatch.setattr(paper, "TILE_SIZE", 32)
     monkeypatch.setattr(paper, "FRAMES", 1)
     code, out, err = call("all", "--runs", finished_run, "--output", tmp_path)
     assert (code, [Path(line).name for line in out.split()]) == (0, ["grid.png"])
     said = [line for line in err.splitlines() if line.startswith(("not drawn", "drawing"))]
-    assert [line.split(":")[1].strip() for line in said[:4]] == ["tsne", "curves", "polar", "interpolation"]
-    assert said[4:] == ["drawing grid"]
+    assert [line.split(":")[1].strip() for line in said[:3]] == ["tsne", "curves", "polar"]
     assert all('pip install "nmr-learn3d[figures]"' in line for line in said[:3])
+    assert said[3:5] == ["drawing grid", "drawing interpolation"]
+    assert said[5].startswith("not drawn: interpolation: "), "the data have a single object"
     code, out, err = call("tsne", "--runs", tmp_path / "nowhere", "--output", tmp_path)
     assert code == 1 and "matplotlib" in err, "the package is looked for first"
 
