@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from learn3d.data.categories import synset_of
-from learn3d.data.layouts import LAYOUTS
+from learn3d.data.layouts import LAYOUTS, layouts_in
 from learn3d.data.readers import READERS
 from learn3d.files.findings import Problem
 
@@ -96,7 +96,9 @@ def check_folder(
     reader = READERS[layout]
     found = reader.contents(folder)
     if not found and not categories:
-        raise FileNotFoundError(f"{folder} holds nothing of the layout {layout!r}; see docs/data-sets.md")
+        others = layouts_in(folder, layout)
+        what = f"; it is a data set of the layout {others[0]!r}: add --layout {others[0]}" if others else ""
+        raise FileNotFoundError(f"{folder} holds nothing of the layout {layout!r}{what or '; see docs/data-sets.md'}")
     reports = []
     for category in categories or found:
         there = found.get(category) or found.get(synset_of(category)) or ("train", "val", "test")

@@ -50,7 +50,7 @@ def require_folder(folder: Path | str) -> None:
         where = "" if folder.is_absolute() else f" (here that is {folder.absolute()})"
         raise MissingFile(
             folder,
-            f"there is no such folder{where}; say where the data set is with --data, or make it (make_dataset)",
+            f"there is no such folder{where}; say where the data set is with --data, or make it (learn3d make-dataset)",
         )
 
 
@@ -86,8 +86,9 @@ def load_dataset(
     try:
         dataset = concatenate(together([functools.partial(load, name) for name in names]))
     except (DamagedFile, FileNotFoundError) as error:
-        if others := _layouts_in(Path(folder), layout):
-            hint = f"this is no data set of the layout {layout!r}; add --layout {others[0]}"
+        if others := layouts_in(Path(folder), layout):
+            hint = f"this is a data set of the layout {others[0]!r}, not {layout!r}; give another folder, or train "
+            hint += f"with a preset for it, or with --layout {others[0]}"
             raise MissingFile(Path(folder), hint) from None
         if not isinstance(error, (DamagedFile, MissingFile)):
             raise
@@ -98,7 +99,7 @@ def load_dataset(
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
 
 
-def _layouts_in(folder: Path, asked: str) -> list[str]:
+def layouts_in(folder: Path, asked: str) -> list[str]:
     """The layouts of which the folder holds something, where it holds nothing of the one that was asked for."""
     found = [layout for layout in LAYOUTS if _holds(folder, layout)]
     return [] if asked in found else found

@@ -52,6 +52,8 @@ def create_method(
     Raises ValueError where the device is absent, and where the method does not go with the data.
     """
     check_device(device)
+    if type(settings) not in _METHODS:
+        raise ValueError(f"no method learns with {type(settings).__name__}; add the pair to learn3d.methods._METHODS")
     kind = _METHODS[type(settings)]
     if kind.needs_poses and shape.pose_features == 0:
         raise ValueError(

@@ -57,7 +57,7 @@ class MultiView(MeshMethod):
 
     @property
     def weights(self) -> dict[str, float]:
-        return {"smoothness": self.settings.lambda_smooth}
+        return {"projection": 1.0, "smoothness": self.settings.lambda_smooth}
 
     def learn(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shapes of both views, {a, b}, in both views: the mean of four IoU losses, and lambda_s times the

@@ -104,19 +104,22 @@ def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
 def backpropagate(
     losses: Mapping[str, Tensor], weights: Mapping[str, float], step: int, ranks: Ranks = ALONE
 ) -> dict[str, float]:
-    """Backpropagate the sum of the losses, each times its weight (1 where none is given); return them, and "total".
+    """Backpropagate the sum of the losses, each times its weight; return them, and "total".
 
     Losses are those of this process's rows; what is returned is of the whole batch, and so is the sum of the gradients
     over the processes. Losses may lie on the CPU and on the networks' device; there is one sum for each of the two.
-    Raises FloatingPointError, with no gradient computed yet, when a loss is not finite.
+    Raises ValueError for a loss without a weight, and FloatingPointError, with no gradient computed yet, when a loss is
+    not finite.
     """
+    if missing := [name for name in losses if name not in weights]:
+        raise ValueError(f"the method's weights lack {', '.join(missing)}; they have {', '.join(weights) or 'none'}")
     totals: dict[torch.device, Tensor] = {}
     for name, loss in losses.items():
-        weight = weights.get(name, 1.0)
+        weight = weights[name]
         term = loss if weight == 1.0 else weight * loss
         totals[loss.device] = totals[loss.device] + term if loss.device in totals else term
     values = ranks.means(read_back(losses))
-    values["total"] = sum(weights.get(name, 1.0) * value for name, value in values.items())
+    values["total"] = sum(weights[name] * value for name, value in values.items())
     if not all(math.isfinite(value) for value in values.values()):
         listed = ", ".join(f"{name} {value:g}" for name, value in values.items())
         raise FloatingPointError(f"the loss is not finite at iteration {step} ({listed})")

@@ -82,6 +82,7 @@ class PoseInvariant(MeshMethod):
     def weights(self) -> dict[str, float]:
         settings = self.settings
         return {
+            "projection": 1.0,
             "smoothness": settings.lambda_smooth,
             "classification": settings.lambda_classification,
             "confusion": settings.lambda_adversarial,

@@ -97,6 +97,10 @@ class PrGAN(Method):
             "encoder": adam(self.encoder, settings.encoder_learning_rate),
         }
 
+    @property
+    def weights(self) -> dict[str, float]:
+        return dict.fromkeys(self.optimizers, 1.0)  # each optimizer has a loss of its own
+
     @functools.cached_property
     def views(self) -> ViewCircle:
         """The K views that silhouettes are projected to."""

@@ -133,8 +133,10 @@ class VPL(MeshMethod):
     def weights(self) -> dict[str, float]:
         settings = self.settings
         return {
+            "projection": 1.0,
             "smoothness": settings.lambda_smooth,
             "inflation": settings.lambda_inflation,
+            "discrimination": 1.0,
             "adversarial": settings.lambda_discriminator,
         }
 

@@ -65,7 +65,7 @@ def test_the_gradient_of_an_upload_comes_back(monkeypatch: pytest.MonkeyPatch) -
 
 def test_losses_are_weighted_added_up_and_returned_in_their_order() -> None:
     x = torch.tensor(3.0, requires_grad=True)
-    values = backpropagate({"b": x.square(), "a": 2 * x, "c": -x}, {"a": 0.5, "c": 0.0}, step=1)
+    values = backpropagate({"b": x.square(), "a": 2 * x, "c": -x}, {"a": 0.5, "b": 1.0, "c": 0.0}, step=1)
     assert list(values.items()) == [("b", 9.0), ("a", 6.0), ("c", -3.0), ("total", 12.0)]
     assert x.grad == 7.0
 
@@ -102,6 +102,6 @@ def test_there_and_back_on_a_gpu() -> None:
 @needs_cuda
 def test_losses_on_both_sides_on_a_gpu() -> None:
     x = torch.tensor(3.0, device="cuda", requires_grad=True)
-    values = backpropagate({"far": x.square(), "near": Download(x).wait() * 2}, {"near": 0.5}, step=1)
+    values = backpropagate({"far": x.square(), "near": Download(x).wait() * 2}, {"near": 0.5, "far": 1.0}, step=1)
     assert values == {"far": 9.0, "near": 6.0, "total": 12.0}
     assert x.grad == 7.0

@@ -170,13 +170,13 @@ def _what_is_there(category: str, split: str, missing: Path) -> str:
     folder = missing.parent
     wanted = f"is missing ({category}, {split})"
     if not folder.is_dir():
-        return f"{wanted}: there is no such folder; give the one that holds the npz files, or make it (make_dataset)"
+        return f"{wanted}: there is no such folder; give the one with the npz files, or make it (learn3d make-dataset)"
     pair = split_paths(folder, category, split)
     for other, kind, lacking in zip(pair, _ARRAYS, reversed(_ARRAYS), strict=True):
         if other.is_file():
             return (
                 f"{wanted}: the {kind} are there ({other.name}), but a split needs the {lacking}, too. Fetch or copy "
-                "that file from where the other came from, or make both again (make_dataset --overwrite)"
+                "that file from where the other came from, or make both again (learn3d make-dataset --overwrite)"
             )
     names = {synset: name for name, synset in SYNSETS.items()}
     found = []
@@ -184,8 +184,8 @@ def _what_is_there(category: str, split: str, missing: Path) -> str:
         whole = [s for s in splits if all(path.is_file() for path in split_paths(folder, prefix, s))]
         found += [f"{names.get(prefix, prefix)} {s}" for s in whole]
     if found:
-        return f"{wanted}; the folder holds: {', '.join(found)}. Choose one of these, or make the split (make_dataset)"
+        return f"{wanted}; the folder holds: {', '.join(found)}. Choose one of these, or make it (learn3d make-dataset)"
     return (
         f"{wanted}; the folder holds no '*_images.npz' with its '*_voxels.npz' at all. Give another folder, or make "
-        "one (make_dataset)"
+        "one (learn3d make-dataset)"
     )

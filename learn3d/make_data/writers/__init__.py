@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from learn3d.data.layouts import LAYOUTS, Layout
+from learn3d.data.layouts import Layout
 from learn3d.make_data.writers.dvr import DvrWriter
 from learn3d.make_data.writers.kar import KarWriter
 from learn3d.make_data.writers.kato import KatoWriter
@@ -25,5 +25,5 @@ def writer_of(layout: Layout) -> type[Writer]:
         "photos": PhotosWriter,
     }
     if layout not in writers:
-        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}; got {layout!r}")
+        raise ValueError(f"layouts that can be written are {', '.join(writers)}; got {layout!r}")
     return writers[layout]

@@ -122,7 +122,7 @@ def test_a_folder_of_another_layout_is_told(tmp_path, command) -> None:
     status, _, said = command(
         "train", "--data", tmp_path / "photos", "--category", "chair", "--output", tmp_path / "run"
     )
-    assert status == 1 and "add --layout photos" in said
+    assert status == 1 and "--layout photos" in said
 
 
 def test_a_photograph_without_a_mask_leads_to_the_option(finished_run, tmp_path, command) -> None:
