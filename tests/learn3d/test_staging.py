@@ -75,8 +75,13 @@ def test_a_loss_that_is_not_finite_stops_before_any_gradient(name: str) -> None:
     x = torch.tensor(1.0, requires_grad=True)
     losses = {"projection": x, "prior": x, name: x * torch.inf}
     with pytest.raises(FloatingPointError, match=rf"iteration 7 .*{name} inf"):
-        backpropagate(losses, {"prior": 1e-3}, step=7)
+        backpropagate(losses, {"projection": 1.0, "prior": 1e-3}, step=7)
     assert x.grad is None
+
+
+def test_a_loss_without_a_weight_is_an_error() -> None:
+    with pytest.raises(ValueError, match="lack norm; they have nrom"):
+        backpropagate({"norm": torch.tensor(1.0)}, {"nrom": 0.1}, step=1)
 
 
 def test_one_copy_reads_all_losses_of_a_device(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -105,7 +105,7 @@ def test_the_table_says_what_each_reader_takes(layout):
 
 def test_unknown_names(folders):
     assert tuple(LAYOUTS) == get_args(Layout) == tuple(READERS)
-    with pytest.raises(ValueError, match="layout must be one of kato, .* got 'lsm'"):
+    with pytest.raises(ValueError, match=r"layout must be one of kato, .* got 'lsm'"):
         load_dataset("lsm", folders, "chair", "test")
     for category in ("chair,chair", "", "chair,"):
         with pytest.raises(ValueError, match="different names joined by commas, got"):
