@@ -97,9 +97,9 @@ class Method(abc.ABC):
         """The shapes of codes [B, C], on the CPU."""
 
     @property
-    @abc.abstractmethod
     def weights(self) -> Mapping[str, float]:
-        """The weight of every loss that `learn` may compute, by the name of the loss."""
+        """The weight of every loss that `descend` is given, by the name of the loss."""
+        return {}
 
     def estimate(self, images: Tensor) -> Estimate:
         """Codes of images as `encode` takes them, and the poses, by methods that estimate them."""
