@@ -76,7 +76,7 @@ def test_the_method_raises_the_iou(tmp_path: Path) -> None:
     make_dataset(
         DatasetConfig(output=data, category="airplane", procedural=250, test=0.2, val=0.1, seed=0), progress=False
     )
-    words = ["kato", "--data", data, "--output", output, "--categories", "airplane", "--methods", "vanilla", "proposed"]
+    words = ["kato", "--data", data, "--output", output, "--category", "airplane", "--methods", "vanilla", "proposed"]
     words += ["--iterations", 600, "--jobs", 2, "--threads", 1, "--set", "validate_every=600"]
     command = [sys.executable, Path(__file__).parents[3] / "tools" / "experiment.py", *words]
     subprocess.run([str(word) for word in command], check=True)
