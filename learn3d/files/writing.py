@@ -25,6 +25,7 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
     if path.exists() and not path.is_file():
         raise OSError(f"{path} is no plain file and is not replaced; give another name")
     temporary = path.with_name(f".{path.name}.partial")
+    temporary.unlink(missing_ok=True)  # a killed process may have left it as a second name of a file
     try:
         yield temporary
         if sync:
@@ -76,7 +77,6 @@ def give_second_name(path: Path, name: Path) -> None:
     A file of that name is replaced.
     """
     with replacing(name, sync=True) as temporary:
-        temporary.unlink(missing_ok=True)
         try:
             os.link(path, temporary)
         except OSError:

@@ -33,11 +33,20 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path, sync: bool) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_second_name_that_was_left_behind_is_not_written_through(tmp_path) -> None:
+    earlier = tmp_path / "earlier"
+    earlier.write_bytes(b"old")
+    (tmp_path / ".a.partial").hardlink_to(earlier)
+    writing.write_bytes(tmp_path / "a", b"new")
+    assert earlier.read_bytes() == b"old"
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_disk_without_room_names_the_file(tmp_path) -> None:
-    (tmp_path / ".a.json.partial").symlink_to("/dev/full")
-    with pytest.raises(OSError, match=r"No space left on device: '.*/a\.json'"):
-        writing.write_json(tmp_path / "a.json", {})
+    full = pytest.raises(OSError, match=r"No space left on device: '.*/a\.json'")
+    with full, writing.replacing(tmp_path / "a.json") as temporary:
+        temporary.symlink_to("/dev/full")
+        temporary.write_bytes(b"{}")
     assert list(tmp_path.iterdir()) == []
 
 
