@@ -5,7 +5,7 @@ Examples:
   learn3d check-dataset DATA --layout kar --category airplane,chair --split train
   learn3d check-dataset DATA --layout r2n2 --json report.json
 
-The exit status is 1 where training or evaluation would fail (an error), 0 where files are merely odd (a warning).
+The exit status is 1 where training or evaluation would fail (an error), 0 where there are warnings at most.
 """
 
 from __future__ import annotations

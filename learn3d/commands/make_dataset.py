@@ -1,4 +1,4 @@
-"""Render a data set from a folder of meshes, a mesh pack or procedural shapes, in the layout of any that we read.
+"""Render a data set from a folder of meshes, a mesh pack or procedural shapes, in the layout of a published data set.
 
 Examples:
   learn3d make-dataset --output data --category chair --source my_chairs --augment 5

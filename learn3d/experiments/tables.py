@@ -57,7 +57,7 @@ class Table:
 PROPOSED, VANILLA, MULTI_VIEW, VPL, PRGAN = (Variant(name, preset) for name, preset in METHODS.items())
 
 _NO_PRIOR = Variant("without-prior", "peng2020-kato", {"lambda_prior": 0.0})
-#: The classification loss trains nobody but the discriminator, which nobody listens to then: both are off.
+#: Without the confusion loss the discriminator has no effect on the encoder, so its own loss is off, too.
 _NO_ADVERSARIAL = Variant(
     "without-adversarial", "peng2020-kato", {"lambda_adversarial": 0.0, "lambda_classification": 0.0}
 )

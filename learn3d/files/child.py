@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from learn3d.files.findings import AGAIN, DamagedFile, MissingFile
+from learn3d.files.findings import FETCH_AGAIN, DamagedFile, MissingFile
 
 try:
     import resource
@@ -114,7 +114,7 @@ def _attempt(call: Call) -> Any:
         _limit(None, None)
         return DamagedFile(call.path, f"reading it would take too much memory; expected {call.wanted}")
     except Exception as error:  # the libraries raise whatever a damaged file leads them to
-        return DamagedFile(call.path, f"cannot be read ({one_line(error)}); expected {call.wanted}. {AGAIN}")
+        return DamagedFile(call.path, f"cannot be read ({one_line(error)}); expected {call.wanted}. {FETCH_AGAIN}")
 
 
 def one_line(error: Exception) -> str:

@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 
 R = TypeVar("R")
 
-AGAIN = "Perhaps the download or copy was cut short: fetch it again"
+FETCH_AGAIN = "Perhaps the download or copy was cut short: fetch it again"
 
 
 class DamagedFile(ValueError):

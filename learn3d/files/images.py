@@ -10,7 +10,7 @@ from typing import Any
 from PIL import Image, UnidentifiedImageError
 
 from learn3d.files import child, limits
-from learn3d.files.findings import AGAIN, DamagedFile
+from learn3d.files.findings import FETCH_AGAIN, DamagedFile
 from learn3d.files.reading import check_file
 
 RENDERINGS = ("PNG", "JPEG", "TIFF")
@@ -29,7 +29,7 @@ def open_image(path: Path, formats: Sequence[str], most_side: int) -> Image.Imag
     try:
         image = Image.open(path, formats=formats)
     except UnidentifiedImageError:
-        hint = "Convert HEIC to JPEG" if path.suffix.lower() in (".heic", ".heif") else AGAIN
+        hint = "Convert HEIC to JPEG" if path.suffix.lower() in (".heic", ".heif") else FETCH_AGAIN
         raise DamagedFile(path, f"cannot be decoded as an image of the kind {', '.join(formats)}. {hint}") from None
     except Image.DecompressionBombError as error:
         raise DamagedFile(path, f"has too many pixels ({error}): make it smaller") from None
@@ -47,7 +47,7 @@ def open_image(path: Path, formats: Sequence[str], most_side: int) -> Image.Imag
         except MemoryError:
             raise
         except Exception as error:  # Pillow's decoders raise whatever a damaged file leads them to
-            raise DamagedFile(path, f"cannot be decoded as an image ({child.one_line(error)}). {AGAIN}") from None
+            raise DamagedFile(path, f"cannot be decoded as an image ({child.one_line(error)}). {FETCH_AGAIN}") from None
         return image
 
 

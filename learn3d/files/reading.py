@@ -12,7 +12,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from learn3d.files.findings import AGAIN, DamagedFile, MissingFile
+from learn3d.files.findings import FETCH_AGAIN, DamagedFile, MissingFile
 
 
 def check_file(path: Path | str, most: int, wanted: str) -> int:
@@ -42,7 +42,7 @@ def read_bytes(path: Path | str, most: int, wanted: str) -> bytes:
                 raise OSError("it is no plain file any more")
             return file.read(min(status.st_size, most))
     except OSError as error:
-        raise DamagedFile(Path(path), f"cannot be read ({error}); expected {wanted}. {AGAIN}") from error
+        raise DamagedFile(Path(path), f"cannot be read ({error}); expected {wanted}. {FETCH_AGAIN}") from error
 
 
 def _open_at_once(path: str, flags: int) -> int:
@@ -54,7 +54,7 @@ def read_text(path: Path | str, most: int, wanted: str, *, encoding: str = "utf-
     try:
         text = read_bytes(path, most, wanted).decode(encoding, errors)
     except UnicodeDecodeError as error:
-        raise DamagedFile(Path(path), f"cannot be read as text ({error}); expected {wanted}. {AGAIN}") from error
+        raise DamagedFile(Path(path), f"cannot be read as text ({error}); expected {wanted}. {FETCH_AGAIN}") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

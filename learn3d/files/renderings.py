@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from learn3d.files import limits
-from learn3d.files.findings import AGAIN, DamagedFile, MissingFile
+from learn3d.files.findings import FETCH_AGAIN, DamagedFile, MissingFile
 from learn3d.files.images import RENDERINGS, open_image
 from learn3d.files.reading import read_text
 
@@ -125,7 +125,7 @@ def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
     text = read_text(path, limits.TABLE_BYTES, wanted)
     lines = [line.split() for line in text.splitlines() if line.strip()]
     if len(lines) < rows:
-        raise DamagedFile(path, f"has {len(lines)} rows, {rows} are needed; expected {wanted}. {AGAIN}")
+        raise DamagedFile(path, f"has {len(lines)} rows, {rows} are needed; expected {wanted}. {FETCH_AGAIN}")
     table = np.empty((rows, columns))
     for k, line in enumerate(lines[:rows]):
         try:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from learn3d.files import limits
-from learn3d.files.findings import AGAIN, DamagedFile
+from learn3d.files.findings import FETCH_AGAIN, DamagedFile
 from learn3d.files.reading import read_bytes
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -28,7 +28,7 @@ def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
     content = memoryview(read_bytes(path, limits.VOLUME_BYTES, wanted))
     order = {b"IM": "<", b"MI": ">"}.get(bytes(content[126:128]))
     if order is None:
-        raise DamagedFile(path, f"cannot be read: it has no header of MATLAB; expected {wanted}. {AGAIN}")
+        raise DamagedFile(path, f"cannot be read: it has no header of MATLAB; expected {wanted}. {FETCH_AGAIN}")
     for kind, element in _elements(content[128:], order):
         if kind == _COMPRESSED:
             unpacked = zlib.decompressobj().decompress(element, limits.SMALL_BYTES)
@@ -82,7 +82,7 @@ def read_binvox(path: Path, size: int) -> Binvox:
     except (KeyError, ValueError):
         found = b""
     if not found or not content.startswith(b"#binvox"):
-        raise DamagedFile(path, f"has no such header; expected {wanted}. {AGAIN}")
+        raise DamagedFile(path, f"has no such header; expected {wanted}. {FETCH_AGAIN}")
     if dim != [size] * 3:
         raise DamagedFile(path, f"holds {'x'.join(map(str, dim))} cells; expected {size}x{size}x{size}")
     low, high = limits.DISTANCE
@@ -90,6 +90,6 @@ def read_binvox(path: Path, size: int) -> Binvox:
         raise DamagedFile(path, f"has translate {translate} and scale {scale}; expected {low:g} .. {high:g}")
     pairs = np.frombuffer(runs[: len(runs) // 2 * 2], np.uint8).reshape(-1, 2)
     if (total := int(pairs[:, 1].sum(dtype=np.int64))) != size**3:
-        raise DamagedFile(path, f"its runs fill {total} cells; expected {size**3}. {AGAIN}")
+        raise DamagedFile(path, f"its runs fill {total} cells; expected {size**3}. {FETCH_AGAIN}")
     grid = np.repeat(pairs[:, 0] != 0, pairs[:, 1]).reshape(size, size, size)  # axes x, z, y
     return Binvox(np.ascontiguousarray(grid.transpose(0, 2, 1)), translate, scale)

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from learn3d.files.child import MEMORY, SECONDS, Call
-from learn3d.files.findings import AGAIN, DamagedFile, MissingFile
+from learn3d.files.findings import FETCH_AGAIN, DamagedFile, MissingFile
 
 _PATIENCE = 60.0  # seconds that a worker may be silent, beside one for every MiB of the file: disks can be slow
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -180,7 +180,7 @@ def _run(calls: list[Call]) -> list[Any]:
         fault = f"reading it was stopped after {patience:.0f} seconds"
     else:
         fault = f"the process that read it crashed (status {status})"
-    return [DamagedFile(calls[0].path, f"{fault}; expected {calls[0].wanted}. {AGAIN}")]
+    return [DamagedFile(calls[0].path, f"{fault}; expected {calls[0].wanted}. {FETCH_AGAIN}")]
 
 
 def _patience(call: Call) -> float:

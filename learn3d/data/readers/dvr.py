@@ -41,7 +41,7 @@ from learn3d.data.readers.renderings import (
     warn_of_repeats,
 )
 from learn3d.files import limits, npz, renderings
-from learn3d.files.findings import AGAIN, DamagedFile, Findings, MissingFile, Problem
+from learn3d.files.findings import FETCH_AGAIN, DamagedFile, Findings, MissingFile, Problem
 from learn3d.files.reading import read_text
 from learn3d.files.worker import Call
 
@@ -112,7 +112,7 @@ def object_ids(folder: Path | str, category: str, split: str) -> list[str]:
         found = ", ".join(_splits(Path(folder), category)) or "none"
         raise MissingFile(path, f"is missing; expected a list of object ids, one per line. Splits here: {found}")
     if not (ids := _read_list(path)):
-        raise DamagedFile(path, f"names no object; expected one id per line. {AGAIN}")
+        raise DamagedFile(path, f"names no object; expected one id per line. {FETCH_AGAIN}")
     check_ids(path, ids)
     return ids
 
@@ -139,7 +139,7 @@ class _Reader(ObjectReader):
 
     def calls(self, name: str) -> list[Call]:
         root = self.root / name
-        calls = [Call(renderings.check_folder, root, (f"the folder of an object that a list names. {AGAIN}",))]
+        calls = [Call(renderings.check_folder, root, (f"the folder of an object that a list names. {FETCH_AGAIN}",))]
         if root.is_dir():
             paths = [path for view in _view_paths(root) for path in view]
             calls += [Call(renderings.read_exactly, path, (IMAGE_SIZE,), "a rendering") for path in paths]

@@ -46,7 +46,7 @@ from learn3d.data.readers.renderings import (
     warn_of_repeats,
 )
 from learn3d.files import limits, renderings, volumes
-from learn3d.files.findings import AGAIN, DamagedFile, Findings, MissingFile, Problem
+from learn3d.files.findings import FETCH_AGAIN, DamagedFile, Findings, MissingFile, Problem
 from learn3d.files.reading import parse_json, read_bytes, read_text
 from learn3d.files.worker import Call
 
@@ -160,7 +160,7 @@ def read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
     try:
         lists = parse_json(content)
     except ValueError as error:
-        raise DamagedFile(path, f"cannot be read as JSON ({error}); {wanted}. {AGAIN}") from error
+        raise DamagedFile(path, f"cannot be read as JSON ({error}); {wanted}. {FETCH_AGAIN}") from error
     entries = lists.values() if isinstance(lists, dict) else [None]
     for entry in entries:
         named = [entry.get(split, []) for split in SPLITS] if isinstance(entry, dict) else [None]
@@ -186,7 +186,7 @@ class _Reader(ObjectReader):
         voxels, root = self._paths(name)
         calls = [
             Call(volumes.read_matlab, voxels, ("Volume", VOXEL_SIZE), "a MATLAB file of voxels"),
-            Call(renderings.check_folder, root, (f"the folder of an object that splits.json names. {AGAIN}",)),
+            Call(renderings.check_folder, root, (f"the folder of an object that splits.json names. {FETCH_AGAIN}",)),
         ]
         if root.is_dir():
             calls.append(Call(renderings.read_table, root / "view.txt", (self.views, 4, _TABLE), _TABLE))
