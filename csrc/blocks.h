@@ -9,26 +9,27 @@
 
 #include "lanes.h"
 #include "parallel.h"
+#include "stages.h"
 
 namespace nmr {
 
 // The rows of one image, in blocks. Each has an even number of rows, so that every 2x2 mean lies in one block.
 struct RowBlocks {
-  int64_t raster_size;  // R
+  Size raster;
   int64_t rows;         // per block
   int64_t count;
 
   // A block has at least 2^14 pixels, and at least a quarter as many pixels as there are faces, because it reads every face's mark.
-  RowBlocks(int64_t R, int64_t num_faces) : raster_size(R) {
+  RowBlocks(Size raster, int64_t num_faces) : raster(raster) {
     const int64_t pixels = std::max<int64_t>(int64_t(1) << 14, num_faces / 2);
-    rows = (pixels + R - 1) / R;
-    rows = std::min(rows + rows % 2, R);
-    count = (R + rows - 1) / rows;
+    rows = (pixels + raster.width - 1) / raster.width;
+    rows = std::min(rows + rows % 2, raster.height);
+    count = (raster.height + rows - 1) / rows;
   }
   int64_t first(int64_t block) const { return block * rows; }
-  int64_t last(int64_t block) const { return std::min(first(block) + rows, raster_size); }
+  int64_t last(int64_t block) const { return std::min(first(block) + rows, raster.height); }
   // Largest number of faces (originals and copies) that can own a pixel of one block.
-  int64_t most_visible(int64_t num_faces) const { return std::min(2 * num_faces, rows * raster_size); }
+  int64_t most_visible(int64_t num_faces) const { return std::min(2 * num_faces, rows * raster.width); }
 };
 
 // The faces that own a pixel, numbered from 1 in ascending order; the background is number 0.

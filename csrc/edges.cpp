@@ -16,9 +16,9 @@ namespace nmr {
 
 template <class T>
 void resolve_forward(const Resolve<T>& args) {
-  const int64_t S = args.image_size, C = args.channels, R = args.anti_aliasing ? 2 * S : S;
+  const int64_t S = args.image.width, C = args.channels, R = args.anti_aliasing ? 2 * S : S;
   parallel_for(args.batch * S, args.num_threads, [&](int64_t n) {  // n: image b, row y
-    const T* upper = args.image + n / S * R * R * C + n % S * (R / S) * R * C;
+    const T* upper = args.pixels + n / S * R * R * C + n % S * (R / S) * R * C;
     T* out = args.resolved + n * S * C;
     if (!args.anti_aliasing) {
       std::copy_n(upper, S * C, out);
@@ -32,11 +32,11 @@ void resolve_forward(const Resolve<T>& args) {
 
 template <class T>
 void resolve_backward(const Resolve<T>& args) {
-  const int64_t S = args.image_size, C = args.channels, R = args.anti_aliasing ? 2 * S : S;
+  const int64_t S = args.image.width, C = args.channels, R = args.anti_aliasing ? 2 * S : S;
   parallel_for(args.batch * R, args.num_threads, [&](int64_t n) {  // n: image b, raster row
     const int64_t per_pixel = R / S;
     const T* grad = args.grad_resolved + (n / R * S + n % R / per_pixel) * S * C;
-    T* out = args.grad_image + n * R * C;
+    T* out = args.grad_pixels + n * R * C;
     if (!args.anti_aliasing) {
       std::copy_n(grad, S * C, out);
       return;
@@ -272,7 +272,7 @@ NMR_INLINE void covered_box(const int32_t* owner, int64_t R, int64_t first[2], i
 
 template <class T>
 void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threads) {
-  const int64_t R = args.raster_size, C = args.channels, F = args.mesh.face_count(b);
+  const int64_t R = args.raster.width, C = args.channels, F = args.mesh.face_count(b);
   const T* vertices = args.mesh.image_vertices(b);
   const int64_t* faces = args.mesh.image_faces(b);
   T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);

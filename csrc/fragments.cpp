@@ -39,11 +39,11 @@ struct FragmentScratch {
     const int64_t most = blocks.most_visible(num_faces);
     visible.reserve_for(num_faces, most);
     reserve(table, (most + 1 + kWidth) * kEntry);
-    reserve(row, 13 * (blocks.raster_size + kWidth));
+    reserve(row, 13 * (blocks.raster.width + kWidth));
   }
   void reserve_for_backward(int64_t num_faces, const RowBlocks& blocks) {
     reserve_for(num_faces, blocks);
-    reserve(terms, blocks.raster_size * 12);
+    reserve(terms, blocks.raster.width * 12);
     reserve(sums, (blocks.most_visible(num_faces) + 1) * 12);
   }
   NMR_INLINE PixelRow<T> pixel_row(int64_t raster_size) {
@@ -65,7 +65,7 @@ struct Block {
 
 template <class T>
 Block<T> make_block(const MeshBatch<T>& mesh, const int32_t* owner, const RowBlocks& blocks, int64_t b, int64_t block) {
-  const int64_t R = blocks.raster_size;
+  const int64_t R = blocks.raster.width;
   return {mesh.image_vertices(b), mesh.image_faces(b),  mesh.face_count(b), R,
           owner + b * R * R,      blocks.first(block), blocks.last(block)};
 }
@@ -93,7 +93,7 @@ NMR_INLINE void set_up_faces(const Block<T>& block, FragmentScratch<T>& scratch)
     }
     for (int64_t n = 0; n < kWidth; ++n) {
       const Triangle<T> t{{corner[0][n], corner[1][n], corner[2][n]}, {corner[3][n], corner[4][n], corner[5][n]}, {1, 1, 1}};
-      const BarycentricMatrix<T> m = barycentric_matrix(t, size);
+      const BarycentricMatrix<T> m = barycentric_matrix(t, size, size);
       for (int k = 0; k < 3; ++k)
         for (int c = 0; c < 3; ++c) matrix[3 * c + k][n] = m.m[k][c];
     }
@@ -147,7 +147,7 @@ NMR_INLINE void evaluate_row(const Block<T>& block, int64_t j, int64_t first, in
 
 template <class T>
 NMR_INLINE void depth_block_body(const DepthImage<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch) {
-  const int64_t R = block.raster_size, S = args.image_size;
+  const int64_t R = block.raster_size, S = args.image.width;
   set_up_faces(block, scratch);
   T* image = args.depth + b * S * S;
   const PixelRow<T> row = scratch.pixel_row(R);
@@ -230,7 +230,7 @@ NMR_INLINE void depth_gradients(const FragmentScratch<T>& scratch, int64_t raste
 template <class T>
 NMR_INLINE void depth_gradient_block_body(const DepthImage<T>& args, const Block<T>& block, int64_t b,
                                           FragmentScratch<T>& scratch, FaceGradients<T>& result) {
-  const int64_t R = block.raster_size, S = args.image_size;
+  const int64_t R = block.raster_size, S = args.image.width;
   set_up_faces(block, scratch);
   const PixelRow<T> row = scratch.pixel_row(R);
   T *grad = row.spare, *terms = scratch.terms.data(), *sums = scratch.sums.data();
@@ -353,10 +353,10 @@ template <class Args, class T = std::remove_pointer_t<decltype(Args::depth)>>
 void forward(const Args& args, int64_t R) {
   const MeshBatch<T>& mesh = args.mesh;
   int64_t most_blocks = 1;
-  for (int64_t b = 0; b < mesh.batch; ++b) most_blocks = std::max(most_blocks, RowBlocks(R, mesh.face_count(b)).count);
+  for (int64_t b = 0; b < mesh.batch; ++b) most_blocks = std::max(most_blocks, RowBlocks({R, R}, mesh.face_count(b)).count);
   parallel_for(mesh.batch * most_blocks, args.num_threads, [&](int64_t task) {
     const int64_t b = task / most_blocks, block = task % most_blocks, F = mesh.face_count(b);
-    const RowBlocks blocks(R, F);
+    const RowBlocks blocks({R, R}, F);
     if (block >= blocks.count) return;
     FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
     scratch.reserve_for(F, blocks);
@@ -369,10 +369,10 @@ void backward(const Args& args, int64_t R) {
   const MeshBatch<T>& mesh = args.mesh;
   std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
   sum_blocks<FaceGradients<T>>(
-      mesh.batch, false, args.num_threads, [&](int64_t b) { return RowBlocks(R, mesh.face_count(b)).count; },
+      mesh.batch, false, args.num_threads, [&](int64_t b) { return RowBlocks({R, R}, mesh.face_count(b)).count; },
       [&](int64_t b, int64_t block, FaceGradients<T>& result) {
         const int64_t F = mesh.face_count(b);
-        const RowBlocks blocks(R, F);
+        const RowBlocks blocks({R, R}, F);
         FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
         scratch.reserve_for_backward(F, blocks);
         reserve(result.ids, blocks.most_visible(F));
@@ -388,22 +388,22 @@ void backward(const Args& args, int64_t R) {
 
 template <class T>
 void fragments_forward(const Fragments<T>& args) {
-  forward(args, args.raster_size);
+  forward(args, args.raster.width);
 }
 
 template <class T>
 void fragments_backward(const Fragments<T>& args) {
-  backward(args, args.raster_size);
+  backward(args, args.raster.width);
 }
 
 template <class T>
 void depth_forward(const DepthImage<T>& args) {
-  forward(args, args.anti_aliasing ? 2 * args.image_size : args.image_size);
+  forward(args, args.anti_aliasing ? 2 * args.image.width : args.image.width);
 }
 
 template <class T>
 void depth_backward(const DepthImage<T>& args) {
-  backward(args, args.anti_aliasing ? 2 * args.image_size : args.image_size);
+  backward(args, args.anti_aliasing ? 2 * args.image.width : args.image.width);
 }
 
 template void fragments_forward(const Fragments<float>&);

@@ -9,16 +9,16 @@
 
 namespace nmr {
 
-// Centre of raster column (or row) i in [-1, 1].
+// Centre of raster column (or row) i in [-1, 1]; size: the number of columns (or rows).
 template <class T>
-NMR_INLINE T pixel_centre(int64_t i, int64_t raster_size) {
-  return static_cast<T>(2 * i + 1 - raster_size) / static_cast<T>(raster_size);
+NMR_INLINE T pixel_centre(int64_t i, int64_t size) {
+  return static_cast<T>(2 * i + 1 - size) / static_cast<T>(size);
 }
 
-// Pixel coordinate of x in [-1, 1]: pixel centres are the integers.
+// Pixel coordinate of x (or y) in [-1, 1]: pixel centres are the integers. size: the number of columns (or rows).
 template <class T>
-NMR_INLINE T to_pixel(T x, T raster_size) {
-  return (x * raster_size + raster_size - 1) / 2;
+NMR_INLINE T to_pixel(T x, T size) {
+  return (x * size + size - 1) / 2;
 }
 
 // One face on the screen: corners in [-1, 1] and depths, in the vertex order in which it is drawn.
@@ -57,11 +57,11 @@ struct BarycentricMatrix {
 };
 
 template <class T>
-NMR_INLINE BarycentricMatrix<T> barycentric_matrix(const Triangle<T>& t, T raster_size) {
+NMR_INLINE BarycentricMatrix<T> barycentric_matrix(const Triangle<T>& t, T width, T height) {
   T X[3], Y[3];
   for (int k = 0; k < 3; ++k) {
-    X[k] = to_pixel(t.x[k], raster_size);
-    Y[k] = to_pixel(t.y[k], raster_size);
+    X[k] = to_pixel(t.x[k], width);
+    Y[k] = to_pixel(t.y[k], height);
   }
   const T det = X[2] * (Y[0] - Y[1]) + X[0] * (Y[1] - Y[2]) + X[1] * (Y[2] - Y[0]);
   return {{{(Y[1] - Y[2]) / det, (X[2] - X[1]) / det, (X[1] * Y[2] - X[2] * Y[1]) / det},

@@ -64,7 +64,7 @@ struct Rates {
 // if they are not defined; the rasterizer never makes such a face an owner.
 template <class T>
 bool screen_weights(const Triangle<T>& t, int64_t row, int64_t column, int64_t R, T (&w)[3]) {
-  const BarycentricMatrix<T> matrix = barycentric_matrix(t, static_cast<T>(R));
+  const BarycentricMatrix<T> matrix = barycentric_matrix(t, static_cast<T>(R), static_cast<T>(R));
   const T x = static_cast<T>(column), y = static_cast<T>(R - 1 - row);
   for (int k = 0; k < 3; ++k) w[k] = clamp_weight(matrix.m[k][0] * x + matrix.m[k][1] * y + matrix.m[k][2]);
   const T sum = w[0] + w[1] + w[2];
@@ -107,7 +107,7 @@ void pull_pixel(const LocalImage<T>& image, int64_t row, int64_t column, T* grad
 // Images in parallel; the pixels of an image in a fixed order, because they share vertices.
 template <class T>
 void local_gradient(const SilhouetteBackward<T>& args) {
-  const int64_t S = args.image_size, R = args.anti_aliasing ? 2 * S : S;
+  const int64_t S = args.image.width, R = args.anti_aliasing ? 2 * S : S;
   parallel_for(args.mesh.batch, args.num_threads, [&](int64_t b) {
     const LocalImage<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b), R, S,
                               args.anti_aliasing, args.eps, args.owner + b * R * R, args.grad_alpha + b * S * S};

@@ -78,7 +78,7 @@ template <class T>
 NMR_INLINE FacePlane<T> face_plane(const Image<T>& image, int32_t id) {
   const bool reversed = id >= image.num_faces;
   const Triangle<T> t = load_triangle(image.vertices, image.faces + 3 * (reversed ? id - image.num_faces : id), reversed);
-  return {barycentric_matrix(t, static_cast<T>(image.settings.raster_size)), {t.z[0], t.z[1], t.z[2]}};
+  return {barycentric_matrix(t, static_cast<T>(image.settings.raster.width), static_cast<T>(image.settings.raster.height)), {t.z[0], t.z[1], t.z[2]}};
 }
 
 // Depths at eight pixels of a row, as published.
@@ -163,7 +163,7 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
   constexpr int64_t kGroup = 16;
   FaceTable<T>& table = *image.table;
   const int64_t first = chunk * kChunk, last = std::min(first + kChunk, image.num_faces);
-  const T size = static_cast<T>(image.settings.raster_size);
+  const T size = static_cast<T>(image.settings.raster.width);
   const T near = image.settings.near, far = image.settings.far;
   const bool fill_back = image.settings.fill_back;
   const T* vertices = image.vertices;
@@ -406,7 +406,7 @@ NMR_CLONES void fill(const Image<double>& image, const Band<double>& band, int64
 
 template <class T>
 void rasterize(const Rasterize<T>& args) {
-  const int64_t R = args.settings.raster_size, batch = args.mesh.batch;
+  const int64_t R = args.settings.raster.width, batch = args.mesh.batch;
   // Many images: one thread per image. Few images: all threads share one image at a time.
   const bool share = batch < args.num_threads;
   const int64_t bands = share ? std::min<int64_t>(args.num_threads * 4, (R + 2 * kBlock - 1) / (2 * kBlock)) : 1;

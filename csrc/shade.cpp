@@ -97,7 +97,7 @@ int64_t first_cube(const TextureCubes<T>& args, int64_t b) {
 template <class T>
 void texture_cubes_forward(const TextureCubes<T>& args) {
   with_channels(args.channels, [&](auto known) {
-    const int64_t R = args.raster_size, C = known ? known() : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
+    const int64_t R = args.raster.width, C = known ? known() : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
     for_rows(args.batch, R, args.num_threads, [&](int64_t b, int64_t row) {
       const int64_t start = (b * R + row) * R, F = face_count(args, b);
       const T* textures = args.textures + first_cube(args, b) * cube;
@@ -118,7 +118,7 @@ namespace {
 // Adds the gradients of the pixels of image b whose face lies in [first_face, last_face) to its cubes.
 template <int64_t kChannels, class T>
 void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first_face, int64_t last_face) {
-  const int64_t R = args.raster_size, C = kChannels ? kChannels : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
+  const int64_t R = args.raster.width, C = kChannels ? kChannels : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
   const int64_t F = face_count(args, b);
   T* grad_textures = args.grad_textures + first_cube(args, b) * cube;
   for (int64_t n = b * R * R; n < (b + 1) * R * R; ++n) {
@@ -184,7 +184,7 @@ struct CornerSums {
 template <int64_t kChannels, class T>
 void interpolate_block_backward(const Interpolate<T>& args, const ImageAttributes<T>& image, const RowBlocks& blocks, int64_t b,
                                 int64_t block, CornerSums<T>& sums) {
-  const int64_t R = args.raster_size, C = kChannels ? kChannels : args.channels, F = image.num_faces;
+  const int64_t R = args.raster.width, C = kChannels ? kChannels : args.channels, F = image.num_faces;
   const int64_t begin = (b * R + blocks.first(block)) * R, end = (b * R + blocks.last(block)) * R;
   if (args.grad_attributes) {
     sums.visible.reserve_for(F, blocks.most_visible(F));
@@ -231,7 +231,7 @@ void scatter_corner_sums(const Interpolate<T>& args, const ImageAttributes<T>& i
 template <class T>
 void interpolate_forward(const Interpolate<T>& args) {
   with_channels(args.channels, [&](auto known) {
-    const int64_t R = args.raster_size, C = known ? known() : args.channels;
+    const int64_t R = args.raster.width, C = known ? known() : args.channels;
     for_rows(args.batch, R, args.num_threads, [&](int64_t b, int64_t row) {
       const ImageAttributes<T> image = image_attributes(args, b);
       const T* attributes = args.attributes + image.first_row * C;
@@ -256,7 +256,7 @@ template <class T>
 void interpolate_backward(const Interpolate<T>& args) {
   const int64_t rows = args.num_attributes * (args.starts ? 1 : args.attribute_batch);
   if (args.grad_attributes) std::fill_n(args.grad_attributes, rows * args.channels, T(0));
-  const auto blocks_of = [&](int64_t b) { return RowBlocks(args.raster_size, image_attributes(args, b).num_faces); };
+  const auto blocks_of = [&](int64_t b) { return RowBlocks(args.raster, image_attributes(args, b).num_faces); };
   sum_blocks<CornerSums<T>>(
       args.batch, !args.starts && args.attribute_batch == 1, args.num_threads, [&](int64_t b) { return blocks_of(b).count; },
       [&](int64_t b, int64_t block, CornerSums<T>& sums) {

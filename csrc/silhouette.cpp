@@ -15,7 +15,7 @@ namespace nmr {
 
 template <class T>
 void silhouette_forward(const SilhouetteForward<T>& args) {
-  const int64_t S = args.image_size, R = args.anti_aliasing ? 2 * S : S;
+  const int64_t S = args.image.width, R = args.anti_aliasing ? 2 * S : S;
   parallel_for(args.batch, args.num_threads, [&](int64_t b) {
     const int32_t* owner = args.owner + b * R * R;
     T* alpha = args.alpha + b * S * S;
@@ -308,7 +308,7 @@ NMR_CLONES void find_visible(const int32_t* owner, int64_t pixels, int64_t num_f
 
 template <class T>
 void silhouette_backward(const SilhouetteBackward<T>& args) {
-  const int64_t S = args.image_size, R = args.anti_aliasing ? 2 * S : S, batch = args.mesh.batch;
+  const int64_t S = args.image.width, R = args.anti_aliasing ? 2 * S : S, batch = args.mesh.batch;
   // Many images: one thread per image. Few images: all threads share one image at a time.
   const bool share = batch < args.num_threads;
   const int threads = share ? args.num_threads : 1;

@@ -7,7 +7,20 @@
 
 namespace nmr {
 
-// A batch of meshes. In renderer space x, y lie in [-1, 1] on the screen (y up) and z is the depth.
+// The pixels of an image or of a raster.
+struct Size {
+  int64_t height, width;
+
+  int64_t pixels() const { return height * width; }
+  bool operator==(const Size& other) const { return height == other.height && width == other.width; }
+};
+
+// The raster of an image: twice as fine with anti-aliasing.
+inline Size raster_of(Size image, bool anti_aliasing) {
+  return anti_aliasing ? Size{2 * image.height, 2 * image.width} : image;
+}
+
+// A batch of meshes. In renderer space x, y lie in [-1, 1] across the screen (y up) and z is the depth.
 template <class T>
 struct MeshBatch {
   const T* vertices;       // [B, V, 3], or packed [N, 3]
@@ -74,7 +87,7 @@ struct Project {
 // Settings of the rasterizer.
 template <class T>
 struct RasterSettings {
-  int64_t raster_size;  // R: pixels per side of the raster (2 S with anti-aliasing, else S)
+  Size raster;          // pixels of the raster: H x W
   bool fill_back;       // also draw every face with its vertex order reversed
   T near;               // pixels with depth <= near are not drawn
   T far;                // nor those with depth >= far
@@ -85,29 +98,29 @@ template <class T>
 struct Rasterize {
   MeshBatch<T> mesh;
   RasterSettings<T> settings;
-  int32_t* owner;  // out [B, R, R]; -1 background, f front, F + f reversed copy of f
+  int32_t* owner;  // out [B, H, W]; -1 background, f front, F + f reversed copy of f
   int num_threads;
 };
 
 // Coverage of an owner map, with NMR's gradient (silhouette.cpp) or that of Kato and Harada 2019 (local_gradient.cpp).
 template <class T>
 struct SilhouetteForward {
-  const int32_t* owner;  // [B, R, R]
+  const int32_t* owner;  // [B, H, W], of raster_of(image, anti_aliasing)
   int64_t batch;
-  int64_t image_size;    // S
-  bool anti_aliasing;    // R = 2 S, 2x2 mean
-  T* alpha;              // out [B, S, S]
+  Size image;            // h x w
+  bool anti_aliasing;    // 2x2 mean
+  T* alpha;              // out [B, h, w]
   int num_threads;
 };
 
 template <class T>
 struct SilhouetteBackward {
   MeshBatch<T> mesh;
-  int64_t image_size;
+  Size image;           // h x w
   bool anti_aliasing;
   T eps;                // NMR's: keeps the distance to an edge away from zero; local: if rates differ by less, the gradient is 0
-  const int32_t* owner; // [B, R, R]
-  const T* grad_alpha;  // [B, S, S]
+  const int32_t* owner; // [B, H, W]
+  const T* grad_alpha;  // [B, h, w]
   T* grad_vertices;     // out, like mesh.vertices; z gets 0
   int num_threads;
 };
@@ -116,13 +129,13 @@ struct SilhouetteBackward {
 template <class T>
 struct Fragments {
   MeshBatch<T> mesh;
-  int64_t raster_size;
+  Size raster;           // H x W
   T far;                 // depth of the background
-  const int32_t* owner;  // [B, R, R]
-  T* weights;            // forward out [B, R, R, 3]: of the face's own vertices 0, 1, 2, perspective-correct; 0 on background
-  T* depth;              // forward out [B, R, R]
-  const T* grad_weights; // backward in [B, R, R, 3], or nullptr
-  const T* grad_depth;   // backward in [B, R, R], or nullptr
+  const int32_t* owner;  // [B, H, W]
+  T* weights;            // forward out [B, H, W, 3]: of the face's own vertices 0, 1, 2, perspective-correct; 0 on background
+  T* depth;              // forward out [B, H, W]
+  const T* grad_weights; // backward in [B, H, W, 3], or nullptr
+  const T* grad_depth;   // backward in [B, H, W], or nullptr
   T* grad_vertices;      // backward out, like mesh.vertices
   int num_threads;
 };
@@ -131,12 +144,12 @@ struct Fragments {
 template <class T>
 struct DepthImage {
   MeshBatch<T> mesh;
-  int64_t image_size;
+  Size image;           // h x w
   bool anti_aliasing;
   T far;
   const int32_t* owner;
-  T* depth;             // forward out [B, S, S]
-  const T* grad_depth;  // backward in [B, S, S]
+  T* depth;             // forward out [B, h, w]
+  const T* grad_depth;  // backward in [B, h, w]
   T* grad_vertices;     // backward out, like mesh.vertices
   int num_threads;
 };
@@ -144,9 +157,10 @@ struct DepthImage {
 // Colours from texture cubes (shade.cpp): axis k of a cube is the weight of the face's vertex k.
 template <class T>
 struct TextureCubes {
-  const int32_t* owner;    // [B, R, R]
-  const T* weights;        // [B, R, R, 3] of Fragments
-  int64_t batch, raster_size;
+  const int32_t* owner;    // [B, H, W]
+  const T* weights;        // [B, H, W, 3] of Fragments
+  int64_t batch;
+  Size raster;             // H x W
   const T* textures;       // [B or 1, F, ts, ts, ts, C], or packed [M, ts, ts, ts, C]
   int64_t texture_batch;   // 1 or B when not packed
   int64_t num_faces;       // F (packed: M)
@@ -154,7 +168,7 @@ struct TextureCubes {
   int64_t texture_size;    // ts; a cube of one texel is constant
   int64_t channels;        // C
   T eps;                   // coordinates are clamped to [0, ts - 1 - eps]
-  T* colors;               // forward out [B, R, R, C]; 0 on background
+  T* colors;               // forward out [B, H, W, C]; 0 on background
   const T* grad_colors;    // backward in
   T* grad_textures;        // backward out, like textures
   int num_threads;
@@ -163,9 +177,10 @@ struct TextureCubes {
 // Values given at the corners of faces, interpolated over the pixels (shade.cpp).
 template <class T>
 struct Interpolate {
-  const int32_t* owner;      // [B, R, R]
-  const T* weights;          // [B, R, R, 3] of Fragments
-  int64_t batch, raster_size;
+  const int32_t* owner;      // [B, H, W]
+  const T* weights;          // [B, H, W, 3] of Fragments
+  int64_t batch;
+  Size raster;               // H x W
   const T* attributes;       // [B or 1, N, C], or packed [N, C]
   int64_t attribute_batch;   // 1 or B when not packed
   int64_t num_attributes;    // N
@@ -174,10 +189,10 @@ struct Interpolate {
   int64_t num_faces;         // F (packed: M)
   bool corners_per_image;
   const int64_t* starts;     // packed: [B + 1, 2], first attribute row and first face of each mesh; else nullptr
-  T* values;                 // forward out [B, R, R, C]; 0 on background
+  T* values;                 // forward out [B, H, W, C]; 0 on background
   const T* grad_values;      // backward in
   T* grad_attributes;        // backward out, like attributes, or nullptr
-  T* grad_weights;           // backward out [B, R, R, 3], or nullptr
+  T* grad_weights;           // backward out [B, H, W, 3], or nullptr
   int num_threads;
 };
 
@@ -185,13 +200,13 @@ struct Interpolate {
 template <class T>
 struct Resolve {
   int64_t batch;
-  int64_t image_size;      // S
-  bool anti_aliasing;      // R = 2 S
+  Size image;              // h x w
+  bool anti_aliasing;
   int64_t channels;        // C
-  const T* image;          // [B, R, R, C]
-  T* resolved;             // forward out [B, S, S, C]
+  const T* pixels;         // [B, H, W, C] of the raster
+  T* resolved;             // forward out [B, h, w, C]
   const T* grad_resolved;  // backward in
-  T* grad_image;           // backward out [B, R, R, C]
+  T* grad_pixels;          // backward out [B, H, W, C]
   int num_threads;
 };
 
@@ -199,12 +214,12 @@ struct Resolve {
 template <class T>
 struct EdgesBackward {
   MeshBatch<T> mesh;
-  int64_t raster_size;
+  Size raster;           // H x W
   T eps;
-  const int32_t* owner;  // [B, R, R]
-  const T* image;        // [B, R, R, C]
+  const int32_t* owner;  // [B, H, W]
+  const T* image;        // [B, H, W, C]
   int64_t channels;      // C
-  const T* grad_image;   // [B, R, R, C]
+  const T* grad_image;   // [B, H, W, C]
   T* grad_vertices;      // out, like mesh.vertices; z gets 0
   int num_threads;
 };

@@ -17,12 +17,13 @@ from ._validate import (
     check_depth_range,
     check_eps,
     check_faces,
-    check_size,
+    check_image_size,
     check_transformed,
     check_vertices,
     describe,
 )
 from .cameras import Camera
+from .cameras.projection import ProjectingCamera
 from .fragments import Fragments
 from .lights import Lights
 from .textures import Colors
@@ -33,22 +34,30 @@ Meshes = Tensor | Sequence[Tensor]
 
 
 class Scene(NamedTuple):
-    """Checked arguments: meshes before and after the camera, and the size of the raster."""
+    """Checked arguments: meshes before and after the camera, and height and width of the raster."""
 
     world: Tensor
     mesh: MeshBatch
     camera: Camera | None
-    raster_size: int
+    raster: tuple[int, int]
 
     def rasterize(self, fill_back: bool, near: float, far: float) -> Tensor:
-        return ops.rasterize(*self.mesh[:3], self.raster_size, bool(fill_back), float(near), float(far))
+        return ops.rasterize(*self.mesh[:3], *self.raster, bool(fill_back), float(near), float(far))
 
     def silhouette(
         self, anti_aliasing: bool, fill_back: bool, near: float, far: float, eps: float, local: bool = False
     ):
-        size = self.raster_size // 2 if anti_aliasing else self.raster_size
+        height, width = (size // 2 if anti_aliasing else size for size in self.raster)
         return ops.silhouette(
-            *self.mesh[:3], size, bool(anti_aliasing), bool(fill_back), float(near), float(far), float(eps), local
+            *self.mesh[:3],
+            height,
+            width,
+            bool(anti_aliasing),
+            bool(fill_back),
+            float(near),
+            float(far),
+            float(eps),
+            local,
         )
 
     def depth(self, owner: Tensor, anti_aliasing: bool, far: float) -> Tensor:
@@ -63,13 +72,13 @@ def make_scene(
     vertices: Meshes,
     faces: Meshes,
     camera: Camera | None,
-    image_size: int,
+    image_size: int | tuple[int, int],
     anti_aliasing: bool,
     near: float,
     far: float,
     eps: float = 1e-4,
 ) -> Scene:
-    size = check_size(image_size, "image_size", _LARGEST_IMAGE)
+    height, width = check_image_size(image_size, _LARGEST_IMAGE)
     check_depth_range(near, far)
     packed = is_list(vertices) or is_list(faces)
     if packed:
@@ -79,6 +88,8 @@ def make_scene(
     world = mesh.vertices
     if camera is not None:
         check_camera(camera, mesh.starts is not None)
+        if isinstance(camera, ProjectingCamera):
+            camera = camera.for_image(height, width)
         if mesh.starts is None:
             mesh = mesh._replace(vertices=camera.transform(world))
         else:
@@ -86,7 +97,8 @@ def make_scene(
         check_transformed(mesh.vertices, world, mesh.starts is not None)
     mesh = mesh._replace(faces=check_faces(mesh.faces, mesh.batch, mesh.vertices.device))
     check_eps(eps, mesh.vertices.dtype)
-    return Scene(world, mesh, camera, size * 2 if anti_aliasing else size)
+    scale = 2 if anti_aliasing else 1
+    return Scene(world, mesh, camera, (scale * height, scale * width))
 
 
 def shade(
@@ -96,7 +108,7 @@ def shade(
     background: float | Sequence[float] | Tensor,
     interpolation_gradient: bool,
 ) -> Tensor:
-    """The shaded raster ``[B, R, R, C]``, with the background filled in."""
+    """The shaded raster ``[B, H, W, C]``, with the background filled in."""
     if not interpolation_gradient:
         fragments = replace(fragments, weights=fragments.weights.detach())
     shape, covered = fragments.owner.shape, fragments.covered.unsqueeze(-1)
@@ -130,5 +142,5 @@ def average(image: Tensor, anti_aliasing: bool) -> Tensor:
     """Mean of 2x2 pixels, without the gradient of edges."""
     if not anti_aliasing:
         return image
-    batch, size, _, channels = image.shape
-    return image.view(batch, size // 2, 2, size // 2, 2, channels).mean((2, 4))
+    batch, height, width, channels = image.shape
+    return image.view(batch, height // 2, 2, width // 2, 2, channels).mean((2, 4))

@@ -135,15 +135,28 @@ def as_floats(value: object, name: str, wanted: str) -> Tensor:
     return tensor
 
 
-def check_size(value: object, name: str, largest: int) -> int:
+def check_size(value: object, name: str, largest: int, wanted: str = "an integer") -> int:
     """An integer in 1..largest."""
     if not isinstance(value, torch.SymInt):
         if isinstance(value, bool) or not hasattr(value, "__index__") or isinstance(value, Tensor):
-            raise TypeError(f"{name} must be an integer, got {describe(value)}")
+            raise TypeError(f"{name} must be {wanted}, got {describe(value)}")
         value = operator.index(value)
     if not 1 <= value <= largest:
         raise ValueError(f"{name} must lie in 1..{largest}, got {value}")
     return value
+
+
+def check_image_size(value: object, largest: int) -> tuple[int, int]:
+    """(height, width): an integer for a square image, or a pair of integers, each in 1..largest."""
+    if isinstance(value, Tensor | np.ndarray) and value.shape == (2,):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        if len(value) != 2:
+            raise ValueError(f"image_size must be an integer or a pair (height, width), got {value!r}")
+        height, width = (check_size(size, "image_size", largest) for size in value)
+        return height, width
+    size = check_size(value, "image_size", largest, "an integer or a pair (height, width)")
+    return size, size
 
 
 def check_choice(value: object, name: str, choices: tuple[str, ...]) -> None:

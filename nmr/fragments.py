@@ -25,18 +25,19 @@ _LARGEST = 1e12
 class Fragments:
     """The nearest face at each centre of the raster, made by :func:`nmr.render_fragments`.
 
-    R is the image size S, or 2 S with anti-aliasing. Row 0 is the top. For shading of your own, compute an image
-    ``[B, R, R, C]`` from these and call :meth:`resolve`, which averages pixels and gives the vertices NMR's gradient.
+    H and W are those of the image, or twice as many with anti-aliasing. Row 0 is the top. For shading of your own,
+    compute an image
+    ``[B, H, W, C]`` from these and call :meth:`resolve`, which averages pixels and gives the vertices NMR's gradient.
 
     Attributes
     ----------
-    owner : int32 Tensor [B, R, R]
+    owner : int32 Tensor [B, H, W]
         ``owner[b, y, x] = f``: face f is nearest and seen from its front; ``F + f``: from its back; -1: background.
-    weights : Tensor [B, R, R, 3]
+    weights : Tensor [B, H, W, 3]
         Perspective-correct barycentric weights of the face's vertices in their own order; their sum is 1. 0 on
         background. Differentiable in the vertices (at fixed owner). Use ``weights.detach()`` for NMR's definition, in
         which colours move vertices only through edges.
-    depth : Tensor [B, R, R]
+    depth : Tensor [B, H, W]
         z of the nearest point, ``far`` on background. Differentiable in the vertices (at fixed owner).
     vertices, faces
         The meshes in renderer space, ``[B, V, 3]``; for a list of meshes ``[N, 3]``, one mesh after the other.
@@ -61,21 +62,21 @@ class Fragments:
 
     @property
     def covered(self) -> Tensor:
-        """bool ``[B, R, R]``: some face is there."""
+        """bool ``[B, H, W]``: some face is there."""
         return self.owner >= 0
 
     @property
     def is_back(self) -> Tensor:
-        """bool ``[B, R, R]``: the face there is seen from its back (its vertices run clockwise on the screen)."""
+        """bool ``[B, H, W]``: the face there is seen from its back (its vertices run clockwise on the screen)."""
         return self.owner >= self.mesh.num_faces
 
     @property
     def face_index(self) -> Tensor:
-        """int32 ``[B, R, R]``: f where face f is nearest, seen from either side; -1 is background."""
+        """int32 ``[B, H, W]``: f where face f is nearest, seen from either side; -1 is background."""
         return torch.where(self.is_back, self.owner - self.mesh.num_faces, self.owner)
 
     def interpolate(self, attributes: Tensor | list[Tensor], corners: Tensor | list[Tensor] | None = None) -> Tensor:
-        """Values given at vertices, interpolated at each pixel: ``[B, R, R, C]``, 0 on background.
+        """Values given at vertices, interpolated at each pixel: ``[B, H, W, C]``, 0 on background.
 
         Parameters
         ----------
@@ -97,7 +98,7 @@ class Fragments:
         return ops.interpolate(attributes, faces, self.owner, self.weights, starts)
 
     def per_face(self, values: Tensor | list[Tensor]) -> Tensor:
-        """Values of faces, ``[F, C]``, ``[B, F, C]`` or a list, at each pixel: ``[B, R, R, C]``, 0 on background."""
+        """Values of faces, ``[F, C]``, ``[B, F, C]`` or a list, at each pixel: ``[B, H, W, C]``, 0 on background."""
         return self._per_face(values, "values")
 
     def _per_face(self, values: object, name: str) -> Tensor:
@@ -117,7 +118,7 @@ class Fragments:
         return F.embedding(index, rows, padding_idx=len(rows) - 1)
 
     def normals(self, smooth: bool = False) -> Tensor:
-        """Unit normals in world space of the side that is seen, ``[B, R, R, 3]``, 0 on background.
+        """Unit normals in world space of the side that is seen, ``[B, H, W, 3]``, 0 on background.
 
         Flat: the normal of the face. Smooth: the normals of its vertices (means over the adjacent faces, weighted by
         area), interpolated. If the camera does not mirror the world (LookAt does not), the front of face (v0, v1, v2)
@@ -181,7 +182,7 @@ class Fragments:
         return (torch.linalg.cross(sides[:, 0], sides[:, 1], dim=-1) * sides[:, 2]).sum(-1).view(-1, 1, 1) < 0
 
     def resolve(self, image: Tensor) -> Tensor:
-        """The image ``[B, S, S, C]`` of a shaded raster ``[B, R, R, C]``, with NMR's gradient.
+        """The image ``[B, h, w, C]`` of a shaded raster ``[B, H, W, C]``, with NMR's gradient.
 
         The mean of 2x2 pixels with anti-aliasing, else the image itself. The gradient goes back to the raster and, by
         NMR's definition, to x and y of the vertices: every visible edge is pulled by those pixels whose loss would fall
@@ -190,7 +191,7 @@ class Fragments:
         Raises
         ------
         TypeError, ValueError
-            If image is not a float tensor [B, R, R, C] of the dtype of the vertices.
+            If image is not a float tensor [B, H, W, C] of the dtype of the vertices.
         """
         if not isinstance(image, Tensor) or image.dtype != self.vertices.dtype:
             raise TypeError(

@@ -85,7 +85,7 @@ class Lights:
             )
 
     def shade(self, fragments: Fragments) -> Tensor:
-        """The light on each pixel, ``[B, R, R, 3]``; undefined on background."""
+        """The light on each pixel, ``[B, H, W, 3]``; undefined on background."""
         rows = {
             "ambient": self.ambient.reshape(-1, 1),
             "ambient_color": self.ambient_color.reshape(-1, 3),

@@ -26,7 +26,7 @@ def render(
     colors: Colors | None = None,
     lights: Lights | None = None,
     background: float | Sequence[float] | Tensor = 0.0,
-    image_size: int = 256,
+    image_size: int | tuple[int, int] = 256,
     anti_aliasing: bool = True,
     fill_back: bool = True,
     near: float = 0.1,
@@ -116,7 +116,7 @@ def render_rgb(
     colors: Colors | None = None,
     lights: Lights | None = None,
     background: float | Sequence[float] | Tensor = 0.0,
-    image_size: int = 256,
+    image_size: int | tuple[int, int] = 256,
     anti_aliasing: bool = True,
     fill_back: bool = True,
     near: float = 0.1,
@@ -128,7 +128,7 @@ def render_rgb(
 
     Returns
     -------
-    Tensor [B, S, S, C]
+    Tensor [B, h, w, C]
         ``rgb[b, y, x]`` is the colour of the pixel in row y from the top, with as many channels as ``colors`` have.
 
     Examples
@@ -160,7 +160,7 @@ def render_silhouette(
     faces: Meshes,
     camera: Camera | None = None,
     *,
-    image_size: int = 256,
+    image_size: int | tuple[int, int] = 256,
     anti_aliasing: bool = True,
     fill_back: bool = True,
     near: float = 0.1,
@@ -180,10 +180,11 @@ def render_silhouette(
         Vertex indices. A face is seen from its front where its vertices run counter-clockwise on the screen.
     camera : Camera, optional
         For example :class:`nmr.LookAt`.
-    image_size : int
-        S, pixels per side.
+    image_size : int or (height, width)
+        Pixels: h and w; an int means a square. x and y in renderer space go from -1 to 1 across the whole image.
+        LookAt, Look and Orthographic have square pixels: their field of view belongs to the shorter side.
     anti_aliasing : bool
-        Render 2S x 2S pixels and average 2x2 of them.
+        Render 2h x 2w pixels and average 2x2 of them.
     fill_back : bool
         Also draw faces that are seen from behind (clockwise on the screen). LookAt, Look and Orthographic show mesh
         files mirrored, so that their outsides are clockwise.
@@ -197,7 +198,7 @@ def render_silhouette(
 
     Returns
     -------
-    Tensor [B, S, S], dtype and device of ``vertices``
+    Tensor [B, h, w], dtype and device of ``vertices``
         ``alpha[b, y, x]`` is the covered part (0 or 1; with anti-aliasing 0, 1/4, ... 1) of the pixel in row y from the
         top.
 
@@ -211,8 +212,8 @@ def render_silhouette(
     on the batch size. There are no second derivatives.
 
     The local gradient is that of Kato and Harada 2019 (view prior learning). I is the coverage (0 or 1) of pixels of
-    the raster of R x R pixels (R = 2S with anti-aliasing, else S). g is the gradient of the loss with respect to I
-    (with anti-aliasing a quarter of the gradient of the image pixel). i and j are neighbours, j to the right of i::
+    the raster, R is its width (for y its height). g is the gradient of the loss with respect to I (with anti-aliasing a
+    quarter of the gradient of the image pixel). i and j are neighbours, j to the right of i::
 
         right(i, j) = -(I_i - I_j) g_j R / 2    rate at which the loss falls if the content of i moves to j
         left(i, j)  = -(I_j - I_i) g_i R / 2    rate at which the loss falls if the content of j moves to i
@@ -251,7 +252,7 @@ def render_depth(
     faces: Meshes,
     camera: Camera | None = None,
     *,
-    image_size: int = 256,
+    image_size: int | tuple[int, int] = 256,
     anti_aliasing: bool = True,
     fill_back: bool = True,
     near: float = 0.1,
@@ -261,7 +262,7 @@ def render_depth(
 
     Returns
     -------
-    Tensor [B, S, S]
+    Tensor [B, h, w]
         ``depth[b, y, x]`` is z of the nearest face at the pixel in row y from the top, ``far`` where there is none.
         With anti-aliasing it is the mean of 2x2 pixels, so that edges mix in ``far``, as published; else z is exact.
 
@@ -291,7 +292,7 @@ def render_normals(
     camera: Camera | None = None,
     *,
     smooth: bool = False,
-    image_size: int = 256,
+    image_size: int | tuple[int, int] = 256,
     anti_aliasing: bool = True,
     fill_back: bool = True,
     near: float = 0.1,
@@ -301,7 +302,7 @@ def render_normals(
 
     Returns
     -------
-    Tensor [B, S, S, 3]
+    Tensor [B, h, w, 3]
         ``normals[b, y, x]`` is the unit normal of the side that is seen (:meth:`Fragments.normals`) at the pixel in row
         y from the top: the normal of the face or, with ``smooth``, the interpolated normal of its vertices. 0 where
         there is no face. With anti-aliasing it is the mean of 2x2 pixels, and shorter than 1 at edges.
@@ -332,7 +333,7 @@ def render_fragments(
     faces: Meshes,
     camera: Camera | None = None,
     *,
-    image_size: int = 256,
+    image_size: int | tuple[int, int] = 256,
     anti_aliasing: bool = False,
     fill_back: bool = True,
     near: float = 0.1,
@@ -344,7 +345,7 @@ def render_fragments(
     Returns
     -------
     Fragments
-        S x S pixels; with ``anti_aliasing`` 2S x 2S pixels, which :meth:`Fragments.resolve` averages.
+        h x w pixels; with ``anti_aliasing`` 2h x 2w pixels, which :meth:`Fragments.resolve` averages.
 
     Notes
     -----
@@ -371,7 +372,7 @@ def render_face_index(
     faces: Meshes,
     camera: Camera | None = None,
     *,
-    image_size: int = 256,
+    image_size: int | tuple[int, int] = 256,
     fill_back: bool = True,
     near: float = 0.1,
     far: float = 100.0,
@@ -380,7 +381,7 @@ def render_face_index(
 
     Returns
     -------
-    int32 Tensor [B, S, S]
+    int32 Tensor [B, h, w]
         ``face_index[b, y, x] = f`` means face f is nearest there (seen from either side); -1 is background. Row 0 is
         the top. Of equally near faces the first one is taken. Not differentiable.
 

@@ -1,6 +1,6 @@
 """Colours of meshes: per vertex, per face, cubes of texels, images with uv coordinates, or a class of your own.
 
-Any object with ``sample(fragments) -> [B, R, R, C]`` can be used as colours: see :class:`Colors`.
+Any object with ``sample(fragments) -> [B, H, W, C]`` can be used as colours: see :class:`Colors`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Colors(Protocol):
     """The interface of colours: write a class with this method for shading of your own."""
 
     def sample(self, fragments: Fragments) -> Tensor:
-        """``[B, R, R, C]`` in the dtype of the vertices; values on the background are ignored."""
+        """``[B, H, W, C]`` in the dtype of the vertices; values on the background are ignored."""
         ...
 
 
@@ -58,7 +58,7 @@ class VertexColors:
         check_values(self.colors, "colors", "V, C")
 
     def sample(self, fragments: Fragments) -> Tensor:
-        """Colours ``[B, R, R, C]`` of fragments, 0 on background."""
+        """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
         return fragments._interpolate(self.colors, None, "colors", "")
 
 
@@ -90,7 +90,7 @@ class FaceColors:
         check_values(self.colors, "colors", "F, C")
 
     def sample(self, fragments: Fragments) -> Tensor:
-        """Colours ``[B, R, R, C]`` of fragments, 0 on background."""
+        """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
         return fragments._per_face(self.colors, "colors")
 
 
@@ -132,7 +132,7 @@ class TextureCubes:
                 )
 
     def sample(self, fragments: Fragments) -> Tensor:
-        """Colours ``[B, R, R, C]`` of fragments, 0 on background."""
+        """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
         textures = check_values(self.textures, "textures", "F, ts, ts, ts, C")
         textures = fragments.mesh.values(textures, "textures", "face")
         return ops.sample_texture_cubes(
@@ -190,7 +190,7 @@ class UVTexture:
             raise ValueError(f'wrap must be "repeat", "clamp" or "mirror", got {self.wrap!r}')
 
     def sample(self, fragments: Fragments) -> Tensor:
-        """Colours ``[B, R, R, C]`` of fragments, 0 on background."""
+        """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
         uv = fragments._interpolate(self.uv, self.uv_faces, "uv", "uv_faces")
         uv = torch.where(uv.detach().abs() < 1e6, uv, torch.zeros_like(uv))
         texels, first, height, width = self._texels(fragments)

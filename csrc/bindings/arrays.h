@@ -97,11 +97,11 @@ MeshBatch<T> mesh_batch(const Array<T>& vertices, const Indices& faces, const st
   return mesh;
 }
 
-// R of an owner map [B, R, R]; each of its entries must name a face of its image, or a reversed copy of one.
+// The raster of an owner map [B, H, W]; each of its entries must name a face of its image, or a reversed copy of one.
 template <class FaceCount>
-int64_t require_owner(const Array<int32_t>& owner, int64_t batch, const FaceCount& face_count, int num_threads) {
-  require(owner.ndim() == 3 && owner.shape(0) == batch && owner.shape(1) == owner.shape(2),
-          "owner must have shape [" + std::to_string(batch) + ", R, R], got " + shape_of(owner));
+Size require_owner(const Array<int32_t>& owner, int64_t batch, const FaceCount& face_count, int num_threads) {
+  require(owner.ndim() == 3 && owner.shape(0) == batch,
+          "owner must have shape [" + std::to_string(batch) + ", H, W], got " + shape_of(owner));
   const int64_t pixels = owner.shape(1) * owner.shape(2);
   const int32_t* entries = owner.data();
   parallel_for(batch, num_threads, [&](int64_t b) {
@@ -111,12 +111,19 @@ int64_t require_owner(const Array<int32_t>& owner, int64_t batch, const FaceCoun
     for (int64_t n = 0; n < pixels; ++n) wrong |= static_cast<uint32_t>(entry[n]) + 1 > limit;
     require(!wrong, "the owner map does not belong to these faces");
   });
-  return owner.shape(1);
+  return {owner.shape(1), owner.shape(2)};
 }
 
 template <class T>
-int64_t require_owner(const Array<int32_t>& owner, const MeshBatch<T>& mesh, int num_threads) {
+Size require_owner(const Array<int32_t>& owner, const MeshBatch<T>& mesh, int num_threads) {
   return require_owner(owner, mesh.batch, [&](int64_t b) { return mesh.face_count(b); }, num_threads);
+}
+
+// The image of a raster: half its size with anti-aliasing.
+inline Size require_image(const Array<int32_t>& owner, Size raster, bool anti_aliasing) {
+  require(!anti_aliasing || (raster.height % 2 == 0 && raster.width % 2 == 0),
+          "an anti-aliased owner map has an even size, got " + shape_of(owner));
+  return anti_aliasing ? Size{raster.height / 2, raster.width / 2} : raster;
 }
 
 // The parts of the module, one per file.

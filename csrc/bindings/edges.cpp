@@ -4,22 +4,21 @@
 namespace nmr {
 namespace {
 
-// `image` is [B, R, R, C], `resolved` [B, S, S, C].
+// `pixels` is [B, H, W, C], `resolved` [B, h, w, C].
 template <class T>
-Resolve<T> resolve_args(const Array<T>& image, const Array<T>& resolved, bool anti_aliasing, int num_threads) {
-  require(resolved.ndim() == 4, "a resolved image must have shape [B, S, S, C], got " + shape_of(resolved));
-  const int64_t batch = resolved.shape(0), image_size = resolved.shape(1), channels = resolved.shape(3);
-  const int64_t raster_size = anti_aliasing ? 2 * image_size : image_size;
-  require(image_size >= 1 && channels >= 1, "an image must have pixels and channels, got " + shape_of(resolved));
-  require_shape(resolved, "a resolved image", {batch, image_size, image_size, channels});
-  require_shape(image, "image", {batch, raster_size, raster_size, channels});
-  return {batch, image_size, anti_aliasing, channels, nullptr, nullptr, nullptr, nullptr, num_threads};
+Resolve<T> resolve_args(const Array<T>& pixels, const Array<T>& resolved, bool anti_aliasing, int num_threads) {
+  require(resolved.ndim() == 4, "a resolved image must have shape [B, h, w, C], got " + shape_of(resolved));
+  const int64_t batch = resolved.shape(0), channels = resolved.shape(3);
+  const Size image{resolved.shape(1), resolved.shape(2)}, raster = raster_of(image, anti_aliasing);
+  require(image.height >= 1 && image.width >= 1 && channels >= 1, "an image must have pixels and channels, got " + shape_of(resolved));
+  require_shape(pixels, "image", {batch, raster.height, raster.width, channels});
+  return {batch, image, anti_aliasing, channels, nullptr, nullptr, nullptr, nullptr, num_threads};
 }
 
 template <class T>
 void resolve_forward_py(const Array<T>& image, Array<T>& resolved, bool anti_aliasing, int num_threads) {
   Resolve<T> args = resolve_args(image, resolved, anti_aliasing, num_threads);
-  args.image = image.data();
+  args.pixels = image.data();
   args.resolved = resolved.mutable_data();
   py::gil_scoped_release release;
   resolve_forward(args);
@@ -29,7 +28,7 @@ template <class T>
 void resolve_backward_py(const Array<T>& grad_resolved, Array<T>& grad_image, bool anti_aliasing, int num_threads) {
   Resolve<T> args = resolve_args(grad_image, grad_resolved, anti_aliasing, num_threads);
   args.grad_resolved = grad_resolved.data();
-  args.grad_image = grad_image.mutable_data();
+  args.grad_pixels = grad_image.mutable_data();
   py::gil_scoped_release release;
   resolve_backward(args);
 }
@@ -39,13 +38,13 @@ void edges_backward_py(const Array<T>& vertices, const Indices& faces, const std
                        const Array<int32_t>& owner, const Array<T>& image, const Array<T>& grad_image, Array<T>& grad_vertices,
                        double eps, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const int64_t raster_size = require_owner(owner, mesh, num_threads);
-  require(image.ndim() == 4 && image.shape(3) >= 1, "image must have shape [B, R, R, C], got " + shape_of(image));
-  require_shape(image, "image", {mesh.batch, raster_size, raster_size, image.shape(3)});
+  const Size raster = require_owner(owner, mesh, num_threads);
+  require(image.ndim() == 4 && image.shape(3) >= 1, "image must have shape [B, H, W, C], got " + shape_of(image));
+  require_shape(image, "image", {mesh.batch, raster.height, raster.width, image.shape(3)});
   require_like(grad_image, "grad_image", image);
   require_like(grad_vertices, "grad_vertices", vertices);
-  const EdgesBackward<T> args{mesh,           raster_size,       static_cast<T>(eps),          owner.data(), image.data(),
-                              image.shape(3), grad_image.data(), grad_vertices.mutable_data(), num_threads};
+  const EdgesBackward<T> args{mesh, raster, static_cast<T>(eps), owner.data(), image.data(), image.shape(3), grad_image.data(),
+                              grad_vertices.mutable_data(), num_threads};
   py::gil_scoped_release release;
   edges_backward(args);
 }

@@ -8,16 +8,16 @@ template <class T>
 Fragments<T> fragments_args(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
                             const Array<int32_t>& owner, double far, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const int64_t raster_size = require_owner(owner, mesh, num_threads);
-  return {mesh, raster_size, static_cast<T>(far), owner.data(), nullptr, nullptr, nullptr, nullptr, nullptr, num_threads};
+  const Size raster = require_owner(owner, mesh, num_threads);
+  return {mesh, raster, static_cast<T>(far), owner.data(), nullptr, nullptr, nullptr, nullptr, nullptr, num_threads};
 }
 
 template <class T>
 void fragments_forward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
                           const Array<int32_t>& owner, Array<T>& weights, Array<T>& depth, double far, int num_threads) {
   Fragments<T> args = fragments_args(vertices, faces, starts, owner, far, num_threads);
-  require_shape(weights, "weights", {args.mesh.batch, args.raster_size, args.raster_size, 3});
-  require_shape(depth, "depth", {args.mesh.batch, args.raster_size, args.raster_size});
+  require_shape(weights, "weights", {args.mesh.batch, args.raster.height, args.raster.width, 3});
+  require_shape(depth, "depth", {args.mesh.batch, args.raster.height, args.raster.width});
   args.weights = weights.mutable_data();
   args.depth = depth.mutable_data();
   py::gil_scoped_release release;
@@ -30,11 +30,11 @@ void fragments_backward_py(const Array<T>& vertices, const Indices& faces, const
                            const std::optional<Array<T>>& grad_depth, Array<T>& grad_vertices, int num_threads) {
   Fragments<T> args = fragments_args(vertices, faces, starts, owner, 0, num_threads);
   if (grad_weights) {
-    require_shape(*grad_weights, "grad_weights", {args.mesh.batch, args.raster_size, args.raster_size, 3});
+    require_shape(*grad_weights, "grad_weights", {args.mesh.batch, args.raster.height, args.raster.width, 3});
     args.grad_weights = grad_weights->data();
   }
   if (grad_depth) {
-    require_shape(*grad_depth, "grad_depth", {args.mesh.batch, args.raster_size, args.raster_size});
+    require_shape(*grad_depth, "grad_depth", {args.mesh.batch, args.raster.height, args.raster.width});
     args.grad_depth = grad_depth->data();
   }
   require_like(grad_vertices, "grad_vertices", vertices);
@@ -47,16 +47,15 @@ template <class T>
 DepthImage<T> depth_args(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
                          const Array<int32_t>& owner, bool anti_aliasing, double far, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const int64_t raster_size = require_owner(owner, mesh, num_threads), image_size = anti_aliasing ? raster_size / 2 : raster_size;
-  require(!anti_aliasing || raster_size % 2 == 0, "an anti-aliased owner map has an even size, got " + shape_of(owner));
-  return {mesh, image_size, anti_aliasing, static_cast<T>(far), owner.data(), nullptr, nullptr, nullptr, num_threads};
+  const Size image = require_image(owner, require_owner(owner, mesh, num_threads), anti_aliasing);
+  return {mesh, image, anti_aliasing, static_cast<T>(far), owner.data(), nullptr, nullptr, nullptr, num_threads};
 }
 
 template <class T>
 void depth_forward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
                       const Array<int32_t>& owner, Array<T>& depth, bool anti_aliasing, double far, int num_threads) {
   DepthImage<T> args = depth_args(vertices, faces, starts, owner, anti_aliasing, far, num_threads);
-  require_shape(depth, "depth", {args.mesh.batch, args.image_size, args.image_size});
+  require_shape(depth, "depth", {args.mesh.batch, args.image.height, args.image.width});
   args.depth = depth.mutable_data();
   py::gil_scoped_release release;
   depth_forward(args);
@@ -67,7 +66,7 @@ void depth_backward_py(const Array<T>& vertices, const Indices& faces, const std
                        const Array<int32_t>& owner, const Array<T>& grad_depth, Array<T>& grad_vertices, bool anti_aliasing,
                        int num_threads) {
   DepthImage<T> args = depth_args(vertices, faces, starts, owner, anti_aliasing, 0, num_threads);
-  require_shape(grad_depth, "grad_depth", {args.mesh.batch, args.image_size, args.image_size});
+  require_shape(grad_depth, "grad_depth", {args.mesh.batch, args.image.height, args.image.width});
   require_like(grad_vertices, "grad_vertices", vertices);
   args.grad_depth = grad_depth.data();
   args.grad_vertices = grad_vertices.mutable_data();

@@ -8,22 +8,21 @@ template <class T>
 void rasterize_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts, Array<int32_t>& owner,
                   bool fill_back, double near, double far, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  require(owner.ndim() == 3 && owner.shape(1) >= 1 && owner.shape(1) <= 16384,
-          "owner must have shape [B, R, R] with R in 1..16384, got " + shape_of(owner));
-  const int64_t raster_size = owner.shape(1);
-  require_shape(owner, "owner", {mesh.batch, raster_size, raster_size});
-  const Rasterize<T> args{mesh, {raster_size, fill_back, static_cast<T>(near), static_cast<T>(far)}, owner.mutable_data(), num_threads};
+  require(owner.ndim() == 3 && owner.shape(0) == mesh.batch && owner.shape(1) >= 1 && owner.shape(1) <= 16384 &&
+              owner.shape(2) >= 1 && owner.shape(2) <= 16384,
+          "owner must have shape [" + std::to_string(mesh.batch) + ", H, W] with H and W in 1..16384, got " + shape_of(owner));
+  const Size raster{owner.shape(1), owner.shape(2)};
+  const Rasterize<T> args{mesh, {raster, fill_back, static_cast<T>(near), static_cast<T>(far)}, owner.mutable_data(), num_threads};
   py::gil_scoped_release release;
   rasterize(args);
 }
 
 template <class T>
 void silhouette_forward_py(const Array<int32_t>& owner, Array<T>& alpha, bool anti_aliasing, int num_threads) {
-  require(alpha.ndim() == 3, "alpha must have shape [B, S, S], got " + shape_of(alpha));
-  const int64_t batch = alpha.shape(0), image_size = alpha.shape(1), raster_size = anti_aliasing ? 2 * image_size : image_size;
-  require_shape(alpha, "alpha", {batch, image_size, image_size});
-  require_shape(owner, "owner", {batch, raster_size, raster_size});
-  const SilhouetteForward<T> args{owner.data(), batch, image_size, anti_aliasing, alpha.mutable_data(), num_threads};
+  require(alpha.ndim() == 3, "alpha must have shape [B, h, w], got " + shape_of(alpha));
+  const Size image{alpha.shape(1), alpha.shape(2)}, raster = raster_of(image, anti_aliasing);
+  require_shape(owner, "owner", {alpha.shape(0), raster.height, raster.width});
+  const SilhouetteForward<T> args{owner.data(), alpha.shape(0), image, anti_aliasing, alpha.mutable_data(), num_threads};
   py::gil_scoped_release release;
   silhouette_forward(args);
 }
@@ -33,11 +32,10 @@ void silhouette_backward_py(const Array<T>& vertices, const Indices& faces, cons
                             const Array<int32_t>& owner, const Array<T>& grad_alpha, Array<T>& grad_vertices, bool anti_aliasing,
                             double eps, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const int64_t raster_size = require_owner(owner, mesh, num_threads), image_size = anti_aliasing ? raster_size / 2 : raster_size;
-  require(!anti_aliasing || raster_size % 2 == 0, "an anti-aliased owner map has an even size, got " + shape_of(owner));
-  require_shape(grad_alpha, "grad_alpha", {mesh.batch, image_size, image_size});
+  const Size image = require_image(owner, require_owner(owner, mesh, num_threads), anti_aliasing);
+  require_shape(grad_alpha, "grad_alpha", {mesh.batch, image.height, image.width});
   require_like(grad_vertices, "grad_vertices", vertices);
-  const SilhouetteBackward<T> args{mesh, image_size, anti_aliasing, static_cast<T>(eps), owner.data(), grad_alpha.data(),
+  const SilhouetteBackward<T> args{mesh, image, anti_aliasing, static_cast<T>(eps), owner.data(), grad_alpha.data(),
                                    grad_vertices.mutable_data(), num_threads};
   py::gil_scoped_release release;
   backward(args);

@@ -4,14 +4,14 @@
 namespace nmr {
 namespace {
 
-// Checks weights [B, R, R, 3] and an owner map of the given number of faces (packed: those of starts).
+// Checks weights [B, H, W, 3] and an owner map of the given number of faces (packed: those of starts).
 template <class T>
 void require_fragments(const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts,
                        int64_t num_faces, int num_threads) {
   const int64_t batch = starts ? starts->shape(0) - 1 : owner.ndim() == 3 ? owner.shape(0) : 0;
   const int64_t* s = starts ? starts->data() : nullptr;
-  const int64_t R = require_owner(owner, batch, [&](int64_t b) { return s ? s[2 * b + 3] - s[2 * b + 1] : num_faces; }, num_threads);
-  require_shape(weights, "weights", {batch, R, R, 3});
+  const Size raster = require_owner(owner, batch, [&](int64_t b) { return s ? s[2 * b + 3] - s[2 * b + 1] : num_faces; }, num_threads);
+  require_shape(weights, "weights", {batch, raster.height, raster.width, 3});
 }
 
 // --- texture cubes
@@ -35,7 +35,7 @@ TextureCubes<T> texture_args(const Array<T>& textures, const Array<int32_t>& own
   args.owner = owner.data();
   args.weights = weights.data();
   args.batch = owner.shape(0);
-  args.raster_size = owner.shape(1);
+  args.raster = {owner.shape(1), owner.shape(2)};
   args.textures = textures.data();
   args.texture_batch = texture_batch;
   args.num_faces = num_faces;
@@ -51,7 +51,7 @@ template <class T>
 void texture_cubes_forward_py(const Array<T>& textures, const Array<int32_t>& owner, const Array<T>& weights,
                               const std::optional<Indices>& starts, Array<T>& colors, double eps, int num_threads) {
   TextureCubes<T> args = texture_args(textures, owner, weights, starts, eps, num_threads);
-  require_shape(colors, "colors", {args.batch, args.raster_size, args.raster_size, args.channels});
+  require_shape(colors, "colors", {args.batch, args.raster.height, args.raster.width, args.channels});
   args.colors = colors.mutable_data();
   py::gil_scoped_release release;
   texture_cubes_forward(args);
@@ -62,7 +62,7 @@ template <class T>
 void texture_cubes_backward_py(const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts,
                                const Array<T>& grad_colors, Array<T>& grad_textures, double eps, int num_threads) {
   TextureCubes<T> args = texture_args(grad_textures, owner, weights, starts, eps, num_threads);
-  require_shape(grad_colors, "grad_colors", {args.batch, args.raster_size, args.raster_size, args.channels});
+  require_shape(grad_colors, "grad_colors", {args.batch, args.raster.height, args.raster.width, args.channels});
   args.textures = nullptr;
   args.grad_colors = grad_colors.data();
   args.grad_textures = grad_textures.mutable_data();
@@ -97,7 +97,7 @@ Interpolate<T> interpolate_args(const Array<T>& attributes, const Indices& corne
   args.owner = owner.data();
   args.weights = weights.data();
   args.batch = batch;
-  args.raster_size = owner.shape(1);
+  args.raster = {owner.shape(1), owner.shape(2)};
   args.attributes = attributes.data();
   args.attribute_batch = attribute_batch;
   args.num_attributes = num_attributes;
@@ -114,7 +114,7 @@ template <class T>
 void interpolate_forward_py(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner,
                             const Array<T>& weights, const std::optional<Indices>& starts, Array<T>& values, int num_threads) {
   Interpolate<T> args = interpolate_args(attributes, corners, owner, weights, starts, num_threads);
-  require_shape(values, "values", {args.batch, args.raster_size, args.raster_size, args.channels});
+  require_shape(values, "values", {args.batch, args.raster.height, args.raster.width, args.channels});
   args.values = values.mutable_data();
   py::gil_scoped_release release;
   interpolate_forward(args);
@@ -125,7 +125,7 @@ void interpolate_backward_py(const Array<T>& attributes, const Indices& corners,
                              const Array<T>& weights, const std::optional<Indices>& starts, const Array<T>& grad_values,
                              std::optional<Array<T>> grad_attributes, std::optional<Array<T>> grad_weights, int num_threads) {
   Interpolate<T> args = interpolate_args(attributes, corners, owner, weights, starts, num_threads);
-  require_shape(grad_values, "grad_values", {args.batch, args.raster_size, args.raster_size, args.channels});
+  require_shape(grad_values, "grad_values", {args.batch, args.raster.height, args.raster.width, args.channels});
   args.grad_values = grad_values.data();
   if (grad_attributes) {
     require_like(*grad_attributes, "grad_attributes", attributes);

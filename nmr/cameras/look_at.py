@@ -11,7 +11,15 @@ from torch import Tensor
 
 from .. import ops
 from .._validate import as_numbers
-from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched, common_batch
+from .projection import (
+    Numbers,
+    ProjectingCamera,
+    Projection,
+    SquarePixels,
+    as_parameter,
+    batched,
+    common_batch,
+)
 
 Scalars = float | Sequence[float] | Tensor
 
@@ -90,7 +98,7 @@ def _perspective(half_fov_deg: float | Tensor, dtype: torch.dtype) -> dict[str, 
 
 
 @dataclass(frozen=True, eq=False)
-class LookAt(ProjectingCamera):
+class LookAt(SquarePixels):
     """A perspective camera at ``eye`` that looks at ``at``.
 
     A vertex v maps to ``u = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at - eye)``, then to
@@ -138,7 +146,7 @@ class LookAt(ProjectingCamera):
 
 
 @dataclass(frozen=True, eq=False)
-class Look(ProjectingCamera):
+class Look(SquarePixels):
     """A perspective camera at ``eye`` that looks along ``direction`` (of any length).
 
     ``z = n(direction)``; everything else is as in :class:`LookAt`.
@@ -168,7 +176,7 @@ class Look(ProjectingCamera):
 
 
 @dataclass(frozen=True, eq=False)
-class Orthographic(ProjectingCamera):
+class Orthographic(SquarePixels):
     """A camera without perspective, posed as :class:`LookAt`: ``(scale u_x, scale u_y, u_z)``.
 
     ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half the width of what is seen, in world units.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -38,6 +38,14 @@ class ProjectingCamera:
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         """The camera in its general form, computed in ``dtype`` in host memory; differentiable in its parameters."""
         raise NotImplementedError
+
+    def for_image(self, height: int, width: int) -> ProjectingCamera:
+        """The camera for an image of height x width pixels.
+
+        Cameras with a field of view (LookAt, Look, Orthographic) have square pixels: the field of view belongs to the
+        shorter side of the image, and more is seen along the longer one. Others stretch theirs over the whole image.
+        """
+        return self
 
     def transform(self, vertices: Tensor, starts: Tensor | None = None) -> Tensor:
         """Vertices from world to renderer space, in the dtype of ``vertices``.
@@ -153,6 +161,27 @@ class Projection(ProjectingCamera):
             ones = torch.ones_like(extent)
             intrinsics = intrinsics / torch.stack([extent, extent, ones], dim=-1).unsqueeze(1)
         return Projection(matrix, intrinsics, distortion, self.perspective)
+
+
+class SquarePixels(ProjectingCamera):
+    """Base class of cameras whose field of view belongs to the shorter side of an image."""
+
+    def for_image(self, height: int, width: int) -> ProjectingCamera:
+        return self if height == width else _Shaped(self, height, width)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shaped(ProjectingCamera):
+    """A camera with square pixels in an image that is not square: x and y count from -1 to 1 across its sides."""
+
+    camera: ProjectingCamera
+    height: int
+    width: int
+
+    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
+        square, short = self.camera.projection(dtype), min(self.height, self.width)
+        scale = torch.tensor([[short / self.width], [short / self.height]], dtype=dtype)
+        return replace(square, intrinsics=square.intrinsics * scale)
 
 
 def _check_batch(vertices: object, starts: object) -> tuple[Tensor, int]:

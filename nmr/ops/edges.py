@@ -10,8 +10,13 @@ from ._host import _C, host_array, no_second_derivative, num_threads
 
 
 def _image_shape(image, anti_aliasing) -> tuple[int, int, int, int]:
-    image_size = image.shape[1] // (2 if anti_aliasing else 1)
-    return image.shape[0], image_size, image_size, image.shape[3]
+    scale = 2 if anti_aliasing else 1
+    return image.shape[0], image.shape[1] // scale, image.shape[2] // scale, image.shape[3]
+
+
+def _raster_shape(resolved, anti_aliasing) -> tuple[int, int, int, int]:
+    scale = 2 if anti_aliasing else 1
+    return resolved.shape[0], scale * resolved.shape[1], scale * resolved.shape[2], resolved.shape[3]
 
 
 # --- resolve
@@ -27,7 +32,7 @@ def resolve(
     anti_aliasing: bool,
     eps: float,
 ) -> Tensor:
-    """The image ``[B, S, S, C]`` of raster pixels ``[B, R, R, C]``: the mean of 2x2 with anti-aliasing, else a copy.
+    """The image ``[B, h, w, C]`` of raster pixels ``[B, H, W, C]``: the mean of 2x2 with anti-aliasing, else a copy.
 
     The gradient in ``image`` is that of the mean. That in x and y of ``vertices`` is NMR's, summed over channels.
     """
@@ -62,19 +67,15 @@ resolve.register_autograd(_resolve_backward, setup_context=_resolve_setup)
 
 @torch.library.custom_op("nmr::resolve_backward", mutates_args=())
 def resolve_backward(grad_resolved: Tensor, anti_aliasing: bool) -> Tensor:
-    """Gradient ``[B, R, R, C]`` of the mean in :func:`resolve`."""
-    batch, size, _, channels = grad_resolved.shape
-    raster_size = size * (2 if anti_aliasing else 1)
-    grad_image = torch.empty((batch, raster_size, raster_size, channels), dtype=grad_resolved.dtype)
+    """Gradient ``[B, H, W, C]`` of the mean in :func:`resolve`."""
+    grad_image = torch.empty(_raster_shape(grad_resolved, anti_aliasing), dtype=grad_resolved.dtype)
     _C.resolve_backward(host_array(grad_resolved), grad_image.numpy(), anti_aliasing, num_threads())
     return grad_image.to(grad_resolved.device)
 
 
 @resolve_backward.register_fake
 def _(grad_resolved, anti_aliasing):
-    batch, size, _, channels = grad_resolved.shape
-    raster_size = size * (2 if anti_aliasing else 1)
-    return grad_resolved.new_empty((batch, raster_size, raster_size, channels))
+    return grad_resolved.new_empty(_raster_shape(grad_resolved, anti_aliasing))
 
 
 resolve_backward.register_autograd(no_second_derivative("render"))
@@ -90,7 +91,7 @@ def edges_backward(
     grad_image: Tensor,
     eps: float,
 ) -> Tensor:
-    """NMR's gradient of raster pixels ``[B, R, R, C]``, per vertex, of the shape of ``vertices``; zero in z."""
+    """NMR's gradient of raster pixels ``[B, H, W, C]``, per vertex, of the shape of ``vertices``; zero in z."""
     grad_vertices = torch.empty(vertices.shape, dtype=vertices.dtype)
     arrays = vertices, faces, starts, owner, image, grad_image
     _C.edges_backward(*map(host_array, arrays), grad_vertices.numpy(), eps, num_threads())

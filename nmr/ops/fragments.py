@@ -19,7 +19,7 @@ def fragments(
     owner: Tensor,
     far: float,
 ) -> tuple[Tensor, Tensor]:
-    """Perspective-correct weights ``[B, R, R, 3]`` of the owner's own vertices 0, 1, 2, and depth ``[B, R, R]``.
+    """Perspective-correct weights ``[B, H, W, 3]`` of the owner's own vertices 0, 1, 2, and depth ``[B, H, W]``.
 
     On the background the weights are 0 and the depth is ``far``. Both are differentiable in the vertices at a fixed
     owner.
@@ -78,6 +78,11 @@ fragments_backward.register_autograd(no_second_derivative("render_fragments"))
 # --- depth image
 
 
+def _image_shape(owner, anti_aliasing) -> tuple[int, int, int]:
+    scale = 2 if anti_aliasing else 1
+    return owner.shape[0], owner.shape[1] // scale, owner.shape[2] // scale
+
+
 @torch.library.custom_op("nmr::depth_image", mutates_args=())
 def depth_image(
     vertices: Tensor,
@@ -87,12 +92,11 @@ def depth_image(
     anti_aliasing: bool,
     far: float,
 ) -> Tensor:
-    """Depth ``[B, S, S]`` of an owner map; with anti-aliasing the mean of 2x2 pixels, ``far`` mixed in.
+    """Depth ``[B, h, w]`` of an owner map; with anti-aliasing the mean of 2x2 pixels, ``far`` mixed in.
 
     The same numbers as the depth of :func:`fragments`, with a true derivative at a fixed owner, but faster.
     """
-    batch, image_size = owner.shape[0], owner.shape[1] // (2 if anti_aliasing else 1)
-    depth = torch.empty((batch, image_size, image_size), dtype=vertices.dtype)
+    depth = torch.empty(_image_shape(owner, anti_aliasing), dtype=vertices.dtype)
     arrays = host_array(vertices), host_array(faces), host_array(starts), host_array(owner)
     _C.depth_forward(*arrays, depth.numpy(), anti_aliasing, far, num_threads())
     return depth.to(vertices.device)
@@ -100,8 +104,7 @@ def depth_image(
 
 @depth_image.register_fake
 def _(vertices, faces, starts, owner, anti_aliasing, far):
-    image_size = owner.shape[1] // (2 if anti_aliasing else 1)
-    return vertices.new_empty((owner.shape[0], image_size, image_size))
+    return vertices.new_empty(_image_shape(owner, anti_aliasing))
 
 
 def _depth_setup(ctx, inputs, output):

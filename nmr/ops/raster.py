@@ -9,8 +9,8 @@ from torch import Tensor
 from ._host import _C, batch_size, host_array, no_second_derivative, num_threads
 
 
-def _owner_map(vertices, faces, starts, raster_size, fill_back, near, far) -> Tensor:
-    owner = torch.empty((batch_size(vertices, starts), raster_size, raster_size), dtype=torch.int32)
+def _owner_map(vertices, faces, starts, height, width, fill_back, near, far) -> Tensor:
+    owner = torch.empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
     arrays = host_array(vertices), host_array(faces), host_array(starts)
     _C.rasterize(*arrays, owner.numpy(), fill_back, near, far, num_threads())
     return owner
@@ -24,18 +24,19 @@ def rasterize(
     vertices: Tensor,
     faces: Tensor,
     starts: Optional[Tensor],  # noqa: UP045
-    raster_size: int,
+    height: int,
+    width: int,
     fill_back: bool,
     near: float,
     far: float,
 ) -> Tensor:
-    """Owner map ``[B, R, R]`` of meshes in renderer space; not differentiable."""
-    return _owner_map(vertices, faces, starts, raster_size, fill_back, near, far).to(vertices.device)
+    """Owner map ``[B, height, width]`` of meshes in renderer space; not differentiable."""
+    return _owner_map(vertices, faces, starts, height, width, fill_back, near, far).to(vertices.device)
 
 
 @rasterize.register_fake
-def _(vertices, faces, starts, raster_size, fill_back, near, far):
-    return vertices.new_empty((batch_size(vertices, starts), raster_size, raster_size), dtype=torch.int32)
+def _(vertices, faces, starts, height, width, fill_back, near, far):
+    return vertices.new_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
 
 
 # --- silhouette
@@ -46,7 +47,8 @@ def silhouette(
     vertices: Tensor,
     faces: Tensor,
     starts: Optional[Tensor],  # noqa: UP045
-    image_size: int,
+    height: int,
+    width: int,
     anti_aliasing: bool,
     fill_back: bool,
     near: float,
@@ -54,26 +56,26 @@ def silhouette(
     eps: float,
     local: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Silhouettes ``alpha [B, S, S]`` and the owner map ``[B, R, R]`` of meshes in renderer space.
+    """Silhouettes ``alpha [B, height, width]`` and the owner map ``[B, H, W]`` of meshes in renderer space.
 
     Its gradient is :func:`silhouette_backward` or, if ``local``, :func:`local_gradient`.
     """
-    raster_size = image_size * (2 if anti_aliasing else 1)
-    owner = _owner_map(vertices, faces, starts, raster_size, fill_back, near, far)
-    alpha = torch.empty((owner.shape[0], image_size, image_size), dtype=vertices.dtype)
+    scale = 2 if anti_aliasing else 1
+    owner = _owner_map(vertices, faces, starts, scale * height, scale * width, fill_back, near, far)
+    alpha = torch.empty((owner.shape[0], height, width), dtype=vertices.dtype)
     _C.silhouette_forward(owner.numpy(), alpha.numpy(), anti_aliasing, num_threads())
     return alpha.to(vertices.device), owner.to(vertices.device)
 
 
 @silhouette.register_fake
-def _(vertices, faces, starts, image_size, anti_aliasing, fill_back, near, far, eps, local=False):
-    batch, raster_size = batch_size(vertices, starts), image_size * (2 if anti_aliasing else 1)
-    alpha = vertices.new_empty((batch, image_size, image_size))
-    return alpha, vertices.new_empty((batch, raster_size, raster_size), dtype=torch.int32)
+def _(vertices, faces, starts, height, width, anti_aliasing, fill_back, near, far, eps, local=False):
+    batch, scale = batch_size(vertices, starts), 2 if anti_aliasing else 1
+    alpha = vertices.new_empty((batch, height, width))
+    return alpha, vertices.new_empty((batch, scale * height, scale * width), dtype=torch.int32)
 
 
 def _silhouette_setup(ctx, inputs, output):
-    vertices, faces, starts, _, anti_aliasing, _, _, _, eps, local = inputs
+    vertices, faces, starts, _, _, anti_aliasing, _, _, _, eps, local = inputs
     owner = output[1]
     ctx.mark_non_differentiable(owner)
     ctx.set_materialize_grads(False)  # no zeros in the shape of the owner map
@@ -84,9 +86,9 @@ def _silhouette_setup(ctx, inputs, output):
 
 def _silhouette_backward(ctx, grad_alpha, _grad_owner):
     if grad_alpha is None:
-        return (None,) * 10
+        return (None,) * 11
     gradient = local_gradient if ctx.local else silhouette_backward
-    return gradient(*ctx.saved_tensors, grad_alpha, *ctx.settings), *(None,) * 9
+    return gradient(*ctx.saved_tensors, grad_alpha, *ctx.settings), *(None,) * 10
 
 
 silhouette.register_autograd(_silhouette_backward, setup_context=_silhouette_setup)

@@ -19,7 +19,7 @@ def sample_texture_cubes(
     starts: Optional[Tensor],  # noqa: UP045
     eps: float,
 ) -> Tensor:
-    """Colours ``[B, R, R, C]`` from texture cubes; 0 on background.
+    """Colours ``[B, H, W, C]`` from texture cubes; 0 on background.
 
     textures are ``[B or 1, F, ts, ts, ts, C]``, packed ``[M, ts, ts, ts, C]``.
     Axis k of a cube is the weight of the face's vertex k: sampled trilinearly at ``weights * (ts - 1)``, clamped to
@@ -87,7 +87,7 @@ def interpolate(
     weights: Tensor,
     starts: Optional[Tensor],  # noqa: UP045
 ) -> Tensor:
-    """``values[b, y, x] = sum_k weights[b, y, x, k] attributes[b, corners[f, k]]`` ``[B, R, R, C]``; 0 on background.
+    """``values[b, y, x] = sum_k weights[b, y, x, k] attributes[b, corners[f, k]]`` ``[B, H, W, C]``; 0 on background.
 
     attributes are ``[B or 1, N, C]``, packed ``[N, C]``; corners ``[F, 3]``, ``[B, F, 3]`` or packed ``[M, 3]`` are
     rows of them, counted from the first of the mesh; ``starts`` (packed) are first row and first face of each mesh.

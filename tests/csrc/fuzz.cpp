@@ -59,7 +59,7 @@ Scene<T> decode(Bytes bytes) {
   constexpr int64_t batches[] = {0, 1, 2, 9};
   s.batch = batches[more / 8 % 4];
   s.channels = 1 + more / 32 % 4;
-  s.image_size = 1 + bytes.next() % (s.anti_aliasing ? 10 : 20);
+  s.image = square(1 + bytes.next() % (s.anti_aliasing ? 10 : 20));
   s.texture_size = 1 + bytes.next() % 4;
   s.grid_size = 1 + bytes.next() % 6;
   const int planes = bytes.next();

@@ -21,7 +21,7 @@ std::vector<T> input(const Scene<T>& scene, Stream stream, int64_t size) {
 template <class T>
 std::vector<int32_t> made_up_owner(const Scene<T>& scene) {
   std::vector<int32_t> owner(scene.pixels());
-  const int64_t per_image = scene.raster_size() * scene.raster_size();
+  const int64_t per_image = scene.raster().pixels();
   for (int64_t n = 0; n < scene.pixels(); ++n) {
     const int64_t choices = 2 * scene.mesh().face_count(n / per_image) + 1;
     const double u = (noise(64 * scene.seed + kOwner, n) + 1) / 2;
@@ -32,13 +32,13 @@ std::vector<int32_t> made_up_owner(const Scene<T>& scene) {
 
 template <class T>
 void run_silhouette(const Scene<T>& s, Results<T>& r, int num_threads) {
-  const int64_t size = s.batch * s.image_size * s.image_size;
+  const int64_t size = s.batch * s.image.pixels();
   r.alpha = unwritten<T>(size);
-  silhouette_forward(SilhouetteForward<T>{r.owner.data(), s.batch, s.image_size, s.anti_aliasing, r.alpha.data(), num_threads});
+  silhouette_forward(SilhouetteForward<T>{r.owner.data(), s.batch, s.image, s.anti_aliasing, r.alpha.data(), num_threads});
   const std::vector<T> grad_alpha = input(s, kGradAlpha, size);
   r.grad_silhouette = unwritten<T>(3 * s.rows());
   r.grad_local = unwritten<T>(3 * s.rows());
-  SilhouetteBackward<T> args{s.mesh(), s.image_size, s.anti_aliasing, s.eps, r.owner.data(), grad_alpha.data(),
+  SilhouetteBackward<T> args{s.mesh(), s.image, s.anti_aliasing, s.eps, r.owner.data(), grad_alpha.data(),
                              r.grad_silhouette.data(), num_threads};
   silhouette_backward(args);
   args.grad_vertices = r.grad_local.data();
@@ -51,16 +51,16 @@ void run_fragments(const Scene<T>& s, Results<T>& r, int num_threads) {
   r.depth = unwritten<T>(s.pixels());
   r.grad_fragments = unwritten<T>(3 * s.rows());
   const std::vector<T> grad_weights = input(s, kGradWeights, 3 * s.pixels()), grad_depth = input(s, kGradDepth, s.pixels());
-  Fragments<T> args{s.mesh(), s.raster_size(), s.far, r.owner.data(), r.weights.data(), r.depth.data(), grad_weights.data(),
+  Fragments<T> args{s.mesh(), s.raster(), s.far, r.owner.data(), r.weights.data(), r.depth.data(), grad_weights.data(),
                     grad_depth.data(), r.grad_fragments.data(), num_threads};
   fragments_forward(args);
   fragments_backward(args);
 
-  const int64_t size = s.batch * s.image_size * s.image_size;
+  const int64_t size = s.batch * s.image.pixels();
   r.depth_image = unwritten<T>(size);
   r.grad_depth = unwritten<T>(3 * s.rows());
   const std::vector<T> grad_image = input(s, kGradDepthImage, size);
-  DepthImage<T> image{s.mesh(), s.image_size, s.anti_aliasing, s.far, r.owner.data(), r.depth_image.data(), grad_image.data(),
+  DepthImage<T> image{s.mesh(), s.image, s.anti_aliasing, s.far, r.owner.data(), r.depth_image.data(), grad_image.data(),
                       r.grad_depth.data(), num_threads};
   depth_forward(image);
   depth_backward(image);
@@ -74,7 +74,7 @@ void run_shading(const Scene<T>& s, Results<T>& r, int num_threads) {
   const std::vector<T> grad_colors = input(s, kGradColors, s.pixels() * C);
   r.colors = unwritten<T>(s.pixels() * C);
   r.grad_textures = unwritten<T>(textures.size());
-  TextureCubes<T> cubes{r.owner.data(), r.weights.data(), s.batch, s.raster_size(), textures.data(), groups, s.num_faces, starts, ts,
+  TextureCubes<T> cubes{r.owner.data(), r.weights.data(), s.batch, s.raster(), textures.data(), groups, s.num_faces, starts, ts,
                         C, s.eps, r.colors.data(), grad_colors.data(), r.grad_textures.data(), num_threads};
   texture_cubes_forward(cubes);
   texture_cubes_backward(cubes);
@@ -84,7 +84,7 @@ void run_shading(const Scene<T>& s, Results<T>& r, int num_threads) {
   r.values = unwritten<T>(s.pixels() * C);
   r.grad_attributes = unwritten<T>(attributes.size());
   r.grad_weights = unwritten<T>(3 * s.pixels());
-  Interpolate<T> values{r.owner.data(), r.weights.data(), s.batch, s.raster_size(), attributes.data(), groups, s.num_vertices, C,
+  Interpolate<T> values{r.owner.data(), r.weights.data(), s.batch, s.raster(), attributes.data(), groups, s.num_vertices, C,
                         s.faces.data(), s.num_faces, s.faces_per_image, starts, r.values.data(), grad_values.data(),
                         r.grad_attributes.data(), r.grad_weights.data(), num_threads};
   interpolate_forward(values);
@@ -95,14 +95,14 @@ template <class T>
 void run_edges(const Scene<T>& s, Results<T>& r, int num_threads) {
   const std::vector<T> image = input(s, kImage, s.pixels() * s.channels), grad = input(s, kGradImage, s.pixels() * s.channels);
   r.grad_edges = unwritten<T>(3 * s.rows());
-  edges_backward(EdgesBackward<T>{s.mesh(), s.raster_size(), s.eps, r.owner.data(), image.data(), s.channels, grad.data(),
+  edges_backward(EdgesBackward<T>{s.mesh(), s.raster(), s.eps, r.owner.data(), image.data(), s.channels, grad.data(),
                                   r.grad_edges.data(), num_threads});
 
-  const int64_t size = s.batch * s.image_size * s.image_size * s.channels;
+  const int64_t size = s.batch * s.image.pixels() * s.channels;
   const std::vector<T> grad_resolved = input(s, kGradResolved, size);
   r.resolved = unwritten<T>(size);
   r.grad_image = unwritten<T>(image.size());
-  Resolve<T> resolve{s.batch, s.image_size, s.anti_aliasing, s.channels, image.data(), r.resolved.data(), grad_resolved.data(),
+  Resolve<T> resolve{s.batch, s.image, s.anti_aliasing, s.channels, image.data(), r.resolved.data(), grad_resolved.data(),
                      r.grad_image.data(), num_threads};
   resolve_forward(resolve);
   resolve_backward(resolve);
@@ -209,7 +209,7 @@ template <class T>
 Results<T> run_stages(const Scene<T>& scene, int num_threads) {
   Results<T> r;
   r.owner.assign(scene.pixels(), std::numeric_limits<int32_t>::min());
-  rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), scene.fill_back, scene.near, scene.far}, r.owner.data(), num_threads});
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, r.owner.data(), num_threads});
   if (scene.foreign_owner) r.owner = made_up_owner(scene);
   run_silhouette(scene, r, num_threads);
   run_fragments(scene, r, num_threads);
@@ -243,7 +243,7 @@ const char* first_difference(const Results<T>& a, const Results<T>& b) {
 template <class T>
 const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   const MeshBatch<T> mesh = scene.mesh();
-  const int64_t R = scene.raster_size(), S = scene.image_size, C = scene.channels;
+  const int64_t R = scene.raster_size(), S = scene.image.width, C = scene.channels;
   for (int64_t b = 0; b < scene.batch; ++b) {
     const int64_t F = mesh.face_count(b), limit = scene.fill_back || scene.foreign_owner ? 2 * F : F;
     for (int64_t n = 0; n < R * R; ++n) {

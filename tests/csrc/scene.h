@@ -32,6 +32,8 @@ std::vector<T> unwritten(int64_t size) {
   return std::vector<T>(size, std::numeric_limits<T>::quiet_NaN());
 }
 
+inline Size square(int64_t size) { return {size, size}; }
+
 template <class T>
 struct Scene {
   int64_t batch = 0, num_vertices = 0, num_faces = 0;  // as in MeshBatch: packed, the sums over all meshes
@@ -40,7 +42,7 @@ struct Scene {
   std::vector<int64_t> faces;
   std::vector<int64_t> starts;  // empty unless packed
 
-  int64_t image_size = 8;
+  Size image = square(8);
   bool anti_aliasing = true, fill_back = true;
   T near = T(0.1), far = T(100), eps = T(1e-4);
   int64_t channels = 3, texture_size = 2, grid_size = 4;
@@ -50,8 +52,9 @@ struct Scene {
   uint64_t seed = 1;           // of textures, attributes, cameras and upstream gradients
 
   bool packed() const { return !starts.empty(); }
-  int64_t raster_size() const { return anti_aliasing ? 2 * image_size : image_size; }
-  int64_t pixels() const { return batch * raster_size() * raster_size(); }
+  Size raster() const { return raster_of(image, anti_aliasing); }
+  int64_t raster_size() const { return raster().width; }  // of a square raster
+  int64_t pixels() const { return batch * raster().pixels(); }
   MeshBatch<T> mesh() const {
     return {vertices.data(), faces.data(), batch, num_vertices, num_faces, faces_per_image, packed() ? starts.data() : nullptr};
   }

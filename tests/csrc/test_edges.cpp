@@ -8,14 +8,14 @@ namespace {
 template <class T>
 std::vector<int32_t> owner_of(const Scene<T>& scene) {
   std::vector<int32_t> owner(scene.pixels());
-  rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), scene.fill_back, scene.near, scene.far}, owner.data(), 1});
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, owner.data(), 1});
   return owner;
 }
 
 template <class T>
 std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& owner, const std::vector<T>& image, const std::vector<T>& grad) {
   std::vector<T> result = unwritten<T>(3 * scene.rows());
-  edges_backward(EdgesBackward<T>{scene.mesh(), scene.raster_size(), scene.eps, owner.data(), image.data(),
+  edges_backward(EdgesBackward<T>{scene.mesh(), scene.raster(), scene.eps, owner.data(), image.data(),
                                   static_cast<int64_t>(image.size()) / std::max<int64_t>(1, scene.pixels()), grad.data(), result.data(), 2});
   return result;
 }
@@ -37,7 +37,7 @@ TEST_REAL(edge_gradients_are_the_definition) {
   for (int64_t channels : {1, 3, 4})
     for (uint64_t seed = 0; seed < 4; ++seed) {
       Scene<T> scene = seed == 0 ? pack<T>({sphere(1, 1), Mesh{}, soup(6, 5)}) : stack<T>({soup(8, seed), soup(8, seed + 50)}, seed % 2);
-      scene.image_size = 13;
+      scene.image = square(13);
       const int64_t R = scene.raster_size();
       const std::vector<int32_t> owner = owner_of(scene);
       const std::vector<T> image = noise_array<T>(1, scene.pixels() * channels), grad = noise_array<T>(2, scene.pixels() * channels);
@@ -52,7 +52,7 @@ TEST_REAL(edge_gradients_are_the_definition) {
 // An image that is its own coverage has the silhouette's gradient.
 TEST_REAL(edge_gradients_of_coverage_are_the_silhouettes) {
   Scene<T> scene = stack<T>({sphere(2, 1), sphere(2, 2)}, true);
-  scene.image_size = 16;
+  scene.image = square(16);
   const int64_t S = 16, R = 32;
   const std::vector<int32_t> owner = owner_of(scene);
   const std::vector<T> grad_alpha = noise_array<T>(3, 2 * S * S);
@@ -61,13 +61,13 @@ TEST_REAL(edge_gradients_of_coverage_are_the_silhouettes) {
     image[n] = T(owner[n] >= 0);
     grad[n] = grad_alpha[(n / R / R * S + n / R % R / 2) * S + n % R / 2] / 4;
   }
-  silhouette_backward(SilhouetteBackward<T>{scene.mesh(), S, true, scene.eps, owner.data(), grad_alpha.data(), expected.data(), 1});
+  silhouette_backward(SilhouetteBackward<T>{scene.mesh(), square(S), true, scene.eps, owner.data(), grad_alpha.data(), expected.data(), 1});
   check_close(gradient(scene, owner, image, grad), expected, sizeof(T) == 4 ? 1e-5 : 1e-12);
 }
 
 TEST_REAL(edge_gradients_of_an_image_of_one_colour_are_zero) {
   Scene<T> scene = single<T>(sphere(1, 1));
-  scene.image_size = 12;
+  scene.image = square(12);
   const std::vector<int32_t> owner = owner_of(scene);
   const std::vector<T> image(2 * scene.pixels(), T(0.3)), grad = noise_array<T>(1, 2 * scene.pixels());
   for (T g : gradient(scene, owner, image, grad)) CHECK_EQUAL(g, T(0));
@@ -79,7 +79,7 @@ TEST_REAL(resolve_is_a_mean_and_its_gradient_the_adjoint) {
       const int64_t B = 2, S = 7, step = anti_aliasing ? 2 : 1, R = step * S;
       const std::vector<T> image = noise_array<T>(1, B * R * R * C), grad_resolved = noise_array<T>(2, B * S * S * C);
       std::vector<T> resolved = unwritten<T>(grad_resolved.size()), grad_image = unwritten<T>(image.size());
-      const Resolve<T> args{B, S, anti_aliasing, C, image.data(), resolved.data(), grad_resolved.data(), grad_image.data(), 2};
+      const Resolve<T> args{B, square(S), anti_aliasing, C, image.data(), resolved.data(), grad_resolved.data(), grad_image.data(), 2};
       resolve_forward(args);
       resolve_backward(args);
       double product = 0, adjoint = 0;

@@ -8,7 +8,7 @@ namespace {
 template <class T>
 std::vector<int32_t> owner_of(const Scene<T>& scene) {
   std::vector<int32_t> owner(scene.pixels());
-  rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), scene.fill_back, scene.near, scene.far}, owner.data(), 1});
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, owner.data(), 1});
   return owner;
 }
 
@@ -16,14 +16,14 @@ template <class T>
 void fragments(const Scene<T>& scene, const std::vector<int32_t>& owner, std::vector<T>& weights, std::vector<T>& depth) {
   weights = unwritten<T>(3 * scene.pixels());
   depth = unwritten<T>(scene.pixels());
-  fragments_forward(Fragments<T>{scene.mesh(), scene.raster_size(), scene.far, owner.data(), weights.data(), depth.data(), nullptr,
+  fragments_forward(Fragments<T>{scene.mesh(), scene.raster(), scene.far, owner.data(), weights.data(), depth.data(), nullptr,
                                  nullptr, nullptr, 1});
 }
 
 template <class T>
 std::vector<T> depth_image(const Scene<T>& scene, const std::vector<int32_t>& owner) {
-  std::vector<T> depth = unwritten<T>(scene.batch * scene.image_size * scene.image_size);
-  depth_forward(DepthImage<T>{scene.mesh(), scene.image_size, scene.anti_aliasing, scene.far, owner.data(), depth.data(), nullptr, nullptr, 1});
+  std::vector<T> depth = unwritten<T>(scene.batch * scene.image.pixels());
+  depth_forward(DepthImage<T>{scene.mesh(), scene.image, scene.anti_aliasing, scene.far, owner.data(), depth.data(), nullptr, nullptr, 1});
   return depth;
 }
 
@@ -33,7 +33,7 @@ std::vector<Mesh> meshes() { return {soup(10, 1), sphere(1, 2), Mesh{}}; }
 
 TEST_REAL(fragments_are_the_definition) {
   Scene<T> scene = pack<T>(meshes());
-  scene.image_size = 21;
+  scene.image = square(21);
   const int64_t R = scene.raster_size();
   const std::vector<int32_t> owner = owner_of(scene);
   std::vector<T> weights, depth;
@@ -70,7 +70,7 @@ TEST_REAL(fragments_are_the_definition) {
 TEST_REAL(depth_images_are_means_of_the_fragments) {
   for (bool anti_aliasing : {false, true}) {
     Scene<T> scene = pack<T>(meshes());
-    scene.image_size = 15;
+    scene.image = square(15);
     scene.anti_aliasing = anti_aliasing;
     scene.far = T(50);
     const int64_t S = 15, R = scene.raster_size(), step = anti_aliasing ? 2 : 1;
@@ -90,19 +90,19 @@ TEST_REAL(depth_images_are_means_of_the_fragments) {
 // Central differences with the owner map held fixed.
 TEST(fragment_gradients_are_the_derivative) {
   Scene<double> scene = pack<double>(meshes());
-  scene.image_size = 7;
+  scene.image = square(7);
   const std::vector<int32_t> owner = owner_of(scene);
   const std::vector<double> u = noise_array<double>(1, 3 * scene.pixels()), g = noise_array<double>(2, scene.pixels());
   const std::vector<double> h = noise_array<double>(3, scene.batch * 49);
   std::vector<double> of_weights = unwritten<double>(3 * scene.rows()), of_depth = of_weights, of_both = of_weights, of_image = of_weights;
   const auto backward = [&](const double* grad_weights, const double* grad_depth, std::vector<double>& out) {
-    fragments_backward(Fragments<double>{scene.mesh(), scene.raster_size(), scene.far, owner.data(), nullptr, nullptr, grad_weights,
+    fragments_backward(Fragments<double>{scene.mesh(), scene.raster(), scene.far, owner.data(), nullptr, nullptr, grad_weights,
                                          grad_depth, out.data(), 2});
   };
   backward(u.data(), nullptr, of_weights);
   backward(nullptr, g.data(), of_depth);
   backward(u.data(), g.data(), of_both);
-  depth_backward(DepthImage<double>{scene.mesh(), 7, true, scene.far, owner.data(), nullptr, h.data(), of_image.data(), 2});
+  depth_backward(DepthImage<double>{scene.mesh(), square(7), true, scene.far, owner.data(), nullptr, h.data(), of_image.data(), 2});
   const std::vector<double> original = scene.vertices;
   for (size_t n = 0; n < original.size(); ++n) {
     double difference[3] = {0, 0, 0};

@@ -11,7 +11,7 @@ template <class T>
 void check_survives(Scene<T> scene) {
   for (int64_t image_size : {1, 7}) {
     for (int variant = 0; variant < 4; ++variant) {
-      scene.image_size = image_size;
+      scene.image = square(image_size);
       scene.anti_aliasing = variant % 2 == 0;
       scene.fill_back = variant < 2;
       const Results<T> one = run_stages(scene, 1);
@@ -94,7 +94,7 @@ TEST_REAL(scratch_of_earlier_calls_does_not_show) {
   std::vector<Results<T>> first;
   const auto scene = [](int n) {
     Scene<T> s = single<T>(n % 2 ? sphere(2, 1) : soup(4, n));
-    s.image_size = 3 + 11 * (n % 3);
+    s.image = square(3 + 11 * (n % 3));
     s.anti_aliasing = n % 2;
     return s;
   };

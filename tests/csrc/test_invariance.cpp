@@ -21,10 +21,10 @@ std::vector<Scene<T>> scenes() {
   all[1].per_image_values = true;
   all[1].distorted = false;
   all[3].anti_aliasing = all[3].fill_back = all[3].perspective = false;
-  all[3].image_size = 19;
+  all[3].image = square(19);
   all[3].channels = 1;
   all.push_back(single<T>(sphere(2, 6)));  // a raster that is worked on in blocks
-  all[4].image_size = 110;
+  all[4].image = square(110);
   return all;
 }
 

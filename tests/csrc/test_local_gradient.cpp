@@ -8,14 +8,14 @@ namespace {
 template <class T>
 std::vector<int32_t> draw(const Scene<T>& scene) {
   std::vector<int32_t> owner(scene.pixels());
-  rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), scene.fill_back, scene.near, scene.far}, owner.data(), 1});
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, owner.data(), 1});
   return owner;
 }
 
 template <class T>
 std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& owner, const std::vector<T>& grad_alpha) {
   std::vector<T> grad = unwritten<T>(3 * scene.rows());
-  local_gradient(SilhouetteBackward<T>{scene.mesh(), scene.image_size, scene.anti_aliasing, scene.eps, owner.data(),
+  local_gradient(SilhouetteBackward<T>{scene.mesh(), scene.image, scene.anti_aliasing, scene.eps, owner.data(),
                                        grad_alpha.data(), grad.data(), 2});
   return grad;
 }
@@ -35,7 +35,7 @@ T slow_move(const T (&coverage)[3], const T (&grad)[3], const bool (&exists)[3],
 
 template <class T>
 void check_gradient(const Scene<T>& scene) {
-  const int64_t S = scene.image_size, R = scene.raster_size();
+  const int64_t S = scene.image.width, R = scene.raster_size();
   const std::vector<int32_t> owner = draw(scene);
   const std::vector<T> grad_alpha = noise_array<T>(scene.seed, scene.batch * S * S);
   std::vector<T> expected(3 * scene.rows(), T(0));
@@ -78,7 +78,7 @@ TEST_REAL(local_gradient_is_the_definition) {
   for (uint64_t seed = 0; seed < 8; ++seed)
     for (int64_t S : {1, 5, 12, 16}) {
       Scene<T> scene = stack<T>({soup(8, seed), soup(8, seed + 100)}, seed % 2);
-      scene.image_size = S;
+      scene.image = square(S);
       scene.anti_aliasing = seed % 4 < 2;
       scene.fill_back = seed % 3 != 0;
       scene.eps = seed % 2 ? T(1e-4) : T(0.5);  // the latter: many ties
@@ -86,7 +86,7 @@ TEST_REAL(local_gradient_is_the_definition) {
       check_gradient(scene);
     }
   Scene<T> scene = pack<T>({sphere(2, 1), soup(3, 1), Mesh{}, sphere(1, 2)});
-  scene.image_size = 24;
+  scene.image = square(24);
   check_gradient(scene);
 }
 
@@ -94,7 +94,7 @@ TEST_REAL(local_gradient_is_the_definition) {
 TEST_REAL(local_gradient_reaches_one_pixel) {
   for (int gap = 0; gap < 4; ++gap) {
     Scene<T> scene = single<T>(square(-0.75, -0.25, 0.0, 0.25));  // up to column 7 of 16
-    scene.image_size = 16;
+    scene.image = square(16);
     scene.anti_aliasing = false;
     std::vector<T> grad_alpha(256, T(0));
     for (int y = 6; y < 10; ++y)
@@ -109,7 +109,7 @@ TEST_REAL(local_gradient_reaches_one_pixel) {
 
 TEST_REAL(local_gradient_mirrors) {
   Scene<T> scene = single<T>(sphere(2, 4)), mirrored = scene;
-  scene.image_size = mirrored.image_size = 32;
+  scene.image = mirrored.image = square(32);
   for (size_t n = 0; n < scene.vertices.size(); n += 3) mirrored.vertices[n] = -scene.vertices[n];
   std::vector<T> grad_alpha = noise_array<T>(3, 32 * 32), flipped(32 * 32);
   for (int n = 0; n < 32 * 32; ++n) flipped[32 * (n / 32) + 31 - n % 32] = grad_alpha[n];

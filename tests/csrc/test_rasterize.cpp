@@ -8,14 +8,14 @@ namespace {
 template <class T>
 std::vector<int32_t> rasterized(const Scene<T>& scene, int num_threads = 1) {
   std::vector<int32_t> owner(scene.pixels(), -7);
-  rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), scene.fill_back, scene.near, scene.far}, owner.data(), num_threads});
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, owner.data(), num_threads});
   return owner;
 }
 
 template <class T>
 Scene<T> raster_of(const Mesh& mesh, int64_t raster_size, bool fill_back = true) {
   Scene<T> scene = single<T>(mesh);
-  scene.image_size = raster_size;
+  scene.image = square(raster_size);
   scene.anti_aliasing = false;
   scene.fill_back = fill_back;
   return scene;
@@ -53,7 +53,7 @@ TEST_REAL(rasterize_draws_the_definition) {
     check_against_definition(raster_of<T>(sphere(2, seed), 40, seed % 2));
   }
   Scene<T> packed = pack<T>({sphere(1, 1), soup(5, 2), Mesh{}, soup(30, 3)});
-  packed.image_size = 20;
+  packed.image = square(20);
   check_against_definition(packed);
 }
 

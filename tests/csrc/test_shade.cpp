@@ -41,7 +41,7 @@ struct Fragment {
 
 template <class T>
 TextureCubes<T> cubes(const Fragment<T>& f, const std::vector<T>& textures, int64_t groups, int64_t ts, int64_t channels, T eps) {
-  return {f.owner.data(), f.weights.data(), f.batch, f.raster_size, textures.data(), groups, f.num_faces, nullptr,
+  return {f.owner.data(), f.weights.data(), f.batch, {f.raster_size, f.raster_size}, textures.data(), groups, f.num_faces, nullptr,
           ts,             channels,         eps,     nullptr,       nullptr,         nullptr, 2};
 }
 
@@ -117,7 +117,7 @@ TEST_REAL(interpolation_is_the_weighted_mean_and_its_gradients_the_adjoint) {
           const std::vector<T> grad_values = noise_array<T>(2, static_cast<int64_t>(f.owner.size()) * channels);
           std::vector<T> values = unwritten<T>(grad_values.size()), grad_attributes = unwritten<T>(attributes.size());
           std::vector<T> grad_weights = unwritten<T>(f.weights.size());
-          const Interpolate<T> args{f.owner.data(), f.weights.data(), f.batch, f.raster_size, attributes.data(), groups, rows, channels,
+          const Interpolate<T> args{f.owner.data(), f.weights.data(), f.batch, {f.raster_size, f.raster_size}, attributes.data(), groups, rows, channels,
                                     corners.data(), num_faces, corners_per_image, packed ? f.starts : nullptr, values.data(),
                                     grad_values.data(), grad_attributes.data(), grad_weights.data(), 2};
           interpolate_forward(args);

@@ -13,16 +13,16 @@ struct Drawn {
 
 template <class T>
 Drawn<T> draw(const Scene<T>& scene) {
-  Drawn<T> drawn{std::vector<int32_t>(scene.pixels()), unwritten<T>(scene.batch * scene.image_size * scene.image_size)};
-  rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), scene.fill_back, scene.near, scene.far}, drawn.owner.data(), 1});
-  silhouette_forward(SilhouetteForward<T>{drawn.owner.data(), scene.batch, scene.image_size, scene.anti_aliasing, drawn.alpha.data(), 1});
+  Drawn<T> drawn{std::vector<int32_t>(scene.pixels()), unwritten<T>(scene.batch * scene.image.pixels())};
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, drawn.owner.data(), 1});
+  silhouette_forward(SilhouetteForward<T>{drawn.owner.data(), scene.batch, scene.image, scene.anti_aliasing, drawn.alpha.data(), 1});
   return drawn;
 }
 
 template <class T>
 std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& owner, const std::vector<T>& grad_alpha) {
   std::vector<T> grad = unwritten<T>(3 * scene.rows());
-  silhouette_backward(SilhouetteBackward<T>{scene.mesh(), scene.image_size, scene.anti_aliasing, scene.eps, owner.data(),
+  silhouette_backward(SilhouetteBackward<T>{scene.mesh(), scene.image, scene.anti_aliasing, scene.eps, owner.data(),
                                             grad_alpha.data(), grad.data(), 2});
   return grad;
 }
@@ -40,7 +40,7 @@ double relative_difference(const std::vector<T>& a, const std::vector<T>& b) {
 
 template <class T>
 void check_gradient(const Scene<T>& scene) {
-  const int64_t S = scene.image_size, R = scene.raster_size();
+  const int64_t S = scene.image.width, R = scene.raster_size();
   const Drawn<T> drawn = draw(scene);
   const std::vector<T> grad_alpha = noise_array<T>(scene.seed, scene.batch * S * S);
   std::vector<T> expected(3 * scene.rows(), T(0));
@@ -62,7 +62,7 @@ void check_gradient(const Scene<T>& scene) {
 TEST_REAL(silhouette_is_the_covered_share) {
   for (bool anti_aliasing : {false, true}) {
     Scene<T> scene = stack<T>({sphere(2, 1), sphere(2, 2)}, true);
-    scene.image_size = 17;
+    scene.image = square(17);
     scene.anti_aliasing = anti_aliasing;
     const Drawn<T> drawn = draw(scene);
     double sum = 0, pixels = 0;
@@ -77,21 +77,21 @@ TEST_REAL(silhouette_gradient_is_the_definition) {
   for (uint64_t seed = 0; seed < 8; ++seed) {
     for (int64_t S : {1, 5, 12, 16}) {
       Scene<T> scene = stack<T>({soup(8, seed), soup(8, seed + 100)}, seed % 2);
-      scene.image_size = S;
+      scene.image = square(S);
       scene.anti_aliasing = seed % 4 < 2;
       scene.seed = seed;
       check_gradient(scene);
     }
   }
   Scene<T> scene = pack<T>({sphere(2, 1), soup(3, 1), Mesh{}, sphere(1, 2)});
-  scene.image_size = 24;
+  scene.image = square(24);
   check_gradient(scene);
 }
 
 // A square to the left of the pixels that the loss wants: its right side is pulled to the right, nothing else moves.
 TEST_REAL(silhouette_gradient_pulls_towards_what_is_wanted) {
   Scene<T> scene = single<T>(Mesh{{-0.6, -0.45, 1, -0.1, -0.45, 1, -0.1, 0.45, 1, -0.6, 0.45, 1}, {0, 1, 2, 0, 2, 3}});
-  scene.image_size = 16;
+  scene.image = square(16);
   scene.anti_aliasing = false;
   const Drawn<T> drawn = draw(scene);
   std::vector<T> grad_alpha(256, T(0));
@@ -108,7 +108,7 @@ TEST_REAL(silhouette_gradient_of_what_is_hidden_is_zero) {
   for (double x : {-0.2, -0.2, 3.0, 0.2, -0.2, 3.0, 0.0, 0.2, 3.0}) mesh.vertices.push_back(x);  // behind it
   mesh.faces.insert(mesh.faces.end(), {3, 4, 5});
   Scene<T> scene = single<T>(mesh);
-  scene.image_size = 16;
+  scene.image = square(16);
   const std::vector<T> grad = gradient(scene, draw(scene).owner, noise_array<T>(1, 256));
   for (int n = 9; n < 18; ++n) CHECK_EQUAL(grad[n], T(0));
   CHECK(grad[0] != 0);
@@ -117,7 +117,7 @@ TEST_REAL(silhouette_gradient_of_what_is_hidden_is_zero) {
 // Mirroring the world mirrors the gradient. (Column 0 has the published extrapolation quirk, so the mesh keeps off the borders.)
 TEST_REAL(silhouette_gradient_mirrors) {
   Scene<T> scene = single<T>(sphere(2, 4)), mirrored = scene;
-  scene.image_size = mirrored.image_size = 32;
+  scene.image = mirrored.image = square(32);
   for (size_t n = 0; n < scene.vertices.size(); n += 3) mirrored.vertices[n] = -scene.vertices[n];
   std::vector<T> grad_alpha = noise_array<T>(3, 32 * 32), flipped(32 * 32);
   for (int n = 0; n < 32 * 32; ++n) flipped[32 * (n / 32) + 31 - n % 32] = grad_alpha[n];

@@ -40,7 +40,7 @@ Scene<T> spheres(int64_t batch) {
     }
   }
   Scene<T> scene = stack<T>(meshes, true);
-  scene.image_size = kSize;
+  scene.image = square(kSize);
   return scene;
 }
 
@@ -55,12 +55,12 @@ struct W1 {
         grad_vertices(scene.vertices.size()) {}
 
   void forward() {
-    rasterize(Rasterize<T>{scene.mesh(), {scene.raster_size(), true, scene.near, scene.far}, owner.data(), 1});
-    silhouette_forward(SilhouetteForward<T>{owner.data(), scene.batch, kSize, true, alpha.data(), 1});
+    rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), true, scene.near, scene.far}, owner.data(), 1});
+    silhouette_forward(SilhouetteForward<T>{owner.data(), scene.batch, scene.image, true, alpha.data(), 1});
   }
 
   void backward() {
-    silhouette_backward(SilhouetteBackward<T>{scene.mesh(), kSize, true, scene.eps, owner.data(), grad_alpha.data(), grad_vertices.data(), 1});
+    silhouette_backward(SilhouetteBackward<T>{scene.mesh(), scene.image, true, scene.eps, owner.data(), grad_alpha.data(), grad_vertices.data(), 1});
   }
 
   // d(1 - IoU) / d alpha, IoU = sum(a t) / sum(a + t - a t) of each image with its neighbour.
@@ -100,7 +100,7 @@ void print_hashes(const char* type, const W1<T>& w1) {
               hash(w1.alpha), hash(w1.grad_vertices), area / double(w1.alpha.size()));
   // Every stage on other meshes; the camera and the smoothness loss included.
   Scene<T> scene = pack<T>({sphere(2, 1), soup(40, 2), Mesh{}, sphere(1, 3)});
-  scene.image_size = 31;
+  scene.image = square(31);
   scene.texture_size = 4;
   run_stages(scene, 2).for_each([&](const char* name, const auto& values) {
     if (!values.empty()) std::printf("%-7s %-17s %016" PRIx64 "\n", type, name, hash(values));

@@ -13,7 +13,7 @@ EPS = 1e-3
 
 
 def owner_of(vertices, faces, raster_size, fill_back=True, starts=None):
-    return nmr.ops.rasterize(vertices, faces, starts, raster_size, fill_back, 0.1, 50.0)
+    return nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, fill_back, 0.1, 50.0)
 
 
 def random_image(owner, channels, dtype=torch.float64, seed=0):
@@ -55,8 +55,9 @@ def test_coverage_as_a_channel_has_the_gradient_of_the_silhouette(name):
     v = load_vector(name)
     vertices, faces = torch.from_numpy(v["vertices"]).requires_grad_(), torch.from_numpy(v["faces"]).long()
     anti_aliasing, far = bool(v["anti_aliasing"]), float(v["far"])
-    raster_size = int(v["image_size"]) * (2 if anti_aliasing else 1)
-    owner = nmr.ops.rasterize(vertices.detach(), faces, None, raster_size, bool(v["fill_back"]), float(v["near"]), far)
+    size = int(v["image_size"]) * (2 if anti_aliasing else 1)
+    settings = size, size, bool(v["fill_back"]), float(v["near"]), far
+    owner = nmr.ops.rasterize(vertices.detach(), faces, None, *settings)
     image = (owner >= 0).float()[..., None]
     alpha = nmr.ops.resolve(image, vertices, faces, None, owner, anti_aliasing, float(v["eps"]))[..., 0]
     alpha.backward(torch.from_numpy(v["grad_alpha"]))
@@ -187,12 +188,12 @@ ALL = tuple(CALLS)
         (
             ALL[:2],
             dict(resolved=np.zeros((2, 4, 4))),
-            r"resolved image must have shape \[B, S, S, C\], got \[2, 4, 4\]",
+            r"resolved image must have shape \[B, h, w, C\], got \[2, 4, 4\]",
         ),
-        (ALL[:2], dict(resolved=np.zeros((2, 4, 5, 3))), r"resolved image must have shape \[2, 4, 4, 3\]"),
+        (ALL[:2], dict(resolved=np.zeros((2, 4, 5, 3))), r"image must have shape \[2, 8, 10, 3\]"),
         (ALL[:2], dict(resolved=np.zeros((2, 4, 4, 0))), "must have pixels and channels"),
         (ALL, dict(image=np.zeros((2, 8, 7, 3))), r"image must have shape \[2, 8, 8, 3\], got \[2, 8, 7, 3\]"),
-        (ALL[2:], dict(image=np.zeros((2, 8, 8))), r"image must have shape \[B, R, R, C\], got \[2, 8, 8\]"),
+        (ALL[2:], dict(image=np.zeros((2, 8, 8))), r"image must have shape \[B, H, W, C\], got \[2, 8, 8\]"),
         (ALL[2:], dict(owner=np.full((2, 8, 8), 8, np.int32)), "the owner map does not belong to these faces"),
         (ALL[2:], dict(grad_image=np.zeros((2, 8, 8, 2))), r"grad_image must have shape \[2, 8, 8, 3\]"),
         (ALL[2:], dict(grad=np.zeros((2, 12, 2))), r"grad_vertices must have shape \[2, 12, 3\]"),

@@ -12,7 +12,7 @@ FAR = 50.0
 
 
 def owner_of(vertices, faces, raster_size, fill_back=True, starts=None):
-    return nmr.ops.rasterize(vertices, faces, starts, raster_size, fill_back, 0.1, FAR)
+    return nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, fill_back, 0.1, FAR)
 
 
 def gradients(vertices, faces, starts, owner, upstream_seed=0):
@@ -222,7 +222,7 @@ ALL = tuple(CALLS)
 @pytest.mark.parametrize(
     "calls, change, words",
     [
-        (ALL, dict(owner=np.zeros((2, 8, 9), np.int32)), r"owner must have shape \[2, R, R\], got \[2, 8, 9\]"),
+        (ALL, dict(owner=np.zeros((3, 8, 8), np.int32)), r"owner must have shape \[2, H, W\], got \[3, 8, 8\]"),
         (ALL, dict(owner=np.full((2, 8, 8), 8, np.int32)), "the owner map does not belong to these faces"),
         (ALL, dict(owner=np.full((2, 8, 8), -2, np.int32)), "the owner map does not belong to these faces"),
         (ALL, dict(faces=np.full((4, 3), 12)), "vertex 12, but a mesh has 12 vertices"),

@@ -208,7 +208,7 @@ def test_a_list_equals_its_meshes_one_by_one():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_opcheck(dtype):
     vertices, faces = random_soup(0, dtype=dtype)
-    settings = 12, True, True, 0.1, 100.0, 1e-4
+    settings = 12, 12, True, True, 0.1, 100.0, 1e-4
     torch.library.opcheck(nmr.ops.silhouette, (vertices.clone().requires_grad_(), faces, None, *settings, True))
     _, owner = nmr.ops.silhouette(vertices, faces, None, *settings)  # without it, as before
     upstream = noise(2, 12, 12, dtype=dtype)

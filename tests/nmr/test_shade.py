@@ -12,7 +12,7 @@ EPS = 1e-3
 
 
 def fragments_of(vertices, faces, raster_size, starts=None):
-    owner = nmr.ops.rasterize(vertices, faces, starts, raster_size, True, 0.1, 50.0)
+    owner = nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, True, 0.1, 50.0)
     return owner, nmr.ops.fragments(vertices, faces, starts, owner, 50.0)[0]
 
 
@@ -271,8 +271,8 @@ PACKED = dict(
 @pytest.mark.parametrize(
     "calls, packed, change, words",
     [
-        (ALL, False, dict(owner=np.zeros((2, 8, 9), np.int32)), r"owner must have shape \[2, R, R\], got \[2, 8, 9\]"),
-        (ALL, False, dict(owner=np.zeros((8, 8), np.int32)), r"owner must have shape \[0, R, R\], got \[8, 8\]"),
+        (ALL, False, dict(owner=np.full((2, 8, 9), -1, np.int32)), r"weights must have shape \[2, 8, 9, 3\]"),
+        (ALL, False, dict(owner=np.zeros((8, 8), np.int32)), r"owner must have shape \[0, H, W\], got \[8, 8\]"),
         (ALL, False, dict(owner=np.full((2, 8, 8), 8, np.int32)), "the owner map does not belong to these faces"),
         (ALL, True, dict(owner=np.full((2, 8, 8), 2, np.int32)), "the owner map does not belong to these faces"),
         (ALL, False, dict(weights=np.zeros((2, 8, 8, 2))), r"weights must have shape \[2, 8, 8, 3\]"),

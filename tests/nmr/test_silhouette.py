@@ -138,14 +138,14 @@ def test_gradient_descent_finds_the_target():
 
 def op_arguments(dtype=torch.float32, requires_grad=True):
     vertices, faces = random_soup(0, dtype=dtype)
-    return vertices.requires_grad_(requires_grad), faces, None, 12, True, True, 0.1, 100.0, 1e-4
+    return vertices.requires_grad_(requires_grad), faces, None, 12, 12, True, True, 0.1, 100.0, 1e-4
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_opcheck(dtype):
     torch.library.opcheck(nmr.ops.silhouette, op_arguments(dtype))
     _, owner = nmr.ops.silhouette(*op_arguments(dtype, False))
-    torch.library.opcheck(nmr.ops.rasterize, (*op_arguments(dtype, False)[:3], 24, True, 0.1, 100.0))
+    torch.library.opcheck(nmr.ops.rasterize, (*op_arguments(dtype, False)[:3], 24, 24, True, 0.1, 100.0))
     vertices, faces = op_arguments(dtype, False)[:2]
     upstream = torch.randn(2, 12, 12, dtype=dtype)
     torch.library.opcheck(nmr.ops.silhouette_backward, (vertices, faces, None, owner, upstream, True, 1e-4))

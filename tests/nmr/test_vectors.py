@@ -59,6 +59,7 @@ def test_index_map(name):
         torch.from_numpy(v["faces"]).long(),
         None,
         raster_size,
+        raster_size,
         bool(v["fill_back"]),
         float(v["near"]),
         float(v["far"]),

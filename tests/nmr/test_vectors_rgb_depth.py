@@ -16,8 +16,9 @@ def render(v):
     vertices = torch.from_numpy(v["vertices"]).requires_grad_()
     faces, far, eps = torch.from_numpy(v["faces"]).long(), float(v["far"]), float(v["eps"])
     mode, anti_aliasing = str(v["mode"]), bool(v["anti_aliasing"])
-    raster_size = int(v["image_size"]) * (2 if anti_aliasing else 1)
-    owner = nmr.ops.rasterize(vertices.detach(), faces, None, raster_size, bool(v["fill_back"]), float(v["near"]), far)
+    size = int(v["image_size"]) * (2 if anti_aliasing else 1)
+    settings = size, size, bool(v["fill_back"]), float(v["near"]), far
+    owner = nmr.ops.rasterize(vertices.detach(), faces, None, *settings)
     if "face_index_map" in v:
         assert np.array_equal(owner.numpy(), v["face_index_map"][:, ::-1])
     images, textures = {}, None

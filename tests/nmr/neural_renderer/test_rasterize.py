@@ -166,7 +166,7 @@ def test_one_texture_for_all_images_and_other_channels():
         (dict(textures=torch.rand(2, 8, 2, 2, 2, 3)), ValueError, "number of faces"),
         (dict(textures=torch.rand(2, 9, 2, 2, 3)), ValueError, r"textures must have shape"),
         (dict(image_size=0), ValueError, "image_size must lie in"),
-        (dict(image_size=(8, 9)), TypeError, "image_size must be an integer"),
+        (dict(image_size=(8, 9, 3)), ValueError, "image_size must be an integer"),
         (dict(image_size=8.5), TypeError, "image_size must be an integer"),
         (dict(near=2, far=1), ValueError, "near < far"),
         (dict(eps=0), ValueError, "eps must be positive"),
