@@ -15,17 +15,17 @@ namespace nmr {
 
 template <class T>
 void silhouette_forward(const SilhouetteForward<T>& args) {
-  const int64_t S = args.image.width, R = args.anti_aliasing ? 2 * S : S;
+  const Size image = args.image, raster = raster_of(image, args.anti_aliasing);
   parallel_for(args.batch, args.num_threads, [&](int64_t b) {
-    const int32_t* owner = args.owner + b * R * R;
-    T* alpha = args.alpha + b * S * S;
+    const int32_t* owner = args.owner + b * raster.pixels();
+    T* alpha = args.alpha + b * image.pixels();
     if (!args.anti_aliasing) {
-      for (int64_t n = 0; n < S * S; ++n) alpha[n] = owner[n] >= 0 ? T(1) : T(0);
+      for (int64_t n = 0; n < image.pixels(); ++n) alpha[n] = owner[n] >= 0 ? T(1) : T(0);
       return;
     }
-    for (int64_t y = 0; y < S; ++y, alpha += S) {
-      const int32_t *upper = owner + 2 * y * R, *lower = upper + R;
-      for (int64_t x = 0; x < S; ++x) {
+    for (int64_t y = 0; y < image.height; ++y, alpha += image.width) {
+      const int32_t *upper = owner + 2 * y * raster.width, *lower = upper + raster.width;
+      for (int64_t x = 0; x < image.width; ++x) {
         const int covered = (lower[2 * x] >= 0) + (lower[2 * x + 1] >= 0) + (upper[2 * x] >= 0) + (upper[2 * x + 1] >= 0);
         alpha[x] = T(0.25) * static_cast<T>(covered);
       }
@@ -44,15 +44,15 @@ struct BackwardScratch {
 
 template <class T>
 struct RowScratch {
-  std::vector<T> grad_row;  // [R + lanes]
+  std::vector<T> grad_row;  // [W + lanes]
 };
 
 // How the crossing c of an edge P-Q and a line moves with each end of the edge.
 template <class T>
 struct Lever {
   T crossing;  // c
-  T factor_p;  // 2 / R (Qs - Ps) / (Qs - n): travel of P, in [-1, 1] coordinates, that moves the crossing by one pixel
-  T factor_q;  // 2 / R (Qs - Ps) / (n - Ps)
+  T factor_p;  // 2 / M (Qs - Ps) / (Qs - n): travel of P, in [-1, 1] coordinates, that moves the crossing by one of M pixels
+  T factor_q;  // 2 / M (Qs - Ps) / (n - Ps)
   T eps;
 };
 
@@ -124,15 +124,15 @@ NMR_INLINE void corner_pixels(const SweepImage<T>& image, int32_t id, T* X, T* Y
   const bool reversed = id >= image.num_faces;
   const Triangle<T> t = load_triangle(image.vertices, image.faces + 3 * (reversed ? id - image.num_faces : id), reversed);
   for (int k = 0; k < 3; ++k) {
-    X[k] = to_pixel(t.x[k], static_cast<T>(image.R));
-    Y[k] = to_pixel(t.y[k], static_cast<T>(image.R));
+    X[k] = to_pixel(t.x[k], static_cast<T>(image.raster.width));
+    Y[k] = to_pixel(t.y[k], static_cast<T>(image.raster.height));
   }
 }
 
 // Sweeps one group of lines.
 template <class T>
 NMR_INLINE void run_sweep(const SweepImage<T>& image, const Sweep<T>& sweep, T* grad) {
-  const int64_t R = image.R, stride = R + kLanes, d = sweep.outward;
+  const int64_t H = image.raster.height, W = image.raster.width, d = sweep.outward;
   const int axis = sweep.edge < 3 ? 0 : 1, p = sweep.edge - 3 * axis, q = p < 2 ? p + 1 : 0, o = p > 0 ? p - 1 : 2;
   const PullLines<T>& lines = image.lines[axis];
   T grad_p = 0, grad_q = 0;
@@ -142,7 +142,7 @@ NMR_INLINE void run_sweep(const SweepImage<T>& image, const Sweep<T>& sweep, T* 
   for (uint32_t bits = sweep.pulled; bits; bits &= bits - 1) {
     const int64_t k = lowest_bit(bits), n = sweep.start + k;
     const Lever<T> lever{sweep.crossing[k], sweep.factor_p[k], sweep.factor_q[k], image.eps};
-    const T *position = lines.position.data() + n * stride, *weight = lines.weight.data() + n * stride;
+    const T *position = lines.position.data() + n * lines.stride, *weight = lines.weight.data() + n * lines.stride;
     const T outer = static_cast<T>(sweep.inner[k] + d);
     if (sweep.regular >> k & 1) {
       pull_listed(position, weight, lines.count[n], outer, static_cast<T>(d), lever, pulls_p, pulls_q);
@@ -163,14 +163,14 @@ NMR_INLINE void run_sweep(const SweepImage<T>& image, const Sweep<T>& sweep, T* 
     for (uint32_t bits = sweep.gains; bits; bits &= bits - 1) {
       const int64_t k = lowest_bit(bits), n = sweep.start + k, inner = sweep.inner[k];
       // pixel m of line n: owner[m * step]
-      const int32_t* owner = axis == 0 ? image.owner + (R - 1) * R + n : image.owner + (R - 1 - n) * R;
-      const int64_t step = axis == 0 ? -R : 1;
+      const int32_t* owner = axis == 0 ? image.owner + (H - 1) * W + n : image.owner + (H - 1 - n) * W;
+      const int64_t step = axis == 0 ? -W : 1, length = axis == 0 ? H : W;
       const Lever<T> lever{sweep.crossing[k], sweep.factor_p[k], sweep.factor_q[k], image.eps};
       const T line = static_cast<T>(n);
       const int end = (line - s[p]) * (line - s[o]) < 0 ? p : q;
       const T far_side = line_height(s[end], t[end], s[o], t[o], line);
-      const int64_t limit = sweep_limit(far_side, d, R);
-      const int64_t m_first = std::max<int64_t>(std::min(inner, limit), 0), m_last = std::min(std::max(inner, limit), R - 1);
+      const int64_t limit = sweep_limit(far_side, d, length);
+      const int64_t m_first = std::max<int64_t>(std::min(inner, limit), 0), m_last = std::min(std::max(inner, limit), length - 1);
       for (int64_t m = m_first; m <= m_last; ++m) {
         if (owner[m * step] != sweep.id) continue;
         const T g = axis == 0 ? image.grad(n, m) : image.grad(m, n);
@@ -191,17 +191,18 @@ NMR_INLINE void run_sweeps(const SweepImage<T>& image, const Sweep<T>* sweeps, i
 // Prepares the sweeps of one face, and runs all prepared sweeps when the scratch is full. Returns how many are prepared.
 template <class T>
 NMR_INLINE int64_t prepare_face(const SweepImage<T>& image, int32_t face, int32_t id, Sweep<T>* sweeps, int64_t count, T* grad) {
-  const int64_t R = image.R;
-  if (R == 1) return count;  // a crossing lies between two pixels of a line; here there is only one
-  const T raster_size = static_cast<T>(R), top = raster_size - 1;
+  const int64_t H = image.raster.height, W = image.raster.width;
+  const T height = static_cast<T>(H), width = static_cast<T>(W);
   T X[3], Y[3];
   corner_pixels(image, id, X, Y);
   // All six crossings of edges and axes, one per lane; lanes 6 and 7 repeat.
   const Lanes<T> ps{X[0], X[1], X[2], Y[0], Y[1], Y[2], X[0], X[0]}, pt{Y[0], Y[1], Y[2], X[0], X[1], X[2], Y[0], Y[0]};
   const Lanes<T> qs{X[1], X[2], X[0], Y[1], Y[2], Y[0], X[1], X[1]}, qt{Y[1], Y[2], Y[0], X[1], X[2], X[0], Y[1], Y[1]};
+  const Lanes<T> top{width - 1, width - 1, width - 1, height - 1, height - 1, height - 1, width - 1, width - 1};  // the last line
+  const Lanes<T> length{height, height, height, width, width, width, height, height};  // of a line
   const LaneMask<T> ascending = ps < qs;
   const Lanes<T> least = select(ascending, ps, qs), most = select(ascending, qs, ps);
-  const Lanes<T> low = select(least > T(0), least, splat(T(0))), high = select(most < top, most, splat(top));
+  const Lanes<T> low = select(least > T(0), least, splat(T(0))), high = select(most < top, most, top);
   // Edges parallel to the scan line (least == most) are left out: neither end can move a crossing.
   const LaneMask<T> in_reach = (least < most) & (low <= top) & (high > T(-1));
   const Lanes<T> from = select(in_reach, low, splat(T(1))), to = select(in_reach, high, splat(T(0)));
@@ -215,19 +216,22 @@ NMR_INLINE int64_t prepare_face(const SweepImage<T>& image, int32_t face, int32_
   store_lanes(pt_at, pt);
   store_lanes(qs_at, qs);
   store_lanes(slope_at, (qt - pt) / (qs - ps));
-  store_lanes(scale_at, (qs - ps) * T(2) / raster_size);
+  store_lanes(scale_at, (qs - ps) * T(2) / length);
   store_lanes(first_at, truncate(first));
   store_lanes(last_at, truncate(last));
   const uint32_t outward_up = lane_bits(ascending) ^ 0x07;
 
-  for (uint32_t bits = lane_bits(first <= last) & 0x3f; bits; bits &= bits - 1) {
+  // A crossing lies between two pixels of its line.
+  const uint32_t usable = (H > 1 ? 0x07 : 0) | (W > 1 ? 0x38 : 0);
+  for (uint32_t bits = lane_bits(first <= last) & usable; bits; bits &= bits - 1) {
     const int64_t e = lowest_bit(bits);
     const bool by_columns = e < 3;
     const PullLines<T>& lines = image.lines[by_columns ? 0 : 1];
     const int32_t d = outward_up >> e & 1 ? 1 : -1;
     // pixel m of line n: origin[n * step_s + m * step_t]
-    const int32_t* origin = image.owner + (R - 1) * R;
-    const int32_t step_s = by_columns ? 1 : static_cast<int32_t>(-R), step_t = by_columns ? static_cast<int32_t>(-R) : 1;
+    const int32_t* origin = image.owner + (H - 1) * W;
+    const int32_t step_s = by_columns ? 1 : static_cast<int32_t>(-W), step_t = by_columns ? static_cast<int32_t>(-W) : 1;
+    const T end = by_columns ? height - 1 : width - 1;  // the last pixel of a line
     const T direction = static_cast<T>(d);
     const T* pulls = d > 0 ? lines.last.data() : lines.first.data();
     const T* gains = d > 0 ? lines.gain_first.data() : lines.gain_last.data();
@@ -235,13 +239,13 @@ NMR_INLINE int64_t prepare_face(const SweepImage<T>& image, int32_t face, int32_
       const Lanes32 number = lane_numbers() + start, last_number = splat32(last_at[e]);
       const Lanes<T> line = to_values<T>(number);
       const Lanes<T> crossing = (line - ps_at[e]) * slope_at[e] + pt_at[e];
-      const LaneMask<T> on_screen = widen_mask<T>(number <= last_number) & (crossing >= T(-1)) & (crossing <= top + 1);
+      const LaneMask<T> on_screen = widen_mask<T>(number <= last_number) & (crossing >= T(-1)) & (crossing <= end + 1);
       // The pixel on the inner side: floor(c) if outward is up, else ceil(c) = -floor(-c).
       const Lanes<T> rising = select(on_screen, crossing * direction, splat(T(0)));
       Lanes<T> in = to_values<T>(truncate(rising));
       in = select(in > rising, in - T(1), in) * direction;
       const Lanes<T> out = in + direction;
-      const LaneMask<T> valid = on_screen & (in >= T(0)) & (in <= top) & (out >= T(0)) & (out <= top);
+      const LaneMask<T> valid = on_screen & (in >= T(0)) & (in <= end) & (out >= T(0)) & (out <= end);
       const LaneMask<T> pulled = (load_lanes<Lanes<T>>(pulls + start) - out) * direction >= T(0);
       const LaneMask<T> gained = (load_lanes<Lanes<T>>(gains + start) - in) * direction <= T(0);
       // Owners of the pixels on both sides; unused lanes read a pixel of the last line.
@@ -308,26 +312,33 @@ NMR_CLONES void find_visible(const int32_t* owner, int64_t pixels, int64_t num_f
 
 template <class T>
 void silhouette_backward(const SilhouetteBackward<T>& args) {
-  const int64_t S = args.image.width, R = args.anti_aliasing ? 2 * S : S, batch = args.mesh.batch;
+  const Size raster = raster_of(args.image, args.anti_aliasing);
+  const int64_t H = raster.height, W = raster.width, batch = args.mesh.batch;
   // Many images: one thread per image. Few images: all threads share one image at a time.
   const bool share = batch < args.num_threads;
   const int threads = share ? args.num_threads : 1;
   parallel_for(batch, share ? 1 : args.num_threads, [&](int64_t b) {
     BackwardScratch<T>& scratch = thread_scratch<BackwardScratch<T>>();
-    const SweepImage<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b), R, S,
-                              args.anti_aliasing, args.eps, args.owner + b * R * R, args.grad_alpha + b * S * S, scratch.lines,
-                              args.eps > T(1e-15) ? T(1e15) : T(0)};
-    for (PullLines<T>& lines : scratch.lines) lines.reserve_lines(R);
+    const SweepImage<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b), raster,
+                              args.image, args.anti_aliasing, args.eps, args.owner + b * raster.pixels(),
+                              args.grad_alpha + b * args.image.pixels(), scratch.lines, args.eps > T(1e-15) ? T(1e15) : T(0)};
+    scratch.lines[0].reserve_lines(W, H);
+    scratch.lines[1].reserve_lines(H, W);
     // Shared image: bands of columns, then bands of rows. Bands consist of whole vectors, so that no two threads write the same vector.
-    const int64_t band = share ? std::max<int64_t>(R / threads / kLanes * kLanes, 64) : R, bands = (R + band - 1) / band;
-    parallel_for(share ? 2 * bands : 1, threads, [&](int64_t n) {
-      T* grad_row = reserve(thread_scratch<RowScratch<T>>().grad_row, R + kLanes);
-      const int64_t first = n % bands * band, last = std::min(first + band, R);
-      collect(image, share ? n < bands ? LineRange{0, 0, first, last} : LineRange{first, last, 0, 0} : LineRange{0, R, 0, R}, grad_row);
+    const int64_t longer = std::max(H, W), band = share ? std::max<int64_t>(longer / threads / kLanes * kLanes, 64) : longer;
+    const int64_t column_bands = (W + band - 1) / band, row_bands = (H + band - 1) / band;
+    parallel_for(share ? column_bands + row_bands : 1, threads, [&](int64_t n) {
+      T* grad_row = reserve(thread_scratch<RowScratch<T>>().grad_row, W + kLanes);
+      const auto part = [band](int64_t k, int64_t lines) { return std::min(k * band, lines); };
+      const int64_t k = n - column_bands;  // number of a band of rows
+      const LineRange range = !share ? LineRange{0, H, 0, W}
+                              : k < 0 ? LineRange{0, 0, part(n, W), part(n + 1, W)}
+                                      : LineRange{part(k, H), part(k + 1, H), 0, 0};
+      collect(image, range, grad_row);
     });
     VisibleFaces& visible = scratch.visible;
-    visible.reserve_for(image.num_faces, std::min(2 * image.num_faces, R * R));
-    find_visible(image.owner, R * R, image.num_faces, visible);
+    visible.reserve_for(image.num_faces, std::min(2 * image.num_faces, raster.pixels()));
+    find_visible(image.owner, raster.pixels(), image.num_faces, visible);
     FaceGradients<T>& gradients = scratch.gradients;
     gradients.count = visible.count - 1;
     gradients.ids.assign(visible.ids.begin() + 1, visible.ids.begin() + visible.count);

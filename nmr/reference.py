@@ -24,16 +24,21 @@ def _cross(p: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def face_index(
-    vertices: Tensor, faces: Tensor, raster_size: int, fill_back: bool = True, near: float = 0.1, far: float = 100.0
+    vertices: Tensor,
+    faces: Tensor,
+    raster_size: int | tuple[int, int],
+    fill_back: bool = True,
+    near: float = 0.1,
+    far: float = 100.0,
 ) -> Tensor:
-    """Index map ``[R, R]`` of one mesh: row 0 = bottom, -1 = background, F + f = back copy of face f."""
-    R = raster_size
-    column = torch.arange(R)
-    centre = (2 * column + 1 - R).to(vertices) / R
-    points = torch.stack(torch.meshgrid(centre, centre, indexing="xy"), dim=-1)
-    x_pixel, y_pixel = torch.meshgrid(column.to(vertices), column.to(vertices), indexing="xy")
-    depth = torch.full((R, R), far, dtype=vertices.dtype)
-    index = torch.full((R, R), -1)
+    """Index map ``[H, W]`` of one mesh: row 0 = bottom, -1 = background, F + f = back copy of face f."""
+    H, W = (raster_size, raster_size) if isinstance(raster_size, int) else raster_size
+    column, row = torch.arange(W), torch.arange(H)
+    x_centre, y_centre = (2 * column + 1 - W).to(vertices) / W, (2 * row + 1 - H).to(vertices) / H
+    points = torch.stack(torch.meshgrid(x_centre, y_centre, indexing="xy"), dim=-1)
+    x_pixel, y_pixel = torch.meshgrid(column.to(vertices), row.to(vertices), indexing="xy")
+    depth = torch.full((H, W), far, dtype=vertices.dtype)
+    index = torch.full((H, W), -1)
     for f, corners in enumerate(vertices[with_back_faces(faces, fill_back)]):
         (x, y, z), flat = corners.unbind(1), corners[:, :2].double()
         if not corners[:, :2].isfinite().all() or z.isnan().any() or torch.linalg.det(flat[1:] - flat[0]) == 0:
@@ -45,7 +50,7 @@ def face_index(
         for a, b in ((0, 1), (1, 2), (2, 0)):
             left, right = _cross(points, corners[a], corners[b])
             inside &= ~(left < right)
-        X, Y = (x * R + R - 1) / 2, (y * R + R - 1) / 2
+        X, Y = (x * W + W - 1) / 2, (y * H + H - 1) / 2
         det = X[2] * (Y[0] - Y[1]) + X[0] * (Y[1] - Y[2]) + X[1] * (Y[2] - Y[0])
         weights = []
         for k in range(3):
@@ -62,18 +67,17 @@ def face_index(
 
 
 def silhouette(index: Tensor, anti_aliasing: bool, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Alpha ``[S, S]``, row 0 = top, of an index map ``[R, R]``."""
+    """Alpha ``[h, w]``, row 0 = top, of an index map ``[H, W]``."""
     alpha = (index >= 0).to(dtype).flip(0)
     return alpha.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2)) if anti_aliasing else alpha
 
 
 def _screen_weights(corners: Tensor) -> Tensor:
-    """Clamped, normalised weights ``[R, R, 3]`` at the pixel centres of corners ``[R, R, 3, 3]``; row 0 = bottom."""
-    R = corners.shape[0]
+    """Clamped, normalised weights ``[H, W, 3]`` at the pixel centres of corners ``[H, W, 3, 3]``; row 0 = bottom."""
+    H, W = corners.shape[:2]
     x, y, _ = corners.unbind(-1)
-    X, Y = (x * R + R - 1) / 2, (y * R + R - 1) / 2
-    column = torch.arange(R).to(corners)
-    x_pixel, y_pixel = torch.meshgrid(column, column, indexing="xy")
+    X, Y = (x * W + W - 1) / 2, (y * H + H - 1) / 2
+    x_pixel, y_pixel = torch.meshgrid(torch.arange(W).to(corners), torch.arange(H).to(corners), indexing="xy")
     a, b = [1, 2, 0], [2, 0, 1]
     dx, dy = X[..., b] - X[..., a], Y[..., a] - Y[..., b]
     linear = dy * x_pixel[..., None] + dx * y_pixel[..., None] + X[..., a] * Y[..., b] - X[..., b] * Y[..., a]
@@ -82,7 +86,7 @@ def _screen_weights(corners: Tensor) -> Tensor:
 
 
 def fragments(vertices: Tensor, faces: Tensor, index: Tensor, far: float = 100.0) -> tuple[Tensor, Tensor]:
-    """Perspective-correct weights ``[R, R, 3]`` and depth ``[R, R]`` of an index map; autograd differentiates both."""
+    """Perspective-correct weights ``[H, W, 3]`` and depth ``[H, W]`` of an index map; autograd differentiates both."""
     drawn = index >= 0
     corners = vertices[with_back_faces(faces, True)[index.clamp_min(0)]]
     screen, z = _screen_weights(corners), corners[..., 2]
@@ -96,7 +100,7 @@ def fragments(vertices: Tensor, faces: Tensor, index: Tensor, far: float = 100.0
 
 
 def resolve(image: Tensor, anti_aliasing: bool) -> Tensor:
-    """The image ``[S, S, C]``, row 0 = top, of raster pixels ``[R, R, C]``, row 0 = bottom."""
+    """The image ``[h, w, C]``, row 0 = top, of raster pixels ``[H, W, C]``, row 0 = bottom."""
     image = image.flip(0)
     return image.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2)) if anti_aliasing else image
 
@@ -117,7 +121,7 @@ def texture_color(texture: Tensor, weights: Tensor, eps: float) -> Tensor:
 
 
 def _raster_gradient(grad_resolved: Tensor, anti_aliasing: bool) -> Tensor:
-    """Gradient ``[R, R, ...]`` of the raster, row 0 = bottom, from that ``[S, S, ...]`` of the image, row 0 = top."""
+    """Gradient ``[H, W, ...]`` of the raster, row 0 = bottom, from that ``[h, w, ...]`` of the image, row 0 = top."""
     if anti_aliasing:
         grad_resolved = (grad_resolved / 4).repeat_interleave(2, 0).repeat_interleave(2, 1)
     return grad_resolved.flip(0)
@@ -132,7 +136,7 @@ def silhouette_gradient(
     fill_back: bool = True,
     eps: float = 1e-4,
 ) -> Tensor:
-    """NMR's gradient ``[V, 3]`` of one image, from its index map ``[R, R]`` and the gradient ``[S, S]`` of alpha."""
+    """NMR's gradient ``[V, 3]`` of one image, from its index map ``[H, W]`` and the gradient ``[h, w]`` of alpha."""
     image = (index >= 0).to(vertices)[..., None]
     return edge_gradient(vertices, faces, index, image, grad_alpha[..., None], anti_aliasing, fill_back, eps)
 
@@ -147,17 +151,18 @@ def edge_gradient(
     fill_back: bool = True,
     eps: float = 1e-4,
 ) -> Tensor:
-    """NMR's gradient ``[V, 3]`` of one image ``[R, R, C]``, from the gradient ``[S, S, C]`` of the resolved image.
+    """NMR's gradient ``[V, 3]`` of one image ``[H, W, C]``, from the gradient ``[h, w, C]`` of the resolved image.
 
     Index map and image have row 0 = bottom, the gradient has row 0 = top.
     """
-    R = index.shape[0]
+    H, W = index.shape
+    size = vertices.new_tensor([W, H])
     grad = _raster_gradient(grad_resolved, anti_aliasing)
     result = torch.zeros_like(vertices)
     for f, face in enumerate(with_back_faces(faces, fill_back)):
         if not (index == f).any():
             continue
-        pixel = (vertices[face, :2] * R + R - 1) / 2
+        pixel = (vertices[face, :2] * size + size - 1) / 2
         for p in range(3):
             q, o = (p + 1) % 3, (p + 2) % 3
             for axis in (0, 1):  # 0: lines of constant x, swept along y, which moves y; 1: the other way round
@@ -175,12 +180,12 @@ def _sweep_edge(
     p: Tensor, q: Tensor, o: Tensor, axis: int, f: int, lines: Tensor, image: Tensor, grad: Tensor, eps: float
 ) -> tuple[float, float]:
     """Gradients of the sweep coordinates of p and q; points are (scan, sweep), ``lines[n]`` is the line at scan n."""
-    R = lines.shape[0]
+    num_lines, length = lines.shape
     pull_p = pull_q = 0.0
     direction = (-1 if p[0] < q[0] else 1) * (1 if axis == 0 else -1)
     low, high = sorted((float(p[0]), float(q[0])))
     first = math.ceil(max(low, 0))
-    last = math.trunc(min(high, R - 1))  # towards zero, as published: not floor
+    last = math.trunc(min(high, num_lines - 1))  # towards zero, as published: not floor
     for n in range(first, last + 1):
         if p[0] == q[0]:
             continue
@@ -189,16 +194,16 @@ def _sweep_edge(
             continue
         inner = math.floor(crossing) if direction > 0 else math.ceil(crossing)
         outer = inner + direction
-        if min(inner, outer) < 0 or max(inner, outer) > R - 1:
+        if min(inner, outer) < 0 or max(inner, outer) > length - 1:
             continue
-        m = torch.arange(R)
+        m = torch.arange(length)
         # Outside: change of the loss if a pixel gets the value of the inner pixel.
         beyond = m >= outer if direction > 0 else m <= outer
         outside = ((image[n] - image[n, inner]) * grad[n]).sum(-1)
         outside = torch.where(beyond & (lines[n, inner] == f), outside, torch.zeros_like(outside))
         # Inside: change of the loss if a pixel of this face gets the value of the outer pixel.
         limit = _height(p, o, n) if (n - p[0]) * (n - o[0]) < 0 else _height(q, o, n)
-        limit = 0 if math.isnan(limit) else max(min(limit, R), -1)
+        limit = 0 if math.isnan(limit) else max(min(limit, length), -1)
         limit = math.ceil(limit) if direction > 0 else math.floor(limit)
         between = (m >= min(inner, limit)) & (m <= max(inner, limit))
         inside = ((image[n] - image[n, outer]) * grad[n]).sum(-1)
@@ -207,7 +212,7 @@ def _sweep_edge(
         for end, other in ((p, q), (q, p)):
             if other[0] == n:
                 continue
-            travel = (q[0] - p[0]) / ((q[0] - n) if end is p else (n - p[0])) * (m - crossing) * 2 / R
+            travel = (q[0] - p[0]) / ((q[0] - n) if end is p else (n - p[0])) * (m - crossing) * 2 / length
             travel = torch.where(travel > 0, travel + eps, travel - eps)
             pull = float((gain / travel).sum())
             if end is p:
@@ -226,7 +231,7 @@ def local_gradient(
 ) -> Tensor:
     """The silhouette's local gradient ``[V, 3]`` of one image, of Kato and Harada 2019 (:func:`nmr.render_silhouette`).
 
-    From the index map ``[R, R]``, row 0 = bottom, and the gradient ``[S, S]`` of alpha, row 0 = top.
+    From the index map ``[H, W]``, row 0 = bottom, and the gradient ``[h, w]`` of alpha, row 0 = top.
     """
     coverage = (index >= 0).to(vertices)
     grad = _raster_gradient(grad_alpha, anti_aliasing)
@@ -241,7 +246,7 @@ def local_gradient(
 
 
 def _one_pixel_moves(image: Tensor, grad: Tensor, eps: float) -> Tensor:
-    """d loss / d (coordinate along the rows) of the point seen in each pixel, ``[R, R]``."""
+    """d loss / d (coordinate along the rows) of the point seen in each pixel, ``[H, W]``."""
     per_pixel = image.shape[1] / 2
     step = image[:, 1:] - image[:, :-1]
     right, left = step * grad[:, 1:] * per_pixel, -step * grad[:, :-1] * per_pixel  # the image moves by a pixel

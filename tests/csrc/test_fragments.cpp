@@ -48,7 +48,7 @@ TEST_REAL(fragments_are_the_definition) {
     }
     ++covered;
     const int64_t b = n / (R * R), F = scene.mesh().face_count(b);
-    const SlowHit<T> hit = SlowFace<T>(scene, b, owner[n]).at(n % R, R - 1 - n / R % R, R);
+    const SlowHit<T> hit = SlowFace<T>(scene, b, owner[n]).at(n % R, R - 1 - n / R % R, square(R));
     CHECK_NEAR(depth[n], hit.depth, tolerance * hit.depth);
     // A point of the face: its depth and its place on the screen are those of the pixel.
     double z = 0, xz = 0, yz = 0;

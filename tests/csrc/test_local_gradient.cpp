@@ -35,36 +35,40 @@ T slow_move(const T (&coverage)[3], const T (&grad)[3], const bool (&exists)[3],
 
 template <class T>
 void check_gradient(const Scene<T>& scene) {
-  const int64_t S = scene.image.width, R = scene.raster_size();
-  const std::vector<int32_t> owner = draw(scene);
-  const std::vector<T> grad_alpha = noise_array<T>(scene.seed, scene.batch * S * S);
+  const int64_t H = scene.raster().height, W = scene.raster().width, w = scene.image.width;
+  const std::vector<T> grad_alpha = noise_array<T>(scene.seed, scene.batch * scene.image.pixels());
+  std::vector<int32_t> owners, owner;
+  std::vector<T> depth;
   std::vector<T> expected(3 * scene.rows(), T(0));
   for (int64_t b = 0; b < scene.batch; ++b) {
     const int64_t F = scene.mesh().face_count(b);
-    for (int64_t n = 0; n < R * R; ++n) {
-      const int32_t id = owner[b * R * R + n];
+    const T* upstream = grad_alpha.data() + b * scene.image.pixels();
+    slow_rasterize(scene, b, owner, depth);
+    owners.insert(owners.end(), owner.begin(), owner.end());
+    for (int64_t n = 0; n < H * W; ++n) {
+      const int32_t id = owner[n];
       if (id < 0) continue;
       T move[2];
       for (int axis = 0; axis < 2; ++axis) {
         T coverage[3] = {}, grad[3] = {};
         bool exists[3];
         for (int k = 0; k < 3; ++k) {  // in ascending x or y
-          const int64_t column = n % R + (axis == 0 ? k - 1 : 0), row = n / R - (axis == 1 ? k - 1 : 0);
-          exists[k] = column >= 0 && column < R && row >= 0 && row < R;
+          const int64_t column = n % W + (axis == 0 ? k - 1 : 0), row = n / W - (axis == 1 ? k - 1 : 0);
+          exists[k] = column >= 0 && column < W && row >= 0 && row < H;
           if (!exists[k]) continue;
-          coverage[k] = owner[b * R * R + row * R + column] >= 0;
-          grad[k] = scene.anti_aliasing ? grad_alpha[(b * S + row / 2) * S + column / 2] / 4 : grad_alpha[b * S * S + row * R + column];
+          coverage[k] = owner[row * W + column] >= 0;
+          grad[k] = scene.anti_aliasing ? upstream[row / 2 * w + column / 2] / 4 : upstream[row * W + column];
         }
-        move[axis] = slow_move(coverage, grad, exists, T(R) / 2, scene.eps);
+        move[axis] = slow_move(coverage, grad, exists, T(axis == 0 ? W : H) / 2, scene.eps);
       }
-      const SlowHit<T> hit = SlowFace<T>(scene, b, id).at(n % R, R - 1 - n / R, R);
+      const SlowHit<T> hit = SlowFace<T>(scene, b, id).at(n % W, H - 1 - n / W, scene.raster());
       const int64_t* corner = scene.mesh().image_faces(b) + 3 * (id % F);
       for (int k = 0; k < 3; ++k)
         for (int axis = 0; axis < 2; ++axis)
           expected[3 * (scene.mesh().vertex_start(b) + corner[id < F ? k : 2 - k]) + axis] += hit.weights[k] * move[axis];
     }
   }
-  const std::vector<T> grad = gradient(scene, owner, grad_alpha);
+  const std::vector<T> grad = gradient(scene, owners, grad_alpha);
   for (size_t n = 0; n < grad.size(); ++n) CHECK_NEAR(grad[n], expected[n], sizeof(T) == 4 ? 1e-4 : 1e-12);
 }
 
@@ -76,9 +80,9 @@ Mesh square(double left, double bottom, double right, double top) {
 
 TEST_REAL(local_gradient_is_the_definition) {
   for (uint64_t seed = 0; seed < 8; ++seed)
-    for (int64_t S : {1, 5, 12, 16}) {
+    for (Size image : {Size{1, 1}, Size{5, 5}, Size{12, 12}, Size{16, 16}, Size{1, 9}, Size{9, 1}, Size{12, 17}, Size{21, 4}}) {
       Scene<T> scene = stack<T>({soup(8, seed), soup(8, seed + 100)}, seed % 2);
-      scene.image = square(S);
+      scene.image = image;
       scene.anti_aliasing = seed % 4 < 2;
       scene.fill_back = seed % 3 != 0;
       scene.eps = seed % 2 ? T(1e-4) : T(0.5);  // the latter: many ties

@@ -38,7 +38,7 @@ void check_against_definition(const Scene<T>& scene) {
       const int32_t id = owner[b * R * R + n];
       CHECK_EQUAL(id >= 0, expected[n] >= 0);
       if (id == expected[n]) continue;
-      const SlowHit<T> hit = SlowFace<T>(scene, b, id).at(n % R, R - 1 - n / R, R);
+      const SlowHit<T> hit = SlowFace<T>(scene, b, id).at(n % R, R - 1 - n / R, square(R));
       CHECK(hit.inside);
       CHECK_NEAR(hit.depth, depth[n], 1e-5 * depth[n]);
     }

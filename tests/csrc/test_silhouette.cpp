@@ -20,11 +20,24 @@ Drawn<T> draw(const Scene<T>& scene) {
 }
 
 template <class T>
-std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& owner, const std::vector<T>& grad_alpha) {
+std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& owner, const std::vector<T>& grad_alpha,
+                        int num_threads = 2) {
   std::vector<T> grad = unwritten<T>(3 * scene.rows());
   silhouette_backward(SilhouetteBackward<T>{scene.mesh(), scene.image, scene.anti_aliasing, scene.eps, owner.data(),
-                                            grad_alpha.data(), grad.data(), 2});
+                                            grad_alpha.data(), grad.data(), num_threads});
   return grad;
+}
+
+// Owner maps of every image, drawn by the slow rasterizer.
+template <class T>
+std::vector<int32_t> slow_owner(const Scene<T>& scene) {
+  std::vector<int32_t> all, owner;
+  std::vector<T> depth;
+  for (int64_t b = 0; b < scene.batch; ++b) {
+    slow_rasterize(scene, b, owner, depth);
+    all.insert(all.end(), owner.begin(), owner.end());
+  }
+  return all;
 }
 
 // |a - b| / |b|
@@ -40,21 +53,23 @@ double relative_difference(const std::vector<T>& a, const std::vector<T>& b) {
 
 template <class T>
 void check_gradient(const Scene<T>& scene) {
-  const int64_t S = scene.image.width, R = scene.raster_size();
-  const Drawn<T> drawn = draw(scene);
-  const std::vector<T> grad_alpha = noise_array<T>(scene.seed, scene.batch * S * S);
+  const int64_t pixels = scene.raster().pixels(), W = scene.raster().width, w = scene.image.width;
+  const std::vector<int32_t> owner = slow_owner(scene);
+  const std::vector<T> grad_alpha = noise_array<T>(scene.seed, scene.batch * scene.image.pixels());
   std::vector<T> expected(3 * scene.rows(), T(0));
   for (int64_t b = 0; b < scene.batch; ++b) {
-    std::vector<T> coverage(R * R), grad(R * R);
-    for (int64_t n = 0; n < R * R; ++n) {
-      coverage[n] = T(drawn.owner[b * R * R + n] >= 0);
-      const int64_t y = n / R, x = n % R;
-      grad[n] = scene.anti_aliasing ? grad_alpha[(b * S + y / 2) * S + x / 2] / 4 : grad_alpha[b * S * S + n];
+    std::vector<T> coverage(pixels), grad(pixels);
+    const T* upstream = grad_alpha.data() + b * scene.image.pixels();
+    for (int64_t n = 0; n < pixels; ++n) {
+      coverage[n] = T(owner[b * pixels + n] >= 0);
+      grad[n] = scene.anti_aliasing ? upstream[n / W / 2 * w + n % W / 2] / 4 : upstream[n];
     }
-    slow_edge_gradient(scene, b, drawn.owner.data() + b * R * R, coverage.data(), grad.data(), 1,
+    slow_edge_gradient(scene, b, owner.data() + b * pixels, coverage.data(), grad.data(), 1,
                        expected.data() + 3 * scene.mesh().vertex_start(b));
   }
-  CHECK_NEAR(relative_difference(gradient(scene, drawn.owner, grad_alpha), expected), 0, sizeof(T) == 4 ? 1e-5 : 1e-12);
+  const std::vector<T> grad = gradient(scene, owner, grad_alpha, 1);
+  CHECK_NEAR(relative_difference(grad, expected), 0, sizeof(T) == 4 ? 1e-5 : 1e-12);
+  for (int threads : {2, 5}) CHECK(gradient(scene, owner, grad_alpha, threads) == grad);
 }
 
 }  // namespace
@@ -75,17 +90,37 @@ TEST_REAL(silhouette_is_the_covered_share) {
 
 TEST_REAL(silhouette_gradient_is_the_definition) {
   for (uint64_t seed = 0; seed < 8; ++seed) {
-    for (int64_t S : {1, 5, 12, 16}) {
+    for (Size image : {square(1), square(5), square(12), square(16), Size{1, 9}, Size{9, 1}, Size{2, 21}, Size{21, 4}, Size{12, 17}}) {
       Scene<T> scene = stack<T>({soup(8, seed), soup(8, seed + 100)}, seed % 2);
-      scene.image = square(S);
+      scene.image = image;
       scene.anti_aliasing = seed % 4 < 2;
       scene.seed = seed;
       check_gradient(scene);
     }
   }
   Scene<T> scene = pack<T>({sphere(2, 1), soup(3, 1), Mesh{}, sphere(1, 2)});
-  scene.image = square(24);
-  check_gradient(scene);
+  for (Size image : {square(24), Size{18, 47}, Size{83, 14}}) {  // the latter two: more than one band of lines per thread
+    scene.image = image;
+    check_gradient(scene);
+  }
+}
+
+TEST_REAL(silhouette_of_a_wide_image_is_the_covered_share) {
+  for (bool anti_aliasing : {false, true}) {
+    const Size image{5, 13}, raster = raster_of(image, anti_aliasing);
+    std::vector<int32_t> owner(2 * raster.pixels());
+    for (size_t n = 0; n < owner.size(); ++n) owner[n] = noise(7, n) > 0 ? static_cast<int32_t>(n % 3) : -1;
+    std::vector<T> alpha = unwritten<T>(2 * 65);
+    silhouette_forward(SilhouetteForward<T>{owner.data(), 2, image, anti_aliasing, alpha.data(), 2});
+    const int64_t k = anti_aliasing ? 2 : 1;
+    for (int64_t n = 0; n < 2 * 65; ++n) {
+      T covered = 0;
+      for (int64_t dy = 0; dy < k; ++dy)
+        for (int64_t dx = 0; dx < k; ++dx)
+          covered += owner[n / 65 * raster.pixels() + (n % 65 / 13 * k + dy) * raster.width + n % 13 * k + dx] >= 0;
+      CHECK_EQUAL(alpha[n], covered / T(k * k));
+    }
+  }
 }
 
 // A square to the left of the pixels that the loss wants: its right side is pulled to the right, nothing else moves.

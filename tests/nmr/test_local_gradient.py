@@ -44,6 +44,21 @@ def test_equals_the_slow_definition(seed, anti_aliasing, fill_back):
     assert grad[..., :2].any() and not grad[..., 2].any()
 
 
+@pytest.mark.parametrize("size", [(7, 16), (15, 6), (1, 9), (9, 1)])
+@pytest.mark.parametrize("anti_aliasing", [False, True])
+def test_rectangles_equal_the_slow_definition(size, anti_aliasing):
+    vertices, faces = random_soup(2)
+    upstream = noise(2, *size)
+    raster = tuple(n * (1 + anti_aliasing) for n in size)
+    index = torch.stack([reference.face_index(v, faces, raster) for v in vertices])
+    owner = index.flip(1).to(torch.int32).contiguous()
+    grad = nmr.ops.local_gradient(vertices, faces, None, owner, upstream, anti_aliasing, 1e-4)
+    for b in range(2):
+        expected = reference.local_gradient(vertices[b], faces, index[b], upstream[b], anti_aliasing)
+        torch.testing.assert_close(grad[b], expected, rtol=1e-9, atol=1e-9)
+    assert grad.any()
+
+
 def test_float32_is_close_to_float64():
     vertices, faces = random_soup(1, dtype=torch.float32)
     upstream = noise(2, 12, 12)

@@ -61,6 +61,22 @@ def test_equals_the_slow_definition(seed, anti_aliasing, fill_back):
     assert leaf.grad[..., :2].any() and not leaf.grad[..., 2].any()
 
 
+@pytest.mark.parametrize("size", [(7, 16), (15, 6), (1, 9), (9, 1)])
+@pytest.mark.parametrize("anti_aliasing", [False, True])
+def test_rectangles_equal_the_slow_definition(size, anti_aliasing):
+    vertices, faces = random_soup(5, dtype=torch.float64)
+    upstream = torch.randn(2, *size, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    raster = tuple(n * (1 + anti_aliasing) for n in size)
+    index = torch.stack([reference.face_index(v, faces, raster) for v in vertices])
+    grad = nmr.ops.silhouette_backward(
+        vertices, faces, None, index.flip(1).to(torch.int32).contiguous(), upstream, anti_aliasing, 1e-4
+    )
+    for b in range(2):
+        expected = reference.silhouette_gradient(vertices[b], faces, index[b], upstream[b], anti_aliasing)
+        torch.testing.assert_close(grad[b], expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+    assert grad.any()
+
+
 def test_same_bits_for_any_number_of_threads():
     vertices, faces, camera = bumpy_spheres(batch=7)
     vertices = camera.transform(vertices)
