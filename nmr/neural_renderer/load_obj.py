@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from ._images import read_image
 
-WRAPPINGS = ("REPEAT", "MIRRORED_REPEAT", "CLAMP_TO_EDGE", "CLAMP_TO_BORDER")
+texture_wrapping_dict = {"REPEAT": 0, "MIRRORED_REPEAT": 1, "CLAMP_TO_EDGE": 2, "CLAMP_TO_BORDER": 3}
 _GREY = 0.5  # colour of faces without a material
 _LARGEST = float(np.finfo(np.float32).max)
 _MOST_BYTES = 2**30  # of an .obj or .mtl file; reading one takes some 30 times its size
@@ -40,6 +41,9 @@ def load_obj(
     use_bilinear: bool = True,
 ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
     """Read a mesh; polygons become fans of triangles.
+
+    As published, faces of fewer than three corners add nothing, and texture coordinates are read only with
+    ``load_texture``. A ``vt`` with one number has v = 0.
 
     Parameters
     ----------
@@ -75,9 +79,8 @@ def load_obj(
     >>> vertices, faces, textures = nr.load_obj("chair.obj", texture_size=8, load_texture=True)
     """
     filename_obj = os.fspath(filename_obj)
-    if texture_wrapping not in WRAPPINGS:
-        raise ValueError(f"texture_wrapping must be one of {', '.join(WRAPPINGS)}, got {texture_wrapping!r}")
-    obj = _read_obj(filename_obj)
+    _check_wrapping(texture_wrapping)
+    obj = _read_obj(filename_obj, with_uv=load_texture)
     vertices = torch.from_numpy(np.array(obj.vertices, np.float32).reshape(-1, 3))
     faces = torch.from_numpy(np.array(obj.faces, np.int32).reshape(-1, 3))
     if normalization:
@@ -94,23 +97,59 @@ def load_obj(
     return vertices, faces, _textures(filename_obj, obj, texture_size, texture_wrapping, use_bilinear)
 
 
-def _read_obj(filename: str) -> _Obj:
+def load_textures(
+    filename_obj: str | os.PathLike,
+    filename_mtl: str | os.PathLike,
+    texture_size: int,
+    texture_wrapping: str = "REPEAT",
+    use_bilinear: bool = True,
+) -> Tensor:
+    """The textures ``[F, ts, ts, ts, 3]`` of a mesh, with the materials of ``filename_mtl``: see :func:`load_obj`.
+
+    >>> textures = nr.load_obj("chair.obj", load_texture=True)[2]  # with the materials that the file names
+    """
+    filename_obj, filename_mtl = os.fspath(filename_obj), os.fspath(filename_mtl)
+    _check_wrapping(texture_wrapping)
+    obj = _read_obj(filename_obj, with_uv=True)
+    return _textures(filename_obj, obj, texture_size, texture_wrapping, use_bilinear, filename_mtl)
+
+
+def _check_wrapping(wrapping: str) -> None:
+    if wrapping not in texture_wrapping_dict:
+        raise ValueError(f"texture_wrapping must be one of {', '.join(texture_wrapping_dict)}, got {wrapping!r}")
+
+
+def _keyword(line: str) -> tuple[str, str]:
+    """The first word of a line, and the rest."""
+    keyword, *rest = line.split(None, 1)
+    return keyword, rest[0].rstrip() if rest else ""
+
+
+def _without_comment(text: str) -> str:
+    """``text`` before a ``#`` that begins a word; names may hold one inside."""
+    return re.split(r"(?:^|\s)#", text, maxsplit=1)[0].rstrip()
+
+
+def _read_obj(filename: str, with_uv: bool) -> _Obj:
+    """Without ``with_uv``, texture coordinates are skipped, and those of faces are -1."""
     obj = _Obj()
     _check_file(filename)
     with open(filename, encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
-            keyword, _, rest = line.strip().partition(" ")
+            if line.isspace():
+                continue
+            keyword, rest = _keyword(line)
             try:
                 if keyword == "v":
-                    obj.vertices.extend(_numbers(rest, 3))
-                elif keyword == "vt":
-                    obj.uv.extend(_numbers(rest, 2))
+                    obj.vertices.extend(_numbers(rest.split(None, 3), 3))
+                elif keyword == "vt" and with_uv:
+                    obj.uv.extend(_numbers([*_without_comment(rest).split(None, 2)[:2], "0"], 2))  # v is 0 if missing
                 elif keyword == "f":
-                    _add_polygon(obj, rest)
+                    _add_polygon(obj, _without_comment(rest), with_uv)
                 elif keyword == "usemtl":
-                    obj.materials.append((rest.strip(), len(obj.faces) // 3))
+                    obj.materials.append((_without_comment(rest), len(obj.faces) // 3))
                 elif keyword == "mtllib":
-                    obj.libraries.append(rest.strip())
+                    obj.libraries.append(rest)
             except (ValueError, IndexError, OverflowError) as error:
                 raise ValueError(f"{filename}, line {number}: {line.strip()[:200]!r} cannot be read: {error}") from None
     if not obj.vertices or not obj.faces:
@@ -133,24 +172,24 @@ def _check_file(filename: str) -> None:
         raise ValueError(f"{filename} has {os.path.getsize(filename)} bytes; at most {_MOST_BYTES} are read")
 
 
-def _numbers(rest: str, count: int) -> tuple[float, ...]:
-    values = tuple(float(x) for x in rest.split()[:count])
+def _numbers(words: list[str], count: int) -> tuple[float, ...]:
+    values = tuple(float(word) for word in words[:count])
     if len(values) < count or not all(abs(value) <= _LARGEST for value in values):
         raise ValueError(f"{count} numbers are needed, finite in float32")
     return values
 
 
-def _add_polygon(obj: _Obj, line: str) -> None:
+def _add_polygon(obj: _Obj, line: str, with_uv: bool) -> None:
     """Adds the fan of a polygon. Of a long line the corners are taken one by one, for there may be millions of them."""
     corners = line.split() if len(line) < 2**16 else (word[0] for word in re.finditer(r"\S+", line))
     points, uvs, num_points, num_uvs = array("i"), array("i"), len(obj.vertices) // 3, len(obj.uv) // 2
     for corner in corners:
         part = corner.split("/", 2)
         points.append(_index(part[0], num_points))
-        if len(part) > 1 and part[1]:
+        if with_uv and len(part) > 1 and part[1]:
             uvs.append(_index(part[1], num_uvs))
-    if len(points) < 3:
-        raise ValueError("a face needs three corners")
+    if not points:
+        raise ValueError("a face needs corners")
     for i in range(1, len(points) - 1):
         obj.faces.extend((points[0], points[i], points[i + 1]))
         obj.uv_faces.extend((uvs[0], uvs[i], uvs[i + 1]) if len(uvs) == len(points) else (-1, -1, -1))
@@ -170,14 +209,16 @@ def load_mtl(filename_mtl: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     _check_file(filename_mtl)
     with open(filename_mtl, encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
-            keyword, _, rest = line.strip().partition(" ")
+            if line.isspace():
+                continue
+            keyword, rest = _keyword(line)
             if keyword == "newmtl":
-                material = rest.strip()
+                material = _without_comment(rest)
             elif keyword == "map_Kd":
-                images[material] = rest.strip().replace("\\", "/")
+                images[material] = rest.replace("\\", "/")
             elif keyword == "Kd":
                 try:
-                    colors[material] = np.array(_numbers(rest, 3), dtype=np.float32)
+                    colors[material] = np.array(_numbers(rest.split(None, 3), 3), dtype=np.float32)
                 except ValueError as error:
                     raise ValueError(
                         f"{filename_mtl}, line {number}: {line.strip()!r} cannot be read: {error}"
@@ -185,23 +226,43 @@ def load_mtl(filename_mtl: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     return colors, images
 
 
-def _textures(filename_obj: str, obj: _Obj, texture_size: int, wrapping: str, bilinear: bool) -> Tensor:
-    if not obj.libraries:
+def _libraries(folder: str, obj: _Obj) -> Iterator[str]:
+    """The .mtl files of an .obj file. A line may hold one name with spaces, or several names."""
+    for line in obj.libraries:
+        whole = [name for name in (line, _without_comment(line)) if os.path.exists(os.path.join(folder, name))]
+        for name in whole[:1] or _without_comment(line).split():
+            yield os.path.join(folder, name)
+
+
+def _image(folder: str, line: str) -> str:
+    """The file of a line ``map_Kd``, in which options may come before the name and a comment after it."""
+    short = _without_comment(line)
+    names = (line, short, (short.split() or [""])[-1])
+    paths = [os.path.join(folder, name) for name in names]
+    return next((path for path in paths if os.path.exists(path)), paths[-1])
+
+
+def _textures(
+    filename_obj: str, obj: _Obj, texture_size: int, wrapping: str, bilinear: bool, library: str | None = None
+) -> Tensor:
+    folder = os.path.dirname(filename_obj)
+    libraries = [library] if library is not None else list(_libraries(folder, obj))
+    if not libraries:
         raise ValueError(
             f"{filename_obj} names no .mtl file (line `mtllib ...`); call load_obj with load_texture=False"
         )
-    folder = os.path.dirname(filename_obj)
     colors, images = {}, {}
-    for library in obj.libraries:
-        for one in [library] if os.path.exists(os.path.join(folder, library)) else library.split():
-            more_colors, more_images = load_mtl(os.path.join(folder, one))
-            colors.update(more_colors)
-            images.update(more_images)
+    for library in libraries:
+        more_colors, more_images = load_mtl(library)
+        colors.update(more_colors)
+        images.update(more_images)
     uv_faces, uvs = np.array(obj.uv_faces).reshape(-1, 3), np.array(obj.uv, np.float32).reshape(-1, 2)
     textures = np.full((len(uv_faces), texture_size, texture_size, texture_size, 3), _GREY, dtype=np.float32)
     faces_of: dict[str, list[np.ndarray]] = {}
     ends = [first for _, first in obj.materials[1:]] + [len(uv_faces)]
     for (name, first), end in zip(obj.materials, ends, strict=True):
+        if name not in colors and name not in images:  # as published, the first word counts
+            name = (name.split() or [""])[0]
         faces_of.setdefault(name, []).append(np.arange(first, end))
     for name, runs in faces_of.items():
         faces = np.concatenate(runs)
@@ -209,10 +270,8 @@ def _textures(filename_obj: str, obj: _Obj, texture_size: int, wrapping: str, bi
             textures[faces] = colors[name]
         chosen = faces[(uv_faces[faces] >= 0).all(1)]
         if name in images and len(chosen):
-            path = os.path.join(folder, images[name])
-            if not os.path.exists(path):  # map_Kd may have options before the file name
-                path = os.path.join(folder, (images[name].split() or [""])[-1])
-            textures[chosen] = bake_textures(read_image(path), uvs[uv_faces[chosen]], texture_size, wrapping, bilinear)
+            image, uv = read_image(_image(folder, images[name])), uvs[uv_faces[chosen]]
+            textures[chosen] = bake_textures(image, uv, texture_size, wrapping, bilinear)
     return torch.from_numpy(textures)
 
 

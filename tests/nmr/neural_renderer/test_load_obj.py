@@ -8,7 +8,7 @@ from memory_checks import at_most
 from vectors import load_vector, vector_names
 
 import nmr.neural_renderer as nr
-from nmr.neural_renderer.load_obj import bake_textures, load_mtl
+from nmr.neural_renderer.load_obj import bake_textures, load_mtl, load_textures, texture_wrapping_dict
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
@@ -106,15 +106,73 @@ def test_material_file_beside_the_obj_is_found_from_elsewhere(tmp_path, monkeypa
         (TRIANGLE + "f 1 2 4\n", "refers to vertex 4, but there are 3"),
         (TRIANGLE + "f 1 2 0\n", "line 4: 'f 1 2 0' cannot be read: there is no element 0"),
         (TRIANGLE + "f 1 2 -4\n", "there is no element -4"),
-        (TRIANGLE + "f 1 2\n", "a face needs three corners"),
+        (TRIANGLE + "f\n", "a face needs corners"),
+        (TRIANGLE + "f 1 2\n", "has no faces"),
         (TRIANGLE + "f a b c\n", "line 4.*cannot be read"),
         ("v 1 2\n", "line 1.*3 numbers are needed"),
         (TRIANGLE + "vt 0 0\nf 1/1 2/2 3/1\n", "refers to texture coordinate 2, but there are 1"),
+        (TRIANGLE + "f 1/1 2/2 3/3\n", "refers to texture coordinate 3, but there are 0"),
+        (TRIANGLE + "vt\nf 1 2 3\n", "line 4.*2 numbers are needed"),
     ],
 )
 def test_errors_of_files(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
-        nr.load_obj(write(tmp_path, a_obj=text))
+        nr.load_obj(write(tmp_path, a_obj=text), load_texture=True)
+
+
+@pytest.mark.parametrize("line", ["f 1 2", "f 1", "vt 0.5", "vt", "vt a b", "f 1/1 2/2 3/3", "f 1 2 3 # f 1 2 2", "\t"])
+def test_lines_that_the_published_function_accepts(tmp_path, line):
+    """Faces of one or two corners add nothing; texture coordinates are not read without ``load_texture``."""
+    faces = nr.load_obj(write(tmp_path, a_obj=f"{TRIANGLE}f 3 2 1\n{line}\n"))[1]
+    assert faces.tolist() == [[2, 1, 0]] + ([[0, 1, 2]] if line.count("3") else [])
+
+
+@pytest.mark.parametrize("blank", ["\t", " \t ", "\t\t"])
+def test_tabs_between_words(tmp_path, blank):
+    obj = "\tmtllib a.mtl\nv 0 0 1\nv 1 0 0\nv 0 1 0\nv 0 2 0\nusemtl red\nf 1 2 4\n".replace(" ", blank)
+    path = write(tmp_path, a_obj=obj, a_mtl="newmtl red\n Kd 1 0 0\n".replace(" ", blank))
+    vertices, faces, textures = nr.load_obj(path, normalization=False, load_texture=True)
+    assert vertices.tolist() == [[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 2, 0]] and faces.tolist() == [[0, 1, 3]]
+    assert torch.all(textures == torch.tensor([1.0, 0, 0]))
+
+
+@pytest.mark.parametrize("used", ["red # the roof", "red roof", "red\t#", "red"])
+@pytest.mark.parametrize("made", ["red # the roof", "red"])
+def test_comments_after_names(tmp_path, used, made):
+    """Without a material of the whole name, the first word is the name, as published."""
+    obj = f"mtllib a.mtl # materials\n{TRIANGLE}usemtl {used}\nf 1 2 3\n"
+    path = write(tmp_path, a_obj=obj, a_mtl=f"newmtl blue\nKd 0 0 1\nnewmtl {made}\nKd 1 0 0 # red\n")
+    assert torch.all(nr.load_obj(path, load_texture=True)[2] == torch.tensor([1.0, 0, 0]))
+
+
+@pytest.mark.parametrize("line", ["wood.png # oak", "wood #1.png", "-s 1 1 1 wood.png\t# oak"])
+def test_names_of_images(tmp_path, line):
+    image_module = pytest.importorskip("PIL.Image")
+    name = "wood #1.png" if "#1" in line else "wood.png"
+    image_module.new("RGB", (2, 2), (51, 51, 51)).save(tmp_path / name)
+    obj = f"mtllib a.mtl\n{TRIANGLE}vt 0.5\nusemtl m\nf 1/1 2/1 3/1\n"
+    path = write(tmp_path, a_obj=obj, a_mtl=f"newmtl m\nmap_Kd {line}\n")
+    textures = nr.load_obj(path, load_texture=True)[2]
+    torch.testing.assert_close(textures, torch.full_like(textures, 0.2))
+
+
+def test_textures_of_another_material_file(tmp_path):
+    path, _ = materials(tmp_path)
+    textures = nr.load_obj(path, texture_size=2, load_texture=True)[2]
+    assert torch.equal(load_textures(path, tmp_path / "a.mtl", 2), textures)
+    (tmp_path / "b.mtl").write_text("newmtl red\nKd 0 1 0\n")
+    assert torch.all(load_textures(path, tmp_path / "b.mtl", 2, use_bilinear=False)[1] == torch.tensor([0, 1.0, 0]))
+    assert texture_wrapping_dict == {"REPEAT": 0, "MIRRORED_REPEAT": 1, "CLAMP_TO_EDGE": 2, "CLAMP_TO_BORDER": 3}
+    with pytest.raises(ValueError, match="texture_wrapping must be one of REPEAT"):
+        load_textures(path, tmp_path / "a.mtl", 2, "WRAP")
+
+
+def test_millions_of_corners_take_little_memory(tmp_path):
+    """Some 30 times the size of the file."""
+    write(tmp_path, a_obj=f"{TRIANGLE}f {'1 ' * 200_000}\n")
+    with at_most(30 * 400_000):
+        faces = nr.load_obj(tmp_path / "a.obj")[1]
+    assert faces.shape == (199_998, 3)
 
 
 def test_errors(tmp_path, monkeypatch):
