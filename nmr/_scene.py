@@ -28,7 +28,7 @@ from .fragments import Fragments
 from .lights import Lights
 from .textures import Colors
 
-_LARGEST_IMAGE = 8192
+LARGEST_IMAGE = 8192
 
 Meshes = Tensor | Sequence[Tensor]
 
@@ -78,7 +78,7 @@ def make_scene(
     far: float,
     eps: float = 1e-4,
 ) -> Scene:
-    height, width = check_image_size(image_size, _LARGEST_IMAGE)
+    height, width = check_image_size(image_size, LARGEST_IMAGE)
     check_depth_range(near, far)
     packed = is_list(vertices) or is_list(faces)
     if packed:

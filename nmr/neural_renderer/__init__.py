@@ -2,11 +2,12 @@
 
 Names, arguments, their order and defaults are the published ones. So are images and gradients, except for defects that
 are corrected here (``docs/from-neural-renderer.md`` lists them). The operators of :mod:`nmr` do the work. Images are
-``[B, 3, S, S]`` and ``[B, S, S]`` with row 0 at the top; vertices ``[B, V, 3]``, faces ``[B, F, 3]``, textures
-``[B, F, ts, ts, ts, 3]``.
+``[B, 3, h, w]`` and ``[B, h, w]`` with row 0 at the top; vertices ``[B, V, 3]``, faces ``[B, F, 3]``, textures
+``[B, F, ts, ts, ts, 3]``. :func:`install_as` lets other people's ``import neural_renderer`` find this package.
 """
 
 from .get_points_from_angles import get_points_from_angles
+from .install_as import install_as
 from .lighting import lighting
 from .load_obj import load_obj
 from .look import look
@@ -24,6 +25,7 @@ __all__ = [
     "Rasterize",
     "Renderer",
     "get_points_from_angles",
+    "install_as",
     "lighting",
     "load_obj",
     "look",

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._validate import as_floats, check_vertices, describe
+from .._scene import LARGEST_IMAGE
+from .._validate import as_floats, check_image_size, check_vertices, describe
 
 Numbers = float | Sequence | np.ndarray | Tensor
 
@@ -25,6 +26,15 @@ def check_batch(vertices: object) -> Tensor:
     if checked is not vertices:
         raise ValueError(f"vertices must have shape [B, V, 3], got {describe(vertices)}; use vertices[None]")
     return checked
+
+
+def height_and_width(image_size: object) -> tuple[int, int]:
+    """Pixels of an image: from a pair, or from one number, which may be a whole float or an array without axes."""
+    if isinstance(image_size, (np.generic, np.ndarray, Tensor)) and image_size.ndim == 0:
+        image_size = image_size.item()
+    if isinstance(image_size, float) and image_size.is_integer():
+        image_size = int(image_size)
+    return check_image_size(image_size, LARGEST_IMAGE)
 
 
 def integer_faces(faces: object, batch: int) -> Tensor:

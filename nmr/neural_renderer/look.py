@@ -9,6 +9,12 @@ from ..cameras import Orthographic
 from ._convert import Numbers, check_batch
 
 
+def orthographic_look(eye: Numbers, direction: Numbers, up: Numbers) -> Orthographic:
+    """The camera at ``eye`` that looks along ``direction``, without perspective."""
+    eye, direction = (torch.as_tensor(x).double() for x in (eye, direction))
+    return Orthographic(eye, eye + direction, up)
+
+
 def look(vertices: Tensor, eye: Numbers, direction: Numbers = (0, 1, 0), up: Numbers | None = None) -> Tensor:
     """Vertices in the axes of a camera at ``eye`` that looks along ``direction``: x right, y up, z forward.
 
@@ -17,5 +23,4 @@ def look(vertices: Tensor, eye: Numbers, direction: Numbers = (0, 1, 0), up: Num
 
     >>> nr.perspective(nr.look(vertices, [0, 0, -3], [0, 0, 1]))
     """
-    eye, direction = (torch.as_tensor(x).double() for x in (eye, direction))
-    return Orthographic(eye, eye + direction, (0, 1, 0) if up is None else up).transform(check_batch(vertices))
+    return orthographic_look(eye, direction, (0, 1, 0) if up is None else up).transform(check_batch(vertices))

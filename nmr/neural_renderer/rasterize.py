@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,7 +11,7 @@ from .. import ops
 from .._validate import describe
 from ..fragments import Fragments
 from ..render import render
-from ._convert import Numbers, check_textures, like
+from ._convert import Numbers, check_textures, height_and_width, like
 
 DEFAULT_IMAGE_SIZE = 256
 DEFAULT_ANTI_ALIASING = True
@@ -49,7 +48,7 @@ def draw(
     vertices: Tensor,
     faces: Tensor,
     textures: Tensor | None,
-    image_size: int,
+    image_size: object,
     anti_aliasing: bool,
     near: float,
     far: float,
@@ -61,15 +60,13 @@ def draw(
     light: Tensor | None = None,
 ) -> dict[str, Tensor | None]:
     """Draws ``outputs`` out of "rgb", "alpha", "depth" of meshes in renderer space; the others are None."""
-    if isinstance(image_size, (np.generic, Tensor)) and image_size.ndim == 0:
-        image_size = image_size.item()
     images = render(
         vertices,
         faces,
         outputs=outputs,
         colors=_Cubes(textures, light),
         background=like(background_color, "background_color", vertices) if "rgb" in outputs else 0.0,
-        image_size=int(image_size) if isinstance(image_size, float) and image_size.is_integer() else image_size,
+        image_size=height_and_width(image_size),
         anti_aliasing=anti_aliasing,
         fill_back=fill_back,
         near=near,
@@ -94,7 +91,7 @@ def _soup(faces: object) -> tuple[Tensor, Tensor]:
 def rasterize_rgbad(
     faces: Tensor,
     textures: Tensor | None = None,
-    image_size: int = DEFAULT_IMAGE_SIZE,
+    image_size: int | tuple[int, int] = DEFAULT_IMAGE_SIZE,
     anti_aliasing: bool = DEFAULT_ANTI_ALIASING,
     near: float = DEFAULT_NEAR,
     far: float = DEFAULT_FAR,
@@ -113,10 +110,10 @@ def rasterize_rgbad(
         that are counter-clockwise on the screen are drawn.
     textures : Tensor [B, F, ts, ts, ts, 3]
         Axis k of a cube belongs to corner k; [1, F, ...] serves all images. Needed for RGB.
-    image_size : int
-        S, pixels per side.
+    image_size : int or (height, width)
+        Pixels, h and w; one number means a square.
     anti_aliasing : bool
-        Average 2x2 pixels of a raster of 2S x 2S.
+        Average 2x2 pixels of a raster of 2h x 2w.
     near, far : float
         A pixel is covered only where near < depth < far; depth is ``far`` elsewhere.
     eps : float
@@ -128,7 +125,7 @@ def rasterize_rgbad(
     Returns
     -------
     dict
-        "rgb" ``[B, 3, S, S]``, "alpha" ``[B, S, S]``, "depth" ``[B, S, S]``, row 0 = top, or None where not wanted.
+        "rgb" ``[B, 3, h, w]``, "alpha" ``[B, h, w]``, "depth" ``[B, h, w]``, row 0 = top, or None where not wanted.
 
     Notes
     -----
@@ -153,40 +150,40 @@ def rasterize_rgbad(
 def rasterize(
     faces: Tensor,
     textures: Tensor,
-    image_size: int = DEFAULT_IMAGE_SIZE,
+    image_size: int | tuple[int, int] = DEFAULT_IMAGE_SIZE,
     anti_aliasing: bool = DEFAULT_ANTI_ALIASING,
     near: float = DEFAULT_NEAR,
     far: float = DEFAULT_FAR,
     eps: float = DEFAULT_EPS,
     background_color: object = DEFAULT_BACKGROUND_COLOR,
 ) -> Tensor:
-    """RGB images ``[B, 3, S, S]``: see :func:`rasterize_rgbad`."""
+    """RGB images ``[B, 3, h, w]``: see :func:`rasterize_rgbad`."""
     settings = (image_size, anti_aliasing, near, far, eps, background_color)
     return rasterize_rgbad(faces, textures, *settings, True, False, False)["rgb"]
 
 
 def rasterize_silhouettes(
     faces: Tensor,
-    image_size: int = DEFAULT_IMAGE_SIZE,
+    image_size: int | tuple[int, int] = DEFAULT_IMAGE_SIZE,
     anti_aliasing: bool = DEFAULT_ANTI_ALIASING,
     near: float = DEFAULT_NEAR,
     far: float = DEFAULT_FAR,
     eps: float = DEFAULT_EPS,
 ) -> Tensor:
-    """Coverage ``[B, S, S]``: see :func:`rasterize_rgbad`."""
+    """Coverage ``[B, h, w]``: see :func:`rasterize_rgbad`."""
     settings = (image_size, anti_aliasing, near, far, eps, None)
     return rasterize_rgbad(faces, None, *settings, False, True, False)["alpha"]
 
 
 def rasterize_depth(
     faces: Tensor,
-    image_size: int = DEFAULT_IMAGE_SIZE,
+    image_size: int | tuple[int, int] = DEFAULT_IMAGE_SIZE,
     anti_aliasing: bool = DEFAULT_ANTI_ALIASING,
     near: float = DEFAULT_NEAR,
     far: float = DEFAULT_FAR,
     eps: float = DEFAULT_EPS,
 ) -> Tensor:
-    """Depth images ``[B, S, S]``: see :func:`rasterize_rgbad`."""
+    """Depth images ``[B, h, w]``: see :func:`rasterize_rgbad`."""
     settings = (image_size, anti_aliasing, near, far, eps, None)
     return rasterize_rgbad(faces, None, *settings, False, False, True)["depth"]
 
@@ -194,13 +191,13 @@ def rasterize_depth(
 class Rasterize(torch.nn.Module):
     """:func:`rasterize_rgbad` as a module, one level lower: no averaging, channels last, row 0 = bottom.
 
-    ``forward(faces, textures)`` returns ``(rgb [B, R, R, 3], alpha [B, R, R], depth [B, R, R])`` with R =
-    ``image_size``; an image that is not wanted is an empty tensor.
+    ``forward(faces, textures)`` returns ``(rgb [B, h, w, 3], alpha [B, h, w], depth [B, h, w])``; an image that is not
+    wanted is an empty tensor.
     """
 
     def __init__(
         self,
-        image_size: int,
+        image_size: int | tuple[int, int],
         near: float,
         far: float,
         eps: float,

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ..cameras import Look, LookAt
-from ._convert import check_batch, integer_faces
+from ..cameras import Look, LookAt, Orthographic
+from ._convert import check_batch, height_and_width, integer_faces
 from .lighting import face_light
-from .look import look
-from .look_at import look_at
+from .look import orthographic_look
 from .projection import projection
 from .rasterize import DEFAULT_EPS, DEFAULT_FAR, DEFAULT_NEAR, draw
 from .vertices_to_faces import vertices_to_faces
@@ -24,10 +24,11 @@ class Renderer(torch.nn.Module):
 
     Parameters
     ----------
-    image_size : int
-        S, pixels per side.
+    image_size : int or (height, width)
+        Pixels, h and w; one number means a square. "look_at" and "look" have square pixels: their field of view belongs
+        to the shorter side. "projection" stretches an image of ``orig_size`` over the whole one.
     anti_aliasing : bool
-        Average 2x2 pixels of a raster of 2S x 2S.
+        Average 2x2 pixels of a raster of 2h x 2w.
     background_color : [3] or [B, 3]
         Background of RGB images. Colours and vectors, here and below, are lists, tuples, arrays or tensors; gradients
         reach tensors.
@@ -37,7 +38,8 @@ class Renderer(torch.nn.Module):
         The function of that name takes vertices to renderer space. "none" (also "None", None): vertices are already
         in renderer space. "projection" without K, R and t means "look_at", as in the Chainer version.
     K, R, t, dist_coeffs, orig_size
-        Camera of "projection": see :func:`projection`. The methods take others for one call.
+        Camera of "projection": see :func:`projection`. The methods take others for one call. As published, arrays
+        become float32 tensors, and dist_coeffs are zeros ``[1, 5]`` if not given.
     perspective : bool
         With "look_at" and "look": divide by the depth.
     viewing_angle : float
@@ -55,6 +57,9 @@ class Renderer(torch.nn.Module):
     ----------
     eye : [3] or [B, 3]
         Position of the camera of "look_at" and "look"; (0, 0, -(1 / tan(viewing_angle) + 1)) by default.
+    camera_up : [3] or [B, 3]
+        Up in the image of "look_at" and "look"; (0, 1, 0) by default, as published. (The published class has no such
+        attribute; some of its forks do.)
     rasterizer_eps : float
         1e-3 by default.
 
@@ -95,15 +100,18 @@ class Renderer(torch.nn.Module):
         self.fill_back = fill_back
         self.camera_mode = camera_mode
         self._mode()
-        self.K = K
-        self.R = R
-        self.t = t
-        self.dist_coeffs = dist_coeffs
+        self.K, self.R, self.t, self.dist_coeffs = (
+            torch.tensor(x, dtype=torch.float32) if isinstance(x, np.ndarray) else x for x in (K, R, t, dist_coeffs)
+        )
+        if dist_coeffs is None:
+            self.dist_coeffs = torch.zeros(1, 5)
         self.orig_size = orig_size
         self.perspective = perspective
         self.viewing_angle = viewing_angle
-        self.eye = [0, 0, -(1 / math.tan(math.radians(viewing_angle)) + 1)]
+        tangent = math.tan(math.radians(viewing_angle))  # 0 is possible for cameras that do not use the angle
+        self.eye = [0, 0, -(1 / tangent + 1)] if tangent else None
         self.camera_direction = camera_direction
+        self.camera_up = (0, 1, 0)
         self.near = near
         self.far = far
         self.light_intensity_ambient = light_intensity_ambient
@@ -134,7 +142,7 @@ class Renderer(torch.nn.Module):
         raise ValueError(f"mode must be None, 'rgb', 'silhouettes' or 'depth', got {mode!r}")
 
     def render_silhouettes(self, vertices, faces, K=None, R=None, t=None, dist_coeffs=None, orig_size=None) -> Tensor:
-        """Coverage ``[B, S, S]``, row 0 = top.
+        """Coverage ``[B, h, w]``, row 0 = top.
 
         ``vertices [B, V, 3]`` float32 or float64; ``faces [B, F, 3]`` (``[1, F, 3]`` or ``[F, 3]`` for all meshes). One
         mesh and a camera with B poses give B images. Raises TypeError or ValueError for wrong types, shapes and ranges.
@@ -142,17 +150,17 @@ class Renderer(torch.nn.Module):
         return self._draw(vertices, faces, None, (K, R, t, dist_coeffs, orig_size), ("alpha",))["alpha"]
 
     def render_depth(self, vertices, faces, K=None, R=None, t=None, dist_coeffs=None, orig_size=None) -> Tensor:
-        """Depth ``[B, S, S]``, row 0 = top, 100 on background; arguments as :meth:`render_silhouettes`."""
+        """Depth ``[B, h, w]``, row 0 = top, 100 on background; arguments as :meth:`render_silhouettes`."""
         return self._draw(vertices, faces, None, (K, R, t, dist_coeffs, orig_size), ("depth",))["depth"]
 
     def render_rgb(self, vertices, faces, textures, K=None, R=None, t=None, dist_coeffs=None, orig_size=None) -> Tensor:
-        """Lit colours ``[B, 3, S, S]``, row 0 = top; ``textures [B or 1, F, ts, ts, ts, 3]`` in [0, 1]."""
+        """Lit colours ``[B, 3, h, w]``, row 0 = top; ``textures [B or 1, F, ts, ts, ts, 3]`` in [0, 1]."""
         return self._draw(vertices, faces, textures, (K, R, t, dist_coeffs, orig_size), ("rgb",))["rgb"]
 
     def render(
         self, vertices, faces, textures, K=None, R=None, t=None, dist_coeffs=None, orig_size=None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """``(rgb [B, 3, S, S], depth [B, S, S], alpha [B, S, S])``, in one pass; arguments as :meth:`render_rgb`."""
+        """``(rgb [B, 3, h, w], depth [B, h, w], alpha [B, h, w])``, in one pass; arguments as :meth:`render_rgb`."""
         images = self._draw(vertices, faces, textures, (K, R, t, dist_coeffs, orig_size), ("rgb", "alpha", "depth"))
         return images["rgb"], images["depth"], images["alpha"]
 
@@ -221,10 +229,14 @@ class Renderer(torch.nn.Module):
                     f"camera_mode='projection' needs K, R and t; missing: {', '.join(missing)}; give them to the "
                     "renderer or to this call"
                 )
-        if not self.perspective:
-            return look(vertices, self.eye, self.camera_direction) if mode == "look" else look_at(vertices, self.eye)
-        if mode == "look":
-            camera = Look(self.eye, self.camera_direction, half_fov_deg=self.viewing_angle)
+        if self.eye is None:
+            raise ValueError(f"camera_mode={self.camera_mode!r} needs an eye; set renderer.eye")
+        if mode == "look" and self.perspective:
+            camera = Look(self.eye, self.camera_direction, self.camera_up, half_fov_deg=self.viewing_angle)
+        elif mode == "look":
+            camera = orthographic_look(self.eye, self.camera_direction, self.camera_up)
+        elif self.perspective:
+            camera = LookAt(self.eye, up=self.camera_up, half_fov_deg=self.viewing_angle)
         else:
-            camera = LookAt(self.eye, half_fov_deg=self.viewing_angle)
-        return camera.transform(vertices)
+            camera = Orthographic(self.eye, up=self.camera_up)
+        return camera.for_image(*height_and_width(self.image_size)).transform(vertices)

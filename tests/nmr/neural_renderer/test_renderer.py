@@ -120,6 +120,47 @@ def test_defaults_of_attributes():
     assert not list(renderer.parameters()) and not renderer.state_dict()
 
 
+def test_calibrated_cameras_are_stored_as_published():
+    K, R, t = np.eye(3)[None], np.eye(3)[None], np.array([[0.0, 0, 4]])
+    renderer = nr.Renderer(K=K, R=R, t=t, dist_coeffs=np.zeros((1, 5)))
+    for value, given in ((renderer.K, K), (renderer.R, R), (renderer.t, t), (renderer.dist_coeffs, np.zeros((1, 5)))):
+        assert isinstance(value, torch.Tensor) and value.dtype == torch.float32 and value.tolist() == given.tolist()
+    K[0, 0, 0] = 2  # the array is the caller's
+    assert renderer.K[0, 0, 0] == 1
+    assert torch.equal(nr.Renderer(K=K, R=R, t=t).dist_coeffs, torch.zeros(1, 5))
+    leaf = torch.zeros(1, 3, requires_grad=True)
+    assert nr.Renderer(K=K, R=R, t=leaf).t is leaf
+
+
+def test_calibrated_cameras_need_no_viewing_angle():
+    vertices, faces = sphere()
+    K = torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    camera = dict(K=K, R=torch.eye(3), t=torch.tensor([0, 0, 4.0]), orig_size=1, image_size=16)
+    renderer = nr.Renderer(camera_mode="projection", viewing_angle=0, **camera)
+    expected = nr.Renderer(**camera).render_silhouettes(vertices, faces)
+    assert expected.any() and torch.equal(renderer.render_silhouettes(vertices, faces), expected)
+    renderer.camera_mode = "look_at"
+    with pytest.raises(ValueError, match=r"camera_mode='look_at' needs an eye; set renderer\.eye"):
+        renderer.render_silhouettes(vertices, faces)
+
+
+@pytest.mark.parametrize("perspective", [True, False])
+@pytest.mark.parametrize("mode", ["look", "look_at"])
+def test_up_of_the_camera(mode, perspective):
+    """A world whose up is z, as in the forks that render cars: its tip is on top, as if z were y."""
+    vertices = torch.tensor([[[0.0, 0.5, 0], [0, -0.5, 0], [0.5, 0, 0], [-0.5, 0, 0], [0, 0, 0.8]]])
+    faces = torch.tensor([[[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4]]])
+    renderer = nr.Renderer(camera_mode=mode, image_size=32, perspective=perspective)
+    assert renderer.camera_up == (0, 1, 0)
+    renderer.eye, renderer.camera_direction = [-2, 3, 1], [2, -3, -1]
+    upright = renderer.render_silhouettes(vertices.roll(-1, 2), faces)
+    assert (upright[0].sum(1) > 0).any() and not torch.equal(upright, upright.flip(1))
+    renderer.eye, renderer.camera_direction = [1, -2, 3], [-1, 2, -3]
+    for up, expected in (([0, 0, 1], upright), (torch.tensor([[0, 0, -1.0]]), upright.flip(1, 2))):
+        renderer.camera_up = up
+        assert (renderer.render_silhouettes(vertices, faces) - expected).abs().mean() < 1e-3
+
+
 def test_modes_of_a_call():
     vertices, faces = sphere()
     textures = torch.rand(2, 80, 2, 2, 2, 3)

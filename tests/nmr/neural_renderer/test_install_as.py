@@ -1,0 +1,131 @@
+"""Other people's code that imports ``neural_renderer``, as they would write it."""
+
+import importlib
+import sys
+
+import pytest
+import torch
+
+import nmr
+import nmr.neural_renderer as nr
+
+# A package with a renderer and a training step, in the manner of the reconstruction of human bodies.
+BODY = {
+    "__init__.py": "",
+    "renderer.py": """
+import torch
+
+import neural_renderer as nr
+import neural_renderer
+import neural_renderer.rasterize
+from neural_renderer.projection import projection as nr_projection
+from neural_renderer.vertices_to_faces import vertices_to_faces
+from neural_renderer import Renderer, get_points_from_angles
+
+
+class BodyRenderer:
+    def __init__(self, faces, image_size=32):
+        self.faces = faces[None]
+        self.renderer = nr.Renderer(camera_mode="look_at", image_size=image_size)
+        self.renderer.eye = get_points_from_angles(2.732, 10, 20)
+        assert isinstance(self.renderer, Renderer) and Renderer is neural_renderer.renderer.Renderer
+
+    def mask(self, vertices):
+        return self.renderer(vertices, self.faces.expand(len(vertices), -1, -1), mode="silhouettes")
+
+    def mask_by_hand(self, vertices):
+        vertices = nr.perspective(nr.look_at(vertices, self.renderer.eye), angle=30)
+        faces = nr.vertices_to_faces(vertices, self.faces.expand(len(vertices), -1, -1))
+        return nr.rasterize_silhouettes(torch.cat([faces, faces.flip(2)], dim=1), 32)
+""",
+    "train.py": """
+import torch
+from .renderer import BodyRenderer
+from neural_renderer.load_obj import load_obj, load_textures, texture_wrapping_dict
+
+
+def step(vertices, faces):
+    vertices = vertices.clone().requires_grad_()
+    loss = (BodyRenderer(faces).mask(vertices) - 1).pow(2).mean()
+    loss.backward()
+    return vertices.grad
+""",
+}
+
+
+@pytest.fixture(autouse=True)
+def no_alias(monkeypatch, tmp_path):
+    """No test sees the alias of another, and none leaves one."""
+
+    def belongs(key):
+        return key.partition(".")[0] in ("neural_renderer", "body", "nmr_alias")
+
+    for key in filter(belongs, list(sys.modules)):
+        monkeypatch.delitem(sys.modules, key)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield
+    for key in filter(belongs, list(sys.modules)):
+        del sys.modules[key]
+
+
+def package(folder, name, **files):
+    (folder / name).mkdir()
+    for file, text in files.items():
+        (folder / name / file).write_text(text)
+    importlib.invalidate_caches()
+
+
+def test_code_of_others_runs_unchanged(tmp_path):
+    package(tmp_path, "body", **BODY)
+    nr.install_as("neural_renderer")
+    train = importlib.import_module("body.train")
+    vertices, faces = nmr.icosphere(1)
+    assert train.step(0.5 * vertices[None], faces).any()
+    renderer = train.BodyRenderer(faces)
+    mask = renderer.mask(0.5 * vertices[None])
+    assert 0.05 < mask.mean() < 0.9 and torch.equal(renderer.mask_by_hand(0.5 * vertices[None]), mask)
+    assert train.load_obj is nr.load_obj and set(train.texture_wrapping_dict) >= {"REPEAT"}
+
+
+def test_all_modules_are_those_of_this_package():
+    nr.install_as()
+    assert importlib.import_module("neural_renderer") is nr
+    names = [key for key in sys.modules if key.startswith("nmr.neural_renderer.")]
+    assert len(names) > 12
+    for name in names:
+        assert importlib.import_module(name.removeprefix("nmr.")) is sys.modules[name]
+    with pytest.raises(ModuleNotFoundError, match=r"neural_renderer\.cuda"):
+        importlib.import_module("neural_renderer.cuda")
+
+
+def test_other_names_and_second_calls():
+    nr.install_as("nmr_alias")
+    nr.install_as("nmr_alias")
+    assert importlib.import_module("nmr_alias.projection").projection is nr.projection
+    assert "neural_renderer" not in sys.modules
+    for name in ("nmr.alias", "", None, "neural-renderer"):
+        with pytest.raises(ValueError, match="name must be an identifier"):
+            nr.install_as(name)
+
+
+@pytest.mark.parametrize("imported", [False, True])
+def test_another_package_is_not_shadowed_in_silence(tmp_path, imported):
+    package(tmp_path, "neural_renderer", **{"__init__.py": "from .look import answer", "look.py": "answer = 42"})
+    if imported:
+        importlib.import_module("neural_renderer")
+    message = "already imported from" if imported else "neural_renderer, .*__init__"
+    with pytest.raises(ImportError, match=rf"{message}.*pip uninstall neural_renderer_pytorch.*replace=True"):
+        nr.install_as()
+    other = importlib.import_module("neural_renderer")
+    assert other is not nr and other.answer == 42
+    nr.install_as(replace=True)
+    assert importlib.import_module("neural_renderer") is nr
+    assert importlib.import_module("neural_renderer.look").look is nr.look
+
+
+def test_a_folder_of_that_name_is_another_package(tmp_path):
+    """A checkout of the original repository, beside a script."""
+    (tmp_path / "neural_renderer").mkdir()
+    importlib.invalidate_caches()
+    with pytest.raises(ImportError, match=rf"another package neural_renderer, {tmp_path}"):
+        nr.install_as()
