@@ -11,12 +11,17 @@ except ImportError as error:
         "run `pip install .` in the repository and start Python in another folder, or use `pip install -e .`"
     ) from error
 
-__all__ = ["_C", "batch_size", "host_array", "no_second_derivative", "num_threads"]
+__all__ = ["_C", "batch_size", "host_array", "host_empty", "no_second_derivative", "num_threads"]
 
 
 def host_array(tensor):
     """The tensor as a C-contiguous NumPy array in host memory (a view on the CPU); None stays None."""
     return None if tensor is None else tensor.detach().cpu().contiguous().numpy()
+
+
+def host_empty(shape, dtype) -> Tensor:
+    """A new tensor in host memory, whatever the default device is."""
+    return torch.empty(shape, dtype=dtype, device="cpu")
 
 
 def num_threads() -> int:

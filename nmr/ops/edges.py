@@ -1,12 +1,10 @@
 """Operators: from raster pixels to image pixels, with NMR's gradient of the edges."""
 
-# No `from __future__ import annotations` here: torch 2.4 reads the operators' types from the annotations themselves.
-from typing import Optional
-
 import torch
 from torch import Tensor
 
-from ._host import _C, host_array, no_second_derivative, num_threads
+from ._host import _C, host_array, host_empty, no_second_derivative, num_threads
+from ._register import operator, register_autograd
 
 
 def _image_shape(image, anti_aliasing) -> tuple[int, int, int, int]:
@@ -22,12 +20,12 @@ def _raster_shape(resolved, anti_aliasing) -> tuple[int, int, int, int]:
 # --- resolve
 
 
-@torch.library.custom_op("nmr::resolve", mutates_args=())
+@operator
 def resolve(
     image: Tensor,
     vertices: Tensor,
     faces: Tensor,
-    starts: Optional[Tensor],  # noqa: UP045
+    starts: Tensor | None,
     owner: Tensor,
     anti_aliasing: bool,
     eps: float,
@@ -36,12 +34,12 @@ def resolve(
 
     The gradient in ``image`` is that of the mean. That in x and y of ``vertices`` is NMR's, summed over channels.
     """
-    resolved = torch.empty(_image_shape(image, anti_aliasing), dtype=image.dtype)
+    resolved = host_empty(_image_shape(image, anti_aliasing), dtype=image.dtype)
     _C.resolve_forward(host_array(image), resolved.numpy(), anti_aliasing, num_threads())
     return resolved.to(image.device)
 
 
-@resolve.register_fake
+@torch.library.register_fake(resolve)
 def _(image, vertices, faces, starts, owner, anti_aliasing, eps):
     return image.new_empty(_image_shape(image, anti_aliasing))
 
@@ -62,45 +60,45 @@ def _resolve_backward(ctx, grad_resolved):
     return grad_image, grad_vertices, None, None, None, None, None
 
 
-resolve.register_autograd(_resolve_backward, setup_context=_resolve_setup)
+register_autograd(resolve, _resolve_backward, _resolve_setup)
 
 
-@torch.library.custom_op("nmr::resolve_backward", mutates_args=())
+@operator
 def resolve_backward(grad_resolved: Tensor, anti_aliasing: bool) -> Tensor:
     """Gradient ``[B, H, W, C]`` of the mean in :func:`resolve`."""
-    grad_image = torch.empty(_raster_shape(grad_resolved, anti_aliasing), dtype=grad_resolved.dtype)
+    grad_image = host_empty(_raster_shape(grad_resolved, anti_aliasing), dtype=grad_resolved.dtype)
     _C.resolve_backward(host_array(grad_resolved), grad_image.numpy(), anti_aliasing, num_threads())
     return grad_image.to(grad_resolved.device)
 
 
-@resolve_backward.register_fake
+@torch.library.register_fake(resolve_backward)
 def _(grad_resolved, anti_aliasing):
     return grad_resolved.new_empty(_raster_shape(grad_resolved, anti_aliasing))
 
 
-resolve_backward.register_autograd(no_second_derivative("render"))
+register_autograd(resolve_backward, no_second_derivative("render"))
 
 
-@torch.library.custom_op("nmr::edges_backward", mutates_args=())
+@operator
 def edges_backward(
     vertices: Tensor,
     faces: Tensor,
-    starts: Optional[Tensor],  # noqa: UP045
+    starts: Tensor | None,
     owner: Tensor,
     image: Tensor,
     grad_image: Tensor,
     eps: float,
 ) -> Tensor:
     """NMR's gradient of raster pixels ``[B, H, W, C]``, per vertex, of the shape of ``vertices``; zero in z."""
-    grad_vertices = torch.empty(vertices.shape, dtype=vertices.dtype)
+    grad_vertices = host_empty(vertices.shape, dtype=vertices.dtype)
     arrays = vertices, faces, starts, owner, image, grad_image
     _C.edges_backward(*map(host_array, arrays), grad_vertices.numpy(), eps, num_threads())
     return grad_vertices.to(vertices.device)
 
 
-@edges_backward.register_fake
+@torch.library.register_fake(edges_backward)
 def _(vertices, faces, starts, owner, image, grad_image, eps):
     return vertices.new_empty(vertices.shape)
 
 
-edges_backward.register_autograd(no_second_derivative("render"))
+register_autograd(edges_backward, no_second_derivative("render"))

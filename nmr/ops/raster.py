@@ -1,16 +1,14 @@
 """Operators: which face is nearest at each pixel, and silhouettes with NMR's gradient or the local one."""
 
-# No `from __future__ import annotations` here: torch 2.4 reads the operators' types from the annotations themselves.
-from typing import Optional
-
 import torch
 from torch import Tensor
 
-from ._host import _C, batch_size, host_array, no_second_derivative, num_threads
+from ._host import _C, batch_size, host_array, host_empty, no_second_derivative, num_threads
+from ._register import operator, register_autograd
 
 
 def _owner_map(vertices, faces, starts, height, width, fill_back, near, far) -> Tensor:
-    owner = torch.empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
+    owner = host_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
     arrays = host_array(vertices), host_array(faces), host_array(starts)
     _C.rasterize(*arrays, owner.numpy(), fill_back, near, far, num_threads())
     return owner
@@ -19,11 +17,11 @@ def _owner_map(vertices, faces, starts, height, width, fill_back, near, far) -> 
 # --- rasterize
 
 
-@torch.library.custom_op("nmr::rasterize", mutates_args=())
+@operator
 def rasterize(
     vertices: Tensor,
     faces: Tensor,
-    starts: Optional[Tensor],  # noqa: UP045
+    starts: Tensor | None,
     height: int,
     width: int,
     fill_back: bool,
@@ -34,7 +32,7 @@ def rasterize(
     return _owner_map(vertices, faces, starts, height, width, fill_back, near, far).to(vertices.device)
 
 
-@rasterize.register_fake
+@torch.library.register_fake(rasterize)
 def _(vertices, faces, starts, height, width, fill_back, near, far):
     return vertices.new_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
 
@@ -42,11 +40,11 @@ def _(vertices, faces, starts, height, width, fill_back, near, far):
 # --- silhouette
 
 
-@torch.library.custom_op("nmr::silhouette", mutates_args=())
+@operator
 def silhouette(
     vertices: Tensor,
     faces: Tensor,
-    starts: Optional[Tensor],  # noqa: UP045
+    starts: Tensor | None,
     height: int,
     width: int,
     anti_aliasing: bool,
@@ -54,7 +52,7 @@ def silhouette(
     near: float,
     far: float,
     eps: float,
-    local: bool = False,
+    local: bool,
 ) -> tuple[Tensor, Tensor]:
     """Silhouettes ``alpha [B, height, width]`` and the owner map ``[B, H, W]`` of meshes in renderer space.
 
@@ -62,13 +60,13 @@ def silhouette(
     """
     scale = 2 if anti_aliasing else 1
     owner = _owner_map(vertices, faces, starts, scale * height, scale * width, fill_back, near, far)
-    alpha = torch.empty((owner.shape[0], height, width), dtype=vertices.dtype)
+    alpha = host_empty((owner.shape[0], height, width), dtype=vertices.dtype)
     _C.silhouette_forward(owner.numpy(), alpha.numpy(), anti_aliasing, num_threads())
     return alpha.to(vertices.device), owner.to(vertices.device)
 
 
-@silhouette.register_fake
-def _(vertices, faces, starts, height, width, anti_aliasing, fill_back, near, far, eps, local=False):
+@torch.library.register_fake(silhouette)
+def _(vertices, faces, starts, height, width, anti_aliasing, fill_back, near, far, eps, local):
     batch, scale = batch_size(vertices, starts), 2 if anti_aliasing else 1
     alpha = vertices.new_empty((batch, height, width))
     return alpha, vertices.new_empty((batch, scale * height, scale * width), dtype=torch.int32)
@@ -91,14 +89,14 @@ def _silhouette_backward(ctx, grad_alpha, _grad_owner):
     return gradient(*ctx.saved_tensors, grad_alpha, *ctx.settings), *(None,) * 10
 
 
-silhouette.register_autograd(_silhouette_backward, setup_context=_silhouette_setup)
+register_autograd(silhouette, _silhouette_backward, _silhouette_setup)
 
 
-@torch.library.custom_op("nmr::silhouette_backward", mutates_args=())
+@operator
 def silhouette_backward(
     vertices: Tensor,
     faces: Tensor,
-    starts: Optional[Tensor],  # noqa: UP045
+    starts: Tensor | None,
     owner: Tensor,
     grad_alpha: Tensor,
     anti_aliasing: bool,
@@ -109,25 +107,25 @@ def silhouette_backward(
 
 
 def _gradient(kernel, vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps) -> Tensor:
-    grad_vertices = torch.empty(vertices.shape, dtype=vertices.dtype)
+    grad_vertices = host_empty(vertices.shape, dtype=vertices.dtype)
     arrays = map(host_array, (vertices, faces, starts, owner, grad_alpha))
     kernel(*arrays, grad_vertices.numpy(), anti_aliasing, eps, num_threads())
     return grad_vertices.to(vertices.device)
 
 
-@silhouette_backward.register_fake
+@torch.library.register_fake(silhouette_backward)
 def _(vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps):
     return vertices.new_empty(vertices.shape)
 
 
-silhouette_backward.register_autograd(no_second_derivative("render_silhouette"))
+register_autograd(silhouette_backward, no_second_derivative("render_silhouette"))
 
 
-@torch.library.custom_op("nmr::local_gradient", mutates_args=())
+@operator
 def local_gradient(
     vertices: Tensor,
     faces: Tensor,
-    starts: Optional[Tensor],  # noqa: UP045
+    starts: Tensor | None,
     owner: Tensor,
     grad_alpha: Tensor,
     anti_aliasing: bool,
@@ -137,9 +135,9 @@ def local_gradient(
     return _gradient(_C.local_gradient, vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps)
 
 
-@local_gradient.register_fake
+@torch.library.register_fake(local_gradient)
 def _(vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps):
     return vertices.new_empty(vertices.shape)
 
 
-local_gradient.register_autograd(no_second_derivative("render_silhouette"))
+register_autograd(local_gradient, no_second_derivative("render_silhouette"))

@@ -1,22 +1,20 @@
 """Operators: colours from texture cubes, and interpolation of values given at the corners of faces."""
 
-# No `from __future__ import annotations` here: torch 2.4 reads the operators' types from the annotations themselves.
-from typing import Optional
-
 import torch
 from torch import Tensor
 
-from ._host import _C, host_array, no_second_derivative, num_threads
+from ._host import _C, host_array, host_empty, no_second_derivative, num_threads
+from ._register import operator, register_autograd
 
 # --- texture cubes
 
 
-@torch.library.custom_op("nmr::sample_texture_cubes", mutates_args=())
+@operator
 def sample_texture_cubes(
     textures: Tensor,
     owner: Tensor,
     weights: Tensor,
-    starts: Optional[Tensor],  # noqa: UP045
+    starts: Tensor | None,
     eps: float,
 ) -> Tensor:
     """Colours ``[B, H, W, C]`` from texture cubes; 0 on background.
@@ -25,13 +23,13 @@ def sample_texture_cubes(
     Axis k of a cube is the weight of the face's vertex k: sampled trilinearly at ``weights * (ts - 1)``, clamped to
     ``[0, ts - 1 - eps]``. Differentiable in ``textures`` only, as published.
     """
-    colors = torch.empty((*owner.shape, textures.shape[-1]), dtype=textures.dtype)
+    colors = host_empty((*owner.shape, textures.shape[-1]), dtype=textures.dtype)
     arrays = host_array(textures), host_array(owner), host_array(weights), host_array(starts)
     _C.texture_cubes_forward(*arrays, colors.numpy(), eps, num_threads())
     return colors.to(textures.device)
 
 
-@sample_texture_cubes.register_fake
+@torch.library.register_fake(sample_texture_cubes)
 def _(textures, owner, weights, starts, eps):
     return textures.new_empty((*owner.shape, textures.shape[-1]))
 
@@ -49,56 +47,56 @@ def _texture_cubes_backward(ctx, grad_colors):
     return grad_textures, None, None, None, None
 
 
-sample_texture_cubes.register_autograd(_texture_cubes_backward, setup_context=_texture_cubes_setup)
+register_autograd(sample_texture_cubes, _texture_cubes_backward, _texture_cubes_setup)
 
 
-@torch.library.custom_op("nmr::texture_cubes_backward", mutates_args=())
+@operator
 def texture_cubes_backward(
     owner: Tensor,
     weights: Tensor,
-    starts: Optional[Tensor],  # noqa: UP045
+    starts: Tensor | None,
     grad_colors: Tensor,
     shape: list[int],
     eps: float,
 ) -> Tensor:
     """Gradient of :func:`sample_texture_cubes` in its textures, of the given shape; shared ones sum over images."""
-    grad_textures = torch.empty(shape, dtype=grad_colors.dtype)
+    grad_textures = host_empty(shape, dtype=grad_colors.dtype)
     arrays = owner, weights, starts, grad_colors
     _C.texture_cubes_backward(*map(host_array, arrays), grad_textures.numpy(), eps, num_threads())
     return grad_textures.to(grad_colors.device)
 
 
-@texture_cubes_backward.register_fake
+@torch.library.register_fake(texture_cubes_backward)
 def _(owner, weights, starts, grad_colors, shape, eps):
     return grad_colors.new_empty(shape)
 
 
-texture_cubes_backward.register_autograd(no_second_derivative("render_rgb"))
+register_autograd(texture_cubes_backward, no_second_derivative("render_rgb"))
 
 
 # --- interpolate
 
 
-@torch.library.custom_op("nmr::interpolate", mutates_args=())
+@operator
 def interpolate(
     attributes: Tensor,
     corners: Tensor,
     owner: Tensor,
     weights: Tensor,
-    starts: Optional[Tensor],  # noqa: UP045
+    starts: Tensor | None,
 ) -> Tensor:
     """``values[b, y, x] = sum_k weights[b, y, x, k] attributes[b, corners[f, k]]`` ``[B, H, W, C]``; 0 on background.
 
     attributes are ``[B or 1, N, C]``, packed ``[N, C]``; corners ``[F, 3]``, ``[B, F, 3]`` or packed ``[M, 3]`` are
     rows of them, counted from the first of the mesh; ``starts`` (packed) are first row and first face of each mesh.
     """
-    values = torch.empty((*owner.shape, attributes.shape[-1]), dtype=attributes.dtype)
+    values = host_empty((*owner.shape, attributes.shape[-1]), dtype=attributes.dtype)
     arrays = attributes, corners, owner, weights, starts
     _C.interpolate_forward(*map(host_array, arrays), values.numpy(), num_threads())
     return values.to(attributes.device)
 
 
-@interpolate.register_fake
+@torch.library.register_fake(interpolate)
 def _(attributes, corners, owner, weights, starts):
     return attributes.new_empty((*owner.shape, attributes.shape[-1]))
 
@@ -113,23 +111,23 @@ def _interpolate_backward(ctx, grad_values):
     return grads[0] if of_attributes else None, None, None, grads[1] if of_weights else None, None
 
 
-interpolate.register_autograd(_interpolate_backward, setup_context=_interpolate_setup)
+register_autograd(interpolate, _interpolate_backward, _interpolate_setup)
 
 
-@torch.library.custom_op("nmr::interpolate_backward", mutates_args=())
+@operator
 def interpolate_backward(
     attributes: Tensor,
     corners: Tensor,
     owner: Tensor,
     weights: Tensor,
-    starts: Optional[Tensor],  # noqa: UP045
+    starts: Tensor | None,
     grad_values: Tensor,
     of_attributes: bool,
     of_weights: bool,
 ) -> tuple[Tensor, Tensor]:
     """Gradients of :func:`interpolate` in attributes and weights; a gradient that is not requested is empty."""
-    grad_attributes = torch.empty(attributes.shape if of_attributes else 0, dtype=attributes.dtype)
-    grad_weights = torch.empty(weights.shape if of_weights else 0, dtype=attributes.dtype)
+    grad_attributes = host_empty(attributes.shape if of_attributes else 0, dtype=attributes.dtype)
+    grad_weights = host_empty(weights.shape if of_weights else 0, dtype=attributes.dtype)
     arrays = attributes, corners, owner, weights, starts, grad_values
     _C.interpolate_backward(
         *map(host_array, arrays),
@@ -140,7 +138,7 @@ def interpolate_backward(
     return grad_attributes.to(attributes.device), grad_weights.to(attributes.device)
 
 
-@interpolate_backward.register_fake
+@torch.library.register_fake(interpolate_backward)
 def _(attributes, corners, owner, weights, starts, grad_values, of_attributes, of_weights):
     return (
         attributes.new_empty(attributes.shape if of_attributes else 0),
@@ -148,4 +146,4 @@ def _(attributes, corners, owner, weights, starts, grad_values, of_attributes, o
     )
 
 
-interpolate_backward.register_autograd(no_second_derivative("render_rgb"))
+register_autograd(interpolate_backward, no_second_derivative("render_rgb"))

@@ -225,11 +225,11 @@ def test_opcheck(dtype):
     vertices, faces = random_soup(0, dtype=dtype)
     settings = 12, 12, True, True, 0.1, 100.0, 1e-4
     torch.library.opcheck(nmr.ops.silhouette, (vertices.clone().requires_grad_(), faces, None, *settings, True))
-    _, owner = nmr.ops.silhouette(vertices, faces, None, *settings)  # without it, as before
+    _, owner = nmr.ops.silhouette(vertices, faces, None, *settings, True)
     upstream = noise(2, 12, 12, dtype=dtype)
     torch.library.opcheck(nmr.ops.local_gradient, (vertices, faces, None, owner, upstream, True, 1e-4))
     packed = pack(different_soups(dtype))
-    _, owner = nmr.ops.silhouette(*packed, *settings)
+    _, owner = nmr.ops.silhouette(*packed, *settings, True)
     torch.library.opcheck(nmr.ops.silhouette, (packed[0].requires_grad_(), *packed[1:], *settings, True))
     upstream = noise(4, 12, 12, dtype=dtype)
     torch.library.opcheck(nmr.ops.local_gradient, (packed[0].detach(), *packed[1:], owner, upstream, True, 1e-4))

@@ -154,7 +154,7 @@ def test_gradient_descent_finds_the_target():
 
 def op_arguments(dtype=torch.float32, requires_grad=True):
     vertices, faces = random_soup(0, dtype=dtype)
-    return vertices.requires_grad_(requires_grad), faces, None, 12, 12, True, True, 0.1, 100.0, 1e-4
+    return vertices.requires_grad_(requires_grad), faces, None, 12, 12, True, True, 0.1, 100.0, 1e-4, False
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

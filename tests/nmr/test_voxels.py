@@ -236,7 +236,7 @@ def test_kato19_of_a_face_far_larger_than_the_grid():
 def test_opcheck():
     vertices, faces = nmr.icosphere(1)
     batch = torch.stack([0.3 * vertices + 0.5, 0.4 * vertices + 0.5])
-    for arguments in ((batch, faces, 6), (batch, faces, 6, True)):
+    for arguments in ((batch, faces, 6, False), (batch, faces, 6, True)):
         torch.library.opcheck(nmr.ops.voxels, arguments)
 
 
