@@ -14,7 +14,16 @@ from torch import Tensor
 
 from .._validate import as_numbers, describe
 from .pinhole import Pinhole
-from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched, common_batch, height_and_width
+from .projection import (
+    Numbers,
+    ProjectingCamera,
+    Projection,
+    SquarePixels,
+    as_parameter,
+    batched,
+    common_batch,
+    height_and_width,
+)
 
 # Camera axes here: x right, y down, z away (OpenCV). OpenGL: right, up, towards the viewer; PyTorch3D: left, up, away.
 _OPENGL_AXES = torch.tensor([[1.0], [-1.0], [-1.0]], dtype=torch.float64)
@@ -33,14 +42,15 @@ def _image_size(image_size: tuple[float, float] | None, in_ndc: bool) -> tuple[f
     return height_and_width((1, 1) if image_size is None else image_size, "image_size")
 
 
-def _plain(camera: ProjectingCamera) -> Projection:
+def _plain(camera: ProjectingCamera, height: float, width: float) -> Projection:
+    """The camera for an image of this shape."""
     if not isinstance(camera, ProjectingCamera):
         raise TypeError(f"camera must be one of nmr's (nmr.cameras.ProjectingCamera), got {describe(camera)}")
-    return camera.projection().plain()
+    return camera.for_image(height, width).projection().plain()
 
 
-def _without_distortion(camera: ProjectingCamera, target: str) -> Projection:
-    projection = _plain(camera)
+def _without_distortion(camera: ProjectingCamera, target: str, height: float, width: float) -> Projection:
+    projection = _plain(camera, height, width)
     if projection.distortion is not None and projection.perspective and projection.distortion.any():
         raise ValueError(f"{target} has no lens distortion; undistort the images and drop dist_coeffs")
     return projection
@@ -69,7 +79,7 @@ def from_opencv(
     dist_coeffs : [4] or [5], [B, 4] or [B, 5], also as a column, optional
         k1, k2, p1, p2 and k3.
     height, width : number
-        The image that K belongs to. The rendered square shows all of it, stretched if it is not square.
+        The image that K belongs to. The rendered image shows all of it, stretched if it has another shape.
     pixel_center : float
         Coordinate of the centre of the first pixel: 0 in OpenCV, 0.5 where pixel coordinates begin at its corner
         (COLMAP; :class:`nmr.Pinhole` itself).
@@ -77,7 +87,7 @@ def from_opencv(
     Returns
     -------
     Pinhole
-        At ``image_size`` = height = width, a vertex that OpenCV projects to (u, v) lies in row v, column u.
+        At ``image_size=(height, width)``, a vertex that OpenCV projects to (u, v) lies in row v, column u.
 
     Raises
     ------
@@ -107,11 +117,12 @@ def to_opencv(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """``K [B, 3, 3]``, ``R [B, 3, 3]``, ``t [B, 3]`` and ``dist_coeffs [B, 5]`` or None, as :func:`from_opencv` takes.
 
+    A vertex keeps its pixel in images of ``image_size=(height, width)``.
     The determinant of R is -1 for the cameras of a left-handed world (see above). An orthographic camera raises a
     ValueError.
     """
     height, width = height_and_width((height, width), "height and width")
-    projection = _plain(camera)
+    projection = _plain(camera, height, width)
     if not projection.perspective:
         raise ValueError("OpenCV has no orthographic camera; use to_opengl or to_pytorch3d")
     x, y = projection.intrinsics.unbind(1)
@@ -163,15 +174,18 @@ def from_opengl(view: Numbers, projection: Numbers) -> Projection:
     return Projection(_OPENGL_AXES * view[:, :3], intrinsics, perspective=perspective)
 
 
-def to_opengl(camera: ProjectingCamera, *, near: float, far: float) -> tuple[Tensor, Tensor]:
+def to_opengl(
+    camera: ProjectingCamera, *, near: float, far: float, image_size: tuple[float, float] | None = None
+) -> tuple[Tensor, Tensor]:
     """``view`` and ``projection``, ``[B, 4, 4]``, as :func:`from_opengl` takes them; near and far map to -1 and 1 in z.
 
+    ``image_size`` (height, width) is that of the images to come; it must be given if they are not square.
     The determinant of ``view`` is -1 for the cameras of a left-handed world (see above); the winding of a face on the
     screen is the same as here. A distorted camera raises a ValueError.
     """
     if not 0 <= near < far < float("inf"):
         raise ValueError(f"near and far must be finite with 0 <= near < far, got near={near}, far={far}")
-    camera = _without_distortion(camera, "OpenGL")
+    camera = _without_distortion(camera, "OpenGL", *_image_size(image_size, True))
     matrix, intrinsics = camera.matrix, camera.intrinsics
     last = torch.tensor([[[0.0, 0.0, 0.0, 1.0]]], dtype=torch.float64)
     view = torch.cat([_OPENGL_AXES * matrix, last.expand(matrix.shape[0], 1, 4)], dim=1)
@@ -211,7 +225,8 @@ def from_pytorch3d(
     """A ``PerspectiveCameras`` or ``OrthographicCameras`` of PyTorch3D.
 
     There ``(X, Y, Z) = v R + T`` with row vectors and X left, Y up, Z away; ``x_ndc = fx X / Z + px`` (``fx X + px``
-    if orthographic), y likewise; +1 is the left and the upper border of a square image.
+    if orthographic), y likewise; +1 is the left and the upper border of a square image, and of
+    the shorter side of any other.
 
     Parameters
     ----------
@@ -221,7 +236,8 @@ def from_pytorch3d(
     in_ndc : bool
         False: in pixels from the upper left corner of the image; ``image_size`` is then needed.
     image_size : (height, width), optional
-        Of an image that is not square: its shorter side spans [-1, 1] there. The rendered square shows all of it.
+        The image of these numbers. The rendered image shows all of it, stretched if it has another shape. Without it,
+        they are taken for those of the rendered image, whatever its shape.
     orthographic : bool
 
     Returns
@@ -248,7 +264,12 @@ def from_pytorch3d(
     focal, centre = focal * (shorter / size), centre * (shorter / size)
     # x = -x_ndc, and X of the camera axes also changes its sign: only the principal point needs a minus.
     intrinsics = torch.stack([_row(focal[:, 0], 0, -centre[:, 0]), _row(0, -focal[:, 1], centre[:, 1])], dim=1)
-    return Projection(_PYTORCH3D_AXES * matrix, intrinsics, perspective=not orthographic)
+    kind = _SquareProjection if image_size is None else Projection
+    return kind(_PYTORCH3D_AXES * matrix, intrinsics, perspective=not orthographic)
+
+
+class _SquareProjection(Projection, SquarePixels):
+    """A projection whose [-1, 1] belongs to the shorter side of an image."""
 
 
 def from_pytorch3d_fov(
@@ -284,8 +305,8 @@ def to_pytorch3d(
     TypeError, ValueError
         For anything but a camera of nmr, a camera with distortion or skew, or a missing or impossible image_size.
     """
-    camera = _without_distortion(camera, "PyTorch3D")
     height, width = _image_size(image_size, in_ndc)
+    camera = _without_distortion(camera, "PyTorch3D", height, width)
     shorter, size = min(height, width), torch.tensor([width, height], dtype=torch.float64)
     intrinsics, matrix = camera.intrinsics, _PYTORCH3D_AXES * camera.matrix
     if intrinsics[:, 0, 1].any() or intrinsics[:, 1, 0].any():

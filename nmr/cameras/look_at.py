@@ -110,7 +110,7 @@ class LookAt(SquarePixels):
     eye, at, up : [3] or [B, 3], tensors or sequences, world units
         A camera whose pose is not finite, or farther away than 1e15, sees nothing.
     half_fov_deg : float, or Tensor [] or [B]
-        a: half of the field of view, in degrees, horizontal = vertical (the published ``viewing_angle``).
+        a: half of the field of view across the shorter side of the image, in degrees (the published ``viewing_angle``).
 
     Differentiable in every parameter that is given as a tensor.
 
@@ -179,8 +179,9 @@ class Look(SquarePixels):
 class Orthographic(SquarePixels):
     """A camera without perspective, posed as :class:`LookAt`: ``(scale u_x, scale u_y, u_z)``.
 
-    ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half the width of what is seen, in world units.
-    The published renderer's ``perspective=False`` has scale 1. Differentiable in every parameter given as a tensor.
+    ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half of what is seen across the shorter side of
+    the image, in world units. The published renderer's ``perspective=False`` has scale 1. Differentiable in every
+    parameter given as a tensor.
 
     Raises
     ------

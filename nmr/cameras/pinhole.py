@@ -31,7 +31,7 @@ class Pinhole(ProjectingCamera):
     dist_coeffs : [5] or [B, 5], optional
         k1, k2, p1, p2, k3. The gradient is finite also on the optical axis.
     orig_size : number or (height, width), keyword only
-        The image that K belongs to. It is mapped onto the whole rendered square, and stretched if it is not square.
+        The image that K belongs to. It is mapped onto the whole rendered image: stretched, if that has another shape.
 
     All but orig_size are tensors or sequences, and differentiable if tensors.
 

@@ -232,7 +232,26 @@ def test_every_camera_survives_every_convention(name, convention):
     if (name, convention) == ("Orthographic", "opencv"):
         pytest.skip("OpenCV has no orthographic camera")
     vertices = torch.from_numpy(points())[None]
-    torch.testing.assert_close(through(camera, convention).transform(vertices), camera.transform(vertices))
+    expected = camera.for_image(40, 60) if convention == "opencv" else camera
+    torch.testing.assert_close(through(camera, convention).transform(vertices), expected.transform(vertices))
+
+
+@pytest.mark.parametrize("size", [(40, 60), (60, 40)])
+@pytest.mark.parametrize("name", CAMERAS)
+def test_images_that_are_not_square(name, size):
+    """Cameras with square pixels keep them in other libraries, and PyTorch3D's numbers belong to the shorter side."""
+    camera, vertices = CAMERAS[name], torch.from_numpy(points())[None]
+    expected = camera.for_image(*size).transform(vertices)
+    assert (name == "Pinhole") == torch.equal(expected, camera.transform(vertices))
+    opengl = cameras.to_opengl(camera, near=0.1, far=10.0, image_size=size)
+    torch.testing.assert_close(cameras.from_opengl(*opengl).transform(vertices), expected)
+    arguments = cameras.to_pytorch3d(camera, image_size=size)
+    assert arguments.pop("image_size").tolist() == [list(size)]
+    arguments["orthographic"] = not camera.projection().perspective
+    sized = cameras.from_pytorch3d(**arguments, image_size=size)
+    torch.testing.assert_close(sized.transform(vertices), expected)
+    free = cameras.from_pytorch3d(**arguments).for_image(*size)
+    torch.testing.assert_close(free.transform(vertices), expected)
 
 
 @pytest.mark.parametrize("name", CAMERAS)
