@@ -62,6 +62,16 @@ def test_from_nvdiffrast_draws_the_same_picture_three_ways():
     assert (names["also"] - image).abs().max(-1).values.gt(1e-3).float().mean() < 1e-3
 
 
+def test_from_neural_renderer_maps_of_forks():
+    names = run(ROOT / "docs" / "from-neural-renderer.md")
+    index, same, visible = names["face_index"], names["same"], names["visible"]
+    assert index.shape == (2, 64, 64) and torch.equal(index, same)
+    assert visible.shape == (2, 320)
+    for b in range(2):  # the near side of a sphere
+        assert set(visible[b].nonzero()[:, 0].tolist()) == set(index[b].unique().tolist()) - {-1}
+        assert 60 < visible[b].sum() < 160
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_pages_run_and_what_they_name_exists(page):
     tested_elsewhere = ("README.md", "from-pytorch3d.md", "from-nvdiffrast.md", "development.md")

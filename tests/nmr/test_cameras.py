@@ -96,7 +96,7 @@ def test_published_values_and_gradients(name):
     if name == "projection":  # the published one rounds pixels, this one does not
         np.testing.assert_allclose(out.detach().numpy(), wanted, rtol=0, atol=1e-6)
     elif name.startswith("perspective"):  # torch's tangent may round otherwise on another processor
-        np.testing.assert_allclose(out.detach().numpy(), wanted, rtol=2e-7)
+        np.testing.assert_allclose(out.detach().numpy(), wanted, rtol=3e-7)  # two units in the last place
     else:
         assert np.array_equal(out.detach().numpy(), wanted)
     for key, argument in arguments.items():

@@ -1,7 +1,11 @@
 """Other people's code that imports ``neural_renderer``, as they would write it."""
 
 import importlib
+import re
+import shlex
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -85,6 +89,23 @@ def test_code_of_others_runs_unchanged(tmp_path):
     mask = renderer.mask(0.5 * vertices[None])
     assert 0.05 < mask.mean() < 0.9 and torch.equal(renderer.mask_by_hand(0.5 * vertices[None]), mask)
     assert train.load_obj is nr.load_obj and set(train.texture_wrapping_dict) >= {"REPEAT"}
+
+
+def test_a_script_runs_untouched(tmp_path):
+    """With the command of the page "moving from neural_renderer"."""
+    root = Path(__file__).parents[3]
+    page = (root / "docs" / "from-neural-renderer.md").read_text()
+    (command,) = re.findall(r"```bash\n(python -c .*)\n```", page)
+    (tmp_path / "train.py").write_text("""
+import neural_renderer as nr
+from neural_renderer.projection import projection
+
+if __name__ == "__main__":
+    print(nr.__name__, nr.__version__, projection is nr.projection)
+""")
+    arguments = [sys.executable, *shlex.split(command)[1:]]
+    printed = subprocess.run(arguments, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert printed.stdout == "nmr.neural_renderer 1.1.3 True\n", printed.stderr
 
 
 def test_all_modules_are_those_of_this_package():
