@@ -15,7 +15,7 @@ OUTPUTS = ("rgb", "alpha", "depth", "normals", "fragments")
 class Images:
     """The outputs of :func:`render`, as attributes; unpacking gives them in the requested order.
 
-    ``rgb [B, S, S, C]``, ``alpha [B, S, S]``, ``depth [B, S, S]``, ``normals [B, S, S, 3]``, ``fragments``
+    ``rgb [B, h, w, C]``, ``alpha [B, h, w]``, ``depth [B, h, w]``, ``normals [B, h, w, 3]``, ``fragments``
     (:class:`Fragments`). Outputs that were not requested raise an AttributeError.
     """
 

@@ -61,7 +61,7 @@ def render(
     Images
         ``images.rgb[b, y, x]`` is the colour [C] of the pixel in row y from the top, mean of 2x2 with anti-aliasing
         (background mixed in at edges); alpha, depth, normals as in :func:`render_silhouette`, :func:`render_depth` and
-        :func:`render_normals`; fragments at the resolution of the raster (2 S with anti-aliasing).
+        :func:`render_normals`; fragments at the resolution of the raster (2h x 2w with anti-aliasing).
 
     Notes
     -----
