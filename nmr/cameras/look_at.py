@@ -90,11 +90,12 @@ def _posed(eye: Tensor, forward: Tensor, up: Tensor, dtype: torch.dtype, **rest:
 
 
 def _perspective(half_fov_deg: float | Tensor, dtype: torch.dtype) -> dict[str, Tensor]:
+    """The angle is rounded to ``dtype``, as published. The tangent is rounded once more: the same on all processors."""
     if isinstance(half_fov_deg, Tensor):
-        angle = (half_fov_deg.to("cpu", torch.float64) * (math.pi / 180)).to(dtype).reshape(-1)
+        angle = half_fov_deg.to("cpu", torch.float64).reshape(-1) * (math.pi / 180)
     else:
-        angle = torch.tensor([math.radians(half_fov_deg)], dtype=dtype)
-    return {"intrinsics": _Y_UP.to(dtype), "extent": torch.tan(angle)}
+        angle = torch.tensor([math.radians(half_fov_deg)], dtype=torch.float64, device="cpu")
+    return {"intrinsics": _Y_UP.to(dtype), "extent": torch.tan(angle.to(dtype).double()).to(dtype)}
 
 
 @dataclass(frozen=True, eq=False)
