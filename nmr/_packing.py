@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ._validate import check_faces, check_vertices, describe
+from ._validate import cast_under_autocast, check_faces, check_vertices, describe
 
 Values = Tensor | tuple[Tensor, ...]  # result of check_values: a tensor with a batch axis, or one tensor per mesh
 
@@ -114,7 +114,7 @@ class MeshBatch(NamedTuple):
 
 
 def _starts(rows: Sequence[int], faces: Sequence[int]) -> Tensor:
-    return torch.tensor([[0, *accumulate(rows)], [0, *accumulate(faces)]]).T.contiguous()
+    return torch.tensor([[0, *accumulate(rows)], [0, *accumulate(faces)]], device="cpu").T.contiguous()
 
 
 def is_list(value: object) -> bool:
@@ -124,6 +124,7 @@ def is_list(value: object) -> bool:
 def pack_meshes(vertices: object, faces: object) -> MeshBatch:
     """Meshes given as lists, checked and laid end to end; a list of one becomes the batch ``[1, V, 3]``."""
     if is_list(vertices):
+        vertices = [cast_under_autocast(part) for part in vertices]
         for part in vertices:
             if not isinstance(part, Tensor):
                 raise TypeError(

@@ -79,7 +79,6 @@ def make_scene(
     eps: float = 1e-4,
 ) -> Scene:
     height, width = check_image_size(image_size, LARGEST_IMAGE)
-    check_depth_range(near, far)
     packed = is_list(vertices) or is_list(faces)
     if packed:
         mesh = pack_meshes(vertices, faces)
@@ -96,6 +95,7 @@ def make_scene(
             mesh = mesh._replace(vertices=camera.transform(world, starts=mesh.starts))
         check_transformed(mesh.vertices, world, mesh.starts is not None)
     mesh = mesh._replace(faces=check_faces(mesh.faces, mesh.batch, mesh.vertices.device))
+    check_depth_range(near, far, mesh.vertices.dtype)
     check_eps(eps, mesh.vertices.dtype)
     scale = 2 if anti_aliasing else 1
     return Scene(world, mesh, camera, (scale * height, scale * width))

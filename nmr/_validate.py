@@ -21,6 +21,14 @@ def describe(value: object) -> str:
     return type(value).__name__
 
 
+def cast_under_autocast(tensor: object) -> object:
+    """Half precision becomes float32 inside ``torch.autocast``, as for torch's own functions that need float32."""
+    half = isinstance(tensor, Tensor) and tensor.dtype in (torch.float16, torch.bfloat16)
+    if half and torch.is_autocast_enabled(tensor.device.type):
+        return tensor.float()
+    return tensor
+
+
 def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
     """``vertices`` as ``[B, V, 3]`` float32 or float64; ``otherwise``: what else is accepted, for the error."""
     if not isinstance(vertices, Tensor):
@@ -30,6 +38,7 @@ def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
         )
     if vertices.ndim not in (2, 3) or vertices.shape[-1] != 3:
         raise ValueError(f"vertices must have shape [B, V, 3] or [V, 3], got {describe(vertices)}")
+    vertices = cast_under_autocast(vertices)
     if vertices.dtype not in _FLOATS:
         raise TypeError(f"vertices must be float32 or float64, got {describe(vertices)}; call vertices.float()")
     return vertices if vertices.ndim == 3 else vertices.unsqueeze(0)
@@ -91,12 +100,14 @@ def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor,
     ndim = axes.count(",") + 1
     wanted = f"{name} must be a float tensor [{axes}] or [B, {axes}], or a list of [{axes}], one per mesh"
     if isinstance(values, Sequence) and not isinstance(values, str) and len(values):
+        values = tuple(map(cast_under_autocast, values))
         for value in values:
             if not isinstance(value, Tensor) or value.dtype not in _FLOATS:
                 raise TypeError(f"{wanted}; the list holds {describe(value)}")
             if value.ndim != ndim or value.shape[-1] != values[0].shape[-1] or value.dtype != values[0].dtype:
                 raise ValueError(f"{wanted}; the list holds {describe(values[0])} and {describe(value)}")
-        return tuple(values)
+        return values
+    values = cast_under_autocast(values)
     if not isinstance(values, Tensor) or values.dtype not in _FLOATS:
         raise TypeError(f"{wanted}, got {describe(values)}; use torch.as_tensor() and .float()")
     if values.ndim not in (ndim, ndim + 1) or values.shape[-1] == 0:
@@ -124,7 +135,7 @@ def _joined(value: object) -> Tensor:
     # torch.as_tensor would detach the tensors in a sequence.
     if isinstance(value, list | tuple) and any(isinstance(part, Tensor | np.ndarray | list | tuple) for part in value):
         return torch.stack([_joined(part) for part in value])
-    return torch.as_tensor(value, dtype=torch.float64)
+    return torch.tensor(value, dtype=torch.float64, device="cpu")  # a copy, also of an array
 
 
 def as_floats(value: object, name: str, wanted: str) -> Tensor:
@@ -173,11 +184,15 @@ def check_number(value: object, name: str) -> float:
         raise TypeError(f"{name} must be a number, got {describe(value)}") from error
 
 
-def check_depth_range(near: float, far: float) -> None:
-    """0 <= near < far, both finite."""
+def check_depth_range(near: float, far: float, dtype: torch.dtype) -> None:
+    """0 <= near < far; the sum of 2x2 pixels of depth far must be finite in the dtype."""
     near, far = check_number(near, "near"), check_number(far, "far")
-    if not (0 <= near < far < float("inf")):
-        raise ValueError(f"near and far must be finite with 0 <= near < far, got near={near}, far={far}")
+    largest = torch.finfo(dtype).max / 4
+    if not 0 <= near < far <= largest:
+        raise ValueError(
+            f"near and far must be finite with 0 <= near < far <= {largest:.4g} (for {dtype}), "
+            f"got near={near}, far={far}"
+        )
 
 
 def check_eps(eps: float, dtype: torch.dtype) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from . import ops
 from ._packing import MeshBatch
-from ._validate import check_values, describe
+from ._validate import cast_under_autocast, check_values, describe
 from .mesh import _unit
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ class Fragments:
         if self.camera is None:
             return False
         points = _usable(self.world.detach())
-        axes = torch.cat([points.new_zeros(1, 3), torch.eye(3).to(points)])
+        axes = torch.cat([points.new_zeros(1, 3), torch.eye(3, dtype=points.dtype, device=points.device)])
 
         def corner(mesh: Tensor) -> Tensor:  # [V, 3] -> [4, 3]
             middle = mesh.mean(-2, keepdim=True)
@@ -175,7 +175,7 @@ class Fragments:
                 probe = self.camera.transform(corner(points))
         else:
             probe = torch.cat([corner(m) if len(m) else axes for m in points.split(self.mesh.vertex_counts)])
-            starts = 4 * torch.arange(self.mesh.batch + 1).view(-1, 1).expand(-1, 2)
+            starts = 4 * torch.arange(self.mesh.batch + 1, device="cpu").view(-1, 1).expand(-1, 2)
             with torch.no_grad():
                 probe = self.camera.transform(probe, starts=starts.contiguous()).view(-1, 4, 3)
         sides = probe[:, 1:] - probe[:, :1]
@@ -193,6 +193,7 @@ class Fragments:
         TypeError, ValueError
             If image is not a float tensor [B, H, W, C] of the dtype of the vertices.
         """
+        image = cast_under_autocast(image)
         if not isinstance(image, Tensor) or image.dtype != self.vertices.dtype:
             raise TypeError(
                 f"image must be a tensor of {self.vertices.dtype}, as the vertices are, got {describe(image)}"

@@ -13,7 +13,7 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
 
     Returns
     -------
-    vertices : float32 [V, 3], of length 1
+    vertices : float32 [V, 3], of length 1, on the default device
     faces : int64 [F, 3], counter-clockwise seen from outside
 
     Raises
@@ -34,11 +34,12 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
     t = (1 + 5**0.5) / 2
     corners = [(-1, t, 0), (1, t, 0), (-1, -t, 0), (1, -t, 0)]
     corners += [(z, x, y) for x, y, z in corners[:4]] + [(y, z, x) for x, y, z in corners[:4]]
-    vertices = torch.tensor(corners, dtype=torch.float64)
+    vertices = torch.tensor(corners, dtype=torch.float64, device="cpu")
     # The 20 triples of mutually nearest corners (distance 2), wound outwards.
     near = torch.cdist(vertices, vertices) < 2.1
     faces = torch.tensor(
-        [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[i, k]]
+        [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[i, k]],
+        device="cpu",
     )
     a, b, c = vertices[faces].unbind(1)
     inward = (torch.linalg.cross(b - a, c - a) * a).sum(1) < 0
@@ -51,7 +52,8 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
         midpoints = vertices[pairs].sum(1)
         vertices = torch.cat([vertices, midpoints / midpoints.norm(dim=1, keepdim=True)])
         faces = torch.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], dim=1).view(-1, 3)
-    return vertices.float(), faces
+    device = torch.get_default_device()
+    return vertices.to(device, torch.float32), faces.to(device)
 
 
 def unique_edges(faces: Tensor) -> Tensor:
@@ -111,7 +113,7 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
     faces = _one_mesh(faces)
     # Sides 0-1, 1-2 and 2-0 with their opposite corners, grouped by edge; a stable sort keeps the face order.
     opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
-    order = torch.argsort(torch.arange(len(faces)).repeat(3), stable=True)
+    order = torch.argsort(torch.arange(len(faces), device="cpu").repeat(3), stable=True)
     sides, opposite = _sides(faces)[order], opposite[order]
     edges, edge_of_side, counts = torch.unique(sides, dim=0, return_inverse=True, return_counts=True)
     if open_mesh:

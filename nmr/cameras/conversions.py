@@ -26,14 +26,15 @@ from .projection import (
 )
 
 # Camera axes here: x right, y down, z away (OpenCV). OpenGL: right, up, towards the viewer; PyTorch3D: left, up, away.
-_OPENGL_AXES = torch.tensor([[1.0], [-1.0], [-1.0]], dtype=torch.float64)
-_PYTORCH3D_AXES = torch.tensor([[-1.0], [-1.0], [1.0]], dtype=torch.float64)
+_HOST = {"dtype": torch.float64, "device": "cpu"}  # where cameras are computed, whatever the default device is
+_OPENGL_AXES = torch.tensor([[1.0], [-1.0], [-1.0]], **_HOST)
+_PYTORCH3D_AXES = torch.tensor([[-1.0], [-1.0], [1.0]], **_HOST)
 
 
 def _row(*entries: Tensor | float) -> Tensor:
     """``[B, len(entries)]`` of tensors ``[B]`` and numbers."""
     batch = max((x.shape[0] for x in entries if isinstance(x, Tensor)), default=1)
-    return torch.stack([torch.as_tensor(x, dtype=torch.float64).expand(batch) for x in entries], dim=-1)
+    return torch.stack([torch.as_tensor(x, **_HOST).expand(batch) for x in entries], dim=-1)
 
 
 def _image_size(image_size: tuple[float, float] | None, in_ndc: bool) -> tuple[float, float]:
@@ -96,7 +97,7 @@ def from_opencv(
     """
     height, width = height_and_width((height, width), "height and width")
     K = batched(as_parameter(K, "K", 3, 3), torch.float64, 3, 3)
-    shift = torch.zeros(3, 3, dtype=torch.float64)
+    shift = torch.zeros(3, 3, **_HOST)
     shift[:2, 2] = 0.5 - pixel_center
     t = as_numbers(t, "t", "numbers of shape [3], [3, 1], [B, 3] or [B, 3, 1]")
     t = t.squeeze(-1) if t.shape[-1:] == (1,) else t
@@ -126,7 +127,7 @@ def to_opencv(
     if not projection.perspective:
         raise ValueError("OpenCV has no orthographic camera; use to_opengl or to_pytorch3d")
     x, y = projection.intrinsics.unbind(1)
-    corner = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    corner = torch.tensor([0.0, 0.0, 1.0], **_HOST)
     shift = (0.5 - pixel_center) * corner
     third = corner.expand_as(x)
     K = torch.stack([width / 2 * (corner + x) - shift, height / 2 * (corner - y) - shift, third], dim=1)
@@ -159,7 +160,7 @@ def from_opengl(view: Numbers, projection: Numbers) -> Projection:
     """
     view = batched(as_parameter(view, "view", 4, 4), torch.float64, 4, 4)
     clip = batched(as_parameter(projection, "projection", 4, 4), torch.float64, 4, 4)
-    last = torch.tensor([[0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
+    last = torch.tensor([[0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]], **_HOST)
     perspective = bool((clip[:, 3] == last[0]).all())
     if not (view[:, 3] == last[1]).all():
         raise ValueError("the last row of view must be (0, 0, 0, 1); are the matrices transposed?")
@@ -187,7 +188,7 @@ def to_opengl(
         raise ValueError(f"near and far must be finite with 0 <= near < far, got near={near}, far={far}")
     camera = _without_distortion(camera, "OpenGL", *_image_size(image_size, True))
     matrix, intrinsics = camera.matrix, camera.intrinsics
-    last = torch.tensor([[[0.0, 0.0, 0.0, 1.0]]], dtype=torch.float64)
+    last = torch.tensor([[[0.0, 0.0, 0.0, 1.0]]], **_HOST)
     view = torch.cat([_OPENGL_AXES * matrix, last.expand(matrix.shape[0], 1, 4)], dim=1)
     x, y, third = intrinsics.unbind(-1)
     zero, depth = torch.zeros_like(x), far - near
@@ -197,7 +198,7 @@ def to_opengl(
     else:
         top = torch.stack([x, -y, zero, third], dim=-1)
         bottom = [[0.0, 0.0, -2 / depth, -(far + near) / depth], [0.0, 0.0, 0.0, 1.0]]
-    return view, torch.cat([top, torch.tensor([bottom], dtype=torch.float64).expand(len(top), 2, 4)], dim=1)
+    return view, torch.cat([top, torch.tensor([bottom], **_HOST).expand(len(top), 2, 4)], dim=1)
 
 
 # --- PyTorch3D
@@ -258,7 +259,7 @@ def from_pytorch3d(
     matrix = torch.cat([R.transpose(1, 2).expand(batch, 3, 3), T.expand(batch, 3, 1)], dim=-1)
     focal, centre = _pairs(focal_length, "focal_length"), _pairs(principal_point, "principal_point")
     height, width = _image_size(image_size, in_ndc)
-    shorter, size = min(height, width), torch.tensor([width, height], dtype=torch.float64)
+    shorter, size = min(height, width), torch.tensor([width, height], **_HOST)
     if not in_ndc:
         focal, centre = focal * (2 / shorter), -(centre - size / 2) * (2 / shorter)
     focal, centre = focal * (shorter / size), centre * (shorter / size)
@@ -307,7 +308,7 @@ def to_pytorch3d(
     """
     height, width = _image_size(image_size, in_ndc)
     camera = _without_distortion(camera, "PyTorch3D", height, width)
-    shorter, size = min(height, width), torch.tensor([width, height], dtype=torch.float64)
+    shorter, size = min(height, width), torch.tensor([width, height], **_HOST)
     intrinsics, matrix = camera.intrinsics, _PYTORCH3D_AXES * camera.matrix
     if intrinsics[:, 0, 1].any() or intrinsics[:, 1, 0].any():
         raise ValueError("PyTorch3D's focal_length and principal_point cannot express the skew of this camera")
@@ -318,4 +319,6 @@ def to_pytorch3d(
     arguments = dict(
         R=matrix[:, :, :3].transpose(1, 2), T=matrix[:, :, 3], focal_length=focal, principal_point=centre, in_ndc=in_ndc
     )
-    return arguments if image_size is None else arguments | {"image_size": torch.tensor([[height, width]])}
+    return (
+        arguments if image_size is None else arguments | {"image_size": torch.tensor([[height, width]], device="cpu")}
+    )

@@ -24,7 +24,7 @@ from .projection import (
 Scalars = float | Sequence[float] | Tensor
 
 # Camera axes have y down, renderer space has y up.
-_Y_UP = torch.tensor([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]])
+_Y_UP = torch.tensor([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]], device="cpu")
 _NARROWEST_DEG = 1e-9  # float32 can still represent 1 / tan of this angle
 
 

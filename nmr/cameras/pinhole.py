@@ -10,7 +10,7 @@ from .._validate import as_numbers
 from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched, common_batch, height_and_width
 
 # From pixels (u right, v down) to [-1, 1]: x = 2 u / width - 1, y = 1 - 2 v / height.
-_CENTRE = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+_CENTRE = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64, device="cpu")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +72,6 @@ class Pinhole(ProjectingCamera):
         batch = common_batch(R=R, t=t)
         matrix = torch.cat([R.expand(batch, 3, 3), t.expand(batch, 3, 1)], dim=-1)
         height, width = self.orig_size
-        intrinsics = K[:, :2] * torch.tensor([[2 / width], [-2 / height]], dtype=K.dtype) + _CENTRE
+        intrinsics = K[:, :2] * K.new_tensor([[2 / width], [-2 / height]]) + _CENTRE
         distortion = None if self.dist_coeffs is None else batched(self.dist_coeffs, dtype, 5)
         return Projection(matrix, intrinsics.to(dtype), distortion)

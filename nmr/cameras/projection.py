@@ -180,7 +180,7 @@ class _Shaped(ProjectingCamera):
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         square, short = self.camera.projection(dtype), min(self.height, self.width)
-        scale = torch.tensor([[short / self.width], [short / self.height]], dtype=dtype)
+        scale = square.intrinsics.new_tensor([[short / self.width], [short / self.height]])
         return replace(square, intrinsics=square.intrinsics * scale)
 
 

@@ -1,0 +1,137 @@
+"""Checks and conversions of arguments that all public functions share: dtypes, depth range, default device."""
+
+import numpy as np
+import pytest
+import torch
+
+import nmr
+from nmr import cameras
+
+SPHERE, FACES = nmr.icosphere(1)
+CAMERA = nmr.LookAt([0.5, 0.3, -3.0])
+COLORS = torch.linspace(0, 1, SPHERE.numel()).view_as(SPHERE)
+SIZE = {"image_size": 16}
+MATRICES = (
+    torch.eye(4, dtype=torch.float64),
+    torch.tensor([[2.0, 0, 0, 0], [0, 2, 0, 0], [0, 0, -1, -2], [0, 0, -1, 0]]),
+)
+INTRINSICS = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
+PINHOLE = nmr.Pinhole(INTRINSICS, torch.eye(3), [0.0, 0.0, 2.0], orig_size=(480, 640))
+
+
+def rgb(vertices, colors=COLORS, lights=None):
+    return nmr.render_rgb(vertices, FACES, CAMERA, colors=nmr.VertexColors(colors), lights=lights, **SIZE)
+
+
+# --- autocast
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_cast_under_autocast(dtype):
+    """As the output of a Linear: the image and the gradient are those of the vertices in float32."""
+    half = SPHERE.to(dtype).requires_grad_()
+    full = half.detach().float().requires_grad_()
+    wanted = nmr.render_silhouette(full, FACES, CAMERA, **SIZE)
+    with torch.autocast("cpu", torch.bfloat16):
+        got = nmr.render_silhouette(half, FACES, CAMERA, **SIZE)
+        packed = nmr.render_silhouette([half, half[:12]], [FACES, FACES[:0]], CAMERA, **SIZE)
+        colored = rgb(half, COLORS.to(dtype))
+        fragments = nmr.render_fragments(half, FACES, CAMERA, **SIZE)
+        resolved = fragments.resolve(fragments.interpolate([COLORS.to(dtype)]).to(dtype))
+        smooth = nmr.losses.smoothness_loss(half, nmr.edge_table(FACES))
+    assert got.dtype == colored.dtype == resolved.dtype == smooth.dtype == torch.float32
+    assert torch.equal(got, wanted) and torch.equal(packed[:1], wanted)
+    assert torch.equal(colored, rgb(full, COLORS.to(dtype).float()))
+    ramp = torch.linspace(-1, 1, 16)
+    (got * ramp).sum().backward()
+    (wanted * ramp).sum().backward()
+    assert full.grad.any() and torch.equal(half.grad, full.grad.to(dtype))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_an_error_otherwise(dtype):
+    with pytest.raises(TypeError, match=r"vertices must be float32 or float64, got .*16 .*call vertices.float\(\)"):
+        nmr.render_silhouette(SPHERE.to(dtype), FACES, CAMERA, **SIZE)
+    with torch.autocast("cpu", enabled=False), pytest.raises(TypeError, match="colors must be a float tensor"):
+        rgb(SPHERE, COLORS.to(dtype))
+
+
+# --- near and far
+
+
+@pytest.mark.parametrize("draw", [nmr.render_silhouette, nmr.render_depth, nmr.render_normals, nmr.render_face_index])
+def test_far_must_be_finite_in_the_dtype_of_the_vertices(draw):
+    with pytest.raises(ValueError, match=r"near < far <= 8.507e\+37 \(for torch.float32\), got near=0.1, far=1e\+39"):
+        draw(SPHERE, FACES, CAMERA, far=1e39, **SIZE)
+    assert draw(SPHERE, FACES, CAMERA, far=8.5e37, **SIZE).isfinite().all()
+    assert draw(SPHERE.double(), FACES, CAMERA, far=1e39, **SIZE).isfinite().all()
+    with pytest.raises(ValueError, match="near and far must be finite"):
+        draw(SPHERE.double(), FACES, CAMERA, far=float("inf"), **SIZE)
+
+
+# --- arrays
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_parameters_of_cameras_are_copies_of_arrays(dtype):
+    eye, matrix = np.array([0.0, 0.0, -3.0], dtype), np.array(INTRINSICS, dtype)
+    camera, pinhole = nmr.LookAt(eye), nmr.Pinhole(matrix, np.eye(3), [0.0, 0.0, 2.0], orig_size=(480, 640))
+    before = [x.transform(SPHERE) for x in (camera, pinhole)]
+    eye[2], matrix[0, 0] = -9.0, 1.0
+    assert torch.equal(camera.transform(SPHERE), before[0]) and torch.equal(pinhole.transform(SPHERE), before[1])
+
+
+# --- default device
+
+DRAWN = {
+    "silhouette": lambda: nmr.render_silhouette(SPHERE, FACES, CAMERA, **SIZE),
+    "list": lambda: nmr.render_silhouette([SPHERE, SPHERE[:12]], [FACES, FACES[:0]], CAMERA, **SIZE),
+    "local": lambda: nmr.render_silhouette(SPHERE, FACES, CAMERA, gradient="local", **SIZE),
+    "wide": lambda: CAMERA.for_image(8, 16).transform(SPHERE),
+    "depth": lambda: nmr.render_depth(SPHERE, FACES, CAMERA, **SIZE),
+    "normals": lambda: nmr.render_normals(SPHERE, FACES, CAMERA, smooth=True, **SIZE),
+    "normals of a list": lambda: nmr.render_normals([SPHERE, SPHERE], [FACES, FACES[1:]], CAMERA, **SIZE),
+    "face index": lambda: nmr.render_face_index(SPHERE, FACES, CAMERA, **SIZE),
+    "rgb": lambda: rgb(SPHERE),
+    "lit": lambda: rgb(SPHERE, lights=nmr.Lights(direction=[0.0, 1.0, -1.0])),
+    "background": lambda: nmr.render_rgb(SPHERE, FACES, CAMERA, background=[0.1, 0.2, 0.3], **SIZE),
+    "voxels": lambda: nmr.voxelize(0.3 * SPHERE + 0.5, FACES, 8),
+    "edge_table": lambda: nmr.edge_table(FACES),
+    "unique_edges": lambda: nmr.unique_edges(FACES),
+    "vertex_normals": lambda: nmr.vertex_normals(SPHERE, FACES),
+    "soft_iou": lambda: nmr.losses.soft_iou_loss(COLORS, COLORS.round()),
+    "smoothness": lambda: nmr.losses.smoothness_loss(SPHERE, nmr.edge_table(FACES)),
+    "laplacian": lambda: nmr.losses.laplacian_loss(SPHERE, nmr.edge_table(FACES)),
+    "edge_length": lambda: nmr.losses.edge_length_loss(SPHERE, nmr.edge_table(FACES)),
+    "consistency": lambda: nmr.losses.normal_consistency_loss(SPHERE, nmr.edge_table(FACES)),
+    "inflation": lambda: nmr.losses.inflation_loss(SPHERE, FACES),
+    "look_at": lambda: nmr.LookAt.from_angles(2.0, 30.0, [0.0, 90.0]).transform(SPHERE),
+    "look": lambda: nmr.Look([0.0, 0.0, -3.0], half_fov_deg=torch.tensor(20.0, device="cpu")).transform(SPHERE),
+    "orthographic": lambda: nmr.Orthographic([0.0, 0.0, -2.0], scale=0.5).transform(SPHERE),
+    "pinhole": lambda: nmr.Pinhole(INTRINSICS, np.eye(3), [0.0, 0.0, 2.0], orig_size=480).transform(SPHERE),
+    "from_opencv": lambda: cameras.from_opencv(
+        INTRINSICS, np.eye(3), [0.0, 0.0, 2.0], [0.1, 0.0, 0.0, 0.0], height=480, width=640
+    ).transform(SPHERE),
+    "to_opencv": lambda: cameras.to_opencv(PINHOLE, height=480, width=640)[0],
+    "from_opengl": lambda: cameras.from_opengl(*MATRICES).transform(SPHERE),
+    "to_opengl": lambda: torch.stack(cameras.to_opengl(PINHOLE, near=0.1, far=10.0)),
+    "from_pytorch3d": lambda: cameras.from_pytorch3d(np.eye(3), [0.0, 0.0, 2.0]).transform(SPHERE),
+    "from_pytorch3d_fov": lambda: cameras.from_pytorch3d_fov(np.eye(3), [0.0, 0.0, 2.0], 40.0).transform(SPHERE),
+    "to_pytorch3d": lambda: cameras.to_pytorch3d(CAMERA, image_size=(64, 64))["focal_length"],
+}
+
+
+@pytest.mark.parametrize("function", DRAWN.values(), ids=DRAWN)
+def test_the_default_device_does_not_matter(function):
+    """Results are on the device of the arguments; the device "meta" has no values, so that any use of it fails."""
+    wanted = function()
+    with torch.device("meta"):
+        got = function()
+    assert got.device.type == "cpu" and torch.equal(got, wanted)
+
+
+def test_spheres_are_made_on_the_default_device():
+    with torch.device("meta"):
+        vertices, faces = nmr.icosphere(1)
+    assert (vertices.device.type, faces.device.type) == ("meta", "meta")
+    assert (vertices.shape, faces.shape) == (SPHERE.shape, FACES.shape)
