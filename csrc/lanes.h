@@ -215,15 +215,4 @@ NMR_INLINE auto min_lanes(V v) {
   return least;
 }
 
-// Number of the lowest bit that is set; bits must not be 0.
-NMR_INLINE int64_t lowest_bit(uint32_t bits) {
-#if defined(__GNUC__)
-  return __builtin_ctz(bits);
-#else
-  int64_t n = 0;
-  while (!(bits >> n & 1)) ++n;
-  return n;
-#endif
-}
-
 }  // namespace nmr

@@ -2,15 +2,23 @@
 #pragma once
 
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
 #include <exception>
 #include <type_traits>
 #include <vector>
 
+// Several x86-64 levels in one program: see levels.h.
+#if defined(NMR_MULTIVERSION) && defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && __GNUC__ >= 12
+#define NMR_LEVELS 1
+#else
+#define NMR_LEVELS 0
+#endif
+
 // A function marked NMR_CLONES is compiled for three levels of x86-64, and the loader chooses one. Only code that is inlined into it
 // is compiled with it, so functions called in its loops are marked NMR_INLINE. The macro is empty on other processors, with other
 // compilers, with GCC before 12 (which does not know the levels), and without glibc (which makes the choice at load time).
-#if defined(NMR_MULTIVERSION) && defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && __GNUC__ >= 12
+#if NMR_LEVELS
 #define NMR_CLONES __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4")))
 #else
 #define NMR_CLONES
@@ -23,6 +31,30 @@
 #endif
 
 namespace nmr {
+
+// Number of the lowest bit that is set; bits must not be 0.
+NMR_INLINE int64_t lowest_bit(uint32_t bits) {
+#if defined(__GNUC__)
+  return __builtin_ctz(bits);
+#else
+  int64_t n = 0;
+  while (!(bits >> n & 1)) ++n;
+  return n;
+#endif
+}
+
+// The level of this processor that lane code is compiled for (levels.h): 3 for x86-64-v3, else 1.
+inline int cpu_level() {
+#if NMR_LEVELS
+  static const int level = [] {
+    const char* wanted = std::getenv("NMR_CPU_LEVEL");
+    return __builtin_cpu_supports("x86-64-v3") && !(wanted && std::strcmp(wanted, "base") == 0) ? 3 : 1;
+  }();
+  return level;
+#else
+  return 1;
+#endif
+}
 
 // Calls body(i) for i in [0, count), each i on one thread. Iterations must be independent, so that the result does not
 // depend on num_threads. An exception (std::bad_alloc) reaches the caller after all threads have stopped.

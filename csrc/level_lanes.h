@@ -1,0 +1,340 @@
+// Eight values that are processed together (lanes), for one level: levels.h includes this file in the namespace of each. A vector that
+// does not fit into a register of the level is two halves. Every operation treats each lane separately, so results do not depend on
+// the level.
+
+constexpr int64_t kLanes = 8;
+
+// Two vectors of half the lanes.
+template <class V>
+struct Halves {
+  V low, high;
+};
+
+#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
+
+#if defined(__AVX512F__) && !NMR_AVX2
+constexpr int64_t kRegisterBytes = 64;
+#elif defined(__AVX2__) || NMR_AVX2
+constexpr int64_t kRegisterBytes = 32;
+#else
+constexpr int64_t kRegisterBytes = 16;
+#endif
+
+// N values of type E: a vector type of the compiler if it fits into a register.
+template <class E, int64_t N, bool fits = N * static_cast<int64_t>(sizeof(E)) <= kRegisterBytes>
+struct LaneType {
+  typedef E Type __attribute__((vector_size(N * sizeof(E))));
+};
+template <class V, class E>
+NMR_INLINE V splat_register(E x) {
+  return x - V{};
+}
+template <class To, class V>
+NMR_INLINE To convert_register(V v) {
+  return __builtin_convertvector(v, To);
+}
+
+#else
+
+// One value, for compilers without vector types.
+template <class E>
+struct One {
+  E value;
+};
+template <class E, int64_t N, bool fits = N == 1>
+struct LaneType {
+  using Type = One<E>;
+};
+template <class V, class E>
+NMR_INLINE V splat_register(E x) {
+  return {x};
+}
+template <class To, class V>
+NMR_INLINE To convert_register(V v) {
+  return {static_cast<decltype(To::value)>(v.value)};
+}
+
+#endif
+
+template <class E, int64_t N>
+struct LaneType<E, N, false> {
+  using Type = Halves<typename LaneType<E, N / 2>::Type>;
+};
+
+template <class T> using MaskElement = std::conditional_t<sizeof(T) == 8, int64_t, int32_t>;
+template <class T> using Lanes = typename LaneType<T, kLanes>::Type;
+template <class T> using LaneMask = Lanes<MaskElement<T>>;  // all bits of a lane are set or none
+using Lanes32 = Lanes<int32_t>;
+
+template <class V> struct IsHalves : std::false_type {};
+template <class V> struct IsHalves<Halves<V>> : std::true_type {};
+
+#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
+#define NMR_ONE_OPERATOR(op)
+#define NMR_ONE_COMPARISON(op)
+#else
+#define NMR_ONE_OPERATOR(op)                             \
+  template <class E>                                     \
+  NMR_INLINE One<E> operator op(One<E> a, One<E> b) {    \
+    return {static_cast<E>(a.value op b.value)};         \
+  }
+#define NMR_ONE_COMPARISON(op)                                      \
+  template <class E>                                                \
+  NMR_INLINE One<MaskElement<E>> operator op(One<E> a, One<E> b) {  \
+    return {a.value op b.value ? -1 : 0};                           \
+  }
+#endif
+#define NMR_LANE_OPERATOR(op)                                   \
+  NMR_ONE_OPERATOR(op)                                          \
+  template <class V>                                            \
+  NMR_INLINE Halves<V> operator op(Halves<V> a, Halves<V> b) {  \
+    return {a.low op b.low, a.high op b.high};                  \
+  }
+#define NMR_LANE_COMPARISON(op)                                                     \
+  NMR_ONE_COMPARISON(op)                                                            \
+  template <class V>                                                                \
+  NMR_INLINE auto operator op(Halves<V> a, Halves<V> b) {                           \
+    return Halves<decltype(a.low op b.low)>{a.low op b.low, a.high op b.high};      \
+  }
+NMR_LANE_OPERATOR(+)
+NMR_LANE_OPERATOR(-)
+NMR_LANE_OPERATOR(*)
+NMR_LANE_OPERATOR(/)
+NMR_LANE_OPERATOR(&)
+NMR_LANE_OPERATOR(|)
+NMR_LANE_COMPARISON(<)
+NMR_LANE_COMPARISON(>)
+NMR_LANE_COMPARISON(<=)
+NMR_LANE_COMPARISON(>=)
+NMR_LANE_COMPARISON(==)
+#undef NMR_LANE_OPERATOR
+#undef NMR_LANE_COMPARISON
+#undef NMR_ONE_OPERATOR
+#undef NMR_ONE_COMPARISON
+
+template <class V, class U>
+NMR_INLINE V load_lanes(const U* p) {
+  V v;
+  std::memcpy(&v, p, sizeof v);
+  return v;
+}
+template <class V, class U>
+NMR_INLINE void store_lanes(U* p, V v) {
+  std::memcpy(p, &v, sizeof v);
+}
+
+// All lanes equal to x.
+template <class V, class E>
+NMR_INLINE V splat_as(E x) {
+  if constexpr (IsHalves<V>::value) {
+    const auto half = splat_as<decltype(V::low)>(x);
+    return {half, half};
+  } else {
+    return splat_register<V>(x);
+  }
+}
+template <class T>
+NMR_INLINE Lanes<T> splat(T x) {
+  return splat_as<Lanes<T>>(x);
+}
+
+// 0, 1, ..., 7
+NMR_INLINE Lanes32 lane_numbers() {
+  constexpr int32_t numbers[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7};
+  return load_lanes<Lanes32>(numbers);
+}
+
+// The lanes of `yes` where the mask is set, else those of `no`.
+template <class M, class V>
+NMR_INLINE V select(M mask, V yes, V no) {
+  if constexpr (IsHalves<V>::value)
+    return {select(mask.low, yes.low, no.low), select(mask.high, yes.high, no.high)};
+  else
+#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
+    return mask ? yes : no;
+#else
+    return mask.value ? yes : no;
+#endif
+}
+
+// The values where the mask is set, else +0: of any value, also of NaN.
+template <class M, class V>
+NMR_INLINE V keep(M mask, V v) {
+  if constexpr (IsHalves<V>::value)
+    return {keep(mask.low, v.low), keep(mask.high, v.high)};
+  else
+#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
+    return (V)(mask & (M)v);
+#else
+    return mask.value ? v : V{0};
+#endif
+}
+
+// Each lane converted to the element type of `To`; to integers truncated, and then every lane must be in range. Halves on one side only
+// come from element types of different size.
+template <class To, class V>
+NMR_INLINE To convert_lanes(V v) {
+  if constexpr (IsHalves<V>::value && IsHalves<To>::value) {
+    return {convert_lanes<decltype(To::low)>(v.low), convert_lanes<decltype(To::low)>(v.high)};
+  } else if constexpr (IsHalves<To>::value) {
+    typename LaneType<std::decay_t<decltype(v[0])>, static_cast<int64_t>(sizeof(V) / sizeof(v[0])) / 2>::Type half[2];
+    std::memcpy(half, &v, sizeof v);
+    return {convert_lanes<decltype(To::low)>(half[0]), convert_lanes<decltype(To::low)>(half[1])};
+  } else if constexpr (IsHalves<V>::value) {
+    using Element = std::decay_t<decltype(std::declval<To>()[0])>;
+    using Half = typename LaneType<Element, static_cast<int64_t>(sizeof(To) / sizeof(Element)) / 2>::Type;
+    const Half half[2] = {convert_lanes<Half>(v.low), convert_lanes<Half>(v.high)};
+    To result;
+    std::memcpy(&result, half, sizeof result);
+    return result;
+  } else {
+    return convert_register<To>(v);
+  }
+}
+template <class T>
+NMR_INLINE Lanes<T> to_values(Lanes32 v) {
+  return convert_lanes<Lanes<T>>(v);
+}
+template <class V>
+NMR_INLINE Lanes32 truncate(V v) {
+  return convert_lanes<Lanes32>(v);
+}
+// A mask over lanes of T as one over 32-bit lanes, and back.
+template <class M>
+NMR_INLINE Lanes32 narrow_mask(M mask) {
+  return convert_lanes<Lanes32>(mask);
+}
+template <class T>
+NMR_INLINE LaneMask<T> widen_mask(Lanes32 mask) {
+  return convert_lanes<LaneMask<T>>(mask);
+}
+
+// Number of lanes of a vector, or of a half.
+template <class V>
+constexpr int lane_count() {
+  if constexpr (IsHalves<V>::value)
+    return 2 * lane_count<decltype(V::low)>();
+  else
+#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
+    return sizeof(V) / sizeof(std::declval<V>()[0]);
+#else
+    return 1;
+#endif
+}
+
+// Bit k is set where lane k of the mask is.
+template <class M>
+NMR_INLINE uint32_t lane_bits(M mask) {
+  if constexpr (IsHalves<M>::value) {
+    return lane_bits(mask.low) | lane_bits(mask.high) << lane_count<decltype(mask.low)>();
+  } else {
+#if !defined(__GNUC__) || defined(NMR_NO_VECTOR_TYPES)
+    return mask.value & 1;
+#else
+    constexpr size_t bytes = sizeof mask, lane_bytes = bytes / lane_count<M>();
+#if defined(__AVX2__) || NMR_AVX2
+    if constexpr (bytes == 32 && lane_bytes == 4) return _mm256_movemask_ps((__m256)mask);
+    if constexpr (bytes == 32 && lane_bytes == 8) return _mm256_movemask_pd((__m256d)mask);
+#endif
+#if defined(__SSE2__)
+    if constexpr (bytes == 16 && lane_bytes == 4) return _mm_movemask_ps((__m128)mask);
+    if constexpr (bytes == 16 && lane_bytes == 8) return _mm_movemask_pd((__m128d)mask);
+#endif
+    uint32_t bits = 0;
+    for (int k = 0; k < lane_count<M>(); ++k) bits |= static_cast<uint32_t>(mask[k] & 1) << k;
+    return bits;
+#endif
+  }
+}
+
+// p[offset[0]], ..., p[offset[7]]
+NMR_INLINE Lanes32 gather_lanes(const int32_t* p, Lanes32 offset) {
+#if defined(__AVX2__) || NMR_AVX2
+  return (Lanes32)_mm256_i32gather_epi32(p, (__m256i)offset, 4);
+#else
+  int32_t at[kLanes], value[kLanes];
+  store_lanes(at, offset);
+  for (int64_t k = 0; k < kLanes; ++k) value[k] = p[at[k]];
+  return load_lanes<Lanes32>(value);
+#endif
+}
+
+#if defined(__AVX2__) || NMR_AVX2
+// Byte k of entry b: the number of the k-th set bit of b.
+struct SetBits {
+  uint64_t entry[256];
+  constexpr SetBits() : entry() {
+    for (int b = 0; b < 256; ++b) {
+      int found = 0;
+      for (uint64_t k = 0; k < 8; ++k)
+        if (b >> k & 1) entry[b] |= k << 8 * found++;
+    }
+  }
+};
+constexpr SetBits kSetBits;
+#endif
+
+// Writes the lanes whose bit is set to out, one after the other, and anything to the rest of out[0..7]; returns how many are set.
+NMR_INLINE int64_t compress_lanes(Lanes32 v, uint32_t bits, int32_t* out) {
+#if defined(__AVX2__) || NMR_AVX2
+  const __m256i order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(static_cast<int64_t>(kSetBits.entry[bits])));
+  store_lanes(out, _mm256_permutevar8x32_epi32((__m256i)v, order));
+  return __builtin_popcount(bits);
+#else
+  int32_t value[kLanes];
+  store_lanes(value, v);
+  int64_t count = 0;
+  for (int64_t k = 0; k < kLanes; ++k) {
+    out[count] = value[k];
+    count += bits >> k & 1;
+  }
+  return count;
+#endif
+}
+
+// floor(x), for x in the range of int32
+template <class T>
+NMR_INLINE Lanes<T> floor_lanes(Lanes<T> x) {
+#if defined(__AVX2__) || NMR_AVX2
+  if constexpr (std::is_same_v<T, float>) return (Lanes<T>)_mm256_floor_ps((__m256)x);
+#endif
+  const Lanes<T> rounded = to_values<T>(truncate(x));
+  return select(rounded > x, rounded - splat(T(1)), rounded);
+}
+
+// Lanes of a vector as an array, for code that treats them one by one.
+template <class E, class V>
+struct LaneArray {
+  E lane[kLanes];
+  explicit NMR_INLINE LaneArray(V v) { store_lanes(lane, v); }
+};
+
+// sums[0] += the sum of the lanes of p, sums[1] += that of q; always in the order ((0 + 4) + (2 + 6)) + ((1 + 5) + (3 + 7)).
+template <class T>
+NMR_INLINE void add_lane_sums(Lanes<T> p, Lanes<T> q, T* sums) {
+#if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)
+  if constexpr (std::is_same_v<T, float>) {
+    __m128 low[2], high[2];
+    if constexpr (IsHalves<Lanes<T>>::value) {
+      low[0] = p.low, high[0] = p.high, low[1] = q.low, high[1] = q.high;
+    } else {
+      __m128 half[2];
+      std::memcpy(half, &p, sizeof half);
+      low[0] = half[0], high[0] = half[1];
+      std::memcpy(half, &q, sizeof half);
+      low[1] = half[0], high[1] = half[1];
+    }
+    const __m128 p4 = low[0] + high[0], q4 = low[1] + high[1];
+    const __m128 pairs = _mm_unpacklo_ps(p4, q4) + _mm_unpackhi_ps(p4, q4);  // p02 q02 p13 q13
+    const __m128 sum = pairs + _mm_movehl_ps(pairs, pairs);
+    __m128 total = _mm_castsi128_ps(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(sums)));
+    total = total + sum;
+    _mm_storel_epi64(reinterpret_cast<__m128i*>(sums), _mm_castps_si128(total));
+    return;
+  }
+#endif
+  const LaneArray<T, Lanes<T>> a(p), b(q);
+  const auto sum = [](const T* v) { return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7])); };
+  sums[0] += sum(a.lane);
+  sums[1] += sum(b.lane);
+}

@@ -1,0 +1,369 @@
+// The inner loops of the silhouette gradient; included by levels.h for every instruction set.
+//
+// For axis 0 the lines are columns: s is the scan coordinate x and t the sweep coordinate y. For axis 1 they are rows: s is y, t is x.
+// A sweep goes outward, up or down its line. In the coordinate of its direction (t or -t, see PullLines) it always goes up.
+
+// --- which pixels can pull
+
+// Whether all values are finite.
+template <class T>
+bool all_finite(const T* values, int64_t count) {
+  Lanes<T> zeros = splat(T(0));
+  int64_t n = 0;
+  for (; n + kLanes <= count; n += kLanes) zeros = zeros + load_lanes<Lanes<T>>(values + n) * splat(T(0));
+  T zero = 0;
+  for (; n < count; ++n) zero += values[n] * T(0);
+  return zero == T(0) && lane_bits(zeros == splat(T(0))) == 0xff;
+}
+
+// Gradients of one row of raster pixels (counted from the bottom), followed by lanes of zeros.
+template <class T>
+NMR_INLINE void expand_row(const SweepImage<T>& image, int64_t j, T* row) {
+  const int64_t w = image.size.width;
+  if (image.anti_aliasing) {
+    const T* grad = image.grad_alpha + (image.size.height - 1 - j / 2) * w;
+    for (int64_t x = 0; x < w; ++x) row[2 * x] = row[2 * x + 1] = grad[x] / 4;
+  } else {
+    std::copy_n(image.grad_alpha + (image.size.height - 1 - j) * w, w, row);
+  }
+  std::fill_n(row + image.raster.width, kLanes, T(0));
+}
+
+// Empties lines [first, last). Until they are finished, gain_start holds the first and the last pixel that gains.
+template <class T>
+NMR_INLINE void start_lines(PullLines<T>& lines, int64_t first, int64_t last) {
+  const T infinity = std::numeric_limits<T>::infinity();
+  std::fill(lines.count.begin() + first, lines.count.begin() + last, 0);
+  std::fill(lines.gain_start[0].begin() + first, lines.gain_start[0].begin() + last, infinity);
+  std::fill(lines.gain_start[1].begin() + first, lines.gain_start[1].begin() + last, -infinity);
+}
+
+template <class T>
+NMR_INLINE void append_pull(PullLines<T>& lines, int64_t n, int64_t m, T weight) {
+  const int64_t at = n * lines.stride + kPad + lines.count[n]++;
+  lines.position[at] = static_cast<T>(m);
+  lines.weight[at] = weight;
+}
+
+template <class T>
+NMR_INLINE void finish_lines(PullLines<T>& lines, int64_t first, int64_t last) {
+  const T infinity = std::numeric_limits<T>::infinity(), length = static_cast<T>(lines.stride - 2 * kPad);
+  for (int64_t n = first; n < last; ++n) {
+    const int32_t count = lines.count[n];
+    T* position = lines.position.data() + n * lines.stride + kPad;
+    lines.pull_end[0][n] = count ? position[count - 1] : -infinity;
+    lines.pull_end[1][n] = count ? -position[0] : -infinity;
+    lines.gain_start[1][n] = std::max(T(1) - length, -lines.gain_start[1][n]);
+    store_lanes(position - kPad, splat(T(-1)));
+    store_lanes(position + count, splat(length));
+  }
+}
+
+// Fills the lines of a range. grad_row: [W + lanes] of scratch.
+template <class T>
+void collect_lines(const SweepImage<T>& image, const LineRange& range, T* grad_row) {
+  const int64_t H = image.raster.height, W = image.raster.width;
+  const bool any_column = range.column_first < range.column_last;
+  PullLines<T>&columns = image.lines[0], &rows = image.lines[1];
+  start_lines(columns, range.column_first, range.column_last);
+  start_lines(rows, range.row_first, range.row_last);
+  const int64_t j_first = any_column ? 0 : range.row_first, j_last = any_column ? H : range.row_last;
+  for (int64_t j = j_first; j < j_last; ++j) {
+    const bool in_rows = j >= range.row_first && j < range.row_last;
+    const int32_t* owner = image.owner + (H - 1 - j) * W;
+    if (j == j_first || !image.anti_aliasing || j % 2 == 0) expand_row(image, j, grad_row);
+    const int64_t i_last = in_rows ? W : range.column_last;
+    for (int64_t start = in_rows ? 0 : range.column_first; start < i_last; start += kLanes) {
+      const Lanes<T> g = load_lanes<Lanes<T>>(grad_row + start);
+      Lanes32 id = splat(int32_t(-1));
+      if (start + kLanes <= W)
+        id = load_lanes<Lanes32>(owner + start);
+      else
+        std::memcpy(&id, owner + start, (W - start) * sizeof(int32_t));
+      const Lanes32 background = id < splat(int32_t(0));
+      uint32_t bits = lane_bits(narrow_mask(g < splat(T(0))) & background);
+      const uint32_t gain_bits = lane_bits(g > splat(T(0))) & ~lane_bits(background);
+      for (; bits; bits &= bits - 1) {
+        const int64_t i = start + lowest_bit(bits);
+        if (in_rows) append_pull(rows, j, i, -grad_row[i]);
+        if (i >= range.column_first && i < range.column_last) append_pull(columns, i, j, -grad_row[i]);
+      }
+      if (!gain_bits) continue;
+      if (in_rows) {
+        rows.gain_start[0][j] = std::min(rows.gain_start[0][j], static_cast<T>(start));  // at least that
+        rows.gain_start[1][j] = static_cast<T>(start + kLanes - 1);                      // at most that
+      }
+      if (any_column) {
+        const LaneMask<T> here = (g > splat(T(0))) & widen_mask<T>(id >= splat(int32_t(0)));
+        T *gain_first = columns.gain_start[0].data() + start, *gain_last = columns.gain_start[1].data() + start;
+        const Lanes<T> line_first = load_lanes<Lanes<T>>(gain_first), at = splat(static_cast<T>(j));
+        store_lanes(gain_first, select(here & (line_first > at), at, line_first));
+        store_lanes(gain_last, select(here, at, load_lanes<Lanes<T>>(gain_last)));
+      }
+    }
+  }
+  finish_lines(columns, range.column_first, range.column_last);
+  finish_lines(rows, range.row_first, range.row_last);
+}
+
+// --- the faces that own a pixel; all others have gradient 0
+
+// Writes their owner entries to ids, ascending, and returns their number. seen: [2 F + 1 + pad] of scratch.
+int64_t find_visible(const int32_t* owner, int64_t pixels, int64_t num_faces, uint8_t* seen, int32_t* ids) {
+  const int64_t entries = 2 * num_faces + 1;  // entry 0 is the background
+  std::memset(seen, 0, entries + kPad);
+  int64_t n = 0;
+  for (; n + kLanes <= pixels; n += kLanes) {
+    if (!lane_bits(load_lanes<Lanes32>(owner + n) >= splat(int32_t(0)))) continue;
+    for (int64_t k = 0; k < kLanes; ++k) seen[owner[n + k] + 1] = 1;
+  }
+  for (; n < pixels; ++n) seen[owner[n] + 1] = 1;
+  seen[0] = 0;
+  int64_t count = 0;
+  for (int64_t e = 0; e < entries; e += 8) {
+    uint64_t any;
+    std::memcpy(&any, seen + e, sizeof any);
+    if (!any) continue;
+    for (int64_t k = e; k < e + 8; ++k) {
+      ids[count] = static_cast<int32_t>(k - 1);
+      count += seen[k];
+    }
+  }
+  return count;
+}
+
+// --- the pulls
+
+// How the crossing c of an edge P-Q and a line moves with each end of the edge.
+template <class T>
+struct Lever {
+  T crossing;  // c
+  T factor_p;  // 2 / M (Qs - Ps) / (Qs - n): travel of P, in [-1, 1] coordinates, that moves the crossing by one of M pixels
+  T factor_q;  // 2 / M (Qs - Ps) / (n - Ps)
+  T eps;
+};
+
+// How far the end must travel to move the crossing by `offset` pixels; eps keeps it away from zero.
+template <class T>
+NMR_INLINE T travel(T factor, T offset, T eps) {
+  const T h = factor * offset;
+  return h > 0 ? h + eps : h - eps;
+}
+
+// The pull of one pixel, for pixels inside the face and for levers of extreme size. An end without a finite lever does not move.
+template <class T>
+NMR_INLINE void pull(T weight, T offset, const Lever<T>& lever, T* pulls) {
+  if (std::isfinite(lever.factor_p)) pulls[0] += weight / travel(lever.factor_p, offset, lever.eps);
+  if (std::isfinite(lever.factor_q)) pulls[1] += weight / travel(lever.factor_q, offset, lever.eps);
+}
+
+// Sums the pulls of the listed pixels beyond the crossing: above it if kUp, else below. The quotients w / h_p and w / h_q share one
+// division: w / (h_p h_q) times h_q and h_p.
+template <bool kUp, class T>
+NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, const Lever<T>& lever, T* pulls) {
+  // All offsets have the same sign, so the signs of both distances are constant.
+  const T eps = kUp ? lever.eps : -lever.eps;
+  const Lanes<T> crossing = splat(lever.crossing), factor_p = splat(lever.factor_p), factor_q = splat(lever.factor_q);
+  const Lanes<T> eps_p = splat(lever.factor_p > 0 ? eps : -eps), eps_q = splat(lever.factor_q > 0 ? eps : -eps);
+  Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
+  int64_t n = kUp ? count - kLanes : 0;  // from the border of the image inwards
+  bool more;
+  do {
+    const Lanes<T> offset = load_lanes<Lanes<T>>(position + n) - crossing;
+    const LaneMask<T> beyond = kUp ? offset > splat(T(0)) : offset < splat(T(0));
+    const Lanes<T> h_p = offset * factor_p + eps_p, h_q = offset * factor_q + eps_q;
+    const Lanes<T> share = keep(beyond, load_lanes<Lanes<T>>(weight + n) / (h_p * h_q));
+    pulls_p = pulls_p + share * h_q;
+    pulls_q = pulls_q + share * h_p;
+    more = kUp ? position[n] > lever.crossing : position[n + kLanes - 1] < lever.crossing;
+    n += kUp ? -kLanes : kLanes;
+  } while (more);
+  add_lane_sums<T>(pulls_p, pulls_q, pulls);
+}
+
+// Pulls of the pixels inside the face that should be background: the loss falls if the edge moves in past them.
+template <class T>
+void pull_inside(const SweepImage<T>& image, const SweepScratch<T>& block, int axis, int32_t edge, int64_t n, int64_t inner, int64_t d,
+                 const Lever<T>& lever, T* pulls) {
+  const int64_t H = image.raster.height, W = image.raster.width, face = edge % kSweptFaces, p = edge / kSweptFaces;
+  const int64_t q = p < 2 ? p + 1 : 0, o = p > 0 ? p - 1 : 2;
+  // pixel m of line n: owner[m * step]
+  const int32_t* owner = axis == 0 ? image.owner + (H - 1) * W + n : image.owner + (H - 1 - n) * W;
+  const int64_t step = axis == 0 ? -W : 1, length = axis == 0 ? H : W;
+  const auto s = [&](int64_t k) { return block.corner[axis][k][face]; };
+  const auto t = [&](int64_t k) { return block.corner[1 - axis][k][face]; };
+  const T line = static_cast<T>(n);
+  const int64_t end = (line - s(p)) * (line - s(o)) < 0 ? p : q;
+  const T far_side = line_height(s(end), t(end), s(o), t(o), line);
+  const int64_t limit = sweep_limit(far_side, d, length);
+  const int64_t m_first = std::max<int64_t>(std::min(inner, limit), 0), m_last = std::min(std::max(inner, limit), length - 1);
+  for (int64_t m = m_first; m <= m_last; ++m) {
+    if (owner[m * step] != block.id[face]) continue;
+    const T g = axis == 0 ? image.grad(n, m) : image.grad(m, n);
+    if (g > 0) pull(g, static_cast<T>(m) - lever.crossing, lever, pulls);
+  }
+}
+
+// --- the sweeps
+
+// Sweeps all crossings of one axis and direction, and empties them.
+template <bool kUp, class T>
+void run_crossings(const SweepImage<T>& image, int axis, SweepScratch<T>& block) {
+  const int64_t H = image.raster.height, W = image.raster.width;
+  const PullLines<T>& lines = image.lines[axis];
+  Crossings<T>& crossings = block.crossings[axis][kUp ? 0 : 1];
+  const int32_t d = kUp ? 1 : -1;
+  const T top = static_cast<T>((axis == 0 ? H : W) - 1);  // the last pixel of a line
+  // The inner pixel is floor(c) in the coordinate of the direction. It and the next one lie on the line if start <= c < end.
+  const Lanes<T> start = splat(kUp ? T(0) : -top), end = splat(kUp ? top : T(0));
+  // pixel m of line n: owner[origin + n * step_n + m * step_m]
+  const int32_t across = static_cast<int32_t>(-W), step = axis == 0 ? across * d : d;
+  const Lanes32 origin = splat(static_cast<int32_t>((H - 1) * W)), step_n = splat(axis == 0 ? int32_t(1) : across), step_m = splat(step);
+  const Lanes32 all = splat(static_cast<int32_t>(crossings.count)), face_of = splat(static_cast<int32_t>(kSweptFaces - 1));
+  int64_t num_pulled = 0, num_gained = 0;
+  for (int64_t i = 0; i < crossings.count; i += kLanes) {
+    const Lanes<T> at = load_lanes<Lanes<T>>(crossings.at + i);
+    const Lanes32 number = lane_numbers() + splat(static_cast<int32_t>(i)), used = number < all;
+    const Lanes32 may_pull = used & narrow_mask((at >= start) & (at < load_lanes<Lanes<T>>(crossings.pull_end + i)));
+    const Lanes32 may_gain = used & narrow_mask((at >= load_lanes<Lanes<T>>(crossings.gain_start + i)) & (at < end));
+    const Lanes32 wanted = may_pull | may_gain;
+    const Lanes32 inner = truncate(floor_lanes<T>(keep(widen_mask<T>(wanted), at)));
+    const Lanes32 pixel = origin + load_lanes<Lanes32>(crossings.line + i) * step_n + inner * step_m;
+    const Lanes32 face = load_lanes<Lanes32>(crossings.edge + i) & face_of;
+    const Lanes32 id = gather_lanes(block.id, keep(used, face));
+    const Lanes32 inner_owner = gather_lanes(image.owner, keep(wanted, pixel));
+    const Lanes32 outer_owner = gather_lanes(image.owner, keep(wanted, pixel + step_m));
+    num_pulled += compress_lanes(number, lane_bits(may_pull & (inner_owner == id)), crossings.pulled + num_pulled);
+    const uint32_t gain_bits = lane_bits(may_gain & (outer_owner < splat(int32_t(0))));
+    if (gain_bits) num_gained += compress_lanes(number, gain_bits, crossings.gained + num_gained);
+  }
+  crossings.count = 0;
+
+  const auto lever_of = [&](int32_t i) {
+    const T line = static_cast<T>(crossings.line[i]), reach = block.reach[axis][crossings.edge[i]];
+    return Lever<T>{kUp ? crossings.at[i] : -crossings.at[i], reach / (block.qs[axis][crossings.edge[i]] - line),
+                    reach / (line - block.ps[axis][crossings.edge[i]]), image.eps};
+  };
+  // Outside: pixels from the outer one to the border that should be covered. The loss falls if the edge moves out to them.
+  for (int64_t k = 0; k < num_pulled; ++k) {
+    const int32_t i = crossings.pulled[k], n = crossings.line[i];
+    const Lever<T> lever = lever_of(i);
+    T* pulls = block.pulls[axis][crossings.edge[i]];
+    const T *position = lines.positions(n), *weight = lines.weights(n);
+    const bool regular = std::abs(lever.factor_p) < image.largest_lever && std::abs(lever.factor_q) < image.largest_lever;
+    if (regular) {
+      pull_listed<kUp>(position, weight, lines.count[n], lever, pulls);
+    } else {
+      for (int32_t m = 0; m < lines.count[n]; ++m)
+        if (kUp ? position[m] > lever.crossing : position[m] < lever.crossing)
+          pull(weight[m], position[m] - lever.crossing, lever, pulls);
+    }
+  }
+  for (int64_t k = 0; k < num_gained; ++k) {
+    const int32_t i = crossings.gained[k];
+    const int64_t inner = d * static_cast<int64_t>(std::floor(crossings.at[i]));
+    pull_inside(image, block, axis, crossings.edge[i], crossings.line[i], inner, d, lever_of(i), block.pulls[axis][crossings.edge[i]]);
+  }
+}
+
+template <class T>
+NMR_INLINE void run_crossings(const SweepImage<T>& image, int axis, int direction, SweepScratch<T>& block) {
+  direction == 0 ? run_crossings<true>(image, axis, block) : run_crossings<false>(image, axis, block);
+}
+
+// Finds the crossings of the edges k, k + 1 of eight faces, from number `first` of the block, and the lines of an axis.
+template <class T>
+NMR_INLINE void cross_edges(const SweepImage<T>& image, int axis, int k, int64_t first, SweepScratch<T>& block) {
+  const PullLines<T>& lines = image.lines[axis];
+  const T num_lines = static_cast<T>(axis == 0 ? image.raster.width : image.raster.height);
+  const T length = static_cast<T>(axis == 0 ? image.raster.height : image.raster.width);
+  const int64_t edge = k * kSweptFaces + first, q = k < 2 ? k + 1 : 0;
+  const Lanes<T> ps = load_lanes<Lanes<T>>(block.corner[axis][k] + first), qs = load_lanes<Lanes<T>>(block.corner[axis][q] + first);
+  const Lanes<T> pt = load_lanes<Lanes<T>>(block.corner[1 - axis][k] + first), qt = load_lanes<Lanes<T>>(block.corner[1 - axis][q] + first);
+  const Lanes<T> zero = splat(T(0)), one = splat(T(1)), top = splat(num_lines - 1);
+  const LaneMask<T> ascending = ps < qs;
+  const Lanes<T> least = select(ascending, ps, qs), most = select(ascending, qs, ps);
+  const Lanes<T> low = select(least > zero, least, zero), high = select(most < top, most, top);
+  // Edges parallel to the scan line (least == most) are left out: neither end can move a crossing.
+  const LaneMask<T> in_reach = (least < most) & (low <= top) & (high > splat(T(-1)));
+  const Lanes<T> from = select(in_reach, low, one), to = select(in_reach, high, zero);
+  const Lanes<T> whole = to_values<T>(truncate(from));
+  const Lanes32 first_line = truncate(select(whole < from, whole + one, whole));
+  // Truncation towards zero, as published: an edge that ends in (-1, 0) is extrapolated to line 0.
+  const Lanes32 last_line = truncate(to);
+  const Lanes<T> slope = (qt - pt) / (qs - ps);
+  store_lanes(block.ps[axis] + edge, ps);
+  store_lanes(block.qs[axis] + edge, qs);
+  store_lanes(block.reach[axis] + edge, (qs - ps) * splat(T(2)) / splat(length));
+  const uint32_t found = lane_bits(first_line <= last_line);
+  const uint32_t up = axis == 0 ? ~lane_bits(ascending) : lane_bits(ascending);  // outward is towards larger t
+  const LaneArray<int32_t, Lanes32> first_at(first_line), last_at(last_line);
+
+  for (int direction = 0; direction < 2; ++direction) {
+    Crossings<T>& crossings = block.crossings[axis][direction];
+    const T *pull_end = lines.pull_end[direction].data(), *gain_start = lines.gain_start[direction].data();
+    const LaneArray<T, Lanes<T>> slope_at(direction ? zero - slope : slope), height_at(direction ? zero - pt : pt);
+    for (uint32_t bits = found & (direction ? ~up : up); bits; bits &= bits - 1) {
+      const int64_t lane = lowest_bit(bits);
+      const Lanes<T> scan = splat(block.ps[axis][edge + lane]), slopes = splat(slope_at.lane[lane]), height = splat(height_at.lane[lane]);
+      const int32_t last = last_at.lane[lane];
+      for (int32_t start = first_at.lane[lane]; start <= last; start += kLanes) {
+        if (crossings.count > kCrossings - kLanes) run_crossings(image, axis, direction, block);
+        const Lanes32 line = lane_numbers() + splat(start);
+        const int64_t count = crossings.count;
+        store_lanes(crossings.at + count, (to_values<T>(line) - scan) * slopes + height);
+        store_lanes(crossings.pull_end + count, load_lanes<Lanes<T>>(pull_end + start));
+        store_lanes(crossings.gain_start + count, load_lanes<Lanes<T>>(gain_start + start));
+        store_lanes(crossings.line + count, line);
+        store_lanes(crossings.edge + count, splat(static_cast<int32_t>(edge + lane)));
+        crossings.count += std::min<int64_t>(last - start + 1, kLanes);
+      }
+    }
+  }
+}
+
+// Gradients [3, 2] of x and y of the corners of up to kSweptFaces visible faces, in the order in which they are drawn.
+template <class T>
+NMR_INLINE void sweep_block(const SweepImage<T>& image, const int32_t* ids, int64_t count, SweepScratch<T>& block, T* grad) {
+  for (int64_t n = 0; n < count; ++n) {
+    const bool reversed = ids[n] >= image.num_faces;
+    const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
+    block.id[n] = ids[n];
+    for (int k = 0; k < 3; ++k) {
+      const T* vertex = image.vertices + 3 * face[reversed ? 2 - k : k];
+      block.corner[0][k][n] = vertex[0];
+      block.corner[1][k][n] = vertex[1];
+    }
+  }
+  const int64_t padded = (count + kLanes - 1) / kLanes * kLanes;
+  for (int axis = 0; axis < 2; ++axis) {
+    const Lanes<T> size = splat(static_cast<T>(axis == 0 ? image.raster.width : image.raster.height));
+    for (int k = 0; k < 3; ++k) {
+      T* corner = block.corner[axis][k];
+      std::fill(corner + count, corner + padded, T(0));
+      for (int64_t n = 0; n < padded; n += kLanes)
+        store_lanes(corner + n, (load_lanes<Lanes<T>>(corner + n) * size + size - splat(T(1))) * splat(T(0.5)));  // to_pixel
+      std::fill_n(block.pulls[axis][k * kSweptFaces], 2 * count, T(0));
+    }
+  }
+  for (int axis = 0; axis < 2; ++axis) {
+    for (Crossings<T>& crossings : block.crossings[axis]) crossings.count = 0;
+    // A crossing lies between two pixels of its line.
+    const bool crossable = (axis == 0 ? image.raster.height : image.raster.width) > 1;
+    for (int64_t n = 0; crossable && n < padded; n += kLanes)
+      for (int k = 0; k < 3; ++k) cross_edges(image, axis, k, n, block);
+    for (int direction = 0; direction < 2; ++direction) run_crossings(image, axis, direction, block);
+    // Corner k is the start of edge k and the end of the one before. Axis 0 moves y, axis 1 moves x.
+    for (int64_t n = 0; n < count; ++n)
+      for (int k = 0; k < 3; ++k)
+        grad[6 * n + 2 * k + 1 - axis] =
+            0 - (block.pulls[axis][k * kSweptFaces + n][0] + block.pulls[axis][(k + 2) % 3 * kSweptFaces + n][1]);
+  }
+}
+
+// The same for visible faces [first, last) of the list.
+template <class T>
+void sweep_faces(const SweepImage<T>& image, const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block, T* grad) {
+  for (int64_t n = first; n < last; n += kSweptFaces)
+    sweep_block(image, ids + n, std::min(kSweptFaces, last - n), block, grad + 6 * n);
+}
