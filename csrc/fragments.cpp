@@ -22,17 +22,17 @@ constexpr int64_t kEntry = 16;  // numbers per face in the table: columns 0, 1, 
 // Values of the covered pixels of one row, from the first covered pixel on. Rows are padded to whole vectors.
 template <class T>
 struct PixelRow {
-  T* raw;      // [R + kWidth, 8] clamped weights and depths of the corners, each padded to four
-  T *w[3], *z; // [R + kWidth] normalised weights, depth
-  T* spare;    // [R + kWidth] a row of the image
+  T* raw;      // [W + kWidth, 8] clamped weights and depths of the corners, each padded to four
+  T *w[3], *z; // [W + kWidth] normalised weights, depth
+  T* spare;    // [W + kWidth] a row of the image
 };
 
 template <class T>
 struct FragmentScratch {
   VisibleFaces visible;
   std::vector<T> table;  // [visible, kEntry]
-  std::vector<T> row;    // [13, R + kWidth] PixelRow
-  std::vector<T> terms;  // [R, 12] contribution of each pixel to its face
+  std::vector<T> row;    // [13, W + kWidth] PixelRow
+  std::vector<T> terms;  // [W, 12] contribution of each pixel to its face
   std::vector<T> sums;   // [visible, 12]
 
   void reserve_for(int64_t num_faces, const RowBlocks& blocks) {
@@ -46,8 +46,8 @@ struct FragmentScratch {
     reserve(terms, blocks.raster.width * 12);
     reserve(sums, (blocks.most_visible(num_faces) + 1) * 12);
   }
-  NMR_INLINE PixelRow<T> pixel_row(int64_t raster_size) {
-    const int64_t stride = raster_size + kWidth;
+  NMR_INLINE PixelRow<T> pixel_row(int64_t width) {
+    const int64_t stride = width + kWidth;
     T* r = row.data();
     return {r, {r + 8 * stride, r + 9 * stride, r + 10 * stride}, r + 11 * stride, r + 12 * stride};
   }
@@ -58,25 +58,26 @@ template <class T>
 struct Block {
   const T* vertices;
   const int64_t* faces;
-  int64_t num_faces, raster_size;
-  const int32_t* owner;  // [R, R], row 0 = top
+  int64_t num_faces;
+  Size raster;
+  const int32_t* owner;  // [H, W], row 0 = top
   int64_t first, last;   // rows
 };
 
 template <class T>
 Block<T> make_block(const MeshBatch<T>& mesh, const int32_t* owner, const RowBlocks& blocks, int64_t b, int64_t block) {
-  const int64_t R = blocks.raster.width;
-  return {mesh.image_vertices(b), mesh.image_faces(b),  mesh.face_count(b), R,
-          owner + b * R * R,      blocks.first(block), blocks.last(block)};
+  return {mesh.image_vertices(b), mesh.image_faces(b), mesh.face_count(b), blocks.raster,
+          owner + b * blocks.raster.pixels(), blocks.first(block), blocks.last(block)};
 }
 
 // The table of the block's visible faces; entry 0 (background) has weights (1, 0, 0) and depth 1.
 template <class T>
 NMR_INLINE void set_up_faces(const Block<T>& block, FragmentScratch<T>& scratch) {
   VisibleFaces& visible = scratch.visible;
-  visible.find(block.owner + block.first * block.raster_size, (block.last - block.first) * block.raster_size, block.num_faces);
+  const int64_t W = block.raster.width;
+  visible.find(block.owner + block.first * W, (block.last - block.first) * W, block.num_faces);
   T* table = scratch.table.data();
-  const T size = static_cast<T>(block.raster_size);
+  const T width = static_cast<T>(W), height = static_cast<T>(block.raster.height);
   T corner[9][kWidth], matrix[9][kWidth];
   for (int64_t start = 0; start < visible.count; start += kWidth) {
     const int64_t lanes = std::min(kWidth, visible.count - start);
@@ -93,7 +94,7 @@ NMR_INLINE void set_up_faces(const Block<T>& block, FragmentScratch<T>& scratch)
     }
     for (int64_t n = 0; n < kWidth; ++n) {
       const Triangle<T> t{{corner[0][n], corner[1][n], corner[2][n]}, {corner[3][n], corner[4][n], corner[5][n]}, {1, 1, 1}};
-      const BarycentricMatrix<T> m = barycentric_matrix(t, size, size);
+      const BarycentricMatrix<T> m = barycentric_matrix(t, width, height);
       for (int k = 0; k < 3; ++k)
         for (int c = 0; c < 3; ++c) matrix[3 * c + k][n] = m.m[k][c];
     }
@@ -114,11 +115,10 @@ NMR_INLINE void set_up_faces(const Block<T>& block, FragmentScratch<T>& scratch)
 template <class T>
 NMR_INLINE void evaluate_row(const Block<T>& block, int64_t j, int64_t first, int64_t last, const FragmentScratch<T>& scratch,
                              const PixelRow<T>& row) {
-  const int64_t R = block.raster_size;
-  const int32_t* owner = block.owner + j * R;
+  const int32_t* owner = block.owner + j * block.raster.width;
   const int32_t* slots = scratch.visible.slots.data() + 1;
   const T* table = scratch.table.data();
-  const T y = static_cast<T>(R - 1 - j);
+  const T y = static_cast<T>(block.raster.height - 1 - j);
   T* raw = row.raw;
   for (int64_t i = first; i < last; ++i, raw += 8) {
     const T* entry = table + slots[owner[i]] * kEntry;
@@ -147,42 +147,42 @@ NMR_INLINE void evaluate_row(const Block<T>& block, int64_t j, int64_t first, in
 
 template <class T>
 NMR_INLINE void depth_block_body(const DepthImage<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch) {
-  const int64_t R = block.raster_size, S = args.image.width;
+  const int64_t W = block.raster.width, w = args.image.width;
   set_up_faces(block, scratch);
-  T* image = args.depth + b * S * S;
-  const PixelRow<T> row = scratch.pixel_row(R);
+  T* image = args.depth + b * args.image.pixels();
+  const PixelRow<T> row = scratch.pixel_row(W);
   for (int64_t j = block.first; j < block.last; ++j) {
-    const int32_t* owner = block.owner + j * R;
+    const int32_t* owner = block.owner + j * W;
     int64_t first, last;
-    covered_range(owner, R, first, last);
+    covered_range(owner, W, first, last);
     evaluate_row(block, j, first, last, scratch, row);
-    T* out = args.anti_aliasing ? row.spare : image + j * S;
+    T* out = args.anti_aliasing ? row.spare : image + j * w;
     std::fill_n(out, first, args.far);
     for (int64_t i = first; i < last; ++i) out[i] = owner[i] < 0 ? args.far : row.z[i - first];
-    std::fill_n(out + last, R - last, args.far);
+    std::fill_n(out + last, W - last, args.far);
     if (!args.anti_aliasing) continue;
-    T* mean = image + j / 2 * S;
+    T* mean = image + j / 2 * w;
     if (j % 2 == 0)
-      for (int64_t i = 0; i < S; ++i) mean[i] = out[2 * i] + out[2 * i + 1];
+      for (int64_t i = 0; i < w; ++i) mean[i] = out[2 * i] + out[2 * i + 1];
     else
-      for (int64_t i = 0; i < S; ++i) mean[i] = (mean[i] + out[2 * i] + out[2 * i + 1]) / 4;
+      for (int64_t i = 0; i < w; ++i) mean[i] = (mean[i] + out[2 * i] + out[2 * i + 1]) / 4;
   }
 }
 
 template <class T>
 NMR_INLINE void fragments_block_body(const Fragments<T>& args, const Block<T>& block, int64_t b, FragmentScratch<T>& scratch) {
-  const int64_t R = block.raster_size;
+  const int64_t W = block.raster.width;
   set_up_faces(block, scratch);
-  const PixelRow<T> row = scratch.pixel_row(R);
+  const PixelRow<T> row = scratch.pixel_row(W);
   for (int64_t j = block.first; j < block.last; ++j) {
-    const int32_t* owner = block.owner + j * R;
-    T* depth = args.depth + (b * R + j) * R;
-    T* weights = args.weights + 3 * (b * R + j) * R;
+    const int32_t* owner = block.owner + j * W;
+    T* depth = args.depth + b * block.raster.pixels() + j * W;
+    T* weights = args.weights + 3 * (b * block.raster.pixels() + j * W);
     int64_t first, last;
-    covered_range(owner, R, first, last);
+    covered_range(owner, W, first, last);
     evaluate_row(block, j, first, last, scratch, row);
-    std::fill_n(depth, R, args.far);
-    std::fill_n(weights, 3 * R, T(0));
+    std::fill_n(depth, W, args.far);
+    std::fill_n(weights, 3 * W, T(0));
     depth += first;
     weights += 3 * first;
     owner += first;
@@ -209,16 +209,16 @@ NMR_INLINE T moderate_or_zero(T value) {
 
 // grad z_k = S_k / z_k^2, grad X_k = S_k sum_m M_m0 / z_m with S_k = sum over pixels of g z^2 w_k.
 template <class T>
-NMR_INLINE void depth_gradients(const FragmentScratch<T>& scratch, int64_t raster_size, FaceGradients<T>& result) {
-  const T half = static_cast<T>(raster_size) / 2;
+NMR_INLINE void depth_gradients(const FragmentScratch<T>& scratch, Size raster, FaceGradients<T>& result) {
+  const T half_width = static_cast<T>(raster.width) / 2, half_height = static_cast<T>(raster.height) / 2;
   T* out = result.values.data();
   result.count = scratch.visible.count - 1;
   for (int64_t n = 1; n <= result.count; ++n, out += 9) {
     const T *entry = scratch.table.data() + n * kEntry, *sum = scratch.sums.data() + 4 * n;
     result.ids[n - 1] = scratch.visible.ids[n];
     const T *mx = entry, *my = entry + 4, *z = entry + 12;
-    const T slope_x = moderate_or_zero(mx[0] / z[0] + mx[1] / z[1] + mx[2] / z[2]) * half;
-    const T slope_y = moderate_or_zero(my[0] / z[0] + my[1] / z[1] + my[2] / z[2]) * half;
+    const T slope_x = moderate_or_zero(mx[0] / z[0] + mx[1] / z[1] + mx[2] / z[2]) * half_width;
+    const T slope_y = moderate_or_zero(my[0] / z[0] + my[1] / z[1] + my[2] / z[2]) * half_height;
     for (int k = 0; k < 3; ++k) {
       out[3 * k] = sum[k] * slope_x;
       out[3 * k + 1] = sum[k] * slope_y;
@@ -230,23 +230,23 @@ NMR_INLINE void depth_gradients(const FragmentScratch<T>& scratch, int64_t raste
 template <class T>
 NMR_INLINE void depth_gradient_block_body(const DepthImage<T>& args, const Block<T>& block, int64_t b,
                                           FragmentScratch<T>& scratch, FaceGradients<T>& result) {
-  const int64_t R = block.raster_size, S = args.image.width;
+  const int64_t W = block.raster.width, w = args.image.width;
   set_up_faces(block, scratch);
-  const PixelRow<T> row = scratch.pixel_row(R);
+  const PixelRow<T> row = scratch.pixel_row(W);
   T *grad = row.spare, *terms = scratch.terms.data(), *sums = scratch.sums.data();
   const int32_t* slots = scratch.visible.slots.data() + 1;
   std::fill_n(sums, 4 * scratch.visible.count, T(0));
   for (int64_t j = block.first; j < block.last; ++j) {
-    const int32_t* owner = block.owner + j * R;
+    const int32_t* owner = block.owner + j * W;
     int64_t first, last;
-    covered_range(owner, R, first, last);
+    covered_range(owner, W, first, last);
     if (first == last) continue;
     evaluate_row(block, j, first, last, scratch, row);
     if (args.anti_aliasing) {
-      const T* quarter = args.grad_depth + (b * S + j / 2) * S;
-      for (int64_t i = 0; i < S; ++i) grad[2 * i] = grad[2 * i + 1] = quarter[i] / 4;
+      const T* quarter = args.grad_depth + b * args.image.pixels() + j / 2 * w;
+      for (int64_t i = 0; i < w; ++i) grad[2 * i] = grad[2 * i + 1] = quarter[i] / 4;
     } else {
-      std::copy_n(args.grad_depth + (b * S + j) * S, S, grad);
+      std::copy_n(args.grad_depth + b * args.image.pixels() + j * w, w, grad);
     }
     for (int64_t n = 0; n < last - first; ++n) {
       const T c = grad[first + n] * row.z[n] * row.z[n];
@@ -259,14 +259,14 @@ NMR_INLINE void depth_gradient_block_body(const DepthImage<T>& args, const Block
       for (int k = 0; k < 4; ++k) sum[k] += term[k];
     }
   }
-  depth_gradients(scratch, R, result);
+  depth_gradients(scratch, block.raster, result);
 }
 
 // With u_m = dL/db_m, g = dL/dz and h_m = z (u_m - sum_k u_k b_k) - g z^2:  dL = sum_m h_m d(w_m / z_m), so that
 // grad z_m = -H_mm / z_m^2 and grad X_k = -sum_m H_mk M_m0 / z_m with H_mk = sum over pixels of h_m w_k.
 template <class T>
-NMR_INLINE void fragment_gradients(const FragmentScratch<T>& scratch, int64_t raster_size, FaceGradients<T>& result) {
-  const T half = static_cast<T>(raster_size) / 2;
+NMR_INLINE void fragment_gradients(const FragmentScratch<T>& scratch, Size raster, FaceGradients<T>& result) {
+  const T half_width = static_cast<T>(raster.width) / 2, half_height = static_cast<T>(raster.height) / 2;
   T* out = result.values.data();
   result.count = scratch.visible.count - 1;
   for (int64_t n = 1; n <= result.count; ++n, out += 9) {
@@ -274,8 +274,8 @@ NMR_INLINE void fragment_gradients(const FragmentScratch<T>& scratch, int64_t ra
     result.ids[n - 1] = scratch.visible.ids[n];
     T slope_x[3], slope_y[3];
     for (int m = 0; m < 3; ++m) {
-      slope_x[m] = moderate_or_zero(entry[m] / z[m]) * half;
-      slope_y[m] = moderate_or_zero(entry[4 + m] / z[m]) * half;
+      slope_x[m] = moderate_or_zero(entry[m] / z[m]) * half_width;
+      slope_y[m] = moderate_or_zero(entry[4 + m] / z[m]) * half_height;
     }
     for (int k = 0; k < 3; ++k) {
       out[3 * k] = -(sum[k] * slope_x[0] + sum[4 + k] * slope_x[1] + sum[8 + k] * slope_x[2]);
@@ -288,20 +288,21 @@ NMR_INLINE void fragment_gradients(const FragmentScratch<T>& scratch, int64_t ra
 template <class T>
 NMR_INLINE void fragments_gradient_block_body(const Fragments<T>& args, const Block<T>& block, int64_t b,
                                               FragmentScratch<T>& scratch, FaceGradients<T>& result) {
-  const int64_t R = block.raster_size;
+  const int64_t W = block.raster.width;
   set_up_faces(block, scratch);
-  const PixelRow<T> row = scratch.pixel_row(R);
+  const PixelRow<T> row = scratch.pixel_row(W);
   T *sums = scratch.sums.data(), *terms = scratch.terms.data();
   const int32_t* slots = scratch.visible.slots.data() + 1;
   std::fill_n(sums, 12 * scratch.visible.count, T(0));
   for (int64_t j = block.first; j < block.last; ++j) {
-    const int32_t* owner = block.owner + j * R;
+    const int32_t* owner = block.owner + j * W;
     int64_t first, last;
-    covered_range(owner, R, first, last);
+    covered_range(owner, W, first, last);
     if (first == last) continue;
     evaluate_row(block, j, first, last, scratch, row);
-    const T* grad_depth = args.grad_depth ? args.grad_depth + (b * R + j) * R : nullptr;
-    const T* grad_weights = args.grad_weights ? args.grad_weights + 3 * (b * R + j) * R : nullptr;
+    const int64_t at = b * block.raster.pixels() + j * W;
+    const T* grad_depth = args.grad_depth ? args.grad_depth + at : nullptr;
+    const T* grad_weights = args.grad_weights ? args.grad_weights + 3 * at : nullptr;
     for (int64_t n = 0; n < last - first; ++n) {
       const int64_t i = first + n;
       const T w[4] = {row.w[0][n], row.w[1][n], row.w[2][n], 0}, z = row.z[n];
@@ -326,7 +327,7 @@ NMR_INLINE void fragments_gradient_block_body(const Fragments<T>& args, const Bl
       for (int k = 0; k < 12; ++k) sum[k] += term[k];
     }
   }
-  fragment_gradients(scratch, R, result);
+  fragment_gradients(scratch, block.raster, result);
 }
 
 #define NMR_DEFINE_BLOCKS(T)                                                                                              \
@@ -350,13 +351,13 @@ NMR_DEFINE_BLOCKS(double)
 
 // The blocks of an image depend only on its own number of faces, so that results do not depend on other images of a packed batch.
 template <class Args, class T = std::remove_pointer_t<decltype(Args::depth)>>
-void forward(const Args& args, int64_t R) {
+void forward(const Args& args, Size raster) {
   const MeshBatch<T>& mesh = args.mesh;
   int64_t most_blocks = 1;
-  for (int64_t b = 0; b < mesh.batch; ++b) most_blocks = std::max(most_blocks, RowBlocks({R, R}, mesh.face_count(b)).count);
+  for (int64_t b = 0; b < mesh.batch; ++b) most_blocks = std::max(most_blocks, RowBlocks(raster, mesh.face_count(b)).count);
   parallel_for(mesh.batch * most_blocks, args.num_threads, [&](int64_t task) {
     const int64_t b = task / most_blocks, block = task % most_blocks, F = mesh.face_count(b);
-    const RowBlocks blocks({R, R}, F);
+    const RowBlocks blocks(raster, F);
     if (block >= blocks.count) return;
     FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
     scratch.reserve_for(F, blocks);
@@ -365,14 +366,14 @@ void forward(const Args& args, int64_t R) {
 }
 
 template <class Args, class T = std::remove_pointer_t<decltype(Args::grad_vertices)>>
-void backward(const Args& args, int64_t R) {
+void backward(const Args& args, Size raster) {
   const MeshBatch<T>& mesh = args.mesh;
   std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
   sum_blocks<FaceGradients<T>>(
-      mesh.batch, false, args.num_threads, [&](int64_t b) { return RowBlocks({R, R}, mesh.face_count(b)).count; },
+      mesh.batch, false, args.num_threads, [&](int64_t b) { return RowBlocks(raster, mesh.face_count(b)).count; },
       [&](int64_t b, int64_t block, FaceGradients<T>& result) {
         const int64_t F = mesh.face_count(b);
-        const RowBlocks blocks({R, R}, F);
+        const RowBlocks blocks(raster, F);
         FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
         scratch.reserve_for_backward(F, blocks);
         reserve(result.ids, blocks.most_visible(F));
@@ -388,22 +389,22 @@ void backward(const Args& args, int64_t R) {
 
 template <class T>
 void fragments_forward(const Fragments<T>& args) {
-  forward(args, args.raster.width);
+  forward(args, args.raster);
 }
 
 template <class T>
 void fragments_backward(const Fragments<T>& args) {
-  backward(args, args.raster.width);
+  backward(args, args.raster);
 }
 
 template <class T>
 void depth_forward(const DepthImage<T>& args) {
-  forward(args, args.anti_aliasing ? 2 * args.image.width : args.image.width);
+  forward(args, raster_of(args.image, args.anti_aliasing));
 }
 
 template <class T>
 void depth_backward(const DepthImage<T>& args) {
-  backward(args, args.anti_aliasing ? 2 * args.image.width : args.image.width);
+  backward(args, raster_of(args.image, args.anti_aliasing));
 }
 
 template void fragments_forward(const Fragments<float>&);

@@ -51,10 +51,11 @@ struct FaceTable {
 // Rows of one band of an image, padded so that a vector of pixels may reach past the last column.
 template <class T>
 struct BandScratch {
-  std::vector<T> centres;        // [R + lanes] pixel centres in [-1, 1]
-  std::vector<T> most, least;    // [rows, R + lanes] bounds of the owner's q = 1 / depth; -infinity on background
-  std::vector<int32_t> owner;    // [rows, R + lanes]
-  std::vector<T> block_least;    // [rows / block, R / block] the smallest of `least` in a block
+  std::vector<T> columns, rows;  // [W + lanes] and [H] pixel centres in [-1, 1]
+  Size raster{0, 0};             // for which they are computed
+  std::vector<T> most, least;    // [rows, W + lanes] bounds of the owner's q = 1 / depth; -infinity on background
+  std::vector<int32_t> owner;    // [rows, W + lanes]
+  std::vector<T> block_least;    // [rows / block, W / block] the smallest of `least` in a block
 };
 
 template <class T>
@@ -78,7 +79,8 @@ template <class T>
 NMR_INLINE FacePlane<T> face_plane(const Image<T>& image, int32_t id) {
   const bool reversed = id >= image.num_faces;
   const Triangle<T> t = load_triangle(image.vertices, image.faces + 3 * (reversed ? id - image.num_faces : id), reversed);
-  return {barycentric_matrix(t, static_cast<T>(image.settings.raster.width), static_cast<T>(image.settings.raster.height)), {t.z[0], t.z[1], t.z[2]}};
+  const Size raster = image.settings.raster;
+  return {barycentric_matrix(t, static_cast<T>(raster.width), static_cast<T>(raster.height)), {t.z[0], t.z[1], t.z[2]}};
 }
 
 // Depths at eight pixels of a row, as published.
@@ -117,10 +119,10 @@ struct DepthBound {
   T slope_x, slope_y, level, margin, nearest;
 };
 
-// For a face with corners (x, y, z), whose depths lie in [lo, hi], lo > 0, on a raster of `size` pixels.
+// For a face with corners (x, y, z), whose depths lie in [lo, hi], lo > 0, on a raster of width x height pixels.
 //
 // The published weights come from the inverse of a matrix, clamped and normalised: q' = sum w_k / z_k. Let u be the unit roundoff, D
-// twice the area in pixels and M the largest pixel coordinate (R / 2 at least). To first order, the errors are:
+// twice the area in pixels and M the largest pixel coordinate (half the longer side at least). To first order, the errors are:
 // - of the determinant 12 u M L, with L <= 2 M the longest side, the same for all three weights; of each weight 32 u M^2 / D more;
 // - a pixel that passes the edge test may lie outside by 48 u M^2 / D in terms of weights;
 // - so each weight before normalisation is off by at most E = 110 u M^2 / D, and all weights together after it by 7.1 E (if E is small);
@@ -129,15 +131,15 @@ struct DepthBound {
 // The margin is larger than the sum: 640 u M^2 / D times the range, and 32 u q. If the bounds of two faces are disjoint, their depths
 // differ even after rounding. If E could be large, and for double, the bounds are those of the corners: q' is a weighted mean of their q.
 template <class T>
-NMR_INLINE DepthBound<T> bound_depth(const T (&x)[3], const T (&y)[3], const T (&z)[3], T lo, T hi, T size) {
+NMR_INLINE DepthBound<T> bound_depth(const T (&x)[3], const T (&y)[3], const T (&z)[3], T lo, T hi, T width, T height) {
   constexpr T eps = std::numeric_limits<T>::epsilon();
   const T most = 1 / lo, least = 1 / hi, range = most - least, rounding = 16 * eps * most;
   DepthBound<T> bound{0, 0, (most + least) / 2, range / 2 + rounding, most + rounding};
   if constexpr (sizeof(T) < sizeof(double)) {
     double X[3], Y[3], q[3];
-    T M = size / 2;  // even small pixel coordinates come from sums of this size
+    T M = std::max(width, height) / 2;  // even small pixel coordinates come from sums of this size
     for (int k = 0; k < 3; ++k) {
-      const T px = to_pixel(x[k], size), py = to_pixel(y[k], size);
+      const T px = to_pixel(x[k], width), py = to_pixel(y[k], height);
       M = max3(M, std::abs(px), std::abs(py));
       X[k] = px;
       Y[k] = py;
@@ -163,13 +165,14 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
   constexpr int64_t kGroup = 16;
   FaceTable<T>& table = *image.table;
   const int64_t first = chunk * kChunk, last = std::min(first + kChunk, image.num_faces);
-  const T size = static_cast<T>(image.settings.raster.width);
+  const T width = static_cast<T>(image.settings.raster.width), height = static_cast<T>(image.settings.raster.height);
+  const T longer = std::max(width, height), shorter = std::min(width, height);
   const T near = image.settings.near, far = image.settings.far;
   const bool fill_back = image.settings.fill_back;
   const T* vertices = image.vertices;
   const T infinity = std::numeric_limits<T>::infinity();
   const T moderate = std::sqrt(std::numeric_limits<T>::max()) / 4;  // products of two pixel coordinates stay finite
-  const T eps = std::numeric_limits<T>::epsilon(), resolution = 288 * eps;
+  const T eps = std::numeric_limits<T>::epsilon(), resolution = 288 * eps * (longer / shorter);
   const T smallest = std::sqrt(std::numeric_limits<T>::min()) / eps;  // 1 / depth and its slopes stay ordinary numbers
   int32_t num_front = 0, num_back = 0;
   T front_sum = 0, back_sum = 0;
@@ -205,20 +208,21 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
       const T lo = min3(z0, z1, z2), hi = max3(z0, z1, z2);
       // No bounds for faces so thin that all three weights could round to 0, or close to the limits of T or of depth.
       const T det = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0);
-      const bool bounded = (std::abs(det) >= resolution * largest * largest) & (largest * size < moderate) & (near >= 0) &
+      const bool bounded = (std::abs(det) >= resolution * largest * largest) & (largest * longer < moderate) & (near >= 0) &
                            (lo * (1 - 16 * eps) > near) & (hi * (1 + 16 * eps) < far) & (lo > smallest) & (hi < 1 / smallest);
       // For faces without bounds, those of an ordinary triangle are computed and not used.
       const auto checked = [bounded](T value, T ordinary) { return bounded ? value : ordinary; };
       const DepthBound<T> bound = bound_depth<T>({checked(x0, 0), checked(x1, 1), checked(x2, 0)},
                                                  {checked(y0, 0), checked(y1, 0), checked(y2, 1)},
-                                                 {checked(z0, 1), checked(z1, 1), checked(z2, 1)}, checked(lo, 1), checked(hi, 1), size);
+                                                 {checked(z0, 1), checked(z1, 1), checked(z2, 1)}, checked(lo, 1), checked(hi, 1),
+                                                 width, height);
       slope_x[n] = bound.slope_x;
       slope_y[n] = bound.slope_y;
       level[n] = bound.level;
       margin[n] = checked(bound.margin, infinity);
       nearest[n] = checked(bound.nearest, infinity);
-      pixel_range(min3(x0, x1, x2), max3(x0, x1, x2), size, i0[n], i1[n]);
-      pixel_range(min3(y0, y1, y2), max3(y0, y1, y2), size, j0[n], j1[n]);
+      pixel_range(min3(x0, x1, x2), max3(x0, x1, x2), width, i0[n], i1[n]);
+      pixel_range(min3(y0, y1, y2), max3(y0, y1, y2), height, j0[n], j1[n]);
       const bool drawn = usable & (i0[n] <= i1[n]) & (j0[n] <= j1[n]);
       is_front[n] = drawn & ccw;
       is_back[n] = drawn & cw & fill_back;
@@ -255,8 +259,9 @@ NMR_INLINE void set_up_faces(const Image<T>& image, int64_t chunk) {
 template <class T>
 struct Band {
   int64_t row_first, row_last;  // inclusive, from the bottom
-  int64_t size, stride;
-  const T* centres;
+  Size raster;
+  int64_t stride;
+  const T *columns, *rows;      // pixel centres
   T *most, *least;
   int32_t* owner;
 };
@@ -305,14 +310,14 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
 
   for (int64_t i = i_first; i <= i_last; i += kLanes) {
     const LaneMask<T> in_box = widen_mask<T>(lane_numbers() <= static_cast<int32_t>(i_last - i));
-    const Lanes<T> xp = load_lanes<Lanes<T>>(band.centres + i);
+    const Lanes<T> xp = load_lanes<Lanes<T>>(band.columns + i);
     const Lanes<T> c0 = (xp - x0) * dy0, c1 = (xp - x1) * dy1, c2 = (xp - x2) * dy2;
     const Lanes<T> q_column = to_values<T>(lane_numbers() + static_cast<int32_t>(i)) * slope_x + level;
     const int64_t first = (j_first - band.row_first) * band.stride + i;
     T *most_at = band.most + first, *least_at = band.least + first;
     int32_t* owner_at = band.owner + first;
     for (int64_t j = j_first; j <= j_last; ++j, most_at += band.stride, least_at += band.stride, owner_at += band.stride) {
-      const T yp = band.centres[j];
+      const T yp = band.rows[j];
       const T e0 = (yp - y0) * dx0, e1 = (yp - y1) * dx1, e2 = (yp - y2) * dx2;
       const LaneMask<T> inside = in_box & ~((e0 < c0) | (e1 < c1) | (e2 < c2));
       const Lanes<T> q = q_column + slope_y * static_cast<T>(j), q_most = q + margin, q_least = q - margin;
@@ -365,7 +370,7 @@ NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& b
 template <class T>
 NMR_INLINE void fill_band(const Image<T>& image, const Band<T>& band, int64_t blocks, T* block_least, int32_t* owner) {
   const FaceTable<T>& table = *image.table;
-  const int64_t rows = band.row_last - band.row_first + 1, R = band.size;
+  const int64_t rows = band.row_last - band.row_first + 1, H = band.raster.height, W = band.raster.width;
   for (T* q : {band.most, band.least}) std::fill_n(q, rows * band.stride, -std::numeric_limits<T>::infinity());
   std::fill_n(band.owner, rows * band.stride, -1);
   const int64_t chunks = (image.num_faces + kChunk - 1) / kChunk;
@@ -390,7 +395,7 @@ NMR_INLINE void fill_band(const Image<T>& image, const Band<T>& band, int64_t bl
     }
   }
   for (int64_t j = 0; j < rows; ++j)
-    std::memcpy(owner + (R - 1 - band.row_first - j) * R, band.owner + j * band.stride, R * sizeof(int32_t));
+    std::memcpy(owner + (H - 1 - band.row_first - j) * W, band.owner + j * band.stride, W * sizeof(int32_t));
 }
 
 NMR_CLONES void set_up_chunk(const Image<float>& image, int64_t chunk) { set_up_faces(image, chunk); }
@@ -406,10 +411,11 @@ NMR_CLONES void fill(const Image<double>& image, const Band<double>& band, int64
 
 template <class T>
 void rasterize(const Rasterize<T>& args) {
-  const int64_t R = args.settings.raster.width, batch = args.mesh.batch;
+  const Size raster = args.settings.raster;
+  const int64_t H = raster.height, W = raster.width, batch = args.mesh.batch;
   // Many images: one thread per image. Few images: all threads share one image at a time.
   const bool share = batch < args.num_threads;
-  const int64_t bands = share ? std::min<int64_t>(args.num_threads * 4, (R + 2 * kBlock - 1) / (2 * kBlock)) : 1;
+  const int64_t bands = share ? std::min<int64_t>(args.num_threads * 4, (H + 2 * kBlock - 1) / (2 * kBlock)) : 1;
   parallel_for(batch, share ? 1 : args.num_threads, [&](int64_t b) {
     FaceTable<T>& table = thread_scratch<FaceTable<T>>();
     const int64_t num_faces = args.mesh.face_count(b);
@@ -419,17 +425,20 @@ void rasterize(const Rasterize<T>& args) {
     parallel_for((num_faces + kChunk - 1) / kChunk, threads, [&](int64_t chunk) { set_up_chunk(image, chunk); });
     parallel_for(bands, threads, [&](int64_t n) {
       BandScratch<T>& scratch = thread_scratch<BandScratch<T>>();
-      Band<T> band{n * R / bands, (n + 1) * R / bands - 1, R, R + kLanes, nullptr, nullptr, nullptr, nullptr};
-      if (static_cast<int64_t>(scratch.centres.size()) != band.stride) {
-        scratch.centres.resize(band.stride);
-        for (int64_t i = 0; i < band.stride; ++i) scratch.centres[i] = pixel_centre<T>(i, R);
+      if (!(scratch.raster == raster)) {
+        scratch.columns.resize(W + kLanes);
+        scratch.rows.resize(H);
+        for (int64_t i = 0; i < W + kLanes; ++i) scratch.columns[i] = pixel_centre<T>(i, W);
+        for (int64_t j = 0; j < H; ++j) scratch.rows[j] = pixel_centre<T>(j, H);
+        scratch.raster = raster;
       }
-      const int64_t rows = band.row_last - band.row_first + 1, blocks = (R + kBlock - 1) / kBlock;
-      band.centres = scratch.centres.data();
+      Band<T> band{n * H / bands, (n + 1) * H / bands - 1, raster, W + kLanes, scratch.columns.data(), scratch.rows.data(),
+                   nullptr, nullptr, nullptr};
+      const int64_t rows = band.row_last - band.row_first + 1, blocks = (W + kBlock - 1) / kBlock;
       band.most = reserve(scratch.most, rows * band.stride);
       band.least = reserve(scratch.least, rows * band.stride);
       band.owner = reserve(scratch.owner, rows * band.stride);
-      fill(image, band, blocks, reserve(scratch.block_least, (rows / kBlock + 1) * blocks), args.owner + b * R * R);
+      fill(image, band, blocks, reserve(scratch.block_least, (rows / kBlock + 1) * blocks), args.owner + b * H * W);
     });
   });
 }

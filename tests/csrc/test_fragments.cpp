@@ -29,12 +29,12 @@ std::vector<T> depth_image(const Scene<T>& scene, const std::vector<int32_t>& ow
 
 std::vector<Mesh> meshes() { return {soup(10, 1), sphere(1, 2), Mesh{}}; }
 
-}  // namespace
-
-TEST_REAL(fragments_are_the_definition) {
+// Weights and depth of every pixel; each covered pixel shows a point of its face.
+template <class T>
+void check_against_definition(Size image) {
   Scene<T> scene = pack<T>(meshes());
-  scene.image = square(21);
-  const int64_t R = scene.raster_size();
+  scene.image = image;
+  const int64_t H = scene.raster().height, W = scene.raster().width;
   const std::vector<int32_t> owner = owner_of(scene);
   std::vector<T> weights, depth;
   fragments(scene, owner, weights, depth);
@@ -47,8 +47,8 @@ TEST_REAL(fragments_are_the_definition) {
       continue;
     }
     ++covered;
-    const int64_t b = n / (R * R), F = scene.mesh().face_count(b);
-    const SlowHit<T> hit = SlowFace<T>(scene, b, owner[n]).at(n % R, R - 1 - n / R % R, square(R));
+    const int64_t b = n / (H * W), F = scene.mesh().face_count(b);
+    const SlowHit<T> hit = SlowFace<T>(scene, b, owner[n]).at(n % W, H - 1 - n / W % H, scene.raster());
     CHECK_NEAR(depth[n], hit.depth, tolerance * hit.depth);
     // A point of the face: its depth and its place on the screen are those of the pixel.
     double z = 0, xz = 0, yz = 0;
@@ -61,39 +61,49 @@ TEST_REAL(fragments_are_the_definition) {
     }
     CHECK_NEAR(w[0] + w[1] + w[2], 1, tolerance);
     CHECK_NEAR(z, depth[n], tolerance * z);
-    CHECK_NEAR(xz / z, static_cast<double>(2 * (n % R) + 1 - R) / static_cast<double>(R), 5 * tolerance);
-    CHECK_NEAR(yz / z, static_cast<double>(R - 1 - 2 * (n / R % R)) / static_cast<double>(R), 5 * tolerance);
+    CHECK_NEAR(xz / z, static_cast<double>(2 * (n % W) + 1 - W) / static_cast<double>(W), 5 * tolerance);
+    CHECK_NEAR(yz / z, static_cast<double>(H - 1 - 2 * (n / W % H)) / static_cast<double>(H), 5 * tolerance);
   }
-  CHECK(covered > 1000);
+  CHECK(covered > scene.pixels() / 10);
+}
+
+}  // namespace
+
+TEST_REAL(fragments_are_the_definition) {
+  for (Size image : {Size{21, 21}, Size{9, 40}, Size{40, 9}}) check_against_definition<T>(image);
 }
 
 TEST_REAL(depth_images_are_means_of_the_fragments) {
-  for (bool anti_aliasing : {false, true}) {
+  for (int n = 0; n < 6; ++n) {
+    const bool anti_aliasing = n % 2;
+    const Size size[] = {{15, 15}, {5, 32}, {33, 6}};
     Scene<T> scene = pack<T>(meshes());
-    scene.image = square(15);
+    scene.image = size[n / 2];
     scene.anti_aliasing = anti_aliasing;
     scene.far = T(50);
-    const int64_t S = 15, R = scene.raster_size(), step = anti_aliasing ? 2 : 1;
+    const int64_t h = scene.image.height, w = scene.image.width, W = scene.raster().width, step = anti_aliasing ? 2 : 1;
     const std::vector<int32_t> owner = owner_of(scene);
     std::vector<T> weights, depth;
     fragments(scene, owner, weights, depth);
     const std::vector<T> image = depth_image(scene, owner);
-    for (int64_t n = 0; n < scene.batch * S * S; ++n) {
-      double sum = 0;
-      for (int64_t j = 0; j < step; ++j)
-        for (int64_t i = 0; i < step; ++i) sum += depth[(n / S / S * R + step * (n / S % S) + j) * R + step * (n % S) + i];
-      CHECK_NEAR(image[n], sum / (step * step), 1e-5 * sum);
-    }
+    for (int64_t b = 0; b < scene.batch; ++b)
+      for (int64_t y = 0; y < h; ++y)
+        for (int64_t x = 0; x < w; ++x) {
+          double sum = 0;
+          for (int64_t j = 0; j < step; ++j)
+            for (int64_t i = 0; i < step; ++i) sum += depth[b * scene.raster().pixels() + (step * y + j) * W + step * x + i];
+          CHECK_NEAR(image[(b * h + y) * w + x], sum / (step * step), 1e-5 * sum);
+        }
   }
 }
 
 // Central differences with the owner map held fixed.
-TEST(fragment_gradients_are_the_derivative) {
+void check_derivative(Size image_size) {
   Scene<double> scene = pack<double>(meshes());
-  scene.image = square(7);
+  scene.image = image_size;
   const std::vector<int32_t> owner = owner_of(scene);
   const std::vector<double> u = noise_array<double>(1, 3 * scene.pixels()), g = noise_array<double>(2, scene.pixels());
-  const std::vector<double> h = noise_array<double>(3, scene.batch * 49);
+  const std::vector<double> h = noise_array<double>(3, scene.batch * image_size.pixels());
   std::vector<double> of_weights = unwritten<double>(3 * scene.rows()), of_depth = of_weights, of_both = of_weights, of_image = of_weights;
   const auto backward = [&](const double* grad_weights, const double* grad_depth, std::vector<double>& out) {
     fragments_backward(Fragments<double>{scene.mesh(), scene.raster(), scene.far, owner.data(), nullptr, nullptr, grad_weights,
@@ -102,7 +112,7 @@ TEST(fragment_gradients_are_the_derivative) {
   backward(u.data(), nullptr, of_weights);
   backward(nullptr, g.data(), of_depth);
   backward(u.data(), g.data(), of_both);
-  depth_backward(DepthImage<double>{scene.mesh(), square(7), true, scene.far, owner.data(), nullptr, h.data(), of_image.data(), 2});
+  depth_backward(DepthImage<double>{scene.mesh(), image_size, true, scene.far, owner.data(), nullptr, h.data(), of_image.data(), 2});
   const std::vector<double> original = scene.vertices;
   for (size_t n = 0; n < original.size(); ++n) {
     double difference[3] = {0, 0, 0};
@@ -122,6 +132,10 @@ TEST(fragment_gradients_are_the_derivative) {
     CHECK_NEAR(of_both[n], difference[0] + difference[1], scale);
     CHECK_NEAR(of_image[n], difference[2], scale);
   }
+}
+
+TEST(fragment_gradients_are_the_derivative) {
+  for (Size image : {Size{7, 7}, Size{4, 11}, Size{11, 4}}) check_derivative(image);
 }
 
 }  // namespace nmr::test

@@ -13,12 +13,17 @@ std::vector<int32_t> rasterized(const Scene<T>& scene, int num_threads = 1) {
 }
 
 template <class T>
-Scene<T> raster_of(const Mesh& mesh, int64_t raster_size, bool fill_back = true) {
+Scene<T> raster_of(const Mesh& mesh, Size raster, bool fill_back = true) {
   Scene<T> scene = single<T>(mesh);
-  scene.image = square(raster_size);
+  scene.image = raster;
   scene.anti_aliasing = false;
   scene.fill_back = fill_back;
   return scene;
+}
+
+template <class T>
+Scene<T> raster_of(const Mesh& mesh, int64_t raster_size, bool fill_back = true) {
+  return raster_of<T>(mesh, square(raster_size), fill_back);
 }
 
 int64_t covered(const std::vector<int32_t>& owner) {
@@ -28,17 +33,17 @@ int64_t covered(const std::vector<int32_t>& owner) {
 // Coverage exactly; the owner, too, unless two faces are equally deep to rounding.
 template <class T>
 void check_against_definition(const Scene<T>& scene) {
-  const int64_t R = scene.raster_size();
+  const int64_t H = scene.raster().height, W = scene.raster().width;
   const std::vector<int32_t> owner = rasterized(scene);
   for (int64_t b = 0; b < scene.batch; ++b) {
     std::vector<int32_t> expected;
     std::vector<T> depth;
     slow_rasterize(scene, b, expected, depth);
-    for (int64_t n = 0; n < R * R; ++n) {
-      const int32_t id = owner[b * R * R + n];
+    for (int64_t n = 0; n < H * W; ++n) {
+      const int32_t id = owner[b * H * W + n];
       CHECK_EQUAL(id >= 0, expected[n] >= 0);
       if (id == expected[n]) continue;
-      const SlowHit<T> hit = SlowFace<T>(scene, b, id).at(n % R, R - 1 - n / R, square(R));
+      const SlowHit<T> hit = SlowFace<T>(scene, b, id).at(n % W, H - 1 - n / W, scene.raster());
       CHECK(hit.inside);
       CHECK_NEAR(hit.depth, depth[n], 1e-5 * depth[n]);
     }
@@ -55,6 +60,28 @@ TEST_REAL(rasterize_draws_the_definition) {
   Scene<T> packed = pack<T>({sphere(1, 1), soup(5, 2), Mesh{}, soup(30, 3)});
   packed.image = square(20);
   check_against_definition(packed);
+}
+
+TEST_REAL(rasterize_draws_rectangles) {
+  for (uint64_t seed = 0; seed < 4; ++seed) {
+    for (Size raster : {Size{1, 9}, Size{9, 1}, Size{7, 40}, Size{40, 7}, Size{33, 64}, Size{130, 24}}) {
+      const Scene<T> scene = raster_of<T>(seed % 2 ? soup(12, seed) : sphere(2, seed), raster);
+      check_against_definition(scene);
+      for (int threads : {2, 5}) CHECK(rasterized(scene, threads) == rasterized(scene));
+    }
+  }
+  Scene<T> packed = pack<T>({sphere(1, 1), soup(5, 2), Mesh{}, soup(30, 3)});
+  packed.image = {9, 21};
+  check_against_definition(packed);
+}
+
+// One image after the other on the same thread: nothing of the first one's size may stay.
+TEST_REAL(rasterize_of_another_size_starts_afresh) {
+  const Mesh mesh = soup(12, 3);
+  const std::vector<int32_t> wide = rasterized(raster_of<T>(mesh, {16, 24})), tall = rasterized(raster_of<T>(mesh, {24, 24}));
+  CHECK(rasterized(raster_of<T>(mesh, {16, 24})) == wide);
+  CHECK(rasterized(raster_of<T>(mesh, {24, 24})) == tall);
+  check_against_definition(raster_of<T>(mesh, {24, 16}));
 }
 
 // Corners on pixel centres and borders: every comparison is exact, so no rounding excuses a difference.
@@ -88,11 +115,13 @@ TEST_REAL(rasterize_almost_coplanar_faces_by_exact_depth) {
       const double z = 1 / (0.4 + 0.02 * static_cast<double>(seed % 5) * mesh.vertices[n] - 0.03 * mesh.vertices[n + 1]);
       mesh.vertices[n + 2] = z * (1 + static_cast<double>(n * (seed + 1) % 7) * std::numeric_limits<T>::epsilon());
     }
-    const Scene<T> scene = raster_of<T>(mesh, 48);
-    std::vector<int32_t> expected;
-    std::vector<T> depth;
-    slow_rasterize(scene, 0, expected, depth);
-    CHECK(rasterized(scene) == expected);
+    for (Size raster : {Size{48, 48}, Size{12, 90}, Size{90, 12}}) {
+      const Scene<T> scene = raster_of<T>(mesh, raster);
+      std::vector<int32_t> expected;
+      std::vector<T> depth;
+      slow_rasterize(scene, 0, expected, depth);
+      CHECK(rasterized(scene) == expected);
+    }
   }
 }
 

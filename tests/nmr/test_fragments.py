@@ -12,7 +12,8 @@ FAR = 50.0
 
 
 def owner_of(vertices, faces, raster_size, fill_back=True, starts=None):
-    return nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, fill_back, 0.1, FAR)
+    height, width = (raster_size, raster_size) if isinstance(raster_size, int) else raster_size
+    return nmr.ops.rasterize(vertices, faces, starts, height, width, fill_back, 0.1, FAR)
 
 
 def gradients(vertices, faces, starts, owner, upstream_seed=0):
@@ -34,7 +35,7 @@ def gradients(vertices, faces, starts, owner, upstream_seed=0):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("fill_back", [False, True])
-@pytest.mark.parametrize("raster_size", [18, 23])
+@pytest.mark.parametrize("raster_size", [18, 23, (9, 40), (40, 9)])
 def test_equals_the_slow_definition(seed, fill_back, raster_size):
     vertices, faces = random_soup(seed)
     owner = owner_of(vertices, faces, raster_size, fill_back)
@@ -75,12 +76,13 @@ def test_weights_interpolate_the_face_in_space():
 
 
 @pytest.mark.parametrize("anti_aliasing", [False, True])
-def test_depth_image_is_the_mean_of_the_depth_of_fragments(anti_aliasing):
+@pytest.mark.parametrize("size", [(22, 22), (8, 50), (50, 8)])
+def test_depth_image_is_the_mean_of_the_depth_of_fragments(anti_aliasing, size):
     vertices, faces = random_soup(6, dtype=torch.float32)
-    owner = owner_of(vertices, faces, 22)
+    owner = owner_of(vertices, faces, size)
     leaves = [vertices.clone().requires_grad_() for _ in range(2)]
     _, depth = nmr.ops.fragments(leaves[0], faces, None, owner, FAR)
-    mean = depth.view(2, 11, 2, 11, 2).mean((2, 4)) if anti_aliasing else depth
+    mean = depth.view(2, size[0] // 2, 2, size[1] // 2, 2).mean((2, 4)) if anti_aliasing else depth
     image = nmr.ops.depth_image(leaves[1], faces, None, owner, anti_aliasing, FAR)
     torch.testing.assert_close(image, mean)
     upstream = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
@@ -113,7 +115,7 @@ def test_one_of_the_two_gradients():
     assert grads[0].any() and grads[1].any()
 
 
-@pytest.mark.parametrize("batch, raster_size", [(5, 40), (2, 300)])
+@pytest.mark.parametrize("batch, raster_size", [(5, 40), (2, 300), (2, (100, 500)), (1, (500, 60))])
 def test_same_bits_for_any_number_of_threads(batch, raster_size):
     """Also of fewer images than threads, large enough to be cut into blocks."""
     vertices, faces = random_soup(2, batch, 60, torch.float32)
