@@ -16,11 +16,11 @@ constexpr int64_t kRows = 8;  // raster rows processed together in forward passe
 
 // Calls body(b, row) for every row of every raster.
 template <class Body>
-void for_rows(int64_t batch, int64_t R, int num_threads, const Body& body) {
-  const int64_t tiles = (R + kRows - 1) / kRows;
+void for_rows(int64_t batch, int64_t height, int num_threads, const Body& body) {
+  const int64_t tiles = (height + kRows - 1) / kRows;
   parallel_for(batch * tiles, num_threads, [&](int64_t n) {
     const int64_t first = n % tiles * kRows;
-    for (int64_t row = first; row < std::min(first + kRows, R); ++row) body(n / tiles, row);
+    for (int64_t row = first; row < std::min(first + kRows, height); ++row) body(n / tiles, row);
   });
 }
 
@@ -97,12 +97,13 @@ int64_t first_cube(const TextureCubes<T>& args, int64_t b) {
 template <class T>
 void texture_cubes_forward(const TextureCubes<T>& args) {
   with_channels(args.channels, [&](auto known) {
-    const int64_t R = args.raster.width, C = known ? known() : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
-    for_rows(args.batch, R, args.num_threads, [&](int64_t b, int64_t row) {
-      const int64_t start = (b * R + row) * R, F = face_count(args, b);
+    const int64_t H = args.raster.height, W = args.raster.width;
+    const int64_t C = known ? known() : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
+    for_rows(args.batch, H, args.num_threads, [&](int64_t b, int64_t row) {
+      const int64_t start = (b * H + row) * W, F = face_count(args, b);
       const T* textures = args.textures + first_cube(args, b) * cube;
       T* color = args.colors + start * C;
-      for (int64_t n = start; n < start + R; ++n, color += C) {
+      for (int64_t n = start; n < start + W; ++n, color += C) {
         const int64_t id = args.owner[n];
         if (id >= 0)
           blend<known()>(texels_of(args.weights + 3 * n, ts, args.eps), textures + (id < F ? id : id - F) * cube, C, color);
@@ -118,10 +119,11 @@ namespace {
 // Adds the gradients of the pixels of image b whose face lies in [first_face, last_face) to its cubes.
 template <int64_t kChannels, class T>
 void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first_face, int64_t last_face) {
-  const int64_t R = args.raster.width, C = kChannels ? kChannels : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
+  const int64_t pixels = args.raster.pixels(), C = kChannels ? kChannels : args.channels;
+  const int64_t ts = args.texture_size, cube = ts * ts * ts * C;
   const int64_t F = face_count(args, b);
   T* grad_textures = args.grad_textures + first_cube(args, b) * cube;
-  for (int64_t n = b * R * R; n < (b + 1) * R * R; ++n) {
+  for (int64_t n = b * pixels; n < (b + 1) * pixels; ++n) {
     const int64_t id = args.owner[n], f = id < F ? id : id - F;
     if (f < first_face || f >= last_face) continue;  // also background
     const Texels<T> texels = texels_of(args.weights + 3 * n, ts, args.eps);
@@ -184,8 +186,8 @@ struct CornerSums {
 template <int64_t kChannels, class T>
 void interpolate_block_backward(const Interpolate<T>& args, const ImageAttributes<T>& image, const RowBlocks& blocks, int64_t b,
                                 int64_t block, CornerSums<T>& sums) {
-  const int64_t R = args.raster.width, C = kChannels ? kChannels : args.channels, F = image.num_faces;
-  const int64_t begin = (b * R + blocks.first(block)) * R, end = (b * R + blocks.last(block)) * R;
+  const int64_t H = args.raster.height, W = args.raster.width, C = kChannels ? kChannels : args.channels, F = image.num_faces;
+  const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
   if (args.grad_attributes) {
     sums.visible.reserve_for(F, blocks.most_visible(F));
     sums.visible.find(args.owner + begin, end - begin, F);
@@ -231,13 +233,13 @@ void scatter_corner_sums(const Interpolate<T>& args, const ImageAttributes<T>& i
 template <class T>
 void interpolate_forward(const Interpolate<T>& args) {
   with_channels(args.channels, [&](auto known) {
-    const int64_t R = args.raster.width, C = known ? known() : args.channels;
-    for_rows(args.batch, R, args.num_threads, [&](int64_t b, int64_t row) {
+    const int64_t H = args.raster.height, W = args.raster.width, C = known ? known() : args.channels;
+    for_rows(args.batch, H, args.num_threads, [&](int64_t b, int64_t row) {
       const ImageAttributes<T> image = image_attributes(args, b);
       const T* attributes = args.attributes + image.first_row * C;
-      const int64_t start = (b * R + row) * R;
+      const int64_t start = (b * H + row) * W;
       T* value = args.values + start * C;
-      for (int64_t n = start; n < start + R; ++n, value += C) {
+      for (int64_t n = start; n < start + W; ++n, value += C) {
         const int64_t id = args.owner[n];
         if (id < 0) {
           for (int64_t c = 0; c < C; ++c) value[c] = 0;
