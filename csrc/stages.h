@@ -1,5 +1,5 @@
 // The argument struct of each stage: inputs, outputs, sizes, settings. Raw arrays only, row-major. Every image has row 0 at the top.
-// Stages in the order of a render: camera, rasterize, then those that use the owner map: silhouette, fragments, depth, shading,
+// Stages in the order of a render: camera, clip, rasterize, then those that use the owner map: silhouette, fragments, depth, shading,
 // resolve.
 #pragma once
 
@@ -81,6 +81,28 @@ struct Project {
   T* grad_distortion;    // backward out [B, 5], or nullptr
   T* grad_origin;        // backward out [B, 3], or nullptr
   T* grad_extent;        // backward out [B], or nullptr
+  int num_threads;
+};
+
+// Near-plane clipping (clip.cpp): how much room the drawn meshes need ...
+template <class T>
+struct ClipCount {
+  MeshBatch<T> mesh;
+  T near;           // faces are cut at this depth
+  int64_t* counts;  // out [B, 2]: new vertices, drawn faces. A mesh that no face crosses keeps all its faces: 0, F
+  int num_threads;
+};
+
+// ... and the faces that are drawn, packed. Room that is left over is filled with faces without area.
+template <class T>
+struct ClipFaces {
+  MeshBatch<T> mesh;
+  T near;
+  const int64_t* starts;  // [B + 1, 2]: first new vertex and first drawn face of each mesh, then P and M
+  int64_t* faces;         // out [M, 3]: vertices of the mesh; its new vertices are numbered after its own
+  int32_t* source;        // out [M]: the face of the mesh that a drawn face is part of
+  int64_t* corners;       // out [M, 3]: k < 3: corner k of that face; 3 + p: new vertex p of the mesh
+  int64_t* ends;          // out [P, 4]: a new vertex lies between two rows of `vertices`, which are these two corners of its face
   int num_threads;
 };
 
@@ -249,6 +271,9 @@ template <class T> void pose_forward(const Pose<T>& args);
 template <class T> void pose_backward(const Pose<T>& args);
 template <class T> void project_forward(const Project<T>& args);
 template <class T> void project_backward(const Project<T>& args);
+template <class T> bool crosses_near(const T* vertices, int64_t count, T near);  // some depth is smaller
+template <class T> void clip_count(const ClipCount<T>& args);
+template <class T> void clip_faces(const ClipFaces<T>& args);
 template <class T> void rasterize(const Rasterize<T>& args);
 template <class T> void silhouette_forward(const SilhouetteForward<T>& args);
 template <class T> void silhouette_backward(const SilhouetteBackward<T>& args);

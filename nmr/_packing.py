@@ -28,6 +28,10 @@ class MeshBatch(NamedTuple):
     def batch(self) -> int:
         return self.vertices.shape[0] if self.starts is None else len(self.vertex_counts)
 
+    def each_vertices(self) -> tuple[Tensor, ...]:
+        """The vertices ``[V_b, 3]`` of each mesh."""
+        return self.vertices.unbind(0) if self.starts is None else self.vertices.split(self.vertex_counts)
+
     @property
     def num_faces(self) -> int | Tensor:
         """F; of packed meshes int32 ``[B, 1, 1]``."""
@@ -99,7 +103,7 @@ class MeshBatch(NamedTuple):
             raise ValueError(
                 f"{name} must have one row [3] per face (the meshes have {list(self.face_counts)}), got {list(rows)}"
             )
-        return torch.cat(parts), _starts([len(part) for part in attributes], rows)
+        return torch.cat(parts), packed_starts([len(part) for part in attributes], rows)
 
     def _one_size(self, parts: Sequence[Tensor], name: str) -> tuple[Tensor, ...]:
         if len({part.shape for part in parts}) != 1:
@@ -113,7 +117,8 @@ class MeshBatch(NamedTuple):
         return parts
 
 
-def _starts(rows: Sequence[int], faces: Sequence[int]) -> Tensor:
+def packed_starts(rows: Sequence[int], faces: Sequence[int]) -> Tensor:
+    """int64 ``[B + 1, 2]`` in host memory from the number of rows and faces of each mesh."""
     return torch.tensor([[0, *accumulate(rows)], [0, *accumulate(faces)]], device="cpu").T.contiguous()
 
 
@@ -154,5 +159,5 @@ def pack_meshes(vertices: object, faces: object) -> MeshBatch:
     if len(vertices) == 1:
         return MeshBatch(vertices[0].unsqueeze(0), faces[0])
     vertex_counts, face_counts = tuple(len(part) for part in vertices), tuple(len(part) for part in faces)
-    starts = _starts(vertex_counts, face_counts)
+    starts = packed_starts(vertex_counts, face_counts)
     return MeshBatch(torch.cat(tuple(vertices)), torch.cat(faces), starts, vertex_counts, face_counts)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from . import ops
+from ._clip import Clipped, clip_near
 from ._packing import MeshBatch, is_list, pack_meshes
 from ._validate import (
     as_floats,
@@ -34,22 +35,30 @@ Meshes = Tensor | Sequence[Tensor]
 
 
 class Scene(NamedTuple):
-    """Checked arguments: meshes before and after the camera, and height and width of the raster."""
+    """Checked arguments: meshes before and after the camera, and height and width of the raster.
+
+    If faces cross the near plane, ``clipped`` has the meshes that are drawn. Owner maps are then of these.
+    """
 
     world: Tensor
     mesh: MeshBatch
     camera: Camera | None
     raster: tuple[int, int]
+    clipped: Clipped | None = None
+
+    @property
+    def drawn(self) -> MeshBatch:
+        return self.mesh if self.clipped is None else self.clipped.mesh
 
     def rasterize(self, fill_back: bool, near: float, far: float) -> Tensor:
-        return ops.rasterize(*self.mesh[:3], *self.raster, bool(fill_back), float(near), float(far))
+        return ops.rasterize(*self.drawn[:3], *self.raster, bool(fill_back), float(near), float(far))
 
     def silhouette(
         self, anti_aliasing: bool, fill_back: bool, near: float, far: float, eps: float, local: bool = False
     ):
         height, width = (size // 2 if anti_aliasing else size for size in self.raster)
         return ops.silhouette(
-            *self.mesh[:3],
+            *self.drawn[:3],
             height,
             width,
             bool(anti_aliasing),
@@ -61,11 +70,19 @@ class Scene(NamedTuple):
         )
 
     def depth(self, owner: Tensor, anti_aliasing: bool, far: float) -> Tensor:
-        return ops.depth_image(*self.mesh[:3], owner, bool(anti_aliasing), float(far))
+        return ops.depth_image(*self.drawn[:3], owner, bool(anti_aliasing), float(far))
 
     def fragments(self, owner: Tensor, anti_aliasing: bool, far: float, eps: float) -> Fragments:
-        weights, depth = ops.fragments(*self.mesh[:3], owner, float(far))
-        return Fragments(owner, weights, depth, self.mesh, self.world, self.camera, bool(anti_aliasing), float(eps))
+        weights, depth = ops.fragments(*self.drawn[:3], owner, float(far))
+        drawn, drawn_owner = self.drawn, owner
+        if self.clipped is not None:
+            weights, owner = self.clipped.weights(owner, weights), self.clipped.owner(owner)
+        settings = bool(anti_aliasing), float(eps)
+        return Fragments(owner, weights, depth, self.mesh, self.world, self.camera, *settings, drawn, drawn_owner)
+
+    def face_index(self, owner: Tensor) -> Tensor:
+        owner = owner if self.clipped is None else self.clipped.owner(owner)
+        return torch.where(owner >= self.mesh.num_faces, owner - self.mesh.num_faces, owner)
 
 
 def make_scene(
@@ -76,6 +93,7 @@ def make_scene(
     anti_aliasing: bool,
     near: float,
     far: float,
+    clip: bool,
     eps: float = 1e-4,
 ) -> Scene:
     height, width = check_image_size(image_size, LARGEST_IMAGE)
@@ -98,7 +116,8 @@ def make_scene(
     check_depth_range(near, far, mesh.vertices.dtype)
     check_eps(eps, mesh.vertices.dtype)
     scale = 2 if anti_aliasing else 1
-    return Scene(world, mesh, camera, (scale * height, scale * width))
+    clipped = clip_near(world, mesh, camera, near, far) if clip else None
+    return Scene(world, mesh, camera, (scale * height, scale * width), clipped)
 
 
 def shade(

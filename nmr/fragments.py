@@ -51,6 +51,8 @@ class Fragments:
     camera: Camera | None
     anti_aliasing: bool
     eps: float
+    _drawn: MeshBatch  # the meshes as drawn: faces that cross the near plane are cut
+    _drawn_owner: Tensor
 
     @property
     def vertices(self) -> Tensor:
@@ -200,7 +202,7 @@ class Fragments:
             )
         if image.ndim != 4 or image.shape[:3] != self.owner.shape:
             raise ValueError(f"image must have shape {[*self.owner.shape, 'C']}, got {describe(image)}")
-        return ops.resolve(image, *self.mesh[:3], self.owner, self.anti_aliasing, self.eps)
+        return ops.resolve(image, *self._drawn[:3], self._drawn_owner, self.anti_aliasing, self.eps)
 
 
 def _usable(points: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ def render(
     fill_back: bool = True,
     near: float = 0.1,
     far: float = 100.0,
+    clip: bool = True,
     eps: float = 1e-4,
     smooth_normals: bool = False,
     interpolation_gradient: bool = False,
@@ -39,7 +40,7 @@ def render(
 
     Parameters
     ----------
-    vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, eps
+    vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps
         As :func:`render_silhouette`.
     outputs : sequence of "rgb", "alpha", "depth", "normals", "fragments"
         What to draw. These are also the names of the attributes of the result.
@@ -83,7 +84,7 @@ def render(
     listed = is_list(outputs) and all(name in OUTPUTS for name in outputs)
     if not listed or not outputs or len(set(outputs)) != len(outputs):
         raise ValueError(f"outputs must be a tuple of one or more different names out of {OUTPUTS}, got {outputs!r}")
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, eps)
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
     images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the requested order
     if "alpha" in images and "rgb" not in images:
         images["alpha"], owner = scene.silhouette(anti_aliasing, fill_back, near, far, eps)
@@ -121,6 +122,7 @@ def render_rgb(
     fill_back: bool = True,
     near: float = 0.1,
     far: float = 100.0,
+    clip: bool = True,
     eps: float = 1e-4,
     interpolation_gradient: bool = False,
 ) -> Tensor:
@@ -150,6 +152,7 @@ def render_rgb(
         fill_back=fill_back,
         near=near,
         far=far,
+        clip=clip,
         eps=eps,
         interpolation_gradient=interpolation_gradient,
     ).rgb
@@ -165,6 +168,7 @@ def render_silhouette(
     fill_back: bool = True,
     near: float = 0.1,
     far: float = 100.0,
+    clip: bool = True,
     eps: float = 1e-4,
     gradient: str = "nmr",
 ) -> Tensor:
@@ -189,7 +193,12 @@ def render_silhouette(
         Also draw faces that are seen from behind (clockwise on the screen). LookAt, Look and Orthographic show mesh
         files mirrored, so that their outsides are clockwise.
     near, far : float
-        A pixel is covered only where near < depth < far. Faces are not clipped.
+        A pixel is covered only where near < depth < far.
+    clip : bool
+        Cut the faces that reach behind the plane at depth ``near``, so that their part in front is drawn where it is
+        seen, with gradients to their corners. Without this, as in the published renderer, corners behind the eye land
+        mirrored on the image, and the whole face is drawn wrongly. Scenes in front of the plane are the same. With near
+        = 0 the cut is at far / 100000. Without a camera, x and y are taken as divided by z (perspective).
     eps : float
         In NMR's gradient, added to the distance between an edge and a pixel (in units of [-1, 1]). In the local one,
         the gradient is 0 if the two directions lower the loss at rates that differ by less than eps. Both as published.
@@ -242,7 +251,7 @@ def render_silhouette(
     torch.Size([2, 64, 64])
     """
     check_choice(gradient, "gradient", ("nmr", "local"))
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, eps)
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
     alpha, _ = scene.silhouette(anti_aliasing, fill_back, near, far, eps, gradient == "local")
     return alpha
 
@@ -257,6 +266,7 @@ def render_depth(
     fill_back: bool = True,
     near: float = 0.1,
     far: float = 100.0,
+    clip: bool = True,
 ) -> Tensor:
     """Depth images of meshes; the arguments are those of :func:`render_silhouette`.
 
@@ -282,7 +292,7 @@ def render_depth(
     >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
     >>> depth = nmr.render_depth(vertices, faces, camera, anti_aliasing=False)  # 2 in the middle
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far)
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip)
     return scene.depth(scene.rasterize(fill_back, near, far), anti_aliasing, far)
 
 
@@ -297,6 +307,7 @@ def render_normals(
     fill_back: bool = True,
     near: float = 0.1,
     far: float = 100.0,
+    clip: bool = True,
 ) -> Tensor:
     """Normals of meshes in world space; the arguments are those of :func:`render_silhouette`.
 
@@ -323,7 +334,7 @@ def render_normals(
     >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
     >>> picture = (1 + nmr.render_normals(vertices, faces, camera, smooth=True)) / 2
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far)
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip)
     fragments = scene.fragments(scene.rasterize(fill_back, near, far), anti_aliasing, far, 1e-4)
     return average(fragments.normals(smooth), anti_aliasing)
 
@@ -338,6 +349,7 @@ def render_fragments(
     fill_back: bool = True,
     near: float = 0.1,
     far: float = 100.0,
+    clip: bool = True,
     eps: float = 1e-4,
 ) -> Fragments:
     """Face, weights and depth at each pixel, for shading of your own; arguments as in :func:`render_silhouette`.
@@ -362,7 +374,7 @@ def render_fragments(
     >>> fragments = nmr.render_fragments(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), anti_aliasing=True)
     >>> image = fragments.resolve(fragments.interpolate(vertices).sin())
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, eps)
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
     return scene.fragments(scene.rasterize(fill_back, near, far), anti_aliasing, far, eps)
 
 
@@ -376,6 +388,7 @@ def render_face_index(
     fill_back: bool = True,
     near: float = 0.1,
     far: float = 100.0,
+    clip: bool = True,
 ) -> Tensor:
     """Which face is nearest at each pixel centre; the arguments are those of :func:`render_silhouette`.
 
@@ -396,7 +409,6 @@ def render_face_index(
     >>> face_index = nmr.render_face_index(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), image_size=64)
     >>> seen = torch.unique(face_index[face_index >= 0])
     """
-    scene = make_scene(vertices, faces, camera, image_size, False, near, far)
+    scene = make_scene(vertices, faces, camera, image_size, False, near, far, clip)
     owner = scene.rasterize(fill_back, near, far)
-    num_faces = scene.mesh.num_faces
-    return torch.where(owner >= num_faces, owner - num_faces, owner)
+    return scene.face_index(owner)

@@ -4,6 +4,7 @@
 PYBIND11_MODULE(_C, m) {
   m.doc() = "Compiled kernels of nmr. Use the functions of the package nmr, which validate and document.";
   nmr::bind_camera(m);
+  nmr::bind_clip(m);
   nmr::bind_raster(m);
   nmr::bind_fragments(m);
   nmr::bind_edges(m);

@@ -71,6 +71,7 @@ def draw(
         fill_back=fill_back,
         near=near,
         far=far,
+        clip=False,  # as published
         eps=eps,
     )
     drawn: dict[str, Tensor | None] = dict.fromkeys(("rgb", "alpha", "depth")) | dict(zip(outputs, images, strict=True))

@@ -13,6 +13,7 @@ owner map is int32:
 """
 
 from .camera import pose, pose_backward, project, project_backward
+from .clip import clip_count, clip_faces
 from .edges import edges_backward, resolve, resolve_backward
 from .fragments import depth_backward, depth_image, fragments, fragments_backward
 from .mesh import smoothness, smoothness_backward, voxels
@@ -20,6 +21,8 @@ from .raster import local_gradient, rasterize, silhouette, silhouette_backward
 from .shade import interpolate, interpolate_backward, sample_texture_cubes, texture_cubes_backward
 
 __all__ = [
+    "clip_count",
+    "clip_faces",
     "depth_backward",
     "depth_image",
     "edges_backward",

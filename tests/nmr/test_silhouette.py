@@ -262,15 +262,16 @@ def test_any_mesh_through_any_camera(mesh, pose):
 
 
 def test_vertices_without_a_finite_image_get_no_gradient_and_spoil_nothing():
-    """In the plane of the eye, at the eye, not a number: the other faces keep image and gradient."""
+    """In the plane of the eye, at the eye, not a number: without clipping, the other faces keep image and gradient."""
     vertices, faces = nmr.icosphere(1)
     bad = torch.tensor([[0.0, 1.0, -3.0], [0.0, 0.0, -3.0], [float("nan"), 0.0, 0.0]])
     eye = torch.tensor([0.0, 0.0, -3.0], requires_grad=True)
     extra = torch.tensor([[0, 1, len(vertices) + k] for k in range(3)])
-    good = render_with_gradient(vertices[None], faces, camera=nmr.LookAt(eye), image_size=16)
+    options = {"camera": nmr.LookAt(eye), "image_size": 16, "clip": False}
+    good = render_with_gradient(vertices[None], faces, **options)
     eye_grad, eye.grad = eye.grad, None
     both = torch.cat([vertices, bad])[None]
-    spoiled = render_with_gradient(both, torch.cat([faces, extra]), camera=nmr.LookAt(eye), image_size=16)
+    spoiled = render_with_gradient(both, torch.cat([faces, extra]), **options)
     assert torch.equal(spoiled[0], good[0]) and torch.equal(spoiled[1][:, :-3], good[1])
     assert not spoiled[1][:, -3:].any() and torch.equal(eye.grad, eye_grad) and eye_grad.any()
 

@@ -1,0 +1,149 @@
+// Near-plane clipping: which faces are drawn in place of those that cross the plane z = near. Only the topology is decided here; the
+// new vertices are computed where the camera is known (nmr/_clip.py).
+//
+// A face with one corner in front becomes one triangle, a face with two becomes two triangles. The new vertices lie on the two edges
+// that cross the plane. Faces wholly in front stay as they are, faces wholly behind are left out. Each cut face has new vertices of
+// its own. Neighbours name the ends of their common edge in the same order, so their new vertices have the same bits and leave no gap.
+#include <algorithm>
+
+#include "parallel.h"
+#include "stages.h"
+
+namespace nmr {
+namespace {
+
+constexpr int64_t kLanes = 16;
+
+// Whether a depth lies behind the plane. NaN does not: such a face is not drawn anyway.
+template <class T>
+NMR_INLINE bool any_behind_body(const T* vertices, int64_t count, T near) {
+  int32_t behind[kLanes] = {};
+  int64_t v = 0;
+  for (; v + kLanes <= count; v += kLanes)
+    for (int64_t l = 0; l < kLanes; ++l) behind[l] |= vertices[3 * (v + l) + 2] < near;
+  for (; v < count; ++v) behind[0] |= vertices[3 * v + 2] < near;
+  return std::any_of(behind, behind + kLanes, [](int32_t any) { return any != 0; });
+}
+
+NMR_CLONES bool any_behind(const float* vertices, int64_t count, float near) { return any_behind_body(vertices, count, near); }
+NMR_CLONES bool any_behind(const double* vertices, int64_t count, double near) { return any_behind_body(vertices, count, near); }
+
+constexpr int64_t kPieces[4] = {1, 2, 1, 0};  // triangles that are left of a face with 0, 1, 2, 3 corners behind the plane
+
+// The corners of a face that lie behind the plane.
+struct Sides {
+  bool behind[3];
+  int count;  // 0 if a depth is NaN
+
+  bool cut() const { return count == 1 || count == 2; }
+};
+
+template <class T>
+Sides sides_of(const T* vertices, const int64_t* face, T near) {
+  Sides sides{};
+  bool ordered = true;
+  for (int k = 0; k < 3; ++k) {
+    const T z = vertices[3 * face[k] + 2];
+    sides.behind[k] = z < near;
+    sides.count += sides.behind[k];
+    ordered = ordered && z == z;
+  }
+  return ordered ? sides : Sides{};
+}
+
+}  // namespace
+
+template <class T>
+bool crosses_near(const T* vertices, int64_t count, T near) {
+  return any_behind(vertices, count, near);
+}
+
+template <class T>
+void clip_count(const ClipCount<T>& args) {
+  const MeshBatch<T>& mesh = args.mesh;
+  parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
+    const int64_t num_faces = mesh.face_count(b);
+    int64_t cut = 0, drawn = 0;
+    for (int64_t f = 0; f < num_faces; ++f) {
+      const Sides sides = sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f, args.near);
+      cut += sides.cut();
+      drawn += kPieces[sides.count];
+    }
+    args.counts[2 * b] = 2 * cut;
+    args.counts[2 * b + 1] = cut ? drawn : num_faces;
+  });
+}
+
+template <class T>
+void clip_faces(const ClipFaces<T>& args) {
+  const MeshBatch<T>& mesh = args.mesh;
+  parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
+    const int64_t vertex_start = mesh.vertex_start(b), num_vertices = mesh.vertex_count(b);
+    const int64_t first_vertex = args.starts[2 * b], last_vertex = args.starts[2 * b + 2];
+    const int64_t first_face = args.starts[2 * b + 1], last_face = args.starts[2 * b + 3];
+    int64_t p = first_vertex, n = first_face;
+    // The new vertex on the edge between corners i and j of a face: its number among the new vertices of the mesh.
+    const auto cut_edge = [&](const int64_t* face, int i, int j) {
+      if (face[i] > face[j]) std::swap(i, j);
+      int64_t* end = args.ends + 4 * p;
+      end[0] = vertex_start + face[i];
+      end[1] = vertex_start + face[j];
+      end[2] = i;
+      end[3] = j;
+      return p++ - first_vertex;
+    };
+    // A triangle of face f; each corner is a corner k of f (k < 3), or the new vertex k - 3.
+    const auto draw = [&](int64_t f, int64_t k0, int64_t k1, int64_t k2) {
+      const int64_t* face = mesh.image_faces(b) + 3 * f;
+      const int64_t corner[3] = {k0, k1, k2};
+      for (int k = 0; k < 3; ++k) {
+        args.corners[3 * n + k] = corner[k];
+        args.faces[3 * n + k] = corner[k] < 3 ? face[corner[k]] : num_vertices + corner[k] - 3;
+      }
+      args.source[n++] = static_cast<int32_t>(f);
+    };
+    const int64_t num_faces = mesh.face_count(b);
+    bool any_cut = false;
+    for (int64_t f = 0; f < num_faces && !any_cut; ++f)
+      any_cut = sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f, args.near).cut();
+    for (int64_t f = 0; f < num_faces; ++f) {
+      const int64_t* face = mesh.image_faces(b) + 3 * f;
+      const Sides sides = sides_of(mesh.image_vertices(b), face, args.near);
+      if (!any_cut || sides.count == 0) {
+        draw(f, 0, 1, 2);
+      } else if (sides.cut()) {
+        int i = 0;  // the corner that is alone on its side
+        while (sides.behind[i] != (sides.count == 1)) ++i;
+        const int j = (i + 1) % 3, k = (i + 2) % 3;
+        const int64_t on_ij = 3 + cut_edge(face, i, j), on_ki = 3 + cut_edge(face, k, i);
+        int64_t whole[3];
+        if (sides.count == 2) {  // the triangle at corner i, in the face's own order
+          whole[i] = i, whole[j] = on_ij, whole[k] = on_ki;
+          draw(f, whole[0], whole[1], whole[2]);
+        } else {
+          draw(f, on_ij, j, k);
+          draw(f, on_ij, k, on_ki);
+        }
+      }
+    }
+    // What is left of the given room: faces without area, and new vertices that no face uses.
+    for (; n < last_face; ++n) {
+      std::fill_n(args.faces + 3 * n, 3, int64_t(0));
+      std::fill_n(args.corners + 3 * n, 3, int64_t(0));
+      args.source[n] = 0;
+    }
+    for (; p < last_vertex; ++p) {
+      const int64_t end[4] = {vertex_start, vertex_start, 0, 0};
+      std::copy_n(end, 4, args.ends + 4 * p);
+    }
+  });
+}
+
+template bool crosses_near(const float*, int64_t, float);
+template bool crosses_near(const double*, int64_t, double);
+template void clip_count(const ClipCount<float>&);
+template void clip_count(const ClipCount<double>&);
+template void clip_faces(const ClipFaces<float>&);
+template void clip_faces(const ClipFaces<double>&);
+
+}  // namespace nmr

@@ -1,0 +1,140 @@
+"""Near-plane clipping: the meshes that are drawn in place of those that cross the plane, and the way back to these.
+
+The kernels then see a packed mesh in which faces are cut. What users see (owner, weights) is that of their own faces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from . import ops
+from ._packing import MeshBatch, packed_starts
+from .cameras import Camera
+from .cameras.projection import ProjectingCamera
+
+# With near = 0, faces are cut at this part of far: the image of a point in the plane of the eye is infinitely large.
+_NEAREST = 1e-5
+# Beyond this a new vertex counts as not finite: products with gradients could overflow.
+_LARGEST = 1e12
+
+
+class Clipped(NamedTuple):
+    """The drawn meshes, packed, and where each drawn face lies on the face that it is part of."""
+
+    mesh: MeshBatch
+    source: Tensor  # int32 [M + 1]: face of the user's mesh; the last row is -1
+    num_faces: int | Tensor  # of the user's meshes, as MeshBatch.num_faces
+    corners: Tensor  # [M, 3]: rows of places
+    places: Tensor  # packed [3 B + P, 3]: barycentric coordinates on the source
+    place_starts: Tensor  # [B + 1, 2]: first of the places and first face of each mesh
+
+    def owner(self, owner: Tensor) -> Tensor:
+        """An owner map of the drawn meshes as one of the user's: ``[B, H, W]`` or ``[B, H, W, K]``."""
+        one = (-1, *(1,) * (owner.ndim - 1))
+        drawn, num_faces = self.mesh.num_faces.view(one), self.num_faces
+        num_faces = num_faces.view(one) if isinstance(num_faces, Tensor) else num_faces
+        back = owner >= drawn
+        face = torch.where(back, owner - drawn, owner).long() + self.mesh.first_faces(0).view(one)
+        source = self.source[torch.where(owner < 0, len(self.source) - 1, face)]
+        return torch.where(back, source + num_faces, source)
+
+    def weights(self, owner: Tensor, weights: Tensor) -> Tensor:
+        """Weights on the drawn faces ``[B, H, W, 3]`` (of their owner map) as weights on the user's faces.
+
+        Both are linear in space: a point with weights b_k on a face whose corners lie at B_k has the weights
+        sum_k b_k B_k.
+        """
+        return ops.interpolate(self.places, self.corners, owner, weights, self.place_starts)
+
+
+def clip_near(world: Tensor, mesh: MeshBatch, camera: Camera | None, near: float, far: float) -> Clipped | None:
+    """Cuts the faces that cross z = near; None if there are none.
+
+    ``world`` and ``mesh`` are the meshes before and after the camera. The new vertices are interpolated in the world
+    and then go through the camera, so that gradients reach the corners of the cut edges.
+    """
+    plane = float(near) or _NEAREST * float(far)
+    room = _room(mesh, plane)
+    if room is None:
+        return None
+    num_new, num_drawn = zip(*room, strict=True)
+    new_starts = packed_starts(num_new, num_drawn)
+    faces, source, corners, ends = ops.clip_faces(*mesh[:3], plane, new_starts, sum(num_new), sum(num_drawn))
+    share, new = _new_vertices(world, mesh, camera, plane, ends[:, :2], new_starts)
+    own, own_counts = mesh.each_vertices(), mesh.vertex_counts or (mesh.vertices.shape[-2],) * mesh.batch
+    vertices = torch.cat([x for pair in zip(own, new.split(num_new), strict=True) for x in pair])
+    vertex_counts = tuple(v + n for v, n in zip(own_counts, num_new, strict=True))
+    drawn = MeshBatch(vertices, faces, packed_starts(vertex_counts, num_drawn), vertex_counts, num_drawn)
+    eye = torch.eye(3).to(vertices)
+    places = (1 - share) * eye[ends[:, 2]] + share * eye[ends[:, 3]]
+    places = torch.cat([x for part in places.split(num_new) for x in (eye, part)])
+    place_starts = packed_starts([3 + n for n in num_new], num_drawn)
+    source = torch.cat([source, source.new_full((1,), -1)])
+    return Clipped(drawn, source, mesh.num_faces, corners, places, place_starts)
+
+
+def _room(mesh: MeshBatch, plane: float) -> list[tuple[int, int]] | None:
+    """New vertices and drawn faces of each mesh; None if nothing is cut.
+
+    What has no values yet (in torch.compile and torch.func.vmap) gets room for the case that every face is cut.
+    """
+    if not torch.compiler.is_compiling():
+        try:
+            room = ops.clip_count(*mesh[:3], plane).tolist()
+            return room if any(new for new, _ in room) else None
+        except RuntimeError:
+            pass
+    counts = mesh.face_counts or (mesh.faces.shape[-2],) * mesh.batch
+    return [(2 * n, 2 * n) for n in counts]
+
+
+def _new_vertices(
+    world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: float, rows: Tensor, starts: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The new vertices between two rows of the vertices: how far from the first ``[P, 1]``, and in renderer space."""
+    if camera is None:  # the perspective image (x, y, z) of a point is linear in space as (x z, y z, z)
+        ends = F.embedding(rows, mesh.vertices.reshape(-1, 3))
+        finite = _moderate(ends).view(-1, 1, 1)
+        ends = torch.where(finite, ends, torch.zeros_like(ends))  # no gradient is 0 * inf
+        z = torch.where(finite, ends[..., 2:], float("nan"))
+        ends = torch.cat([ends[..., :2] * z, z], dim=-1)
+    else:
+        shared = mesh.starts is None and world.shape[0] == 1
+        ends = F.embedding(rows % world.shape[1] if shared else rows, world.reshape(-1, 3))
+        if isinstance(camera, ProjectingCamera):
+            # Without the division, also points in the plane of the eye have a depth, with a gradient.
+            flat = replace(camera.projection(world.dtype), perspective=False, distortion=None)
+            z = flat.transform(ends.view(-1, 3), starts=2 * starts).view(-1, 2, 3)[..., 2:]
+        else:
+            z = F.embedding(rows, mesh.vertices.reshape(-1, 3))[..., 2:]
+    usable = _moderate(ends) & _moderate(z)
+    ends, z = (torch.where(usable.unsqueeze(-1), x, torch.zeros_like(x)) for x in (ends, z))
+    height = z[:, 1] - z[:, 0]
+    share = (plane - z[:, 0]) / torch.where(height == 0, torch.ones_like(height), height)
+    points = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    if camera is None:
+        points = torch.cat([points[:, :2] / plane, torch.full_like(points[:, 2:], plane)], dim=-1)
+    elif mesh.starts is not None or isinstance(camera, ProjectingCamera):
+        points = camera.transform(points, starts=starts)
+    else:
+        points = _transform_padded(points, world, mesh.batch, camera, starts)
+    return share, torch.where(usable, points, float("inf"))
+
+
+def _moderate(ends: Tensor) -> Tensor:
+    """Whether both ends ``[P, 2, C]`` of an edge are finite and not huge: ``[P, 1]``."""
+    return (ends.abs() < _LARGEST).flatten(1).all(1, keepdim=True)
+
+
+def _transform_padded(points: Tensor, world: Tensor, batch: int, camera: Camera, starts: Tensor) -> Tensor:
+    """Packed points through a camera that takes batches ``[B, V, 3]`` only; vertices of the mesh fill the gaps."""
+    counts = starts[:, 0].diff().tolist()
+    fill = world[:, :1].expand(batch, max(counts), 3)
+    parts = [torch.cat([x, gap[len(x) :]]) for x, gap in zip(points.split(counts), fill, strict=True)]
+    transformed = camera.transform(torch.stack(parts))
+    return torch.cat([part[:n] for part, n in zip(transformed, counts, strict=True)])

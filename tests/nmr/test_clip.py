@@ -1,0 +1,293 @@
+"""Faces that cross the near plane: what is seen of them is what finer meshes show, with gradients to their corners."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import nmr
+
+SIZE = 48
+CAMERA = nmr.LookAt([0.0, 0.0, 0.0], [0.0, -0.3, 1.0], half_fov_deg=35.0)
+PINHOLE = nmr.Pinhole(
+    [[40.0, 0.0, 24.0], [0.0, 40.0, 24.0], [0.0, 0.0, 1.0]],
+    [[1.0, 0.0, 0.0], [0.0, -0.96, -0.28], [0.0, -0.28, 0.96]],
+    [0.1, 0.0, 0.0],
+    orig_size=48,
+)
+
+
+def floor(n, dtype=torch.float32, height=-1.0):
+    """A square of 2 n^2 faces below the origin, 20 wide: the eye is above its middle."""
+    steps = torch.linspace(-10, 10, n + 1, dtype=dtype)
+    x, z = torch.meshgrid(steps, steps, indexing="xy")
+    vertices = torch.stack([x + 0.01 * z, torch.full_like(x, height), z], dim=-1).reshape(-1, 3)
+    first = (torch.arange(n).view(-1, 1) * (n + 1) + torch.arange(n)).view(-1, 1)
+    return vertices, (first + torch.tensor([[0, 1, n + 2, 0, n + 2, n + 1]])).view(-1, 3)
+
+
+def tilted(dtype=torch.float64):
+    """Three faces with one, two and no corner behind the eye, seen from either side."""
+    points = [[-2, -1, -1], [2, -1.2, -1.5], [0.3, -0.4, 5], [-2, 0.9, 4], [2.5, 0.6, 3], [0.2, 0.5, -0.7], [0.1, 0, 3]]
+    return torch.tensor(points, dtype=dtype), torch.tensor([[0, 1, 2], [3, 5, 4], [2, 3, 6]])
+
+
+@pytest.mark.parametrize("camera", [CAMERA, PINHOLE], ids=["LookAt", "Pinhole"])
+@pytest.mark.parametrize("image_size", [SIZE])
+def test_a_floor_under_the_eye_is_that_of_a_fine_mesh(camera, image_size):
+    coarse, fine = floor(1), floor(150)
+    options = {"image_size": image_size, "anti_aliasing": False}
+
+    def draw(mesh):
+        uv = (mesh[0][:, [0, 2]] + 10) / 20
+        chequered = nmr.UVTexture(torch.eye(2).repeat(20, 20).unsqueeze(-1), uv)
+        images = nmr.render(*mesh, camera, outputs=("rgb", "alpha", "depth"), colors=chequered, **options)
+        fragments = nmr.render_fragments(*mesh, camera, **options)
+        return *images, fragments.interpolate(mesh[0]), fragments.normals()
+
+    (rgb, alpha, depth, points, normals), wanted = draw(coarse), draw(fine)
+    assert torch.equal(alpha, wanted[1]) and 0.3 < alpha.mean() < 0.95
+    assert not torch.equal(alpha, nmr.render_silhouette(*coarse, camera, clip=False, **options))
+    # At the horizon, rounding of x in pixels counts for the most.
+    torch.testing.assert_close(depth, wanted[2], rtol=1e-3, atol=0)
+    torch.testing.assert_close(points, wanted[3], rtol=2e-3, atol=2e-3)
+    torch.testing.assert_close(normals, wanted[4])
+    assert (rgb - wanted[0]).abs().mean() < 2e-3
+    fragments = nmr.render_fragments(*coarse, camera, **options)
+    assert fragments.owner.unique().tolist() in ([-1, 1], [-1, 0, 1], [-1, 2, 3], [-1, 3])
+    torch.testing.assert_close(fragments.weights.sum(-1), alpha, rtol=0, atol=1e-5)
+
+
+def test_without_a_camera_the_perspective_image_is_cut():
+    vertices, faces = floor(1)
+    seen = CAMERA.transform(vertices)[0]
+    options = {"image_size": SIZE, "anti_aliasing": False}
+    images = nmr.render(vertices, faces, CAMERA, outputs=("alpha", "depth"), **options)
+    again = nmr.render(seen, faces, outputs=("alpha", "depth"), **options)
+    assert torch.equal(images.alpha, again.alpha)
+    torch.testing.assert_close(images.depth, again.depth, rtol=1e-4, atol=0)
+
+
+def test_a_room_from_inside():
+    # A cube of 12 faces around the eye: every pixel shows a wall, at the distance of the cube's sides.
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+    sides = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    faces = torch.tensor([[side[0], side[k], side[k + 1]] for side in sides for k in (1, 2)])
+    for direction in ([0.2, -0.3, 1.0], [1.0, 0.1, 0.1], [-0.4, 0.9, -0.5]):
+        camera = nmr.Look([0.3, -0.2, 0.1], direction, half_fov_deg=50.0)
+        fragments = nmr.render_fragments(corners, faces, camera, image_size=SIZE, near=0.05)
+        points = fragments.interpolate(corners)
+        # Pixels exactly between two walls may be missed by both.
+        assert fragments.covered.float().mean() > 0.995
+        walls = points.abs().amax(-1)[fragments.covered]
+        torch.testing.assert_close(walls, torch.ones_like(walls), rtol=0, atol=1e-4)
+        plain = nmr.render_fragments(corners, faces, camera, image_size=SIZE, near=0.05, clip=False)
+        assert (plain.owner != fragments.owner).float().mean() > 0.05
+
+
+def test_one_face_is_drawn_as_its_part_in_front():
+    # Cut by hand, with the same gradient by the chain rule.
+    vertices, faces = torch.tensor([[-1.0, -1.0, 4.0], [3.0, -0.5, -2.0], [0.5, 1.0, 3.0]]), torch.tensor([[0, 1, 2]])
+    vertices, near = vertices.double().requires_grad_(), 0.5
+    eye = nmr.LookAt([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], half_fov_deg=40.0)
+    a, b, c = vertices
+
+    def at_near(p, q):
+        return p + (near - p[2]) / (q[2] - p[2]) * (q - p)
+
+    parts = torch.stack([at_near(a, b), b, c, a, at_near(b, c)])
+    target = torch.rand(1, SIZE, SIZE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    grads = []
+    for points, triangles in ((vertices, faces), (parts, torch.tensor([[4, 2, 3], [4, 3, 0]]))):
+        alpha = nmr.render_silhouette(points, triangles, eye, image_size=SIZE, near=near)
+        loss = (alpha - target).square().sum()
+        grads.append((alpha, *torch.autograd.grad(loss, vertices)))
+    assert torch.equal(grads[0][0], grads[1][0]) and grads[0][0].sum() > 100
+    torch.testing.assert_close(grads[0][1], grads[1][1], rtol=1e-9, atol=1e-9)
+    assert (grads[0][1].abs().sum(-1) > 0.1).all()  # the corner behind the eye has one, too
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_gradients_are_the_derivative(packed):
+    vertices, faces = tilted()
+    values = torch.rand(7, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    camera = replace(CAMERA, eye=torch.tensor([[0.02, 0.03, -0.01]], dtype=torch.float64))
+
+    def draw(vertices, eye):
+        meshes = ([vertices, vertices[:6] + 0.03], [faces, faces[:2]]) if packed else (vertices, faces)
+        seen = nmr.render_fragments(*meshes, replace(camera, eye=eye), image_size=7)
+        depth = nmr.render_depth(*meshes, replace(camera, eye=eye), image_size=7)
+        attributes = [values, values[:6]] if packed else values
+        return seen.weights, seen.depth.clamp_max(50), depth, seen.interpolate(attributes), seen.normals()
+
+    covered = nmr.render_fragments(vertices, faces, camera, image_size=7)
+    assert {0, 1, 2} <= {owner % 3 for owner in covered.owner[covered.covered].tolist()}
+    vertices.requires_grad_(), camera.eye.requires_grad_()
+    assert torch.autograd.gradcheck(draw, (vertices, camera.eye), eps=1e-7, atol=1e-4, rtol=1e-4)
+
+
+def test_faces_keep_their_numbers_and_sides():
+    vertices, faces = tilted(torch.float32)
+    owner = nmr.render_fragments(vertices, faces, CAMERA, image_size=SIZE).owner
+    seen = nmr.render_face_index(vertices, faces, CAMERA, image_size=SIZE)
+    assert seen.unique().tolist() == [-1, 0, 1, 2] and torch.equal(seen, torch.where(owner >= 3, owner - 3, owner))
+    flipped = nmr.render_fragments(vertices, faces.flip(1), CAMERA, image_size=SIZE)
+    assert torch.equal(flipped.is_back, (owner >= 0) & (owner < 3)) and torch.equal(flipped.face_index, seen)
+    front = nmr.render_fragments(vertices, faces, CAMERA, image_size=SIZE, fill_back=False).owner
+    assert 0 < (front >= 0).sum() < (owner >= 0).sum() and front.max() < 3
+
+
+def test_scenes_in_front_of_the_plane_keep_their_bits():
+    vertices, faces = nmr.icosphere(2)
+    vertices = vertices.repeat(2, 1, 1).requires_grad_()
+    camera = nmr.LookAt([[0.0, 0.0, -3.0], [1.0, 2.0, -2.0]])
+    results = []
+    for clip in (False, True):
+        outputs = ("rgb", "alpha", "depth", "normals")
+        images = nmr.render(vertices, faces, camera, outputs=outputs, image_size=SIZE, clip=clip)
+        loss = sum((image * torch.linspace(-1, 1, image.numel()).view(image.shape)).sum() for image in images)
+        results.append([*images, *torch.autograd.grad(loss, vertices)])
+    for a, b in zip(*results, strict=True):
+        assert torch.equal(a, b)
+
+
+def _gradients(meshes, camera):
+    """Images and gradients of the vertices of each mesh."""
+    vertices, faces = meshes
+    leaves = [v.clone().requires_grad_() for v in vertices]
+    given = torch.stack(leaves) if isinstance(faces, torch.Tensor) else leaves
+    images = nmr.render(given, faces, camera, outputs=("rgb", "alpha", "depth", "normals"), image_size=SIZE)
+    loss = sum(
+        (image * torch.linspace(-1, 1, image[0].numel()).view(image.shape[1:])).flatten(1).sum(1).sum()
+        for image in images
+    )
+    return list(images), torch.autograd.grad(loss, leaves)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_batch_draws_each_mesh_as_if_alone(shared):
+    vertices, faces = tilted(torch.float32)
+    ahead = vertices + torch.tensor([0.0, 0.0, 4.0])  # crosses nothing
+    behind = vertices - torch.tensor([0.0, 0.0, 20.0])
+    meshes = [vertices, ahead, behind, 0.9 * vertices]
+    all_faces = faces if shared else [faces, faces[:2], faces, faces.flip(0)]
+    images, grads = _gradients((meshes, all_faces), CAMERA)
+    assert images[1].flatten(1).sum(1).gt(0).tolist() == [True, True, False, True]
+    for b, mesh in enumerate(meshes):
+        alone, grad = _gradients(([mesh], [faces if shared else all_faces[b]]), CAMERA)
+        for image, single in zip(images, alone, strict=True):
+            assert torch.equal(image[b : b + 1], single)
+        assert torch.equal(grads[b], grad[0])
+
+
+def test_one_mesh_and_many_poses():
+    vertices, faces = floor(1)
+    eyes = torch.tensor([[0.0, 0.0, 0.0], [0.0, 3.0, -30.0], [1.0, 0.5, 2.0]])
+    at = eyes + torch.tensor([0.0, -0.3, 1.0])
+    together = nmr.render_depth(vertices, faces, nmr.LookAt(eyes, at), image_size=SIZE)
+    for b in range(3):
+        alone = nmr.render_depth(vertices, faces, nmr.LookAt(eyes[b], at[b]), image_size=SIZE)
+        assert torch.equal(together[b : b + 1], alone)
+
+
+def test_a_camera_of_ones_own():
+    class Shift:  # takes batches only
+        def transform(self, vertices):
+            return CAMERA.transform(vertices)
+
+    vertices, faces = tilted(torch.float32)
+    vertices = torch.stack([vertices, vertices + torch.tensor([0.0, 0.0, 4.0]), 0.8 * vertices]).requires_grad_()
+    results = []
+    for camera in (CAMERA, Shift()):
+        alpha, depth = nmr.render(vertices, faces, camera, outputs=("alpha", "depth"), image_size=SIZE)
+        results.append((alpha, depth, *torch.autograd.grad((alpha * depth).sum(), vertices)))
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(b.detach().abs().max()))
+
+
+def test_an_orthographic_camera():
+    vertices, faces = tilted()
+    camera = nmr.Orthographic([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], scale=0.4)
+    fragments = nmr.render_fragments(vertices, faces, camera, image_size=SIZE)
+    z = fragments.interpolate(vertices)[fragments.covered][:, 2]
+    assert len(z) > 100 and z.min() >= 0.1 - 1e-9
+    torch.testing.assert_close(z, fragments.depth[fragments.covered])
+
+
+def test_a_corner_in_the_plane_of_the_eye():
+    vertices = torch.tensor([[-1.0, -0.5, 0.0], [1.0, -0.5, 0.0], [0.0, -0.2, 3.0]], dtype=torch.float64)
+    camera = nmr.LookAt([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], half_fov_deg=45.0)
+    faces = torch.tensor([[0, 1, 2]])
+    assert nmr.render_silhouette(vertices, faces, camera, image_size=SIZE, clip=False).sum() == 0
+    fragments = nmr.render_fragments(vertices, faces, camera, image_size=SIZE)
+    assert fragments.covered.sum() > 100
+    torch.testing.assert_close(fragments.interpolate(vertices)[..., 2], fragments.depth * fragments.covered % 100)
+
+    def depth(vertices):
+        return nmr.render_depth(vertices, faces, camera, image_size=7)
+
+    assert torch.autograd.gradcheck(depth, vertices.requires_grad_(), eps=1e-7, atol=1e-4, rtol=1e-4)
+
+
+def test_corners_that_are_not_finite_draw_nothing_and_spoil_nothing():
+    vertices, faces = tilted(torch.float32)
+    for bad in (float("nan"), float("inf"), -float("inf"), 1e38):
+        for camera in (CAMERA, None):
+            points = vertices.clone()
+            points[1] = bad
+            points.requires_grad_()
+            alpha, depth = nmr.render(points, faces, camera, outputs=("alpha", "depth"), image_size=16)
+            fragments = nmr.render_fragments(points, faces, camera, image_size=16)
+            (alpha.sum() + depth.sum() + fragments.weights.square().sum()).backward()
+            assert alpha.isfinite().all() and depth.isfinite().all() and points.grad.isfinite().all()
+            assert fragments.face_index.unique().tolist() == [-1, 1, 2]
+
+
+def test_near_zero():
+    vertices, faces = floor(1)
+    alpha = nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=0.0)
+    assert torch.equal(alpha, nmr.render_silhouette(*floor(150), CAMERA, image_size=SIZE, near=0.0))
+
+
+def test_compile_and_vmap_leave_room_for_every_cut():
+    vertices, faces = tilted(torch.float32)
+
+    def loss(vertices):
+        outputs = nmr.render(vertices, faces, CAMERA, outputs=("rgb", "alpha", "depth"), image_size=16)
+        return sum(image.square().sum() for image in outputs)
+
+    eager, compiled = (vertices.clone().requires_grad_() for _ in range(2))
+    loss(eager).backward()
+    torch.compile(loss, fullgraph=True, backend="aot_eager")(compiled).backward()
+    torch.testing.assert_close(compiled.grad, eager.grad, rtol=1e-5, atol=1e-5 * float(eager.grad.abs().max()))
+    many = torch.stack([vertices, vertices + torch.tensor([0.0, 0.0, 4.0])])
+    grads = torch.func.vmap(torch.func.grad(loss))(many)
+    torch.testing.assert_close(grads[0], eager.grad, rtol=1e-5, atol=1e-5 * float(eager.grad.abs().max()))
+    torch.testing.assert_close(torch.func.vmap(loss)(many)[0], loss(vertices))
+
+
+def test_results_do_not_depend_on_threads():
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            results.append(_gradients(([tilted(torch.float32)[0]] * 2, tilted()[1]), CAMERA))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(*(x[0] for x in results), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(*(x[1] for x in results), strict=True))
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_opcheck(packed):
+    vertices, faces = tilted(torch.float32)
+    seen = CAMERA.transform(vertices)
+    starts = torch.tensor([[0, 0], [7, 3]]) if packed else None
+    arguments = (seen[0] if packed else seen, faces, starts, 0.1)
+    torch.library.opcheck(nmr.ops.clip_count, arguments)
+    room = nmr.ops.clip_count(*arguments)
+    assert room.tolist() == [[4, 4]]
+    torch.library.opcheck(nmr.ops.clip_faces, (*arguments, torch.tensor([[0, 0], [4, 4]]), 4, 4))
+    with pytest.raises(ValueError, match="too little room"):
+        nmr.ops.clip_faces(*arguments, torch.tensor([[0, 0], [4, 3]]), 4, 3)
