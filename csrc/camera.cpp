@@ -10,7 +10,7 @@
 namespace nmr {
 namespace {
 
-constexpr int kLanes = 16;       // vertices processed together, and partial sums per gradient; the same on every processor
+constexpr int kGroup = 16;       // vertices processed together, and partial sums per gradient; the same on every processor
 constexpr int64_t kChunk = 512;  // vertices per task: sums are taken per chunk, then over chunks
 constexpr int kSums = 12 + 6 + 5;        // sums over vertices per camera: gradients of matrix, intrinsics, distortion
 constexpr int kTotals = kSums + 3 + 1;   // plus the gradients of origin and extent, which follow from the sums
@@ -100,7 +100,7 @@ NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
 template <class T, bool kPerspective, bool kDistorted>
 NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T* __restrict points) {
   const T infinity = std::numeric_limits<T>::infinity();
-  for (int l = 0; l < kLanes; ++l) {
+  for (int l = 0; l < kGroup; ++l) {
     const Sight<T> s = sight_of<T, kPerspective, kDistorted, true>(c, vertices[3 * l] - c.o[0], vertices[3 * l + 1] - c.o[1],
                                                                vertices[3 * l + 2] - c.o[2]);
     points[3 * l] = is_finite(s.size) ? s.x : infinity;
@@ -109,12 +109,13 @@ NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T*
   }
 }
 
-// Adds the gradient of kLanes vertices to grad_vertices, and that of the camera to the partial sums. A vertex without an image, or
-// whose gradient would overflow, gets gradient 0 and contributes 0 to the camera. (An upstream NaN is passed on.)
+// Adds the gradient of kGroup vertices to grad_vertices, and that of the camera to the partial sums. A vertex without an image, or
+// whose gradient would overflow although the upstream gradient is finite, gets gradient 0 and contributes 0 to the camera. If the
+// upstream gradient is infinite or NaN, that of the vertex and of the camera is NaN.
 template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
 NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, const T* __restrict grad_points,
-                               T* __restrict grad_vertices, T (*__restrict sums)[kLanes]) {
-  for (int l = 0; l < kLanes; ++l) {
+                               T* __restrict grad_vertices, T (*__restrict sums)[kGroup]) {
+  for (int l = 0; l < kGroup; ++l) {
     T x = vertices[3 * l] - c.o[0], y = vertices[3 * l + 1] - c.o[1], z = vertices[3 * l + 2] - c.o[2];
     T gx = grad_points[3 * l], gy = grad_points[3 * l + 1], gz = grad_points[3 * l + 2];
     Sight<T> s = sight_of<T, kPerspective, kDistorted, false>(c, x, y, z);
@@ -128,7 +129,8 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
     const bool keep = is_finite(bound >= kLimit<T> ? std::numeric_limits<T>::infinity() : s.size);
     // Values of skipped vertices are set to 0 before they are multiplied, so that no product is 0 * inf.
     x = keep ? x : T(0), y = keep ? y : T(0), z = keep ? z : T(0);
-    gx = keep ? gx : T(0), gy = keep ? gy : T(0), gz = keep ? gz : T(0);
+    const T nothing = is_finite(s.size) ? gx * T(0) + gy * T(0) + gz * T(0) : T(0);  // NaN if the upstream gradient is not finite
+    gx = keep ? gx : nothing, gy = keep ? gy : nothing, gz = keep ? gz : nothing;
     s.px = keep ? s.px : T(0), s.py = keep ? s.py : T(0);
     s.qx = keep ? s.qx : T(0), s.qy = keep ? s.qy : T(0);
     if (kPerspective) s.inverse_z = keep ? s.inverse_z : T(0);
@@ -182,10 +184,10 @@ struct Run {
 // The last, incomplete group of a run is copied and padded with NaN vertices, which have no image.
 template <class T>
 struct Padded {
-  T vertices[3 * kLanes], grad_points[3 * kLanes], out[3 * kLanes];
+  T vertices[3 * kGroup], grad_points[3 * kGroup], out[3 * kGroup];
 
   Padded(const T* from, int64_t count) : grad_points{}, out{} {
-    std::fill_n(vertices, 3 * kLanes, std::numeric_limits<T>::quiet_NaN());
+    std::fill_n(vertices, 3 * kGroup, std::numeric_limits<T>::quiet_NaN());
     std::copy_n(from, 3 * count, vertices);
   }
 };
@@ -194,9 +196,9 @@ template <class T, bool kPerspective, bool kDistorted>
 NMR_INLINE void forward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run) {
   const T* vertices = args.vertices + 3 * run.vertices;
   T* points = args.points + 3 * run.points;
-  const int64_t whole = run.count / kLanes * kLanes, rest = run.count - whole;
+  const int64_t whole = run.count / kGroup * kGroup, rest = run.count - whole;
   Padded<T> last(vertices + 3 * whole, rest);
-  for (int64_t n = 0; n < run.count; n += kLanes)  // one call, so that it is inlined into each clone
+  for (int64_t n = 0; n < run.count; n += kGroup)  // one call, so that it is inlined into each clone
     forward_lanes<T, kPerspective, kDistorted>(lens, n < whole ? vertices + 3 * n : last.vertices, n < whole ? points + 3 * n : last.out);
   std::copy_n(last.out, 3 * rest, points + 3 * whole);
 }
@@ -221,14 +223,14 @@ NMR_INLINE void forward_run_body(const Project<T>& args, const Run& run) {
 
 template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
 NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run, T* grad_vertices, double* total) {
-  T sums[kSums][kLanes] = {};
+  T sums[kSums][kGroup] = {};
   const T* vertices = args.vertices + 3 * run.vertices;
   const T* grad_points = args.grad_points + 3 * run.points;
-  const int64_t whole = run.count / kLanes * kLanes, rest = run.count - whole;
+  const int64_t whole = run.count / kGroup * kGroup, rest = run.count - whole;
   Padded<T> last(vertices + 3 * whole, rest);
   std::copy_n(grad_points + 3 * whole, 3 * rest, last.grad_points);
   std::copy_n(grad_vertices + 3 * whole, 3 * rest, last.out);
-  for (int64_t n = 0; n < run.count; n += kLanes) {
+  for (int64_t n = 0; n < run.count; n += kGroup) {
     const bool inside = n < whole;
     backward_lanes<T, kPerspective, kDistorted, kSumCamera>(lens, inside ? vertices + 3 * n : last.vertices,
                                                             inside ? grad_points + 3 * n : last.grad_points,
@@ -238,7 +240,7 @@ NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, con
   if (!kSumCamera) return;
   for (int k = 0; k < kSums; ++k) {
     total[k] = 0;
-    for (int l = 0; l < kLanes; ++l) total[k] += static_cast<double>(sums[k][l]);
+    for (int l = 0; l < kGroup; ++l) total[k] += static_cast<double>(sums[k][l]);
   }
   // u depends on v - origin and q on p / extent.
   const double* t = total;

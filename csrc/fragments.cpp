@@ -207,6 +207,14 @@ NMR_INLINE T moderate_or_zero(T value) {
   return std::abs(value) < std::sqrt(std::numeric_limits<T>::max()) ? value : T(0);
 }
 
+// The square of a depth, as a factor of a gradient: 0 beyond the depth up to which sums of squares cannot overflow.
+template <class T> constexpr T kDeepest = T(1e100);
+template <> constexpr float kDeepest<float> = 1e15f;
+template <class T>
+NMR_INLINE T depth_or_zero(T z) {
+  return std::abs(z) < kDeepest<T> ? z : T(0);
+}
+
 // grad z_k = S_k / z_k^2, grad X_k = S_k sum_m M_m0 / z_m with S_k = sum over pixels of g z^2 w_k.
 template <class T>
 NMR_INLINE void depth_gradients(const FragmentScratch<T>& scratch, Size raster, FaceGradients<T>& result) {
@@ -249,7 +257,7 @@ NMR_INLINE void depth_gradient_block_body(const DepthImage<T>& args, const Block
       std::copy_n(args.grad_depth + b * args.image.pixels() + j * w, w, grad);
     }
     for (int64_t n = 0; n < last - first; ++n) {
-      const T c = grad[first + n] * row.z[n] * row.z[n];
+      const T z = depth_or_zero(row.z[n]), c = grad[first + n] * z * z;
       for (int k = 0; k < 3; ++k) terms[4 * n + k] = c * row.w[k][n];
       terms[4 * n + 3] = 0;
     }
@@ -307,7 +315,7 @@ NMR_INLINE void fragments_gradient_block_body(const Fragments<T>& args, const Bl
       const int64_t i = first + n;
       const T w[4] = {row.w[0][n], row.w[1][n], row.w[2][n], 0}, z = row.z[n];
       T h[3];
-      const T pull = grad_depth ? -grad_depth[i] * z * z : T(0);
+      const T deep = depth_or_zero(z), pull = grad_depth ? -grad_depth[i] * deep * deep : T(0);
       for (int m = 0; m < 3; ++m) h[m] = pull;
       if (grad_weights) {
         const bool reversed = owner[i] >= block.num_faces;

@@ -77,17 +77,21 @@ void pose_forward(const Pose<T>& args) {
   }
 }
 
-// In double: for float inputs, divisions by numbers as small as 1e-5 then cannot overflow.
+// In double: for float inputs, divisions by numbers as small as 1e-5 then cannot overflow. An upstream gradient that is infinite or
+// NaN makes the gradient NaN.
 template <class T>
 void pose_backward(const Pose<T>& args) {
   const double largest = std::numeric_limits<T>::max();
   for (int64_t b = 0; b < args.batch; ++b) {
     Vec3<double> grad_forward = Vec3<double>::Zero(), grad_up = Vec3<double>::Zero();
     const Axes<T> axes(args, b);
-    if (axes.usable) {
+    const Eigen::Map<const Matrix34<T>> grad_matrix(args.grad_matrix + 12 * b);
+    if (axes.usable && !grad_matrix.allFinite()) {
+      grad_forward.setConstant(std::numeric_limits<double>::quiet_NaN());
+      grad_up = grad_forward;
+    } else if (axes.usable) {
       const Vec3<double> up = axes.up.template cast<double>();
       const Vec3<double> x = axes.x.template cast<double>(), z = axes.z.template cast<double>();
-      const Eigen::Map<const Matrix34<T>> grad_matrix(args.grad_matrix + 12 * b);
       const Eigen::Matrix<double, 3, 3> grad_rows = grad_matrix.template leftCols<3>().transpose().template cast<double>();
       Vec3<double> grad_x = grad_rows.col(0), grad_z = grad_rows.col(2);
       const Vec3<double> grad_upright = normalized_backward(axes.upright.template cast<double>(), -grad_rows.col(1));  // of z x x

@@ -1,8 +1,8 @@
 // Smoothness loss: sum over edges of (1 + cos(theta))^2, where theta is the angle between the two faces at the edge (cos = -1 when
 // flat), with Kato's guards against division by zero. theta is the angle between the heights of the two faces over the edge.
 //
-// All meshes share the edges, so kLanes meshes are processed together, one per lane: their vertices are interleaved first, and every
-// load and every sum of the gradient is a whole vector. The remaining meshes are processed one by one, kLanes edges at a time. Both
+// All meshes share the edges, so kGroup meshes are processed together, one per lane: their vertices are interleaved first, and every
+// load and every sum of the gradient is a whole vector. The remaining meshes are processed one by one, kGroup edges at a time. Both
 // ways sum a mesh's edges in the same order, and give the same bits.
 #include <algorithm>
 #include <cmath>
@@ -15,7 +15,7 @@ namespace nmr {
 namespace {
 
 constexpr double kGuard = 1e-6;  // added to every squared length and denominator
-constexpr int kLanes = 16;
+constexpr int kGroup = 16;
 constexpr int kCoordinates = 12;  // x, y, z of an edge's first and second vertex and of the two opposite ones
 
 template <class T>
@@ -119,34 +119,34 @@ NMR_INLINE void edge_backward(const Vec3<T>& origin, const Vec3<T>& end, const V
   height_backward(a, b2, h2, grad_dot * h1.vector, grad_denominator * h1.length, grad_end, grad_right);
 }
 
-// kLanes points, as [3, kLanes].
+// kGroup points, as [3, kGroup].
 template <class T>
 NMR_INLINE Vec3<T> point(const T* points, int l) {
-  return {points[l], points[kLanes + l], points[2 * kLanes + l]};
+  return {points[l], points[kGroup + l], points[2 * kGroup + l]};
 }
 template <class T>
 NMR_INLINE void set_point(T* points, int l, const Vec3<T>& p) {
   points[l] = p.x;
-  points[kLanes + l] = p.y;
-  points[2 * kLanes + l] = p.z;
+  points[kGroup + l] = p.y;
+  points[2 * kGroup + l] = p.z;
 }
 
 template <class T>
 NMR_INLINE void lanes_forward(const T* __restrict origin, const T* __restrict end, const T* __restrict left,
                               const T* __restrict right, T* __restrict loss) {
-  for (int l = 0; l < kLanes; ++l) loss[l] = edge_loss(point(origin, l), point(end, l), point(left, l), point(right, l));
+  for (int l = 0; l < kGroup; ++l) loss[l] = edge_loss(point(origin, l), point(end, l), point(left, l), point(right, l));
 }
 
 template <class T>
 NMR_INLINE void lanes_backward(const T* __restrict origin, const T* __restrict end, const T* __restrict left,
                                const T* __restrict right, const T* __restrict grad_loss, T* __restrict grad) {
-  for (int l = 0; l < kLanes; ++l) {
+  for (int l = 0; l < kGroup; ++l) {
     Vec3<T> g1, g2, g3;
     edge_backward(point(origin, l), point(end, l), point(left, l), point(right, l), grad_loss[l], g1, g2, g3);
     set_point(grad, l, T(-1) * (g1 + g2 + g3));
-    set_point(grad + 3 * kLanes, l, g1);
-    set_point(grad + 6 * kLanes, l, g2);
-    set_point(grad + 9 * kLanes, l, g3);
+    set_point(grad + 3 * kGroup, l, g1);
+    set_point(grad + 6 * kGroup, l, g2);
+    set_point(grad + 9 * kGroup, l, g3);
   }
 }
 
@@ -155,48 +155,48 @@ NMR_INLINE void add(const T* __restrict values, T* __restrict sums) {
   for (int64_t n = 0; n < count; ++n) sums[n] += values[n];
 }
 
-// Converts kLanes meshes, from image b on: [V * 3] of each <-> [V * 3, kLanes].
+// Converts kGroup meshes, from image b on: [V * 3] of each <-> [V * 3, kGroup].
 template <class T>
 NMR_INLINE void interleave(const T* from, int64_t rows, T* to) {
   for (int64_t r = 0; r < rows; ++r)
-    for (int l = 0; l < kLanes; ++l) to[r * kLanes + l] = from[l * rows + r];
+    for (int l = 0; l < kGroup; ++l) to[r * kGroup + l] = from[l * rows + r];
 }
 template <class T>
 NMR_INLINE void separate(const T* from, int64_t rows, T* to) {
-  for (int l = 0; l < kLanes; ++l)
-    for (int64_t r = 0; r < rows; ++r) to[l * rows + r] = from[r * kLanes + l];
+  for (int l = 0; l < kGroup; ++l)
+    for (int64_t r = 0; r < rows; ++r) to[l * rows + r] = from[r * kGroup + l];
 }
 
 template <class T>
 struct SmoothnessScratch {
-  std::vector<T> vertices, grad;  // [V, 3, kLanes]
+  std::vector<T> vertices, grad;  // [V, 3, kGroup]
 };
 
 template <class T>
 NMR_INLINE void meshes_forward_body(const Smoothness<T>& args, int64_t b, T* vertices) {
   interleave(args.vertices + b * args.num_vertices * 3, args.num_vertices * 3, vertices);
-  double sum[kLanes] = {};
+  double sum[kGroup] = {};
   for (int64_t n = 0; n < args.num_edges; ++n) {
     const int64_t* e = args.edges + 4 * n;
-    constexpr int64_t stride = 3 * kLanes;
-    T loss[kLanes];
+    constexpr int64_t stride = 3 * kGroup;
+    T loss[kGroup];
     lanes_forward(vertices + stride * e[0], vertices + stride * e[1], vertices + stride * e[2], vertices + stride * e[3], loss);
-    for (int l = 0; l < kLanes; ++l) sum[l] += static_cast<double>(loss[l]);
+    for (int l = 0; l < kGroup; ++l) sum[l] += static_cast<double>(loss[l]);
   }
-  for (int l = 0; l < kLanes; ++l) args.loss[b + l] = static_cast<T>(sum[l]);
+  for (int l = 0; l < kGroup; ++l) args.loss[b + l] = static_cast<T>(sum[l]);
 }
 
 template <class T>
 NMR_INLINE void meshes_backward_body(const Smoothness<T>& args, int64_t b, T* vertices, T* grad) {
   const int64_t rows = args.num_vertices * 3;
   interleave(args.vertices + b * rows, rows, vertices);
-  std::fill_n(grad, rows * kLanes, T(0));
-  T grad_loss[kLanes];
-  for (int l = 0; l < kLanes; ++l) grad_loss[l] = args.grad_loss[b + l];
+  std::fill_n(grad, rows * kGroup, T(0));
+  T grad_loss[kGroup];
+  for (int l = 0; l < kGroup; ++l) grad_loss[l] = args.grad_loss[b + l];
   for (int64_t n = 0; n < args.num_edges; ++n) {
     const int64_t* e = args.edges + 4 * n;
-    constexpr int64_t stride = 3 * kLanes;
-    T g[kCoordinates][kLanes];
+    constexpr int64_t stride = 3 * kGroup;
+    T g[kCoordinates][kGroup];
     lanes_backward(vertices + stride * e[0], vertices + stride * e[1], vertices + stride * e[2], vertices + stride * e[3],
                    grad_loss, g[0]);
     for (int i = 0; i < 4; ++i) add<stride>(g[3 * i], grad + stride * e[i]);
@@ -204,10 +204,10 @@ NMR_INLINE void meshes_backward_body(const Smoothness<T>& args, int64_t b, T* ve
   separate(grad, rows, args.grad_vertices + b * rows);
 }
 
-// kLanes edges of one mesh; if there are fewer, the last one is repeated.
+// kGroup edges of one mesh; if there are fewer, the last one is repeated.
 template <class T>
-NMR_INLINE void gather(const T* vertices, const int64_t* edges, int64_t count, T (&points)[kCoordinates][kLanes]) {
-  for (int64_t l = 0; l < kLanes; ++l) {
+NMR_INLINE void gather(const T* vertices, const int64_t* edges, int64_t count, T (&points)[kCoordinates][kGroup]) {
+  for (int64_t l = 0; l < kGroup; ++l) {
     const int64_t* e = edges + 4 * std::min(l, count - 1);
     for (int k = 0; k < kCoordinates; ++k) points[k][l] = vertices[3 * e[k / 3] + k % 3];
   }
@@ -217,9 +217,9 @@ template <class T>
 NMR_INLINE void mesh_forward_body(const Smoothness<T>& args, int64_t b) {
   const T* vertices = args.vertices + b * args.num_vertices * 3;
   double sum = 0;
-  for (int64_t n = 0; n < args.num_edges; n += kLanes) {
-    const int64_t count = std::min<int64_t>(kLanes, args.num_edges - n);
-    T p[kCoordinates][kLanes], loss[kLanes];
+  for (int64_t n = 0; n < args.num_edges; n += kGroup) {
+    const int64_t count = std::min<int64_t>(kGroup, args.num_edges - n);
+    T p[kCoordinates][kGroup], loss[kGroup];
     gather(vertices, args.edges + 4 * n, count, p);
     lanes_forward(p[0], p[3], p[6], p[9], loss);
     for (int64_t l = 0; l < count; ++l) sum += static_cast<double>(loss[l]);
@@ -232,11 +232,11 @@ NMR_INLINE void mesh_backward_body(const Smoothness<T>& args, int64_t b) {
   const T* vertices = args.vertices + b * args.num_vertices * 3;
   T* grad = args.grad_vertices + b * args.num_vertices * 3;
   std::fill_n(grad, args.num_vertices * 3, T(0));
-  T grad_loss[kLanes];
-  std::fill_n(grad_loss, kLanes, args.grad_loss[b]);
-  for (int64_t n = 0; n < args.num_edges; n += kLanes) {
-    const int64_t count = std::min<int64_t>(kLanes, args.num_edges - n);
-    T p[kCoordinates][kLanes], g[kCoordinates][kLanes];
+  T grad_loss[kGroup];
+  std::fill_n(grad_loss, kGroup, args.grad_loss[b]);
+  for (int64_t n = 0; n < args.num_edges; n += kGroup) {
+    const int64_t count = std::min<int64_t>(kGroup, args.num_edges - n);
+    T p[kCoordinates][kGroup], g[kCoordinates][kGroup];
     gather(vertices, args.edges + 4 * n, count, p);
     lanes_backward(p[0], p[3], p[6], p[9], grad_loss, g[0]);
     for (int64_t l = 0; l < count; ++l) {
@@ -255,15 +255,15 @@ NMR_CLONES void mesh_forward(const Smoothness<double>& args, int64_t b) { mesh_f
 NMR_CLONES void mesh_backward(const Smoothness<float>& args, int64_t b) { mesh_backward_body(args, b); }
 NMR_CLONES void mesh_backward(const Smoothness<double>& args, int64_t b) { mesh_backward_body(args, b); }
 
-// Calls meshes(b) for groups of kLanes images from b on, and mesh(b) for each remaining image.
+// Calls meshes(b) for groups of kGroup images from b on, and mesh(b) for each remaining image.
 template <class Meshes, class Mesh>
 void for_groups(int64_t batch, int num_threads, const Meshes& meshes, const Mesh& mesh) {
-  const int64_t groups = batch / kLanes;
-  parallel_for(groups + batch % kLanes, num_threads, [&](int64_t i) {
+  const int64_t groups = batch / kGroup;
+  parallel_for(groups + batch % kGroup, num_threads, [&](int64_t i) {
     if (i < groups)
-      meshes(i * kLanes);
+      meshes(i * kGroup);
     else
-      mesh(groups * kLanes + i - groups);
+      mesh(groups * kGroup + i - groups);
   });
 }
 
@@ -272,7 +272,7 @@ void for_groups(int64_t batch, int num_threads, const Meshes& meshes, const Mesh
 template <class T>
 void smoothness_forward(const Smoothness<T>& args) {
   const auto meshes = [&](int64_t b) {
-    meshes_forward(args, b, reserve(thread_scratch<SmoothnessScratch<T>>().vertices, args.num_vertices * 3 * kLanes));
+    meshes_forward(args, b, reserve(thread_scratch<SmoothnessScratch<T>>().vertices, args.num_vertices * 3 * kGroup));
   };
   for_groups(args.batch, args.num_threads, meshes, [&](int64_t b) { mesh_forward(args, b); });
 }
@@ -281,8 +281,8 @@ template <class T>
 void smoothness_backward(const Smoothness<T>& args) {
   const auto meshes = [&](int64_t b) {
     SmoothnessScratch<T>& scratch = thread_scratch<SmoothnessScratch<T>>();
-    T* vertices = reserve(scratch.vertices, args.num_vertices * 3 * kLanes);
-    meshes_backward(args, b, vertices, reserve(scratch.grad, args.num_vertices * 3 * kLanes));
+    T* vertices = reserve(scratch.vertices, args.num_vertices * 3 * kGroup);
+    meshes_backward(args, b, vertices, reserve(scratch.grad, args.num_vertices * 3 * kGroup));
   };
   for_groups(args.batch, args.num_threads, meshes, [&](int64_t b) { mesh_backward(args, b); });
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,6 +26,7 @@ Scalars = float | Sequence[float] | Tensor
 
 # Camera axes have y down, renderer space has y up.
 _Y_UP = torch.tensor([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]], device="cpu")
+_SHORTEST = 1e-5  # a shorter up x forward is not stretched to a unit vector (pose.cpp)
 _NARROWEST_DEG = 1e-9  # float32 can still represent 1 / tan of this angle
 
 
@@ -78,6 +80,26 @@ def _check_pose(camera: ProjectingCamera, *names: str, **scalar: float | Tensor)
     )
 
 
+def _warn_if_up_is_ahead(forward: Tensor, up: Tensor) -> None:
+    """Warns of cameras that look along their up vector, and so see nothing; not when compiled, traced or on a GPU."""
+    if torch.compiler.is_compiling() or forward.device.type != "cpu" or up.device.type != "cpu":
+        return
+    forward, up = (batched(x.detach(), torch.float64, 3) for x in (forward, up))
+    forward = forward / forward.norm(dim=-1, keepdim=True)
+    sideways = torch.linalg.cross(*torch.broadcast_tensors(up, forward))
+    ahead = sideways.norm(dim=-1) < _SHORTEST  # False for NaN
+    try:
+        which = ahead.nonzero().flatten().tolist()
+    except RuntimeError:  # inside torch.func.vmap values cannot be read
+        return
+    if which:
+        warnings.warn(
+            f"camera {which[0]} of {len(ahead)} looks along its up vector ({len(which)} in all): it has no left and "
+            "right, and its image is empty. Give it another up, for example up=(0, 0, 1) to look straight down.",
+            stacklevel=4,
+        )
+
+
 def _between(eye: Tensor, at: Tensor) -> Tensor:
     return batched(at, torch.float64, 3) - batched(eye, torch.float64, 3)
 
@@ -104,7 +126,8 @@ class LookAt(SquarePixels):
 
     A vertex v maps to ``u = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at - eye)``, then to
     ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``; n(v) = v / max(abs(v), 1e-5). An eye straight above or below ``at``
-    gives x = y = 0, not an error. The world is left-handed (x right, y up, z away), as in the published renderer.
+    gives x = y = 0, as published: an empty image, and a UserWarning that asks for another ``up``. The world
+    is left-handed (x right, y up, z away), as in the published renderer.
 
     Parameters
     ----------
@@ -134,13 +157,20 @@ class LookAt(SquarePixels):
 
     def __post_init__(self) -> None:
         _check_pose(self, "eye", "at", "up", half_fov_deg=_fov(self.half_fov_deg))
+        _warn_if_up_is_ahead(_between(self.eye, self.at), self.up)
 
     @classmethod
     def from_angles(
-        cls, distance: Scalars, elevation_deg: Scalars, azimuth_deg: Scalars, *, half_fov_deg: Scalars = 30.0
+        cls,
+        distance: Scalars,
+        elevation_deg: Scalars,
+        azimuth_deg: Scalars,
+        *,
+        up: Numbers = (0.0, 1.0, 0.0),
+        half_fov_deg: Scalars = 30.0,
     ) -> LookAt:
-        """The camera that looks at the origin from :func:`points_from_angles`."""
-        return cls(eye=points_from_angles(distance, elevation_deg, azimuth_deg), half_fov_deg=half_fov_deg)
+        """The camera that looks at the origin from :func:`points_from_angles`; straight down needs another ``up``."""
+        return cls(eye=points_from_angles(distance, elevation_deg, azimuth_deg), up=up, half_fov_deg=half_fov_deg)
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         return _posed(self.eye, _between(self.eye, self.at), self.up, dtype, **_perspective(self.half_fov_deg, dtype))
@@ -171,6 +201,7 @@ class Look(SquarePixels):
 
     def __post_init__(self) -> None:
         _check_pose(self, "eye", "direction", "up", half_fov_deg=_fov(self.half_fov_deg))
+        _warn_if_up_is_ahead(self.direction, self.up)
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         return _posed(self.eye, self.direction, self.up, dtype, **_perspective(self.half_fov_deg, dtype))
@@ -204,6 +235,7 @@ class Orthographic(SquarePixels):
     def __post_init__(self) -> None:
         scale = _scalar(self.scale, "scale", 0, math.inf, "between 0 and infinity")
         _check_pose(self, "eye", "at", "up", scale=scale)
+        _warn_if_up_is_ahead(_between(self.eye, self.at), self.up)
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         scale = batched(self.scale, dtype, 1, 1) if isinstance(self.scale, Tensor) else self.scale

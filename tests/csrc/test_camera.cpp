@@ -171,6 +171,46 @@ TEST_REAL(project_of_vertices_that_have_no_image) {
     }
 }
 
+// An upstream gradient that is infinite or NaN must be seen: it makes the gradient of its vertex and of its camera NaN, and no other.
+// One that is finite but would overflow counts as 0.
+TEST_REAL(project_passes_on_gradients_that_are_not_finite) {
+  const T inf = std::numeric_limits<T>::infinity(), nan = std::numeric_limits<T>::quiet_NaN(), huge = std::numeric_limits<T>::max();
+  for_each_camera([&](int64_t vertex_batch, bool perspective, bool distorted, bool placed, bool packed) {
+    for (T upstream : {inf, -inf, nan, huge})
+      for (int k = 0; k < 3; ++k) {
+        const Camera<T> camera(vertex_batch, perspective, distorted, placed, packed);
+        std::vector<T> grad_points = noise_array<T>(7, 3 * camera.outputs());
+        grad_points[3 * 2 + k] = upstream;  // of vertex 2 in image 0
+        std::vector<T> grad_vertices = unwritten<T>(camera.vertices.size()), grad_matrix = unwritten<T>(36);
+        std::vector<T> grad_intrinsics = unwritten<T>(18);
+        Project<T> call = camera.args(1);
+        call.grad_points = grad_points.data();
+        call.grad_vertices = grad_vertices.data();
+        call.grad_matrix = grad_matrix.data();
+        call.grad_intrinsics = grad_intrinsics.data();
+        project_backward(call);
+        for (size_t n = 0; n < grad_vertices.size(); ++n) CHECK_EQUAL(std::isfinite(grad_vertices[n]), upstream == huge || n / 3 != 2);
+        bool seen = false;
+        for (size_t n = 0; n < 12; ++n) seen = seen || std::isnan(grad_matrix[n]);
+        CHECK_EQUAL(seen, upstream != huge);
+        for (size_t n = 12; n < 36; ++n) CHECK(std::isfinite(grad_matrix[n]));
+        for (size_t n = 6; n < 18; ++n) CHECK(std::isfinite(grad_intrinsics[n]));
+      }
+  });
+}
+
+TEST_REAL(pose_passes_on_gradients_that_are_not_finite) {
+  const std::vector<T> forward = noise_array<T>(1, 6), up = noise_array<T>(2, 6);
+  const T inf = std::numeric_limits<T>::infinity(), nan = std::numeric_limits<T>::quiet_NaN();
+  for (T upstream : {inf, -inf, nan}) {
+    std::vector<T> grad_matrix = noise_array<T>(3, 24), grad_forward = unwritten<T>(6), grad_up = unwritten<T>(6);
+    grad_matrix[9] = upstream;
+    pose_backward(Pose<T>{forward.data(), up.data(), 2, nullptr, grad_matrix.data(), grad_forward.data(), grad_up.data()});
+    for (int n = 0; n < 6; ++n) CHECK(n < 3 ? std::isnan(grad_forward[n]) : std::isfinite(grad_forward[n]));
+    for (int n = 0; n < 6; ++n) CHECK(n < 3 ? std::isnan(grad_up[n]) : std::isfinite(grad_up[n]));
+  }
+}
+
 // Rows x, -y, z of a rotation; z along forward, and up seen upwards.
 TEST_REAL(a_pose_is_a_rotation_that_looks_along_its_direction) {
   const std::vector<T> forward = noise_array<T>(1, 30), up = noise_array<T>(2, 30);

@@ -97,6 +97,32 @@ TEST_REAL(depth_images_are_means_of_the_fragments) {
   }
 }
 
+// Depths whose square overflows: the gradient is a number, and that of faces at ordinary depths does not change.
+TEST_REAL(depths_whose_square_overflows_have_finite_gradients) {
+  const T limit = std::numeric_limits<T>::max();
+  const Mesh mesh{{-0.9, -0.9, 1, -0.1, -0.9, 2, -0.9, 0.9, 3, 0.1, -0.9, 1, 0.9, -0.9, 1, 0.9, 0.9, 1}, {0, 1, 2, 3, 4, 5}};
+  std::vector<T> usual[2];
+  for (T deep : {T(2), 2 * std::sqrt(limit), std::sqrt(limit) / 2, limit / 4}) {
+    Scene<T> scene = single<T>(mesh);
+    for (int k = 3; k < 6; ++k) scene.vertices[3 * k + 2] = deep;
+    scene.far = limit;
+    scene.anti_aliasing = false;
+    const std::vector<int32_t> owner = owner_of(scene);
+    CHECK(std::count_if(owner.begin(), owner.end(), [](int32_t id) { return id % 2 == 1; }) > 0);
+    const std::vector<T> upstream = noise_array<T>(5, scene.pixels()), of_weights = noise_array<T>(6, 3 * scene.pixels());
+    std::vector<T> grad[2] = {unwritten<T>(18), unwritten<T>(18)};
+    depth_backward(DepthImage<T>{scene.mesh(), scene.image, false, scene.far, owner.data(), nullptr, upstream.data(), grad[0].data(), 1});
+    fragments_backward(Fragments<T>{scene.mesh(), scene.raster(), scene.far, owner.data(), nullptr, nullptr, of_weights.data(),
+                                    upstream.data(), grad[1].data(), 1});
+    for (int which = 0; which < 2; ++which) {
+      for (T g : grad[which]) CHECK(std::isfinite(g));
+      grad[which].resize(9);
+      if (deep == 2) usual[which] = grad[which];
+      CHECK(grad[which] == usual[which]);
+    }
+  }
+}
+
 // Central differences with the owner map held fixed.
 void check_derivative(Size image_size) {
   Scene<double> scene = pack<double>(meshes());

@@ -1,6 +1,7 @@
 """Cameras: geometry, published values and gradients, batches, packed meshes, vertices without an image, errors."""
 
 import math
+import warnings
 from dataclasses import replace
 
 import hypothesis.extra.numpy as hnp
@@ -283,7 +284,28 @@ def test_compile():
 
 
 def test_eye_on_the_up_axis_is_degenerate_but_finite():
-    assert nmr.LookAt([0.0, 2.0, 0.0]).transform(torch.rand(1, 4, 3)).isfinite().all()
+    with pytest.warns(UserWarning, match="looks along its up vector"):
+        camera = nmr.LookAt([0.0, 2.0, 0.0])
+    assert camera.transform(torch.rand(1, 4, 3)).isfinite().all()
+
+
+def test_looking_straight_down_warns_and_another_up_shows_the_object():
+    sphere, faces = nmr.icosphere(1)
+    with pytest.warns(UserWarning, match="camera 1 of 2 looks along its up vector .* up="):
+        camera = nmr.LookAt.from_angles(3.0, [30.0, 90.0], 0.0)
+    alpha = nmr.render_silhouette(sphere, faces, camera, image_size=16)
+    assert alpha[0].any() and not alpha[1].any()
+    for down in (
+        lambda up: nmr.Look([0.0, 3.0, 0.0], [0.0, -1.0, 0.0], up),
+        lambda up: nmr.Orthographic([0.0, 3.0, 0.0], up=up),
+        lambda up: nmr.LookAt.from_angles(3.0, -90.0, 0.0, up=up),
+    ):
+        with pytest.warns(UserWarning, match="camera 0 of 1"):
+            down((0.0, 2.0, 0.0))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            camera = down((0.0, 0.0, 1.0))
+        assert nmr.render_silhouette(sphere, faces, camera, image_size=16).any()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
