@@ -159,6 +159,26 @@ def test_gradients_of_depth_and_normals_in_the_middle(output, size):
     close(results[1], results[0], 1e-5)
 
 
+@pytest.mark.parametrize("size", [WIDE, TALL])
+def test_a_floor_under_the_eye_is_clipped(size):
+    """It fills the lower half of any image, whatever lies behind the eye; the middle is the square image."""
+    camera = nmr.Look([0.0, 1.0, 0.0], [0.0, 0.0, 1.0], half_fov_deg=40.0)
+    floor = torch.tensor([[-90.0, 0, -90], [90, 0, -80], [85, 0, 90], [-80, 0, 85]], dtype=torch.float64)
+    faces, results = torch.tensor([[0, 1, 2], [0, 2, 3]]), []
+    for shape in ((SIZE, SIZE), size):
+        leaf = floor.clone().requires_grad_()
+        depth = nmr.render_depth(leaf, faces, camera, image_size=shape, anti_aliasing=False)
+        index = nmr.render_face_index(leaf, faces, camera, image_size=shape)
+        half = shape[0] // 2
+        assert (index[:, half + 1 :] >= 0).all() and (index[:, :half] == -1).all()
+        middle = middle_of(depth, shape)
+        (middle * torch.linspace(-1, 1, SIZE, dtype=torch.float64)).sum().backward()
+        results.append((middle.detach(), middle_of(index, shape), leaf.grad))
+    for actual, expected in zip(results[1], results[0], strict=True):
+        close(actual.double(), expected.double(), 1e-5)
+    assert results[0][2].any()
+
+
 def across(vertices):
     """Coordinates in renderer space of the transposed picture: rows become columns."""
     return vertices[..., [1, 0, 2]] * vertices.new_tensor([-1, -1, 1])

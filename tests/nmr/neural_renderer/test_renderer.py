@@ -269,6 +269,27 @@ def test_silhouettes_and_depth_have_their_own_range_as_published():
     assert not alpha.any() and torch.all(depth == 1.5)
 
 
+def test_faces_that_cross_the_plane_of_the_eye_are_not_clipped():
+    """As published: x and y of a vertex behind the eye are divided by a negative depth."""
+    vertices = torch.tensor([[[-1.0, -0.5, 0.5], [1, -0.5, 0.5], [0.3, -0.5, -4]]])
+    faces, options = torch.tensor([[[0, 1, 2]]]), dict(image_size=16)
+    renderer = nr.Renderer(camera_mode="look", image_size=16)
+    renderer.eye = [0, 0, -1]
+    _, depth, alpha = renderer(vertices, faces, torch.ones(1, 1, 2, 2, 2, 3))
+    on_screen = nr.perspective(nr.look(vertices, renderer.eye, [0, 0, 1]))
+    by_hand = nr.rasterize_silhouettes(
+        nr.vertices_to_faces(on_screen, torch.cat([faces, faces.flip(-1)], 1)), **options
+    )
+    for clip in (True, False):
+        wanted = nmr.render_silhouette(vertices, faces[0], nmr.Look(renderer.eye), clip=clip, **options)
+        assert wanted.any()
+        for silhouette in (renderer.render_silhouettes(vertices, faces), alpha, by_hand):
+            assert torch.equal(silhouette, wanted) != clip
+        wanted = nmr.render_depth(vertices, faces[0], nmr.Look(renderer.eye), clip=clip, **options)
+        for image in (renderer.render_depth(vertices, faces), depth):
+            assert torch.equal(image, wanted) != clip
+
+
 def test_light_without_direction_leaves_flat_colours():
     vertices, faces = sphere()
     renderer = nr.Renderer(camera_mode="look_at", image_size=16, anti_aliasing=False)
