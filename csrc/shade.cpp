@@ -1,39 +1,12 @@
 // Colours from texture cubes, and interpolation of values given at the corners of faces. Both read the owner map and the
 // perspective-correct weights, in the vertex order of the original face, so that reversed copies are not special.
 #include <algorithm>
-#include <type_traits>
-#include <utility>
 #include <vector>
 
-#include "blocks.h"
-#include "parallel.h"
-#include "stages.h"
+#include "corner_values.h"
 
 namespace nmr {
 namespace {
-
-constexpr int64_t kRows = 8;  // raster rows processed together in forward passes
-
-// Calls body(b, row) for every row of every raster.
-template <class Body>
-void for_rows(int64_t batch, int64_t height, int num_threads, const Body& body) {
-  const int64_t tiles = (height + kRows - 1) / kRows;
-  parallel_for(batch * tiles, num_threads, [&](int64_t n) {
-    const int64_t first = n % tiles * kRows;
-    for (int64_t row = first; row < std::min(first + kRows, height); ++row) body(n / tiles, row);
-  });
-}
-
-// Calls body(c) with c the number of channels as a compile-time constant if it is 1, 3 or 4, and with c = 0 for other numbers.
-template <class Body>
-void with_channels(int64_t channels, const Body& body) {
-  switch (channels) {
-    case 1: return body(std::integral_constant<int64_t, 1>());
-    case 3: return body(std::integral_constant<int64_t, 3>());
-    case 4: return body(std::integral_constant<int64_t, 4>());
-    default: return body(std::integral_constant<int64_t, 0>());
-  }
-}
 
 // The texels around one pixel: texture = sum over the 8 corners c of weight[c] texel[offset[c]], trilinear at t_k = b_k (ts - 1)
 // clamped to [0, ts - 1 - eps].
@@ -97,10 +70,9 @@ int64_t first_cube(const TextureCubes<T>& args, int64_t b) {
 template <class T>
 void texture_cubes_forward(const TextureCubes<T>& args) {
   with_channels(args.channels, [&](auto known) {
-    const int64_t H = args.raster.height, W = args.raster.width;
-    const int64_t C = known ? known() : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
-    for_rows(args.batch, H, args.num_threads, [&](int64_t b, int64_t row) {
-      const int64_t start = (b * H + row) * W, F = face_count(args, b);
+    const int64_t W = args.raster.width, C = known ? known() : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
+    for_rows(args.batch, args.raster.height, args.num_threads, [&](int64_t b, int64_t row) {
+      const int64_t start = (b * args.raster.height + row) * W, F = face_count(args, b);
       const T* textures = args.textures + first_cube(args, b) * cube;
       T* color = args.colors + start * C;
       for (int64_t n = start; n < start + W; ++n, color += C) {
@@ -119,9 +91,8 @@ namespace {
 // Adds the gradients of the pixels of image b whose face lies in [first_face, last_face) to its cubes.
 template <int64_t kChannels, class T>
 void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first_face, int64_t last_face) {
-  const int64_t pixels = args.raster.pixels(), C = kChannels ? kChannels : args.channels;
-  const int64_t ts = args.texture_size, cube = ts * ts * ts * C;
-  const int64_t F = face_count(args, b);
+  const int64_t C = kChannels ? kChannels : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
+  const int64_t F = face_count(args, b), pixels = args.raster.pixels();
   T* grad_textures = args.grad_textures + first_cube(args, b) * cube;
   for (int64_t n = b * pixels; n < (b + 1) * pixels; ++n) {
     const int64_t id = args.owner[n], f = id < F ? id : id - F;
@@ -157,31 +128,6 @@ void texture_cubes_backward(const TextureCubes<T>& args) {
 
 namespace {
 
-// The attribute rows and corners of image b.
-template <class T>
-struct ImageAttributes {
-  int64_t first_row;       // of attributes
-  const int64_t* corners;  // [F, 3]
-  int64_t num_faces;
-};
-
-template <class T>
-ImageAttributes<T> image_attributes(const Interpolate<T>& args, int64_t b) {
-  if (args.starts) {
-    const int64_t* s = args.starts + 2 * b;
-    return {s[0], args.corners + 3 * s[1], s[3] - s[1]};
-  }
-  return {args.attribute_batch == 1 ? 0 : b * args.num_attributes,
-          args.corners + (args.corners_per_image ? 3 * b * args.num_faces : 0), args.num_faces};
-}
-
-// Sums per visible face of a block: [count, 3, C] over its corners.
-template <class T>
-struct CornerSums {
-  VisibleFaces visible;
-  std::vector<T> values;
-};
-
 // grad_weights of a block's pixels, and its sums of b_k g.
 template <int64_t kChannels, class T>
 void interpolate_block_backward(const Interpolate<T>& args, const ImageAttributes<T>& image, const RowBlocks& blocks, int64_t b,
@@ -214,30 +160,16 @@ void interpolate_block_backward(const Interpolate<T>& args, const ImageAttribute
   }
 }
 
-template <class T>
-void scatter_corner_sums(const Interpolate<T>& args, const ImageAttributes<T>& image, const CornerSums<T>& sums) {
-  const int64_t C = args.channels, F = image.num_faces;
-  const T* value = sums.values.data() + 3 * C;  // skips the background's
-  for (int64_t n = 1; n < sums.visible.count; ++n) {
-    const int64_t id = sums.visible.ids[n];
-    const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);
-    for (int k = 0; k < 3; ++k, value += C) {
-      T* grad = args.grad_attributes + (image.first_row + corners[k]) * C;
-      for (int64_t c = 0; c < C; ++c) grad[c] += value[c];
-    }
-  }
-}
-
 }  // namespace
 
 template <class T>
 void interpolate_forward(const Interpolate<T>& args) {
   with_channels(args.channels, [&](auto known) {
-    const int64_t H = args.raster.height, W = args.raster.width, C = known ? known() : args.channels;
-    for_rows(args.batch, H, args.num_threads, [&](int64_t b, int64_t row) {
+    const int64_t W = args.raster.width, C = known ? known() : args.channels;
+    for_rows(args.batch, args.raster.height, args.num_threads, [&](int64_t b, int64_t row) {
       const ImageAttributes<T> image = image_attributes(args, b);
       const T* attributes = args.attributes + image.first_row * C;
-      const int64_t start = (b * H + row) * W;
+      const int64_t start = (b * args.raster.height + row) * W;
       T* value = args.values + start * C;
       for (int64_t n = start; n < start + W; ++n, value += C) {
         const int64_t id = args.owner[n];
@@ -267,7 +199,7 @@ void interpolate_backward(const Interpolate<T>& args) {
         });
       },
       [&](int64_t b, const CornerSums<T>& sums) {
-        if (args.grad_attributes) scatter_corner_sums(args, image_attributes(args, b), sums);
+        if (args.grad_attributes) scatter_corner_sums(sums, image_attributes(args, b), args.channels, args.grad_attributes);
       });
 }
 

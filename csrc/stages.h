@@ -218,6 +218,51 @@ struct Interpolate {
   int num_threads;
 };
 
+// How a texture continues outside [0, 1].
+enum class Wrap : int { repeat, clamp, mirror };
+
+// Mipmaps of texture images (texture.cpp): each level has half the size of the one before, rounded down, until it is one texel. A
+// texel is the mean of the part of the finer level that it covers. Smaller images repeat their last level.
+template <class T>
+struct Mipmaps {
+  int64_t images, levels;  // I, L
+  const int64_t* grids;    // [I, L, 3]: first texel, height, width of each level in the pyramid
+  int64_t channels;        // C
+  const T* texels;         // the images end to end [., C]
+  T* pyramid;              // forward out [., C]: level 0 is the image itself
+  const T* grad_pyramid;   // backward in
+  T* grad_texels;          // backward out, like texels
+  int num_threads;
+};
+
+// Colours from texture images at interpolated uv coordinates (texture.cpp); bilinear, and linear between mipmaps if level is given.
+// A coordinate that is not finite, or not below 1e6, counts as 0.
+template <class T>
+struct SampleUV {
+  Interpolate<T> uv;       // attributes: the uv coordinates, 2 channels
+  const T* texels;         // [N, C], images (or pyramids) end to end
+  int64_t num_texels;      // N
+  int64_t channels;        // C
+  const int64_t* grids;    // [I, L, 3]: first texel, height, width of each level of each image
+  int64_t images, levels;  // I is 1 (shared) or B; L
+  const T* level;          // [B, H, W] in [0, L - 1], or nullptr: level 0 everywhere
+  Wrap wrap;
+  T* colors;               // forward out [B, H, W, C]; 0 on background
+  const T* grad_colors;    // backward in
+  T* grad_texels;          // backward out, like texels, or nullptr
+};
+
+// The mipmap level of each pixel (texture.cpp), as OpenGL defines it: log2 of the number of texels that the pixel spans, from the
+// derivatives of uv on the screen, clamped to the levels that there are.
+template <class T>
+struct UVLevels {
+  Interpolate<T> uv;       // as in SampleUV
+  MeshBatch<T> mesh;       // in renderer space
+  const int64_t* grids;    // as in SampleUV
+  int64_t images, levels;
+  T* level;                // out [B, H, W]; 0 on background
+};
+
 // From raster pixels to image pixels: the mean of 2x2 with anti-aliasing, else a copy (edges.cpp).
 template <class T>
 struct Resolve {
@@ -286,6 +331,11 @@ template <class T> void texture_cubes_forward(const TextureCubes<T>& args);
 template <class T> void texture_cubes_backward(const TextureCubes<T>& args);
 template <class T> void interpolate_forward(const Interpolate<T>& args);
 template <class T> void interpolate_backward(const Interpolate<T>& args);
+template <class T> void mipmaps_forward(const Mipmaps<T>& args);
+template <class T> void mipmaps_backward(const Mipmaps<T>& args);
+template <class T> void sample_uv_forward(const SampleUV<T>& args);
+template <class T> void sample_uv_backward(const SampleUV<T>& args);
+template <class T> void uv_levels(const UVLevels<T>& args);
 template <class T> void resolve_forward(const Resolve<T>& args);
 template <class T> void resolve_backward(const Resolve<T>& args);
 template <class T> void edges_backward(const EdgesBackward<T>& args);

@@ -91,13 +91,17 @@ class Fragments:
         return self._interpolate(attributes, corners, "attributes", "corners")
 
     def _interpolate(self, attributes: object, corners: object, name: str, corners_name: str) -> Tensor:
-        values, starts, faces = check_values(attributes, name, "V, C"), self.mesh.starts, self.faces
-        if corners is None:
-            attributes = self.mesh.values(values, name, "vertex")
-        else:
-            attributes = self.mesh.values(values, name)
-            faces, starts = self.mesh.corners(corners, values, corners_name)
+        attributes, faces, starts = self._corner_values(attributes, corners, name, corners_name)
         return ops.interpolate(attributes, faces, self.owner, self.weights, starts)
+
+    def _corner_values(
+        self, attributes: object, corners: object, name: str, corners_name: str
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Checked attributes, their rows at the corners of faces, and starts, as the operators take them."""
+        values = check_values(attributes, name, "V, C")
+        if corners is None:
+            return self.mesh.values(values, name, "vertex"), self.faces, self.mesh.starts
+        return self.mesh.values(values, name), *self.mesh.corners(corners, values, corners_name)
 
     def per_face(self, values: Tensor | list[Tensor]) -> Tensor:
         """Values of faces, ``[F, C]``, ``[B, F, C]`` or a list, at each pixel: ``[B, H, W, C]``, 0 on background."""

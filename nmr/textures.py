@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from . import ops
 from ._packing import is_list
-from ._validate import check_faces, check_values, describe
+from ._validate import check_choice, check_faces, check_values, describe
 
 if TYPE_CHECKING:
     from .fragments import Fragments
@@ -142,7 +141,7 @@ class TextureCubes:
 
 @dataclass(frozen=True, eq=False)
 class UVTexture:
-    """An image mapped onto the mesh by uv coordinates, with bilinear interpolation.
+    """An image mapped onto the mesh by uv coordinates.
 
     Parameters
     ----------
@@ -156,6 +155,19 @@ class UVTexture:
         vertex have different rows.
     wrap : "repeat", "clamp" or "mirror"
         How the image continues outside [0, 1].
+    filter : "bilinear" or "mipmap"
+        "bilinear": interpolated between the four nearest texels. Where the image is drawn smaller than it is, most
+        texels are then skipped: pictures flicker, and those texels get no gradient. "mipmap" takes such colours from
+        smaller copies of the image, linearly between the two that fit best (trilinear), so that each pixel shows the
+        mean of about the texels that it covers, and every texel gets a gradient.
+
+    Notes
+    -----
+    Mipmaps: each level has half the height and half the width of the one before, rounded down, until one texel is left;
+    a texel is the mean of the area that it covers. The level of a pixel is OpenGL's,
+    ``log2(max(|d(x, y)/dX|, |d(x, y)/dY|))``, where (x, y) is the position in texels of the full image and (X, Y) that
+    in pixels of the raster, clamped to the levels that there are. The derivatives are those of the pixel's face, not
+    differences of neighbours. The level counts as a constant in gradients: it chooses a resolution, not a place.
 
     Raises
     ------
@@ -174,6 +186,7 @@ class UVTexture:
     uv: Tensor | list[Tensor]
     uv_faces: Tensor | list[Tensor] | None = None
     wrap: Literal["repeat", "clamp", "mirror"] = "repeat"
+    filter: Literal["bilinear", "mipmap"] = "bilinear"
 
     def __post_init__(self) -> None:
         for image in _each(check_values(self.image, "image", "H, W, C")):
@@ -186,48 +199,38 @@ class UVTexture:
             for faces in _each(self.uv_faces):
                 batch = len(faces) if isinstance(faces, Tensor) and faces.ndim else 0
                 check_faces(faces, batch, torch.device("cpu"), "uv_faces")
-        if self.wrap not in ("repeat", "clamp", "mirror"):
-            raise ValueError(f'wrap must be "repeat", "clamp" or "mirror", got {self.wrap!r}')
+        check_choice(self.wrap, "wrap", ops.WRAPS)
+        check_choice(self.filter, "filter", ("bilinear", "mipmap"))
 
     def sample(self, fragments: Fragments) -> Tensor:
         """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
-        uv = fragments._interpolate(self.uv, self.uv_faces, "uv", "uv_faces")
-        uv = torch.where(uv.detach().abs() < 1e6, uv, torch.zeros_like(uv))
-        texels, first, height, width = self._texels(fragments)
-        x, y = uv[..., 0] * width - 0.5, (1 - uv[..., 1]) * height - 0.5
-        column, row = x.detach().floor(), y.detach().floor()
-        right, down = (x - column).unsqueeze(-1), (y - row).unsqueeze(-1)
-        colors, nothing = 0, len(texels) - 1
-        for dy, share_y in ((0, 1 - down), (1, down)):
-            line = first + _wrapped(row.long() + dy, height, self.wrap) * width
-            for dx, share_x in ((0, 1 - right), (1, right)):
-                index = line + _wrapped(column.long() + dx, width, self.wrap)
-                index = torch.where(fragments.covered, index, nothing)
-                # embedding, not indexing: its backward pass sums in a fixed order.
-                colors = colors + share_y * share_x * F.embedding(index, texels, padding_idx=nothing)
-        return colors
+        attributes, corners, starts = fragments._corner_values(self.uv, self.uv_faces, "uv", "uv_faces")
+        at = attributes, corners, fragments.owner, fragments.weights, starts
+        texels, grids, count = self._texels(fragments)
+        level = None
+        if self.filter == "mipmap":
+            texels = ops.mipmaps(texels, grids, count)
+            level = ops.uv_levels(*fragments.mesh[:3], *at, grids)
+        return ops.sample_uv(texels, grids, level, *at, ops.WRAPS.index(self.wrap))
 
-    def _texels(self, fragments: Fragments) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """All texels ``[., C]`` and a row of zeros; first texel, height and width of each image ``[B | 1, 1, 1]``."""
+    def _texels(self, fragments: Fragments) -> tuple[Tensor, Tensor, int]:
+        """All texels ``[., C]``, where each level of each image lies (or will lie), and the number of their texels."""
         image, batch = check_values(self.image, "image", "H, W, C"), fragments.mesh.batch
         if len(image) not in (1, batch):
             raise ValueError(f"image must be one for all {batch} images drawn, or one for each, got {len(image)}")
-        sizes = torch.tensor([part.shape[:2] for part in image], device=fragments.owner.device)
-        height, width = sizes.T.reshape(2, -1, 1, 1)
-        first = torch.cumsum(height * width, 0) - height * width
-        rows = [part.reshape(-1, part.shape[-1]) for part in image]
-        texels = torch.cat([*rows, rows[0].new_zeros(1, rows[0].shape[1])])
-        return texels.to(fragments.weights), first, height, width
-
-
-def _wrapped(index: Tensor, size: Tensor, wrap: str) -> Tensor:
-    """Maps texel indices outside 0..size - 1 back into the image."""
-    if wrap == "repeat":
-        return index % size
-    if wrap == "clamp":
-        return torch.minimum(index.clamp_min(0), size - 1)
-    index = index % (2 * size)
-    return torch.minimum(index, 2 * size - 1 - index)
+        sizes = [tuple(part.shape[:2]) for part in image]
+        levels = max(max(size).bit_length() for size in sizes) if self.filter == "mipmap" else 1
+        grids, first = [], 0
+        for height, width in sizes:
+            for _ in range(levels):
+                grids.append((first, height, width))
+                first += height * width
+                height, width = max(height // 2, 1), max(width // 2, 1)
+        if isinstance(image, Tensor):
+            texels = image.reshape(-1, image.shape[-1])
+        else:
+            texels = torch.cat([part.reshape(-1, part.shape[-1]) for part in image])
+        return texels.to(fragments.weights), torch.tensor(grids, device="cpu").view(len(sizes), levels, 3), first
 
 
 def _each(values: Tensor | tuple[Tensor, ...] | list[Tensor]) -> tuple[Tensor, ...]:

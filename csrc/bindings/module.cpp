@@ -9,5 +9,6 @@ PYBIND11_MODULE(_C, m) {
   nmr::bind_fragments(m);
   nmr::bind_edges(m);
   nmr::bind_shade(m);
+  nmr::bind_texture(m);
   nmr::bind_mesh(m);
 }

@@ -19,8 +19,10 @@ from .fragments import depth_backward, depth_image, fragments, fragments_backwar
 from .mesh import smoothness, smoothness_backward, voxels
 from .raster import local_gradient, rasterize, silhouette, silhouette_backward
 from .shade import interpolate, interpolate_backward, sample_texture_cubes, texture_cubes_backward
+from .texture import WRAPS, mipmaps, mipmaps_backward, sample_uv, sample_uv_backward, uv_levels
 
 __all__ = [
+    "WRAPS",
     "clip_count",
     "clip_faces",
     "depth_backward",
@@ -31,6 +33,8 @@ __all__ = [
     "interpolate",
     "interpolate_backward",
     "local_gradient",
+    "mipmaps",
+    "mipmaps_backward",
     "pose",
     "pose_backward",
     "project",
@@ -39,10 +43,13 @@ __all__ = [
     "resolve",
     "resolve_backward",
     "sample_texture_cubes",
+    "sample_uv",
+    "sample_uv_backward",
     "silhouette",
     "silhouette_backward",
     "smoothness",
     "smoothness_backward",
     "texture_cubes_backward",
+    "uv_levels",
     "voxels",
 ]
