@@ -79,6 +79,7 @@ NMR_INLINE void covered_range(const int32_t* owner, int64_t R, int64_t& first, i
 template <class Result, class BlockCount, class Produce, class Consume>
 void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& block_count, const Produce& produce,
                 const Consume& consume) {
+  const ScratchUse use;
   if (!shared && batch >= num_threads) {
     parallel_for(batch, num_threads, [&](int64_t b) {
       Result& result = thread_scratch<Result>();

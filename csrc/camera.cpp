@@ -305,12 +305,14 @@ void write(const double* sum, int count, T* grad, int64_t b) {
 
 template <class T>
 void project_forward(const Project<T>& args) {
+  const ScratchUse use;
   const std::vector<Run>& runs = runs_of(args, thread_scratch<ProjectScratch>());
   parallel_for(static_cast<int64_t>(runs.size()), args.num_threads, [&](int64_t r) { forward_run(args, runs[r]); });
 }
 
 template <class T>
 void project_backward(const Project<T>& args) {
+  const ScratchUse use;
   ProjectScratch& scratch = thread_scratch<ProjectScratch>();
   const std::vector<Run>& runs = runs_of(args, scratch);
   const int64_t num_runs = static_cast<int64_t>(runs.size());

@@ -1,12 +1,12 @@
-// The parallel loop, scratch memory per thread, and the choice of instruction set.
+// The parallel loop, and the choice of instruction set.
 #pragma once
 
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
 #include <exception>
-#include <type_traits>
-#include <vector>
+
+#include "scratch.h"
 
 // Several x86-64 levels in one program: see levels.h.
 #if defined(NMR_MULTIVERSION) && defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && __GNUC__ >= 12
@@ -61,41 +61,34 @@ inline int cpu_level() {
 template <class Body>
 void parallel_for(int64_t count, int num_threads, const Body& body) {
   const int threads = static_cast<int>(count < num_threads ? count : num_threads);
+  const ScratchUse caller;
   if (threads <= 1) {
     for (int64_t i = 0; i < count; ++i) body(i);
     return;
   }
   std::exception_ptr failure;
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-  for (int64_t i = 0; i < count; ++i) {
-    try {
-      body(i);
-    } catch (...) {
+  ThreadScratch& mine = ThreadScratch::mine();
+  int64_t grown = 0;  // scratch that other threads reserved; it may belong to this one (sum_blocks)
+#pragma omp parallel num_threads(threads)
+  {
+    ThreadScratch& scratch = ThreadScratch::mine();
+    const ScratchUse use;
+    const int64_t before = scratch.grown();
+#pragma omp for schedule(dynamic, 1) nowait
+    for (int64_t i = 0; i < count; ++i) {
+      try {
+        body(i);
+      } catch (...) {
 #pragma omp critical(nmr_failure)
-      if (!failure) failure = std::current_exception();
+        if (!failure) failure = std::current_exception();
+      }
     }
+    const int64_t reserved = &scratch == &mine ? 0 : scratch.grown() - before;
+#pragma omp atomic
+    grown += reserved;
   }
+  mine.count(grown);
   if (failure) std::rethrow_exception(failure);
-}
-
-// Memory that a thread keeps between calls, one object per type.
-template <class Scratch>
-Scratch& thread_scratch() {
-  static thread_local Scratch scratch;
-  return scratch;
-}
-
-// Grows a buffer (never shrinks it) and returns its storage. With NMR_FRESH_SCRATCH (sanitizer builds) the buffer is new, has exactly
-// this size, and is filled with garbage: sanitizers and tests then notice reads beyond it and reads of unwritten values.
-template <class T>
-T* reserve(std::vector<T>& buffer, size_t size) {
-#ifdef NMR_FRESH_SCRATCH
-  buffer = std::vector<T>(size);
-  if constexpr (std::is_trivially_copyable_v<T>)
-    if (size > 0) std::memset(static_cast<void*>(buffer.data()), 93, size * sizeof(T));
-#endif
-  if (buffer.size() < size) buffer.resize(size);
-  return buffer.data();
 }
 
 }  // namespace nmr

@@ -1,6 +1,8 @@
 #include <atomic>
+#include <cmath>
 #include <new>
 #include <stdexcept>
+#include <thread>
 
 #include "../../csrc/parallel.h"
 #include "check.h"
@@ -53,5 +55,53 @@ TEST(scratch_belongs_to_a_thread_and_grows) {
     for (int64_t n = 0; n < 100 + i; ++n) CHECK_EQUAL(values[n], static_cast<double>(i));
   });
 }
+
+// A buffer that counts how many of its kind exist.
+struct Counted {
+  static std::atomic<int> alive;
+  std::vector<double> values;
+  Counted() { ++alive; }
+  ~Counted() { --alive; }
+};
+std::atomic<int> Counted::alive{0};
+
+TEST(scratch_beyond_the_limit_is_freed_after_the_outermost_loop) {
+  ThreadScratch::free_all();
+  const size_t limit = ThreadScratch::kLimit / sizeof(double);
+  for (int threads : {1, 3}) {
+    parallel_for(6, threads, [&](int64_t) { reserve(thread_scratch<Counted>().values, limit / 4); });
+    CHECK(Counted::alive >= 1 && Counted::alive <= threads);
+    parallel_for(1, 1, [&](int64_t) {
+      double* values = reserve(thread_scratch<Counted>().values, 2 * limit);
+      values[0] = 7;
+      parallel_for(threads, threads, [&](int64_t) { reserve(thread_scratch<Counted>().values, 1); });  // within: nothing is freed
+      CHECK_EQUAL(values[0], 7);
+      CHECK_EQUAL(&thread_scratch<Counted>().values[0], values);
+    });
+    parallel_for(6, threads, [&](int64_t) { reserve(thread_scratch<Counted>().values, 2 * limit); });
+    CHECK_EQUAL(Counted::alive.load(), 0);
+  }
+}
+
+TEST(free_all_spares_what_is_in_use) {
+  parallel_for(4, 2, [](int64_t) { reserve(thread_scratch<Counted>().values, 10); });
+  {
+    const ScratchUse use;
+    reserve(thread_scratch<Counted>().values, 10);
+    std::thread other([] { ThreadScratch::free_all(); });
+    other.join();
+    CHECK_EQUAL(Counted::alive.load(), 1);
+    CHECK_EQUAL(thread_scratch<Counted>().values.size(), size_t(10));
+  }
+  ThreadScratch::free_all();
+  CHECK_EQUAL(Counted::alive.load(), 0);
+}
+
+#ifdef NMR_FRESH_SCRATCH
+TEST(fresh_scratch_is_not_a_number) {
+  const ScratchUse use;
+  CHECK(std::isnan(reserve(thread_scratch<Counted>().values, 3)[2]));
+}
+#endif
 
 }  // namespace nmr::test

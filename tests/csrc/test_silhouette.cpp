@@ -149,6 +149,28 @@ TEST_REAL(silhouette_gradient_of_what_is_hidden_is_zero) {
   CHECK(grad[0] != 0);
 }
 
+// A gradient of alpha that is not finite must not vanish: gradient scalers look for it.
+TEST_REAL(silhouette_gradient_of_an_image_with_a_gradient_that_is_not_finite_is_nan) {
+  Scene<T> scene = stack<T>({sphere(1, 1), sphere(1, 2)}, true);
+  scene.image = square(16);
+  const Drawn<T> drawn = draw(scene);
+  const std::vector<T> grad_alpha = noise_array<T>(1, 512), healthy = gradient(scene, drawn.owner, grad_alpha);
+  for (T bad : {std::numeric_limits<T>::quiet_NaN(), std::numeric_limits<T>::infinity(), -std::numeric_limits<T>::infinity()})
+    for (size_t pixel : {0, 100, 255, 256, 511})
+      for (int threads : {1, 5}) {
+        std::vector<T> spoiled = grad_alpha;
+        spoiled[pixel] = bad;
+        const std::vector<T> grad = gradient(scene, drawn.owner, spoiled, threads);
+        const int64_t b = pixel / 256, per_image = 3 * scene.num_vertices;
+        for (int64_t n = 0; n < 2 * per_image; ++n) {
+          if (n / per_image != b) CHECK_EQUAL(grad[n], healthy[n]);  // the other image is well
+          if (n / per_image == b && healthy[n] != 0) CHECK(std::isnan(grad[n]));
+          if (n % 3 == 2) CHECK_EQUAL(grad[n], T(0));
+        }
+        CHECK(gradient(scene, drawn.owner, grad_alpha, threads) == healthy);  // and so is the next call
+      }
+}
+
 // Mirroring the world mirrors the gradient. (Column 0 has the published extrapolation quirk, so the mesh keeps off the borders.)
 TEST_REAL(silhouette_gradient_mirrors) {
   Scene<T> scene = single<T>(sphere(2, 4)), mirrored = scene;
