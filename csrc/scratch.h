@@ -120,15 +120,13 @@ Scratch& thread_scratch() {
 // reads of unwritten values.
 template <class T>
 T* reserve(std::vector<T>& buffer, size_t size) {
+  if (buffer.size() < size) ThreadScratch::mine().count(static_cast<int64_t>((size - buffer.size()) * sizeof(T)));
 #ifdef NMR_FRESH_SCRATCH
   buffer = std::vector<T>(size);
   if constexpr (std::is_trivially_copyable_v<T>)
     if (size > 0) std::memset(static_cast<void*>(buffer.data()), 0xff, size * sizeof(T));
 #endif
-  if (buffer.size() < size) {
-    ThreadScratch::mine().count(static_cast<int64_t>((size - buffer.size()) * sizeof(T)));
-    buffer.resize(size);
-  }
+  if (buffer.size() < size) buffer.resize(size);
   return buffer.data();
 }
 
