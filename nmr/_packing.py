@@ -123,7 +123,7 @@ def packed_starts(rows: Sequence[int], faces: Sequence[int]) -> Tensor:
 
 
 def is_list(value: object) -> bool:
-    return isinstance(value, list | tuple)
+    return isinstance(value, (list, tuple))
 
 
 def pack_meshes(vertices: object, faces: object) -> MeshBatch:

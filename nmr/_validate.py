@@ -133,7 +133,7 @@ def _joined(value: object) -> Tensor:
     if isinstance(value, Tensor):
         return value
     # torch.as_tensor would detach the tensors in a sequence.
-    if isinstance(value, list | tuple) and any(isinstance(part, Tensor | np.ndarray | list | tuple) for part in value):
+    if isinstance(value, (list, tuple)) and any(isinstance(part, (Tensor, np.ndarray, list, tuple)) for part in value):
         return torch.stack([_joined(part) for part in value])
     return torch.tensor(value, dtype=torch.float64, device="cpu")  # a copy, also of an array
 
@@ -159,9 +159,9 @@ def check_size(value: object, name: str, largest: int, wanted: str = "an integer
 
 def check_image_size(value: object, largest: int) -> tuple[int, int]:
     """(height, width): an integer for a square image, or a pair of integers, each in 1..largest."""
-    if isinstance(value, Tensor | np.ndarray) and value.shape == (2,):
+    if isinstance(value, (Tensor, np.ndarray)) and value.shape == (2,):
         value = value.tolist()
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         if len(value) != 2:
             raise ValueError(f"image_size must be an integer or a pair (height, width), got {value!r}")
         height, width = (check_size(size, "image_size", largest) for size in value)

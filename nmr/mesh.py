@@ -52,7 +52,7 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
         midpoints = vertices[pairs].sum(1)
         vertices = torch.cat([vertices, midpoints / midpoints.norm(dim=1, keepdim=True)])
         faces = torch.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], dim=1).view(-1, 3)
-    device = torch.get_default_device()
+    device = torch.empty(0).device
     return vertices.to(device, torch.float32), faces.to(device)
 
 

@@ -96,7 +96,8 @@ def register_autograd(op, backward, setup_context=None):
     )
 
     def kernel(*args):
-        if not (torch.is_grad_enabled() and torch._C._any_requires_grad(*args)) and forward_ad._current_level < 0:
+        wanted = torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in args)
+        if not wanted and forward_ad._current_level < 0:
             return below(*args)
         if not torch._C._are_functorch_transforms_active():
             return function.apply(*args)
