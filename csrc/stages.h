@@ -312,6 +312,20 @@ struct Smoothness {
   int num_threads;
 };
 
+// Soft intersection over union of pairs of images (soft_iou.cpp).
+template <class T>
+struct SoftIou {
+  const T* prediction;  // [B, N]
+  const T* target;      // [B, N]
+  int64_t batch, count;
+  double* areas;        // forward out, backward in [B, 2]: I and U
+  T* iou;               // forward out [B]
+  const T* grad_iou;    // backward in [B]
+  T* grad_prediction;   // backward out [B, N], or nullptr
+  T* grad_target;       // backward out [B, N], or nullptr
+  int num_threads;
+};
+
 template <class T> void pose_forward(const Pose<T>& args);
 template <class T> void pose_backward(const Pose<T>& args);
 template <class T> void project_forward(const Project<T>& args);
@@ -341,6 +355,8 @@ template <class T> void resolve_backward(const Resolve<T>& args);
 template <class T> void edges_backward(const EdgesBackward<T>& args);
 template <class T> void smoothness_forward(const Smoothness<T>& args);
 template <class T> void smoothness_backward(const Smoothness<T>& args);
+template <class T> void soft_iou_forward(const SoftIou<T>& args);
+template <class T> void soft_iou_backward(const SoftIou<T>& args);
 void voxelize(const Voxelize& args);
 
 }  // namespace nmr

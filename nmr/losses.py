@@ -10,6 +10,7 @@ import math
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from . import ops
 from ._validate import check_number, check_vertices, describe
@@ -35,9 +36,9 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
     Returns
     -------
-    scalar Tensor
+    scalar Tensor, float64 if prediction is, else float32 (also for half precision)
         0 if all pairs are binary and equal. A pair of two empty images counts as equal (the published code returns
-        NaN); its gradient is 0.
+        NaN); its gradient is 0. Differentiable in both arguments, twice.
 
     Raises
     ------
@@ -60,11 +61,21 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
             "prediction and target must have the same shape [B, ...] with B >= 1, "
             f"got {describe(prediction)} and {describe(target)}"
         )
-    prediction, target = prediction.flatten(1), target.flatten(1)
+    dtype = torch.float64 if prediction.dtype == torch.float64 else torch.float32
+    prediction, target = prediction.flatten(1).to(dtype), target.flatten(1).to(dtype)
+    if prediction.is_cpu and target.is_cpu and forward_ad._current_level < 0:
+        iou, _ = ops.soft_iou(prediction, target)
+    else:
+        iou = _soft_iou(prediction, target)
+    return 1 - iou.mean()
+
+
+def _soft_iou(prediction: Tensor, target: Tensor) -> Tensor:
+    """Soft IoU ``[B]`` of pairs ``[B, N]``, by torch: on the device of the images, and in forward mode."""
     intersection = (prediction * target).sum(1)
-    union = prediction.sum(1) + target.sum(1) - intersection
+    union = (prediction + target).sum(1) - intersection
     empty = union == 0
-    return 1 - (intersection + empty).div(union + empty).mean()
+    return torch.where(empty, 1.0, intersection / torch.where(empty, 1.0, union))
 
 
 def smoothness_loss(vertices: Tensor, edges: Tensor) -> Tensor:

@@ -53,8 +53,21 @@ void require_like(const Array<T>& array, const char* name, const Array<U>& other
   require_shape(array, name, std::vector<int64_t>(other.shape(), other.shape() + other.ndim()));
 }
 
+// The storage of a gradient of this shape, or nullptr if the gradient is not wanted.
+template <class T>
+T* optional_out(std::optional<Array<T>>& grad, const char* name, const std::vector<int64_t>& shape) {
+  if (!grad) return nullptr;
+  require_shape(*grad, name, shape);
+  return grad->mutable_data();
+}
+
+// Every index must lie in 0..limit-1. Callers release the GIL.
 inline void require_indices(const int64_t* index, int64_t count, int64_t limit, const char* name, const char* what,
                             const char* plural) {
+  const uint64_t last = static_cast<uint64_t>(limit) - 1;
+  uint64_t wrong = 0;  // its highest bit: the signs of i and limit - 1 - i (without branches, so that the loop is vectorized)
+  for (int64_t n = 0; n < count; ++n) wrong |= static_cast<uint64_t>(index[n]) | (last - static_cast<uint64_t>(index[n]));
+  if (!(wrong >> 63)) return;
   for (int64_t n = 0; n < count; ++n)
     if (index[n] < 0 || index[n] >= limit)
       throw std::invalid_argument(std::string(name) + " refer to " + what + " " + std::to_string(index[n]) + ", but a mesh has " +
@@ -87,11 +100,13 @@ MeshBatch<T> mesh_batch(const Array<T>& vertices, const Indices& faces, const st
     require_starts(*starts, mesh.num_vertices, mesh.num_faces);
     mesh.batch = starts->shape(0) - 1;
     for (int64_t b = 0; b < mesh.batch; ++b) require_vertices(mesh.vertex_count(b));
+    const py::gil_scoped_release release;
     for (int64_t b = 0; b < mesh.batch; ++b)
       require_indices(mesh.image_faces(b), 3 * mesh.face_count(b), mesh.vertex_count(b), "faces", "vertex", "vertices");
   } else {
     mesh.batch = vertices.shape(0);
     require_vertices(mesh.num_vertices);
+    const py::gil_scoped_release release;
     require_indices(faces.data(), faces.size(), mesh.num_vertices, "faces", "vertex", "vertices");
   }
   return mesh;
@@ -104,6 +119,7 @@ Size require_owner(const Array<int32_t>& owner, int64_t batch, const FaceCount& 
           "owner must have shape [" + std::to_string(batch) + ", H, W], got " + shape_of(owner));
   const int64_t pixels = owner.shape(1) * owner.shape(2);
   const int32_t* entries = owner.data();
+  const py::gil_scoped_release release;
   parallel_for(batch, num_threads, [&](int64_t b) {
     const uint32_t limit = static_cast<uint32_t>(2 * face_count(b));
     const int32_t* entry = entries + b * pixels;

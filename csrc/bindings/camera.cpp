@@ -94,14 +94,6 @@ void project_forward_py(const Array<T>& vertices, const Array<T>& matrix, const 
   project_forward(args);
 }
 
-// The storage of a gradient of this shape, or nullptr if the gradient is not wanted.
-template <class T>
-T* optional_out(Optional<T>& grad, const char* name, const std::vector<int64_t>& shape) {
-  if (!grad) return nullptr;
-  require_shape(*grad, name, shape);
-  return grad->mutable_data();
-}
-
 template <class T>
 void project_backward_py(const Array<T>& vertices, const Array<T>& matrix, const Array<T>& intrinsics,
                          const Optional<T>& distortion, const Optional<T>& origin, const Optional<T>& extent,

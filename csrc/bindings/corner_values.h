@@ -32,6 +32,7 @@ Interpolate<T> interpolate_args(const Array<T>& attributes, const Indices& corne
           "attributes must have the batch size " + std::to_string(batch) + " or 1, got " + shape_of(attributes));
   require(!per_image || corners.shape(0) == batch,
           "corners [B, F, 3] must have the batch size " + std::to_string(batch) + ", got " + shape_of(corners));
+  const py::gil_scoped_release release;
   for (int64_t b = 0; packed && b < batch; ++b) {
     const int64_t* s = starts->data() + 2 * b;
     require_indices(corners.data() + 3 * s[1], 3 * (s[3] - s[1]), s[2] - s[0], "corners", "attribute", "attributes");

@@ -1,4 +1,4 @@
-// Losses on meshes, and voxels.
+// Losses, and voxels.
 #include "arrays.h"
 
 namespace nmr {
@@ -10,6 +10,7 @@ Smoothness<T> smoothness_args(const Array<T>& vertices, const Array<int64_t>& ed
   require(edges.ndim() == 2 && edges.shape(1) == 4, "edges must have shape [E, 4], got " + shape_of(edges));
   Smoothness<T> args{vertices.data(), edges.data(), vertices.shape(0), vertices.shape(1), edges.shape(0),
                      nullptr,         nullptr,      nullptr,           num_threads};
+  const py::gil_scoped_release release;
   require_indices(edges.data(), edges.size(), args.num_vertices, "edges", "vertex", "vertices");
   return args;
 }
@@ -35,6 +36,36 @@ void smoothness_backward_py(const Array<T>& vertices, const Array<int64_t>& edge
   smoothness_backward(args);
 }
 
+template <class T>
+SoftIou<T> soft_iou_args(const Array<T>& prediction, const Array<T>& target, Array<double>& areas, int num_threads) {
+  require(prediction.ndim() == 2, "prediction must have shape [B, N], got " + shape_of(prediction));
+  require_like(target, "target", prediction);
+  require_shape(areas, "areas", {prediction.shape(0), 2});
+  return {prediction.data(), target.data(), prediction.shape(0), prediction.shape(1), areas.mutable_data(), nullptr, nullptr, nullptr,
+          nullptr, num_threads};
+}
+
+template <class T>
+void soft_iou_forward_py(const Array<T>& prediction, const Array<T>& target, Array<double>& areas, Array<T>& iou, int num_threads) {
+  SoftIou<T> args = soft_iou_args(prediction, target, areas, num_threads);
+  require_shape(iou, "iou", {args.batch});
+  args.iou = iou.mutable_data();
+  py::gil_scoped_release release;
+  soft_iou_forward(args);
+}
+
+template <class T>
+void soft_iou_backward_py(const Array<T>& prediction, const Array<T>& target, Array<double>& areas, const Array<T>& grad_iou,
+                          std::optional<Array<T>> grad_prediction, std::optional<Array<T>> grad_target, int num_threads) {
+  SoftIou<T> args = soft_iou_args(prediction, target, areas, num_threads);
+  require_shape(grad_iou, "grad_iou", {args.batch});
+  args.grad_iou = grad_iou.data();
+  args.grad_prediction = optional_out(grad_prediction, "grad_prediction", {args.batch, args.count});
+  args.grad_target = optional_out(grad_target, "grad_target", {args.batch, args.count});
+  py::gil_scoped_release release;
+  soft_iou_backward(args);
+}
+
 void voxelize_py(const Array<float>& vertices, const Indices& faces, Array<bool>& voxels, int64_t size, bool touched,
                  int num_threads) {
   const MeshBatch<float> mesh = mesh_batch(vertices, faces, std::nullopt);
@@ -46,18 +77,23 @@ void voxelize_py(const Array<float>& vertices, const Indices& faces, Array<bool>
 }
 
 template <class T>
-void define_smoothness(py::module_& m) {
+void define_losses(py::module_& m) {
   m.def("smoothness_forward", &smoothness_forward_py<T>, py::arg("vertices").noconvert(), py::arg("edges").noconvert(),
         py::arg("loss").noconvert(), py::arg("num_threads"));
   m.def("smoothness_backward", &smoothness_backward_py<T>, py::arg("vertices").noconvert(), py::arg("edges").noconvert(),
         py::arg("grad_loss").noconvert(), py::arg("grad_vertices").noconvert(), py::arg("num_threads"));
+  m.def("soft_iou_forward", &soft_iou_forward_py<T>, py::arg("prediction").noconvert(), py::arg("target").noconvert(),
+        py::arg("areas").noconvert(), py::arg("iou").noconvert(), py::arg("num_threads"));
+  m.def("soft_iou_backward", &soft_iou_backward_py<T>, py::arg("prediction").noconvert(), py::arg("target").noconvert(),
+        py::arg("areas").noconvert(), py::arg("grad_iou").noconvert(), py::arg("grad_prediction").noconvert().none(true),
+        py::arg("grad_target").noconvert().none(true), py::arg("num_threads"));
 }
 
 }  // namespace
 
 void bind_mesh(py::module_& m) {
-  define_smoothness<float>(m);
-  define_smoothness<double>(m);
+  define_losses<float>(m);
+  define_losses<double>(m);
   m.def("voxelize", &voxelize_py, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
         py::arg("voxels").noconvert(), py::arg("size"), py::arg("touched"), py::arg("num_threads"));
 }

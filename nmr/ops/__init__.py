@@ -16,6 +16,7 @@ from .camera import pose, pose_backward, project, project_backward
 from .clip import clip_count, clip_faces
 from .edges import edges_backward, resolve, resolve_backward
 from .fragments import depth_backward, depth_image, fragments, fragments_backward
+from .losses import soft_iou, soft_iou_backward
 from .mesh import smoothness, smoothness_backward, voxels
 from .raster import local_gradient, rasterize, silhouette, silhouette_backward
 from .shade import interpolate, interpolate_backward, sample_texture_cubes, texture_cubes_backward
@@ -49,6 +50,8 @@ __all__ = [
     "silhouette_backward",
     "smoothness",
     "smoothness_backward",
+    "soft_iou",
+    "soft_iou_backward",
     "texture_cubes_backward",
     "uv_levels",
     "voxels",

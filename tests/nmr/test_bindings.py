@@ -6,6 +6,8 @@ Fragments, edges, colours and cameras have theirs beside the tests of their valu
 import mmap
 import subprocess
 import sys
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -24,9 +26,14 @@ CALLS = {
     ),
     "smoothness": lambda a: _C.smoothness_forward(a["vertices"], a["edges"], a["loss"], 1),
     "smoothness_backward": lambda a: _C.smoothness_backward(a["vertices"], a["edges"], a["loss"], a["grad"], 1),
+    "soft_iou": lambda a: _C.soft_iou_forward(a["prediction"], a["target"], a["areas"], a["loss"], 1),
+    "soft_iou_backward": lambda a: _C.soft_iou_backward(
+        a["prediction"], a["target"], a["areas"], a["loss"], a["grad_prediction"], a["grad_target"], 1
+    ),
     "voxelize": lambda a: _C.voxelize(a["vertices"].astype(np.float32), a["faces"], a["voxels"], a["size"], True, 1),
 }
 RASTER, SMOOTHNESS = ("rasterize", "silhouette_backward", "local_gradient"), ("smoothness", "smoothness_backward")
+IOU = ("soft_iou", "soft_iou_backward")
 STARTS = np.array([[0, 0], [6, 2], [12, 4]])
 
 
@@ -57,6 +64,13 @@ STARTS = np.array([[0, 0], [6, 2], [12, 4]])
         (SMOOTHNESS[:1], dict(loss=np.zeros(3)), r"loss must have shape \[2\], got \[3\]"),
         (SMOOTHNESS[1:], dict(loss=np.zeros(3)), r"grad_loss must have shape \[2\], got \[3\]"),
         (SMOOTHNESS[1:], dict(grad=np.zeros((2, 12))), r"grad_vertices must have shape \[2, 12, 3\], got \[2, 12\]"),
+        (IOU, dict(prediction=np.zeros(9)), r"prediction must have shape \[B, N\], got \[9\]"),
+        (IOU, dict(target=np.zeros((2, 8))), r"target must have shape \[2, 9\], got \[2, 8\]"),
+        (IOU, dict(areas=np.zeros((3, 2))), r"areas must have shape \[2, 2\], got \[3, 2\]"),
+        (IOU[:1], dict(loss=np.zeros(3)), r"iou must have shape \[2\], got \[3\]"),
+        (IOU[1:], dict(loss=np.zeros(3)), r"grad_iou must have shape \[2\], got \[3\]"),
+        (IOU[1:], dict(grad_prediction=np.zeros(9)), r"grad_prediction must have shape \[2, 9\], got \[9\]"),
+        (IOU[1:], dict(grad_target=np.zeros((1, 9))), r"grad_target must have shape \[2, 9\], got \[1, 9\]"),
         (("voxelize",), dict(size=0), r"size must lie in 1\.\.1024, got 0"),
         (("voxelize",), dict(size=5), r"voxels must have shape \[2, 5, 5, 5\], got \[2, 4, 4, 4\]"),
     ],
@@ -71,6 +85,11 @@ def test_no_call_reads_or_writes_outside_an_array(calls, change, words):
         grad=np.zeros((2, 12, 3)),
         edges=np.array([[0, 1, 2, 3]]),
         loss=np.zeros(2),
+        prediction=np.ones((2, 9)),
+        target=np.ones((2, 9)),
+        areas=np.ones((2, 2)),
+        grad_prediction=np.zeros((2, 9)),
+        grad_target=np.zeros((2, 9)),
         voxels=np.zeros((2, 4, 4, 4), bool),
         size=4,
     )
@@ -78,6 +97,50 @@ def test_no_call_reads_or_writes_outside_an_array(calls, change, words):
         CALLS[call](arguments)
         with pytest.raises(ValueError, match=words):
             CALLS[call]({**arguments, **change})
+
+
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda v, wrong, owner: _C.smoothness_forward(v, wrong.reshape(-1, 4), np.zeros(1), 1), "edges refer to"),
+        (lambda v, wrong, owner: _C.rasterize(v, wrong, None, owner, True, 0.1, 100.0, 1), "faces refer to vertex"),
+        (
+            lambda v, wrong, owner: _C.interpolate_forward(
+                v, wrong[None], owner[:, :2], np.zeros((1, 2, 4096, 3)), None, np.zeros((1, 2, 4096, 3)), 1
+            ),
+            "corners refer to",
+        ),
+        (
+            lambda v, wrong, owner: _C.silhouette_backward(
+                v, wrong[:1], None, owner, np.zeros((1, 4096, 4096)), np.zeros((1, 3, 3)), False, 1e-4, 1
+            ),
+            "the owner map does not belong",
+        ),
+    ],
+)
+def test_other_python_threads_run_while_arrays_are_checked(call, words):
+    vertices, wrong, owner = np.zeros((1, 3, 3)), np.zeros((4_000_000, 3), int), np.zeros((1, 4096, 4096), np.int32)
+    wrong[-1], owner[0, -1, -1] = 3, 2
+    turns, stop, interval = [0], [False], sys.getswitchinterval()
+
+    def take_turns():
+        while not stop[0]:
+            turns[0] += 1
+            time.sleep(0)
+
+    thread = threading.Thread(target=take_turns)
+    sys.setswitchinterval(100)  # no thread is asked to give way
+    try:
+        thread.start()
+        time.sleep(0.01)
+        before = turns[0]
+        with pytest.raises(ValueError, match=words):
+            call(vertices, wrong, owner)
+        assert turns[0] > before
+    finally:
+        stop[0] = True
+        sys.setswitchinterval(interval)
+        thread.join()
 
 
 @pytest.mark.parametrize("points", [(2, 5, 3), (3, 4, 3)])

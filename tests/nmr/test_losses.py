@@ -136,6 +136,85 @@ def test_soft_iou_of_empty_images():
     assert soft_iou_loss(torch.zeros(2, 4, 4), torch.zeros(2, 4, 4)) == 0
 
 
+def test_the_gradient_of_a_pair_of_empty_images_is_zero():
+    prediction = torch.zeros(2, 5, requires_grad=True)
+    soft_iou_loss(prediction, torch.tensor([[0.0, 0, 0, 0, 0], [0, 1, 1, 0, 0]])).backward()
+    assert not prediction.grad[0].any() and prediction.grad[1].any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.bool, torch.uint8, torch.int64, torch.float64])
+def test_soft_iou_sums_in_float32(dtype):
+    """A float16 cannot hold the sum of 90,000 ones."""
+    ones = torch.ones(2, 300, 300)
+    loss = soft_iou_loss(ones, ones.to(dtype))
+    assert loss == 0 and loss.dtype == torch.float32
+    if dtype.is_floating_point:
+        prediction = ones.to(dtype).requires_grad_()
+        loss = soft_iou_loss(prediction, 0.5 * ones)
+        loss.backward()
+        assert loss == 0.5 and loss.dtype == torch.promote_types(dtype, torch.float32)
+        assert prediction.grad.isfinite().all() and prediction.grad.dtype == dtype
+
+
+def plain_iou(prediction, target):
+    """The published formula."""
+    intersection = (prediction * target).flatten(1).sum(1)
+    union = (prediction + target - prediction * target).flatten(1).sum(1)
+    return 1 - (intersection / union).mean()
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 31, 4096, 4097, 10007])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_soft_iou_is_the_formula_and_its_derivative(count, dtype):
+    g = torch.Generator().manual_seed(count)
+    images = [torch.rand(3, count, generator=g, dtype=torch.float64) for _ in range(2)]
+    given = [x.to(dtype).requires_grad_() for x in images]
+    exact = [x.detach().double().requires_grad_() for x in given]
+    ours, plain = soft_iou_loss(*given), plain_iou(*exact)
+    tolerance = {"rtol": 0, "atol": 1e-6 if dtype == torch.float32 else 1e-13}
+    torch.testing.assert_close(ours.double(), plain, **tolerance)
+    for a, b in zip(torch.autograd.grad(ours, given), torch.autograd.grad(plain, exact), strict=True):
+        torch.testing.assert_close(a.double() / b.abs().max(), b / b.abs().max(), **tolerance)
+    (alone,) = torch.autograd.grad(soft_iou_loss(given[0], images[1].to(dtype)), given[0])
+    assert torch.equal(alone, torch.autograd.grad(soft_iou_loss(*given), given)[0])
+
+
+def test_soft_iou_derivatives_of_any_kind():
+    """First and second ones, in forward mode, in torch.func, compiled; and opcheck."""
+    g = torch.Generator().manual_seed(0)
+    prediction, target, tangent = (torch.rand(3, 20, generator=g, dtype=torch.float64) for _ in range(3))
+    leaves = prediction.requires_grad_(), target.requires_grad_()
+    assert torch.autograd.gradcheck(soft_iou_loss, leaves, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(soft_iou_loss, leaves)
+    (gradient,) = torch.autograd.grad(plain_iou(*leaves), leaves[0])
+    prediction, target = prediction.detach(), target.detach()
+    torch.testing.assert_close(torch.func.grad(soft_iou_loss)(prediction, target), gradient)
+    _, slope = torch.func.jvp(lambda p: soft_iou_loss(p, target), (prediction,), (tangent,))
+    torch.testing.assert_close(slope, (gradient * tangent).sum())
+    hessian = torch.func.jacrev(torch.func.grad(soft_iou_loss))(prediction, target)
+    torch.testing.assert_close(hessian, torch.func.jacrev(torch.func.grad(plain_iou))(prediction, target))
+    compiled = torch.compile(torch.func.grad(soft_iou_loss), fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(prediction, target), gradient)
+    for dtype in (torch.float32, torch.float64):
+        images = [x.to(dtype).detach().requires_grad_() for x in (prediction, target)]
+        torch.library.opcheck(nmr.ops.soft_iou, images)
+        areas, upstream = nmr.ops.soft_iou(*images)[1], torch.rand(3, dtype=dtype, generator=g)
+        torch.library.opcheck(nmr.ops.soft_iou_backward, (*images, areas, upstream, True, False))
+
+
+def test_soft_iou_same_bits_for_any_number_of_threads_and_any_batch():
+    g = torch.Generator().manual_seed(0)
+    images, before, results = [torch.rand(7, 5001, generator=g) for _ in range(2)], torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            results.append(nmr.ops.soft_iou(*images)[0])
+    finally:
+        torch.set_num_threads(before)
+    results.append(torch.cat([nmr.ops.soft_iou(*(x[b : b + 1] for x in images))[0] for b in range(7)]))
+    assert all(torch.equal(results[0], other) for other in results[1:])
+
+
 def test_soft_iou_error():
     for a, b in (((1, 4, 4), (1, 5, 4)), ((0, 4, 4), (0, 4, 4)), ((4,), (4,))):
         with pytest.raises(ValueError, match=r"same shape \[B, \.\.\.\] with B >= 1, got float32"):
