@@ -26,8 +26,8 @@ class Fragments:
     """The nearest face at each centre of the raster, made by :func:`nmr.render_fragments`.
 
     H and W are those of the image, or twice as many with anti-aliasing. Row 0 is the top. For shading of your own,
-    compute an image
-    ``[B, H, W, C]`` from these and call :meth:`resolve`, which averages pixels and gives the vertices NMR's gradient.
+    compute an image ``[B, H, W, C]`` from these and call :meth:`resolve`, which averages pixels and gives the vertices
+    NMR's gradient.
 
     Attributes
     ----------

@@ -392,6 +392,20 @@ def test_extreme_shapes(size):
         assert leaf.grad.isfinite().all()
 
 
+def test_compiled_functions_draw_the_same():
+    vertices, faces, _ = mesh(torch.float32)
+
+    def loss(leaf):
+        return nmr.render_silhouette(leaf, faces, CAMERAS["look_at"], image_size=(24, 40)).square().sum()
+
+    grads = []
+    for function in (loss, torch.compile(loss, fullgraph=True, backend="aot_eager")):
+        leaf = vertices.clone().requires_grad_()
+        function(leaf).backward()
+        grads.append(leaf.grad)
+    assert grads[0].any() and torch.equal(*grads)
+
+
 @pytest.mark.parametrize("threads", [2, 5])
 def test_bits_do_not_depend_on_threads_or_batch(threads):
     vertices, faces, numbers = mesh(torch.float32)
