@@ -16,7 +16,7 @@ __all__ = ["_C", "batch_size", "host_array", "host_empty", "no_second_derivative
 
 def host_array(tensor):
     """The tensor as a C-contiguous NumPy array in host memory (a view on the CPU); None stays None."""
-    return None if tensor is None else tensor.detach().cpu().contiguous().numpy()
+    return None if tensor is None else tensor.contiguous().numpy(force=True)
 
 
 def host_empty(shape, dtype) -> Tensor:

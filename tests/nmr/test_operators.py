@@ -1,5 +1,6 @@
 """How the operators are registered: torch.func, forward mode, graph breaks, default devices, the first call."""
 
+import os
 import subprocess
 import sys
 
@@ -119,3 +120,24 @@ print("torch._dynamo" in sys.modules)
 """
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_a_forked_process_renders_with_one_thread():
+    """As docs/multi-process.md says: with more threads it would wait for those of its parent, in torch, too."""
+    program = """
+import os, torch, nmr
+vertices, faces = nmr.icosphere(2)
+vertices = (vertices * torch.linspace(0.5, 1, 8).view(-1, 1, 1)).requires_grad_()
+def render():
+    image = nmr.render_silhouette(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), image_size=32)
+    return torch.autograd.grad(image.sum(), vertices)[0]
+torch.set_num_threads(2)
+wanted = render()
+child = os.fork()
+if child == 0:
+    torch.set_num_threads(1)
+    os._exit(0 if torch.equal(render(), wanted) else 1)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
