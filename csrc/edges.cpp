@@ -160,7 +160,7 @@ NMR_INLINE void pull_listed(const Lines<T>& lines, int64_t n, int32_t first, int
     const int32_t lanes = last - start;
     for (int k = 0; k < kWidth; ++k) {
       const bool counts = (k < lanes) & (gain[k] > 0) & (!kOwn | (owner[start + k] == id));
-      const T offset = position[start + k] - lever.crossing;
+      const T offset = k < lanes ? position[start + k] - lever.crossing : T(1);  // beyond the list there may be anything
       const T h_p = lever.p * offset, h_q = lever.q * offset;
       pulls.p[k] -= (counts & lever.p_acts ? gain[k] : T(0)) / (h_p + (h_p > 0 ? lines.eps : -lines.eps));
       pulls.q[k] -= (counts & lever.q_acts ? gain[k] : T(0)) / (h_q + (h_q > 0 ? lines.eps : -lines.eps));
