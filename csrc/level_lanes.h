@@ -61,7 +61,12 @@ struct LaneType<E, N, false> {
   using Type = Halves<typename LaneType<E, N / 2>::Type>;
 };
 
-template <class T> using MaskElement = std::conditional_t<sizeof(T) == 8, int64_t, int32_t>;
+#if defined(__clang__)
+typedef long long Mask64;  // what comparing vectors of double gives
+#else
+typedef int64_t Mask64;
+#endif
+template <class T> using MaskElement = std::conditional_t<sizeof(T) == 8, Mask64, int32_t>;
 template <class T> using Lanes = typename LaneType<T, kLanes>::Type;
 template <class T> using LaneMask = Lanes<MaskElement<T>>;  // all bits of a lane are set or none
 using Lanes32 = Lanes<int32_t>;
