@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from statistics import median
 
 import torch
@@ -141,10 +143,22 @@ def milliseconds(program: str, seconds: list[Timing]) -> Row:
 def settings(threads: int, repeats: int, **more: int | float | str) -> dict[str, int | float | str]:
     """What a figure depends on besides the program. A load far above 0 at the start means that the machine was busy."""
     about = {"threads": threads, **more, "repeats": repeats, "torch": torch.__version__}
-    about |= {"machine": platform.machine(), "cores": num_cores()}
+    about |= {"machine": processor(), "cores": num_cores()}
     if hasattr(os, "getloadavg"):
         about["load"] = round(os.getloadavg()[0], 1)
     return about
+
+
+def processor() -> str:
+    """The processor's name, as in ``AMD EPYC 9B45``; the instruction set if the system does not tell."""
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return platform.processor() or platform.machine()
+    found = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
+    if "model name" not in found:
+        return platform.machine()
+    return f"{found['model name']} (family {found.get('cpu family', '?')}, model {found.get('model', '?')})"
 
 
 def num_cores() -> int:
