@@ -4,7 +4,9 @@
 #   asan          the same under AddressSanitizer and UndefinedBehaviorSanitizer (CXX: g++ or clang++)
 #   tsan          the same under ThreadSanitizer, with a small OpenMP replacement that it understands (g++)
 #   tsan-clang    the same with LLVM's OpenMP, which reports its synchronisation to the sanitizer (clang++)
-#   fuzz SECONDS  libFuzzer (clang++); findings: build/native/fuzz/finding-*; inputs: build/native/corpus
+#   mutate SECONDS [SEED]  mutations of the fuzz target's inputs, the most executions per second; after a crash the input is in
+#                 build/native/mutate/current-SEED
+#   fuzz SECONDS  libFuzzer (clang++), which looks for new code; findings: build/native/fuzz/finding-*; inputs: build/native/corpus
 #   keep          adds to tests/csrc/corpus.hex the inputs that reach new code
 #   count         instructions of workload W1 under callgrind, compared with tests/csrc/instructions.json
 #   variants      whether every available compiler and instruction set gives the same bits
@@ -74,11 +76,21 @@ check_tsan_clang() {
     run_tests tsan-clang
 }
 
+check_mutate() {
+    build mutate "${CXX:-c++}" "$address -O2" fuzz -DNMR_MULTIVERSION=ON
+    local inputs=build/native/mutate/inputs.hex seed=${2:-$RANDOM}
+    [ ! -d build/native/corpus ] || "$python" tests/csrc/corpus.py list build/native/corpus >"$inputs"
+    [ -s "$inputs" ] || cp tests/csrc/corpus.hex "$inputs"
+    # Hardly any memory is waiting to be reused, and no stacks are kept for it: both cost more than the kernels.
+    ASAN_OPTIONS=quarantine_size_mb=1:malloc_context_size=0:detect_leaks=0 nice -n 19 \
+        build/native/mutate/fuzz -mutate "$1" "$seed" "build/native/mutate/current-$seed" "$inputs"
+}
+
 check_fuzz() {
     want clang++ libFuzzer
-    build fuzz clang++ "$address -O2 -fsanitize=fuzzer-no-link" fuzz -DNMR_FUZZER=ON
+    build fuzz clang++ "$address -O2 -fsanitize-coverage=inline-8bit-counters,pc-table" fuzz -DNMR_FUZZER=ON
     "$python" tests/csrc/corpus.py unpack build/native/corpus
-    nice -n 19 build/native/fuzz/fuzz -max_total_time="$1" -max_len=512 -print_final_stats=1 -timeout=10 -rss_limit_mb=2048 \
+    nice -n 19 build/native/fuzz/fuzz -max_total_time="$1" -max_len=512 -entropic=0 -print_final_stats=1 -timeout=10 -rss_limit_mb=2048 \
         -artifact_prefix=build/native/fuzz/finding- build/native/corpus 2>&1 | tee build/native/fuzz.txt |
         grep -v -E "	(NEW|REDUCE|pulse) |NEW_FUNC"
 }
@@ -163,12 +175,12 @@ check_coverage() {
     "${gcovr[@]}" --txt /dev/null --print-summary
 }
 
-[ $# -gt 0 ] || { sed -n '2,15s/^# \{0,1\}//p' "$0"; exit 2; }
+[ $# -gt 0 ] || { sed -n '2,17s/^# \{0,1\}//p' "$0"; exit 2; }
 mkdir -p build/native
 check=$1
 shift
 case $check in
-tests | asan | tsan | count | variants | coverage | fuzz | keep) "check_$check" "$@" ;;
+tests | asan | tsan | count | variants | coverage | mutate | fuzz | keep) "check_$check" "$@" ;;
 tsan-clang) check_tsan_clang ;;
 *) echo "unknown check: $check"; exit 2 ;;
 esac

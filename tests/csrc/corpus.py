@@ -2,6 +2,7 @@
 
 python tests/csrc/corpus.py unpack FOLDER      writes the corpus into a folder
 python tests/csrc/corpus.py pack FOLDER        adds the folder's files, and the seeds of this script, to the corpus
+python tests/csrc/corpus.py list FOLDER        prints the folder's files, an input per line
 """
 
 import hashlib
@@ -14,7 +15,9 @@ CORPUS = Path(__file__).with_name("corpus.hex")
 FLOAT, DOUBLE = 1, 0
 PACKED, PER_IMAGE, ANTI_ALIASED, FILL_BACK, VALUES_PER_IMAGE, PERSPECTIVE, DISTORTED = (1 << n for n in range(7))
 SPECIAL = range(232, 247)
-BATCHES = [0, 1, 2, 9]
+SECOND_RUN = (7, 8, 12)  # seeds: also on two threads, also the first image alone, also packed
+SIDES = [*range(6), 224, 227, 232, 241]  # 1 to 6; 15, 18, 23, 14 pixels
+BATCHES = [1, 1, 1, 1, 2, 2, 3, 9]  # of decode()
 
 # corners as bytes (see coordinate() of fuzz.cpp): x, y = (byte - 116) / 64, z = (byte - 32) / 16
 TETRAHEDRON = (
@@ -35,12 +38,14 @@ NOTHING = ([], [])
 MESHES = [TETRAHEDRON, SQUARE, TWICE, COLLINEAR, SLIVER, BEHIND, BORDER, LAYERS, NOTHING]
 
 
-def encode(rng, number, flags, meshes, size, *, foreign=False, planes=0, spoil=False) -> bytes:
+def encode(rng, number, flags, meshes, size, *, foreign=False, planes=0, spoil=False, hostile=False) -> bytes:
     """The bytes that decode() of fuzz.cpp turns into these meshes; unless packed, all have the first one's sizes."""
     batch, packed = len(meshes), bool(flags & PACKED)
-    more = (7 if foreign else 0) + 8 * BATCHES.index(batch) + 32 * rng.randrange(4)
-    seed = rng.choice((rng.randrange(256), 7))  # 7: also on three threads
-    head = [number, flags, more, size, rng.randrange(4), rng.randrange(6), planes, rng.randrange(8), seed]
+    more = (7 if foreign else 0) + 8 * BATCHES.index(batch) if batch else 255
+    also = rng.randrange(4) + 4 * rng.randrange(8) + (224 if hostile else 0)
+    seed = rng.choice((rng.randrange(256), *SECOND_RUN))
+    head = [number, flags, more, also, rng.choice((0, 0, rng.randrange(4))), *size]
+    head += [rng.randrange(5), planes, rng.randrange(8), seed]
     shapes = meshes if packed else [meshes[0] if meshes else NOTHING]
     head += [len(vertices) + 16 * len(faces) for vertices, faces in shapes]
     lists = meshes if packed or flags & PER_IMAGE else shapes
@@ -57,19 +62,21 @@ def seeds() -> list[bytes]:
     for number in (FLOAT, DOUBLE):
         for layout in (0, PER_IMAGE, PACKED):
             for mesh in MESHES:
-                size = rng.choice(BATCHES[1:])
-                batch = rng.choices(MESHES, k=size - 1) + [mesh] if layout == PACKED else [mesh] * size
+                count = rng.choice(BATCHES)
+                batch = rng.choices(MESHES, k=count - 1) + [mesh] if layout == PACKED else [mesh] * count
                 rich = ANTI_ALIASED | FILL_BACK | PERSPECTIVE | DISTORTED
                 for other in (rich, VALUES_PER_IMAGE | rng.choice((0, FILL_BACK))):
                     options = {
                         "foreign": rng.random() < 0.1,
                         "planes": rng.choice((0, 0, 0, 34, 200)),
                         "spoil": rng.random() < 0.3,
+                        "hostile": rng.random() < 0.1,
                     }
-                    found.append(encode(rng, number, layout | other, batch, rng.randrange(20), **options))
-        found.append(encode(rng, number, 0, [], 8))
-        found.append(encode(rng, number, PACKED, [], 8))
-        found.append(encode(rng, number, PACKED | ANTI_ALIASED, [NOTHING, NOTHING], 8))
+                    size = rng.choice(SIDES), rng.choice(SIDES)
+                    found.append(encode(rng, number, layout | other, batch, size, **options))
+        found.append(encode(rng, number, 0, [], (5, 3)))
+        found.append(encode(rng, number, PACKED, [], (3, 5)))
+        found.append(encode(rng, number, PACKED | ANTI_ALIASED, [NOTHING, NOTHING], (3, 5)))
     return found
 
 
@@ -87,5 +94,9 @@ def pack(folder: Path) -> None:
     print(f"{len(lines)} inputs, {CORPUS.stat().st_size} bytes")
 
 
+def list_files(folder: Path) -> None:
+    sys.stdout.writelines(f"{path.read_bytes().hex()}\n" for path in sorted(folder.glob("*")))
+
+
 if __name__ == "__main__":
-    {"unpack": unpack, "pack": pack}[sys.argv[1]](Path(sys.argv[2]))
+    {"unpack": unpack, "pack": pack, "list": list_files}[sys.argv[1]](Path(sys.argv[2]))

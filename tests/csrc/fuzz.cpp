@@ -1,5 +1,6 @@
-// The fuzz target: bytes -> a scene -> every stage, forward and backward, on one thread and on three. Beyond what the sanitizers
-// find, it stops at a broken promise and at results that depend on the number of threads. corpus.py writes such bytes.
+// The fuzz target: bytes -> a scene -> every stage, forward and backward. Beyond what the sanitizers find, it stops at a broken promise,
+// and for some seeds at results that depend on the number of threads, on the other images of the batch, or on packing. corpus.py
+// writes such bytes.
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
@@ -34,7 +35,7 @@ struct Bytes {
 template <class T>
 T coordinate(Bytes& bytes, bool is_depth) {
   using Limits = std::numeric_limits<T>;
-  const T special[] = {Limits::quiet_NaN(), Limits::infinity(), -Limits::infinity(), Limits::max(), Limits::lowest(), Limits::denorm_min(),
+  static constexpr T special[] = {Limits::quiet_NaN(), Limits::infinity(), -Limits::infinity(), Limits::max(), Limits::lowest(), Limits::denorm_min(),
                        Limits::min(), -Limits::min(), Limits::epsilon(), 1 + Limits::epsilon(), 1 - Limits::epsilon(), T(-0.0),
                        T(1e10), T(-1e20), T(1e-20)};
   const int byte = bytes.next();
@@ -44,10 +45,13 @@ T coordinate(Bytes& bytes, bool is_depth) {
   return bytes.bits<T>();
 }
 
+// Mostly tiny: an input should cost microseconds. One of eight is large enough for several blocks of lanes.
+int64_t side(int byte) { return byte < 224 ? 1 + byte % 6 : 7 + byte % 18; }
+
+// Writes the scene over an earlier one, whose storage it uses again.
 template <class T>
-Scene<T> decode(Bytes bytes) {
-  Scene<T> s;
-  const int flags = bytes.next(), more = bytes.next();
+void decode(Bytes bytes, Scene<T>& s) {
+  const int flags = bytes.next(), more = bytes.next(), also = bytes.next();
   const bool packed = flags & 1;
   s.faces_per_image = !packed && flags & 2;
   s.anti_aliasing = flags & 4;
@@ -56,12 +60,18 @@ Scene<T> decode(Bytes bytes) {
   s.perspective = flags & 32;
   s.distorted = flags & 64;
   s.foreign_owner = more % 8 == 7;
-  constexpr int64_t batches[] = {0, 1, 2, 9};
-  s.batch = batches[more / 8 % 4];
-  s.channels = 1 + more / 32 % 4;
-  s.image = square(1 + bytes.next() % (s.anti_aliasing ? 10 : 20));
-  s.texture_size = 1 + bytes.next() % 4;
-  s.grid_size = 1 + bytes.next() % 6;
+  constexpr int64_t batches[] = {1, 1, 1, 1, 2, 2, 3, 9}, cubes[] = {1, 2, 2, 2, 3, 2, 2, 4};
+  s.batch = batches[more / 8 % 8];
+  if (more == 255) s.batch = 0;
+  s.channels = 1 + also % 4;
+  s.texture_size = cubes[also / 4 % 8];
+  s.hostile_upstream = also / 32 == 7;
+  const int omitted = bytes.next() % 16;
+  s.no_grad_weights = omitted == 1 || omitted == 3;
+  s.no_grad_depth = omitted == 2 || omitted == 3;
+  const int64_t height = side(bytes.next());
+  s.image = {height, side(bytes.next())};
+  s.grid_size = 1 + bytes.next() % 5;
   const int planes = bytes.next();
   s.near = planes % 4 == 0 ? T(0.1) : T(planes % 16) / 8;
   s.far = planes / 16 == 0 ? T(100) : T(planes / 16) / 2;
@@ -69,6 +79,10 @@ Scene<T> decode(Bytes bytes) {
   s.eps = eps == 0 ? T(1e-4) : eps == 1 ? T(1e-3) : T(std::ldexp(1.0, -eps));
   s.seed = bytes.next();
 
+  s.num_vertices = s.num_faces = 0;
+  s.vertices.clear();
+  s.faces.clear();
+  s.starts.clear();
   const int64_t meshes = packed ? s.batch : 1;
   int64_t vertex_counts[9] = {}, face_counts[9] = {};
   for (int64_t m = 0; m < meshes; ++m) {
@@ -86,7 +100,11 @@ Scene<T> decode(Bytes bytes) {
       for (int64_t n = 0; n < 3 * face_counts[m]; ++n) s.faces.push_back(bytes.next() % vertex_counts[m]);
   const int64_t rows = packed ? s.num_vertices : s.batch * s.num_vertices;
   for (int64_t n = 0; n < 3 * rows; ++n) s.vertices.push_back(coordinate<T>(bytes, n % 3 == 2));
-  return s;
+#ifdef NMR_FRESH_SCRATCH
+  s.vertices.shrink_to_fit();
+  s.faces.shrink_to_fit();
+  s.starts.shrink_to_fit();
+#endif
 }
 
 void stop(const char* what, const char* which) {
@@ -96,11 +114,27 @@ void stop(const char* what, const char* which) {
 
 template <class T>
 void run(const Bytes& bytes) {
-  const Scene<T> scene = decode<T>(bytes);
-  const Results<T> one = run_stages(scene, 1);
+  static Scene<T> scene;
+  static Results<T> one, other;
+  decode<T>(bytes, scene);
+  run_stages(scene, 1, one);
   if (const char* broken = broken_promise(scene, one)) stop("broken promise", broken);
-  if (scene.seed % 8 != 7) return;  // threads take time to start: not for every input
-  if (const char* name = first_difference(one, run_stages(scene, 3))) stop("depends on the number of threads", name);
+  switch (scene.seed) {  // what takes another run, or starts threads: not for every input
+    case 7: case 71:
+      run_stages(scene, 2, other);
+      if (const char* name = first_difference(one, other)) stop("depends on the number of threads", name);
+      break;
+    case 8: case 9: case 10: case 11:
+      if (scene.batch < 2) break;
+      run_stages(first_image(scene), 1, other);
+      if (const char* name = depends_on_company(scene, one, other)) stop("depends on the other images", name);
+      break;
+    case 12: case 13: case 14: case 15:
+      if (scene.packed() || !(scene.per_image_values || scene.batch == 1)) break;
+      run_stages(packed(scene), 1, other);
+      if (const char* name = depends_on_packing(one, other)) stop("depends on packing", name);
+      break;
+  }
 }
 
 }  // namespace

@@ -2,6 +2,7 @@
 // the instruction count.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <limits>
 #include <vector>
@@ -26,7 +27,23 @@ std::vector<T> noise_array(uint64_t seed, int64_t size) {
   return values;
 }
 
+// Sizes an array that is used for scene after scene. It keeps its storage, but in sanitizer builds has exactly this size, so that
+// accesses beyond it are seen.
+template <class T>
+void resize(std::vector<T>& values, int64_t size) {
+#ifdef NMR_FRESH_SCRATCH
+  if (values.capacity() != static_cast<size_t>(size)) std::vector<T>().swap(values);
+#endif
+  values.resize(size);
+}
+
 // Memory that a stage must overwrite: what stays NaN was forgotten.
+template <class T>
+void unwritten(std::vector<T>& values, int64_t size) {
+  resize(values, size);
+  std::fill(values.begin(), values.end(), std::numeric_limits<T>::quiet_NaN());
+}
+
 template <class T>
 std::vector<T> unwritten(int64_t size) {
   return std::vector<T>(size, std::numeric_limits<T>::quiet_NaN());
@@ -49,6 +66,8 @@ struct Scene {
   bool per_image_values = false;  // textures and attributes of each image, not shared
   bool perspective = true, distorted = true;  // the camera; undistorted ones have an origin and an extent
   bool foreign_owner = false;  // backward stages get a made-up owner map: any in range is allowed
+  bool hostile_upstream = false;  // NaN, infinities and huge numbers among the upstream gradients
+  bool no_grad_weights = false, no_grad_depth = false;  // optional upstream gradients and results of a backward stage
   uint64_t seed = 1;           // of textures, attributes, cameras and upstream gradients
 
   bool packed() const { return !starts.empty(); }
@@ -68,11 +87,14 @@ struct Scene {
 template <class T>
 struct Results {
   std::vector<int32_t> owner;
+  std::vector<int64_t> clip_counts, clip_starts, clip_faces, clip_corners, clip_ends;
+  std::vector<int32_t> clip_source;
   std::vector<T> alpha, grad_silhouette, grad_local;
   std::vector<T> weights, depth, grad_fragments;
   std::vector<T> depth_image, grad_depth;
   std::vector<T> colors, grad_textures;
   std::vector<T> values, grad_attributes, grad_weights;
+  std::vector<T> pyramid, grad_texels, level, sampled, grad_sampled_texels, grad_uv, grad_uv_weights;
   std::vector<T> resolved, grad_image;
   std::vector<T> grad_edges;
   std::vector<T> points, grad_world, grad_matrix, grad_intrinsics, grad_distortion, grad_origin, grad_extent;
@@ -83,6 +105,12 @@ struct Results {
   template <class Visit>
   void for_each(const Visit& visit) const {
     visit("owner", owner);
+    visit("clip_counts", clip_counts);
+    visit("clip_starts", clip_starts);
+    visit("clip_faces", clip_faces);
+    visit("clip_corners", clip_corners);
+    visit("clip_ends", clip_ends);
+    visit("clip_source", clip_source);
     visit("alpha", alpha);
     visit("grad_silhouette", grad_silhouette);
     visit("grad_local", grad_local);
@@ -96,6 +124,13 @@ struct Results {
     visit("values", values);
     visit("grad_attributes", grad_attributes);
     visit("grad_weights", grad_weights);
+    visit("pyramid", pyramid);
+    visit("grad_texels", grad_texels);
+    visit("level", level);
+    visit("sampled", sampled);
+    visit("grad_sampled_texels", grad_sampled_texels);
+    visit("grad_uv", grad_uv);
+    visit("grad_uv_weights", grad_uv_weights);
     visit("resolved", resolved);
     visit("grad_image", grad_image);
     visit("grad_edges", grad_edges);
@@ -116,13 +151,37 @@ struct Results {
   }
 };
 
-// Runs every stage of csrc, forward and backward.
+// Runs every stage of csrc, forward and backward. Earlier results are overwritten, their storage used again.
 template <class T>
-Results<T> run_stages(const Scene<T>& scene, int num_threads);
+void run_stages(const Scene<T>& scene, int num_threads, Results<T>& results);
 
-// The name of the first result that differs in a bit, or nullptr.
+template <class T>
+Results<T> run_stages(const Scene<T>& scene, int num_threads) {
+  Results<T> results;
+  run_stages(scene, num_threads, results);
+  return results;
+}
+
+// The same meshes packed; of a stacked batch.
+template <class T>
+Scene<T> packed(const Scene<T>& scene);
+
+// The first image alone.
+template <class T>
+Scene<T> first_image(const Scene<T>& scene);
+
+// The name of the first result that differs in a bit, or nullptr. Any NaN is a NaN.
 template <class T>
 const char* first_difference(const Results<T>& a, const Results<T>& b);
+
+// The name of the first result of first_image(scene) that is not the beginning of the batch's, or nullptr. Sums over the batch are
+// not compared.
+template <class T>
+const char* depends_on_company(const Scene<T>& scene, const Results<T>& together, const Results<T>& alone);
+
+// The name of the first result that packing changed, or nullptr. A packed batch is one mesh to the smoothness loss: not compared.
+template <class T>
+const char* depends_on_packing(const Results<T>& stacked, const Results<T>& packed);
 
 // What holds for every scene, however hostile; nullptr, or a sentence that says what does not.
 template <class T>

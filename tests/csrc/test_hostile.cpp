@@ -9,9 +9,10 @@ constexpr double kInf = std::numeric_limits<double>::infinity(), kNaN = std::num
 
 template <class T>
 void check_survives(Scene<T> scene) {
-  for (int64_t image_size : {1, 7}) {
+  for (const Size image : {Size{1, 1}, Size{4, 9}}) {
     for (int variant = 0; variant < 4; ++variant) {
-      scene.image = square(image_size);
+      scene.image = image;
+      scene.hostile_upstream = variant == 1;
       scene.anti_aliasing = variant % 2 == 0;
       scene.fill_back = variant < 2;
       const Results<T> one = run_stages(scene, 1);
@@ -94,7 +95,7 @@ TEST_REAL(scratch_of_earlier_calls_does_not_show) {
   std::vector<Results<T>> first;
   const auto scene = [](int n) {
     Scene<T> s = single<T>(n % 2 ? sphere(2, 1) : soup(4, n));
-    s.image = square(3 + 11 * (n % 3));
+    s.image = {3 + 11 * (n % 3), 4 + 7 * (n % 4)};
     s.anti_aliasing = n % 2;
     return s;
   };

@@ -100,7 +100,7 @@ void print_hashes(const char* type, const W1<T>& w1) {
               hash(w1.alpha), hash(w1.grad_vertices), area / double(w1.alpha.size()));
   // Every stage on other meshes; the camera and the smoothness loss included.
   Scene<T> scene = pack<T>({sphere(2, 1), soup(40, 2), Mesh{}, sphere(1, 3)});
-  scene.image = square(31);
+  scene.image = {31, 22};
   scene.texture_size = 4;
   run_stages(scene, 2).for_each([&](const char* name, const auto& values) {
     if (!values.empty()) std::printf("%-7s %-17s %016" PRIx64 "\n", type, name, hash(values));
