@@ -124,6 +124,16 @@ struct Rasterize {
   int num_threads;
 };
 
+// The K nearest faces at each pixel, nearest first (layers.cpp).
+template <class T>
+struct RasterizeLayers {
+  MeshBatch<T> mesh;
+  RasterSettings<T> settings;
+  int64_t layers;  // K
+  int32_t* owner;  // out [B, H, W, K]; as in Rasterize, -1 after the last face
+  int num_threads;
+};
+
 // Coverage of an owner map, with NMR's gradient (silhouette.cpp) or that of Kato and Harada 2019 (local_gradient.cpp).
 template <class T>
 struct SilhouetteForward {
@@ -334,6 +344,7 @@ template <class T> bool crosses_near(const T* vertices, int64_t count, T near); 
 template <class T> void clip_count(const ClipCount<T>& args);
 template <class T> void clip_faces(const ClipFaces<T>& args);
 template <class T> void rasterize(const Rasterize<T>& args);
+template <class T> void rasterize_layers(const RasterizeLayers<T>& args);
 template <class T> void silhouette_forward(const SilhouetteForward<T>& args);
 template <class T> void silhouette_backward(const SilhouetteBackward<T>& args);
 template <class T> void local_gradient(const SilhouetteBackward<T>& args);

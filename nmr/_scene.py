@@ -53,6 +53,9 @@ class Scene(NamedTuple):
     def rasterize(self, fill_back: bool, near: float, far: float) -> Tensor:
         return ops.rasterize(*self.drawn[:3], *self.raster, bool(fill_back), float(near), float(far))
 
+    def rasterize_layers(self, layers: int, fill_back: bool, near: float, far: float) -> Tensor:
+        return ops.rasterize_layers(*self.drawn[:3], *self.raster, layers, bool(fill_back), float(near), float(far))
+
     def silhouette(
         self, anti_aliasing: bool, fill_back: bool, near: float, far: float, eps: float, local: bool = False
     ):
@@ -73,12 +76,21 @@ class Scene(NamedTuple):
         return ops.depth_image(*self.drawn[:3], owner, bool(anti_aliasing), float(far))
 
     def fragments(self, owner: Tensor, anti_aliasing: bool, far: float, eps: float) -> Fragments:
-        weights, depth = ops.fragments(*self.drawn[:3], owner, float(far))
+        """Those of an owner map ``[B, H, W]``, or of layers ``[B, H, W, K]``."""
+        if owner.ndim == 4:
+            layers = [self._weights_and_depth(layer, far) for layer in owner.unbind(-1)]
+            weights, depth = (torch.stack(x, dim=3) for x in zip(*layers, strict=True))
+        else:
+            weights, depth = self._weights_and_depth(owner, far)
         drawn, drawn_owner = self.drawn, owner
         if self.clipped is not None:
-            weights, owner = self.clipped.weights(owner, weights), self.clipped.owner(owner)
+            owner = self.clipped.owner(owner)
         settings = bool(anti_aliasing), float(eps)
         return Fragments(owner, weights, depth, self.mesh, self.world, self.camera, *settings, drawn, drawn_owner)
+
+    def _weights_and_depth(self, owner: Tensor, far: float) -> tuple[Tensor, Tensor]:
+        weights, depth = ops.fragments(*self.drawn[:3], owner, float(far))
+        return weights if self.clipped is None else self.clipped.weights(owner, weights), depth
 
     def face_index(self, owner: Tensor) -> Tensor:
         owner = owner if self.clipped is None else self.clipped.owner(owner)

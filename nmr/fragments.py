@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -41,6 +41,10 @@ class Fragments:
         z of the nearest point, ``far`` on background. Differentiable in the vertices (at fixed owner).
     vertices, faces
         The meshes in renderer space, ``[B, V, 3]``; for a list of meshes ``[N, 3]``, one mesh after the other.
+
+    With ``faces_per_pixel`` K > 1 these have one more axis: owner and depth ``[B, H, W, K]``, weights ``[B, H, W, K,
+    3]``, nearest first. So do the results of :meth:`interpolate`, :meth:`per_face`, :meth:`normals` and of the
+    properties. For colours, lights and :meth:`resolve` take one :meth:`layer` at a time.
     """
 
     owner: Tensor
@@ -52,7 +56,7 @@ class Fragments:
     anti_aliasing: bool
     eps: float
     _drawn: MeshBatch  # the meshes as drawn: faces that cross the near plane are cut
-    _drawn_owner: Tensor
+    _drawn_owner: Tensor | None  # None: surfaces behind others, which have no edge gradient
 
     @property
     def vertices(self) -> Tensor:
@@ -63,6 +67,37 @@ class Fragments:
         return self.mesh.faces
 
     @property
+    def layers(self) -> int | None:
+        """K, or None without that axis."""
+        return self.owner.shape[3] if self.owner.ndim == 4 else None
+
+    def layer(self, k: int) -> Fragments:
+        """The k-th nearest surfaces, without the axis for K: 0 is what is seen.
+
+        Everything can be done with it, except that only layer 0 can be resolved: NMR's gradient is that of the edges
+        that are seen.
+        """
+        if self.layers is None or not -self.layers <= k < self.layers:
+            have = "one layer without an axis for it" if self.layers is None else f"layers 0..{self.layers - 1}"
+            raise IndexError(f"layer {k} was requested of fragments with {have}; see faces_per_pixel")
+        return replace(
+            self,
+            owner=self.owner[..., k],
+            weights=self.weights[..., k, :],
+            depth=self.depth[..., k],
+            _drawn_owner=self._drawn_owner[..., k] if k in (0, -self.layers) else None,
+        )
+
+    def _wide(self) -> Fragments:
+        """All layers side by side, as one raster ``[B, H, W K]``."""
+        owner, weights, depth = self.owner.flatten(2), self.weights.flatten(2, 3), self.depth.flatten(2)
+        return replace(self, owner=owner, weights=weights, depth=depth)
+
+    def _each_layer(self, raster: Tensor) -> Tensor:
+        """Values ``[B, H, W K, C]`` of :meth:`_wide` as ``[B, H, W, K, C]``."""
+        return raster.unflatten(2, self.owner.shape[2:])
+
+    @property
     def covered(self) -> Tensor:
         """bool ``[B, H, W]``: some face is there."""
         return self.owner >= 0
@@ -70,12 +105,17 @@ class Fragments:
     @property
     def is_back(self) -> Tensor:
         """bool ``[B, H, W]``: the face there is seen from its back (its vertices run clockwise on the screen)."""
-        return self.owner >= self.mesh.num_faces
+        return self.owner >= self._num_faces
 
     @property
     def face_index(self) -> Tensor:
         """int32 ``[B, H, W]``: f where face f is nearest, seen from either side; -1 is background."""
-        return torch.where(self.is_back, self.owner - self.mesh.num_faces, self.owner)
+        return torch.where(self.is_back, self.owner - self._num_faces, self.owner)
+
+    @property
+    def _num_faces(self) -> int | Tensor:
+        num_faces = self.mesh.num_faces
+        return num_faces.unsqueeze(-1) if isinstance(num_faces, Tensor) and self.layers else num_faces
 
     def interpolate(self, attributes: Tensor | list[Tensor], corners: Tensor | list[Tensor] | None = None) -> Tensor:
         """Values given at vertices, interpolated at each pixel: ``[B, H, W, C]``, 0 on background.
@@ -91,6 +131,8 @@ class Fragments:
         return self._interpolate(attributes, corners, "attributes", "corners")
 
     def _interpolate(self, attributes: object, corners: object, name: str, corners_name: str) -> Tensor:
+        if self.layers:
+            return self._each_layer(self._wide()._interpolate(attributes, corners, name, corners_name))
         attributes, faces, starts = self._corner_values(attributes, corners, name, corners_name)
         return ops.interpolate(attributes, faces, self.owner, self.weights, starts)
 
@@ -108,6 +150,8 @@ class Fragments:
         return self._per_face(values, "values")
 
     def _per_face(self, values: object, name: str) -> Tensor:
+        if self.layers:
+            return self._each_layer(self._wide()._per_face(values, name))
         return self._per_side(self.mesh.values(check_values(values, name, "F, C"), name, "face"))
 
     def _per_side(self, front: Tensor, back: Tensor | None = None) -> Tensor:
@@ -131,6 +175,8 @@ class Fragments:
         has the normal ``(v0 - v1) x (v2 - v1)``, as in the published renderer; otherwise the opposite one.
         Differentiable in the world-space vertices and, if smooth, in weights.
         """
+        if self.layers:
+            return self._each_layer(self._wide().normals(smooth))
         if not smooth:
             front = self._face_normals()
             return self._per_side(front, -front)
@@ -200,6 +246,11 @@ class Fragments:
             If image is not a float tensor [B, H, W, C] of the dtype of the vertices.
         """
         image = cast_under_autocast(image)
+        if self.layers or self._drawn_owner is None:
+            raise ValueError(
+                "only the nearest surfaces can be resolved, because NMR's gradient is that of the edges that are seen: "
+                "combine the layers into one image [B, H, W, C] and call fragments.layer(0).resolve(image)"
+            )
         if not isinstance(image, Tensor) or image.dtype != self.vertices.dtype:
             raise TypeError(
                 f"image must be a tensor of {self.vertices.dtype}, as the vertices are, got {describe(image)}"

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ._packing import is_list
 from ._scene import Meshes, average, make_scene, shade
-from ._validate import check_choice
+from ._validate import check_choice, check_size
 from .cameras import Camera
 from .fragments import Fragments
 from .images import OUTPUTS, Images
@@ -351,13 +351,21 @@ def render_fragments(
     far: float = 100.0,
     clip: bool = True,
     eps: float = 1e-4,
+    faces_per_pixel: int = 1,
 ) -> Fragments:
     """Face, weights and depth at each pixel, for shading of your own; arguments as in :func:`render_silhouette`.
+
+    Parameters
+    ----------
+    faces_per_pixel : int
+        K in 1..1024: how many surfaces to return, one behind the other. 1 means the nearest, without an axis for K.
 
     Returns
     -------
     Fragments
-        h x w pixels; with ``anti_aliasing`` 2h x 2w pixels, which :meth:`Fragments.resolve` averages.
+        h x w pixels; with ``anti_aliasing`` 2h x 2w pixels, which :meth:`Fragments.resolve` averages. With K > 1,
+        ``owner[b, y, x, k]`` is the face of the k-th nearest surface, -1 behind the last one (there weights are 0 and
+        depth is ``far``). Of equally near faces the first one comes first.
 
     Notes
     -----
@@ -366,16 +374,26 @@ def render_fragments(
     Raises
     ------
     TypeError, ValueError
-        As :func:`render_silhouette`.
+        As :func:`render_silhouette`; for a faces_per_pixel that is not an integer in 1..1024.
 
     Examples
     --------
     >>> vertices, faces = nmr.icosphere(3)
     >>> fragments = nmr.render_fragments(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), anti_aliasing=True)
     >>> image = fragments.resolve(fragments.interpolate(vertices).sin())
+
+    The thickness of a body, from its two surfaces:
+
+    >>> layers = nmr.render_fragments(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), faces_per_pixel=2)
+    >>> thickness = layers.depth[..., 1] - layers.depth[..., 0]
     """
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
-    return scene.fragments(scene.rasterize(fill_back, near, far), anti_aliasing, far, eps)
+    layers = check_size(faces_per_pixel, "faces_per_pixel", 1024)
+    if layers == 1:
+        owner = scene.rasterize(fill_back, near, far)
+    else:
+        owner = scene.rasterize_layers(layers, fill_back, near, far)
+    return scene.fragments(owner, anti_aliasing, far, eps)
 
 
 @torch.no_grad()

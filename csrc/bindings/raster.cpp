@@ -18,6 +18,19 @@ void rasterize_py(const Array<T>& vertices, const Indices& faces, const std::opt
 }
 
 template <class T>
+void rasterize_layers_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts, Array<int32_t>& owner,
+                         bool fill_back, double near, double far, int num_threads) {
+  const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
+  require(owner.ndim() == 4 && owner.shape(0) == mesh.batch && owner.shape(1) >= 1 && owner.shape(1) <= 16384 &&
+              owner.shape(2) >= 1 && owner.shape(2) <= 16384 && owner.shape(3) >= 1,
+          "owner must have shape [" + std::to_string(mesh.batch) + ", H, W, K] with H and W in 1..16384, got " + shape_of(owner));
+  const RasterSettings<T> settings{{owner.shape(1), owner.shape(2)}, fill_back, static_cast<T>(near), static_cast<T>(far)};
+  const RasterizeLayers<T> args{mesh, settings, owner.shape(3), owner.mutable_data(), num_threads};
+  py::gil_scoped_release release;
+  rasterize_layers(args);
+}
+
+template <class T>
 void silhouette_forward_py(const Array<int32_t>& owner, Array<T>& alpha, bool anti_aliasing, int num_threads) {
   require(alpha.ndim() == 3, "alpha must have shape [B, h, w], got " + shape_of(alpha));
   const Size image{alpha.shape(1), alpha.shape(2)}, raster = raster_of(image, anti_aliasing);
@@ -44,6 +57,9 @@ void silhouette_backward_py(const Array<T>& vertices, const Indices& faces, cons
 template <class T>
 void define_raster(py::module_& m) {
   m.def("rasterize", &rasterize_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("fill_back"), py::arg("near"), py::arg("far"),
+        py::arg("num_threads"));
+  m.def("rasterize_layers", &rasterize_layers_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
         py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("fill_back"), py::arg("near"), py::arg("far"),
         py::arg("num_threads"));
   m.def("silhouette_forward", &silhouette_forward_py<T>, py::arg("owner").noconvert(), py::arg("alpha").noconvert(),

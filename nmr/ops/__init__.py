@@ -18,7 +18,7 @@ from .edges import edges_backward, resolve, resolve_backward
 from .fragments import depth_backward, depth_image, fragments, fragments_backward
 from .losses import soft_iou, soft_iou_backward
 from .mesh import smoothness, smoothness_backward, voxels
-from .raster import local_gradient, rasterize, silhouette, silhouette_backward
+from .raster import local_gradient, rasterize, rasterize_layers, silhouette, silhouette_backward
 from .shade import interpolate, interpolate_backward, sample_texture_cubes, texture_cubes_backward
 from .texture import WRAPS, mipmaps, mipmaps_backward, sample_uv, sample_uv_backward, uv_levels
 
@@ -41,6 +41,7 @@ __all__ = [
     "project",
     "project_backward",
     "rasterize",
+    "rasterize_layers",
     "resolve",
     "resolve_backward",
     "sample_texture_cubes",

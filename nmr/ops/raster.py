@@ -37,6 +37,33 @@ def _(vertices, faces, starts, height, width, fill_back, near, far):
     return vertices.new_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
 
 
+# --- rasterize_layers
+
+
+@operator
+def rasterize_layers(
+    vertices: Tensor,
+    faces: Tensor,
+    starts: Tensor | None,
+    height: int,
+    width: int,
+    layers: int,
+    fill_back: bool,
+    near: float,
+    far: float,
+) -> Tensor:
+    """The owners of the nearest surfaces at each pixel, ``[B, height, width, layers]``, nearest first, then -1."""
+    owner = host_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
+    arrays = host_array(vertices), host_array(faces), host_array(starts)
+    _C.rasterize_layers(*arrays, owner.numpy(), fill_back, near, far, num_threads())
+    return owner.to(vertices.device)
+
+
+@torch.library.register_fake(rasterize_layers)
+def _(vertices, faces, starts, height, width, layers, fill_back, near, far):
+    return vertices.new_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
+
+
 # --- silhouette
 
 

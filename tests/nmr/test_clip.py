@@ -33,7 +33,7 @@ def tilted(dtype=torch.float64):
 
 
 @pytest.mark.parametrize("camera", [CAMERA, PINHOLE], ids=["LookAt", "Pinhole"])
-@pytest.mark.parametrize("image_size", [SIZE])
+@pytest.mark.parametrize("image_size", [SIZE, (32, 64)])
 def test_a_floor_under_the_eye_is_that_of_a_fine_mesh(camera, image_size):
     coarse, fine = floor(1), floor(150)
     options = {"image_size": image_size, "anti_aliasing": False}

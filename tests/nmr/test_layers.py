@@ -1,0 +1,150 @@
+"""The K nearest faces at each pixel."""
+
+import pytest
+import torch
+
+import nmr
+from nmr import reference
+
+NEAR, FAR = 0.1, 100.0
+
+
+def slow_layers(vertices, faces, size, layers, fill_back):
+    """Draws the faces of one mesh one by one; sorts those at each pixel by depth, then by number. Row 0 = top."""
+    ids = range(2 * len(faces) if fill_back else len(faces))
+    triangles = reference.with_back_faces(faces, fill_back)
+    owners, depths = [], []
+    for face in ids:
+        index = reference.face_index(vertices, triangles[face : face + 1], size, False, NEAR, FAR)
+        _, depth = reference.fragments(vertices, triangles[face : face + 1], index, FAR)
+        owners.append(torch.where(index < 0, -1, face)), depths.append(depth)
+    depth, order = torch.stack(depths, -1).sort(dim=-1, stable=True)
+    owner = torch.stack(owners, -1).gather(-1, order)
+    return owner[..., :layers].flip(0), depth[..., :layers].flip(0)
+
+
+def soup(seed, dtype=torch.float64, num_faces=12):
+    """Random triangles in renderer space, some of them partly off the screen."""
+    g = torch.Generator().manual_seed(seed)
+    centre = torch.rand(num_faces, 1, 3, generator=g) * 2 - 1
+    corners = centre + 0.5 * torch.randn(num_faces, 3, 3, generator=g)
+    corners[..., 2] = 1 + torch.rand(num_faces, 3, generator=g)
+    return corners.view(1, -1, 3).to(dtype), torch.arange(num_faces * 3).view(-1, 3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("fill_back", [False, True])
+def test_equals_the_slow_definition(seed, fill_back):
+    vertices, faces = soup(seed)
+    fragments = nmr.render_fragments(vertices, faces, image_size=20, fill_back=fill_back, faces_per_pixel=5, clip=False)
+    owner, depth = slow_layers(vertices[0], faces, 20, 5, fill_back)
+    assert torch.equal(fragments.owner[0].long(), owner) and (owner[..., 1] >= 0).any()
+    torch.testing.assert_close(fragments.depth[0], depth, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("image_size", [33, (20, 41)])
+def test_the_first_layer_is_what_is_seen(dtype, image_size):
+    for seed in range(4):
+        vertices, faces = soup(seed, dtype)
+        plain = nmr.render_fragments(vertices, faces, image_size=image_size)
+        layers = nmr.render_fragments(vertices, faces, image_size=image_size, faces_per_pixel=3)
+        first = layers.layer(0)
+        for name in ("owner", "weights", "depth", "covered", "is_back", "face_index"):
+            assert torch.equal(getattr(first, name), getattr(plain, name))
+        assert torch.equal(first.normals(), plain.normals())
+        image = first.interpolate(vertices)
+        assert torch.equal(first.resolve(image), plain.resolve(plain.interpolate(vertices)))
+        one = nmr.render_fragments(vertices, faces, image_size=image_size, faces_per_pixel=1)
+        assert one.layers is None and torch.equal(one.owner, plain.owner)
+
+
+def test_of_equally_near_faces_the_first_comes_first():
+    vertices = torch.tensor([[-0.9, -0.9, 2.0], [0.9, -0.9, 2.0], [0.0, 0.9, 2.0]])
+    faces = torch.tensor([[0, 1, 2], [1, 2, 0], [2, 1, 0], [0, 1, 2]])
+    owner = nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=6).owner
+    # Faces 0, 1, 3 from their fronts, then 2 (4 + 2) from its back, where the depths have the same bits.
+    middle = owner[0, 5, 4].tolist()
+    assert middle == [0, 1, 3, 6, -1, -1]
+
+
+def test_a_sphere_has_two_surfaces():
+    vertices, faces = nmr.icosphere(4)
+    camera = nmr.LookAt([0.0, 0.0, -3.0], half_fov_deg=25.0)
+    layers = nmr.render_fragments(vertices, faces, camera, image_size=32, faces_per_pixel=4)
+    assert layers.covered.sum((0, 1, 2))[2:].max() <= 2  # where an edge is hit exactly
+    both = layers.covered[..., 1]
+    thickness = (layers.depth[..., 1] - layers.depth[..., 0])[both]
+    points = layers.interpolate(vertices)
+    torch.testing.assert_close(
+        points.norm(dim=-1)[layers.covered], torch.ones(int(layers.covered.sum())), atol=3e-3, rtol=0
+    )
+    assert 1.9 < thickness.max() <= 2 and thickness.min() >= 0
+    normals = layers.normals(smooth=True)
+    towards = (normals * points).sum(-1)
+    assert (towards[..., 0][both] > 0.95).all() and (towards[..., 1][both] < -0.95).all()
+    numbers = layers.per_face(torch.arange(len(faces)).float().unsqueeze(-1)).squeeze(-1)
+    assert torch.equal(numbers[layers.covered], layers.face_index[layers.covered].float())
+
+
+def test_gradients_are_the_derivative():
+    vertices, faces = soup(1)
+    faces = faces[:8]
+    values = torch.rand(vertices.shape[1], 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+    def draw(vertices):
+        layers = nmr.render_fragments(vertices, faces, image_size=6, faces_per_pixel=3)
+        return layers.weights, layers.depth, layers.interpolate(values)
+
+    assert torch.autograd.gradcheck(draw, vertices.clone().requires_grad_(), eps=1e-7, atol=1e-5, rtol=1e-5)
+
+
+def test_lists_batches_and_clipped_faces():
+    meshes = [soup(2, torch.float32), soup(3, torch.float32)]
+    vertices = [v[0] - torch.tensor([0.0, 0.0, 1.5]) for v, _ in meshes]
+    faces = [meshes[0][1], meshes[1][1][:7]]
+    camera = nmr.Look([0.0, 0.0, 0.0], [0.0, 0.1, 1.0], half_fov_deg=40.0)
+    together = nmr.render_fragments(vertices, faces, camera, image_size=24, faces_per_pixel=4)
+    assert together.mesh is not together._drawn  # some are cut
+    for b in range(2):
+        alone = nmr.render_fragments(vertices[b], faces[b], camera, image_size=24, faces_per_pixel=4)
+        nearest = nmr.render_fragments(vertices[b], faces[b], camera, image_size=24)
+        for name in ("owner", "weights", "depth", "face_index"):
+            assert torch.equal(getattr(together, name)[b], getattr(alone, name)[0])
+            assert torch.equal(getattr(together.layer(0), name)[b], getattr(nearest, name)[0])
+        assert torch.equal(together.normals()[b], alone.normals()[0])
+
+
+def test_results_do_not_depend_on_threads():
+    vertices, faces = soup(0, torch.float32)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = nmr.render_fragments(vertices, faces, image_size=100, faces_per_pixel=3).owner
+        torch.set_num_threads(3)
+        assert torch.equal(one, nmr.render_fragments(vertices, faces, image_size=100, faces_per_pixel=3).owner)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_errors():
+    vertices, faces = soup(0)
+    for wrong in (0, 1025):
+        with pytest.raises(ValueError, match="faces_per_pixel"):
+            nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=wrong)
+    with pytest.raises(TypeError, match="faces_per_pixel"):
+        nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=2.0)
+    layers = nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=2)
+    for fragments in (layers, layers.layer(1)):
+        with pytest.raises(ValueError, match="layer\\(0\\)"):
+            fragments.resolve(torch.zeros(1, 8, 8, 3, dtype=torch.float64))
+    with pytest.raises(IndexError, match="faces_per_pixel"):
+        layers.layer(2)
+    with pytest.raises(IndexError, match="faces_per_pixel"):
+        layers.layer(0).layer(0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_opcheck(dtype):
+    vertices, faces = soup(0, dtype)
+    torch.library.opcheck(nmr.ops.rasterize_layers, (vertices, faces, None, 8, 12, 3, True, NEAR, FAR))
