@@ -1,6 +1,6 @@
-// Eight values that are processed together (lanes), for one level: levels.h includes this file in the namespace of each. A vector that
-// does not fit into a register of the level is two halves. Every operation treats each lane separately, so results do not depend on
-// the level.
+// Eight values that are processed together (lanes), for one level: levels.h includes this file in the namespace of
+// each. A vector that does not fit into a register of the level is two halves. Every operation treats each lane
+// separately, so results do not depend on the level.
 
 constexpr int64_t kLanes = 8;
 
@@ -68,7 +68,6 @@ typedef int64_t Mask64;
 #endif
 template <class T> using MaskElement = std::conditional_t<sizeof(T) == 8, Mask64, int32_t>;
 template <class T> using Lanes = typename LaneType<T, kLanes>::Type;
-template <class T> using LaneMask = Lanes<MaskElement<T>>;  // all bits of a lane are set or none
 using Lanes32 = Lanes<int32_t>;
 
 template <class V> struct IsHalves : std::false_type {};
@@ -116,6 +115,9 @@ NMR_LANE_COMPARISON(==)
 #undef NMR_LANE_COMPARISON
 #undef NMR_ONE_OPERATOR
 #undef NMR_ONE_COMPARISON
+
+// What a comparison gives: all bits of a lane are set or none.
+template <class T> using LaneMask = decltype(std::declval<Lanes<T>>() < std::declval<Lanes<T>>());
 
 template <class V, class U>
 NMR_INLINE V load_lanes(const U* p) {
@@ -175,8 +177,8 @@ NMR_INLINE V keep(M mask, V v) {
 #endif
 }
 
-// Each lane converted to the element type of `To`; to integers truncated, and then every lane must be in range. Halves on one side only
-// come from element types of different size.
+// Each lane converted to the element type of `To`; to integers truncated, and then every lane must be in range. Halves
+// on one side only come from element types of different size.
 template <class To, class V>
 NMR_INLINE To convert_lanes(V v) {
   if constexpr (IsHalves<V>::value && IsHalves<To>::value) {
@@ -236,7 +238,7 @@ NMR_INLINE uint32_t lane_bits(M mask) {
 #if !defined(__GNUC__) || defined(NMR_NO_VECTOR_TYPES)
     return mask.value & 1;
 #else
-    constexpr size_t bytes = sizeof mask, lane_bytes = bytes / lane_count<M>();
+    [[maybe_unused]] constexpr size_t bytes = sizeof mask, lane_bytes = bytes / lane_count<M>();
 #if defined(__AVX2__) || NMR_AVX2
     if constexpr (bytes == 32 && lane_bytes == 4) return _mm256_movemask_ps((__m256)mask);
     if constexpr (bytes == 32 && lane_bytes == 8) return _mm256_movemask_pd((__m256d)mask);
@@ -279,7 +281,8 @@ struct SetBits {
 constexpr SetBits kSetBits;
 #endif
 
-// Writes the lanes whose bit is set to out, one after the other, and anything to the rest of out[0..7]; returns how many are set.
+// Writes the lanes whose bit is set to out, one after the other, and anything to the rest of out[0..7]; returns how
+// many are set.
 NMR_INLINE int64_t compress_lanes(Lanes32 v, uint32_t bits, int32_t* out) {
 #if defined(__AVX2__) || NMR_AVX2
   const __m256i order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(static_cast<int64_t>(kSetBits.entry[bits])));
@@ -314,7 +317,8 @@ struct LaneArray {
   explicit NMR_INLINE LaneArray(V v) { store_lanes(lane, v); }
 };
 
-// sums[0] += the sum of the lanes of p, sums[1] += that of q; always in the order ((0 + 4) + (2 + 6)) + ((1 + 5) + (3 + 7)).
+// sums[0] += the sum of the lanes of p, sums[1] += that of q; always in the order ((0 + 4) + (2 + 6)) + ((1 + 5) + (3
+// + 7)).
 template <class T>
 NMR_INLINE void add_lane_sums(Lanes<T> p, Lanes<T> q, T* sums) {
 #if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)

@@ -5,11 +5,11 @@
 //   ...
 //   NMR_AT_BEST_LEVEL(sweep_faces, image, faces);   // calls base::sweep_faces, v3::sweep_faces, ...
 //
-// The file is included once per level, each time in a namespace of its own that also holds the lanes (level_lanes.h) of that level. Its
-// own includes stand above, so that nothing of the standard library is compiled for a level and then shared with code for all
-// processors: a function of a level never has the name of one that another file could call. Levels other than `base` exist for
-// x86-64 with GCC 12 or later and glibc, if NMR_MULTIVERSION is defined. NMR_CPU_LEVEL=base in the environment keeps a process at
-// that level; results do not depend on it.
+// The file is included once per level, each time in a namespace of its own that also holds the lanes (level_lanes.h)
+// of that level. Its own includes stand above, so that nothing of the standard library is compiled for a level and
+// then shared with code for all processors: a function of a level never has the name of one that another file could
+// call. Levels other than `base` exist for x86-64 with GCC 12 or later and glibc, if NMR_MULTIVERSION is defined.
+// NMR_CPU_LEVEL=base in the environment keeps a process at that level; results do not depend on it.
 #include <cstdint>
 #include <cstring>
 #include <type_traits>

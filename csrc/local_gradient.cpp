@@ -1,12 +1,13 @@
-// The silhouette gradient of Kato and Harada 2019, which reaches one pixel: where the object ends between two pixels, the loss decides
-// whether the border should move, and the point seen in the covered pixel moves.
+// The silhouette gradient of Kato and Harada 2019, which reaches one pixel: where the object ends between two pixels,
+// the loss decides whether the border should move, and the point seen in the covered pixel moves.
 //
-// I is the coverage (0 or 1), g the gradient of the loss with respect to I, both on the raster H x W; i and j are neighbours in a row,
-// j to the right. If the content moves right by a pixel (2 / W), I_j becomes I_i, and the loss falls at the rate
+// I is the coverage (0 or 1), g the gradient of the loss with respect to I, both on the raster H x W; i and j are
+// neighbours in a row, j to the right. If the content moves right by a pixel (2 / W), I_j becomes I_i, and the loss
+// falls at the rate
 //     right = -(I_i - I_j) g_j W / 2;      if it moves left, I_i becomes I_j:      left = -(I_j - I_i) g_i W / 2.
-// A covered pixel sums both rates over its two pairs and takes the better direction, or none. The result is distributed to the corners
-// of its face by their weights at its centre, which are treated as constants. y is treated in the same way, upwards and with H. z gets
-// nothing.
+// A covered pixel sums both rates over its two pairs and takes the better direction, or none. The result is
+// distributed to the corners of its face by their weights at its centre, which are treated as constants. y is treated
+// in the same way, upwards and with H. z gets nothing.
 #include <algorithm>
 #include <cmath>
 
@@ -42,7 +43,8 @@ template <class T>
 struct Rates {
   T up = 0, down = 0;
 
-  // A border of the object: the upper (lower) neighbour is background. `own` and `other` are the gradients of the two pixels.
+  // A border of the object: the upper (lower) neighbour is background. `own` and `other` are the gradients of the two
+  // pixels.
   void add_upper_end(T own, T other) {
     up -= other;
     down += own;
@@ -52,7 +54,8 @@ struct Rates {
     down -= other;
   }
 
-  // d loss / d coordinate of the better direction, or 0 if it does not lower the loss or is not clearly better. NaN is kept.
+  // d loss / d coordinate of the better direction, or 0 if it does not lower the loss or is not clearly better. NaN is
+  // kept.
   T gradient(T per_pixel, T eps) const {
     const T u = up * per_pixel, d = down * per_pixel;
     if (!(u - d == u - d)) return u - d;
@@ -61,11 +64,12 @@ struct Rates {
   }
 };
 
-// Screen weights of a face's corners at the centre of a pixel, in the order in which it is drawn, computed as in the rasterizer. False
-// if they are not defined; the rasterizer never makes such a face an owner.
+// Screen weights of a face's corners at the centre of a pixel, in the order in which it is drawn, computed as in the
+// rasterizer. False if they are not defined; the rasterizer never makes such a face an owner.
 template <class T>
 bool screen_weights(const Triangle<T>& t, int64_t row, int64_t column, Size raster, T (&w)[3]) {
-  const BarycentricMatrix<T> matrix = barycentric_matrix(t, static_cast<T>(raster.width), static_cast<T>(raster.height));
+  const T width = static_cast<T>(raster.width), height = static_cast<T>(raster.height);
+  const BarycentricMatrix<T> matrix = barycentric_matrix(t, width, height);
   const T x = static_cast<T>(column), y = static_cast<T>(raster.height - 1 - row);
   for (int k = 0; k < 3; ++k) w[k] = clamp_weight(matrix.m[k][0] * x + matrix.m[k][1] * y + matrix.m[k][2]);
   const T sum = w[0] + w[1] + w[2];
@@ -73,6 +77,7 @@ bool screen_weights(const Triangle<T>& t, int64_t row, int64_t column, Size rast
   return sum > 0;
 }
 
+// Adds the gradient of one covered pixel to the corners of its face.
 template <class T>
 void pull_pixel(const LocalImage<T>& image, int64_t row, int64_t column, T* grad_vertices) {
   const Size raster = image.raster;
@@ -80,7 +85,8 @@ void pull_pixel(const LocalImage<T>& image, int64_t row, int64_t column, T* grad
   Rates<T> x, y;
   bool at_end = false;
   const auto neighbour = [&](int64_t r, int64_t c, auto add) {
-    if (r < 0 || r >= raster.height || c < 0 || c >= raster.width || image.covered(r, c)) return;  // no gradient across the border of the image
+    // No gradient across the border of the image.
+    if (r < 0 || r >= raster.height || c < 0 || c >= raster.width || image.covered(r, c)) return;
     at_end = true;
     add(image.grad(r, c));
   };

@@ -15,9 +15,10 @@
 #define NMR_LEVELS 0
 #endif
 
-// A function marked NMR_CLONES is compiled for three levels of x86-64, and the loader chooses one. Only code that is inlined into it
-// is compiled with it, so functions called in its loops are marked NMR_INLINE. The macro is empty on other processors, with other
-// compilers, with GCC before 12 (which does not know the levels), and without glibc (which makes the choice at load time).
+// A function marked NMR_CLONES is compiled for three levels of x86-64, and the loader chooses one. Only code that is
+// inlined into it is compiled with it, so functions called in its loops are marked NMR_INLINE. The macro is empty on
+// other processors, with other compilers, with GCC before 12 (which does not know the levels), and without glibc
+// (which makes the choice at load time).
 #if NMR_LEVELS
 #define NMR_CLONES __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4")))
 #else

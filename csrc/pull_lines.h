@@ -11,17 +11,18 @@ namespace nmr {
 
 constexpr int64_t kPad = 8;  // entries that lanes may touch before and after the used ones
 
-// The pixels that can pull, for the lines of one axis: N lines of M pixels. Positions are in pixels along the line. Sweeps go up the
-// line (direction 0) or down (direction 1). What belongs to a direction is in its own coordinate: positions are negative for sweeps
-// down, so that every sweep goes towards larger coordinates.
+// The pixels that can pull, for the lines of one axis: N lines of M pixels. Positions are in pixels along the line.
+// Sweeps go up the line (direction 0) or down (direction 1). What belongs to a direction is in its own coordinate:
+// positions are negative for sweeps down, so that every sweep goes towards larger coordinates.
 template <class T>
 struct PullLines {
-  // [N, pad + M + pad] background pixels with gradient < 0, ascending, and -gradient. Their neighbours in the padding have positions
-  // before and after every pixel.
+  // [N, pad + M + pad] background pixels with gradient < 0, ascending, and -gradient. Their neighbours in the padding
+  // have positions before and after every pixel.
   std::vector<T> position, weight;
   std::vector<int32_t> count;      // [N] their number
-  std::vector<T> pull_end[2];      // [N + pad] by direction: a crossing before this has a pulling pixel beyond its outer one
-  std::vector<T> gain_start[2];    // [N + pad] by direction: a crossing before this has no pixel with gradient > 0 inside
+  // [N + pad] by direction: a crossing before pull_end has a pulling pixel beyond it; one before gain_start has no
+  // pixel with gradient > 0 inside.
+  std::vector<T> pull_end[2], gain_start[2];
   int64_t stride;                  // pad + M + pad
 
   void reserve_lines(int64_t N, int64_t M) {
@@ -48,7 +49,8 @@ struct SweepImage {
   PullLines<T>* lines;   // [0] columns: lines of constant x, swept along y; [1] rows
   T largest_lever;       // above this, or with a tiny eps, the product of two distances could overflow or underflow
 
-  // Gradient of raster pixel (column i, row j from the bottom). With a 2x2 mean each pixel gets a quarter of the image's gradient.
+  // Gradient of raster pixel (column i, row j from the bottom). With a 2x2 mean each pixel gets a quarter of the
+  // image's gradient.
   T grad(int64_t i, int64_t j) const {
     return anti_aliasing ? grad_alpha[(size.height - 1 - j / 2) * size.width + i / 2] / 4
                          : grad_alpha[(size.height - 1 - j) * size.width + i];
@@ -70,19 +72,22 @@ struct Crossings {
   // Crossing, and the entries of its line in PullLines, in the coordinate of the direction.
   T at[kCrossings + kPad], pull_end[kCrossings + kPad], gain_start[kCrossings + kPad];
   int32_t line[kCrossings + kPad];
-  int32_t edge[kCrossings + kPad];                            // k * kSweptFaces + face: edge k, k + 1 of a face of the block
-  int32_t pulled[kCrossings + kPad], gained[kCrossings + kPad];  // numbers of the crossings that have something to sweep
+  int32_t edge[kCrossings + kPad];  // k * kSweptFaces + face: edge k, k + 1 of a face of the block
+  // Numbers of the crossings that have something to sweep: outside the face, and inside.
+  int32_t pulled[kCrossings + kPad], gained[kCrossings + kPad];
 };
 
 // Memory for a block of faces.
 template <class T>
 struct SweepScratch {
-  int32_t id[kSweptFaces];                  // in the owner map
-  T corner[2][3][kSweptFaces];              // x (0) and y (1) of the corners in pixels, in the order in which the face is drawn
-  // Of edge P-Q = corners k, k + 1 and the lines of an axis: scan coordinates, and 2 / M (Qs - Ps), the reach of a lever.
+  int32_t id[kSweptFaces];  // in the owner map
+  // x (0) and y (1) of the corners in pixels, in the order in which the face is drawn.
+  T corner[2][3][kSweptFaces];
+  // Of edge P-Q = corners k, k + 1 and the lines of an axis: scan coordinates, and 2 / M (Qs - Ps), the reach of a
+  // lever.
   T ps[2][3 * kSweptFaces], qs[2][3 * kSweptFaces], reach[2][3 * kSweptFaces];
-  T pulls[2][3 * kSweptFaces][2];           // sum of the pulls on P and on Q
-  Crossings<T> crossings[2][2];             // by axis and direction
+  T pulls[2][3 * kSweptFaces][2];  // sum of the pulls on P and on Q
+  Crossings<T> crossings[2][2];    // by axis and direction
 };
 
 }  // namespace nmr

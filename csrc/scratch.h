@@ -11,8 +11,8 @@
 
 namespace nmr {
 
-// What one thread keeps: any number of objects, each of another type. They belong to the thread while it works (ScratchUse); otherwise
-// any thread may free them.
+// What one thread keeps: any number of objects, each of another type. They belong to the thread while it works
+// (ScratchUse); otherwise any thread may free them.
 class ThreadScratch {
  public:
   // A thread whose buffers have grown by more than this since it last freed them frees them when it has finished.
@@ -100,8 +100,8 @@ class ThreadScratch {
   std::vector<std::unique_ptr<AnyKept>> objects_;
 };
 
-// While one of these lives, the references of thread_scratch stay valid on this thread. parallel_for makes one on every thread; a
-// function that calls thread_scratch outside parallel_for makes one itself.
+// While one of these lives, the references of thread_scratch stay valid on this thread. parallel_for makes one on
+// every thread; a function that calls thread_scratch outside parallel_for makes one itself.
 struct ScratchUse {
   ScratchUse() { ThreadScratch::mine().start_use(); }
   ~ScratchUse() { ThreadScratch::mine().end_use(); }
@@ -115,9 +115,9 @@ Scratch& thread_scratch() {
   return ThreadScratch::mine().get<Scratch>();
 }
 
-// Grows a buffer (never shrinks it) and returns its storage. With NMR_FRESH_SCRATCH (sanitizer builds) the buffer is new, has exactly
-// this size, and all its bits are set, which is NaN in a floating-point number: sanitizers and tests then notice reads beyond it and
-// reads of unwritten values.
+// Grows a buffer (never shrinks it) and returns its storage. With NMR_FRESH_SCRATCH (sanitizer builds) the buffer is
+// new, has exactly this size, and all its bits are set, which is NaN in a floating-point number: sanitizers and tests
+// then notice reads beyond it and reads of unwritten values.
 template <class T>
 T* reserve(std::vector<T>& buffer, size_t size) {
   if (buffer.size() < size) ThreadScratch::mine().count(static_cast<int64_t>((size - buffer.size()) * sizeof(T)));

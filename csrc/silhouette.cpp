@@ -17,6 +17,7 @@
 
 namespace nmr {
 
+// Images in parallel.
 template <class T>
 void silhouette_forward(const SilhouetteForward<T>& args) {
   const Size image = args.image, raster = raster_of(image, args.anti_aliasing);
@@ -27,13 +28,7 @@ void silhouette_forward(const SilhouetteForward<T>& args) {
       for (int64_t n = 0; n < image.pixels(); ++n) alpha[n] = owner[n] >= 0 ? T(1) : T(0);
       return;
     }
-    for (int64_t y = 0; y < image.height; ++y, alpha += image.width) {
-      const int32_t *upper = owner + 2 * y * raster.width, *lower = upper + raster.width;
-      for (int64_t x = 0; x < image.width; ++x) {
-        const int covered = (lower[2 * x] >= 0) + (lower[2 * x + 1] >= 0) + (upper[2 * x] >= 0) + (upper[2 * x + 1] >= 0);
-        alpha[x] = T(0.25) * static_cast<T>(covered);
-      }
-    }
+    NMR_AT_BEST_LEVEL(average_coverage, owner, image, alpha);
   });
 }
 
@@ -71,6 +66,8 @@ void scatter(const SweepImage<T>& image, const int32_t* ids, int64_t count, cons
 
 }  // namespace
 
+// grad_vertices of each image: lists the pixels that can pull, sweeps the visible faces, adds up at the vertices. If a
+// gradient of alpha is not finite, x and y of every vertex of a visible face of that image get NaN.
 template <class T>
 void silhouette_backward(const SilhouetteBackward<T>& args) {
   const Size raster = raster_of(args.image, args.anti_aliasing);

@@ -1,7 +1,26 @@
 // The inner loops of the silhouette gradient; included by levels.h for every instruction set.
 //
-// For axis 0 the lines are columns: s is the scan coordinate x and t the sweep coordinate y. For axis 1 they are rows: s is y, t is x.
-// A sweep goes outward, up or down its line. In the coordinate of its direction (t or -t, see PullLines) it always goes up.
+// For axis 0 the lines are columns: s is the scan coordinate x and t the sweep coordinate y. For axis 1 they are rows:
+// s is y, t is x. A sweep goes outward, up or down its line. In the coordinate of its direction (t or -t, see
+// PullLines) it always goes up.
+//
+// An edge of a small face crosses three or four lines only. So edges are first written out as crossings, of all edges
+// with one axis and direction, and then crossings are worked on in full vectors.
+
+// --- coverage
+
+// alpha [h, w]: the covered share of each pixel of an image whose owner map has twice its size.
+template <class T>
+void average_coverage(const int32_t* owner, Size image, T* alpha) {
+  for (int64_t y = 0; y < image.height; ++y, alpha += image.width) {
+    const int32_t *upper = owner + 4 * y * image.width, *lower = upper + 2 * image.width;
+    for (int64_t x = 0; x < image.width; ++x) {
+      const int upper_covered = (upper[2 * x] >= 0) + (upper[2 * x + 1] >= 0);
+      const int lower_covered = (lower[2 * x] >= 0) + (lower[2 * x + 1] >= 0);
+      alpha[x] = T(0.25) * static_cast<T>(upper_covered + lower_covered);
+    }
+  }
+}
 
 // --- which pixels can pull
 
@@ -38,6 +57,7 @@ NMR_INLINE void start_lines(PullLines<T>& lines, int64_t first, int64_t last) {
   std::fill(lines.gain_start[1].begin() + first, lines.gain_start[1].begin() + last, -infinity);
 }
 
+// Adds pixel m to the list of line n.
 template <class T>
 NMR_INLINE void append_pull(PullLines<T>& lines, int64_t n, int64_t m, T weight) {
   const int64_t at = n * lines.stride + kPad + lines.count[n]++;
@@ -45,6 +65,7 @@ NMR_INLINE void append_pull(PullLines<T>& lines, int64_t n, int64_t m, T weight)
   lines.weight[at] = weight;
 }
 
+// Bounds and padding of lines [first, last), when all their pixels have been seen.
 template <class T>
 NMR_INLINE void finish_lines(PullLines<T>& lines, int64_t first, int64_t last) {
   const T infinity = std::numeric_limits<T>::infinity(), length = static_cast<T>(lines.stride - 2 * kPad);
@@ -134,12 +155,12 @@ int64_t find_visible(const int32_t* owner, int64_t pixels, int64_t num_faces, ui
 
 // --- the pulls
 
-// How the crossing c of an edge P-Q and a line moves with each end of the edge.
+// How the crossing c of an edge P-Q and a line n of M pixels moves with each end of the edge.
 template <class T>
 struct Lever {
   T crossing;  // c
-  T factor_p;  // 2 / M (Qs - Ps) / (Qs - n): travel of P, in [-1, 1] coordinates, that moves the crossing by one of M pixels
-  T factor_q;  // 2 / M (Qs - Ps) / (n - Ps)
+  T factor_p;  // 2 / M (Qs - Ps) / (Qs - n): travel of P, in [-1, 1] coordinates, that moves the crossing by one pixel
+  T factor_q;  // 2 / M (Qs - Ps) / (n - Ps): the same of Q
   T eps;
 };
 
@@ -150,15 +171,16 @@ NMR_INLINE T travel(T factor, T offset, T eps) {
   return h > 0 ? h + eps : h - eps;
 }
 
-// The pull of one pixel, for pixels inside the face and for levers of extreme size. An end without a finite lever does not move.
+// The pull of one pixel, for pixels inside the face and for levers of extreme size. An end without a finite lever does
+// not move.
 template <class T>
 NMR_INLINE void pull(T weight, T offset, const Lever<T>& lever, T* pulls) {
   if (std::isfinite(lever.factor_p)) pulls[0] += weight / travel(lever.factor_p, offset, lever.eps);
   if (std::isfinite(lever.factor_q)) pulls[1] += weight / travel(lever.factor_q, offset, lever.eps);
 }
 
-// Sums the pulls of the listed pixels beyond the crossing: above it if kUp, else below. The quotients w / h_p and w / h_q share one
-// division: w / (h_p h_q) times h_q and h_p.
+// Adds the pulls of the listed pixels beyond the crossing: above it if kUp, else below. A pixel of weight w pulls P
+// with w / h_p and Q with w / h_q, h the travel. The quotients share one division: w / (h_p h_q) times h_q and h_p.
 template <bool kUp, class T>
 NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, const Lever<T>& lever, T* pulls) {
   // All offsets have the same sign, so the signs of both distances are constant.
@@ -183,8 +205,8 @@ NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, c
 
 // Pulls of the pixels inside the face that should be background: the loss falls if the edge moves in past them.
 template <class T>
-void pull_inside(const SweepImage<T>& image, const SweepScratch<T>& block, int axis, int32_t edge, int64_t n, int64_t inner, int64_t d,
-                 const Lever<T>& lever, T* pulls) {
+void pull_inside(const SweepImage<T>& image, const SweepScratch<T>& block, int axis, int32_t edge, int64_t n,
+                 int64_t inner, int64_t d, const Lever<T>& lever, T* pulls) {
   const int64_t H = image.raster.height, W = image.raster.width, face = edge % kSweptFaces, p = edge / kSweptFaces;
   const int64_t q = p < 2 ? p + 1 : 0, o = p > 0 ? p - 1 : 2;
   // pixel m of line n: owner[m * step]
@@ -196,7 +218,8 @@ void pull_inside(const SweepImage<T>& image, const SweepScratch<T>& block, int a
   const int64_t end = (line - s(p)) * (line - s(o)) < 0 ? p : q;
   const T far_side = line_height(s(end), t(end), s(o), t(o), line);
   const int64_t limit = sweep_limit(far_side, d, length);
-  const int64_t m_first = std::max<int64_t>(std::min(inner, limit), 0), m_last = std::min(std::max(inner, limit), length - 1);
+  const int64_t m_first = std::max<int64_t>(std::min(inner, limit), 0);
+  const int64_t m_last = std::min(std::max(inner, limit), length - 1);
   for (int64_t m = m_first; m <= m_last; ++m) {
     if (owner[m * step] != block.id[face]) continue;
     const T g = axis == 0 ? image.grad(n, m) : image.grad(m, n);
@@ -214,12 +237,15 @@ void run_crossings(const SweepImage<T>& image, int axis, SweepScratch<T>& block)
   Crossings<T>& crossings = block.crossings[axis][kUp ? 0 : 1];
   const int32_t d = kUp ? 1 : -1;
   const T top = static_cast<T>((axis == 0 ? H : W) - 1);  // the last pixel of a line
-  // The inner pixel is floor(c) in the coordinate of the direction. It and the next one lie on the line if start <= c < end.
+  // The inner pixel is floor(c) in the coordinate of the direction. It and the next one lie on the line if start <= c
+  // < end.
   const Lanes<T> start = splat(kUp ? T(0) : -top), end = splat(kUp ? top : T(0));
   // pixel m of line n: owner[origin + n * step_n + m * step_m]
   const int32_t across = static_cast<int32_t>(-W), step = axis == 0 ? across * d : d;
-  const Lanes32 origin = splat(static_cast<int32_t>((H - 1) * W)), step_n = splat(axis == 0 ? int32_t(1) : across), step_m = splat(step);
-  const Lanes32 all = splat(static_cast<int32_t>(crossings.count)), face_of = splat(static_cast<int32_t>(kSweptFaces - 1));
+  const Lanes32 origin = splat(static_cast<int32_t>((H - 1) * W));
+  const Lanes32 step_n = splat(axis == 0 ? int32_t(1) : across), step_m = splat(step);
+  const Lanes32 all = splat(static_cast<int32_t>(crossings.count));
+  const Lanes32 face_of = splat(static_cast<int32_t>(kSweptFaces - 1));
   int64_t num_pulled = 0, num_gained = 0;
   for (int64_t i = 0; i < crossings.count; i += kLanes) {
     const Lanes<T> at = load_lanes<Lanes<T>>(crossings.at + i);
@@ -244,14 +270,15 @@ void run_crossings(const SweepImage<T>& image, int axis, SweepScratch<T>& block)
     return Lever<T>{kUp ? crossings.at[i] : -crossings.at[i], reach / (block.qs[axis][crossings.edge[i]] - line),
                     reach / (line - block.ps[axis][crossings.edge[i]]), image.eps};
   };
-  // Outside: pixels from the outer one to the border that should be covered. The loss falls if the edge moves out to them.
+  // Outside: pixels from the outer one to the border that should be covered. The loss falls if the edge moves out to
+  // them.
   for (int64_t k = 0; k < num_pulled; ++k) {
     const int32_t i = crossings.pulled[k], n = crossings.line[i];
     const Lever<T> lever = lever_of(i);
     T* pulls = block.pulls[axis][crossings.edge[i]];
     const T *position = lines.positions(n), *weight = lines.weights(n);
-    const bool regular = std::abs(lever.factor_p) < image.largest_lever && std::abs(lever.factor_q) < image.largest_lever;
-    if (regular) {
+    const T largest = image.largest_lever;
+    if (std::abs(lever.factor_p) < largest && std::abs(lever.factor_q) < largest) {
       pull_listed<kUp>(position, weight, lines.count[n], lever, pulls);
     } else {
       for (int32_t m = 0; m < lines.count[n]; ++m)
@@ -262,7 +289,8 @@ void run_crossings(const SweepImage<T>& image, int axis, SweepScratch<T>& block)
   for (int64_t k = 0; k < num_gained; ++k) {
     const int32_t i = crossings.gained[k];
     const int64_t inner = d * static_cast<int64_t>(std::floor(crossings.at[i]));
-    pull_inside(image, block, axis, crossings.edge[i], crossings.line[i], inner, d, lever_of(i), block.pulls[axis][crossings.edge[i]]);
+    const int32_t edge = crossings.edge[i];
+    pull_inside(image, block, axis, edge, crossings.line[i], inner, d, lever_of(i), block.pulls[axis][edge]);
   }
 }
 
@@ -278,8 +306,10 @@ NMR_INLINE void cross_edges(const SweepImage<T>& image, int axis, int k, int64_t
   const T num_lines = static_cast<T>(axis == 0 ? image.raster.width : image.raster.height);
   const T length = static_cast<T>(axis == 0 ? image.raster.height : image.raster.width);
   const int64_t edge = k * kSweptFaces + first, q = k < 2 ? k + 1 : 0;
-  const Lanes<T> ps = load_lanes<Lanes<T>>(block.corner[axis][k] + first), qs = load_lanes<Lanes<T>>(block.corner[axis][q] + first);
-  const Lanes<T> pt = load_lanes<Lanes<T>>(block.corner[1 - axis][k] + first), qt = load_lanes<Lanes<T>>(block.corner[1 - axis][q] + first);
+  const Lanes<T> ps = load_lanes<Lanes<T>>(block.corner[axis][k] + first);
+  const Lanes<T> qs = load_lanes<Lanes<T>>(block.corner[axis][q] + first);
+  const Lanes<T> pt = load_lanes<Lanes<T>>(block.corner[1 - axis][k] + first);
+  const Lanes<T> qt = load_lanes<Lanes<T>>(block.corner[1 - axis][q] + first);
   const Lanes<T> zero = splat(T(0)), one = splat(T(1)), top = splat(num_lines - 1);
   const LaneMask<T> ascending = ps < qs;
   const Lanes<T> least = select(ascending, ps, qs), most = select(ascending, qs, ps);
@@ -298,33 +328,41 @@ NMR_INLINE void cross_edges(const SweepImage<T>& image, int axis, int k, int64_t
   const uint32_t found = lane_bits(first_line <= last_line);
   const uint32_t up = axis == 0 ? ~lane_bits(ascending) : lane_bits(ascending);  // outward is towards larger t
   const LaneArray<int32_t, Lanes32> first_at(first_line), last_at(last_line);
+  const LaneArray<int32_t, Lanes32> edge_at(lane_numbers() + splat(static_cast<int32_t>(edge)));
 
   for (int direction = 0; direction < 2; ++direction) {
     Crossings<T>& crossings = block.crossings[axis][direction];
     const T *pull_end = lines.pull_end[direction].data(), *gain_start = lines.gain_start[direction].data();
     const LaneArray<T, Lanes<T>> slope_at(direction ? zero - slope : slope), height_at(direction ? zero - pt : pt);
+    int64_t count = crossings.count;
     for (uint32_t bits = found & (direction ? ~up : up); bits; bits &= bits - 1) {
       const int64_t lane = lowest_bit(bits);
-      const Lanes<T> scan = splat(block.ps[axis][edge + lane]), slopes = splat(slope_at.lane[lane]), height = splat(height_at.lane[lane]);
+      const Lanes<T> scan = splat(block.ps[axis][edge + lane]);
+      const Lanes<T> slopes = splat(slope_at.lane[lane]), height = splat(height_at.lane[lane]);
       const int32_t last = last_at.lane[lane];
       for (int32_t start = first_at.lane[lane]; start <= last; start += kLanes) {
-        if (crossings.count > kCrossings - kLanes) run_crossings(image, axis, direction, block);
+        if (count > kCrossings - kLanes) {
+          crossings.count = count;
+          run_crossings(image, axis, direction, block);
+          count = 0;
+        }
         const Lanes32 line = lane_numbers() + splat(start);
-        const int64_t count = crossings.count;
         store_lanes(crossings.at + count, (to_values<T>(line) - scan) * slopes + height);
         store_lanes(crossings.pull_end + count, load_lanes<Lanes<T>>(pull_end + start));
         store_lanes(crossings.gain_start + count, load_lanes<Lanes<T>>(gain_start + start));
         store_lanes(crossings.line + count, line);
-        store_lanes(crossings.edge + count, splat(static_cast<int32_t>(edge + lane)));
-        crossings.count += std::min<int64_t>(last - start + 1, kLanes);
+        store_lanes(crossings.edge + count, splat(edge_at.lane[lane]));
+        count += std::min<int64_t>(last - start + 1, kLanes);  // what is written beyond is overwritten, or ignored
       }
     }
+    crossings.count = count;
   }
 }
 
 // Gradients [3, 2] of x and y of the corners of up to kSweptFaces visible faces, in the order in which they are drawn.
 template <class T>
-NMR_INLINE void sweep_block(const SweepImage<T>& image, const int32_t* ids, int64_t count, SweepScratch<T>& block, T* grad) {
+NMR_INLINE void sweep_block(const SweepImage<T>& image, const int32_t* ids, int64_t count, SweepScratch<T>& block,
+                            T* grad) {
   for (int64_t n = 0; n < count; ++n) {
     const bool reversed = ids[n] >= image.num_faces;
     const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
@@ -341,8 +379,10 @@ NMR_INLINE void sweep_block(const SweepImage<T>& image, const int32_t* ids, int6
     for (int k = 0; k < 3; ++k) {
       T* corner = block.corner[axis][k];
       std::fill(corner + count, corner + padded, T(0));
-      for (int64_t n = 0; n < padded; n += kLanes)
-        store_lanes(corner + n, (load_lanes<Lanes<T>>(corner + n) * size + size - splat(T(1))) * splat(T(0.5)));  // to_pixel
+      for (int64_t n = 0; n < padded; n += kLanes) {  // to_pixel
+        const Lanes<T> x = load_lanes<Lanes<T>>(corner + n);
+        store_lanes(corner + n, (x * size + size - splat(T(1))) * splat(T(0.5)));
+      }
       std::fill_n(block.pulls[axis][k * kSweptFaces], 2 * count, T(0));
     }
   }
@@ -363,7 +403,8 @@ NMR_INLINE void sweep_block(const SweepImage<T>& image, const int32_t* ids, int6
 
 // The same for visible faces [first, last) of the list.
 template <class T>
-void sweep_faces(const SweepImage<T>& image, const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block, T* grad) {
+void sweep_faces(const SweepImage<T>& image, const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block,
+                 T* grad) {
   for (int64_t n = first; n < last; n += kSweptFaces)
     sweep_block(image, ids + n, std::min(kSweptFaces, last - n), block, grad + 6 * n);
 }

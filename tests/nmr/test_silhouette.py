@@ -1,5 +1,6 @@
 """render_silhouette: against the slow definition, its invariances, the operator's registration, bad input."""
 
+import os
 import subprocess
 import sys
 
@@ -274,6 +275,61 @@ def test_vertices_without_a_finite_image_get_no_gradient_and_spoil_nothing():
     spoiled = render_with_gradient(both, torch.cat([faces, extra]), **options)
     assert torch.equal(spoiled[0], good[0]) and torch.equal(spoiled[1][:, :-3], good[1])
     assert not spoiled[1][:, -3:].any() and torch.equal(eye.grad, eye_grad) and eye_grad.any()
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_a_gradient_that_is_not_finite_does_not_vanish(bad):
+    """A gradient scaler must see it, and the next step must not."""
+    vertices, faces, camera = bumpy_spheres(batch=3)
+    vertices = camera.transform(vertices)
+    healthy = render_with_gradient(vertices, faces, image_size=32)[1]
+    upstream = torch.randn(3, 32, 32, generator=torch.Generator().manual_seed(0))
+    upstream[1, 20, 3] = bad
+    leaf = vertices.clone().requires_grad_()
+    nmr.render_silhouette(leaf, faces, image_size=32).backward(upstream)
+    assert leaf.grad[1][healthy[1] != 0].isnan().all() and not leaf.grad[..., 2].any()
+    assert torch.equal(leaf.grad[::2], healthy[::2])
+    assert torch.equal(render_with_gradient(vertices, faces, image_size=32)[1], healthy)
+
+
+def test_any_instruction_set_gives_the_same_bits():
+    code = (
+        "import hashlib, sys, torch, nmr\n"
+        "v, f = nmr.icosphere(2)\n"
+        "for dtype in (torch.float32, torch.float64):\n"
+        "    x = (v.to(dtype) * .6 + torch.tensor([.1, .2, 2.], dtype=dtype)).requires_grad_()\n"
+        "    a = nmr.render_silhouette(x[None], f, image_size=(37, 50))\n"
+        "    g = torch.linspace(-1, 1, a.numel(), dtype=dtype).view(a.shape).sin()\n"
+        "    a.backward(g)\n"
+        "    assert x.grad.any()\n"
+        "    print(hashlib.sha256(x.grad.numpy().tobytes()).hexdigest())"
+    )
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", code], check=True, capture_output=True, env={**os.environ, "NMR_CPU_LEVEL": level}
+        ).stdout
+        for level in ("base", "")
+    ]
+    assert outputs[0] == outputs[1] and len(outputs[0].split()) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc/self/statm")
+def test_memory_of_large_images_is_given_back():
+    code = (
+        "import resource, torch, nmr\n"
+        "from nmr import _C\n"
+        "def held(): return int(open('/proc/self/statm').read().split()[1]) * resource.getpagesize() / 2**20\n"
+        "torch.set_num_threads(2)\n"
+        "v, f = nmr.icosphere(2); v = (v * .6 + torch.tensor([0, 0, 2.]))[None].requires_grad_()\n"
+        "def step(size): nmr.render_silhouette(v, f, image_size=size).sum().backward()\n"
+        "step(64); before = held()\n"
+        "step(2048); large = held()\n"
+        "step(700); _C.free_scratch(); step(64)\n"
+        "print(large - before, held() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    grown, after = map(float, done.stdout.split())
+    assert grown < 100 and after < 100, done.stdout  # MiB; the buffers of the large image take 500
 
 
 def test_autocast_leaves_the_renderer_alone():
