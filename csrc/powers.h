@@ -26,7 +26,7 @@ inline double exp2_of(double x) {
   if (x > 1030) x = 1030;  // infinity
   const double whole = std::floor(x + 0.5), t = (x - whole) * 0.69314718055994531;
   double sum = 1;
-  for (int k = 16; k >= 1; --k) sum = 1 + sum * t / k;
+  for (int k = 16; k >= 1; --k) sum = 1 + sum * t * (1.0 / k);
   return std::ldexp(sum, static_cast<int>(whole));
 }
 

@@ -273,6 +273,48 @@ struct UVLevels {
   T* level;                // out [B, H, W]; 0 on background
 };
 
+// Unit normals of meshes in world space (normals.cpp): n((v0 - v1) x (v2 - v1)) of faces, or of vertices the direction of the sum of
+// these products over the faces around them. 0 where there is no area. A vertex that is not finite, or beyond 1e12, counts as the
+// origin and gets no gradient.
+template <class T>
+struct Normals {
+  MeshBatch<T> mesh;
+  bool smooth;            // of vertices, else of faces
+  T* normals;             // forward out [B or 1, F, 3], packed [M, 3]; smooth: like mesh.vertices
+  const T* grad_normals;  // backward in
+  T* grad_vertices;       // backward out, like mesh.vertices
+  int num_threads;
+};
+
+// The parameters of lights, in this order in `layout`; those of each kind have a row per image or one for all, and per light.
+enum class Light : int {
+  ambient, ambient_color, directional, directional_color, direction, point, point_color, position, falloff, specular, shininess, count
+};
+
+// Lit colours, or the normals themselves, at each pixel (lights.cpp). With n the unit normal of the side that is seen, x the point:
+//   lit = color (ambient ambient_color + sum over lights of c relu(n . l)) + highlight,
+//   highlight = specular sum over lights with n . l > 0 of c relu(r . v)^shininess, r = 2 (n . l) n - l, v towards the eye;
+// a directional light has l = direction, c = directional directional_color (in highlights l is the unit vector, and c is multiplied
+// by its length); a point light has l towards position, of length 1, and c = point point_color / (1 + falloff |position - x|^2).
+template <class T>
+struct Lit {
+  Interpolate<T> at;         // attributes: vertices in world space, 3 channels, corners: the faces; grad_attributes, grad_weights
+  const T* normals;          // [B or 1, F, 3], packed [M, 3]; smooth: like the vertices
+  int64_t normal_batch;      // 1 or B when not packed
+  bool smooth;               // normals of vertices, interpolated: sum of b_k n_k, divided by its length or 1e-5
+  const T* viewer;           // [B, 5]: place of the eye, 1; or direction towards the viewer, 0; then -1 if the camera mirrors, else 1
+  const T* parameters;       // all lights, or nullptr: the result is the normal
+  const int64_t* layout;     // [Light::count, 3]: first value, rows (1 or B), lights (0: there are none)
+  int64_t num_parameters;
+  const T* colors;           // [B, H, W, C], or nullptr: white
+  int64_t channels;          // C: 1 or 3
+  T* lit;                    // forward out [B, H, W, 3]; 0 on background
+  const T* grad_lit;         // backward in
+  T* grad_colors;            // backward out [B, H, W, C], or nullptr
+  T* grad_normals;           // backward out, like normals, or nullptr
+  T* grad_parameters;        // backward out [num_parameters], or nullptr
+};
+
 // From raster pixels to image pixels: the mean of 2x2 with anti-aliasing, else a copy (edges.cpp).
 template <class T>
 struct Resolve {
@@ -361,6 +403,10 @@ template <class T> void mipmaps_backward(const Mipmaps<T>& args);
 template <class T> void sample_uv_forward(const SampleUV<T>& args);
 template <class T> void sample_uv_backward(const SampleUV<T>& args);
 template <class T> void uv_levels(const UVLevels<T>& args);
+template <class T> void normals_forward(const Normals<T>& args);
+template <class T> void normals_backward(const Normals<T>& args);
+template <class T> void lit_forward(const Lit<T>& args);
+template <class T> void lit_backward(const Lit<T>& args);
 template <class T> void resolve_forward(const Resolve<T>& args);
 template <class T> void resolve_backward(const Resolve<T>& args);
 template <class T> void edges_backward(const EdgesBackward<T>& args);

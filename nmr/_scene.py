@@ -143,9 +143,12 @@ def shade(
     if not interpolation_gradient:
         fragments = replace(fragments, weights=fragments.weights.detach())
     shape, covered = fragments.owner.shape, fragments.covered.unsqueeze(-1)
-    if colors is None:
+    if lights is not None and not isinstance(lights, Lights):
+        raise TypeError(f"lights must be nmr.Lights, got {describe(lights)}")
+    image = None  # white, for the lights
+    if colors is None and lights is None:
         image = covered.to(fragments.weights).expand(*shape, 3)
-    else:
+    elif colors is not None:
         if not callable(getattr(colors, "sample", None)):
             raise TypeError(
                 "colors must be nmr.VertexColors, FaceColors, TextureCubes, UVTexture or have sample(fragments), "
@@ -155,11 +158,9 @@ def shade(
         if not isinstance(image, Tensor) or image.ndim != 4 or image.shape[:3] != shape or not image.shape[3]:
             raise ValueError(f"colors.sample must return a tensor {[*shape, 'C']}, got {describe(image)}")
     if lights is not None:
-        if not isinstance(lights, Lights):
-            raise TypeError(f"lights must be nmr.Lights, got {describe(lights)}")
-        if image.shape[-1] not in (1, 3):
+        if image is not None and image.shape[-1] not in (1, 3):
             raise ValueError(f"lights need colours of 3 channels (or 1), got {image.shape[-1]}")
-        image = image * lights.shade(fragments)
+        image = lights.shade(fragments, image)
     channels = image.shape[-1]
     wanted = f"a number, [{channels}] or [{shape[0]}, {channels}]"
     behind = as_floats(background, "background", wanted).to(image)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from . import ops
 from ._packing import MeshBatch
-from ._validate import cast_under_autocast, check_values, describe
-from .mesh import _unit
+from ._validate import as_floats, cast_under_autocast, check_values, describe
+from .cameras.projection import ProjectingCamera
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -152,17 +152,10 @@ class Fragments:
     def _per_face(self, values: object, name: str) -> Tensor:
         if self.layers:
             return self._each_layer(self._wide()._per_face(values, name))
-        return self._per_side(self.mesh.values(check_values(values, name, "F, C"), name, "face"))
-
-    def _per_side(self, front: Tensor, back: Tensor | None = None) -> Tensor:
-        """Values of faces, ``[B | 1, F, C]`` or packed ``[M, C]``, at each pixel; ``back``: for turned normals."""
-        rows = front.reshape(-1, front.shape[-1])
-        index = self.face_index.long() + self.mesh.first_faces(len(front))
-        if back is not None:
-            turned = self.is_back != self._mirrored()
-            index = torch.where(turned, index + len(rows), index)
-            rows = torch.cat([rows, back.reshape(-1, back.shape[-1])])
+        values = self.mesh.values(check_values(values, name, "F, C"), name, "face")
+        rows = values.reshape(-1, values.shape[-1])
         rows = torch.cat([rows, rows.new_zeros(1, rows.shape[1])])
+        index = self.face_index.long() + self.mesh.first_faces(len(values))
         index = torch.where(self.covered, index, len(rows) - 1)
         # embedding, not indexing: its backward pass sums in a fixed order.
         return F.embedding(index, rows, padding_idx=len(rows) - 1)
@@ -177,61 +170,84 @@ class Fragments:
         """
         if self.layers:
             return self._each_layer(self._wide().normals(smooth))
-        if not smooth:
-            front = self._face_normals()
-            return self._per_side(front, -front)
-        world, across, rows = self._across()
-        sums = torch.zeros_like(world.vertices).view(-1, 3)
-        sums = sums.scatter_add(0, rows.reshape(-1, 1).expand(-1, 3), across.repeat_interleave(3, dim=0))
-        at_vertices = _unit(sums).view(world.vertices.shape)
-        normals = ops.interpolate(at_vertices, self.faces, self.owner, self.weights, self.mesh.starts)
-        normals = F.normalize(normals, dim=-1, eps=1e-5)  # normals that nearly cancel stay short: finite gradients
-        turned = self.is_back != self._mirrored()
-        return torch.where(turned.unsqueeze(-1), -normals, normals)
+        return self._lit(None, None, torch.zeros(0, 3, dtype=torch.int64, device="cpu"), smooth)
 
-    def _face_normals(self) -> Tensor:
-        """``(v0 - v1) x (v2 - v1)`` in world space, of unit length: ``[B | 1, F, 3]``, packed ``[M, 3]``.
+    def _lit(
+        self,
+        colors: Tensor | None,
+        parameters: Tensor | None,
+        layout: Tensor,
+        smooth: bool,
+        positions: bool = False,
+        highlights: bool = False,
+    ) -> Tensor:
+        """Lit colours ``[B, H, W, 3]`` (:func:`nmr.ops.lit`); without parameters the normals.
 
-        Small faces have unit normals, too. (In the published renderer the normal is short where the product is below
-        1e-5, which makes small meshes dark.) A face without area has the normal 0.
+        ``positions``: the light depends on where a point lies; ``highlights``: also on where the eye is.
         """
-        world, across, _ = self._across()
-        return _unit(across).view(*world.vertices.shape[:-2], self.faces.shape[-2], 3)
+        world = self.world.expand(len(self.faces), -1, -1) if self.faces.ndim == 3 else self.world
+        normals = ops.normals(world, self.faces, self.mesh.starts, smooth)
+        viewer, at = self._viewer(highlights), (self.faces, self.owner, self.weights, self.mesh.starts)
+        points = usable(world) if positions else world.detach()
+        return ops.lit(colors, normals, parameters, layout, viewer, points, *at, smooth)
 
-    def _across(self) -> tuple[MeshBatch, Tensor, Tensor]:
-        """The meshes in world space, ``(v0 - v1) x (v2 - v1)`` of all faces ``[., 3]``, the rows of their corners."""
-        world = _usable(self.world.expand(len(self.faces), -1, -1) if self.faces.ndim == 3 else self.world)
-        world = self.mesh._replace(vertices=world)
-        rows = world.corner_rows()
-        v0, v1, v2 = F.embedding(rows, world.vertices.reshape(-1, 3)).unbind(-2)
-        return world, torch.linalg.cross(v0 - v1, v2 - v1, dim=-1), rows
+    def _viewer(self, needs_eye: bool) -> Tensor:
+        """From where each image is seen, ``[B, 5]``: see :func:`nmr.ops.viewer_of`."""
+        batch = self.mesh.batch
+        if self.camera is None:  # renderer space itself, seen along z
+            return self.weights.new_tensor([0.0, 0.0, -1.0, 0.0, 1.0]).expand(batch, 5)
+        if isinstance(self.camera, ProjectingCamera):
+            projection = self.camera.projection(self.weights.dtype)
+            matrix, intrinsics, _, origin, _ = (x if x is None else x.detach() for x in projection.parameters())
+            viewer = ops.viewer_of(matrix, intrinsics, origin, projection.perspective)
+            return viewer.to(self.weights).expand(batch, 5)
+        side = torch.where(self._probe_mirrored(), -1.0, 1.0).to(self.weights)
+        eye = getattr(self.camera, "eye", None)
+        if eye is None and needs_eye:
+            raise ValueError(
+                "highlights need the eye of the camera: "
+                f"give {type(self.camera).__name__} an attribute eye, [3] or [B, 3], in world space"
+            )
+        eye = side.new_zeros(1, 3) if eye is None else as_floats(eye, "eye", "[3] or [B, 3]").detach().to(side)
+        eye = eye.reshape(-1, 3).expand(batch, 3)
+        return torch.cat([eye, torch.ones_like(side), side], dim=1)
 
-    def _mirrored(self) -> bool | Tensor:
-        """Whether the camera mirrors the world: bool ``[B, 1, 1]``.
+    def _probe_mirrored(self) -> Tensor:
+        """Whether a camera that is not one of nmr's mirrors the world: bool ``[B, 1]``.
 
-        Tested by transforming three short perpendicular edges in the middle of each mesh.
+        Tested by transforming three short perpendicular edges at the farthest point that is seen. They are tried in
+        several lengths; the longest counts that lies in front of the eye as a whole.
         """
-        if self.camera is None:
-            return False
-        points = _usable(self.world.detach())
-        axes = torch.cat([points.new_zeros(1, 3), torch.eye(3, dtype=points.dtype, device=points.device)])
-
-        def corner(mesh: Tensor) -> Tensor:  # [V, 3] -> [4, 3]
-            middle = mesh.mean(-2, keepdim=True)
-            return middle + 0.1 * (mesh - middle).abs().amax((-2, -1), keepdim=True) * axes
-
-        if self.mesh.starts is None:
-            if points.shape[1] == 0:
-                return False
-            with torch.no_grad():
-                probe = self.camera.transform(corner(points))
-        else:
-            probe = torch.cat([corner(m) if len(m) else axes for m in points.split(self.mesh.vertex_counts)])
-            starts = 4 * torch.arange(self.mesh.batch + 1, device="cpu").view(-1, 1).expand(-1, 2)
-            with torch.no_grad():
-                probe = self.camera.transform(probe, starts=starts.contiguous()).view(-1, 4, 3)
-        sides = probe[:, 1:] - probe[:, :1]
-        return (torch.linalg.cross(sides[:, 0], sides[:, 1], dim=-1) * sides[:, 2]).sum(-1).view(-1, 1, 1) < 0
+        with torch.no_grad():
+            batch, pixels = self.owner.shape[0], self.owner[0].numel()
+            depth = torch.where(self.covered, self.depth, -1.0).reshape(batch, pixels)
+            farthest = depth.argmax(1)
+            weights = self.weights.reshape(batch, pixels, 3)[torch.arange(batch), farthest]
+            owner = self.owner.reshape(batch, pixels)[torch.arange(batch), farthest]
+            world = usable(self.world)
+            at = weights.view(batch, 1, 1, 3), self.mesh.starts
+            point = ops.interpolate(world, self.faces, owner.view(batch, 1, 1).contiguous(), *at).view(batch, 1, 3)
+            if self.mesh.starts is None:
+                extent = (world.amax(1) - world.amin(1)).amax(-1) if world.shape[1] else world.new_ones(len(world))
+            else:
+                parts = world.split(self.mesh.vertex_counts)
+                extent = torch.stack([(v.amax(0) - v.amin(0)).amax() if len(v) else v.new_ones(()) for v in parts])
+            corners = torch.cat([world.new_zeros(1, 3), torch.eye(3, dtype=world.dtype, device=world.device)])
+            lengths = 10.0 ** torch.arange(-1, -6, -1, dtype=world.dtype, device=world.device)
+            steps = extent.view(-1, 1, 1, 1) * lengths.view(1, -1, 1, 1) * corners  # [B or 1, lengths, 4, 3]
+            probes = (point.unsqueeze(1) + steps).reshape(batch, -1, 3)
+            if self.mesh.starts is None:
+                seen = self.camera.transform(probes)
+            else:
+                starts = probes.shape[1] * torch.arange(batch + 1, device="cpu").view(-1, 1).expand(-1, 2)
+                seen = self.camera.transform(probes.reshape(-1, 3), starts=starts.contiguous())
+            seen = seen.reshape(batch, -1, 4, 3)
+            sides = seen[:, :, 1:] - seen[:, :, :1]
+            a, b, c = sides.unbind(2)
+            product = (torch.linalg.cross(a, b, dim=-1) * c).sum(-1)
+            in_front = (seen[..., 2] > 0).all(-1) & product.isfinite() & (product != 0)
+            longest = in_front.int().argmax(1, keepdim=True)  # the first that passes
+            return (product.gather(1, longest) < 0) & in_front.any(1, keepdim=True)
 
     def resolve(self, image: Tensor) -> Tensor:
         """The image ``[B, h, w, C]`` of a shaded raster ``[B, H, W, C]``, with NMR's gradient.
@@ -260,6 +276,6 @@ class Fragments:
         return ops.resolve(image, *self._drawn[:3], self._drawn_owner, self.anti_aliasing, self.eps)
 
 
-def _usable(points: Tensor) -> Tensor:
+def usable(points: Tensor) -> Tensor:
     """Puts points that are not finite, or so large that a product overflows, at the origin, without gradient."""
     return torch.where((points.abs() < _LARGEST).all(-1, keepdim=True), points, torch.zeros_like(points))

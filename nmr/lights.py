@@ -1,9 +1,9 @@
-"""Light: ambient and directional, as in the Neural Mesh Renderer."""
+"""Light: ambient and directional, as in the Neural Mesh Renderer; point lights; highlights."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -18,15 +18,39 @@ __all__ = ["Lights"]
 
 Numbers = float | Sequence | Tensor
 
+# In the order of the kernel's enum Light: the shapes that are accepted, and the number of axes after those of lights.
+_SHAPES = {
+    "ambient": ("[] or [B]", (0, 1), 0),
+    "ambient_color": ("[3] or [B, 3]", (1, 2), 1),
+    "directional": ("[], [L] or [B, L]", (0, 1, 2), 0),
+    "directional_color": ("[3], [L, 3] or [B, L, 3]", (1, 2, 3), 1),
+    "direction": ("[3], [L, 3] or [B, L, 3]", (1, 2, 3), 1),
+    "point": ("[], [L] or [B, L]", (0, 1, 2), 0),
+    "point_color": ("[3], [L, 3] or [B, L, 3]", (1, 2, 3), 1),
+    "position": ("[3], [L, 3] or [B, L, 3]", (1, 2, 3), 1),
+    "falloff": ("[], [L] or [B, L]", (0, 1, 2), 0),
+    "specular": ("[] or [B]", (0, 1), 0),
+    "shininess": ("[] or [B]", (0, 1), 0),
+}
+_DIRECTIONAL = ("directional", "directional_color", "direction")
+_POINT = ("point", "point_color", "position", "falloff")
+
 
 @dataclass(frozen=True, eq=False)
 class Lights:
-    """Ambient light and L directional lights. Colours are multiplied by the light.
+    """Ambient light, directional lights, point lights, and the highlights of the last two.
 
-    ``light = ambient * ambient_color + sum over l of directional_l * directional_color_l * relu(n . direction_l)``,
-    where n is the unit normal in world space of the side that is seen (:meth:`Fragments.normals`). n is the normal of
-    the face, as in the published renderer, or, if ``smooth``, the interpolated normal of the vertices. The defaults are
-    the published ones.
+    ``rgb = color * light + highlight``, with n the unit normal in world space of the side that is seen
+    (:meth:`Fragments.normals`) and x the point that is seen::
+
+        light = ambient ambient_color + sum over lights of c relu(n . l)
+        highlight = specular * sum over lights with n . l > 0 of c relu(r . v)^shininess        (Phong)
+
+    A directional light has ``l = direction`` and ``c = directional directional_color``. A point light has l of length 1
+    towards its position and ``c = point point_color / (1 + falloff |position - x|^2)``. r is l, reflected by the
+    surface, and v points towards the eye; highlights use the unit vector along direction, and multiply c by its length.
+    n is the normal of the face, as in the published renderer, or, if ``smooth``, the interpolated normal of the
+    vertices. The defaults are the published ones.
 
     Parameters
     ----------
@@ -39,8 +63,22 @@ class Lights:
     ambient_color : [3] or [B, 3]
     directional_color : [3], [L, 3] or [B, L, 3]
     smooth : bool
+    position : [3], [L, 3] or [B, L, 3], optional; keyword only, as all that follow
+        World-space positions of point lights. Without it there are none. Other numbers of lights than of directional
+        ones are possible.
+    point : number, or Tensor [], [L] or [B, L]
+        Intensity of each point light.
+    point_color : [3], [L, 3] or [B, L, 3]
+    falloff : number, or Tensor [], [L] or [B, L]
+        0: as bright at every distance. Otherwise the light falls to one half at the distance ``falloff^(-1/2)``.
+    specular : number, or Tensor [] or [B]
+        Strength of highlights. They have the colour of the light, not of the surface. The number 0: none.
+    shininess : number, or Tensor [] or [B]
+        The larger, the smaller a highlight is.
 
-    Tensors are differentiable, and so are the vertices through their normals. B is the number of images.
+    Tensors are differentiable, and so are the vertices: through their normals, and through the points that are lit.
+    The eye is known for nmr's cameras (without a camera the viewer looks along z); for highlights, a camera of your own
+    needs an attribute ``eye``, [3] or [B, 3]. The eye counts as a constant. B is the number of images.
 
     Raises
     ------
@@ -54,6 +92,7 @@ class Lights:
     >>> lights = nmr.Lights(0.3, [0.7, 0.2], [[0.0, 0.8, -0.6], [1.0, 0.0, 0.0]], smooth=True)
     >>> nmr.render_rgb(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), lights=lights, image_size=64).shape
     torch.Size([1, 64, 64, 3])
+    >>> lamp = nmr.Lights(0.2, 0.0, position=[2.0, 2.0, -3.0], specular=0.5, shininess=20.0, smooth=True)
     """
 
     ambient: Numbers = 0.5
@@ -62,64 +101,61 @@ class Lights:
     ambient_color: Numbers = (1.0, 1.0, 1.0)
     directional_color: Numbers = (1.0, 1.0, 1.0)
     smooth: bool = False
+    _: KW_ONLY
+    position: Numbers | None = None
+    point: Numbers = 0.5
+    point_color: Numbers = (1.0, 1.0, 1.0)
+    falloff: Numbers = 0.0
+    specular: Numbers = 0.0
+    shininess: Numbers = 20.0
 
     def __post_init__(self) -> None:
-        shapes = {
-            "ambient": ("[] or [B]", (0, 1)),
-            "directional": ("[], [L] or [B, L]", (0, 1, 2)),
-            "direction": ("[3], [L, 3] or [B, L, 3]", (1, 2, 3)),
-            "ambient_color": ("[3] or [B, 3]", (1, 2)),
-            "directional_color": ("[3], [L, 3] or [B, L, 3]", (1, 2, 3)),
-        }
-        for name, (shape, dimensions) in shapes.items():
+        unused = _POINT if self.position is None else ()
+        if isinstance(self.specular, (int, float)) and self.specular == 0:
+            unused = (*unused, "specular", "shininess")
+        object.__setattr__(self, "_unused", unused)
+        for name, (shape, dimensions, _) in _SHAPES.items():
+            if name in unused:
+                continue
             value = as_floats(getattr(self, name), name, shape)
             if value.ndim not in dimensions or 0 in value.shape or ("3" in shape and value.shape[-1] != 3):
                 raise ValueError(f"{name} must have shape {shape}, got {describe(value)}")
             object.__setattr__(self, name, value)
-        counts = {_per_light(self.direction, 1).shape[1], _per_light(self.directional_color, 1).shape[1]}
-        counts.add(_per_light(self.directional, 0).shape[1])
-        if len(counts - {1}) > 1:
-            raise ValueError(
-                "directional, direction and directional_color must have the same number of lights (or one light), got "
-                f"{describe(self.directional)}, {describe(self.direction)} and {describe(self.directional_color)}"
-            )
+        for group in (_DIRECTIONAL, _POINT):
+            if group[0] in unused:
+                continue
+            counts = {_rows(getattr(self, name), name).shape[1] for name in group} - {1}
+            if len(counts) > 1:
+                names, shapes = ", ".join(group), ", ".join(describe(getattr(self, name)) for name in group)
+                raise ValueError(f"{names} must have the same number of lights (or one light), got {shapes}")
 
-    def shade(self, fragments: Fragments) -> Tensor:
-        """The light on each pixel, ``[B, H, W, 3]``; undefined on background."""
-        rows = {
-            "ambient": self.ambient.reshape(-1, 1),
-            "ambient_color": self.ambient_color.reshape(-1, 3),
-            "directional": _per_light(self.directional, 0).unsqueeze(-1),
-            "directional_color": _per_light(self.directional_color, 1),
-            "direction": _per_light(self.direction, 1),
-        }
-        batch = fragments.mesh.batch
-        for name, value in rows.items():
+    def shade(self, fragments: Fragments, colors: Tensor | None = None) -> Tensor:
+        """``colors`` ``[B, H, W, 3 or 1]``, lit: ``[B, H, W, 3]``; 0 on background. Without colours a white surface."""
+        batch, values, layout, first = fragments.mesh.batch, [], [], 0
+        for name in _SHAPES:
+            if name in self._unused:
+                layout.append((first, 1, 0))
+                continue
+            value = _rows(getattr(self, name), name)
             if value.shape[0] not in (1, batch):
                 raise ValueError(
                     f"{name} is given for {value.shape[0]} images, but {batch} are drawn; give one or {batch}"
                 )
-            rows[name] = value.to(fragments.weights)
-        ambient = rows["ambient"] * rows["ambient_color"]
-        colors, directions = torch.broadcast_tensors(rows["directional"] * rows["directional_color"], rows["direction"])
-        directional = list(zip(colors.unbind(1), directions.unbind(1), strict=True))
-        if self.smooth:
-            return _light(fragments.normals(smooth=True), ambient, directional, lambda row: row.view(-1, 1, 1, 3))
-        normals, spread = fragments._face_normals(), fragments.mesh.spread
-        front, back = (_light(side, ambient, directional, spread) for side in (normals, -normals))
-        return fragments._per_side(front, back)
+            values.append(value.reshape(-1).to(fragments.weights))
+            layout.append((first, *value.shape[:2]))
+            first += value.numel()
+        highlights = "specular" not in self._unused
+        positions = highlights or "position" not in self._unused
+        colors = None if colors is None else colors.to(fragments.weights)
+        parameters, layout = torch.cat(values), torch.tensor(layout, device="cpu")
+        return fragments._lit(colors, parameters, layout, bool(self.smooth), positions, highlights)
 
 
-def _light(
-    normals: Tensor, ambient: Tensor, directional: list[tuple[Tensor, Tensor]], spread: Callable[[Tensor], Tensor]
-) -> Tensor:
-    """The formula of :class:`Lights`; ``spread`` expands rows ``[B or 1, 3]`` to the shape of the normals."""
-    light = spread(ambient)
-    for color, direction in directional:
-        light = light + (normals * spread(direction)).sum(-1, keepdim=True).relu() * spread(color)
-    return light
-
-
-def _per_light(value: Tensor, vector: int) -> Tensor:
-    """``[B or 1, L or 1, ...]`` of a value whose last ``vector`` axes belong to each light."""
-    return value[(None,) * (2 + vector - value.ndim)]
+def _rows(value: Tensor, name: str) -> Tensor:
+    """A parameter as ``[B or 1, L or 1, width]``."""
+    shape, _, vector = _SHAPES[name]
+    per_light = "L" in shape
+    value = value if vector else value.unsqueeze(-1)
+    if not per_light:
+        value = value.unsqueeze(-2)
+    return value[(None,) * (3 - value.ndim)]

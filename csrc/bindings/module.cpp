@@ -13,5 +13,6 @@ PYBIND11_MODULE(_C, m) {
   nmr::bind_edges(m);
   nmr::bind_shade(m);
   nmr::bind_texture(m);
+  nmr::bind_lights(m);
   nmr::bind_mesh(m);
 }

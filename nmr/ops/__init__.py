@@ -16,6 +16,7 @@ from .camera import pose, pose_backward, project, project_backward
 from .clip import clip_count, clip_faces
 from .edges import edges_backward, resolve, resolve_backward
 from .fragments import depth_backward, depth_image, fragments, fragments_backward
+from .lights import lit, lit_backward, normals, normals_backward, viewer_of
 from .losses import soft_iou, soft_iou_backward
 from .mesh import smoothness, smoothness_backward, voxels
 from .raster import local_gradient, rasterize, rasterize_layers, silhouette, silhouette_backward
@@ -33,9 +34,13 @@ __all__ = [
     "fragments_backward",
     "interpolate",
     "interpolate_backward",
+    "lit",
+    "lit_backward",
     "local_gradient",
     "mipmaps",
     "mipmaps_backward",
+    "normals",
+    "normals_backward",
     "pose",
     "pose_backward",
     "project",
@@ -55,5 +60,6 @@ __all__ = [
     "soft_iou_backward",
     "texture_cubes_backward",
     "uv_levels",
+    "viewer_of",
     "voxels",
 ]

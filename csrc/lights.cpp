@@ -1,0 +1,507 @@
+// Lights on the faces that are seen, and their normals. The definition stands at struct Lit in stages.h.
+//
+// Where the light depends only on the face (flat, no point lights, no highlights) it is computed once per visible face.
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "corner_values.h"
+#include "powers.h"
+
+namespace nmr {
+namespace {
+
+template <class T>
+using Vec3 = Eigen::Matrix<T, 3, 1>;
+
+template <class T>
+NMR_INLINE Vec3<T> load3(const T* p) {
+  return Vec3<T>(p[0], p[1], p[2]);
+}
+
+template <class T>
+NMR_INLINE void add3(T* p, const Vec3<T>& v) {
+  for (int k = 0; k < 3; ++k) p[k] += v[k];
+}
+
+// v / |v| and |v|; 0 if it has no length. The backward pass is that of the unit vector alone.
+template <class T>
+struct Unit {
+  Vec3<T> unit;
+  T length;
+
+  explicit Unit(const Vec3<T>& v) : unit(Vec3<T>::Zero()), length(v.norm()) {
+    if (length > 0 && length <= std::numeric_limits<T>::max()) unit = v / length;
+  }
+  Vec3<T> backward(const Vec3<T>& grad) const {
+    if (!(length > 0)) return Vec3<T>::Zero();
+    return (grad - unit * unit.dot(grad)) / length;
+  }
+};
+
+// One lamp of an image, directional or a point, and the gradients of the same.
+template <class T>
+struct Lamp {
+  bool point;
+  T intensity;
+  Vec3<T> color, place;  // place: direction, or position
+  T falloff;
+};
+
+// All light of an image; as gradients, the sums over its pixels.
+template <class T>
+struct Lamps {
+  T ambient, specular, shininess;
+  Vec3<T> ambient_color;
+  std::vector<Lamp<T>> lamps;
+  bool highlights;
+
+  void set_zero() {
+    ambient = specular = shininess = 0;
+    ambient_color.setZero();
+    for (Lamp<T>& lamp : lamps) {
+      lamp.intensity = lamp.falloff = 0;
+      lamp.color.setZero();
+      lamp.place.setZero();
+    }
+  }
+};
+
+// Calls body(first value in `parameters`, value) for every parameter of image b.
+template <class T, class Body>
+void for_parameters(const Lit<T>& args, int64_t b, Lamps<T>& lamps, const Body& body) {
+  const auto at = [&](Light name, int64_t light, int64_t width) {
+    const int64_t* l = args.layout + 3 * static_cast<int>(name);
+    return l[0] + ((l[1] == 1 ? 0 : b) * l[2] + (l[2] == 1 ? 0 : light)) * width;
+  };
+  const auto one = [&](Light name, int64_t light, T& value) { body(at(name, light, 1), value); };
+  const auto three = [&](Light name, int64_t light, Vec3<T>& value) {
+    for (int k = 0; k < 3; ++k) body(at(name, light, 3) + k, value[k]);
+  };
+  one(Light::ambient, 0, lamps.ambient);
+  three(Light::ambient_color, 0, lamps.ambient_color);
+  int64_t directional = 0, points = 0;
+  for (Lamp<T>& lamp : lamps.lamps) {
+    const int64_t n = lamp.point ? points++ : directional++;
+    one(lamp.point ? Light::point : Light::directional, n, lamp.intensity);
+    three(lamp.point ? Light::point_color : Light::directional_color, n, lamp.color);
+    three(lamp.point ? Light::position : Light::direction, n, lamp.place);
+    if (lamp.point) one(Light::falloff, n, lamp.falloff);
+  }
+  if (lamps.highlights) {
+    one(Light::specular, 0, lamps.specular);
+    one(Light::shininess, 0, lamps.shininess);
+  }
+}
+
+// Number of lights of a kind: the largest of its parameters, 0 if one has none.
+template <class T>
+int64_t light_count(const Lit<T>& args, Light first, int64_t parameters) {
+  int64_t most = 0;
+  for (int64_t n = 0; n < parameters; ++n) {
+    const int64_t count = args.layout[3 * (static_cast<int64_t>(first) + n) + 2];
+    if (count == 0) return 0;
+    most = std::max(most, count);
+  }
+  return most;
+}
+
+template <class T>
+Lamps<T> lamps_of(const Lit<T>& args, int64_t b) {
+  Lamps<T> lamps{};
+  lamps.ambient_color.setZero();
+  if (!args.parameters) return lamps;
+  const Lamp<T> zero{false, 0, Vec3<T>::Zero(), Vec3<T>::Zero(), 0};
+  lamps.lamps.assign(light_count(args, Light::directional, 3), zero);
+  const size_t directional = lamps.lamps.size();
+  lamps.lamps.resize(directional + light_count(args, Light::point, 4), zero);
+  for (size_t n = directional; n < lamps.lamps.size(); ++n) lamps.lamps[n].point = true;
+  lamps.highlights = light_count(args, Light::specular, 2) > 0;
+  for_parameters(args, b, lamps, [&](int64_t n, T& value) { value = args.parameters[n]; });
+  return lamps;
+}
+
+// Whether the light depends on where on the face a pixel lies.
+template <class T>
+bool uses_position(const Lit<T>& args) {
+  return args.parameters && (light_count(args, Light::point, 4) > 0 || light_count(args, Light::specular, 2) > 0);
+}
+
+// What a pixel shows: its point, normal and the direction towards the eye.
+template <class T>
+struct Spot {
+  Vec3<T> point, normal, eye;
+};
+
+// The light that a surface reflects in its own colour, and that of its highlights.
+template <class T>
+struct PixelLight {
+  Vec3<T> diffuse, highlight;
+};
+
+// relu(r . v)^shininess with r = 2 (n . l) n - l, for a unit vector l with n . l > 0.
+template <class T>
+struct Highlight {
+  Vec3<T> reflected;
+  T cosine, x, value;
+  double log2_x = 0;
+
+  Highlight(const Spot<T>& spot, const Vec3<T>& l, T shininess) : cosine(spot.normal.dot(l)), value(0) {
+    reflected = 2 * cosine * spot.normal - l;
+    x = reflected.dot(spot.eye);
+    if (!(x > 0)) return;
+    log2_x = log2_of(static_cast<double>(x));
+    value = static_cast<T>(exp2_of(shininess * log2_x));
+  }
+  // Adds the gradients of the normal, of l and of the direction towards the eye.
+  void backward(const Spot<T>& spot, const Vec3<T>& l, T shininess, T grad, Spot<T>& grads, Vec3<T>& grad_l, T& grad_shininess) const {
+    if (!(x > 0)) return;
+    grad_shininess += static_cast<T>(grad * value * log2_x * 0.69314718055994531);
+    const T grad_x = grad * shininess * (value / x);
+    const Vec3<T> grad_reflected = grad_x * spot.eye;
+    grads.eye += grad_x * reflected;
+    const T grad_cosine = 2 * spot.normal.dot(grad_reflected);
+    grads.normal += 2 * cosine * grad_reflected + grad_cosine * l;
+    grad_l += grad_cosine * spot.normal - grad_reflected;
+  }
+};
+
+template <class T>
+PixelLight<T> light_at(const Lamps<T>& lamps, const Spot<T>& spot, bool highlights) {
+  PixelLight<T> light{lamps.ambient * lamps.ambient_color, Vec3<T>::Zero()};
+  for (const Lamp<T>& lamp : lamps.lamps) {
+    const Vec3<T> towards = lamp.point ? Vec3<T>(lamp.place - spot.point) : lamp.place;
+    if (!(spot.normal.dot(towards) > 0)) continue;
+    const Vec3<T> color = lamp.intensity * lamp.color;
+    if (!lamp.point && !highlights) {
+      light.diffuse += spot.normal.dot(towards) * color;
+      continue;
+    }
+    const Unit<T> l(towards);
+    const T strength = lamp.point ? 1 / (1 + lamp.falloff * towards.squaredNorm()) : l.length;
+    light.diffuse += (lamp.point ? strength * spot.normal.dot(l.unit) : spot.normal.dot(towards)) * color;
+    if (highlights) light.highlight += lamps.specular * strength * Highlight<T>(spot, l.unit, lamps.shininess).value * color;
+  }
+  return light;
+}
+
+// Adds the gradients of the lamps and of the spot (its normal, point and direction towards the eye).
+template <class T>
+void light_backward(const Lamps<T>& lamps, const Spot<T>& spot, const PixelLight<T>& grad, Lamps<T>& grad_lamps, Spot<T>& grad_spot) {
+  grad_lamps.ambient += grad.diffuse.dot(lamps.ambient_color);
+  grad_lamps.ambient_color += lamps.ambient * grad.diffuse;
+  for (size_t n = 0; n < lamps.lamps.size(); ++n) {
+    const Lamp<T>& lamp = lamps.lamps[n];
+    Lamp<T>& grad_lamp = grad_lamps.lamps[n];
+    const Vec3<T> towards = lamp.point ? Vec3<T>(lamp.place - spot.point) : lamp.place;
+    if (!(spot.normal.dot(towards) > 0)) continue;
+    const Vec3<T> color = lamp.intensity * lamp.color;
+    Vec3<T> grad_color = Vec3<T>::Zero(), grad_towards = Vec3<T>::Zero(), grad_l = Vec3<T>::Zero();
+    T grad_strength = 0;
+    const Unit<T> l(towards);
+    const T square = towards.squaredNorm(), strength = lamp.point ? 1 / (1 + lamp.falloff * square) : l.length;
+    const T colored = grad.diffuse.dot(color);
+    if (lamp.point) {
+      const T cosine = spot.normal.dot(l.unit);
+      grad_color += strength * cosine * grad.diffuse;
+      grad_strength += colored * cosine;
+      grad_spot.normal += colored * strength * l.unit;
+      grad_l += colored * strength * spot.normal;
+    } else {
+      grad_color += spot.normal.dot(towards) * grad.diffuse;
+      grad_spot.normal += colored * towards;
+      grad_towards += colored * spot.normal;
+    }
+    if (lamps.highlights) {
+      const Highlight<T> h(spot, l.unit, lamps.shininess);
+      const T shine = grad.highlight.dot(color);
+      grad_color += lamps.specular * strength * h.value * grad.highlight;
+      grad_lamps.specular += shine * strength * h.value;
+      grad_strength += shine * lamps.specular * h.value;
+      h.backward(spot, l.unit, lamps.shininess, shine * lamps.specular * strength, grad_spot, grad_l, grad_lamps.shininess);
+    }
+    grad_lamp.intensity += grad_color.dot(lamp.color);
+    grad_lamp.color += lamp.intensity * grad_color;
+    grad_towards += l.backward(grad_l);
+    if (lamp.point) {
+      const T grad_square = -grad_strength * strength * strength;
+      grad_lamp.falloff += grad_square * square;
+      grad_towards += 2 * grad_square * lamp.falloff * towards;
+      grad_spot.point -= grad_towards;
+    } else {
+      grad_towards += grad_strength * l.unit;
+    }
+    grad_lamp.place += grad_towards;
+  }
+}
+
+// --- pixels
+
+constexpr double kShortest = 1e-5;  // an interpolated normal that is shorter stays short: its gradient is finite
+
+// Where the values of image b lie.
+template <class T>
+struct View {
+  ImageAttributes<T> image;
+  const T *vertices, *normals, *viewer;
+  int64_t first_normal;  // row of normals
+  T side;                // normals are multiplied by this where a face is seen from its front
+
+  View(const Lit<T>& args, int64_t b) : image(image_attributes(args.at, b)), viewer(args.viewer + 5 * b), side(viewer[4]) {
+    const int64_t* s = args.at.starts ? args.at.starts + 2 * b : nullptr;
+    vertices = args.at.attributes + 3 * image.first_row;
+    const int64_t rows = args.smooth ? args.at.num_attributes : args.at.num_faces;
+    first_normal = s ? s[args.smooth ? 0 : 1] : args.normal_batch == 1 ? 0 : b * rows;
+    normals = args.normals + 3 * first_normal;
+  }
+};
+
+// A pixel: its face, the sign of its normal, and the interpolated normal before it is normalised.
+template <class T>
+struct Pixel {
+  const int64_t* corners;
+  int64_t face;
+  T sign;
+  Vec3<T> mean;
+  T length;  // of the mean, at least 1e-5; smooth only
+  Unit<T> to_eye{Vec3<T>::Zero()};
+  Spot<T> spot;
+};
+
+template <class T>
+NMR_INLINE Pixel<T> pixel_of(const Lit<T>& args, const View<T>& view, int64_t id, const T* weights, bool position) {
+  const int64_t F = view.image.num_faces;
+  Pixel<T> p;
+  p.face = id < F ? id : id - F;
+  p.corners = view.image.corners + 3 * p.face;
+  p.sign = id < F ? view.side : -view.side;
+  p.length = 1;
+  if (args.smooth) {
+    p.mean.setZero();
+    for (int k = 0; k < 3; ++k) p.mean += weights[k] * load3(view.normals + 3 * p.corners[k]);
+    p.length = std::max(p.mean.norm(), T(kShortest));
+  } else {
+    p.mean = load3(view.normals + 3 * p.face);
+  }
+  p.spot.normal = p.sign * (p.mean / p.length);
+  p.spot.point.setZero();
+  p.spot.eye.setZero();
+  if (position) {
+    for (int k = 0; k < 3; ++k) p.spot.point += weights[k] * load3(view.vertices + 3 * p.corners[k]);
+    p.to_eye = Unit<T>(load3(view.viewer) - view.viewer[3] * p.spot.point);
+    p.spot.eye = p.to_eye.unit;
+  }
+  return p;
+}
+
+constexpr int64_t kSums = 18;  // per visible face: of the normal (smooth: of three corners), of the positions of the corners
+
+// The sums of a block: of visible faces, and of the lamps.
+template <class T>
+struct LitSums {
+  VisibleFaces visible;
+  std::vector<T> values;   // [count, kSums]
+  std::vector<T> faces;    // [count, 3] light of each face, or its gradient
+  Lamps<T> lamps;
+};
+
+// The gradients of one pixel, or of one face where all its pixels are lit alike (weights: nullptr).
+template <class T>
+NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps, const Pixel<T>& p, const T* weights,
+                               const PixelLight<T>& grad, bool position, Lamps<T>& grad_lamps, T* sums, T* grad_weights) {
+  Spot<T> grad_spot{Vec3<T>::Zero(), Vec3<T>::Zero(), Vec3<T>::Zero()};
+  if (args.parameters)
+    light_backward(lamps, p.spot, grad, grad_lamps, grad_spot);
+  else
+    grad_spot.normal = grad.diffuse;
+  Vec3<T> grad_mean = p.sign * grad_spot.normal;
+  if (args.smooth && p.length > T(kShortest)) {
+    const Vec3<T> unit = p.mean / p.length;
+    grad_mean = (grad_mean - unit * unit.dot(grad_mean)) / p.length;
+  } else if (args.smooth) {
+    grad_mean /= p.length;
+  }
+  if (position) grad_spot.point -= view.viewer[3] * p.to_eye.backward(grad_spot.eye);
+  if (!args.smooth) add3(sums, grad_mean);
+  for (int k = 0; weights && k < 3; ++k) {
+    T by_weight = 0;
+    if (args.smooth) {
+      add3<T>(sums + 3 * k, weights[k] * grad_mean);
+      by_weight += load3(view.normals + 3 * p.corners[k]).dot(grad_mean);
+    }
+    if (position) {
+      add3<T>(sums + 9 + 3 * k, weights[k] * grad_spot.point);
+      by_weight += load3(view.vertices + 3 * p.corners[k]).dot(grad_spot.point);
+    }
+    if (grad_weights) grad_weights[k] = by_weight;
+  }
+}
+
+// The light of each visible face of the block, or its normal. Weights do not matter.
+template <class T>
+void light_faces(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps, LitSums<T>& sums) {
+  T* face = reserve(sums.faces, 3 * sums.visible.count);
+  for (int64_t n = 1; n < sums.visible.count; ++n) {
+    const Pixel<T> p = pixel_of<T>(args, view, sums.visible.ids[n], nullptr, false);
+    const Vec3<T> light = args.parameters ? light_at(lamps, p.spot, false).diffuse : p.spot.normal;
+    for (int k = 0; k < 3; ++k) face[3 * n + k] = light[k];
+  }
+}
+
+template <class T>
+void find_visible(const Lit<T>& args, const View<T>& view, const RowBlocks& blocks, int64_t begin, int64_t end, LitSums<T>& sums) {
+  sums.visible.reserve_for(view.image.num_faces, blocks.most_visible(view.image.num_faces));
+  sums.visible.find(args.at.owner + begin, end - begin, view.image.num_faces);
+}
+
+// kColors: channels of colours, 0: none, white.
+template <int64_t kColors, class T>
+void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, int64_t block, LitSums<T>& sums) {
+  const int64_t H = args.at.raster.height, W = args.at.raster.width;
+  const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
+  const View<T> view(args, b);
+  const Lamps<T> lamps = lamps_of(args, b);
+  const bool position = uses_position(args), per_face = !args.smooth && !position;
+  if (per_face) {
+    find_visible(args, view, blocks, begin, end, sums);
+    light_faces(args, view, lamps, sums);
+  }
+  for (int64_t n = begin; n < end; ++n) {
+    const int64_t id = args.at.owner[n];
+    T* lit = args.lit + 3 * n;
+    if (id < 0) {
+      for (int k = 0; k < 3; ++k) lit[k] = 0;
+      continue;
+    }
+    const T* color = kColors ? args.colors + kColors * n : nullptr;
+    if (per_face) {
+      const T* face = sums.faces.data() + 3 * sums.visible.slots[id + 1];
+      for (int k = 0; k < 3; ++k) lit[k] = kColors ? color[kColors == 3 ? k : 0] * face[k] : face[k];
+      continue;
+    }
+    const Pixel<T> p = pixel_of(args, view, id, args.at.weights + 3 * n, position);
+    const PixelLight<T> light = args.parameters ? light_at(lamps, p.spot, lamps.highlights) : PixelLight<T>{p.spot.normal, Vec3<T>::Zero()};
+    for (int k = 0; k < 3; ++k)
+      lit[k] = (kColors ? color[kColors == 3 ? k : 0] * light.diffuse[k] : light.diffuse[k]) + light.highlight[k];
+  }
+}
+
+template <int64_t kColors, class T>
+void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, int64_t block, LitSums<T>& sums) {
+  const int64_t H = args.at.raster.height, W = args.at.raster.width;
+  const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
+  const View<T> view(args, b);
+  const Lamps<T> lamps = lamps_of(args, b);
+  const bool position = uses_position(args), per_face = !args.smooth && !position;
+  sums.lamps = lamps;
+  sums.lamps.set_zero();
+  find_visible(args, view, blocks, begin, end, sums);
+  const int64_t count = sums.visible.count;
+  std::fill_n(reserve(sums.values, kSums * count), kSums * count, T(0));
+  if (per_face) light_faces(args, view, lamps, sums);
+  for (int64_t n = begin; n < end; ++n) {
+    const int64_t id = args.at.owner[n];
+    T* grad_color = kColors && args.grad_colors ? args.grad_colors + kColors * n : nullptr;
+    T* grad_weights = args.at.grad_weights ? args.at.grad_weights + 3 * n : nullptr;
+    if (grad_weights) std::fill_n(grad_weights, 3, T(0));
+    for (int64_t k = 0; grad_color && k < kColors; ++k) grad_color[k] = 0;
+    if (id < 0) continue;
+    const T *color = kColors ? args.colors + kColors * n : nullptr, *grad = args.grad_lit + 3 * n;
+    const int64_t slot = sums.visible.slots[id + 1];
+    T* sum = sums.values.data() + kSums * slot;
+    if (per_face) {
+      const T* face = sums.faces.data() + 3 * slot;
+      for (int k = 0; k < 3; ++k) {
+        sum[9 + k] += kColors ? color[kColors == 3 ? k : 0] * grad[k] : grad[k];
+        if (grad_color) grad_color[kColors == 3 ? k : 0] += face[k] * grad[k];
+      }
+      continue;
+    }
+    const T* weights = args.at.weights + 3 * n;
+    const Pixel<T> p = pixel_of(args, view, id, weights, position);
+    PixelLight<T> grads{load3(grad), load3(grad)};
+    for (int k = 0; kColors && k < 3; ++k) grads.diffuse[k] *= color[kColors == 3 ? k : 0];
+    if (grad_color) {
+      const Vec3<T> light = args.parameters ? light_at(lamps, p.spot, false).diffuse : p.spot.normal;
+      for (int k = 0; k < 3; ++k) grad_color[kColors == 3 ? k : 0] += light[k] * grad[k];
+    }
+    pixel_backward(args, view, lamps, p, weights, grads, position, sums.lamps, sum, grad_weights);
+  }
+  for (int64_t n = 1; per_face && n < count; ++n) {
+    T* sum = sums.values.data() + kSums * n;
+    const Pixel<T> p = pixel_of<T>(args, view, sums.visible.ids[n], nullptr, false);
+    const PixelLight<T> grads{load3(sum + 9), Vec3<T>::Zero()};
+    pixel_backward<T>(args, view, lamps, p, nullptr, grads, false, sums.lamps, sum, nullptr);
+  }
+}
+
+// Adds the sums of a block to the gradients.
+template <class T>
+void scatter_lit(const Lit<T>& args, int64_t b, LitSums<T>& sums) {
+  const View<T> view(args, b);
+  const bool position = uses_position(args);
+  const int64_t F = view.image.num_faces;
+  for (int64_t n = 1; n < sums.visible.count; ++n) {
+    const int64_t id = sums.visible.ids[n], face = id < F ? id : id - F;
+    const int64_t* corners = view.image.corners + 3 * face;
+    const T* sum = sums.values.data() + kSums * n;
+    if (args.grad_normals && !args.smooth) add3(args.grad_normals + 3 * (view.first_normal + face), load3(sum));
+    for (int k = 0; k < 3; ++k) {
+      if (args.grad_normals && args.smooth) add3(args.grad_normals + 3 * (view.first_normal + corners[k]), load3(sum + 3 * k));
+      if (args.at.grad_attributes && position)
+        add3(args.at.grad_attributes + 3 * (view.image.first_row + corners[k]), load3(sum + 9 + 3 * k));
+    }
+  }
+  if (args.parameters && args.grad_parameters)
+    for_parameters(args, b, sums.lamps, [&](int64_t n, T& value) { args.grad_parameters[n] += value; });
+}
+
+template <class T, class Body>
+void with_colors(const Lit<T>& args, const Body& body) {
+  if (!args.colors) return body(std::integral_constant<int64_t, 0>());
+  if (args.channels == 1) return body(std::integral_constant<int64_t, 1>());
+  body(std::integral_constant<int64_t, 3>());
+}
+
+}  // namespace
+
+template <class T>
+void lit_forward(const Lit<T>& args) {
+  const auto blocks_of = [&](int64_t b) { return RowBlocks(args.at.raster, image_attributes(args.at, b).num_faces); };
+  int64_t most_blocks = 1;
+  for (int64_t b = 0; b < args.at.batch; ++b) most_blocks = std::max(most_blocks, blocks_of(b).count);
+  parallel_for(args.at.batch * most_blocks, args.at.num_threads, [&](int64_t task) {
+    const int64_t b = task / most_blocks, block = task % most_blocks;
+    const RowBlocks blocks = blocks_of(b);
+    if (block >= blocks.count) return;
+    with_colors(args, [&](auto known) { lit_block_forward<known()>(args, blocks, b, block, thread_scratch<LitSums<T>>()); });
+  });
+}
+
+// Parameters, normals and vertices are summed in the order of images and blocks.
+template <class T>
+void lit_backward(const Lit<T>& args) {
+  const int64_t images = args.at.starts ? 1 : args.normal_batch;
+  const int64_t normals = images * (args.smooth ? args.at.num_attributes : args.at.num_faces);
+  const int64_t vertices = args.at.num_attributes * (args.at.starts ? 1 : args.at.attribute_batch);
+  if (args.grad_normals) std::fill_n(args.grad_normals, 3 * normals, T(0));
+  if (args.at.grad_attributes) std::fill_n(args.at.grad_attributes, 3 * vertices, T(0));
+  if (args.grad_parameters) std::fill_n(args.grad_parameters, args.num_parameters, T(0));
+  const auto blocks_of = [&](int64_t b) { return RowBlocks(args.at.raster, image_attributes(args.at, b).num_faces); };
+  sum_blocks<LitSums<T>>(
+      args.at.batch, true, args.at.num_threads, [&](int64_t b) { return blocks_of(b).count; },
+      [&](int64_t b, int64_t block, LitSums<T>& sums) {
+        with_colors(args, [&](auto known) { lit_block_backward<known()>(args, blocks_of(b), b, block, sums); });
+      },
+      [&](int64_t b, LitSums<T>& sums) { scatter_lit(args, b, sums); });
+}
+
+template void lit_forward(const Lit<float>&);
+template void lit_forward(const Lit<double>&);
+template void lit_backward(const Lit<float>&);
+template void lit_backward(const Lit<double>&);
+
+}  // namespace nmr

@@ -1,0 +1,152 @@
+// Normals of faces and of vertices. Computed in double, so that products of float coordinates neither over- nor underflow.
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include <Eigen/Core>
+#include <Eigen/Geometry>
+
+#include "parallel.h"
+#include "stages.h"
+
+namespace nmr {
+namespace {
+
+using Vec3 = Eigen::Vector3d;
+
+constexpr double kLargest = 1e12;  // coordinates beyond this do not count
+
+// A shorter product counts as no area: its derivative could overflow.
+template <class T> constexpr double kShortest = 1e-290;
+template <> constexpr double kShortest<float> = std::numeric_limits<float>::min();
+
+struct Direction {
+  Vec3 unit;
+  double length;  // 0: there is no direction
+};
+
+template <class T>
+Direction direction_of(const Vec3& v) {
+  const double scale = v.cwiseAbs().maxCoeff();
+  if (!(scale >= kShortest<T>)) return {Vec3::Zero(), 0};
+  const double length = (v / scale).norm() * scale;
+  return {v / length, length};
+}
+
+// dL/dv from dL/d(v / |v|).
+Vec3 direction_backward(const Direction& d, const Vec3& grad) {
+  if (d.length == 0) return Vec3::Zero();
+  return (grad - d.unit * d.unit.dot(grad)) / d.length;
+}
+
+// The meshes' vertices as they count.
+template <class T>
+bool counts(const T* vertex) {
+  return std::abs(vertex[0]) < T(kLargest) && std::abs(vertex[1]) < T(kLargest) && std::abs(vertex[2]) < T(kLargest);
+}
+
+template <class T>
+Vec3 vertex_of(const T* vertex) {
+  return counts(vertex) ? Vec3(vertex[0], vertex[1], vertex[2]) : Vec3(Vec3::Zero());
+}
+
+// Sides v0 - v1 and v2 - v1 of a face, and their product.
+struct Sides {
+  Vec3 a, b, across;
+};
+
+template <class T>
+Sides sides_of(const T* vertices, const int64_t* face) {
+  const Vec3 v1 = vertex_of(vertices + 3 * face[1]);
+  Sides s{vertex_of(vertices + 3 * face[0]) - v1, vertex_of(vertices + 3 * face[2]) - v1, {}};
+  s.across = s.a.cross(s.b);
+  return s;
+}
+
+// Adds the gradient of the product to the corners.
+void sides_backward(const Sides& s, const int64_t* face, const Vec3& grad_across, Vec3* grad_vertices) {
+  const Vec3 grad_a = s.b.cross(grad_across), grad_b = grad_across.cross(s.a);
+  grad_vertices[face[0]] += grad_a;
+  grad_vertices[face[2]] += grad_b;
+  grad_vertices[face[1]] -= grad_a + grad_b;
+}
+
+// Sums of the products around each vertex of mesh b.
+template <class T>
+std::vector<Vec3> vertex_sums(const MeshBatch<T>& mesh, int64_t b) {
+  std::vector<Vec3> sums(mesh.vertex_count(b), Vec3::Zero());
+  const int64_t* face = mesh.image_faces(b);
+  for (int64_t f = 0; f < mesh.face_count(b); ++f, face += 3) {
+    const Vec3 across = sides_of(mesh.image_vertices(b), face).across;
+    for (int k = 0; k < 3; ++k) sums[face[k]] += across;
+  }
+  return sums;
+}
+
+template <class T>
+void store(T* to, const Vec3& v) {
+  for (int k = 0; k < 3; ++k) to[k] = static_cast<T>(v[k]);
+}
+
+template <class T>
+Vec3 load(const T* from) {
+  return Vec3(from[0], from[1], from[2]);
+}
+
+// First row of the normals of mesh b.
+template <class T>
+int64_t first_normal(const Normals<T>& args, int64_t b) {
+  const MeshBatch<T>& mesh = args.mesh;
+  return args.smooth ? mesh.vertex_start(b) : mesh.starts ? mesh.face_start(b) : b * mesh.num_faces;
+}
+
+}  // namespace
+
+template <class T>
+void normals_forward(const Normals<T>& args) {
+  const MeshBatch<T>& mesh = args.mesh;
+  parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
+    T* normals = args.normals + 3 * first_normal(args, b);
+    if (args.smooth) {
+      const std::vector<Vec3> sums = vertex_sums(mesh, b);
+      for (size_t v = 0; v < sums.size(); ++v) store(normals + 3 * v, direction_of<T>(sums[v]).unit);
+      return;
+    }
+    for (int64_t f = 0; f < mesh.face_count(b); ++f)
+      store(normals + 3 * f, direction_of<T>(sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f).across).unit);
+  });
+}
+
+template <class T>
+void normals_backward(const Normals<T>& args) {
+  const MeshBatch<T>& mesh = args.mesh;
+  constexpr double largest = std::numeric_limits<T>::max();
+  parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
+    const T *vertices = mesh.image_vertices(b), *grad_normals = args.grad_normals + 3 * first_normal(args, b);
+    const int64_t V = mesh.vertex_count(b), *face = mesh.image_faces(b);
+    std::vector<Vec3> grads(V, Vec3::Zero()), grad_sums;
+    if (args.smooth) {
+      grad_sums = vertex_sums(mesh, b);
+      for (int64_t v = 0; v < V; ++v)
+        grad_sums[v] = direction_backward(direction_of<T>(grad_sums[v]), load(grad_normals + 3 * v));
+    }
+    for (int64_t f = 0; f < mesh.face_count(b); ++f, face += 3) {
+      const Sides sides = sides_of(vertices, face);
+      const Vec3 grad_across = args.smooth ? Vec3(grad_sums[face[0]] + grad_sums[face[1]] + grad_sums[face[2]])
+                                           : direction_backward(direction_of<T>(sides.across), load(grad_normals + 3 * f));
+      sides_backward(sides, face, grad_across, grads.data());
+    }
+    T* grad_vertices = args.grad_vertices + 3 * mesh.vertex_start(b);
+    for (int64_t v = 0; v < V; ++v)
+      for (int k = 0; k < 3; ++k)
+        grad_vertices[3 * v + k] = counts(vertices + 3 * v) ? static_cast<T>(std::clamp(grads[v][k], -largest, largest)) : T(0);
+  });
+}
+
+template void normals_forward(const Normals<float>&);
+template void normals_forward(const Normals<double>&);
+template void normals_backward(const Normals<float>&);
+template void normals_backward(const Normals<double>&);
+
+}  // namespace nmr
