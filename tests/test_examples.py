@@ -53,7 +53,8 @@ def check_movie(path, width, height):
 
 def test_every_example_is_tested_and_short():
     scripts = sorted(path.stem for path in EXAMPLES.glob("*.py"))
-    assert scripts == ["draw_views", "find_camera", "fit_packed", "fit_silhouette", "fit_texture", "make_photo_folder"]
+    fits = ["fit_lit_vase", "fit_packed", "fit_silhouette", "fit_texture"]
+    assert scripts == ["draw_views", "find_camera", *fits, "make_photo_folder"]
     assert all(len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 80 for name in scripts)
 
 
@@ -76,6 +77,12 @@ def test_fit_texture(tmp_path):
     assert after < before / 5
     pixels = imageio.imread(tmp_path / "fit_texture.png")
     check_picture(pixels[: 2 * 64], 4 * 64, 2 * 64)
+
+
+def test_fit_lit_vase(tmp_path):
+    before, after = run("fit_lit_vase", tmp_path, "--steps", "60", "--size", "48")
+    assert after < before / 2
+    check_picture(imageio.imread(tmp_path / "fit_lit_vase.png"), 4 * 48, 3 * 48)
 
 
 def test_find_camera(tmp_path):

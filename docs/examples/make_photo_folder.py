@@ -12,8 +12,8 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
-from learn3d.make_data.shading import shade_mesh
 from learn3d.make_data.shapes import make_shape
+from learn3d.make_data.studio import photograph
 
 WIDTH, HEIGHT = 320, 240
 FOV_DEG = 40.0  # across the width
@@ -22,11 +22,11 @@ FROM_MESH = mesh_to_object(front="z").T  # from mesh files (right-handed, front 
 
 def take_photo(vertices: np.ndarray, faces: np.ndarray, color: np.ndarray, camera: nmr.LookAt, wall: np.ndarray):
     """A picture uint8 [240, 320, 3] of the object in front of a shaded wall, and its mask [240, 320]."""
-    rgb, alpha = shade_mesh(vertices, faces, color, camera, image_size=WIDTH)
+    rgb, alpha = photograph(vertices, faces, color, camera, image_size=WIDTH)
     rows = slice((WIDTH - HEIGHT) // 2, (WIDTH + HEIGHT) // 2)
     rgb, alpha = rgb[0, rows].astype(np.float32), alpha[0, rows]
     background = wall * np.linspace(1.0, 0.6, HEIGHT)[:, None, None]
-    picture = rgb - (1 - alpha[..., None] / 255) * (255 - background)  # shade_mesh draws on white
+    picture = rgb - (1 - alpha[..., None] / 255) * (255 - background)  # on white so far
     return picture.clip(0, 255).round().astype(np.uint8), alpha
 
 

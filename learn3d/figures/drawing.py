@@ -17,7 +17,7 @@ import nmr
 from learn3d.data.conventions import DISTANCE
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.files import writing
-from learn3d.make_data.shading import shade_mesh
+from learn3d.make_data.studio import photograph, studio_lights
 from learn3d.methods import Grids, Meshes
 from learn3d.methods.surfaces import grid_surface
 
@@ -115,9 +115,9 @@ def draw_surface(surface: Surface, cameras: nmr.LookAt | nmr.Orthographic, *, im
             camera = nmr.LookAt(eye[None], up=up, half_fov_deg=cameras.half_fov_deg)
         else:
             camera = nmr.Orthographic(eye[None], up=up, scale=cameras.scale)
-        light = tuple(_camera_axes(eye, up).T @ torch.tensor(_LIGHT, dtype=torch.float64))
-        fine = {"image_size": image_size, "supersample": 4, "ambient": 0.4, "light": light}
-        rgb, _ = shade_mesh(surface.vertices, surface.faces, colors, camera, **fine)
+        light = tuple((_camera_axes(eye, up).T @ torch.tensor(_LIGHT, dtype=torch.float64)).tolist())
+        fine = {"image_size": image_size, "supersample": 4, "lights": studio_lights(light, ambient=0.4)}
+        rgb, _ = photograph(surface.vertices, surface.faces, colors, camera, **fine)
         pictures.append(rgb)
     return np.concatenate(pictures)
 

@@ -23,7 +23,7 @@ from learn3d.make_data.config import DatasetConfig
 from learn3d.make_data.contact_sheet import draw_sheet, make_row
 from learn3d.make_data.folders import check_room, existing, publish
 from learn3d.make_data.report import DatasetReport, lacking
-from learn3d.make_data.shading import KEY_LIGHT, shade_mesh
+from learn3d.make_data.studio import KEY_LIGHT, photograph, studio_lights
 from learn3d.make_data.writers import RenderedObject, Writer, writer_of
 from learn3d.make_data.writers.pictures import write_png
 from learn3d.terminal import plain
@@ -161,8 +161,8 @@ def _render(
     poses = writer.views(placed, config.views, rng)
     vertices = torch.as_tensor(np.ascontiguousarray(placed, dtype=np.float32))
     faces = torch.as_tensor(np.ascontiguousarray(mesh.faces, dtype=np.int64))
-    light = tuple((writer.turn @ KEY_LIGHT).tolist())
-    rgb, alpha = shade_mesh(vertices, faces, color, poses.cameras(), image_size=writer.image_size, light=light)
+    lights = studio_lights(tuple((writer.turn @ KEY_LIGHT).tolist()))
+    rgb, alpha = photograph(vertices, faces, color, poses.cameras(), image_size=writer.image_size, lights=lights)
     if not alpha.any():
         raise ValueError("no view shows any of it (all faces have no area, or are smaller than a pixel)")
     voxels = writer.voxelize(vertices, faces)

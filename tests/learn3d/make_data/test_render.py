@@ -171,7 +171,7 @@ def test_our_own_mistakes_are_not_taken_for_bad_meshes(tmp_path, folder, monkeyp
     def fail(*_, **__):
         raise IndexError("a slip in the renderer")
 
-    monkeypatch.setattr(render, "shade_mesh", fail)
+    monkeypatch.setattr(render, "photograph", fail)
     with pytest.raises(IndexError, match="a slip in the renderer"):
         make(tmp_path / "data", folder)
 
@@ -312,7 +312,7 @@ def test_nothing_is_left_behind_when_it_fails(tmp_path, folder, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(render, "shade_mesh", interrupt)
+    monkeypatch.setattr(render, "photograph", interrupt)
     with pytest.raises(KeyboardInterrupt):
         make(tmp_path / "data", folder)
     assert list((tmp_path / "data").iterdir()) == []

@@ -9,7 +9,7 @@ import torch
 import nmr
 from learn3d.data.conventions import view_cameras
 from learn3d.data.poses import RotationPoses
-from learn3d.make_data.shading import BACK_LIGHT, shade_mesh
+from learn3d.make_data.studio import BACK_LIGHT, photograph, studio_lights
 
 WHITE = np.ones(3, dtype=np.float32)
 
@@ -25,7 +25,7 @@ def test_alpha_equals_the_antialiased_silhouette():
     vertices, faces = nmr.icosphere(2)
     vertices = vertices * torch.tensor([0.45, 0.2, 0.3])
     cameras = view_cameras(torch.arange(24))
-    _, alpha = shade_mesh(vertices, faces, WHITE, cameras, image_size=64)
+    _, alpha = photograph(vertices, faces, WHITE, cameras, image_size=64)
     wanted = nmr.render_silhouette(vertices, faces, cameras, image_size=64)
     np.testing.assert_array_equal(alpha, np.rint(255 * wanted.numpy()).astype(np.uint8))
     assert set(np.unique(alpha)) == {0, 64, 128, 191, 255}
@@ -37,7 +37,7 @@ def test_colour_is_lambert_on_either_winding(square):
     color = np.array([0.8, 0.4, 0.2], dtype=np.float32)
     light = (0.0, 3.0, -4.0)  # 4/5 of it along -z, towards the camera of azimuth 0
     for f in (faces, faces[:, [2, 1, 0]]):
-        rgb, _ = shade_mesh(vertices, f, color, camera, image_size=32, ambient=0.5, light=light)
+        rgb, _ = photograph(vertices, f, color, camera, image_size=32, lights=studio_lights(light, 0.5))
         np.testing.assert_array_equal(rgb[0, 16, 16], np.rint(255 * color * (0.5 + 0.5 * 0.8)))
         np.testing.assert_array_equal(rgb[1, 16, 16], np.rint(255 * color * (0.5 + 0.5 * 0.8 * BACK_LIGHT)))
         np.testing.assert_array_equal(rgb[:, 0, 0], 255)
@@ -46,7 +46,7 @@ def test_colour_is_lambert_on_either_winding(square):
 def test_edge_pixels_are_the_mean_of_surface_and_paper(square):
     vertices, faces = square
     camera = nmr.LookAt.from_angles(2.732, 0.0, 0.0, half_fov_deg=15.0)
-    rgb, alpha = shade_mesh(vertices, faces, 0 * WHITE, camera, image_size=33, supersample=4)
+    rgb, alpha = photograph(vertices, faces, 0 * WHITE, camera, image_size=33, supersample=4)
     np.testing.assert_allclose(rgb[..., 0], 255.0 - alpha, atol=1.0)  # black on white
     assert ((alpha > 0) & (alpha < 255)).any()
 
@@ -54,7 +54,9 @@ def test_edge_pixels_are_the_mean_of_surface_and_paper(square):
 def test_each_face_keeps_its_own_colour(square):
     vertices, faces = square
     camera = nmr.LookAt.from_angles(2.732, 0.0, 0.0, half_fov_deg=15.0)
-    rgb, _ = shade_mesh(vertices, faces, np.float32([[1, 0, 0], [0, 0, 1]]), camera, image_size=32, ambient=1.0)
+    rgb, _ = photograph(
+        vertices, faces, np.float32([[1, 0, 0], [0, 0, 1]]), camera, image_size=32, lights=studio_lights(ambient=1.0)
+    )
     # face 0 holds the lower right corner of the square (x right, y up), face 1 the upper left one
     np.testing.assert_array_equal(rgb[0, 21, 23], [255, 0, 0])
     np.testing.assert_array_equal(rgb[0, 10, 8], [0, 0, 255])
@@ -65,7 +67,8 @@ def test_parallel_rays_light_the_side_that_they_meet(square):
     rotation = torch.diag(torch.tensor([1.0, 1, -1]))  # from behind: +z is towards the camera
     color = np.array([0.8, 0.4, 0.2], dtype=np.float32)
     cameras = RotationPoses(torch.stack([torch.eye(3), rotation])).cameras()
-    rgb, alpha = shade_mesh(vertices, faces, color, cameras, image_size=32, light=(0.0, 3.0, -4.0))
+    lights = studio_lights((0.0, 3.0, -4.0))
+    rgb, alpha = photograph(vertices, faces, color, cameras, image_size=32, lights=lights)
     np.testing.assert_array_equal(rgb[0, 16, 16], np.rint(255 * color * (0.5 + 0.5 * 0.8)))
     np.testing.assert_array_equal(rgb[1, 16, 16], np.rint(255 * color * (0.5 + 0.5 * 0.8 * BACK_LIGHT)))
     wanted = nmr.render_silhouette(vertices, faces, cameras, image_size=32)
@@ -76,7 +79,7 @@ def test_faces_without_area_give_no_nan(square):
     vertices, faces = square
     faces = torch.cat([faces, torch.tensor([[0, 0, 0], [0, 1, 1]])])
     with np.errstate(all="raise"):
-        rgb, _ = shade_mesh(vertices, faces, WHITE, view_cameras(torch.arange(3)), image_size=16)
+        rgb, _ = photograph(vertices, faces, WHITE, view_cameras(torch.arange(3)), image_size=16)
     assert rgb.shape == (3, 16, 16, 3)
 
 
@@ -85,14 +88,20 @@ def test_faces_without_area_give_no_nan(square):
     [
         ({"vertices": torch.zeros(2, 4, 3)}, r"vertices must be \[V, 3\]"),
         ({"face_colors": np.ones((5, 3))}, r"\[3\] or \[2, 3\]"),
-        ({"light": (0.0, 0.0, 0.0)}, "not all zero"),
-        ({"light": (0.0, float("nan"), 0.0)}, "finite"),
-        ({"ambient": 1.5}, "ambient"),
-        ({"supersample": 0}, "at least 1"),
-        ({"cameras": view_cameras([0]).projection()}, "as nmr.LookAt only"),
+        ({"supersample": 3}, "even number"),
+        ({"image_size": 0}, "at least 1"),
     ],
 )
 def test_errors(square, change, message):
     arguments = {"vertices": square[0], "faces": square[1], "face_colors": WHITE, "cameras": view_cameras([0])}
     with pytest.raises(ValueError, match=message):
-        shade_mesh(**{**arguments, "image_size": 16, **change})
+        photograph(**{**arguments, "image_size": 16, **change})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [(((0.0, 0.0, 0.0),), "not all zero"), (((0.0, float("nan"), 0.0),), "finite"), (((0, 1, 0), 1.5), "ambient")],
+)
+def test_errors_of_lights(settings, message):
+    with pytest.raises(ValueError, match=message):
+        studio_lights(*settings)
