@@ -157,6 +157,32 @@ struct SilhouetteBackward {
   int num_threads;
 };
 
+// The soft silhouette of SoftRas (soft.cpp): alpha = 1 - clear, clear = the product of 1 - D over all faces.
+template <class T>
+struct SoftSettings {
+  RasterSettings<T> raster;  // faces wholly in front of near or behind far are left out
+  T sigma;                   // D = 1 / (1 + exp(-+ d^2 / sigma)); d in units of half the shorter side of the raster
+  T reach;                   // faces whose border is at d^2 >= reach from a pixel outside are left out there
+};
+
+template <class T>
+struct SoftForward {
+  MeshBatch<T> mesh;
+  SoftSettings<T> settings;
+  T* clear;  // out [B, H, W]
+  int num_threads;
+};
+
+template <class T>
+struct SoftBackward {
+  MeshBatch<T> mesh;
+  SoftSettings<T> settings;
+  const T* clear;       // [B, H, W] of the forward pass
+  const T* grad_clear;  // [B, H, W]
+  T* grad_vertices;     // out, like mesh.vertices; z gets 0
+  int num_threads;
+};
+
 // Barycentric weights and depth of the owner at each pixel, and their derivatives (fragments.cpp).
 template <class T>
 struct Fragments {
@@ -390,6 +416,8 @@ template <class T> void rasterize_layers(const RasterizeLayers<T>& args);
 template <class T> void silhouette_forward(const SilhouetteForward<T>& args);
 template <class T> void silhouette_backward(const SilhouetteBackward<T>& args);
 template <class T> void local_gradient(const SilhouetteBackward<T>& args);
+template <class T> void soft_forward(const SoftForward<T>& args);
+template <class T> void soft_backward(const SoftBackward<T>& args);
 template <class T> void fragments_forward(const Fragments<T>& args);
 template <class T> void fragments_backward(const Fragments<T>& args);
 template <class T> void depth_forward(const DepthImage<T>& args);

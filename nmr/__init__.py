@@ -4,6 +4,7 @@ Public names
 ------------
 render              meshes -> several of the images below in one pass
 render_silhouette   meshes -> anti-aliased silhouettes, differentiable with NMR's gradient or a local one
+render_soft_silhouette    meshes -> the soft silhouettes of SoftRas, with their true derivative
 render_rgb          meshes -> colour images, with the same gradient
 render_depth        meshes -> depth images, with their true derivative
 render_normals      meshes -> normals in world space
@@ -40,6 +41,7 @@ from .render import (
     render_normals,
     render_rgb,
     render_silhouette,
+    render_soft_silhouette,
 )
 from .textures import Colors, FaceColors, TextureCubes, UVTexture, VertexColors
 from .voxels import voxelize
@@ -71,6 +73,7 @@ __all__ = [
     "render_normals",
     "render_rgb",
     "render_silhouette",
+    "render_soft_silhouette",
     "unique_edges",
     "vertex_normals",
     "voxelize",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -71,6 +72,14 @@ class Scene(NamedTuple):
             float(eps),
             local,
         )
+
+    def soft_silhouette(
+        self, anti_aliasing: bool, fill_back: bool, near: float, far: float, sigma: float, dist_eps: float
+    ) -> Tensor:
+        reach = sigma * math.log(1 / dist_eps - 1)
+        settings = bool(fill_back), float(near), float(far), float(sigma), reach
+        clear = ops.soft_silhouette(*self.drawn[:3], *self.raster, *settings)
+        return 1 - average(clear.unsqueeze(-1), anti_aliasing).squeeze(-1)
 
     def depth(self, owner: Tensor, anti_aliasing: bool, far: float) -> Tensor:
         return ops.depth_image(*self.drawn[:3], owner, bool(anti_aliasing), float(far))

@@ -255,3 +255,43 @@ def _one_pixel_moves(image: Tensor, grad: Tensor, eps: float) -> Tensor:
     moves = torch.where(right > left, -right, left)
     still = (torch.maximum(right, left) <= 0) | ((right - left).abs() < eps)
     return torch.where(still, torch.zeros_like(moves), moves)
+
+
+def soft_silhouette(
+    vertices: Tensor,
+    faces: Tensor,
+    raster_size: int | tuple[int, int],
+    sigma: float = 1e-5,
+    dist_eps: float = 1e-4,
+    fill_back: bool = True,
+    near: float = 0.1,
+    far: float = 100.0,
+) -> Tensor:
+    """The soft silhouette ``[H, W]``, row 0 = top, of one mesh (:func:`nmr.render_soft_silhouette`).
+
+    Autograd differentiates it.
+    """
+    height, width = (raster_size, raster_size) if isinstance(raster_size, int) else raster_size
+    shorter = min(height, width)
+    x = (2 * torch.arange(width) + 1 - width).to(vertices) / shorter
+    y = (height - 1 - 2 * torch.arange(height)).to(vertices) / shorter
+    points = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+    units = torch.tensor([width / shorter, height / shorter], dtype=vertices.dtype)
+    clear = torch.ones(height, width).to(vertices)
+    for corners in vertices[faces]:
+        z, corners = corners[:, 2], corners[:, :2] * units
+        if not corners.isfinite().all() or (z <= near).all() or (z >= far).all():
+            continue
+        sides = corners.roll(-1, 0) - corners
+        area = sides[0, 0] * sides[1, 1] - sides[0, 1] * sides[1, 0]
+        if area < 0 and not fill_back:
+            continue
+        away = points[:, :, None] - corners  # [H, W, 3, 2]
+        left_of = sides[:, 0] * away[..., 1] - sides[:, 1] * away[..., 0]
+        inside = (left_of * area.sign() > 0).all(-1)
+        t = ((away * sides).sum(-1) / (sides * sides).sum(-1).clamp_min(1e-30)).clamp(0, 1)
+        square = (away - t[..., None] * sides).square().sum(-1).amin(-1)
+        covers = torch.sigmoid(torch.where(inside, square, -square) / sigma)
+        counts = inside | (square < sigma * math.log(1 / dist_eps - 1))
+        clear = clear * torch.where(counts, 1 - covers, torch.ones_like(covers))
+    return 1 - clear

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ._packing import is_list
 from ._scene import Meshes, average, make_scene, shade
-from ._validate import check_choice, check_size
+from ._validate import check_choice, check_number, check_size
 from .cameras import Camera
 from .fragments import Fragments
 from .images import OUTPUTS, Images
@@ -254,6 +254,63 @@ def render_silhouette(
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
     alpha, _ = scene.silhouette(anti_aliasing, fill_back, near, far, eps, gradient == "local")
     return alpha
+
+
+def render_soft_silhouette(
+    vertices: Meshes,
+    faces: Meshes,
+    camera: Camera | None = None,
+    *,
+    sigma: float = 1e-5,
+    dist_eps: float = 1e-4,
+    image_size: int | tuple[int, int] = 256,
+    anti_aliasing: bool = False,
+    fill_back: bool = True,
+    near: float = 0.1,
+    far: float = 100.0,
+    clip: bool = True,
+) -> Tensor:
+    """The soft silhouettes of SoftRas (Liu et al. 2019); other arguments as in :func:`render_silhouette`.
+
+    Parameters
+    ----------
+    sigma : float
+        How soft the image is. A pixel at the distance d from the border of a face is covered by it with probability
+        ``D = sigmoid(d^2 / sigma)`` if it is inside, else ``sigmoid(-d^2 / sigma)``. d is in units of half the shorter
+        side of the image: at sqrt(sigma) from the border D is 0.27 or 0.73.
+    dist_eps : float
+        Faces for which D would be less than this at a pixel outside are left out there. In (0, 0.5).
+
+    Returns
+    -------
+    Tensor [B, h, w]
+        ``alpha = 1 - product over all faces of (1 - D)``. Faces count whether they are seen or hidden.
+
+    Notes
+    -----
+    Differentiable in x and y of the vertices (and through the camera): this is the true derivative of the image (up to
+    the jump of dist_eps). z gets 0. Formulas and constants are the published ones. Unlike there, faces that lie wholly
+    in front of ``near`` or behind ``far`` are left out, and ``fill_back=False`` leaves out those seen from behind.
+    There is no second derivative.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As :func:`render_silhouette`; for a sigma that is not positive, and a dist_eps outside (0, 0.5).
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> camera = nmr.LookAt([0.0, 0.0, -5.0])
+    >>> soft = nmr.render_soft_silhouette(vertices, faces, camera, sigma=1e-3, image_size=64)
+    """
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip)
+    sigma, dist_eps = check_number(sigma, "sigma"), check_number(dist_eps, "dist_eps")
+    if not torch.finfo(scene.mesh.vertices.dtype).tiny <= sigma < float("inf"):
+        raise ValueError(f"sigma must be positive in {scene.mesh.vertices.dtype} and finite, got {sigma}")
+    if not 0 < dist_eps < 0.5:
+        raise ValueError(f"dist_eps must lie between 0 and 0.5, got {dist_eps}")
+    return scene.soft_silhouette(anti_aliasing, fill_back, near, far, sigma, dist_eps)
 
 
 def render_depth(

@@ -146,6 +146,7 @@ inline Size require_image(const Array<int32_t>& owner, Size raster, bool anti_al
 void bind_camera(py::module_& m);
 void bind_clip(py::module_& m);
 void bind_raster(py::module_& m);
+void bind_soft(py::module_& m);
 void bind_fragments(py::module_& m);
 void bind_edges(py::module_& m);
 void bind_shade(py::module_& m);

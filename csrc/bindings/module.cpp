@@ -9,6 +9,7 @@ PYBIND11_MODULE(_C, m) {
   nmr::bind_camera(m);
   nmr::bind_clip(m);
   nmr::bind_raster(m);
+  nmr::bind_soft(m);
   nmr::bind_fragments(m);
   nmr::bind_edges(m);
   nmr::bind_shade(m);
