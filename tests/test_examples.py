@@ -54,7 +54,7 @@ def check_movie(path, width, height):
 def test_every_example_is_tested_and_short():
     scripts = sorted(path.stem for path in EXAMPLES.glob("*.py"))
     fits = ["fit_lit_vase", "fit_packed", "fit_silhouette", "fit_texture"]
-    assert scripts == ["draw_views", "find_camera", *fits, "make_photo_folder"]
+    assert scripts == ["draw_surfaces", "draw_views", "find_camera", *fits, "make_photo_folder"]
     assert all(len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 80 for name in scripts)
 
 
@@ -63,6 +63,16 @@ def test_draw_views_from_the_command_line(tmp_path):
     done = subprocess.run([*command, "--image-size", "64"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     check_picture(imageio.imread(tmp_path / "new" / "views.png"), 2 * 64, 3 * 64)
+
+
+def test_draw_surfaces(tmp_path):
+    run("draw_surfaces", tmp_path, "--image-size", "64")
+    room, wide, soft = (imageio.imread(tmp_path / f"{name}.png") for name in ("room", "wide", "soft"))
+    assert room.shape == (64, 64, 3) and wide.shape == (64, 128, 3) and soft.shape == (32, 128)
+    assert (room.max(-1) > 60).all() and (wide.max(-1) > 60).all()  # walls everywhere
+    assert (np.abs(wide[:, 32:96].astype(int) - room).max(-1) > 8).mean() < 0.02
+    greys = [((tile > 10) & (tile < 245)).mean() for tile in np.split(soft, 4, axis=1)]
+    assert greys[0] < 0.1 and greys[0] < greys[1] < greys[2]
 
 
 def test_fit_silhouette(tmp_path):
