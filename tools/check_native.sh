@@ -8,7 +8,8 @@
 #                 build/native/mutate/current-SEED
 #   fuzz SECONDS  libFuzzer (clang++), which looks for new code; findings: build/native/fuzz/finding-*; inputs: build/native/corpus
 #   keep          adds to tests/csrc/corpus.hex the inputs that reach new code
-#   count         instructions of workload W1 under callgrind, compared with tests/csrc/instructions.json
+#   count         instructions of the kernels under callgrind, compared with tests/csrc/instructions.json; --store: new bounds
+#   count-base, count-arm64   the same without AVX, and for arm64 under qemu
 #   variants      whether every available compiler and instruction set gives the same bits
 #   coverage      coverage of csrc/ and nmr/ by the C++ and Python tests (lines and branches)
 # Exit status 77: a tool that the check needs is missing; a message names it. PYTHON: an interpreter that has cmeel-eigen
@@ -110,6 +111,20 @@ check_count() {
     "$python" tests/csrc/count.py build/native/count/workload "${CXX:-c++}" "$@"
 }
 
+check_count_base() {
+    want valgrind "the instruction count"
+    [ "$(uname -m)" = x86_64 ] || skip "the stored bound is for x86-64"
+    build count-base "${CXX:-c++}" "-O3 -g" workload
+    "$python" tests/csrc/count.py build/native/count-base/workload "${CXX:-c++}" --target x86-64 "$@"
+}
+
+check_count_arm64() {
+    want aarch64-linux-gnu-g++ "the instruction count for arm64"
+    want qemu-aarch64 "the instruction count for arm64"
+    build arm64 aarch64-linux-gnu-g++ -O3 workload -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64
+    "$python" tests/csrc/count.py build/native/arm64/workload aarch64-linux-gnu-g++ --target arm64 "$@"
+}
+
 check_variants() {
     local name compiler flags results=build/native/variants.txt
     rm -f "$results"
@@ -117,7 +132,7 @@ check_variants() {
         command -v "$compiler" >/dev/null || { echo "$name: no $compiler, left out"; continue; }
         if [ "$name" = arm64 ]; then
             command -v qemu-aarch64 >/dev/null || { echo "$name: no qemu-aarch64, left out"; continue; }
-            build "$name" "$compiler" "-O3 $flags" workload -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64
+            build "$name" "$compiler" "-O3${flags:+ $flags}" workload -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64
             qemu-aarch64 -L /usr/aarch64-linux-gnu "build/native/$name/workload" 2 >"build/native/$name.txt"
         else
             case $(uname -m)/$flags in x86_64/* | */ | */-D*) ;; *) continue ;; esac
@@ -175,12 +190,14 @@ check_coverage() {
     "${gcovr[@]}" --txt /dev/null --print-summary
 }
 
-[ $# -gt 0 ] || { sed -n '2,17s/^# \{0,1\}//p' "$0"; exit 2; }
+[ $# -gt 0 ] || { sed -n '2,18s/^# \{0,1\}//p' "$0"; exit 2; }
 mkdir -p build/native
 check=$1
 shift
 case $check in
 tests | asan | tsan | count | variants | coverage | mutate | fuzz | keep) "check_$check" "$@" ;;
 tsan-clang) check_tsan_clang ;;
+count-base) check_count_base "$@" ;;
+count-arm64) check_count_arm64 "$@" ;;
 *) echo "unknown check: $check"; exit 2 ;;
 esac

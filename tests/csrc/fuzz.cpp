@@ -1,6 +1,6 @@
-// The fuzz target: bytes -> a scene -> every stage, forward and backward. Beyond what the sanitizers find, it stops at a broken promise,
-// and for some seeds at results that depend on the number of threads, on the other images of the batch, or on packing. corpus.py
-// writes such bytes.
+// The fuzz target: bytes -> a scene -> every stage, forward and backward. Beyond what the sanitizers find, it stops at
+// a broken promise, and for some seeds at results that depend on the number of threads, on the other images of the
+// batch, or on packing. corpus.py writes such bytes.
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
@@ -31,13 +31,26 @@ struct Bytes {
   }
 };
 
-// One byte for a coordinate on a grid of 1/64 (depth: 1/16), pixel centres and borders among them; or a special value; or raw bits.
+// One byte for a coordinate on a grid of 1/64 (depth: 1/16), pixel centres and borders among them; or a special value;
+// or raw bits.
 template <class T>
 T coordinate(Bytes& bytes, bool is_depth) {
   using Limits = std::numeric_limits<T>;
-  static constexpr T special[] = {Limits::quiet_NaN(), Limits::infinity(), -Limits::infinity(), Limits::max(), Limits::lowest(), Limits::denorm_min(),
-                       Limits::min(), -Limits::min(), Limits::epsilon(), 1 + Limits::epsilon(), 1 - Limits::epsilon(), T(-0.0),
-                       T(1e10), T(-1e20), T(1e-20)};
+  static constexpr T special[] = {Limits::quiet_NaN(),
+                                  Limits::infinity(),
+                                  -Limits::infinity(),
+                                  Limits::max(),
+                                  Limits::lowest(),
+                                  Limits::denorm_min(),
+                                  Limits::min(),
+                                  -Limits::min(),
+                                  Limits::epsilon(),
+                                  1 + Limits::epsilon(),
+                                  1 - Limits::epsilon(),
+                                  T(-0.0),
+                                  T(1e10),
+                                  T(-1e20),
+                                  T(1e-20)};
   const int byte = bytes.next();
   if (byte < 232) return is_depth ? T(byte - 32) / 16 : T(byte - 116) / 64;
   if (byte < 247) return special[byte - 232];

@@ -1,6 +1,7 @@
 // A main for the fuzz target without libFuzzer.
-//   fuzz [-v] FILE...                          runs every input of the files, one per line in hexadecimal digits; -v names each before it does
-//   fuzz -mutate SECONDS SEED CURRENT FILE...  runs mutations of them for that long. CURRENT holds the input that is running, in the
+//   fuzz [-v] FILE...                          runs every input of the files, one per line in hexadecimal digits; -v
+//   names each before it does fuzz -mutate SECONDS SEED CURRENT FILE...  runs mutations of them for that long. CURRENT
+//   holds the input that is running, in the
 //                                              same digits: the culprit after a crash
 #include <fcntl.h>
 #include <sys/mman.h>
@@ -28,7 +29,8 @@ std::vector<Input> read_inputs(int argc, char** argv, int first) {
     std::ifstream file(argv[n]);
     for (std::string line; std::getline(file, line);) {
       Input input;
-      for (size_t k = 0; k + 1 < line.size(); k += 2) input.push_back(static_cast<uint8_t>(std::stoi(line.substr(k, 2), nullptr, 16)));
+      for (size_t k = 0; k + 1 < line.size(); k += 2)
+        input.push_back(static_cast<uint8_t>(std::stoi(line.substr(k, 2), nullptr, 16)));
       inputs.push_back(input);
     }
   }
@@ -47,14 +49,16 @@ struct Random {  // splitmix64
   size_t below(size_t n) { return next() % n; }
 };
 
-// One to eight changes: of a byte of the head (settings) or of any; of a run of bytes; bytes left out or repeated; the rest of another
-// input.
+// One to eight changes: of a byte of the head (settings) or of any; of a run of bytes; bytes left out or repeated; the
+// rest of another input.
 void mutate(Random& random, const std::vector<Input>& inputs, Input& input) {
   constexpr size_t kHead = 12;
   for (size_t changes = 1 + random.below(8); changes > 0 && !input.empty(); --changes) {
     const size_t at = random.below(input.size());
     switch (random.below(8)) {
-      case 0: input[random.below(input.size() < kHead ? input.size() : kHead)] = static_cast<uint8_t>(random.next()); break;
+      case 0:
+        input[random.below(input.size() < kHead ? input.size() : kHead)] = static_cast<uint8_t>(random.next());
+        break;
       case 1: input[at] = static_cast<uint8_t>(random.next()); break;
       case 2: input[at] = static_cast<uint8_t>(input[at] ^ (1u << random.below(8))); break;
       case 3: input[at] = static_cast<uint8_t>(input[at] + random.below(5) - 2); break;
@@ -117,8 +121,8 @@ int fuzz(double seconds, uint64_t seed, const char* path, const std::vector<Inpu
     std::fflush(stdout);
     next_report += 60;
   }
-  std::printf("%llu executions in %.0f s, seed %llu, no finding\n", static_cast<unsigned long long>(executions), elapsed,
-              static_cast<unsigned long long>(seed));
+  std::printf("%llu executions in %.0f s, seed %llu, no finding\n", static_cast<unsigned long long>(executions),
+              elapsed, static_cast<unsigned long long>(seed));
   return 0;
 }
 

@@ -1,5 +1,5 @@
-// A batch of meshes with everything the stages ask for, and one call that runs them all. Shared by the tests, the fuzz target and
-// the instruction count.
+// A batch of meshes with everything the stages ask for, and one call that runs them all. Shared by the tests, the fuzz
+// target and the instruction count.
 #pragma once
 
 #include <algorithm>
@@ -27,8 +27,8 @@ std::vector<T> noise_array(uint64_t seed, int64_t size) {
   return values;
 }
 
-// Sizes an array that is used for scene after scene. It keeps its storage, but in sanitizer builds has exactly this size, so that
-// accesses beyond it are seen.
+// Sizes an array that is used for scene after scene. It keeps its storage, but in sanitizer builds has exactly this
+// size, so that accesses beyond it are seen.
 template <class T>
 void resize(std::vector<T>& values, int64_t size) {
 #ifdef NMR_FRESH_SCRATCH
@@ -75,7 +75,13 @@ struct Scene {
   int64_t raster_size() const { return raster().width; }  // of a square raster
   int64_t pixels() const { return batch * raster().pixels(); }
   MeshBatch<T> mesh() const {
-    return {vertices.data(), faces.data(), batch, num_vertices, num_faces, faces_per_image, packed() ? starts.data() : nullptr};
+    return {vertices.data(),
+            faces.data(),
+            batch,
+            num_vertices,
+            num_faces,
+            faces_per_image,
+            packed() ? starts.data() : nullptr};
   }
   void add_start() {  // of the next packed mesh, or the end
     starts.push_back(num_vertices);
@@ -95,6 +101,10 @@ struct Results {
   std::vector<T> colors, grad_textures;
   std::vector<T> values, grad_attributes, grad_weights;
   std::vector<T> pyramid, grad_texels, level, sampled, grad_sampled_texels, grad_uv, grad_uv_weights;
+  std::vector<T> normals, grad_normals_vertices, lit, grad_lit_colors, grad_lit_normals, grad_lights, grad_lit_vertices,
+      grad_lit_weights;
+  std::vector<int32_t> layers;
+  std::vector<T> clear, grad_soft;
   std::vector<T> resolved, grad_image;
   std::vector<T> grad_edges;
   std::vector<T> points, grad_world, grad_matrix, grad_intrinsics, grad_distortion, grad_origin, grad_extent;
@@ -131,6 +141,17 @@ struct Results {
     visit("grad_sampled_texels", grad_sampled_texels);
     visit("grad_uv", grad_uv);
     visit("grad_uv_weights", grad_uv_weights);
+    visit("normals", normals);
+    visit("grad_normals_vertices", grad_normals_vertices);
+    visit("lit", lit);
+    visit("grad_lit_colors", grad_lit_colors);
+    visit("grad_lit_normals", grad_lit_normals);
+    visit("grad_lights", grad_lights);
+    visit("grad_lit_vertices", grad_lit_vertices);
+    visit("grad_lit_weights", grad_lit_weights);
+    visit("layers", layers);
+    visit("clear", clear);
+    visit("grad_soft", grad_soft);
     visit("resolved", resolved);
     visit("grad_image", grad_image);
     visit("grad_edges", grad_edges);
@@ -174,12 +195,13 @@ Scene<T> first_image(const Scene<T>& scene);
 template <class T>
 const char* first_difference(const Results<T>& a, const Results<T>& b);
 
-// The name of the first result of first_image(scene) that is not the beginning of the batch's, or nullptr. Sums over the batch are
-// not compared.
+// The name of the first result of first_image(scene) that is not the beginning of the batch's, or nullptr. Sums over
+// the batch are not compared.
 template <class T>
 const char* depends_on_company(const Scene<T>& scene, const Results<T>& together, const Results<T>& alone);
 
-// The name of the first result that packing changed, or nullptr. A packed batch is one mesh to the smoothness loss: not compared.
+// The name of the first result that packing changed, or nullptr. A packed batch is one mesh to the smoothness loss: not
+// compared.
 template <class T>
 const char* depends_on_packing(const Results<T>& stacked, const Results<T>& packed);
 
