@@ -160,7 +160,8 @@ NMR_INLINE void pull_listed(const Lines<T>& lines, int64_t n, int32_t first, int
     const int32_t lanes = last - start;
     for (int k = 0; k < kWidth; ++k) {
       const bool counts = (k < lanes) & (gain[k] > 0) & (!kOwn | (owner[start + k] == id));
-      const T offset = k < lanes ? position[start + k] - lever.crossing : T(1);  // beyond the list there may be anything
+      // Loads without a condition, or else compilers do not vectorize this loop; beyond the list there may be anything.
+      const T distance = position[start + k] - lever.crossing, offset = k < lanes ? distance : T(1);
       const T h_p = lever.p * offset, h_q = lever.q * offset;
       pulls.p[k] -= (counts & lever.p_acts ? gain[k] : T(0)) / (h_p + (h_p > 0 ? lines.eps : -lines.eps));
       pulls.q[k] -= (counts & lever.q_acts ? gain[k] : T(0)) / (h_q + (h_q > 0 ? lines.eps : -lines.eps));
