@@ -90,4 +90,18 @@ struct SweepScratch {
   Crossings<T> crossings[2][2];    // by axis and direction
 };
 
+// Adds the gradients [count, 3, 2] of x and y of the corners of faces to their vertices.
+template <class T, class Image>
+void scatter_corners(const Image& image, const int32_t* ids, int64_t count, const T* grad, T* grad_vertices) {
+  for (int64_t n = 0; n < count; ++n, grad += 6) {
+    const bool reversed = ids[n] >= image.num_faces;
+    const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
+    for (int k = 0; k < 3; ++k) {
+      T* vertex = grad_vertices + 3 * face[reversed ? 2 - k : k];
+      vertex[0] += grad[2 * k];
+      vertex[1] += grad[2 * k + 1];
+    }
+  }
+}
+
 }  // namespace nmr

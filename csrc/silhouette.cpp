@@ -50,20 +50,6 @@ struct TaskScratch {
   std::vector<SweepScratch<T>> blocks;  // [1]
 };
 
-// Adds the gradients of faces to their vertices.
-template <class T>
-void scatter(const SweepImage<T>& image, const int32_t* ids, int64_t count, const T* grad, T* grad_vertices) {
-  for (int64_t n = 0; n < count; ++n, grad += 6) {
-    const bool reversed = ids[n] >= image.num_faces;
-    const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
-    for (int k = 0; k < 3; ++k) {
-      T* vertex = grad_vertices + 3 * face[reversed ? 2 - k : k];
-      vertex[0] += grad[2 * k];
-      vertex[1] += grad[2 * k + 1];
-    }
-  }
-}
-
 }  // namespace
 
 // grad_vertices of each image: lists the pixels that can pull, sweeps the visible faces, adds up at the vertices. If a
@@ -90,7 +76,7 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
     T* grad = reserve(scratch.grad, 6 * count);
     if (!NMR_AT_BEST_LEVEL(all_finite, image.grad_alpha, args.image.pixels())) {
       std::fill_n(grad, 6 * count, std::numeric_limits<T>::quiet_NaN());
-      scatter(image, ids, count, grad, grad_vertices);
+      scatter_corners(image, ids, count, grad, grad_vertices);
       return;
     }
 
@@ -115,7 +101,7 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
       SweepScratch<T>& block = *reserve(thread_scratch<TaskScratch<T>>().blocks, 1);
       NMR_AT_BEST_LEVEL(sweep_faces, image, ids, n * chunk, std::min((n + 1) * chunk, count), block, grad);
     });
-    scatter(image, ids, count, grad, grad_vertices);
+    scatter_corners(image, ids, count, grad, grad_vertices);
   });
 }
 

@@ -345,13 +345,17 @@ struct Lit {
 template <class T>
 struct Resolve {
   int64_t batch;
-  Size image;              // h x w
+  Size image;               // h x w
   bool anti_aliasing;
-  int64_t channels;        // C
-  const T* pixels;         // [B, H, W, C] of the raster
-  T* resolved;             // forward out [B, h, w, C]
-  const T* grad_resolved;  // backward in
-  T* grad_pixels;          // backward out [B, H, W, C]
+  int64_t channels;         // C
+  const int32_t* owner;     // [B, H, W], or nullptr without a background
+  const T* pixels;          // [B, H, W, C] of the raster
+  const T* background;      // [B or 1, C] colour of pixels without a face, or nullptr: that in `pixels`
+  int64_t background_batch; // 1 or B
+  T* resolved;              // forward out [B, h, w, C]
+  const T* grad_resolved;   // backward in
+  T* grad_pixels;           // backward out [B, H, W, C], 0 where the background is seen; or nullptr
+  T* grad_background;       // backward out [B, C], or nullptr
   int num_threads;
 };
 
@@ -359,13 +363,16 @@ struct Resolve {
 template <class T>
 struct EdgesBackward {
   MeshBatch<T> mesh;
-  Size raster;           // H x W
+  Size image;               // h x w
+  bool anti_aliasing;
   T eps;
-  const int32_t* owner;  // [B, H, W]
-  const T* image;        // [B, H, W, C]
-  int64_t channels;      // C
-  const T* grad_image;   // [B, H, W, C]
-  T* grad_vertices;      // out, like mesh.vertices; z gets 0
+  const int32_t* owner;     // [B, H, W]
+  const T* pixels;          // [B, H, W, C]
+  int64_t channels;         // C
+  const T* background;      // [B or 1, C] colour of pixels without a face, or nullptr: that in `pixels`
+  int64_t background_batch; // 1 or B
+  const T* grad_resolved;   // [B, h, w, C]
+  T* grad_vertices;         // out, like mesh.vertices; z gets 0
   int num_threads;
 };
 

@@ -7,6 +7,8 @@
 // An edge of a small face crosses three or four lines only. So edges are first written out as crossings, of all edges
 // with one axis and direction, and then crossings are worked on in full vectors.
 
+#include "crossings.h"
+
 // --- coverage
 
 // alpha [h, w]: the covered share of each pixel of an image whose owner map has twice its size.
@@ -23,17 +25,6 @@ void average_coverage(const int32_t* owner, Size image, T* alpha) {
 }
 
 // --- which pixels can pull
-
-// Whether all values are finite.
-template <class T>
-bool all_finite(const T* values, int64_t count) {
-  Lanes<T> zeros = splat(T(0));
-  int64_t n = 0;
-  for (; n + kLanes <= count; n += kLanes) zeros = zeros + load_lanes<Lanes<T>>(values + n) * splat(T(0));
-  T zero = 0;
-  for (; n < count; ++n) zero += values[n] * T(0);
-  return zero == T(0) && lane_bits(zeros == splat(T(0))) == 0xff;
-}
 
 // Gradients of one row of raster pixels (counted from the bottom), followed by lanes of zeros.
 template <class T>
@@ -127,57 +118,7 @@ void collect_lines(const SweepImage<T>& image, const LineRange& range, T* grad_r
   finish_lines(rows, range.row_first, range.row_last);
 }
 
-// --- the faces that own a pixel; all others have gradient 0
-
-// Writes their owner entries to ids, ascending, and returns their number. seen: [2 F + 1 + pad] of scratch.
-int64_t find_visible(const int32_t* owner, int64_t pixels, int64_t num_faces, uint8_t* seen, int32_t* ids) {
-  const int64_t entries = 2 * num_faces + 1;  // entry 0 is the background
-  std::memset(seen, 0, entries + kPad);
-  int64_t n = 0;
-  for (; n + kLanes <= pixels; n += kLanes) {
-    if (!lane_bits(load_lanes<Lanes32>(owner + n) >= splat(int32_t(0)))) continue;
-    for (int64_t k = 0; k < kLanes; ++k) seen[owner[n + k] + 1] = 1;
-  }
-  for (; n < pixels; ++n) seen[owner[n] + 1] = 1;
-  seen[0] = 0;
-  int64_t count = 0;
-  for (int64_t e = 0; e < entries; e += 8) {
-    uint64_t any;
-    std::memcpy(&any, seen + e, sizeof any);
-    if (!any) continue;
-    for (int64_t k = e; k < e + 8; ++k) {
-      ids[count] = static_cast<int32_t>(k - 1);
-      count += seen[k];
-    }
-  }
-  return count;
-}
-
 // --- the pulls
-
-// How the crossing c of an edge P-Q and a line n of M pixels moves with each end of the edge.
-template <class T>
-struct Lever {
-  T crossing;  // c
-  T factor_p;  // 2 / M (Qs - Ps) / (Qs - n): travel of P, in [-1, 1] coordinates, that moves the crossing by one pixel
-  T factor_q;  // 2 / M (Qs - Ps) / (n - Ps): the same of Q
-  T eps;
-};
-
-// How far the end must travel to move the crossing by `offset` pixels; eps keeps it away from zero.
-template <class T>
-NMR_INLINE T travel(T factor, T offset, T eps) {
-  const T h = factor * offset;
-  return h > 0 ? h + eps : h - eps;
-}
-
-// The pull of one pixel, for pixels inside the face and for levers of extreme size. An end without a finite lever does
-// not move.
-template <class T>
-NMR_INLINE void pull(T weight, T offset, const Lever<T>& lever, T* pulls) {
-  if (std::isfinite(lever.factor_p)) pulls[0] += weight / travel(lever.factor_p, offset, lever.eps);
-  if (std::isfinite(lever.factor_q)) pulls[1] += weight / travel(lever.factor_q, offset, lever.eps);
-}
 
 // Adds the pulls of the listed pixels beyond the crossing: above it if kUp, else below. A pixel of weight w pulls P
 // with w / h_p and Q with w / h_q, h the travel. The quotients share one division: w / (h_p h_q) times h_q and h_p.
@@ -294,117 +235,14 @@ void run_crossings(const SweepImage<T>& image, int axis, SweepScratch<T>& block)
   }
 }
 
-template <class T>
-NMR_INLINE void run_crossings(const SweepImage<T>& image, int axis, int direction, SweepScratch<T>& block) {
-  direction == 0 ? run_crossings<true>(image, axis, block) : run_crossings<false>(image, axis, block);
-}
-
-// Finds the crossings of the edges k, k + 1 of eight faces, from number `first` of the block, and the lines of an axis.
-template <class T>
-NMR_INLINE void cross_edges(const SweepImage<T>& image, int axis, int k, int64_t first, SweepScratch<T>& block) {
-  const PullLines<T>& lines = image.lines[axis];
-  const T num_lines = static_cast<T>(axis == 0 ? image.raster.width : image.raster.height);
-  const T length = static_cast<T>(axis == 0 ? image.raster.height : image.raster.width);
-  const int64_t edge = k * kSweptFaces + first, q = k < 2 ? k + 1 : 0;
-  const Lanes<T> ps = load_lanes<Lanes<T>>(block.corner[axis][k] + first);
-  const Lanes<T> qs = load_lanes<Lanes<T>>(block.corner[axis][q] + first);
-  const Lanes<T> pt = load_lanes<Lanes<T>>(block.corner[1 - axis][k] + first);
-  const Lanes<T> qt = load_lanes<Lanes<T>>(block.corner[1 - axis][q] + first);
-  const Lanes<T> zero = splat(T(0)), one = splat(T(1)), top = splat(num_lines - 1);
-  const LaneMask<T> ascending = ps < qs;
-  const Lanes<T> least = select(ascending, ps, qs), most = select(ascending, qs, ps);
-  const Lanes<T> low = select(least > zero, least, zero), high = select(most < top, most, top);
-  // Edges parallel to the scan line (least == most) are left out: neither end can move a crossing.
-  const LaneMask<T> in_reach = (least < most) & (low <= top) & (high > splat(T(-1)));
-  const Lanes<T> from = select(in_reach, low, one), to = select(in_reach, high, zero);
-  const Lanes<T> whole = to_values<T>(truncate(from));
-  const Lanes32 first_line = truncate(select(whole < from, whole + one, whole));
-  // Truncation towards zero, as published: an edge that ends in (-1, 0) is extrapolated to line 0.
-  const Lanes32 last_line = truncate(to);
-  const Lanes<T> slope = (qt - pt) / (qs - ps);
-  store_lanes(block.ps[axis] + edge, ps);
-  store_lanes(block.qs[axis] + edge, qs);
-  store_lanes(block.reach[axis] + edge, (qs - ps) * splat(T(2)) / splat(length));
-  const uint32_t found = lane_bits(first_line <= last_line);
-  const uint32_t up = axis == 0 ? ~lane_bits(ascending) : lane_bits(ascending);  // outward is towards larger t
-  const LaneArray<int32_t, Lanes32> first_at(first_line), last_at(last_line);
-  const LaneArray<int32_t, Lanes32> edge_at(lane_numbers() + splat(static_cast<int32_t>(edge)));
-
-  for (int direction = 0; direction < 2; ++direction) {
-    Crossings<T>& crossings = block.crossings[axis][direction];
-    const T *pull_end = lines.pull_end[direction].data(), *gain_start = lines.gain_start[direction].data();
-    const LaneArray<T, Lanes<T>> slope_at(direction ? zero - slope : slope), height_at(direction ? zero - pt : pt);
-    int64_t count = crossings.count;
-    for (uint32_t bits = found & (direction ? ~up : up); bits; bits &= bits - 1) {
-      const int64_t lane = lowest_bit(bits);
-      const Lanes<T> scan = splat(block.ps[axis][edge + lane]);
-      const Lanes<T> slopes = splat(slope_at.lane[lane]), height = splat(height_at.lane[lane]);
-      const int32_t last = last_at.lane[lane];
-      for (int32_t start = first_at.lane[lane]; start <= last; start += kLanes) {
-        if (count > kCrossings - kLanes) {
-          crossings.count = count;
-          run_crossings(image, axis, direction, block);
-          count = 0;
-        }
-        const Lanes32 line = lane_numbers() + splat(start);
-        store_lanes(crossings.at + count, (to_values<T>(line) - scan) * slopes + height);
-        store_lanes(crossings.pull_end + count, load_lanes<Lanes<T>>(pull_end + start));
-        store_lanes(crossings.gain_start + count, load_lanes<Lanes<T>>(gain_start + start));
-        store_lanes(crossings.line + count, line);
-        store_lanes(crossings.edge + count, splat(edge_at.lane[lane]));
-        count += std::min<int64_t>(last - start + 1, kLanes);  // what is written beyond is overwritten, or ignored
-      }
-    }
-    crossings.count = count;
-  }
-}
-
-// Gradients [3, 2] of x and y of the corners of up to kSweptFaces visible faces, in the order in which they are drawn.
-template <class T>
-NMR_INLINE void sweep_block(const SweepImage<T>& image, const int32_t* ids, int64_t count, SweepScratch<T>& block,
-                            T* grad) {
-  for (int64_t n = 0; n < count; ++n) {
-    const bool reversed = ids[n] >= image.num_faces;
-    const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
-    block.id[n] = ids[n];
-    for (int k = 0; k < 3; ++k) {
-      const T* vertex = image.vertices + 3 * face[reversed ? 2 - k : k];
-      block.corner[0][k][n] = vertex[0];
-      block.corner[1][k][n] = vertex[1];
-    }
-  }
-  const int64_t padded = (count + kLanes - 1) / kLanes * kLanes;
-  for (int axis = 0; axis < 2; ++axis) {
-    const Lanes<T> size = splat(static_cast<T>(axis == 0 ? image.raster.width : image.raster.height));
-    for (int k = 0; k < 3; ++k) {
-      T* corner = block.corner[axis][k];
-      std::fill(corner + count, corner + padded, T(0));
-      for (int64_t n = 0; n < padded; n += kLanes) {  // to_pixel
-        const Lanes<T> x = load_lanes<Lanes<T>>(corner + n);
-        store_lanes(corner + n, (x * size + size - splat(T(1))) * splat(T(0.5)));
-      }
-      std::fill_n(block.pulls[axis][k * kSweptFaces], 2 * count, T(0));
-    }
-  }
-  for (int axis = 0; axis < 2; ++axis) {
-    for (Crossings<T>& crossings : block.crossings[axis]) crossings.count = 0;
-    // A crossing lies between two pixels of its line.
-    const bool crossable = (axis == 0 ? image.raster.height : image.raster.width) > 1;
-    for (int64_t n = 0; crossable && n < padded; n += kLanes)
-      for (int k = 0; k < 3; ++k) cross_edges(image, axis, k, n, block);
-    for (int direction = 0; direction < 2; ++direction) run_crossings(image, axis, direction, block);
-    // Corner k is the start of edge k and the end of the one before. Axis 0 moves y, axis 1 moves x.
-    for (int64_t n = 0; n < count; ++n)
-      for (int k = 0; k < 3; ++k)
-        grad[6 * n + 2 * k + 1 - axis] =
-            0 - (block.pulls[axis][k * kSweptFaces + n][0] + block.pulls[axis][(k + 2) % 3 * kSweptFaces + n][1]);
-  }
-}
-
-// The same for visible faces [first, last) of the list.
+// Gradients [3, 2] of x and y of the corners of visible faces [first, last) of the list, in the order in which they are
+// drawn.
 template <class T>
 void sweep_faces(const SweepImage<T>& image, const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block,
                  T* grad) {
+  const auto run = [](const SweepImage<T>& image, int axis, int direction, SweepScratch<T>& block) {
+    direction == 0 ? run_crossings<true>(image, axis, block) : run_crossings<false>(image, axis, block);
+  };
   for (int64_t n = first; n < last; n += kSweptFaces)
-    sweep_block(image, ids + n, std::min(kSweptFaces, last - n), block, grad + 6 * n);
+    sweep_block(image, ids + n, std::min(kSweptFaces, last - n), block, grad + 6 * n, run);
 }

@@ -4,20 +4,56 @@
 namespace nmr {
 namespace {
 
-// `pixels` is [B, H, W, C], `resolved` [B, h, w, C].
+// The colour of pixels without a face.
 template <class T>
-Resolve<T> resolve_args(const Array<T>& pixels, const Array<T>& resolved, bool anti_aliasing, int num_threads) {
+struct Background {
+  const T* values = nullptr;
+  int64_t batch = 0;
+
+  Background(const std::optional<Array<T>>& background, int64_t images, int64_t channels) {
+    if (!background) return;
+    require(background->ndim() == 2 && (background->shape(0) == 1 || background->shape(0) == images) && background->shape(1) == channels,
+            "background must have shape [1 or " + std::to_string(images) + ", " + std::to_string(channels) + "], got " +
+                shape_of(*background));
+    values = background->data();
+    batch = background->shape(0);
+  }
+};
+
+// `pixels` is [B, H, W, C], `resolved` [B, h, w, C]; the owner map belongs to the pixels.
+template <class T>
+Resolve<T> resolve_args(const Array<int32_t>& owner, const Array<T>& resolved, const std::optional<Array<T>>& background,
+                        bool anti_aliasing, int num_threads) {
   require(resolved.ndim() == 4, "a resolved image must have shape [B, h, w, C], got " + shape_of(resolved));
   const int64_t batch = resolved.shape(0), channels = resolved.shape(3);
   const Size image{resolved.shape(1), resolved.shape(2)}, raster = raster_of(image, anti_aliasing);
-  require(image.height >= 1 && image.width >= 1 && channels >= 1, "an image must have pixels and channels, got " + shape_of(resolved));
-  require_shape(pixels, "image", {batch, raster.height, raster.width, channels});
-  return {batch, image, anti_aliasing, channels, nullptr, nullptr, nullptr, nullptr, num_threads};
+  require(image.height >= 1 && image.width >= 1 && channels >= 1,
+          "an image must have pixels and channels, got " + shape_of(resolved));
+  require_shape(owner, "owner", {batch, raster.height, raster.width});
+  const Background<T> behind(background, batch, channels);
+  Resolve<T> args{};
+  args.batch = batch;
+  args.image = image;
+  args.anti_aliasing = anti_aliasing;
+  args.channels = channels;
+  args.owner = owner.data();
+  args.background = behind.values;
+  args.background_batch = behind.batch;
+  args.num_threads = num_threads;
+  return args;
 }
 
 template <class T>
-void resolve_forward_py(const Array<T>& image, Array<T>& resolved, bool anti_aliasing, int num_threads) {
-  Resolve<T> args = resolve_args(image, resolved, anti_aliasing, num_threads);
+void require_pixels(const Array<T>& pixels, const char* name, const Resolve<T>& args) {
+  const Size raster = raster_of(args.image, args.anti_aliasing);
+  require_shape(pixels, name, {args.batch, raster.height, raster.width, args.channels});
+}
+
+template <class T>
+void resolve_forward_py(const Array<T>& image, const std::optional<Array<T>>& background, const Array<int32_t>& owner,
+                        Array<T>& resolved, bool anti_aliasing, int num_threads) {
+  Resolve<T> args = resolve_args(owner, resolved, background, anti_aliasing, num_threads);
+  require_pixels(image, "image", args);
   args.pixels = image.data();
   args.resolved = resolved.mutable_data();
   py::gil_scoped_release release;
@@ -25,39 +61,52 @@ void resolve_forward_py(const Array<T>& image, Array<T>& resolved, bool anti_ali
 }
 
 template <class T>
-void resolve_backward_py(const Array<T>& grad_resolved, Array<T>& grad_image, bool anti_aliasing, int num_threads) {
-  Resolve<T> args = resolve_args(grad_image, grad_resolved, anti_aliasing, num_threads);
+void resolve_backward_py(const Array<T>& grad_resolved, const std::optional<Array<T>>& background, const Array<int32_t>& owner,
+                         std::optional<Array<T>>& grad_image, std::optional<Array<T>>& grad_background, bool anti_aliasing,
+                         int num_threads) {
+  Resolve<T> args = resolve_args(owner, grad_resolved, background, anti_aliasing, num_threads);
   args.grad_resolved = grad_resolved.data();
-  args.grad_pixels = grad_image.mutable_data();
+  if (grad_image) {
+    require_pixels(*grad_image, "grad_image", args);
+    args.grad_pixels = grad_image->mutable_data();
+  }
+  if (grad_background) {
+    require_shape(*grad_background, "grad_background", {args.batch, args.channels});
+    args.grad_background = grad_background->mutable_data();
+  }
   py::gil_scoped_release release;
   resolve_backward(args);
 }
 
 template <class T>
 void edges_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
-                       const Array<int32_t>& owner, const Array<T>& image, const Array<T>& grad_image, Array<T>& grad_vertices,
-                       double eps, int num_threads) {
+                       const Array<int32_t>& owner, const Array<T>& image, const std::optional<Array<T>>& background,
+                       const Array<T>& grad_resolved, Array<T>& grad_vertices, bool anti_aliasing, double eps, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const Size raster = require_owner(owner, mesh, num_threads);
+  const Size raster = require_owner(owner, mesh, num_threads), size = require_image(owner, raster, anti_aliasing);
   require(image.ndim() == 4 && image.shape(3) >= 1, "image must have shape [B, H, W, C], got " + shape_of(image));
   require_shape(image, "image", {mesh.batch, raster.height, raster.width, image.shape(3)});
-  require_like(grad_image, "grad_image", image);
+  require_shape(grad_resolved, "grad_resolved", {mesh.batch, size.height, size.width, image.shape(3)});
   require_like(grad_vertices, "grad_vertices", vertices);
-  const EdgesBackward<T> args{mesh, raster, static_cast<T>(eps), owner.data(), image.data(), image.shape(3), grad_image.data(),
-                              grad_vertices.mutable_data(), num_threads};
+  const Background<T> behind(background, mesh.batch, image.shape(3));
+  const EdgesBackward<T> args{mesh,         size,           anti_aliasing, static_cast<T>(eps),
+                              owner.data(), image.data(),   image.shape(3), behind.values,
+                              behind.batch, grad_resolved.data(), grad_vertices.mutable_data(), num_threads};
   py::gil_scoped_release release;
   edges_backward(args);
 }
 
 template <class T>
 void define_edges(py::module_& m) {
-  m.def("resolve_forward", &resolve_forward_py<T>, py::arg("image").noconvert(), py::arg("resolved").noconvert(),
-        py::arg("anti_aliasing"), py::arg("num_threads"));
-  m.def("resolve_backward", &resolve_backward_py<T>, py::arg("grad_resolved").noconvert(), py::arg("grad_image").noconvert(),
+  m.def("resolve_forward", &resolve_forward_py<T>, py::arg("image").noconvert(), py::arg("background").noconvert(),
+        py::arg("owner").noconvert(), py::arg("resolved").noconvert(), py::arg("anti_aliasing"), py::arg("num_threads"));
+  m.def("resolve_backward", &resolve_backward_py<T>, py::arg("grad_resolved").noconvert(), py::arg("background").noconvert(),
+        py::arg("owner").noconvert(), py::arg("grad_image").noconvert(), py::arg("grad_background").noconvert(),
         py::arg("anti_aliasing"), py::arg("num_threads"));
   m.def("edges_backward", &edges_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("image").noconvert(),
-        py::arg("grad_image").noconvert(), py::arg("grad_vertices").noconvert(), py::arg("eps"), py::arg("num_threads"));
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("image").noconvert(), py::arg("background").noconvert(),
+        py::arg("grad_resolved").noconvert(), py::arg("grad_vertices").noconvert(), py::arg("anti_aliasing"), py::arg("eps"),
+        py::arg("num_threads"));
 }
 
 }  // namespace

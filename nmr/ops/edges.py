@@ -12,17 +12,13 @@ def _image_shape(image, anti_aliasing) -> tuple[int, int, int, int]:
     return image.shape[0], image.shape[1] // scale, image.shape[2] // scale, image.shape[3]
 
 
-def _raster_shape(resolved, anti_aliasing) -> tuple[int, int, int, int]:
-    scale = 2 if anti_aliasing else 1
-    return resolved.shape[0], scale * resolved.shape[1], scale * resolved.shape[2], resolved.shape[3]
-
-
 # --- resolve
 
 
 @operator
 def resolve(
     image: Tensor,
+    background: Tensor | None,
     vertices: Tensor,
     faces: Tensor,
     starts: Tensor | None,
@@ -32,48 +28,75 @@ def resolve(
 ) -> Tensor:
     """The image ``[B, h, w, C]`` of raster pixels ``[B, H, W, C]``: the mean of 2x2 with anti-aliasing, else a copy.
 
-    The gradient in ``image`` is that of the mean. That in x and y of ``vertices`` is NMR's, summed over channels.
+    Pixels without a face have the colour ``background [B or 1, C]``; without it that in ``image``. The gradients in
+    ``image`` and ``background`` are those of the mean. That in x and y of ``vertices`` is NMR's, summed over channels.
     """
     resolved = host_empty(_image_shape(image, anti_aliasing), dtype=image.dtype)
-    _C.resolve_forward(host_array(image), resolved.numpy(), anti_aliasing, num_threads())
+    arrays = map(host_array, (image, background, owner))
+    _C.resolve_forward(*arrays, resolved.numpy(), anti_aliasing, num_threads())
     return resolved.to(image.device)
 
 
 @torch.library.register_fake(resolve)
-def _(image, vertices, faces, starts, owner, anti_aliasing, eps):
+def _(image, background, vertices, faces, starts, owner, anti_aliasing, eps):
     return image.new_empty(_image_shape(image, anti_aliasing))
 
 
 def _resolve_setup(ctx, inputs, output):
-    image, vertices, faces, starts, owner, anti_aliasing, eps = inputs
-    ctx.save_for_backward(image, vertices, faces, starts, owner)
-    ctx.settings = anti_aliasing, eps
+    *tensors, ctx.anti_aliasing, ctx.eps = inputs
+    ctx.save_for_backward(*tensors)
 
 
 def _resolve_backward(ctx, grad_resolved):
-    image, vertices, faces, starts, owner = ctx.saved_tensors
-    anti_aliasing, eps = ctx.settings
-    grad_image = resolve_backward(grad_resolved, anti_aliasing)
-    grad_vertices = None
-    if ctx.needs_input_grad[1]:
-        grad_vertices = edges_backward(vertices, faces, starts, owner, image, grad_image, eps)
-    return grad_image, grad_vertices, None, None, None, None, None
+    image, background, vertices, faces, starts, owner = ctx.saved_tensors
+    of_image, of_background, of_vertices = ctx.needs_input_grad[:3]
+    grad_image = grad_background = grad_vertices = None
+    if of_image or of_background:
+        wanted = ctx.anti_aliasing, of_image, of_background
+        grad_image, grad_background = resolve_backward(grad_resolved, background, owner, *wanted)
+    if of_background and background.shape[0] == 1:
+        grad_background = grad_background.sum(0, keepdim=True)
+    if of_vertices:
+        mesh = vertices, faces, starts, owner
+        grad_vertices = edges_backward(*mesh, image, background, grad_resolved, ctx.anti_aliasing, ctx.eps)
+    grads = grad_image if of_image else None, grad_background if of_background else None, grad_vertices
+    return *grads, None, None, None, None, None
 
 
 register_autograd(resolve, _resolve_backward, _resolve_setup)
 
 
+def _resolve_grad_shapes(grad_resolved, owner, of_image, of_background):
+    batch, channels = grad_resolved.shape[0], grad_resolved.shape[3]
+    return (*owner.shape, channels) if of_image else (0,), (batch, channels) if of_background else (0,)
+
+
 @operator
-def resolve_backward(grad_resolved: Tensor, anti_aliasing: bool) -> Tensor:
-    """Gradient ``[B, H, W, C]`` of the mean in :func:`resolve`."""
-    grad_image = host_empty(_raster_shape(grad_resolved, anti_aliasing), dtype=grad_resolved.dtype)
-    _C.resolve_backward(host_array(grad_resolved), grad_image.numpy(), anti_aliasing, num_threads())
-    return grad_image.to(grad_resolved.device)
+def resolve_backward(
+    grad_resolved: Tensor,
+    background: Tensor | None,
+    owner: Tensor,
+    anti_aliasing: bool,
+    of_image: bool,
+    of_background: bool,
+) -> tuple[Tensor, Tensor]:
+    """Gradients ``[B, H, W, C]`` and ``[B, C]`` of the mean in :func:`resolve`; one that is not requested is empty."""
+    shapes = _resolve_grad_shapes(grad_resolved, owner, of_image, of_background)
+    grads = [host_empty(shape, dtype=grad_resolved.dtype) for shape in shapes]
+    _C.resolve_backward(
+        *map(host_array, (grad_resolved, background, owner)),
+        grads[0].numpy() if of_image else None,
+        grads[1].numpy() if of_background else None,
+        anti_aliasing,
+        num_threads(),
+    )
+    return grads[0].to(grad_resolved.device), grads[1].to(grad_resolved.device)
 
 
 @torch.library.register_fake(resolve_backward)
-def _(grad_resolved, anti_aliasing):
-    return grad_resolved.new_empty(_raster_shape(grad_resolved, anti_aliasing))
+def _(grad_resolved, background, owner, anti_aliasing, of_image, of_background):
+    shapes = _resolve_grad_shapes(grad_resolved, owner, of_image, of_background)
+    return grad_resolved.new_empty(shapes[0]), grad_resolved.new_empty(shapes[1])
 
 
 register_autograd(resolve_backward, no_second_derivative("render"))
@@ -86,18 +109,23 @@ def edges_backward(
     starts: Tensor | None,
     owner: Tensor,
     image: Tensor,
-    grad_image: Tensor,
+    background: Tensor | None,
+    grad_resolved: Tensor,
+    anti_aliasing: bool,
     eps: float,
 ) -> Tensor:
-    """NMR's gradient of raster pixels ``[B, H, W, C]``, per vertex, of the shape of ``vertices``; zero in z."""
+    """NMR's gradient of raster pixels ``[B, H, W, C]``, per vertex, of the shape of ``vertices``; zero in z.
+
+    If an upstream gradient of an image is not finite, those of all its visible faces are NaN.
+    """
     grad_vertices = host_empty(vertices.shape, dtype=vertices.dtype)
-    arrays = vertices, faces, starts, owner, image, grad_image
-    _C.edges_backward(*map(host_array, arrays), grad_vertices.numpy(), eps, num_threads())
+    arrays = map(host_array, (vertices, faces, starts, owner, image, background, grad_resolved))
+    _C.edges_backward(*arrays, grad_vertices.numpy(), anti_aliasing, eps, num_threads())
     return grad_vertices.to(vertices.device)
 
 
 @torch.library.register_fake(edges_backward)
-def _(vertices, faces, starts, owner, image, grad_image, eps):
+def _(vertices, faces, starts, owner, image, background, grad_resolved, anti_aliasing, eps):
     return vertices.new_empty(vertices.shape)
 
 

@@ -1,0 +1,72 @@
+// Input and memory of the sweeps of the colour gradient (color_sweep.h).
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "parallel.h"
+#include "pull_lines.h"
+#include "stages.h"
+
+namespace nmr {
+
+// The pixels with a gradient, for the lines of one axis: N lines of M pixels, C channels. Others cannot pull. Sweeps go up the line
+// (direction 0) or down (direction 1).
+template <class T>
+struct ColorLines {
+  // [N, 1 + 2 C, pad + M + pad] position on the line in pixels, ascending; colour; gradient. The positions in the padding lie before
+  // and after every pixel.
+  std::vector<T> values;
+  std::vector<int32_t> owner;     // [N, pad + M + pad]
+  std::vector<int32_t> count;     // [N] number of listed pixels
+  std::vector<uint64_t> listed;   // [N, words] bit m: pixel m is listed
+  std::vector<int32_t> before;    // [N, words] number of listed pixels before each word
+  std::vector<T> pull_end[2];     // [N + pad] by direction: a crossing before this has a listed pixel beyond its outer one
+  std::vector<T> gain_start[2];   // [N + pad] by direction: a crossing before this has no listed pixel of a face inside
+  int64_t stride, words, channels;
+
+  void reserve_lines(int64_t N, int64_t M, int64_t C) {
+    stride = M + 2 * kPad;
+    words = (M + 63) / 64;
+    channels = C;
+    reserve(values, N * (1 + 2 * C) * stride);
+    reserve(owner, N * stride);
+    reserve(count, N);
+    reserve(listed, N * words);
+    reserve(before, N * words);
+    for (std::vector<T>* v : {&pull_end[0], &pull_end[1], &gain_start[0], &gain_start[1]}) reserve(*v, N + kPad);
+  }
+  // Positions of the listed pixels of line n; colours and gradients follow, `stride` apart.
+  T* positions(int64_t n) { return values.data() + n * (1 + 2 * channels) * stride + kPad; }
+  const T* positions(int64_t n) const { return values.data() + n * (1 + 2 * channels) * stride + kPad; }
+  int32_t* owners(int64_t n) { return owner.data() + n * stride + kPad; }
+  const int32_t* owners(int64_t n) const { return owner.data() + n * stride + kPad; }
+};
+
+// Input of the sweeps for one image.
+template <class T>
+struct ColorImage {
+  const T* vertices;
+  const int64_t* faces;
+  int64_t num_faces;
+  Size raster, size;       // H x W, and that of the image
+  bool anti_aliasing;
+  T eps;
+  const int32_t* owner;    // row 0 = top; pixel (column i, row j from the bottom) is owner[(H - 1 - j) W + i]
+  const T* pixels;         // [H, W, C]
+  const T* background;     // [C] the colour of pixels without a face, or nullptr: that in `pixels`
+  const T* grad_resolved;  // [h, w, C]
+  int64_t channels;        // C
+  ColorLines<T>* lines;    // [0] columns: lines of constant x, swept along y; [1] rows
+  T largest_lever;         // above this, or with a tiny eps, the product of two distances could overflow or underflow
+
+  const T* color(int64_t pixel) const { return background && owner[pixel] < 0 ? background : pixels + pixel * channels; }
+};
+
+// Memory of one task.
+template <class T>
+struct ColorScratch {
+  std::vector<T> grad_row;  // [C, W + pad] gradient of one row of the raster
+};
+
+}  // namespace nmr

@@ -1,0 +1,309 @@
+// The inner loops of the colour gradient; included by levels.h for every instruction set. Lines, directions and coordinates are those
+// of the silhouette gradient (sweep.h).
+
+#include "crossings.h"
+
+// --- which pixels can pull
+
+// Gradients of one row of raster pixels (counted from the bottom), a plane [W + pad] for each channel. With a 2x2 mean each pixel gets
+// a quarter of the image's gradient.
+template <class T>
+NMR_INLINE void expand_color_row(const ColorImage<T>& image, int64_t j, T* row) {
+  const int64_t w = image.size.width, W = image.raster.width, C = image.channels;
+  const int64_t from_bottom = image.anti_aliasing ? j / 2 : j;
+  const T* grad = image.grad_resolved + (image.size.height - 1 - from_bottom) * w * C;
+  for (int64_t c = 0; c < C; ++c, row += W + kPad) {
+    if (image.anti_aliasing)
+      for (int64_t x = 0; x < w; ++x) row[2 * x] = row[2 * x + 1] = grad[x * C + c] / 4;
+    else
+      for (int64_t x = 0; x < w; ++x) row[x] = grad[x * C + c];
+    std::fill_n(row + W, kPad, T(0));
+  }
+}
+
+// Empties lines [first, last). Until they are finished, gain_start holds the first and the last listed pixel of a face.
+template <class T>
+NMR_INLINE void start_color_lines(ColorLines<T>& lines, int64_t first, int64_t last) {
+  const T infinity = std::numeric_limits<T>::infinity();
+  std::fill(lines.count.begin() + first, lines.count.begin() + last, 0);
+  std::fill(lines.listed.begin() + first * lines.words, lines.listed.begin() + last * lines.words, 0);
+  std::fill(lines.gain_start[0].begin() + first, lines.gain_start[0].begin() + last, infinity);
+  std::fill(lines.gain_start[1].begin() + first, lines.gain_start[1].begin() + last, -infinity);
+}
+
+// Adds pixel m of line n. grad: its gradients, `grad_stride` apart.
+template <int64_t kChannels, class T>
+NMR_INLINE void append_color(ColorLines<T>& lines, int64_t n, int64_t m, int32_t owner, const T* color, const T* grad,
+                             int64_t grad_stride) {
+  const int64_t C = kChannels ? kChannels : lines.channels, stride = lines.stride, at = lines.count[n]++;
+  const T position = static_cast<T>(m);
+  T* out = lines.positions(n) + at;
+  out[0] = position;
+  for (int64_t c = 0; c < C; ++c) {
+    out[(1 + c) * stride] = color[c];
+    out[(1 + C + c) * stride] = grad[c * grad_stride];
+  }
+  lines.owners(n)[at] = owner;
+  lines.listed[n * lines.words + m / 64] |= uint64_t(1) << (m % 64);
+  if (owner < 0) return;
+  T &first = lines.gain_start[0][n], &last = lines.gain_start[1][n];
+  first = std::min(first, position);
+  last = position;
+}
+
+template <class T>
+NMR_INLINE void finish_color_lines(ColorLines<T>& lines, int64_t first, int64_t last) {
+  const T infinity = std::numeric_limits<T>::infinity(), length = static_cast<T>(lines.stride - 2 * kPad);
+  for (int64_t n = first; n < last; ++n) {
+    const int32_t count = lines.count[n];
+    T* position = lines.positions(n);
+    lines.pull_end[0][n] = count ? position[count - 1] : -infinity;
+    lines.pull_end[1][n] = count ? -position[0] : -infinity;
+    lines.gain_start[1][n] = std::max(T(1) - length, -lines.gain_start[1][n]);
+    store_lanes(position - kPad, splat(T(-1)));
+    store_lanes(position + count, splat(length));
+    int32_t before = 0;
+    for (int64_t word = n * lines.words; word < (n + 1) * lines.words; ++word) {
+      lines.before[word] = before;
+      before += set_bits(lines.listed[word]);
+    }
+  }
+}
+
+// Number of listed pixels of line n before pixel m, for m up to the length of the line.
+template <class T>
+NMR_INLINE int64_t listed_before(const ColorLines<T>& lines, int64_t n, int64_t m) {
+  if (m / 64 == lines.words) return lines.count[n];
+  const int64_t word = n * lines.words + m / 64;
+  return lines.before[word] + set_bits(lines.listed[word] & ((uint64_t(1) << (m % 64)) - 1));
+}
+
+// Fills the lines of a range. grad_row: [C, W + pad] of scratch.
+template <int64_t kChannels, class T>
+NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& range, T* grad_row) {
+  const int64_t H = image.raster.height, W = image.raster.width, C = kChannels ? kChannels : image.channels, plane = W + kPad;
+  const bool any_column = range.column_first < range.column_last;
+  ColorLines<T>&columns = image.lines[0], &rows = image.lines[1];
+  start_color_lines(columns, range.column_first, range.column_last);
+  start_color_lines(rows, range.row_first, range.row_last);
+  const int64_t j_first = any_column ? 0 : range.row_first, j_last = any_column ? H : range.row_last;
+  for (int64_t j = j_first; j < j_last; ++j) {
+    const bool in_rows = j >= range.row_first && j < range.row_last;
+    const int64_t row = (H - 1 - j) * W;
+    if (j == j_first || !image.anti_aliasing || j % 2 == 0) expand_color_row(image, j, grad_row);
+    const int64_t i_last = in_rows ? W : range.column_last;
+    for (int64_t start = in_rows ? 0 : range.column_first; start < i_last; start += kLanes) {
+      uint32_t bits = 0;
+      for (int64_t c = 0; c < C; ++c) {
+        const Lanes<T> g = load_lanes<Lanes<T>>(grad_row + c * plane + start);
+        bits |= lane_bits((g < splat(T(0))) | (g > splat(T(0))));
+      }
+      for (; bits; bits &= bits - 1) {
+        const int64_t i = start + lowest_bit(bits);
+        const T* color = image.color(row + i);
+        const int32_t owner = image.owner[row + i];
+        if (in_rows) append_color<kChannels>(rows, j, i, owner, color, grad_row + i, plane);
+        if (i >= range.column_first && i < range.column_last)
+          append_color<kChannels>(columns, i, j, owner, color, grad_row + i, plane);
+      }
+    }
+  }
+  finish_color_lines(columns, range.column_first, range.column_last);
+  finish_color_lines(rows, range.row_first, range.row_last);
+}
+
+// --- the pulls
+
+// What the pixels at n, n + 1, ... of a list gain if they take the reference colour: sum over channels of (colour - reference) gradient.
+template <int64_t kChannels, class T>
+NMR_INLINE Lanes<T> color_gains(const T* position, int64_t stride, int64_t channels, int64_t n, const T* reference) {
+  const int64_t C = kChannels ? kChannels : channels;
+  Lanes<T> gain = splat(T(0));
+  for (int64_t c = 0; c < C; ++c) {
+    const Lanes<T> color = load_lanes<Lanes<T>>(position + (1 + c) * stride + n);
+    gain = gain + (color - splat(reference[c])) * load_lanes<Lanes<T>>(position + (1 + C + c) * stride + n);
+  }
+  return gain;
+}
+
+// Adds the pulls of eight pixels at these offsets from the crossing where the mask is set. The quotients w / h_p and w / h_q share one
+// division: w / (h_p h_q) times h_q and h_p.
+template <class T>
+NMR_INLINE void pull_lanes(LaneMask<T> mask, Lanes<T> weight, Lanes<T> offset, const Lever<T>& lever, Lanes<T>& pulls_p,
+                           Lanes<T>& pulls_q) {
+  const Lanes<T> eps = splat(lever.eps), zero = splat(T(0));
+  const Lanes<T> p = offset * splat(lever.factor_p), q = offset * splat(lever.factor_q);
+  const Lanes<T> h_p = p + select(p > zero, eps, zero - eps), h_q = q + select(q > zero, eps, zero - eps);
+  const Lanes<T> share = keep(mask, weight / (h_p * h_q));
+  pulls_p = pulls_p + keep(mask, share * h_q);
+  pulls_q = pulls_q + keep(mask, share * h_p);
+}
+
+// The pulls of the listed pixels [first, last) of a line, if kOwn those of one face alone, for levers of extreme size.
+template <bool kOwn, class T>
+void pull_one_by_one(const ColorLines<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id, const T* reference,
+                     const Lever<T>& lever, T* pulls) {
+  const int64_t C = lines.channels, stride = lines.stride;
+  const T* position = lines.positions(n);
+  const int32_t* owner = lines.owners(n);
+  for (int64_t k = first; k < last; ++k) {
+    T gain = 0;
+    for (int64_t c = 0; c < C; ++c) gain += (position[(1 + c) * stride + k] - reference[c]) * position[(1 + C + c) * stride + k];
+    if (gain > 0 && (!kOwn || owner[k] == id)) pull(gain, position[k] - lever.crossing, lever, pulls);
+  }
+}
+
+// Outside: every listed pixel beyond the crossing, from the outer one to the border, takes the colour of the inner one if the edge
+// moves out to it.
+template <bool kUp, int64_t kChannels, class T>
+NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, const T* reference, const Lever<T>& lever, T* pulls) {
+  const T* position = lines.positions(n);
+  const int64_t count = lines.count[n];
+  const Lanes<T> crossing = splat(lever.crossing);
+  Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
+  int64_t k = kUp ? count - kLanes : 0;  // from the border of the image inwards
+  bool more;
+  do {
+    const Lanes<T> offset = load_lanes<Lanes<T>>(position + k) - crossing;
+    const LaneMask<T> beyond = kUp ? offset > splat(T(0)) : offset < splat(T(0));
+    const Lanes<T> gain = color_gains<kChannels>(position, lines.stride, lines.channels, k, reference);
+    const LaneMask<T> acts = beyond & (gain > splat(T(0)));
+    if (lane_bits(acts)) pull_lanes<T>(acts, gain, offset, lever, pulls_p, pulls_q);
+    more = kUp ? position[k] > lever.crossing : position[k + kLanes - 1] < lever.crossing;
+    k += kUp ? -kLanes : kLanes;
+  } while (more);
+  add_lane_sums<T>(pulls_p, pulls_q, pulls);
+}
+
+// Inside: the listed pixels [first, last) that face `id` owns take the colour of the outer one if the edge moves in past them.
+template <int64_t kChannels, class T>
+NMR_INLINE void pull_own(const ColorLines<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id, const T* reference,
+                         const Lever<T>& lever, T* pulls) {
+  const T* position = lines.positions(n);
+  const int32_t* owner = lines.owners(n);
+  Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
+  const Lanes32 end = splat(static_cast<int32_t>(last)), own = splat(id);
+  for (int64_t k = first; k < last; k += kLanes) {
+    const Lanes32 number = lane_numbers() + splat(static_cast<int32_t>(k));
+    const Lanes32 here = (number < end) & (load_lanes<Lanes32>(owner + k) == own);
+    if (!lane_bits(here)) continue;
+    const Lanes<T> gain = color_gains<kChannels>(position, lines.stride, lines.channels, k, reference);
+    const LaneMask<T> acts = widen_mask<T>(here) & (gain > splat(T(0)));
+    if (!lane_bits(acts)) continue;
+    pull_lanes<T>(acts, gain, load_lanes<Lanes<T>>(position + k) - splat(lever.crossing), lever, pulls_p, pulls_q);
+  }
+  add_lane_sums<T>(pulls_p, pulls_q, pulls);
+}
+
+// --- the sweeps
+
+// The pixels between the inner one and the far side of the face on the line: where the second edge of the corner opposite lies.
+template <class T>
+NMR_INLINE std::pair<int64_t, int64_t> inside_range(const SweepScratch<T>& block, int axis, int32_t edge, int64_t n, int64_t inner,
+                                                    int64_t d, int64_t length) {
+  const int64_t face = edge % kSweptFaces, p = edge / kSweptFaces, q = p < 2 ? p + 1 : 0, o = p > 0 ? p - 1 : 2;
+  const auto s = [&](int64_t k) { return block.corner[axis][k][face]; };
+  const auto t = [&](int64_t k) { return block.corner[1 - axis][k][face]; };
+  const T line = static_cast<T>(n);
+  const int64_t end = (line - s(p)) * (line - s(o)) < 0 ? p : q;
+  const int64_t limit = sweep_limit(line_height(s(end), t(end), s(o), t(o), line), d, length);
+  return {std::max<int64_t>(std::min(inner, limit), 0), std::min(std::max(inner, limit), length - 1)};
+}
+
+// Sweeps all crossings of one axis and direction, and empties them.
+template <bool kUp, int64_t kChannels, class T>
+void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& block) {
+  const int64_t H = image.raster.height, W = image.raster.width, length = axis == 0 ? H : W;
+  const ColorLines<T>& lines = image.lines[axis];
+  Crossings<T>& crossings = block.crossings[axis][kUp ? 0 : 1];
+  const int32_t d = kUp ? 1 : -1;
+  const T top = static_cast<T>(length - 1);  // the last pixel of a line
+  // The inner pixel is floor(c) in the coordinate of the direction. It and the next one lie on the line if start <= c < end.
+  const Lanes<T> start = splat(kUp ? T(0) : -top), end = splat(kUp ? top : T(0));
+  // pixel m of line n: origin + n * step_n + m * step_m
+  const int32_t across = static_cast<int32_t>(-W), step = axis == 0 ? across * d : d;
+  const Lanes32 origin = splat(static_cast<int32_t>((H - 1) * W)), step_n = splat(axis == 0 ? int32_t(1) : across);
+  const Lanes32 step_m = splat(step), all = splat(static_cast<int32_t>(crossings.count));
+  for (int64_t i = 0; i < crossings.count; i += kLanes) {
+    const Lanes<T> at = load_lanes<Lanes<T>>(crossings.at + i);
+    const Lanes32 used = lane_numbers() + splat(static_cast<int32_t>(i)) < all;
+    const Lanes32 may_pull = used & narrow_mask((at >= start) & (at < end) & (at < load_lanes<Lanes<T>>(crossings.pull_end + i)));
+    const Lanes32 may_gain = used & narrow_mask((at >= start) & (at >= load_lanes<Lanes<T>>(crossings.gain_start + i)) & (at < end));
+    const Lanes32 wanted = may_pull | may_gain;
+    uint32_t bits = lane_bits(wanted);
+    if (!bits) continue;
+    const Lanes32 inner = truncate(floor_lanes<T>(keep(widen_mask<T>(wanted), at)));
+    const Lanes32 pixel = origin + load_lanes<Lanes32>(crossings.line + i) * step_n + inner * step_m;
+    const uint32_t pull_bits = lane_bits(may_pull), gain_bits = lane_bits(may_gain);
+    const LaneArray<int32_t, Lanes32> inner_at(inner), pixel_at(pixel);
+    for (; bits; bits &= bits - 1) {
+      const int64_t k = lowest_bit(bits), n = crossings.line[i + k], inside = pixel_at.lane[k], outside = inside + step;
+      const int32_t edge = crossings.edge[i + k], id = block.id[edge % kSweptFaces];
+      const bool pulled = (pull_bits >> k & 1) && image.owner[inside] == id;
+      int64_t first = 0, last = 0;
+      if (gain_bits >> k & 1) {
+        const auto [m_first, m_last] = inside_range(block, axis, edge, n, int64_t(d) * inner_at.lane[k], d, length);
+        if (m_first <= m_last) {
+          first = listed_before(lines, n, m_first);
+          last = listed_before(lines, n, m_last + 1);
+        }
+      }
+      if (!pulled && first >= last) continue;
+      const T line = static_cast<T>(n), reach = block.reach[axis][edge], crossing = crossings.at[i + k];
+      const Lever<T> lever{kUp ? crossing : -crossing, reach / (block.qs[axis][edge] - line), reach / (line - block.ps[axis][edge]),
+                           image.eps};
+      const bool regular = std::abs(lever.factor_p) < image.largest_lever && std::abs(lever.factor_q) < image.largest_lever;
+      T* pulls = block.pulls[axis][edge];
+      if (pulled) {
+        const T* reference = image.color(inside);
+        if (regular) {
+          pull_outside<kUp, kChannels>(lines, n, reference, lever, pulls);
+        } else {
+          const int64_t outer = int64_t(d) * inner_at.lane[k] + d;
+          const int64_t from = kUp ? listed_before(lines, n, outer) : 0;
+          pull_one_by_one<false>(lines, n, from, kUp ? lines.count[n] : listed_before(lines, n, outer + 1), id, reference, lever, pulls);
+        }
+      }
+      if (first < last) {
+        const T* reference = image.color(outside);
+        if (regular)
+          pull_own<kChannels>(lines, n, first, last, id, reference, lever, pulls);
+        else
+          pull_one_by_one<true>(lines, n, first, last, id, reference, lever, pulls);
+      }
+    }
+  }
+  crossings.count = 0;
+}
+
+// --- for any number of channels: 1, 3 and 4 are compiled in
+
+template <class T>
+void collect_colors(const ColorImage<T>& image, const LineRange& range, T* grad_row) {
+  switch (image.channels) {
+    case 1: return collect_colors_of<1>(image, range, grad_row);
+    case 3: return collect_colors_of<3>(image, range, grad_row);
+    case 4: return collect_colors_of<4>(image, range, grad_row);
+    default: return collect_colors_of<0>(image, range, grad_row);
+  }
+}
+
+template <bool kUp, class T>
+NMR_INLINE void sweep_colors(const ColorImage<T>& image, int axis, SweepScratch<T>& block) {
+  switch (image.channels) {
+    case 1: return sweep_crossings<kUp, 1>(image, axis, block);
+    case 3: return sweep_crossings<kUp, 3>(image, axis, block);
+    case 4: return sweep_crossings<kUp, 4>(image, axis, block);
+    default: return sweep_crossings<kUp, 0>(image, axis, block);
+  }
+}
+
+// Gradients [3, 2] of x and y of the corners of visible faces [first, last) of the list.
+template <class T>
+void sweep_color_faces(const ColorImage<T>& image, const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block, T* grad) {
+  const auto run = [](const ColorImage<T>& image, int axis, int direction, SweepScratch<T>& block) {
+    direction == 0 ? sweep_colors<true>(image, axis, block) : sweep_colors<false>(image, axis, block);
+  };
+  for (int64_t n = first; n < last; n += kSweptFaces)
+    sweep_block(image, ids + n, std::min(kSweptFaces, last - n), block, grad + 6 * n, run);
+}
