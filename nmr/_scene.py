@@ -147,16 +147,16 @@ def shade(
     lights: Lights | None,
     background: float | Sequence[float] | Tensor,
     interpolation_gradient: bool,
-) -> Tensor:
-    """The shaded raster ``[B, H, W, C]``, with the background filled in."""
+) -> tuple[Tensor, Tensor]:
+    """The shaded raster ``[B, H, W, C]``, undefined where there is no face, and the background ``[B | 1, C]``."""
     if not interpolation_gradient:
         fragments = replace(fragments, weights=fragments.weights.detach())
-    shape, covered = fragments.owner.shape, fragments.covered.unsqueeze(-1)
+    shape = fragments.owner.shape
     if lights is not None and not isinstance(lights, Lights):
         raise TypeError(f"lights must be nmr.Lights, got {describe(lights)}")
     image = None  # white, for the lights
     if colors is None and lights is None:
-        image = covered.to(fragments.weights).expand(*shape, 3)
+        image = fragments.weights.new_ones(1).expand(*shape, 3)
     elif colors is not None:
         if not callable(getattr(colors, "sample", None)):
             raise TypeError(
@@ -170,13 +170,17 @@ def shade(
         if image is not None and image.shape[-1] not in (1, 3):
             raise ValueError(f"lights need colours of 3 channels (or 1), got {image.shape[-1]}")
         image = lights.shade(fragments, image)
-    channels = image.shape[-1]
-    wanted = f"a number, [{channels}] or [{shape[0]}, {channels}]"
-    behind = as_floats(background, "background", wanted).to(image)
-    if behind.ndim > 2 or any(n not in (1, m) for n, m in zip(behind.shape[::-1], (channels, shape[0]), strict=False)):
+    image = image.to(fragments.weights)
+    return image, background_rows(background, image.shape[-1], shape[0], image)
+
+
+def background_rows(background: object, channels: int, batch: int, like: Tensor) -> Tensor:
+    """The background of ``batch`` images as ``[B | 1, channels]``, in the dtype and on the device of ``like``."""
+    wanted = f"a number, [{channels}] or [{batch}, {channels}]"
+    behind = as_floats(background, "background", wanted).to(like)
+    if behind.ndim > 2 or any(n not in (1, m) for n, m in zip(behind.shape[::-1], (channels, batch), strict=False)):
         raise ValueError(f"background must be {wanted}, got {describe(behind)}")
-    behind = behind.view(-1, 1, 1, behind.shape[-1]) if behind.ndim else behind
-    return torch.where(covered, image, behind).to(fragments.weights)
+    return behind.expand(channels).unsqueeze(0) if behind.ndim < 2 else behind.expand(-1, channels)
 
 
 def average(image: Tensor, anti_aliasing: bool) -> Tensor:

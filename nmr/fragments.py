@@ -273,7 +273,11 @@ class Fragments:
             )
         if image.ndim != 4 or image.shape[:3] != self.owner.shape:
             raise ValueError(f"image must have shape {[*self.owner.shape, 'C']}, got {describe(image)}")
-        return ops.resolve(image, *self._drawn[:3], self._drawn_owner, self.anti_aliasing, self.eps)
+        return self._resolve(image, None)
+
+    def _resolve(self, image: Tensor, background: Tensor | None) -> Tensor:
+        """The same; pixels without a face have the colour ``background [B | 1, C]``, if it is given."""
+        return ops.resolve(image, background, *self._drawn[:3], self._drawn_owner, self.anti_aliasing, self.eps)
 
 
 def usable(points: Tensor) -> Tensor:

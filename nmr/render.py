@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ._packing import is_list
-from ._scene import Meshes, average, make_scene, shade
+from ._scene import Meshes, average, background_rows, make_scene, shade
 from ._validate import check_choice, check_number, check_size
 from .cameras import Camera
 from .fragments import Fragments
@@ -86,19 +86,30 @@ def render(
         raise ValueError(f"outputs must be a tuple of one or more different names out of {OUTPUTS}, got {outputs!r}")
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
     images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the requested order
-    if "alpha" in images and "rgb" not in images:
-        images["alpha"], owner = scene.silhouette(anti_aliasing, fill_back, near, far, eps)
+    white = "rgb" in images and colors is None and lights is None
+    if white:
+        behind = background_rows(background, 3, scene.mesh.batch, scene.mesh.vertices)
+        white = not behind.requires_grad  # rgb then follows from alpha
+    if white or ("alpha" in images and "rgb" not in images):
+        alpha, owner = scene.silhouette(anti_aliasing, fill_back, near, far, eps)
+        if "alpha" in images:
+            images["alpha"] = alpha
+        if white:
+            covered = alpha.unsqueeze(-1)
+            images["rgb"] = covered + (1 - covered) * behind[:, None, None]
     else:
         owner = scene.rasterize(fill_back, near, far)
     if "depth" in images:
         images["depth"] = scene.depth(owner, anti_aliasing, far)
-    if not {"rgb", "normals", "fragments"}.isdisjoint(images):
+    shaded = "rgb" in images and not white
+    if shaded or "normals" in images or "fragments" in images:
         fragments = scene.fragments(owner, anti_aliasing, far, eps)
-        if "rgb" in images:
-            image = shade(fragments, colors, lights, background, interpolation_gradient)
+        if shaded:
+            image, behind = shade(fragments, colors, lights, background, interpolation_gradient)
             if "alpha" in images:
-                image = torch.cat([image, fragments.covered.unsqueeze(-1).to(image)], dim=-1)
-            image = fragments.resolve(image)
+                image = torch.cat([image, image.new_ones(1).expand(*image.shape[:3], 1)], dim=-1)
+                behind = torch.cat([behind, behind.new_zeros(len(behind), 1)], dim=-1)
+            image = fragments._resolve(image, behind)
             if "alpha" in images:
                 image, images["alpha"] = image[..., :-1], image[..., -1]
             images["rgb"] = image

@@ -20,7 +20,7 @@ enum Stream : uint64_t {
   kAttributes,
   kGradValues,
   kImage,
-  kGradImage,
+  kBackground,
   kMatrix,
   kIntrinsics,
   kDistortion,
@@ -45,7 +45,7 @@ enum Stream : uint64_t {
 
 bool is_upstream(Stream stream) {
   return stream == kGradAlpha || stream == kGradWeights || stream == kGradDepth || stream == kGradDepthImage ||
-         stream == kGradColors || stream == kGradValues || stream == kGradImage || stream == kGradPoints ||
+         stream == kGradColors || stream == kGradValues || stream == kGradPoints ||
          stream == kGradLoss || stream == kGradResolved || stream == kGradPose || stream == kGradPyramid ||
          stream == kGradSampled || stream == kGradNormals || stream == kGradLit || stream == kGradSoft;
 }
@@ -370,19 +370,22 @@ void run_clip(const Scene<T>& s, Results<T>& r, int num_threads) {
 
 template <class T>
 void run_edges(const Scene<T>& s, Results<T>& r, int num_threads) {
-  const std::vector<T>&image = input(s, kImage, s.pixels() * s.channels),
-        &grad = input(s, kGradImage, s.pixels() * s.channels);
-  unwritten(r.grad_edges, 3 * s.rows());
-  edges_backward(EdgesBackward<T>{s.mesh(), s.raster(), s.eps, r.owner.data(), image.data(), s.channels, grad.data(),
-                                  r.grad_edges.data(), num_threads});
+  const std::vector<T>& image = input(s, kImage, s.pixels() * s.channels);
 
   const int64_t size = s.batch * s.image.pixels() * s.channels;
   const std::vector<T>& grad_resolved = input(s, kGradResolved, size);
   unwritten(r.resolved, size);
   unwritten(r.grad_image, image.size());
-  Resolve<T> resolve{s.batch,      s.image,           s.anti_aliasing,      s.channels,
-                     image.data(), r.resolved.data(), grad_resolved.data(), r.grad_image.data(),
-                     num_threads};
+  unwritten(r.grad_background, s.batch * s.channels);
+  unwritten(r.grad_edges, 3 * s.rows());
+  // Half of the scenes have a background, of their own for each image or one for all.
+  const int64_t background_batch = s.per_image_values ? s.batch : 1;
+  const std::vector<T>& colors = input(s, kBackground, background_batch * s.channels);
+  const T* background = s.fill_back ? colors.data() : nullptr;
+  Resolve<T> resolve{s.batch, s.image, s.anti_aliasing, s.channels, r.owner.data(), image.data(), background, background_batch,
+                     r.resolved.data(), grad_resolved.data(), r.grad_image.data(), r.grad_background.data(), num_threads};
+  edges_backward(EdgesBackward<T>{s.mesh(), s.image, s.anti_aliasing, s.eps, r.owner.data(), image.data(), s.channels, background,
+                                  background_batch, grad_resolved.data(), r.grad_edges.data(), num_threads});
   resolve_forward(resolve);
   resolve_backward(resolve);
 }

@@ -105,7 +105,7 @@ struct Results {
       grad_lit_weights;
   std::vector<int32_t> layers;
   std::vector<T> clear, grad_soft;
-  std::vector<T> resolved, grad_image;
+  std::vector<T> resolved, grad_image, grad_background;
   std::vector<T> grad_edges;
   std::vector<T> points, grad_world, grad_matrix, grad_intrinsics, grad_distortion, grad_origin, grad_extent;
   std::vector<T> pose, grad_forward, grad_up;
@@ -154,6 +154,7 @@ struct Results {
     visit("grad_soft", grad_soft);
     visit("resolved", resolved);
     visit("grad_image", grad_image);
+    visit("grad_background", grad_background);
     visit("grad_edges", grad_edges);
     visit("points", points);
     visit("grad_world", grad_world);

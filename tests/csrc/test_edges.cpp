@@ -15,9 +15,24 @@ std::vector<int32_t> owner_of(const Scene<T>& scene) {
 template <class T>
 std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& owner, const std::vector<T>& image, const std::vector<T>& grad) {
   std::vector<T> result = unwritten<T>(3 * scene.rows());
-  edges_backward(EdgesBackward<T>{scene.mesh(), scene.raster(), scene.eps, owner.data(), image.data(),
-                                  static_cast<int64_t>(image.size()) / std::max<int64_t>(1, scene.pixels()), grad.data(), result.data(), 2});
+  const int64_t channels = static_cast<int64_t>(image.size()) / std::max<int64_t>(1, scene.pixels());
+  edges_backward(EdgesBackward<T>{scene.mesh(), scene.image, scene.anti_aliasing, scene.eps, owner.data(), image.data(), channels,
+                                  nullptr, 0, grad.data(), result.data(), 2});
   return result;
+}
+
+// The gradient of the pixels of the raster, of that of the image [B, h, w, C].
+template <class T>
+std::vector<T> at_raster(const Scene<T>& scene, const std::vector<T>& grad, int64_t channels) {
+  const Size raster = scene.raster();
+  const int64_t step = scene.anti_aliasing ? 2 : 1;
+  std::vector<T> pixels(scene.pixels() * channels);
+  for (int64_t n = 0; n < scene.pixels() * channels; ++n) {
+    const int64_t c = n % channels, x = n / channels % raster.width / step, y = n / channels / raster.width % raster.height / step;
+    const int64_t b = n / channels / raster.pixels();
+    pixels[n] = grad[((b * scene.image.height + y) * scene.image.width + x) * channels + c] / T(step * step);
+  }
+  return pixels;
 }
 
 template <class T>
@@ -40,10 +55,12 @@ TEST_REAL(edge_gradients_are_the_definition) {
       scene.image = square(13);
       const int64_t R = scene.raster_size();
       const std::vector<int32_t> owner = owner_of(scene);
-      const std::vector<T> image = noise_array<T>(1, scene.pixels() * channels), grad = noise_array<T>(2, scene.pixels() * channels);
+      const std::vector<T> image = noise_array<T>(1, scene.pixels() * channels);
+      const std::vector<T> grad = noise_array<T>(2, scene.batch * scene.image.pixels() * channels);
+      const std::vector<T> pixels = at_raster(scene, grad, channels);
       std::vector<T> expected(3 * scene.rows(), T(0));
       for (int64_t b = 0; b < scene.batch; ++b)
-        slow_edge_gradient(scene, b, owner.data() + b * R * R, image.data() + b * R * R * channels, grad.data() + b * R * R * channels,
+        slow_edge_gradient(scene, b, owner.data() + b * R * R, image.data() + b * R * R * channels, pixels.data() + b * R * R * channels,
                            channels, expected.data() + 3 * scene.mesh().vertex_start(b));
       check_close(gradient(scene, owner, image, grad), expected, sizeof(T) == 4 ? 1e-4 : 1e-11);
     }
@@ -53,23 +70,20 @@ TEST_REAL(edge_gradients_are_the_definition) {
 TEST_REAL(edge_gradients_of_coverage_are_the_silhouettes) {
   Scene<T> scene = stack<T>({sphere(2, 1), sphere(2, 2)}, true);
   scene.image = square(16);
-  const int64_t S = 16, R = 32;
+  const int64_t S = 16;
   const std::vector<int32_t> owner = owner_of(scene);
   const std::vector<T> grad_alpha = noise_array<T>(3, 2 * S * S);
-  std::vector<T> image(scene.pixels()), grad(scene.pixels()), expected(3 * scene.rows());
-  for (int64_t n = 0; n < scene.pixels(); ++n) {
-    image[n] = T(owner[n] >= 0);
-    grad[n] = grad_alpha[(n / R / R * S + n / R % R / 2) * S + n % R / 2] / 4;
-  }
+  std::vector<T> image(scene.pixels()), expected(3 * scene.rows());
+  for (int64_t n = 0; n < scene.pixels(); ++n) image[n] = T(owner[n] >= 0);
   silhouette_backward(SilhouetteBackward<T>{scene.mesh(), square(S), true, scene.eps, owner.data(), grad_alpha.data(), expected.data(), 1});
-  check_close(gradient(scene, owner, image, grad), expected, sizeof(T) == 4 ? 1e-5 : 1e-12);
+  check_close(gradient(scene, owner, image, grad_alpha), expected, sizeof(T) == 4 ? 1e-5 : 1e-12);
 }
 
 TEST_REAL(edge_gradients_of_an_image_of_one_colour_are_zero) {
   Scene<T> scene = single<T>(sphere(1, 1));
   scene.image = square(12);
   const std::vector<int32_t> owner = owner_of(scene);
-  const std::vector<T> image(2 * scene.pixels(), T(0.3)), grad = noise_array<T>(1, 2 * scene.pixels());
+  const std::vector<T> image(2 * scene.pixels(), T(0.3)), grad = noise_array<T>(1, 2 * scene.image.pixels());
   for (T g : gradient(scene, owner, image, grad)) CHECK_EQUAL(g, T(0));
 }
 
@@ -79,7 +93,8 @@ TEST_REAL(resolve_is_a_mean_and_its_gradient_the_adjoint) {
       const int64_t B = 2, S = 7, step = anti_aliasing ? 2 : 1, R = step * S;
       const std::vector<T> image = noise_array<T>(1, B * R * R * C), grad_resolved = noise_array<T>(2, B * S * S * C);
       std::vector<T> resolved = unwritten<T>(grad_resolved.size()), grad_image = unwritten<T>(image.size());
-      const Resolve<T> args{B, square(S), anti_aliasing, C, image.data(), resolved.data(), grad_resolved.data(), grad_image.data(), 2};
+      const Resolve<T> args{B, square(S), anti_aliasing, C, nullptr, image.data(), nullptr, 0,
+                            resolved.data(), grad_resolved.data(), grad_image.data(), nullptr, 2};
       resolve_forward(args);
       resolve_backward(args);
       double product = 0, adjoint = 0;

@@ -26,7 +26,7 @@ def random_image(owner, channels, dtype=torch.float64, seed=0):
 def resolve_with_gradient(image, vertices, faces, starts, owner, anti_aliasing=False, zeros=0.3):
     """The resolved image and both gradients of a random upstream, of which a part is zero."""
     vertices, image = vertices.clone().requires_grad_(), image.clone().requires_grad_()
-    resolved = nmr.ops.resolve(image, vertices, faces, starts, owner, anti_aliasing, EPS)
+    resolved = nmr.ops.resolve(image, None, vertices, faces, starts, owner, anti_aliasing, EPS)
     g = torch.Generator().manual_seed(1)
     upstream = torch.randn(resolved.shape[1:], generator=g, dtype=resolved.dtype)
     upstream[torch.rand(upstream.shape[:2], generator=g) < zeros] = 0
@@ -59,7 +59,7 @@ def test_coverage_as_a_channel_has_the_gradient_of_the_silhouette(name):
     settings = size, size, bool(v["fill_back"]), float(v["near"]), far
     owner = nmr.ops.rasterize(vertices.detach(), faces, None, *settings)
     image = (owner >= 0).float()[..., None]
-    alpha = nmr.ops.resolve(image, vertices, faces, None, owner, anti_aliasing, float(v["eps"]))[..., 0]
+    alpha = nmr.ops.resolve(image, None, vertices, faces, None, owner, anti_aliasing, float(v["eps"]))[..., 0]
     alpha.backward(torch.from_numpy(v["grad_alpha"]))
     assert np.array_equal(alpha.detach().numpy(), v["alpha"])
     difference = np.linalg.norm(vertices.grad.numpy() - v["grad_vertices"])
@@ -74,7 +74,7 @@ def test_gradient_in_the_image_is_the_mean_s(anti_aliasing):
     image = random_image(owner, 2).requires_grad_()
 
     def resolve(image):
-        return nmr.ops.resolve(image, vertices, faces, None, owner, anti_aliasing, EPS)
+        return nmr.ops.resolve(image, None, vertices, faces, None, owner, anti_aliasing, EPS)
 
     assert torch.autograd.gradcheck(resolve, image)
 
@@ -97,7 +97,7 @@ def test_channels_act_together():
     def spread(image, weights):
         """How far the loss sum(weights . image) wants the two lower corners apart (> 0: together)."""
         leaf = vertices.clone().requires_grad_()
-        (nmr.ops.resolve(image, leaf, faces, None, owner, False, EPS) * torch.tensor(weights)).sum().backward()
+        (nmr.ops.resolve(image, None, leaf, faces, None, owner, False, EPS) * torch.tensor(weights)).sum().backward()
         return leaf.grad[0, 1, 0] - leaf.grad[0, 0, 0]
 
     two = covered.expand(-1, -1, -1, 2).contiguous()
@@ -140,6 +140,57 @@ def test_not_a_number_in_a_pixel_gives_none_in_a_vertex():
     assert grad.any() and not grad.isnan().any()
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("per_image", [False, True])
+def test_background_is_the_colour_of_pixels_without_a_face(threads, per_image):
+    """The same as an image that holds it, in values and gradients; the gradient has the same bits for any threads."""
+    vertices, faces = random_soup(0)
+    owner = owner_of(vertices, faces, 20)
+    image, behind = random_image(owner, 3), torch.rand(2 if per_image else 1, 3, dtype=torch.float64)
+    upstream = torch.randn(2, 10, 10, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    filled = torch.where(owner[..., None] >= 0, image, behind[:, None, None])
+    results = []
+    for given, background in ((image, behind), (filled, None)):
+        leaves = [x.clone().requires_grad_() for x in (given, vertices, behind)]
+        pixels = leaves[0] if background is not None else torch.where(owner[..., None] >= 0, leaves[0], leaves[2][:, None, None])
+        mesh = leaves[1], faces, None, owner
+        resolved = nmr.ops.resolve(pixels, None if background is None else leaves[2], *mesh, True, EPS)
+        resolved.backward(upstream)
+        results.append([resolved.detach(), *(leaf.grad for leaf in leaves)])
+    torch.testing.assert_close(*results)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_an_upstream_gradient_that_is_not_finite_reaches_every_visible_face_of_its_image(value):
+    vertices, faces = random_soup(0)
+    owner = owner_of(vertices, faces, 20)
+    leaf = vertices.clone().requires_grad_()
+    resolved = nmr.ops.resolve(random_image(owner, 3), None, leaf, faces, None, owner, True, EPS)
+    upstream = torch.zeros_like(resolved)
+    upstream[0, 3, 4, 1] = value
+    resolved.backward(upstream)
+    seen = torch.unique(owner[0][owner[0] >= 0] % len(faces))
+    corners = torch.unique(faces[seen.long()])
+    assert leaf.grad[0, corners, :2].isnan().all() and not leaf.grad[1].any()
+
+
+def test_a_step_with_nan_does_not_change_later_steps():
+    vertices, faces = nmr.icosphere(2)
+    camera = nmr.LookAt([0.0, 0.5, -3.0])
+
+    def step(bad):
+        leaf = (0.5 * vertices).requires_grad_()
+        outputs = ("rgb", "alpha") if bad else ("rgb",)
+        images = nmr.render(leaf, faces, camera, outputs=outputs, colors=nmr.VertexColors((vertices + 1) / 2), image_size=64)
+        loss = sum(image[:, 28:32].square().sum() for image in images)
+        (loss * (float("nan") if bad else 1.0)).backward()
+        return leaf.grad
+
+    healthy = step(False)
+    assert step(True).isnan().any()
+    assert torch.equal(step(False), healthy)
+
+
 @pytest.mark.parametrize("batch, num_faces", [(0, 5), (2, 0)])
 def test_empty_batches_and_meshes(batch, num_faces):
     vertices, faces = torch.zeros(batch, 15, 3), torch.zeros(num_faces, 3, dtype=torch.long)
@@ -157,26 +208,30 @@ def test_opcheck(dtype, packed):
     owner = owner_of(vertices, faces, 12, starts=starts)
     image = random_image(owner, 3, dtype)
     leaf = image.clone().requires_grad_()
-    torch.library.opcheck(nmr.ops.resolve, (leaf, vertices.clone().requires_grad_(), faces, starts, owner, True, EPS))
-    torch.library.opcheck(nmr.ops.resolve_backward, (image[:, :6, :6], True))
-    torch.library.opcheck(nmr.ops.edges_backward, (vertices, faces, starts, owner, image, image, EPS))
+    mesh, upstream = (vertices.clone().requires_grad_(), faces, starts, owner), image[:, :6, :6].contiguous()
+    for behind in (None, torch.rand(1, 3, dtype=dtype), torch.rand(len(owner), 3, dtype=dtype, requires_grad=True)):
+        torch.library.opcheck(nmr.ops.resolve, (leaf, behind, *mesh, True, EPS))
+        torch.library.opcheck(nmr.ops.resolve_backward, (upstream, behind, owner, True, True, behind is not None))
+        torch.library.opcheck(nmr.ops.edges_backward, (vertices, *mesh[1:], image, behind, upstream, True, EPS))
 
 
 def test_second_derivatives_are_refused():
     vertices, faces = random_soup(0)
     owner = owner_of(vertices, faces, 12)
     leaf, image = vertices.requires_grad_(), random_image(owner, 3).requires_grad_()
-    loss = nmr.ops.resolve(image, leaf, faces, None, owner, False, EPS).square().sum()
+    loss = nmr.ops.resolve(image, None, leaf, faces, None, owner, False, EPS).square().sum()
     for grad in torch.autograd.grad(loss, (image, leaf), create_graph=True):
         with pytest.raises(RuntimeError, match="render has no second derivative"):
             grad.square().sum().backward(retain_graph=True)
 
 
 CALLS = {
-    "resolve": lambda a: _C.resolve_forward(a["image"], a["resolved"], True, 1),
-    "resolve_backward": lambda a: _C.resolve_backward(a["resolved"], a["image"], True, 1),
+    "resolve": lambda a: _C.resolve_forward(a["image"], a["background"], a["owner"], a["resolved"], True, 1),
+    "resolve_backward": lambda a: _C.resolve_backward(
+        a["resolved"], a["background"], a["owner"], a["image"], a["grad_background"], True, 1
+    ),
     "edges": lambda a: _C.edges_backward(
-        a["vertices"], a["faces"], None, a["owner"], a["image"], a["grad_image"], a["grad"], EPS, 1
+        a["vertices"], a["faces"], None, a["owner"], a["image"], a["background"], a["resolved"], a["grad"], True, EPS, 1
     ),
 }
 ALL = tuple(CALLS)
@@ -190,12 +245,14 @@ ALL = tuple(CALLS)
             dict(resolved=np.zeros((2, 4, 4))),
             r"resolved image must have shape \[B, h, w, C\], got \[2, 4, 4\]",
         ),
-        (ALL[:2], dict(resolved=np.zeros((2, 4, 5, 3))), r"image must have shape \[2, 8, 10, 3\]"),
+        (ALL[:2], dict(resolved=np.zeros((2, 4, 5, 3))), r"owner must have shape \[2, 8, 10\]"),
         (ALL[:2], dict(resolved=np.zeros((2, 4, 4, 0))), "must have pixels and channels"),
         (ALL, dict(image=np.zeros((2, 8, 7, 3))), r"image must have shape \[2, 8, 8, 3\], got \[2, 8, 7, 3\]"),
         (ALL[2:], dict(image=np.zeros((2, 8, 8))), r"image must have shape \[B, H, W, C\], got \[2, 8, 8\]"),
         (ALL[2:], dict(owner=np.full((2, 8, 8), 8, np.int32)), "the owner map does not belong to these faces"),
-        (ALL[2:], dict(grad_image=np.zeros((2, 8, 8, 2))), r"grad_image must have shape \[2, 8, 8, 3\]"),
+        (ALL[2:], dict(resolved=np.zeros((2, 4, 4, 2))), r"grad_resolved must have shape \[2, 4, 4, 3\]"),
+        (ALL, dict(background=np.zeros((3, 3))), r"background must have shape \[1 or 2, 3\], got \[3, 3\]"),
+        (ALL[1:2], dict(grad_background=np.zeros((1, 3))), r"grad_background must have shape \[2, 3\]"),
         (ALL[2:], dict(grad=np.zeros((2, 12, 2))), r"grad_vertices must have shape \[2, 12, 3\]"),
     ],
 )
@@ -205,7 +262,8 @@ def test_no_call_reads_or_writes_outside_an_array(calls, change, words):
         faces=np.arange(12).reshape(4, 3),
         owner=np.zeros((2, 8, 8), np.int32),
         image=np.zeros((2, 8, 8, 3)),
-        grad_image=np.zeros((2, 8, 8, 3)),
+        background=np.zeros((1, 3)),
+        grad_background=np.zeros((2, 3)),
         resolved=np.zeros((2, 4, 4, 3)),
         grad=np.zeros((2, 12, 3)),
     )

@@ -32,7 +32,7 @@ def render(v):
         image = torch.where(covered, colors, torch.from_numpy(v["background"]))
         if mode == "rgbad":
             image = torch.cat([image, covered.float()], dim=-1)
-        image = nmr.ops.resolve(image, vertices, faces, None, owner, anti_aliasing, eps)
+        image = nmr.ops.resolve(image, None, vertices, faces, None, owner, anti_aliasing, eps)
         images["rgb"] = image[..., :3].permute(0, 3, 1, 2)
         if mode == "rgbad":
             images["alpha"] = image[..., 3]
