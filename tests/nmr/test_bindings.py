@@ -189,7 +189,9 @@ def test_gradients_of_gradients_are_refused():
     """Those of the public functions are in their own tests; this one no public function reaches."""
     grad = torch.rand(1, 4, 4, 1, requires_grad=True)
     with pytest.raises(RuntimeError, match=r"render has no second derivative.*without create_graph=True"):
-        ops.edges.resolve_backward(grad, None, torch.zeros(1, 8, 8, dtype=torch.int32), True, True, False)[0].sum().backward()
+        ops.edges.resolve_backward(grad, None, torch.zeros(1, 8, 8, dtype=torch.int32), True, True, False)[
+            0
+        ].sum().backward()
 
 
 def test_without_its_compiled_part_the_package_says_so():

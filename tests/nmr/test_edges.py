@@ -152,7 +152,11 @@ def test_background_is_the_colour_of_pixels_without_a_face(threads, per_image):
     results = []
     for given, background in ((image, behind), (filled, None)):
         leaves = [x.clone().requires_grad_() for x in (given, vertices, behind)]
-        pixels = leaves[0] if background is not None else torch.where(owner[..., None] >= 0, leaves[0], leaves[2][:, None, None])
+        pixels = (
+            leaves[0]
+            if background is not None
+            else torch.where(owner[..., None] >= 0, leaves[0], leaves[2][:, None, None])
+        )
         mesh = leaves[1], faces, None, owner
         resolved = nmr.ops.resolve(pixels, None if background is None else leaves[2], *mesh, True, EPS)
         resolved.backward(upstream)
@@ -181,7 +185,9 @@ def test_a_step_with_nan_does_not_change_later_steps():
     def step(bad):
         leaf = (0.5 * vertices).requires_grad_()
         outputs = ("rgb", "alpha") if bad else ("rgb",)
-        images = nmr.render(leaf, faces, camera, outputs=outputs, colors=nmr.VertexColors((vertices + 1) / 2), image_size=64)
+        images = nmr.render(
+            leaf, faces, camera, outputs=outputs, colors=nmr.VertexColors((vertices + 1) / 2), image_size=64
+        )
         loss = sum(image[:, 28:32].square().sum() for image in images)
         (loss * (float("nan") if bad else 1.0)).backward()
         return leaf.grad
@@ -211,6 +217,7 @@ def test_opcheck(dtype, packed):
     mesh, upstream = (vertices.clone().requires_grad_(), faces, starts, owner), image[:, :6, :6].contiguous()
     for behind in (None, torch.rand(1, 3, dtype=dtype), torch.rand(len(owner), 3, dtype=dtype, requires_grad=True)):
         torch.library.opcheck(nmr.ops.resolve, (leaf, behind, *mesh, True, EPS))
+        behind = None if behind is None else behind.detach()
         torch.library.opcheck(nmr.ops.resolve_backward, (upstream, behind, owner, True, True, behind is not None))
         torch.library.opcheck(nmr.ops.edges_backward, (vertices, *mesh[1:], image, behind, upstream, True, EPS))
 
