@@ -99,6 +99,7 @@ struct Colors {
   std::vector<T> weights, depth, at_vertices, uv, texels, colors, resolved, pyramid, level, normals, lit, clear;
   std::vector<T> upstream, grad_image, grad_weights, grad_depth, grad_vertices, grad_values, grad_texels, grad_pyramid,
       grad_normals, grad_lights;
+  std::vector<T> background = std::vector<T>(3, T(0.2));
   std::vector<int64_t> grids, counts, starts;
   std::vector<T> lights, viewer;
   std::vector<int64_t> layout;
@@ -154,7 +155,8 @@ struct Colors {
             1};
   }
   Resolve<T> resolve() {
-    return {scene.batch, scene.image, true, 3, colors.data(), resolved.data(), upstream.data(), grad_image.data(), 1};
+    return {scene.batch, scene.image, true, 3, owner.data(), colors.data(), background.data(), 1, resolved.data(),
+            upstream.data(), grad_image.data(), nullptr, 1};
   }
   Mipmaps<T> mipmaps() {
     return {1, kLevels, grids.data(), 3, texels.data(), pyramid.data(), grad_pyramid.data(), grad_texels.data(), 1};
@@ -227,8 +229,9 @@ constexpr Row kRows[] = {
      }},
     {"edges_backward",
      [](C& c) {
-       edges_backward(EdgesBackward<float>{c.scene.mesh(), c.scene.raster(), c.scene.eps, c.owner.data(),
-                                           c.colors.data(), 3, c.grad_image.data(), c.grad_vertices.data(), 1});
+       edges_backward(EdgesBackward<float>{c.scene.mesh(), c.scene.image, true, c.scene.eps, c.owner.data(),
+                                           c.colors.data(), 3, c.background.data(), 1, c.upstream.data(),
+                                           c.grad_vertices.data(), 1});
      }},
     {"uv_forward",
      [](C& c) {
