@@ -59,6 +59,7 @@ struct ColorImage {
   int64_t channels;        // C
   ColorLines<T>* lines;    // [0] columns: lines of constant x, swept along y; [1] rows
   T largest_lever;         // above this, or with a tiny eps, the product of two distances could overflow or underflow
+  static constexpr bool kFarSides = true;  // whether sweeps need Crossings::far_side
 
   const T* color(int64_t pixel) const { return background && owner[pixel] < 0 ? background : pixels + pixel * channels; }
 };

@@ -159,7 +159,10 @@ template <bool kUp, int64_t kChannels, class T>
 NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, const T* reference, const Lever<T>& lever, T* pulls) {
   const T* position = lines.positions(n);
   const int64_t count = lines.count[n];
-  const Lanes<T> crossing = splat(lever.crossing);
+  // All offsets have the same sign, so the signs of both distances are constant.
+  const T eps = kUp ? lever.eps : -lever.eps;
+  const Lanes<T> crossing = splat(lever.crossing), factor_p = splat(lever.factor_p), factor_q = splat(lever.factor_q);
+  const Lanes<T> eps_p = splat(lever.factor_p > 0 ? eps : -eps), eps_q = splat(lever.factor_q > 0 ? eps : -eps);
   Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
   int64_t k = kUp ? count - kLanes : 0;  // from the border of the image inwards
   bool more;
@@ -168,7 +171,13 @@ NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, const T* ref
     const LaneMask<T> beyond = kUp ? offset > splat(T(0)) : offset < splat(T(0));
     const Lanes<T> gain = color_gains<kChannels>(position, lines.stride, lines.channels, k, reference);
     const LaneMask<T> acts = beyond & (gain > splat(T(0)));
-    if (lane_bits(acts)) pull_lanes<T>(acts, gain, offset, lever, pulls_p, pulls_q);
+    if (lane_bits(acts)) {
+      // The quotients w / h_p and w / h_q share one division: w / (h_p h_q) times h_q and h_p.
+      const Lanes<T> h_p = offset * factor_p + eps_p, h_q = offset * factor_q + eps_q;
+      const Lanes<T> share = keep(acts, gain / (h_p * h_q));
+      pulls_p = pulls_p + share * h_q;
+      pulls_q = pulls_q + share * h_p;
+    }
     more = kUp ? position[k] > lever.crossing : position[k + kLanes - 1] < lever.crossing;
     k += kUp ? -kLanes : kLanes;
   } while (more);
@@ -197,19 +206,6 @@ NMR_INLINE void pull_own(const ColorLines<T>& lines, int64_t n, int64_t first, i
 
 // --- the sweeps
 
-// The pixels between the inner one and the far side of the face on the line: where the second edge of the corner opposite lies.
-template <class T>
-NMR_INLINE std::pair<int64_t, int64_t> inside_range(const SweepScratch<T>& block, int axis, int32_t edge, int64_t n, int64_t inner,
-                                                    int64_t d, int64_t length) {
-  const int64_t face = edge % kSweptFaces, p = edge / kSweptFaces, q = p < 2 ? p + 1 : 0, o = p > 0 ? p - 1 : 2;
-  const auto s = [&](int64_t k) { return block.corner[axis][k][face]; };
-  const auto t = [&](int64_t k) { return block.corner[1 - axis][k][face]; };
-  const T line = static_cast<T>(n);
-  const int64_t end = (line - s(p)) * (line - s(o)) < 0 ? p : q;
-  const int64_t limit = sweep_limit(line_height(s(end), t(end), s(o), t(o), line), d, length);
-  return {std::max<int64_t>(std::min(inner, limit), 0), std::min(std::max(inner, limit), length - 1)};
-}
-
 // Sweeps all crossings of one axis and direction, and empties them.
 template <bool kUp, int64_t kChannels, class T>
 void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& block) {
@@ -218,62 +214,81 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
   Crossings<T>& crossings = block.crossings[axis][kUp ? 0 : 1];
   const int32_t d = kUp ? 1 : -1;
   const T top = static_cast<T>(length - 1);  // the last pixel of a line
-  // The inner pixel is floor(c) in the coordinate of the direction. It and the next one lie on the line if start <= c < end.
-  const Lanes<T> start = splat(kUp ? T(0) : -top), end = splat(kUp ? top : T(0));
+  // The inner pixel is floor(c) in the coordinate of the direction. It and the next one lie on the line if
+  // start <= c < end.
+  const Lanes<T> start = splat(kUp ? T(0) : -top), end = splat(kUp ? top : T(0)), zero = splat(T(0));
   // pixel m of line n: origin + n * step_n + m * step_m
   const int32_t across = static_cast<int32_t>(-W), step = axis == 0 ? across * d : d;
   const Lanes32 origin = splat(static_cast<int32_t>((H - 1) * W)), step_n = splat(axis == 0 ? int32_t(1) : across);
   const Lanes32 step_m = splat(step), all = splat(static_cast<int32_t>(crossings.count));
+  const Lanes32 face_of = splat(static_cast<int32_t>(kSweptFaces - 1)), sign = splat(d);
+  const Lanes32 last_pixel = splat(static_cast<int32_t>(length - 1)), none = splat(int32_t(0));
+  int32_t pixel_at[kCrossings + kPad], first_at[kCrossings + kPad], last_at[kCrossings + kPad];
+  int64_t num_pulled = 0, num_gained = 0;
   for (int64_t i = 0; i < crossings.count; i += kLanes) {
     const Lanes<T> at = load_lanes<Lanes<T>>(crossings.at + i);
-    const Lanes32 used = lane_numbers() + splat(static_cast<int32_t>(i)) < all;
-    const Lanes32 may_pull = used & narrow_mask((at >= start) & (at < end) & (at < load_lanes<Lanes<T>>(crossings.pull_end + i)));
-    const Lanes32 may_gain = used & narrow_mask((at >= start) & (at >= load_lanes<Lanes<T>>(crossings.gain_start + i)) & (at < end));
+    const Lanes32 number = lane_numbers() + splat(static_cast<int32_t>(i)), used = number < all;
+    const LaneMask<T> on_line = (at >= start) & (at < end);
+    const Lanes32 may_pull = used & narrow_mask(on_line & (at < load_lanes<Lanes<T>>(crossings.pull_end + i)));
+    const Lanes32 may_gain = used & narrow_mask(on_line & (at >= load_lanes<Lanes<T>>(crossings.gain_start + i)));
     const Lanes32 wanted = may_pull | may_gain;
-    uint32_t bits = lane_bits(wanted);
-    if (!bits) continue;
+    if (!lane_bits(wanted)) continue;
     const Lanes32 inner = truncate(floor_lanes<T>(keep(widen_mask<T>(wanted), at)));
     const Lanes32 pixel = origin + load_lanes<Lanes32>(crossings.line + i) * step_n + inner * step_m;
-    const uint32_t pull_bits = lane_bits(may_pull), gain_bits = lane_bits(may_gain);
-    const LaneArray<int32_t, Lanes32> inner_at(inner), pixel_at(pixel);
-    for (; bits; bits &= bits - 1) {
-      const int64_t k = lowest_bit(bits), n = crossings.line[i + k], inside = pixel_at.lane[k], outside = inside + step;
-      const int32_t edge = crossings.edge[i + k], id = block.id[edge % kSweptFaces];
-      const bool pulled = (pull_bits >> k & 1) && image.owner[inside] == id;
-      int64_t first = 0, last = 0;
-      if (gain_bits >> k & 1) {
-        const auto [m_first, m_last] = inside_range(block, axis, edge, n, int64_t(d) * inner_at.lane[k], d, length);
-        if (m_first <= m_last) {
-          first = listed_before(lines, n, m_first);
-          last = listed_before(lines, n, m_last + 1);
-        }
-      }
-      if (!pulled && first >= last) continue;
-      const T line = static_cast<T>(n), reach = block.reach[axis][edge], crossing = crossings.at[i + k];
-      const Lever<T> lever{kUp ? crossing : -crossing, reach / (block.qs[axis][edge] - line), reach / (line - block.ps[axis][edge]),
-                           image.eps};
-      const bool regular = std::abs(lever.factor_p) < image.largest_lever && std::abs(lever.factor_q) < image.largest_lever;
-      T* pulls = block.pulls[axis][edge];
-      if (pulled) {
-        const T* reference = image.color(inside);
-        if (regular) {
-          pull_outside<kUp, kChannels>(lines, n, reference, lever, pulls);
-        } else {
-          const int64_t outer = int64_t(d) * inner_at.lane[k] + d;
-          const int64_t from = kUp ? listed_before(lines, n, outer) : 0;
-          pull_one_by_one<false>(lines, n, from, kUp ? lines.count[n] : listed_before(lines, n, outer + 1), id, reference, lever, pulls);
-        }
-      }
-      if (first < last) {
-        const T* reference = image.color(outside);
-        if (regular)
-          pull_own<kChannels>(lines, n, first, last, id, reference, lever, pulls);
-        else
-          pull_one_by_one<true>(lines, n, first, last, id, reference, lever, pulls);
-      }
-    }
+    const Lanes32 face = load_lanes<Lanes32>(crossings.edge + i) & face_of;
+    const Lanes32 id = gather_lanes(block.id, keep(used, face));
+    const Lanes32 inner_owner = gather_lanes(image.owner, keep(wanted, pixel));
+    // The pixels inside: from the inner one to the far side, at most one pixel beyond the line, as sweep_limit rounds.
+    const Lanes<T> far_side = load_lanes<Lanes<T>>(crossings.far_side + i);
+    Lanes<T> far = keep(far_side == far_side, far_side);
+    far = select(far > splat(T(-1)), far, splat(T(-1)));
+    far = select(far < splat(top + 1), far, splat(top + 1));
+    const Lanes32 limit = truncate(kUp ? zero - floor_lanes<T>(zero - far) : floor_lanes<T>(far)), from = inner * sign;
+    const Lanes32 low = select(from < limit, from, limit), high = select(from < limit, limit, from);
+    const Lanes32 first = select(low < none, none, low), last = select(high < last_pixel, high, last_pixel);
+    store_lanes(pixel_at + i, pixel);
+    store_lanes(first_at + i, first);
+    store_lanes(last_at + i, last);
+    num_pulled += compress_lanes(number, lane_bits(may_pull & (inner_owner == id)), crossings.pulled + num_pulled);
+    num_gained += compress_lanes(number, lane_bits(may_gain & (first <= last)), crossings.gained + num_gained);
   }
   crossings.count = 0;
+
+  const auto lever_of = [&](int32_t i, int32_t edge) {
+    const T line = static_cast<T>(crossings.line[i]), reach = block.reach[axis][edge], crossing = crossings.at[i];
+    return Lever<T>{kUp ? crossing : -crossing, reach / (block.qs[axis][edge] - line),
+                    reach / (line - block.ps[axis][edge]), image.eps};
+  };
+  const auto is_regular = [&](const Lever<T>& lever) {
+    return std::abs(lever.factor_p) < image.largest_lever && std::abs(lever.factor_q) < image.largest_lever;
+  };
+  for (int64_t k = 0; k < num_pulled; ++k) {
+    const int32_t i = crossings.pulled[k], n = crossings.line[i], edge = crossings.edge[i];
+    const T* reference = image.color(pixel_at[i]);
+    const Lever<T> lever = lever_of(i, edge);
+    T* pulls = block.pulls[axis][edge];
+    if (is_regular(lever)) {
+      pull_outside<kUp, kChannels>(lines, n, reference, lever, pulls);
+    } else {
+      const int64_t outer = d * static_cast<int64_t>(std::floor(crossings.at[i])) + d;
+      const int64_t first = kUp ? listed_before(lines, n, outer) : 0;
+      const int64_t last = kUp ? lines.count[n] : listed_before(lines, n, outer + 1);
+      pull_one_by_one<false>(lines, n, first, last, 0, reference, lever, pulls);
+    }
+  }
+  for (int64_t k = 0; k < num_gained; ++k) {
+    const int32_t i = crossings.gained[k], n = crossings.line[i], edge = crossings.edge[i];
+    const int64_t first = listed_before(lines, n, first_at[i]), last = listed_before(lines, n, last_at[i] + 1);
+    if (first >= last) continue;
+    const int32_t id = block.id[edge % kSweptFaces];
+    const T* reference = image.color(pixel_at[i] + step);
+    const Lever<T> lever = lever_of(i, edge);
+    T* pulls = block.pulls[axis][edge];
+    if (is_regular(lever))
+      pull_own<kChannels>(lines, n, first, last, id, reference, lever, pulls);
+    else
+      pull_one_by_one<true>(lines, n, first, last, id, reference, lever, pulls);
+  }
 }
 
 // --- for any number of channels: 1, 3 and 4 are compiled in

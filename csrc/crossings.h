@@ -99,6 +99,13 @@ NMR_INLINE void cross_edges(const Image& image, int axis, int k, int64_t first, 
   const LaneArray<int32_t, Lanes32> first_at(first_line), last_at(last_line);
   const LaneArray<int32_t, Lanes32> edge_at(lane_numbers() + splat(static_cast<int32_t>(edge)));
 
+  // The far side is on edge P-O if the line crosses it, else on Q-O.
+  const int64_t o = k > 0 ? k - 1 : 2;
+  const Lanes<T> os = load_lanes<Lanes<T>>(block.corner[axis][o] + first);
+  const Lanes<T> ot = load_lanes<Lanes<T>>(block.corner[1 - axis][o] + first);
+  const LaneArray<T, Lanes<T>> os_at(os), pt_at(pt), qs_at(qs), qt_at(qt);
+  const LaneArray<T, Lanes<T>> slope_po((ot - pt) / (os - ps)), slope_qo((ot - qt) / (os - qs));
+
   for (int direction = 0; direction < 2; ++direction) {
     Crossings<T>& crossings = block.crossings[axis][direction];
     const T *pull_end = lines.pull_end[direction].data(), *gain_start = lines.gain_start[direction].data();
@@ -120,6 +127,13 @@ NMR_INLINE void cross_edges(const Image& image, int axis, int k, int64_t first, 
         store_lanes(crossings.pull_end + count, load_lanes<Lanes<T>>(pull_end + start));
         store_lanes(crossings.gain_start + count, load_lanes<Lanes<T>>(gain_start + start));
         store_lanes(crossings.line + count, line);
+        if constexpr (Image::kFarSides) {
+          const Lanes<T> n = to_values<T>(line);
+          const auto of = [lane](const LaneArray<T, Lanes<T>>& values) { return splat(values.lane[lane]); };
+          const LaneMask<T> before_p = (n - scan) * (n - of(os_at)) < zero;
+          store_lanes(crossings.far_side + count, select(before_p, of(slope_po) * (n - scan) + of(pt_at),
+                                                         of(slope_qo) * (n - of(qs_at)) + of(qt_at)));
+        }
         store_lanes(crossings.edge + count, splat(edge_at.lane[lane]));
         count += std::min<int64_t>(last - start + 1, kLanes);  // what is written beyond is overwritten, or ignored
       }

@@ -48,6 +48,7 @@ struct SweepImage {
   const T* grad_alpha;
   PullLines<T>* lines;   // [0] columns: lines of constant x, swept along y; [1] rows
   T largest_lever;       // above this, or with a tiny eps, the product of two distances could overflow or underflow
+  static constexpr bool kFarSides = false;  // whether sweeps need Crossings::far_side
 
   // Gradient of raster pixel (column i, row j from the bottom). With a 2x2 mean each pixel gets a quarter of the
   // image's gradient.
@@ -72,6 +73,8 @@ struct Crossings {
   // Crossing, and the entries of its line in PullLines, in the coordinate of the direction.
   T at[kCrossings + kPad], pull_end[kCrossings + kPad], gain_start[kCrossings + kPad];
   int32_t line[kCrossings + kPad];
+  // Colours only: coordinate on the line where it leaves the face on the other side, as an infinite line.
+  T far_side[kCrossings + kPad];
   int32_t edge[kCrossings + kPad];  // k * kSweptFaces + face: edge k, k + 1 of a face of the block
   // Numbers of the crossings that have something to sweep: outside the face, and inside.
   int32_t pulled[kCrossings + kPad], gained[kCrossings + kPad];
