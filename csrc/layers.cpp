@@ -44,7 +44,9 @@ NMR_INLINE void insert_face(const LayerBand<T>& band, int64_t f, bool reversed) 
   const Size raster = band.settings.raster;
   const Triangle<T> t = load_triangle(band.vertices, band.faces + 3 * f, reversed);
   const T *x = t.x, *y = t.y, *z = t.z;
-  if ((y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0]) || !is_drawable(t)) return;
+  if ((y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0])) return;
+  // As in the rasterizer, of the face's own order: rounding may find only one of the two orders flat.
+  if (!is_drawable(load_triangle(band.vertices, band.faces + 3 * f, false))) return;
   const T left = std::min({x[0], x[1], x[2]}), right = std::max({x[0], x[1], x[2]});
   const T bottom = std::min({y[0], y[1], y[2]}), top = std::max({y[0], y[1], y[2]});
   int64_t i_first, i_last, j_first, j_last;

@@ -150,9 +150,9 @@ NMR_INLINE SoftPixel<T> evaluate(const SoftFace<T>& face, T px, T py, T sigma, T
     }
   }
   const T e = exp_negative(least / sigma), large = 1 / (1 + e), small = e / (1 + e);
-  const bool counts = inside | (least < reach);
-  p.covers = counts ? (inside ? large : small) : T(0);
-  p.clears = counts ? (inside ? small : large) : T(1);
+  const T outside_clears = least < reach ? large : T(1), outside_covers = least < reach ? small : T(0);
+  p.covers = inside ? large : outside_covers;
+  p.clears = inside ? small : outside_clears;
   p.sign = inside ? T(1) : T(-1);
   return p;
 }
