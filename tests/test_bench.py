@@ -12,6 +12,7 @@ import nmr
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools" / "bench"))
 
 import bench
+import bench_colors
 import bench_memory
 import bench_peers
 import bench_step
@@ -106,6 +107,37 @@ def test_commands(command, capsys):
         assert title.startswith(f"{workload.upper()}: ") and "batch 2" in settings
         forward, total, fastest, ratio = map(float, ours.split()[-4:])
         assert 0 < forward < total == fastest and ratio == 1
+
+
+def test_colors_are_drawn_with_one_thread_and_checked_against_their_targets(command, monkeypatch, capsys):
+    for kind in bench_colors.KINDS:
+        monkeypatch.setitem(bench.TARGETS, f"colors {kind}", bench.Target(1e6, "ms", "any time will do"))
+    command("colors", "--batch", 2, "--repeats", 1, "--threads", 2)
+    *lines, table = capsys.readouterr().out.split("| target |\n|---|---|---|---|\n")
+    assert lines[0].count("\nthreads 1, batch 2") == len(bench_colors.KINDS)
+    for kind, what in bench_colors.KINDS.items():
+        learned = f"{what}, forward + backward | **"
+        assert learned in table and f"colors {kind}" in bench.TARGETS
+    assert table.count("colours learned, too") == 3 and "missed" not in table
+    assert torch.get_num_threads() == 2
+    monkeypatch.setitem(bench.TARGETS, "colors uv", bench.Target(0, "ms", "nothing is that fast"))
+    with pytest.raises(SystemExit, match=r"targets missed:\nColours: 2 meshes.*texture images of 128x128, forward"):
+        command("colors", "--batch", 2, "--repeats", 1)
+
+
+@pytest.mark.parametrize("kind", bench_colors.KINDS)
+def test_every_kind_of_colour_draws_its_own_image_and_reaches_what_is_learned(kind):
+    spheres = bench_work.deformed_spheres(2, 3, 32, True, ("rgb",))
+    workload = bench_colors.ColorWorkload(spheres, kind)
+    vertices = spheres.vertices.clone().requires_grad_()
+    values = None if kind == "white" else workload.values.clone().requires_grad_()
+    image = workload.image(vertices, values)
+    (image - workload.target).square().mean().backward()
+    assert vertices.grad.any() and (values is None or values.grad.any())
+    inner = image[:, 15:17, 15:17].detach()
+    assert torch.equal(inner, torch.ones_like(inner)) == (kind == "white")
+    unlit = bench_colors.ColorWorkload(spheres, "uv").target
+    assert torch.equal(workload.target, unlit) == (kind == "uv")
 
 
 def test_the_first_render_is_one_in_a_fresh_process(command, capsys):

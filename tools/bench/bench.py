@@ -5,6 +5,7 @@
   bench.py w2: one mesh of 81,920 faces, 512x512
   bench.py w3: one mesh of 1,280 faces, 1024x1024
   bench.py w4: w1 with depth, and with alpha + depth in one pass, instead of silhouettes
+  bench.py colors: w1 in colour, with one thread: white, vertex colours, texture images, lights; exit code as for all
   bench.py two-threads: w1 with two threads and with one
   bench.py first: the first render in a fresh process
   bench.py smoothness: smoothness loss of 128 spheres of 1920 edges
@@ -33,6 +34,7 @@ from typing import Literal, NamedTuple
 import bench_peers as peers
 import torch
 import tyro
+from bench_colors import bench_colors
 from bench_memory import bench_memory
 from bench_processes import bench_processes
 from bench_step import bench_evaluation, bench_step
@@ -93,6 +95,10 @@ TARGETS = {
     "w2": Target(8, "x", "one mesh: deodr cannot share it", "deodr, 1 process"),
     "w3": Target(5, "x", "one mesh: deodr cannot share it", "deodr, 1 process"),
     "w4, 64": Target(6, "x", "as w1", "deodr, 2 processes"),
+    "colors white": Target(25, "ms", "rgb follows from the silhouette"),
+    "colors vertex": Target(28, "ms", "as white, and one interpolation"),
+    "colors uv": Target(40, "ms", "as vertex colours, and four texels a pixel"),
+    "colors uv-lights": Target(50, "ms", "as texture images, and the light of each face"),
     "two-threads": Target(1.85, "x", "the meshes of a batch are independent", ONE_THREAD),
     "first": Target(300, "ms", "nothing is compiled or imported then"),
     "smoothness": Target(3, "ms", "the same as a chain of torch calls takes tens of ms"),
@@ -118,13 +124,13 @@ class Options:
             "step",
             "evaluation",
         ]
-        | Literal["memory", "processes", "scaling"]
+        | Literal["colors", "memory", "processes", "scaling"]
     ] = "w1"
     """What to measure."""
     batch: int | None = None
-    """Meshes of w1 and w4, by default 64 (all measures w1 with 64 and with 128); images of a step, by default 128."""
+    """Meshes of w1, w4 and colors, by default 64 (all: w1 with 64 and with 128); images of a step, by default 128."""
     threads: int = 2
-    """Threads of ours and of torch. deodr has none: it gets one process, and as many as these."""
+    """Threads of ours and of torch (colors takes one). deodr has none: it gets one process, and as many as these."""
     repeats: int = 15
     """Timed runs of each program."""
 
@@ -308,10 +314,23 @@ def bench_all(options: Options) -> list[Result]:
     for bench in benches:
         results.append(bench())
         show(results[-1])
+    show_table(results)
+    return results
+
+
+def bench_all_colors(options: Options) -> list[Result]:
+    """Every kind of colour, and the table."""
+    results = bench_colors(options.batch or MESHES, options.repeats)
+    for result in results:
+        show(result)
+    show_table(results)
+    return results
+
+
+def show_table(results: list[Result]) -> None:
     about = {key: value for key, value in results[0].settings.items() if key != "batch"}
     print(f"\nForward + backward, medians; {', '.join(f'{key} {value}' for key, value in about.items())}\n")
     print(markdown(results), flush=True)
-    return results
 
 
 SINGLE: dict[str, Callable[[Options], Result]] = {
@@ -338,13 +357,15 @@ def main() -> int:
     keep_freed_memory()
     if options.workload == "all":
         results = bench_all(options)
+    elif options.workload == "colors":
+        results = bench_all_colors(options)
     elif options.workload == "scaling":
         results = bench_scaling(options)
     else:
         bench = SINGLE.get(options.workload)
         results = [bench(options) if bench else bench_render(options.workload, options, options.batch or MESHES)]
         show(results[0])
-    if options.workload == "all" and any(map(missed, results)):
+    if options.workload in ("all", "colors") and any(map(missed, results)):
         lines = (
             f"{r.title}: {TARGETS[r.key].reached(r):.2f}, not {TARGETS[r.key]} ({TARGETS[r.key].source})"
             for r in results
