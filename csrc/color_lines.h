@@ -14,19 +14,19 @@ namespace nmr {
 // (direction 0) or down (direction 1).
 template <class T>
 struct ColorLines {
-  // [N, 1 + 2 C, pad + M + pad] position on the line in pixels, ascending; colour; gradient. The positions in the padding lie before
-  // and after every pixel.
+  // [N, blocks, 1 + 2 C, 8] position on the line in pixels, ascending; colour; gradient. What belongs to eight pixels lies
+  // together. The last block is filled with zeros, which have no effect.
   std::vector<T> values;
-  std::vector<int32_t> owner;     // [N, pad + M + pad]
+  std::vector<int32_t> owner;     // [N, blocks, 8]
   std::vector<int32_t> count;     // [N] number of listed pixels
   std::vector<uint64_t> listed;   // [N, words] bit m: pixel m is listed
   std::vector<int32_t> before;    // [N, words] number of listed pixels before each word
   std::vector<T> pull_end[2];     // [N + pad] by direction: a crossing before this has a listed pixel beyond its outer one
   std::vector<T> gain_start[2];   // [N + pad] by direction: a crossing before this has no listed pixel of a face inside
-  int64_t stride, words, channels;
+  int64_t stride, words, channels;  // stride: 8 blocks
 
   void reserve_lines(int64_t N, int64_t M, int64_t C) {
-    stride = M + 2 * kPad;
+    stride = (M + kPad - 1) / kPad * kPad + kPad;
     words = (M + 63) / 64;
     channels = C;
     reserve(values, N * (1 + 2 * C) * stride);
@@ -36,11 +36,12 @@ struct ColorLines {
     reserve(before, N * words);
     for (std::vector<T>* v : {&pull_end[0], &pull_end[1], &gain_start[0], &gain_start[1]}) reserve(*v, N + kPad);
   }
-  // Positions of the listed pixels of line n; colours and gradients follow, `stride` apart.
-  T* positions(int64_t n) { return values.data() + n * (1 + 2 * channels) * stride + kPad; }
-  const T* positions(int64_t n) const { return values.data() + n * (1 + 2 * channels) * stride + kPad; }
-  int32_t* owners(int64_t n) { return owner.data() + n * stride + kPad; }
-  const int32_t* owners(int64_t n) const { return owner.data() + n * stride + kPad; }
+  // Block `block` of line n: eight positions, then as many of each colour and of each gradient.
+  T* at(int64_t n, int64_t block) { return values.data() + (n * stride + block * kPad) * (1 + 2 * channels); }
+  const T* at(int64_t n, int64_t block) const { return values.data() + (n * stride + block * kPad) * (1 + 2 * channels); }
+  T position(int64_t n, int64_t k) const { return at(n, k / kPad)[k % kPad]; }
+  int32_t* owners(int64_t n) { return owner.data() + n * stride; }
+  const int32_t* owners(int64_t n) const { return owner.data() + n * stride; }
 };
 
 // Input of the sweeps for one image.

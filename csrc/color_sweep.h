@@ -35,13 +35,13 @@ NMR_INLINE void start_color_lines(ColorLines<T>& lines, int64_t first, int64_t l
 template <int64_t kChannels, class T>
 NMR_INLINE void append_color(ColorLines<T>& lines, int64_t n, int64_t m, int32_t owner, const T* color, const T* grad,
                              int64_t grad_stride) {
-  const int64_t C = kChannels ? kChannels : lines.channels, stride = lines.stride, at = lines.count[n]++;
+  const int64_t C = kChannels ? kChannels : lines.channels, at = lines.count[n]++;
   const T position = static_cast<T>(m);
-  T* out = lines.positions(n) + at;
+  T* out = lines.at(n, at / kLanes) + at % kLanes;
   out[0] = position;
   for (int64_t c = 0; c < C; ++c) {
-    out[(1 + c) * stride] = color[c];
-    out[(1 + C + c) * stride] = grad[c * grad_stride];
+    out[(1 + c) * kLanes] = color[c];
+    out[(1 + C + c) * kLanes] = grad[c * grad_stride];
   }
   lines.owners(n)[at] = owner;
   lines.listed[n * lines.words + m / 64] |= uint64_t(1) << (m % 64);
@@ -51,17 +51,17 @@ NMR_INLINE void append_color(ColorLines<T>& lines, int64_t n, int64_t m, int32_t
   last = position;
 }
 
+// Bounds, padding and numbers of lines [first, last), when all their pixels have been seen.
 template <class T>
-NMR_INLINE void finish_color_lines(ColorLines<T>& lines, int64_t first, int64_t last) {
-  const T infinity = std::numeric_limits<T>::infinity(), length = static_cast<T>(lines.stride - 2 * kPad);
+NMR_INLINE void finish_color_lines(ColorLines<T>& lines, int64_t first, int64_t last, int64_t length) {
+  const T infinity = std::numeric_limits<T>::infinity();
   for (int64_t n = first; n < last; ++n) {
-    const int32_t count = lines.count[n];
-    T* position = lines.positions(n);
-    lines.pull_end[0][n] = count ? position[count - 1] : -infinity;
-    lines.pull_end[1][n] = count ? -position[0] : -infinity;
-    lines.gain_start[1][n] = std::max(T(1) - length, -lines.gain_start[1][n]);
-    store_lanes(position - kPad, splat(T(-1)));
-    store_lanes(position + count, splat(length));
+    const int64_t count = lines.count[n], rest = count % kLanes;
+    lines.pull_end[0][n] = count ? lines.position(n, count - 1) : -infinity;
+    lines.pull_end[1][n] = count ? -lines.position(n, 0) : -infinity;
+    lines.gain_start[1][n] = std::max(static_cast<T>(1 - length), -lines.gain_start[1][n]);
+    T* block = lines.at(n, count / kLanes);
+    for (int64_t k = 0; rest && k < 1 + 2 * lines.channels; ++k) std::fill(block + k * kLanes + rest, block + (k + 1) * kLanes, T(0));
     int32_t before = 0;
     for (int64_t word = n * lines.words; word < (n + 1) * lines.words; ++word) {
       lines.before[word] = before;
@@ -108,20 +108,20 @@ NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& r
       }
     }
   }
-  finish_color_lines(columns, range.column_first, range.column_last);
-  finish_color_lines(rows, range.row_first, range.row_last);
+  finish_color_lines(columns, range.column_first, range.column_last, H);
+  finish_color_lines(rows, range.row_first, range.row_last, W);
 }
 
 // --- the pulls
 
-// What the pixels at n, n + 1, ... of a list gain if they take the reference colour: sum over channels of (colour - reference) gradient.
+// What eight pixels of a list gain if they take the reference colour: sum over channels of (colour - reference) gradient.
 template <int64_t kChannels, class T>
-NMR_INLINE Lanes<T> color_gains(const T* position, int64_t stride, int64_t channels, int64_t n, const T* reference) {
+NMR_INLINE Lanes<T> color_gains(const T* block, int64_t channels, const T* reference) {
   const int64_t C = kChannels ? kChannels : channels;
   Lanes<T> gain = splat(T(0));
   for (int64_t c = 0; c < C; ++c) {
-    const Lanes<T> color = load_lanes<Lanes<T>>(position + (1 + c) * stride + n);
-    gain = gain + (color - splat(reference[c])) * load_lanes<Lanes<T>>(position + (1 + C + c) * stride + n);
+    const Lanes<T> color = load_lanes<Lanes<T>>(block + (1 + c) * kLanes);
+    gain = gain + (color - splat(reference[c])) * load_lanes<Lanes<T>>(block + (1 + C + c) * kLanes);
   }
   return gain;
 }
@@ -143,13 +143,13 @@ NMR_INLINE void pull_lanes(LaneMask<T> mask, Lanes<T> weight, Lanes<T> offset, c
 template <bool kOwn, class T>
 void pull_one_by_one(const ColorLines<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id, const T* reference,
                      const Lever<T>& lever, T* pulls) {
-  const int64_t C = lines.channels, stride = lines.stride;
-  const T* position = lines.positions(n);
+  const int64_t C = lines.channels;
   const int32_t* owner = lines.owners(n);
   for (int64_t k = first; k < last; ++k) {
+    const T* pixel = lines.at(n, k / kLanes) + k % kLanes;
     T gain = 0;
-    for (int64_t c = 0; c < C; ++c) gain += (position[(1 + c) * stride + k] - reference[c]) * position[(1 + C + c) * stride + k];
-    if (gain > 0 && (!kOwn || owner[k] == id)) pull(gain, position[k] - lever.crossing, lever, pulls);
+    for (int64_t c = 0; c < C; ++c) gain += (pixel[(1 + c) * kLanes] - reference[c]) * pixel[(1 + C + c) * kLanes];
+    if (gain > 0 && (!kOwn || owner[k] == id)) pull(gain, pixel[0] - lever.crossing, lever, pulls);
   }
 }
 
@@ -157,19 +157,19 @@ void pull_one_by_one(const ColorLines<T>& lines, int64_t n, int64_t first, int64
 // moves out to it.
 template <bool kUp, int64_t kChannels, class T>
 NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, const T* reference, const Lever<T>& lever, T* pulls) {
-  const T* position = lines.positions(n);
-  const int64_t count = lines.count[n];
   // All offsets have the same sign, so the signs of both distances are constant.
   const T eps = kUp ? lever.eps : -lever.eps;
   const Lanes<T> crossing = splat(lever.crossing), factor_p = splat(lever.factor_p), factor_q = splat(lever.factor_q);
   const Lanes<T> eps_p = splat(lever.factor_p > 0 ? eps : -eps), eps_q = splat(lever.factor_q > 0 ? eps : -eps);
   Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
-  int64_t k = kUp ? count - kLanes : 0;  // from the border of the image inwards
+  const int64_t entry = kLanes * (1 + 2 * (kChannels ? kChannels : lines.channels));  // numbers of a block
+  const T *begin = lines.at(n, 0), *last = lines.at(n, (lines.count[n] - 1) / kLanes);
+  const T* block = kUp ? last : begin;  // from the border of the image inwards
   bool more;
   do {
-    const Lanes<T> offset = load_lanes<Lanes<T>>(position + k) - crossing;
+    const Lanes<T> offset = load_lanes<Lanes<T>>(block) - crossing;
     const LaneMask<T> beyond = kUp ? offset > splat(T(0)) : offset < splat(T(0));
-    const Lanes<T> gain = color_gains<kChannels>(position, lines.stride, lines.channels, k, reference);
+    const Lanes<T> gain = color_gains<kChannels>(block, lines.channels, reference);
     const LaneMask<T> acts = beyond & (gain > splat(T(0)));
     if (lane_bits(acts)) {
       // The quotients w / h_p and w / h_q share one division: w / (h_p h_q) times h_q and h_p.
@@ -178,8 +178,8 @@ NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, const T* ref
       pulls_p = pulls_p + share * h_q;
       pulls_q = pulls_q + share * h_p;
     }
-    more = kUp ? position[k] > lever.crossing : position[k + kLanes - 1] < lever.crossing;
-    k += kUp ? -kLanes : kLanes;
+    more = kUp ? block != begin && block[0] > lever.crossing : block != last && block[kLanes - 1] < lever.crossing;
+    block += kUp ? -entry : entry;
   } while (more);
   add_lane_sums<T>(pulls_p, pulls_q, pulls);
 }
@@ -188,18 +188,18 @@ NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, const T* ref
 template <int64_t kChannels, class T>
 NMR_INLINE void pull_own(const ColorLines<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id, const T* reference,
                          const Lever<T>& lever, T* pulls) {
-  const T* position = lines.positions(n);
   const int32_t* owner = lines.owners(n);
   Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
-  const Lanes32 end = splat(static_cast<int32_t>(last)), own = splat(id);
-  for (int64_t k = first; k < last; k += kLanes) {
+  const Lanes32 begin = splat(static_cast<int32_t>(first)), end = splat(static_cast<int32_t>(last)), own = splat(id);
+  for (int64_t k = first / kLanes * kLanes; k < last; k += kLanes) {
     const Lanes32 number = lane_numbers() + splat(static_cast<int32_t>(k));
-    const Lanes32 here = (number < end) & (load_lanes<Lanes32>(owner + k) == own);
+    const Lanes32 here = (number >= begin) & (number < end) & (load_lanes<Lanes32>(owner + k) == own);
     if (!lane_bits(here)) continue;
-    const Lanes<T> gain = color_gains<kChannels>(position, lines.stride, lines.channels, k, reference);
+    const T* block = lines.at(n, k / kLanes);
+    const Lanes<T> gain = color_gains<kChannels>(block, lines.channels, reference);
     const LaneMask<T> acts = widen_mask<T>(here) & (gain > splat(T(0)));
     if (!lane_bits(acts)) continue;
-    pull_lanes<T>(acts, gain, load_lanes<Lanes<T>>(position + k) - splat(lever.crossing), lever, pulls_p, pulls_q);
+    pull_lanes<T>(acts, gain, load_lanes<Lanes<T>>(block) - splat(lever.crossing), lever, pulls_p, pulls_q);
   }
   add_lane_sums<T>(pulls_p, pulls_q, pulls);
 }
