@@ -96,7 +96,7 @@ def test_fit_lit_vase(tmp_path):
 
 
 def test_find_camera(tmp_path):
-    before, after = run("find_camera", tmp_path, "--steps", "90", "--image-size", "64")
+    before, after = run("find_camera", tmp_path, "--steps", "120", "--image-size", "64")
     assert after < before / 20
     check_picture(imageio.imread(tmp_path / "find_camera.png"), 4 * 64, 4 * 64)
     check_movie(tmp_path / "find_camera.gif", 4 * 64, 2 * 64)

@@ -118,7 +118,7 @@ image.sum().backward()
 assert vertices.grad.any()
 print("torch._dynamo" in sys.modules)
 """
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    run = subprocess.run([sys.executable, "-I", "-c", program], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"
 
 
@@ -140,4 +140,4 @@ if child == 0:
     os._exit(0 if torch.equal(render(), wanted) else 1)
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 """
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+    subprocess.run([sys.executable, "-I", "-c", program], check=True, timeout=120)

@@ -306,7 +306,10 @@ def test_any_instruction_set_gives_the_same_bits():
     )
     outputs = [
         subprocess.run(
-            [sys.executable, "-c", code], check=True, capture_output=True, env={**os.environ, "NMR_CPU_LEVEL": level}
+            [sys.executable, "-I", "-c", code],
+            check=True,
+            capture_output=True,
+            env={**os.environ, "NMR_CPU_LEVEL": level},
         ).stdout
         for level in ("base", "")
     ]
@@ -327,7 +330,7 @@ def test_memory_of_large_images_is_given_back():
         "step(700); _C.free_scratch(); step(64)\n"
         "print(large - before, held() - before)"
     )
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-I", "-c", code], check=True, capture_output=True, text=True)
     grown, after = map(float, done.stdout.split())
     assert grown < 100 and after < 100, done.stdout  # MiB; the buffers of the large image take 500
 

@@ -205,7 +205,7 @@ def bench_first(options: Options) -> Result:
     about = settings(options.threads, repeats, batch=1)
 
     def run() -> Timing:
-        command = [sys.executable, "-c", FIRST_RENDER.format(threads=options.threads)]
+        command = [sys.executable, "-I", "-c", FIRST_RENDER.format(threads=options.threads)]
         forward, total = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
         return float(forward), float(total)
 
