@@ -142,7 +142,7 @@ def test_every_kind_of_colour_draws_its_own_image_and_reaches_what_is_learned(ki
 
 def test_the_first_render_is_one_in_a_fresh_process(command, capsys):
     command("first", "--repeats", 1, "--threads", 1)
-    total = float(capsys.readouterr().out.splitlines()[3].split()[-3])
+    total = float(capsys.readouterr().out.splitlines()[4].split()[-3])
     assert 0 < total < 5000
 
 
