@@ -7,7 +7,6 @@ from itertools import accumulate
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ._validate import cast_under_autocast, check_faces, check_vertices, describe
@@ -46,26 +45,6 @@ class MeshBatch(NamedTuple):
         if value_batch == 1:
             return 0
         return torch.arange(value_batch, device=self.faces.device).view(-1, 1, 1) * self.faces.shape[-2]
-
-    def spread(self, rows: Tensor) -> Tensor:
-        """Expands one row per image, ``[B | 1, C]``, to its faces: ``[B | 1, 1, C]``, packed ``[M | 1, C]``."""
-        if self.starts is None:
-            return rows.unsqueeze(1)
-        if len(rows) == 1:
-            return rows
-        image = torch.arange(self.batch, device=rows.device)
-        counts = torch.tensor(self.face_counts, device=rows.device)
-        return F.embedding(torch.repeat_interleave(image, counts, output_size=len(self.faces)), rows)
-
-    def corner_rows(self) -> Tensor:
-        """Rows of ``vertices.reshape(-1, 3)`` at the corners of all faces: int64 ``[B F | M, 3]``."""
-        device = self.faces.device
-        if self.starts is None:
-            first = torch.arange(self.batch, device=device) * self.vertices.shape[1]
-            return (self.faces + first.view(-1, 1, 1)).reshape(-1, 3)
-        counts = torch.tensor(self.face_counts, device=device)
-        first = torch.repeat_interleave(self.starts[:-1, 0].to(device), counts, output_size=len(self.faces))
-        return self.faces + first.unsqueeze(1)
 
     def values(self, values: Values, name: str, per: str | None = None) -> Tensor:
         """Values in the layout of these meshes, ``[B | 1, n, ...]`` or packed ``[sum of n_b, ...]``.
