@@ -65,10 +65,4 @@ struct ColorImage {
   const T* color(int64_t pixel) const { return background && owner[pixel] < 0 ? background : pixels + pixel * channels; }
 };
 
-// Memory of one task.
-template <class T>
-struct ColorScratch {
-  std::vector<T> grad_row;  // [C, W + pad] gradient of one row of the raster
-};
-
 }  // namespace nmr

@@ -381,7 +381,7 @@ def test_normals_point_towards_the_viewer_inside_rooms(kind, foreign, packed):
 
 
 def test_normals_of_any_mesh_are_numbers():
-    """Coordinates of every kind; also the gradients are numbers, of lights as of normals."""
+    """Huge, tiny and NaN coordinates: images, and the gradients of normals and lights, are never NaN."""
     g = torch.Generator().manual_seed(0)
     odd = torch.tensor(
         [0.0, 1.0, -1.0, 1e-45, 1e-38, 1e-30, 1e-20, 1e11, -1e11, 1e19, 1e30, 3e38, torch.inf, torch.nan]

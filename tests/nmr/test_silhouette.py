@@ -263,7 +263,7 @@ def test_any_mesh_through_any_camera(mesh, pose):
 
 
 def test_vertices_without_a_finite_image_get_no_gradient_and_spoil_nothing():
-    """In the plane of the eye, at the eye, not a number: without clipping, the other faces keep image and gradient."""
+    """A vertex in the plane of the eye, at the eye, or NaN: without clipping, other faces keep image and gradient."""
     vertices, faces = nmr.icosphere(1)
     bad = torch.tensor([[0.0, 1.0, -3.0], [0.0, 0.0, -3.0], [float("nan"), 0.0, 0.0]])
     eye = torch.tensor([0.0, 0.0, -3.0], requires_grad=True)
