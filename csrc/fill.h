@@ -67,6 +67,15 @@ NMR_INLINE Lanes<T> gather_values(const T* p, const int32_t* offset) {
   return load_lanes<Lanes<T>>(value);
 }
 
+NMR_INLINE int32_t least_lane(Lanes32 v) {
+  const LaneArray<int32_t, Lanes32> each(v);
+  return *std::min_element(each.lane, each.lane + kLanes);
+}
+NMR_INLINE int32_t most_lane(Lanes32 v) {
+  const LaneArray<int32_t, Lanes32> each(v);
+  return *std::max_element(each.lane, each.lane + kLanes);
+}
+
 // --- set-up
 
 // The first and the last of `size` pixels along one axis whose centres lie in [lo, hi]: a face covers no centre outside its bounding box.
@@ -152,6 +161,8 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
   const LaneMask<T> some_bounds = splat(near) >= zero;
   int64_t num_front = 0, num_back = 0;
   Lanes<T> front_sum = zero, back_sum = zero;
+  const Lanes32 most = splat(std::numeric_limits<int32_t>::max()), least = splat(int32_t(-1));
+  Lanes32 column_first = most, column_last = least, row_first = most, row_last = least;
   int32_t *front = table.front.data() + first, *back = table.back.data() + first;
 
   for (int64_t f = first; f < last; f += kLanes) {
@@ -210,6 +221,10 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
     store_lanes(block.column_last, i1);
     store_lanes(block.row_first, j0);
     store_lanes(block.row_last, j1);
+    column_first = min_of(column_first, i0);
+    column_last = max_of(column_last, i1);
+    row_first = min_of(row_first, j0);
+    row_last = max_of(row_last, j1);
 
     const uint32_t drawn = lane_bits(narrow_mask(usable) & (i0 <= i1) & (j0 <= j1)) & (0xffu >> (kLanes - lanes));
     const uint32_t front_bits = drawn & ~lane_bits(not_ccw);
@@ -229,6 +244,7 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
   }
   table.num_front[chunk] = static_cast<int32_t>(num_front);
   table.num_back[chunk] = static_cast<int32_t>(num_back);
+  table.boxes[chunk] = {least_lane(column_first), most_lane(column_last), least_lane(row_first), most_lane(row_last)};
 }
 
 // --- fill
@@ -338,15 +354,36 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
   }
 }
 
-// The least 1 / depth in each block of pixels.
+// The part of a band that faces can reach, in whole blocks of pixels. Columns and rows count from the band's first; the
+// last ones are excluded. The rest of the band stays background, and its memory is not touched.
+struct Window {
+  int64_t column_first, column_last, row_first, row_last;
+};
+
 template <class T>
-NMR_INLINE void bound_blocks(const Band<T>& band, int64_t blocks, T* block_least) {
+Window find_window(const FaceTable<T>& table, int64_t chunks, const Band<T>& band) {
+  PixelBox box{std::numeric_limits<int32_t>::max(), -1, std::numeric_limits<int32_t>::max(), -1};
+  for (int64_t c = 0; c < chunks; ++c) {
+    const PixelBox& part = table.boxes[c];
+    box = {std::min(box.column_first, part.column_first), std::max(box.column_last, part.column_last),
+           std::min(box.row_first, part.row_first), std::max(box.row_last, part.row_last)};
+  }
   const int64_t rows = band.row_last - band.row_first + 1;
-  for (int64_t j = 0; j < rows; j += kLanes)
-    for (int64_t n = 0; n < blocks; ++n) {
+  const int64_t first = std::max<int64_t>(box.row_first - band.row_first, 0);
+  const int64_t last = std::min<int64_t>(box.row_last - band.row_first, rows - 1);
+  if (first > last || box.column_first > box.column_last) return {0, 0, 0, 0};
+  return {box.column_first / kLanes * kLanes, (box.column_last / kLanes + 1) * kLanes, first / kLanes * kLanes,
+          std::min((last / kLanes + 1) * kLanes, rows)};
+}
+
+// The least 1 / depth in each block of pixels of the window.
+template <class T>
+NMR_INLINE void bound_blocks(const Band<T>& band, const Window& window, int64_t blocks, T* block_least) {
+  for (int64_t j = window.row_first; j < window.row_last; j += kLanes)
+    for (int64_t n = window.column_first / kLanes; n < window.column_last / kLanes; ++n) {
       const T* row = band.least + j * band.stride + n * kLanes;
       Lanes<T> least = load_lanes<Lanes<T>>(row);
-      for (int64_t r = j + 1; r < std::min(j + kLanes, rows); ++r) {
+      for (int64_t r = j + 1; r < std::min(j + kLanes, window.row_last); ++r) {
         row += band.stride;
         least = min_of(load_lanes<Lanes<T>>(row), least);
       }
@@ -370,7 +407,12 @@ NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& b
   const uint32_t n_first = static_cast<uint32_t>(block.column_first[lane]) / kSide;
   const uint32_t n_last = static_cast<uint32_t>(block.column_last[lane]) / kSide, last = static_cast<uint32_t>(j_last) / kSide;
   const T nearest = block.nearest[lane];
-  for (uint32_t j = static_cast<uint32_t>(j_first) / kSide; j <= last; ++j) {
+  const uint32_t first = static_cast<uint32_t>(j_first) / kSide;
+  if (last - first <= 1 && n_last - n_first <= 1) {  // most faces; the processor could not foresee when a loop ends
+    const T *low = block_least + first * blocks, *high = block_least + last * blocks;
+    return nearest < std::min(std::min(low[n_first], low[n_last]), std::min(high[n_first], high[n_last]));
+  }
+  for (uint32_t j = first; j <= last; ++j) {
     const T* least = block_least + j * blocks;
     for (uint32_t n = n_first; n <= n_last; ++n)
       if (!(nearest < least[n])) return false;
@@ -378,19 +420,23 @@ NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& b
   return true;
 }
 
-// Fills all faces into one band of rows, and copies it to the image's owner map.
+// Fills all faces into one band of rows, and copies what they can reach to the image's owner map.
 template <class T>
 void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* block_least, int32_t* owner) {
   const Band<T> band = args;  // a copy that no store of pixels can change
   const FaceTable<T>& table = *image.table;
   const int64_t rows = band.row_last - band.row_first + 1, H = band.raster.height, W = band.raster.width;
-  const int64_t pixels = rows * band.stride;
-  for (int64_t n = 0; n < pixels; n += kLanes) {
-    store_lanes(band.most + n, splat(-std::numeric_limits<T>::infinity()));
-    store_lanes(band.least + n, splat(-std::numeric_limits<T>::infinity()));
-    store_lanes(band.owner + n, splat(int32_t(-1)));
-  }
   const int64_t chunks = (image.num_faces + kChunk - 1) / kChunk;
+  const Window window = find_window(table, chunks, band);
+  const Lanes<T> nothing = splat(-std::numeric_limits<T>::infinity());
+  const Lanes32 background = splat(int32_t(-1));
+  for (int64_t j = window.row_first; j < window.row_last; ++j)
+    // One vector more, as a vector that starts in the last block may reach beyond it.
+    for (int64_t i = window.column_first; i <= window.column_last; i += kLanes) {
+      store_lanes(band.most + j * band.stride + i, nothing);
+      store_lanes(band.least + j * band.stride + i, nothing);
+      store_lanes(band.owner + j * band.stride + i, background);
+    }
   // Draw the nearer of the two lists first, so that most faces of the other one are hidden.
   T front_sum = 0, back_sum = 0;
   int64_t num_front = 0, num_back = 0;
@@ -403,7 +449,7 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
   const bool back_first = back_sum * static_cast<T>(num_front) > front_sum * static_cast<T>(num_back);
   for (int pass = 0; pass < 2; ++pass) {
     const bool reversed = (pass == 0) == back_first;
-    if (pass == 1) bound_blocks(band, blocks, block_least);
+    if (pass == 1) bound_blocks(band, window, blocks, block_least);
     for (int64_t c = 0; c < chunks; ++c) {
       const int32_t* list = (reversed ? table.back : table.front).data() + c * kChunk;
       const int32_t count = (reversed ? table.num_back : table.num_front)[c];
@@ -411,6 +457,15 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
         if (pass == 0 || !is_hidden(table, list[n], band, blocks, block_least)) fill_face(image, list[n], reversed, band);
     }
   }
-  for (int64_t j = 0; j < rows; ++j)
-    std::memcpy(owner + (H - 1 - band.row_first - j) * W, band.owner + j * band.stride, W * sizeof(int32_t));
+  const int64_t first = window.column_first, last = std::min(window.column_last, W);
+  for (int64_t j = 0; j < rows; ++j) {
+    int32_t* row = owner + (H - 1 - band.row_first - j) * W;
+    if (j < window.row_first || j >= window.row_last) {
+      std::fill_n(row, W, -1);
+      continue;
+    }
+    std::fill_n(row, first, -1);
+    std::memcpy(row + first, band.owner + j * band.stride + first, (last - first) * sizeof(int32_t));
+    std::fill_n(row + last, W - last, -1);
+  }
 }

@@ -33,12 +33,18 @@ struct FaceBlock {
   int32_t column_first[kTogether], column_last[kTogether], row_first[kTogether], row_last[kTogether];  // pixels inside the box
 };
 
+// Pixels from the first to the last column and row, inclusive.
+struct PixelBox {
+  int32_t column_first, column_last, row_first, row_last;
+};
+
 template <class T>
 struct FaceTable {
   std::vector<FaceBlock<T>> blocks;          // [faces / 8]
   std::vector<int32_t> front, back;          // per chunk: faces drawn in their own order, and reversed; ascending
   std::vector<int32_t> num_front, num_back;  // [chunks]
   std::vector<T> front_sum, back_sum;        // [chunks] sums of `nearest` over them
+  std::vector<PixelBox> boxes;               // [chunks] around the boxes of all their faces
 
   void reserve_faces(int64_t num_faces) {
     const size_t size = static_cast<size_t>(num_faces + 2 * kTogether);
@@ -46,6 +52,7 @@ struct FaceTable {
     for (std::vector<int32_t>* v : {&front, &back}) reserve(*v, size);
     for (std::vector<int32_t>* v : {&num_front, &num_back}) reserve(*v, size / kChunk + 1);
     for (std::vector<T>* v : {&front_sum, &back_sum}) reserve(*v, size / kChunk + 1);
+    reserve(boxes, size / kChunk + 1);
   }
 };
 
