@@ -117,6 +117,12 @@ struct FaceGradients {
   std::vector<int32_t> ids;  // [count] owner entries
   std::vector<T> values;     // [count, 3, 3] of the three corners' x, y, z
   int64_t count;
+
+  // Names the faces; there is memory for them.
+  NMR_INLINE void list(const int32_t* faces, int64_t number) {
+    count = number;
+    std::copy_n(faces, number, ids.data());
+  }
 };
 
 // Adds these gradients to the vertices of one image (faces [F, 3]).

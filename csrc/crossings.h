@@ -1,6 +1,8 @@
 // What the sweeps of silhouettes (sweep.h) and of colours (color_sweep.h) share: visible faces, the crossings of their
 // edges with the lines of an image, and the levers of edges. Part of a level file (levels.h).
 
+#include "visible.h"
+
 // Whether all values are finite.
 template <class T>
 bool all_finite(const T* values, int64_t count) {
@@ -10,32 +12,6 @@ bool all_finite(const T* values, int64_t count) {
   T zero = 0;
   for (; n < count; ++n) zero += values[n] * T(0);
   return zero == T(0) && lane_bits(zeros == splat(T(0))) == 0xff;
-}
-
-// --- the faces that own a pixel; all others have gradient 0
-
-// Writes their owner entries to ids, ascending, and returns their number. seen: [2 F + 1 + pad] of scratch.
-int64_t find_visible(const int32_t* owner, int64_t pixels, int64_t num_faces, uint8_t* seen, int32_t* ids) {
-  const int64_t entries = 2 * num_faces + 1;  // entry 0 is the background
-  std::memset(seen, 0, entries + kPad);
-  int64_t n = 0;
-  for (; n + kLanes <= pixels; n += kLanes) {
-    if (!lane_bits(load_lanes<Lanes32>(owner + n) >= splat(int32_t(0)))) continue;
-    for (int64_t k = 0; k < kLanes; ++k) seen[owner[n + k] + 1] = 1;
-  }
-  for (; n < pixels; ++n) seen[owner[n] + 1] = 1;
-  seen[0] = 0;
-  int64_t count = 0;
-  for (int64_t e = 0; e < entries; e += 8) {
-    uint64_t any;
-    std::memcpy(&any, seen + e, sizeof any);
-    if (!any) continue;
-    for (int64_t k = e; k < e + 8; ++k) {
-      ids[count] = static_cast<int32_t>(k - 1);
-      count += seen[k];
-    }
-  }
-  return count;
 }
 
 // --- how an edge follows a pull

@@ -20,42 +20,6 @@ NMR_INLINE M without(M a, M b) {
 #endif
 }
 
-// a < b ? a : b and a > b ? a : b, as one instruction where there is one.
-template <class V>
-NMR_INLINE V min_of(V a, V b) {
-#if defined(__AVX2__) || NMR_AVX2
-  if constexpr (std::is_same_v<V, Lanes<float>>) return (V)_mm256_min_ps((__m256)a, (__m256)b);
-  if constexpr (std::is_same_v<V, Lanes32>) return (V)_mm256_min_epi32((__m256i)a, (__m256i)b);
-#endif
-  return select(a < b, a, b);
-}
-template <class V>
-NMR_INLINE V max_of(V a, V b) {
-#if defined(__AVX2__) || NMR_AVX2
-  if constexpr (std::is_same_v<V, Lanes<float>>) return (V)_mm256_max_ps((__m256)a, (__m256)b);
-  if constexpr (std::is_same_v<V, Lanes32>) return (V)_mm256_max_epi32((__m256i)a, (__m256i)b);
-#endif
-  return select(a > b, a, b);
-}
-
-// select(), which the compiler precedes by a comparison of the mask with 0.
-template <class M, class V>
-NMR_INLINE V choose(M mask, V yes, V no) {
-#if defined(__AVX2__) || NMR_AVX2
-  if constexpr (sizeof(V) == 32 && !IsHalves<V>::value && sizeof(M) == 32)
-    return (V)_mm256_blendv_ps((__m256)no, (__m256)yes, (__m256)mask);
-#endif
-  return select(mask, yes, no);
-}
-template <class T>
-NMR_INLINE Lanes<T> absolute(Lanes<T> x) {
-  return max_of(x, splat(T(0)) - x);
-}
-template <class T>
-NMR_INLINE Lanes<T> pixel_coordinates(Lanes<T> x, Lanes<T> size) {  // to_pixel of geometry.h
-  return (x * size + size - splat(T(1))) / splat(T(2));
-}
-
 // p[offset[0]], ..., p[offset[7]]
 template <class T>
 NMR_INLINE Lanes<T> gather_values(const T* p, const int32_t* offset) {

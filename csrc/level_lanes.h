@@ -177,6 +177,46 @@ NMR_INLINE V keep(M mask, V v) {
 #endif
 }
 
+// a < b ? a : b and a > b ? a : b, as one instruction where there is one.
+template <class V>
+NMR_INLINE V min_of(V a, V b) {
+#if defined(__AVX2__) || NMR_AVX2
+  if constexpr (std::is_same_v<V, Lanes<float>>) return (V)_mm256_min_ps((__m256)a, (__m256)b);
+  if constexpr (std::is_same_v<V, Lanes32>) return (V)_mm256_min_epi32((__m256i)a, (__m256i)b);
+#endif
+  return select(a < b, a, b);
+}
+template <class V>
+NMR_INLINE V max_of(V a, V b) {
+#if defined(__AVX2__) || NMR_AVX2
+  if constexpr (std::is_same_v<V, Lanes<float>>) return (V)_mm256_max_ps((__m256)a, (__m256)b);
+  if constexpr (std::is_same_v<V, Lanes32>) return (V)_mm256_max_epi32((__m256i)a, (__m256i)b);
+#endif
+  return select(a > b, a, b);
+}
+
+// select(), which the compiler precedes by a comparison of the mask with 0.
+template <class M, class V>
+NMR_INLINE V choose(M mask, V yes, V no) {
+#if defined(__AVX2__) || NMR_AVX2
+  if constexpr (sizeof(V) == 32 && !IsHalves<V>::value && sizeof(M) == 32)
+    return (V)_mm256_blendv_ps((__m256)no, (__m256)yes, (__m256)mask);
+#endif
+  return select(mask, yes, no);
+}
+
+// |x|
+template <class T>
+NMR_INLINE Lanes<T> absolute(Lanes<T> x) {
+  return max_of(x, splat(T(0)) - x);
+}
+
+// to_pixel of geometry.h
+template <class T>
+NMR_INLINE Lanes<T> pixel_coordinates(Lanes<T> x, Lanes<T> size) {
+  return (x * size + size - splat(T(1))) / splat(T(2));
+}
+
 // Each lane converted to the element type of `To`; to integers truncated, and then every lane must be in range. Halves
 // on one side only come from element types of different size.
 template <class To, class V>
@@ -308,6 +348,115 @@ NMR_INLINE Lanes<T> floor_lanes(Lanes<T> x) {
 #endif
   const Lanes<T> rounded = to_values<T>(truncate(x));
   return select(rounded > x, rounded - splat(T(1)), rounded);
+}
+
+#if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)
+// Swaps rows and columns of four values, in each group of four lanes.
+NMR_INLINE void transpose_quads(__m128 (&q)[4]) { _MM_TRANSPOSE4_PS(q[0], q[1], q[2], q[3]); }
+#if defined(__AVX2__) || NMR_AVX2
+NMR_INLINE void transpose_quads(__m256 (&q)[4]) {
+  const __m256 a = _mm256_unpacklo_ps(q[0], q[1]), b = _mm256_unpackhi_ps(q[0], q[1]);
+  const __m256 c = _mm256_unpacklo_ps(q[2], q[3]), d = _mm256_unpackhi_ps(q[2], q[3]);
+  q[0] = _mm256_shuffle_ps(a, c, 0x44), q[1] = _mm256_shuffle_ps(a, c, 0xee);
+  q[2] = _mm256_shuffle_ps(b, d, 0x44), q[3] = _mm256_shuffle_ps(b, d, 0xee);
+}
+NMR_INLINE void transpose_quads(__m256d (&q)[4]) {
+  const __m256d a = _mm256_unpacklo_pd(q[0], q[1]), b = _mm256_unpackhi_pd(q[0], q[1]);
+  const __m256d c = _mm256_unpacklo_pd(q[2], q[3]), d = _mm256_unpackhi_pd(q[2], q[3]);
+  q[0] = _mm256_permute2f128_pd(a, c, 0x20), q[1] = _mm256_permute2f128_pd(b, d, 0x20);
+  q[2] = _mm256_permute2f128_pd(a, c, 0x31), q[3] = _mm256_permute2f128_pd(b, d, 0x31);
+}
+#endif
+#endif
+
+// Four numbers per lane: column[c] gets row[k][c] in lane k.
+template <class T>
+NMR_INLINE void load_quads(const T* const (&row)[kLanes], Lanes<T> (&column)[4]) {
+#if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)
+  if constexpr (std::is_same_v<T, float>) {
+#if defined(__AVX2__) || NMR_AVX2
+    __m256 q[4];
+    for (int k = 0; k < 4; ++k)
+      q[k] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(row[k])), _mm_loadu_ps(row[k + 4]), 1);
+    transpose_quads(q);
+    for (int c = 0; c < 4; ++c) column[c] = (Lanes<T>)q[c];
+#else
+    __m128 low[4], high[4];
+    for (int k = 0; k < 4; ++k) low[k] = _mm_loadu_ps(row[k]), high[k] = _mm_loadu_ps(row[k + 4]);
+    transpose_quads(low);
+    transpose_quads(high);
+    for (int c = 0; c < 4; ++c) {
+      const __m128 halves[2] = {low[c], high[c]};
+      std::memcpy(&column[c], halves, sizeof halves);
+    }
+#endif
+    return;
+  }
+#if defined(__AVX2__) || NMR_AVX2
+  if constexpr (std::is_same_v<T, double>) {
+    __m256d low[4], high[4];
+    for (int k = 0; k < 4; ++k) low[k] = _mm256_loadu_pd(row[k]), high[k] = _mm256_loadu_pd(row[k + 4]);
+    transpose_quads(low);
+    transpose_quads(high);
+    for (int c = 0; c < 4; ++c) {
+      const __m256d halves[2] = {low[c], high[c]};
+      std::memcpy(&column[c], halves, sizeof halves);
+    }
+    return;
+  }
+#endif
+#endif
+  T value[4][kLanes];
+  for (int64_t k = 0; k < kLanes; ++k)
+    for (int c = 0; c < 4; ++c) value[c][k] = row[k][c];
+  for (int c = 0; c < 4; ++c) column[c] = load_lanes<Lanes<T>>(value[c]);
+}
+
+// The other way round: row k of rows, [8, 4], gets lane k of the columns.
+template <class T>
+NMR_INLINE void store_quads(const Lanes<T> (&column)[4], T (&rows)[kLanes][4]) {
+#if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)
+  if constexpr (std::is_same_v<T, float>) {
+#if defined(__AVX2__) || NMR_AVX2
+    __m256 q[4];
+    for (int c = 0; c < 4; ++c) q[c] = (__m256)column[c];
+    transpose_quads(q);
+    for (int k = 0; k < 4; ++k) {
+      _mm_storeu_ps(rows[k], _mm256_castps256_ps128(q[k]));
+      _mm_storeu_ps(rows[k + 4], _mm256_extractf128_ps(q[k], 1));
+    }
+#else
+    __m128 low[4], high[4];
+    for (int c = 0; c < 4; ++c) {
+      __m128 halves[2];
+      std::memcpy(halves, &column[c], sizeof halves);
+      low[c] = halves[0], high[c] = halves[1];
+    }
+    transpose_quads(low);
+    transpose_quads(high);
+    for (int k = 0; k < 4; ++k) _mm_storeu_ps(rows[k], low[k]), _mm_storeu_ps(rows[k + 4], high[k]);
+#endif
+    return;
+  }
+#if defined(__AVX2__) || NMR_AVX2
+  if constexpr (std::is_same_v<T, double>) {
+    __m256d low[4], high[4];
+    for (int c = 0; c < 4; ++c) {
+      __m256d halves[2];
+      std::memcpy(halves, &column[c], sizeof halves);
+      low[c] = halves[0], high[c] = halves[1];
+    }
+    transpose_quads(low);
+    transpose_quads(high);
+    for (int k = 0; k < 4; ++k) _mm256_storeu_pd(rows[k], low[k]), _mm256_storeu_pd(rows[k + 4], high[k]);
+    return;
+  }
+#endif
+#endif
+  T value[4][kLanes];
+  for (int c = 0; c < 4; ++c) store_lanes(value[c], column[c]);
+  for (int64_t k = 0; k < kLanes; ++k)
+    for (int c = 0; c < 4; ++c) rows[k][c] = value[c][k];
 }
 
 // Lanes of a vector as an array, for code that treats them one by one.

@@ -1,0 +1,339 @@
+// The inner loops of fragments and depth images; included by levels.h for every instruction set. See fragments.cpp.
+
+#include "visible.h"
+
+// --- the faces of a block
+
+// Numbers the block's visible faces and fills in the table. Entry 0, of the background, has weights (1, 0, 0) and depth 1.
+template <class T>
+NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& scratch) {
+  const int64_t W = block.raster.width, F = block.num_faces;
+  int32_t *ids = scratch.ids.data(), *slots = scratch.slots.data() + 1;
+  scratch.count = find_visible(block.owner + block.first * W, (block.last - block.first) * W, F, scratch.seen.data(), ids);
+  slots[-1] = 0;
+  T* table = scratch.table.data();
+  for (int64_t n = 0; n < kEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);
+  const Lanes<T> width = splat(static_cast<T>(W)), height = splat(static_cast<T>(block.raster.height));
+  for (int64_t start = 0; start < scratch.count; start += kLanes) {
+    const int64_t last = scratch.count - 1;
+    T corner[3][3][kLanes];  // x, y, z of the corners
+    for (int64_t n = 0; n < kLanes; ++n) {
+      const int64_t at = std::min(start + n, last);  // the last face fills the vector
+      const int32_t id = ids[at];
+      slots[id] = static_cast<int32_t>(at + 1);
+      const bool reversed = id >= F;
+      const int64_t* face = block.faces + 3 * (reversed ? id - F : id);
+      for (int k = 0; k < 3; ++k)
+        for (int c = 0; c < 3; ++c) corner[c][k][n] = block.vertices[3 * face[reversed ? 2 - k : k] + c];
+    }
+    Lanes<T> X[3], Y[3];
+    for (int k = 0; k < 3; ++k) {
+      X[k] = pixel_coordinates<T>(load_lanes<Lanes<T>>(corner[0][k]), width);
+      Y[k] = pixel_coordinates<T>(load_lanes<Lanes<T>>(corner[1][k]), height);
+    }
+    // barycentric_matrix of geometry.h
+    const Lanes<T> det = X[2] * (Y[0] - Y[1]) + X[0] * (Y[1] - Y[2]) + X[1] * (Y[2] - Y[0]);
+    Lanes<T> column[4][4];  // [quad of the entry][k]
+    for (int k = 0; k < 3; ++k) {
+      const int p = (k + 1) % 3, q = (k + 2) % 3;
+      column[0][k] = (Y[p] - Y[q]) / det;
+      column[1][k] = (X[q] - X[p]) / det;
+      column[2][k] = (X[p] * Y[q] - X[q] * Y[p]) / det;
+      column[3][k] = load_lanes<Lanes<T>>(corner[2][k]);
+    }
+    for (int quad = 0; quad < 4; ++quad) {
+      column[quad][3] = splat(quad < 3 ? T(0) : T(1));
+      T rows[kLanes][4];
+      store_quads<T>(column[quad], rows);
+      for (int64_t n = 0; n < kLanes; ++n) std::copy_n(rows[n], 4, table + (start + 1 + n) * kEntry + 4 * quad);
+    }
+  }
+}
+
+// --- eight pixels
+
+template <class T>
+struct FragmentPixels {
+  Lanes<T> w[3];         // normalised weights
+  Lanes<T> corner_z[3];  // depths of the corners
+  Lanes<T> z;            // depth
+  int64_t slot[kLanes];
+};
+
+// The owners of the pixels [i, i + 8) of a row of the raster; background beyond its end.
+NMR_INLINE Lanes32 load_owners(const int32_t* row, int64_t i, int64_t width) {
+  if (i + kLanes <= width) return load_lanes<Lanes32>(row + i);
+  int32_t rest[kLanes];
+  for (int64_t n = 0; n < kLanes; ++n) rest[n] = i + n < width ? row[i + n] : -1;
+  return load_lanes<Lanes32>(rest);
+}
+
+// Weights and depths of the pixels [i, i + 8) with these owners, in the row of pixel coordinate y.
+template <class T>
+NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32 owners, int64_t i, Lanes<T> y) {
+  FragmentPixels<T> p;
+  const LaneArray<int32_t, Lanes32> slots(gather_lanes(scratch.slots.data() + 1, owners));
+  const T* entry[kLanes];
+  for (int64_t n = 0; n < kLanes; ++n) {
+    p.slot[n] = slots.lane[n];
+    entry[n] = scratch.table.data() + p.slot[n] * kEntry;
+  }
+  Lanes<T> column[4][4];
+  for (int quad = 0; quad < 4; ++quad) {
+    load_quads<T>(entry, column[quad]);
+    for (int64_t n = 0; n < kLanes; ++n) entry[n] += 4;
+  }
+  const Lanes<T> x = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i))), zero = splat(T(0)), one = splat(T(1));
+  Lanes<T> raw[3];
+  for (int k = 0; k < 3; ++k)  // clamp_weight of geometry.h
+    raw[k] = min_of(max_of(column[0][k] * x + column[1][k] * y + column[2][k], zero), one);
+  const Lanes<T> sum = raw[0] + raw[1] + raw[2];
+  for (int k = 0; k < 3; ++k) {
+    p.w[k] = raw[k] / sum;
+    p.corner_z[k] = column[3][k];
+  }
+  p.z = one / (p.w[0] / p.corner_z[0] + p.w[1] / p.corner_z[1] + p.w[2] / p.corner_z[2]);
+  return p;
+}
+
+// Calls visit(i, owners, y) for every eight pixels [i, i + 8) of row j (from the top) with a covered one among them, and
+// background(i) for the others.
+template <class T, class Visit, class Background>
+NMR_INLINE void for_covered(const FragmentBlock<T>& block, int64_t j, const Visit& visit, const Background& background) {
+  const int64_t W = block.raster.width;
+  const Lanes<T> y = splat(static_cast<T>(block.raster.height - 1 - j));
+  for (int64_t i = 0; i < W; i += kLanes) {
+    const Lanes32 owners = load_owners(block.owner + j * W, i, W);
+    if (lane_bits(owners >= splat(int32_t(0))))
+      visit(i, owners, y);
+    else
+      background(i);
+  }
+}
+
+// Depths of row j; out has room for eight more.
+template <class T>
+NMR_INLINE void depth_row(const FragmentBlock<T>& block, int64_t j, Lanes<T> far, const FragmentScratch<T>& scratch, T* out) {
+  for_covered(
+      block, j,
+      [&](int64_t i, Lanes32 owners, Lanes<T> y) {
+        const FragmentPixels<T> p = evaluate<T>(scratch, owners, i, y);
+        store_lanes(out + i, choose(widen_mask<T>(owners >= splat(int32_t(0))), p.z, far));
+      },
+      [&](int64_t i) { store_lanes(out + i, far); });
+}
+
+// --- forward
+
+// Fills the block's rows of a depth image.
+template <class T>
+void depth_forward_block(const DepthImage<T>& args, const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch) {
+  const int64_t W = block.raster.width, w = args.image.width;
+  set_up_faces(block, scratch);
+  T* image = args.depth + b * args.image.pixels();
+  T *upper = scratch.rows.data(), *lower = upper + W + kLanes;
+  const Lanes<T> far = splat(args.far);
+  if (!args.anti_aliasing) {
+    for (int64_t j = block.first; j < block.last; ++j) {
+      depth_row(block, j, far, scratch, upper);
+      std::copy_n(upper, w, image + j * w);
+    }
+    return;
+  }
+  for (int64_t j = block.first; j < block.last; j += 2) {
+    depth_row(block, j, far, scratch, upper);
+    depth_row(block, j + 1, far, scratch, lower);
+    T* mean = image + j / 2 * w;
+    for (int64_t i = 0; i < w; ++i)
+      mean[i] = (upper[2 * i] + upper[2 * i + 1] + lower[2 * i] + lower[2 * i + 1]) / 4;
+  }
+}
+
+// Fills the block's rows of weights and depths.
+template <class T>
+void fragments_forward_block(const Fragments<T>& args, const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch) {
+  const int64_t W = block.raster.width;
+  set_up_faces(block, scratch);
+  const Lanes<T> far = splat(args.far), zero = splat(T(0));
+  for (int64_t j = block.first; j < block.last; ++j) {
+    T* depth = args.depth + b * block.raster.pixels() + j * W;
+    T* weights = args.weights + 3 * (b * block.raster.pixels() + j * W);
+    for_covered(
+        block, j,
+        [&](int64_t i, Lanes32 owners, Lanes<T> y) {
+          const FragmentPixels<T> p = evaluate<T>(scratch, owners, i, y);
+          const LaneMask<T> drawn = widen_mask<T>(owners >= splat(int32_t(0)));
+          const LaneMask<T> reversed = widen_mask<T>(owners >= splat(static_cast<int32_t>(block.num_faces)));
+          Lanes<T> at[3];
+          for (int k = 0; k < 3; ++k) at[k] = choose(drawn, p.w[k] * p.z / p.corner_z[k], zero);
+          T value[3][kLanes], z[kLanes];
+          store_lanes(z, choose(drawn, p.z, far));
+          store_lanes(value[0], choose(reversed, at[2], at[0]));
+          store_lanes(value[1], at[1]);
+          store_lanes(value[2], choose(reversed, at[0], at[2]));
+          const int64_t count = std::min(kLanes, W - i);
+          std::copy_n(z, count, depth + i);
+          for (int64_t n = 0; n < count; ++n)
+            for (int k = 0; k < 3; ++k) weights[3 * (i + n) + k] = value[k][n];
+        },
+        [&](int64_t i) {
+          const int64_t count = std::min(kLanes, W - i);
+          std::fill_n(depth + i, count, args.far);
+          std::fill_n(weights + 3 * i, 3 * count, T(0));
+        });
+  }
+}
+
+// --- backward
+
+// Values close to an overflow count as 0: a corner in the plane of the eye gets no gradient, and does not change others.
+template <class T>
+NMR_INLINE Lanes<T> moderate_or_zero(Lanes<T> value) {
+  return keep(absolute<T>(value) < splat(std::sqrt(std::numeric_limits<T>::max())), value);
+}
+
+// A depth whose square is a factor of a gradient: 0 beyond the depth up to which sums of squares cannot overflow.
+template <class T>
+NMR_INLINE Lanes<T> depth_or_zero(Lanes<T> z) {
+  return keep(absolute<T>(z) < splat(sizeof(T) == sizeof(double) ? T(1e100) : T(1e15)), z);
+}
+
+// Adds four numbers per pixel to those of its face: lane k of the columns to sums[stride slot[k] + 0 .. 3].
+template <class T>
+NMR_INLINE void add_quads(const Lanes<T> (&column)[4], const int64_t (&slot)[kLanes], int64_t stride, T* sums) {
+  T term[kLanes][4];
+  store_quads<T>(column, term);
+  for (int64_t n = 0; n < kLanes; ++n) {
+    T* sum = sums + stride * slot[n];
+    T total[4];
+    for (int c = 0; c < 4; ++c) total[c] = sum[c] + term[n][c];
+    std::copy_n(total, 4, sum);
+  }
+}
+
+// Columns of the numbers of the faces [slot, slot + 8) in an array with `stride` numbers per face.
+template <class T>
+NMR_INLINE void load_face_quads(const T* values, int64_t slot, int64_t stride, Lanes<T> (&column)[4]) {
+  const T* row[kLanes];
+  for (int64_t n = 0; n < kLanes; ++n) row[n] = values + (slot + n) * stride;
+  load_quads<T>(row, column);
+}
+
+// Writes the gradients of the faces [slot, slot + 8): grad[3 k + c] of coordinate c of corner k.
+template <class T>
+NMR_INLINE void store_face_gradients(const Lanes<T> (&grad)[9], int64_t slot, FaceGradients<T>& result) {
+  T value[9][kLanes];
+  for (int c = 0; c < 9; ++c) store_lanes(value[c], grad[c]);
+  T* out = result.values.data() + 9 * (slot - 1);
+  const int64_t count = std::min(kLanes, result.count - (slot - 1));
+  for (int64_t n = 0; n < count; ++n, out += 9)
+    for (int c = 0; c < 9; ++c) out[c] = value[c][n];
+}
+
+// With c = g z^2 of each pixel, S_k = sum over pixels of c w_k:  grad z_k = S_k / z_k^2,  grad X_k = S_k sum_m M_m0 / z_m.
+template <class T>
+void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch,
+                          FaceGradients<T>& result) {
+  const int64_t W = block.raster.width, w = args.image.width;
+  set_up_faces(block, scratch);
+  result.list(scratch.ids.data(), scratch.count);
+  T *grad = scratch.rows.data(), *sums = scratch.sums.data();
+  const Lanes<T> zero = splat(T(0)), one = splat(T(1));
+  std::fill_n(sums, 4 * (scratch.count + 1 + kLanes), T(0));
+  std::fill_n(grad + W, kLanes, T(0));
+  for (int64_t j = block.first; j < block.last; ++j) {
+    const T* upstream = args.grad_depth + b * args.image.pixels() + (args.anti_aliasing ? j / 2 : j) * w;
+    if (!args.anti_aliasing) {
+      std::copy_n(upstream, w, grad);
+    } else if (j % 2 == 0) {  // blocks begin with an even row
+      for (int64_t i = 0; i < w; ++i) grad[2 * i] = grad[2 * i + 1] = upstream[i] / 4;
+    }
+    for_covered(
+        block, j,
+        [&](int64_t i, Lanes32 owners, Lanes<T> y) {
+          const FragmentPixels<T> p = evaluate<T>(scratch, owners, i, y);
+          const Lanes<T> z = depth_or_zero<T>(p.z), c = load_lanes<Lanes<T>>(grad + i) * z * z;
+          add_quads<T>({c * p.w[0], c * p.w[1], c * p.w[2], zero}, p.slot, 4, sums);
+        },
+        [](int64_t) {});
+  }
+  const Lanes<T> half_width = splat(static_cast<T>(W) / 2), half_height = splat(static_cast<T>(block.raster.height) / 2);
+  for (int64_t slot = 1; slot <= scratch.count; slot += kLanes) {
+    Lanes<T> sum[4], mx[4], my[4], z[4], out[9];
+    const T* table = scratch.table.data();
+    load_face_quads<T>(sums, slot, 4, sum);
+    load_face_quads<T>(table, slot, kEntry, mx);
+    load_face_quads<T>(table + 4, slot, kEntry, my);
+    load_face_quads<T>(table + 12, slot, kEntry, z);
+    const Lanes<T> slope_x = moderate_or_zero<T>(mx[0] / z[0] + mx[1] / z[1] + mx[2] / z[2]) * half_width;
+    const Lanes<T> slope_y = moderate_or_zero<T>(my[0] / z[0] + my[1] / z[1] + my[2] / z[2]) * half_height;
+    for (int k = 0; k < 3; ++k) {
+      out[3 * k] = sum[k] * slope_x;
+      out[3 * k + 1] = sum[k] * slope_y;
+      out[3 * k + 2] = sum[k] * moderate_or_zero<T>(one / (z[k] * z[k]));
+    }
+    store_face_gradients<T>(out, slot, result);
+  }
+}
+
+// With u_m = dL/db_m, g = dL/dz and h_m = z (u_m - sum_k u_k b_k) - g z^2:  dL = sum_m h_m d(w_m / z_m), so that
+// grad z_m = -H_mm / z_m^2 and grad X_k = -sum_m H_mk M_m0 / z_m with H_mk = sum over pixels of h_m w_k.
+template <class T>
+void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch,
+                              FaceGradients<T>& result) {
+  const int64_t W = block.raster.width;
+  set_up_faces(block, scratch);
+  result.list(scratch.ids.data(), scratch.count);
+  T* sums = scratch.sums.data();
+  const Lanes<T> zero = splat(T(0)), one = splat(T(1));
+  std::fill_n(sums, 12 * (scratch.count + 1 + kLanes), T(0));
+  for (int64_t j = block.first; j < block.last; ++j) {
+    const int64_t row = b * block.raster.pixels() + j * W;
+    for_covered(
+        block, j,
+        [&](int64_t i, Lanes32 owners, Lanes<T> y) {
+          const FragmentPixels<T> p = evaluate<T>(scratch, owners, i, y);
+          const int64_t count = std::min(kLanes, W - i);
+          Lanes<T> h[3] = {zero, zero, zero};
+          if (args.grad_depth) {
+            T grad[kLanes] = {};
+            std::copy_n(args.grad_depth + row + i, count, grad);
+            const Lanes<T> deep = depth_or_zero<T>(p.z);
+            h[0] = h[1] = h[2] = (zero - load_lanes<Lanes<T>>(grad)) * deep * deep;
+          }
+          if (args.grad_weights) {
+            T grad[3][kLanes] = {};
+            for (int64_t n = 0; n < count; ++n)
+              for (int m = 0; m < 3; ++m) grad[m][n] = args.grad_weights[3 * (row + i + n) + m];
+            const LaneMask<T> reversed = widen_mask<T>(owners >= splat(static_cast<int32_t>(block.num_faces)));
+            const Lanes<T> first = load_lanes<Lanes<T>>(grad[0]), last = load_lanes<Lanes<T>>(grad[2]);
+            const Lanes<T> u[3] = {choose(reversed, last, first), load_lanes<Lanes<T>>(grad[1]), choose(reversed, first, last)};
+            Lanes<T> mean = zero;
+            for (int m = 0; m < 3; ++m) mean = mean + u[m] * (p.w[m] * p.z / p.corner_z[m]);
+            for (int m = 0; m < 3; ++m) h[m] = h[m] + p.z * (u[m] - mean);
+          }
+          for (int m = 0; m < 3; ++m)
+            add_quads<T>({h[m] * p.w[0], h[m] * p.w[1], h[m] * p.w[2], zero}, p.slot, 12, sums + 4 * m);
+        },
+        [](int64_t) {});
+  }
+  const Lanes<T> half_width = splat(static_cast<T>(W) / 2), half_height = splat(static_cast<T>(block.raster.height) / 2);
+  for (int64_t slot = 1; slot <= scratch.count; slot += kLanes) {
+    Lanes<T> sum[3][4], mx[4], my[4], z[4], slope_x[3], slope_y[3], out[9];
+    const T* table = scratch.table.data();
+    for (int m = 0; m < 3; ++m) load_face_quads<T>(sums + 4 * m, slot, 12, sum[m]);
+    load_face_quads<T>(table, slot, kEntry, mx);
+    load_face_quads<T>(table + 4, slot, kEntry, my);
+    load_face_quads<T>(table + 12, slot, kEntry, z);
+    for (int m = 0; m < 3; ++m) {
+      slope_x[m] = moderate_or_zero<T>(mx[m] / z[m]) * half_width;
+      slope_y[m] = moderate_or_zero<T>(my[m] / z[m]) * half_height;
+    }
+    for (int k = 0; k < 3; ++k) {
+      out[3 * k] = zero - (sum[0][k] * slope_x[0] + sum[1][k] * slope_x[1] + sum[2][k] * slope_x[2]);
+      out[3 * k + 1] = zero - (sum[0][k] * slope_y[0] + sum[1][k] * slope_y[1] + sum[2][k] * slope_y[2]);
+      out[3 * k + 2] = (zero - sum[k][k]) * moderate_or_zero<T>(one / (z[k] * z[k]));
+    }
+    store_face_gradients<T>(out, slot, result);
+  }
+}

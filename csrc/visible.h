@@ -1,0 +1,26 @@
+// The faces that own a pixel; all others have gradient 0. Part of a level file (levels.h).
+
+// Writes their owner entries to ids, ascending, and returns their number; ids has room for kLanes more. seen: [2 F + 1 +
+// kLanes] of scratch.
+int64_t find_visible(const int32_t* owner, int64_t pixels, int64_t num_faces, uint8_t* seen, int32_t* ids) {
+  const int64_t entries = 2 * num_faces + 1;  // entry 0 is the background
+  std::memset(seen, 0, entries + kLanes);
+  int64_t n = 0;
+  for (; n + kLanes <= pixels; n += kLanes) {
+    if (!lane_bits(load_lanes<Lanes32>(owner + n) >= splat(int32_t(0)))) continue;
+    for (int64_t k = 0; k < kLanes; ++k) seen[owner[n + k] + 1] = 1;
+  }
+  for (; n < pixels; ++n) seen[owner[n] + 1] = 1;
+  seen[0] = 0;
+  int64_t count = 0;
+  for (int64_t e = 0; e < entries; e += 8) {
+    uint64_t any;
+    std::memcpy(&any, seen + e, sizeof any);
+    if (!any) continue;
+    for (int64_t k = e; k < e + 8; ++k) {
+      ids[count] = static_cast<int32_t>(k - 1);
+      count += seen[k];
+    }
+  }
+  return count;
+}
