@@ -19,21 +19,23 @@ struct ColorLines {
   std::vector<T> values;
   std::vector<int32_t> owner;     // [N, blocks, 8]
   std::vector<int32_t> count;     // [N] number of listed pixels
-  std::vector<uint64_t> listed;   // [N, words] bit m: pixel m is listed
-  std::vector<int32_t> before;    // [N, words] number of listed pixels before each word
+  // Number of listed pixels of line n before pixel m, for m up to M: before[n * step_n + m * step_m].
+  std::vector<int32_t> before;
   std::vector<T> pull_end[2];     // [N + pad] by direction: a crossing before this has a listed pixel beyond its outer one
   std::vector<T> gain_start[2];   // [N + pad] by direction: a crossing before this has no listed pixel of a face inside
-  int64_t stride, words, channels;  // stride: 8 blocks
+  int64_t stride, channels;       // stride: 8 blocks
+  int64_t step_n, step_m;         // of before
 
-  void reserve_lines(int64_t N, int64_t M, int64_t C) {
+  // axis 0: columns, whose numbers lie side by side; 1: rows, each with room for eight numbers from any pixel on.
+  void reserve_lines(int axis, int64_t N, int64_t M, int64_t C) {
     stride = (M + kPad - 1) / kPad * kPad + kPad;
-    words = (M + 63) / 64;
     channels = C;
+    step_n = axis == 0 ? 1 : stride;
+    step_m = axis == 0 ? N : 1;
     reserve(values, N * (1 + 2 * C) * stride);
     reserve(owner, N * stride);
     reserve(count, N);
-    reserve(listed, N * words);
-    reserve(before, N * words);
+    reserve(before, axis == 0 ? N * (M + 1) : N * stride);
     for (std::vector<T>* v : {&pull_end[0], &pull_end[1], &gain_start[0], &gain_start[1]}) reserve(*v, N + kPad);
   }
   // Block `block` of line n: eight positions, then as many of each colour and of each gradient.

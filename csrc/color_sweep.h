@@ -26,7 +26,6 @@ template <class T>
 NMR_INLINE void start_color_lines(ColorLines<T>& lines, int64_t first, int64_t last) {
   const T infinity = std::numeric_limits<T>::infinity();
   std::fill(lines.count.begin() + first, lines.count.begin() + last, 0);
-  std::fill(lines.listed.begin() + first * lines.words, lines.listed.begin() + last * lines.words, 0);
   std::fill(lines.gain_start[0].begin() + first, lines.gain_start[0].begin() + last, infinity);
   std::fill(lines.gain_start[1].begin() + first, lines.gain_start[1].begin() + last, -infinity);
 }
@@ -44,7 +43,6 @@ NMR_INLINE void append_color(ColorLines<T>& lines, int64_t n, int64_t m, int32_t
     out[(1 + C + c) * kLanes] = grad[c * grad_stride];
   }
   lines.owners(n)[at] = owner;
-  lines.listed[n * lines.words + m / 64] |= uint64_t(1) << (m % 64);
   if (owner < 0) return;
   T &first = lines.gain_start[0][n], &last = lines.gain_start[1][n];
   first = std::min(first, position);
@@ -62,20 +60,20 @@ NMR_INLINE void finish_color_lines(ColorLines<T>& lines, int64_t first, int64_t 
     lines.gain_start[1][n] = std::max(static_cast<T>(1 - length), -lines.gain_start[1][n]);
     T* block = lines.at(n, count / kLanes);
     for (int64_t k = 0; rest && k < 1 + 2 * lines.channels; ++k) std::fill(block + k * kLanes + rest, block + (k + 1) * kLanes, T(0));
-    int32_t before = 0;
-    for (int64_t word = n * lines.words; word < (n + 1) * lines.words; ++word) {
-      lines.before[word] = before;
-      before += set_bits(lines.listed[word]);
-    }
   }
 }
 
-// Number of listed pixels of line n before pixel m, for m up to the length of the line.
+// Writes how many of the pixels of line n before pixel m, ..., m + 7 are listed. bits: which of these eight are; those
+// before them have been counted.
 template <class T>
-NMR_INLINE int64_t listed_before(const ColorLines<T>& lines, int64_t n, int64_t m) {
-  if (m / 64 == lines.words) return lines.count[n];
-  const int64_t word = n * lines.words + m / 64;
-  return lines.before[word] + set_bits(lines.listed[word] & ((uint64_t(1) << (m % 64)) - 1));
+NMR_INLINE void count_before(ColorLines<T>& lines, int64_t n, int64_t m, uint32_t bits) {
+  // Byte k of `each` is bit k, and byte k of `below` the sum of the bytes before it.
+  const uint64_t apart = bits * UINT64_C(0x0101010101010101) & UINT64_C(0x8040201008040201);
+  const uint64_t each = (apart + UINT64_C(0x7f7f7f7f7f7f7f7f)) >> 7 & UINT64_C(0x0101010101010101);
+  const uint64_t below = each * UINT64_C(0x0101010101010100);
+  int32_t before[kLanes];
+  for (int64_t k = 0; k < kLanes; ++k) before[k] = lines.count[n] + static_cast<int32_t>(below >> 8 * k & 0xff);
+  std::memcpy(lines.before.data() + n * lines.step_n + m, before, sizeof before);
 }
 
 // Fills the lines of a range. grad_row: [C, W + pad] of scratch.
@@ -91,6 +89,9 @@ NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& r
     const bool in_rows = j >= range.row_first && j < range.row_last;
     const int64_t row = (H - 1 - j) * W;
     if (j == j_first || !image.anti_aliasing || j % 2 == 0) expand_color_row(image, j, grad_row);
+    if (any_column)
+      std::copy(columns.count.begin() + range.column_first, columns.count.begin() + range.column_last,
+                columns.before.begin() + j * columns.step_m + range.column_first);
     const int64_t i_last = in_rows ? W : range.column_last;
     for (int64_t start = in_rows ? 0 : range.column_first; start < i_last; start += kLanes) {
       uint32_t bits = 0;
@@ -98,6 +99,7 @@ NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& r
         const Lanes<T> g = load_lanes<Lanes<T>>(grad_row + c * plane + start);
         bits |= lane_bits((g < splat(T(0))) | (g > splat(T(0))));
       }
+      if (in_rows) count_before(rows, j, start, bits);
       for (; bits; bits &= bits - 1) {
         const int64_t i = start + lowest_bit(bits);
         const T* color = image.color(row + i);
@@ -108,6 +110,8 @@ NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& r
       }
     }
   }
+  for (int64_t n = range.column_first; n < range.column_last; ++n) columns.before[H * columns.step_m + n] = columns.count[n];
+  for (int64_t n = range.row_first; n < range.row_last; ++n) rows.before[n * rows.step_n + W] = rows.count[n];
   finish_color_lines(columns, range.column_first, range.column_last, H);
   finish_color_lines(rows, range.row_first, range.row_last, W);
 }
@@ -118,11 +122,12 @@ NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& r
 template <int64_t kChannels, class T>
 NMR_INLINE Lanes<T> color_gains(const T* block, int64_t channels, const T* reference) {
   const int64_t C = kChannels ? kChannels : channels;
-  Lanes<T> gain = splat(T(0));
-  for (int64_t c = 0; c < C; ++c) {
+  const auto term = [&](int64_t c) {
     const Lanes<T> color = load_lanes<Lanes<T>>(block + (1 + c) * kLanes);
-    gain = gain + (color - splat(reference[c])) * load_lanes<Lanes<T>>(block + (1 + C + c) * kLanes);
-  }
+    return (color - splat(reference[c])) * load_lanes<Lanes<T>>(block + (1 + C + c) * kLanes);
+  };
+  Lanes<T> gain = term(0);
+  for (int64_t c = 1; c < C; ++c) gain = gain + term(c);
   return gain;
 }
 
@@ -156,31 +161,27 @@ void pull_one_by_one(const ColorLines<T>& lines, int64_t n, int64_t first, int64
 // Outside: every listed pixel beyond the crossing, from the outer one to the border, takes the colour of the inner one if the edge
 // moves out to it.
 template <bool kUp, int64_t kChannels, class T>
-NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, const T* reference, const Lever<T>& lever, T* pulls) {
+NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, int64_t blocks, const T* reference, const Lever<T>& lever, T* pulls) {
   // All offsets have the same sign, so the signs of both distances are constant.
   const T eps = kUp ? lever.eps : -lever.eps;
   const Lanes<T> crossing = splat(lever.crossing), factor_p = splat(lever.factor_p), factor_q = splat(lever.factor_q);
   const Lanes<T> eps_p = splat(lever.factor_p > 0 ? eps : -eps), eps_q = splat(lever.factor_q > 0 ? eps : -eps);
   Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
-  const int64_t entry = kLanes * (1 + 2 * (kChannels ? kChannels : lines.channels));  // numbers of a block
-  const T *begin = lines.at(n, 0), *last = lines.at(n, (lines.count[n] - 1) / kLanes);
-  const T* block = kUp ? last : begin;  // from the border of the image inwards
-  bool more;
-  do {
+  const int64_t C = kChannels ? kChannels : lines.channels, entry = kLanes * (1 + 2 * C);  // numbers of a block
+  T near_color[kChannels ? kChannels : 1];  // a local copy: kept in registers
+  if (kChannels) std::copy_n(reference, C, near_color), reference = near_color;
+  const T* block = lines.at(n, kUp ? (lines.count[n] - 1) / kLanes : 0);  // from the border of the image inwards
+  for (int64_t k = 0; k < blocks; ++k, block += kUp ? -entry : entry) {
     const Lanes<T> offset = load_lanes<Lanes<T>>(block) - crossing;
     const LaneMask<T> beyond = kUp ? offset > splat(T(0)) : offset < splat(T(0));
-    const Lanes<T> gain = color_gains<kChannels>(block, lines.channels, reference);
+    const Lanes<T> gain = color_gains<kChannels>(block, C, reference);
     const LaneMask<T> acts = beyond & (gain > splat(T(0)));
-    if (lane_bits(acts)) {
-      // The quotients w / h_p and w / h_q share one division: w / (h_p h_q) times h_q and h_p.
-      const Lanes<T> h_p = offset * factor_p + eps_p, h_q = offset * factor_q + eps_q;
-      const Lanes<T> share = keep(acts, gain / (h_p * h_q));
-      pulls_p = pulls_p + share * h_q;
-      pulls_q = pulls_q + share * h_p;
-    }
-    more = kUp ? block != begin && block[0] > lever.crossing : block != last && block[kLanes - 1] < lever.crossing;
-    block += kUp ? -entry : entry;
-  } while (more);
+    // The quotients w / h_p and w / h_q share one division: w / (h_p h_q) times h_q and h_p.
+    const Lanes<T> h_p = offset * factor_p + eps_p, h_q = offset * factor_q + eps_q;
+    const Lanes<T> share = keep(acts, gain / (h_p * h_q));
+    pulls_p = pulls_p + share * h_q;
+    pulls_q = pulls_q + share * h_p;
+  }
   add_lane_sums<T>(pulls_p, pulls_q, pulls);
 }
 
@@ -189,16 +190,17 @@ template <int64_t kChannels, class T>
 NMR_INLINE void pull_own(const ColorLines<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id, const T* reference,
                          const Lever<T>& lever, T* pulls) {
   const int32_t* owner = lines.owners(n);
+  const int64_t C = kChannels ? kChannels : lines.channels;
+  T far_color[kChannels ? kChannels : 1];  // a local copy: kept in registers
+  if (kChannels) std::copy_n(reference, C, far_color), reference = far_color;
   Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
-  const Lanes32 begin = splat(static_cast<int32_t>(first)), end = splat(static_cast<int32_t>(last)), own = splat(id);
+  const Lanes32 begin = splat(static_cast<int32_t>(first - 1)), end = splat(static_cast<int32_t>(last)), own = splat(id);
   for (int64_t k = first / kLanes * kLanes; k < last; k += kLanes) {
     const Lanes32 number = lane_numbers() + splat(static_cast<int32_t>(k));
-    const Lanes32 here = (number >= begin) & (number < end) & (load_lanes<Lanes32>(owner + k) == own);
-    if (!lane_bits(here)) continue;
+    const Lanes32 here = (number > begin) & (number < end) & (load_lanes<Lanes32>(owner + k) == own);
     const T* block = lines.at(n, k / kLanes);
-    const Lanes<T> gain = color_gains<kChannels>(block, lines.channels, reference);
+    const Lanes<T> gain = color_gains<kChannels>(block, C, reference);
     const LaneMask<T> acts = widen_mask<T>(here) & (gain > splat(T(0)));
-    if (!lane_bits(acts)) continue;
     pull_lanes<T>(acts, gain, load_lanes<Lanes<T>>(block) - splat(lever.crossing), lever, pulls_p, pulls_q);
   }
   add_lane_sums<T>(pulls_p, pulls_q, pulls);
@@ -222,9 +224,15 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
   const Lanes32 origin = splat(static_cast<int32_t>((H - 1) * W)), step_n = splat(axis == 0 ? int32_t(1) : across);
   const Lanes32 step_m = splat(step), all = splat(static_cast<int32_t>(crossings.count));
   const Lanes32 face_of = splat(static_cast<int32_t>(kSweptFaces - 1)), sign = splat(d);
-  const Lanes32 last_pixel = splat(static_cast<int32_t>(length - 1)), none = splat(int32_t(0));
-  int32_t pixel_at[kCrossings + kPad], first_at[kCrossings + kPad], last_at[kCrossings + kPad];
-  int64_t num_pulled = 0, num_gained = 0;
+  const Lanes32 last_pixel = splat(static_cast<int32_t>(length - 1)), none = splat(int32_t(0)), one = splat(int32_t(1));
+  const Lanes32 before_n = splat(static_cast<int32_t>(lines.step_n)), before_m = splat(static_cast<int32_t>(lines.step_m));
+  const Lanes<T> largest = splat(image.largest_lever);
+  const int32_t* before = lines.before.data();
+  int32_t pixel_at[kCrossings + kPad], first_at[kCrossings + kPad], last_at[kCrossings + kPad], id_at[kCrossings + kPad];
+  int32_t outer_at[kCrossings + kPad], count_at[kCrossings + kPad];
+  int32_t extreme[2][kCrossings + kPad];  // as pulled and gained, where a lever has extreme size
+  T factor_p[kCrossings + kPad], factor_q[kCrossings + kPad];
+  int64_t num_pulled = 0, num_gained = 0, num_extreme[2] = {0, 0};
   for (int64_t i = 0; i < crossings.count; i += kLanes) {
     const Lanes<T> at = load_lanes<Lanes<T>>(crossings.at + i);
     const Lanes32 number = lane_numbers() + splat(static_cast<int32_t>(i)), used = number < all;
@@ -233,11 +241,12 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
     const Lanes32 may_gain = used & narrow_mask(on_line & (at >= load_lanes<Lanes<T>>(crossings.gain_start + i)));
     const Lanes32 wanted = may_pull | may_gain;
     if (!lane_bits(wanted)) continue;
+    const Lanes32 line = keep(wanted, load_lanes<Lanes32>(crossings.line + i));
     const Lanes32 inner = truncate(floor_lanes<T>(keep(widen_mask<T>(wanted), at)));
-    const Lanes32 pixel = origin + load_lanes<Lanes32>(crossings.line + i) * step_n + inner * step_m;
-    const Lanes32 face = load_lanes<Lanes32>(crossings.edge + i) & face_of;
-    const Lanes32 id = gather_lanes(block.id, keep(used, face));
-    const Lanes32 inner_owner = gather_lanes(image.owner, keep(wanted, pixel));
+    const Lanes32 pixel = keep(wanted, origin + line * step_n + inner * step_m);
+    const Lanes32 edge = keep(used, load_lanes<Lanes32>(crossings.edge + i));
+    const Lanes32 id = gather_lanes(block.id, edge & face_of);
+    const Lanes32 inner_owner = gather_lanes(image.owner, pixel);
     // The pixels inside: from the inner one to the far side, at most one pixel beyond the line, as sweep_limit rounds.
     const Lanes<T> far_side = load_lanes<Lanes<T>>(crossings.far_side + i);
     Lanes<T> far = keep(far_side == far_side, far_side);
@@ -245,49 +254,60 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
     far = select(far < splat(top + 1), far, splat(top + 1));
     const Lanes32 limit = truncate(kUp ? zero - floor_lanes<T>(zero - far) : floor_lanes<T>(far)), from = inner * sign;
     const Lanes32 low = select(from < limit, from, limit), high = select(from < limit, limit, from);
-    const Lanes32 first = select(low < none, none, low), last = select(high < last_pixel, high, last_pixel);
+    // In the list of the line.
+    const Lanes32 origin_n = line * before_n;
+    const Lanes32 first = gather_lanes(before, origin_n + select(low < none, none, low) * before_m);
+    const Lanes32 last = gather_lanes(before, origin_n + (select(high < last_pixel, high, last_pixel) + one) * before_m);
+    const Lanes<T> reach = gather_values<T>(block.reach[axis], edge), scan = to_values<T>(line);
+    const Lanes<T> by_p = reach / (gather_values<T>(block.qs[axis], edge) - scan);
+    const Lanes<T> by_q = reach / (scan - gather_values<T>(block.ps[axis], edge));
+    const LaneMask<T> moderate = (by_p < largest) & (by_p > zero - largest) & (by_q < largest) & (by_q > zero - largest);
+    // Outside: from the outer pixel on, eight at a time, the first or the last eight together.
+    const Lanes32 outer = gather_lanes(before, origin_n + (inner * sign + splat(kUp ? int32_t(1) : int32_t(0))) * before_m);
+    store_lanes(outer_at + i, outer);
+    if (kUp) store_lanes(count_at + i, gather_lanes(lines.count.data(), line));
     store_lanes(pixel_at + i, pixel);
     store_lanes(first_at + i, first);
     store_lanes(last_at + i, last);
-    num_pulled += compress_lanes(number, lane_bits(may_pull & (inner_owner == id)), crossings.pulled + num_pulled);
-    num_gained += compress_lanes(number, lane_bits(may_gain & (first <= last)), crossings.gained + num_gained);
+    store_lanes(id_at + i, id);
+    store_lanes(factor_p + i, by_p);
+    store_lanes(factor_q + i, by_q);
+    const uint32_t regular = lane_bits(moderate);
+    const uint32_t pulls = lane_bits(may_pull & (inner_owner == id)), gains = lane_bits(may_gain & (first < last));
+    num_pulled += compress_lanes(number, pulls & regular, crossings.pulled + num_pulled);
+    num_gained += compress_lanes(number, gains & regular, crossings.gained + num_gained);
+    if (!((pulls | gains) & ~regular)) continue;
+    num_extreme[0] += compress_lanes(number, pulls & ~regular, extreme[0] + num_extreme[0]);
+    num_extreme[1] += compress_lanes(number, gains & ~regular, extreme[1] + num_extreme[1]);
   }
   crossings.count = 0;
 
-  const auto lever_of = [&](int32_t i, int32_t edge) {
-    const T line = static_cast<T>(crossings.line[i]), reach = block.reach[axis][edge], crossing = crossings.at[i];
-    return Lever<T>{kUp ? crossing : -crossing, reach / (block.qs[axis][edge] - line),
-                    reach / (line - block.ps[axis][edge]), image.eps};
+  const auto lever_of = [&](int32_t i) {
+    return Lever<T>{kUp ? crossings.at[i] : -crossings.at[i], factor_p[i], factor_q[i], image.eps};
   };
-  const auto is_regular = [&](const Lever<T>& lever) {
-    return std::abs(lever.factor_p) < image.largest_lever && std::abs(lever.factor_q) < image.largest_lever;
-  };
+  const auto pulls_of = [&](int32_t i) { return block.pulls[axis][crossings.edge[i]]; };
   for (int64_t k = 0; k < num_pulled; ++k) {
-    const int32_t i = crossings.pulled[k], n = crossings.line[i], edge = crossings.edge[i];
-    const T* reference = image.color(pixel_at[i]);
-    const Lever<T> lever = lever_of(i, edge);
-    T* pulls = block.pulls[axis][edge];
-    if (is_regular(lever)) {
-      pull_outside<kUp, kChannels>(lines, n, reference, lever, pulls);
-    } else {
-      const int64_t outer = d * static_cast<int64_t>(std::floor(crossings.at[i])) + d;
-      const int64_t first = kUp ? listed_before(lines, n, outer) : 0;
-      const int64_t last = kUp ? lines.count[n] : listed_before(lines, n, outer + 1);
-      pull_one_by_one<false>(lines, n, first, last, 0, reference, lever, pulls);
-    }
+    const int32_t i = crossings.pulled[k];
+    const T* reference = image.pixels + pixel_at[i] * image.channels;  // of the face
+    const int64_t blocks = kUp ? (count_at[i] + 7) / 8 - outer_at[i] / 8 : (outer_at[i] + 7) / 8;
+    pull_outside<kUp, kChannels>(lines, crossings.line[i], blocks, reference, lever_of(i), pulls_of(i));
+  }
+  for (int64_t k = 0; k < num_extreme[0]; ++k) {
+    const int32_t i = extreme[0][k], n = crossings.line[i];
+    const int64_t outer = d * static_cast<int64_t>(std::floor(crossings.at[i])) + d;
+    const int64_t first = kUp ? before[n * lines.step_n + outer * lines.step_m] : 0;
+    const int64_t last = kUp ? lines.count[n] : before[n * lines.step_n + (outer + 1) * lines.step_m];
+    pull_one_by_one<false>(lines, n, first, last, 0, image.color(pixel_at[i]), lever_of(i), pulls_of(i));
   }
   for (int64_t k = 0; k < num_gained; ++k) {
-    const int32_t i = crossings.gained[k], n = crossings.line[i], edge = crossings.edge[i];
-    const int64_t first = listed_before(lines, n, first_at[i]), last = listed_before(lines, n, last_at[i] + 1);
-    if (first >= last) continue;
-    const int32_t id = block.id[edge % kSweptFaces];
+    const int32_t i = crossings.gained[k];
     const T* reference = image.color(pixel_at[i] + step);
-    const Lever<T> lever = lever_of(i, edge);
-    T* pulls = block.pulls[axis][edge];
-    if (is_regular(lever))
-      pull_own<kChannels>(lines, n, first, last, id, reference, lever, pulls);
-    else
-      pull_one_by_one<true>(lines, n, first, last, id, reference, lever, pulls);
+    pull_own<kChannels>(lines, crossings.line[i], first_at[i], last_at[i], id_at[i], reference, lever_of(i), pulls_of(i));
+  }
+  for (int64_t k = 0; k < num_extreme[1]; ++k) {
+    const int32_t i = extreme[1][k];
+    const T* reference = image.color(pixel_at[i] + step);
+    pull_one_by_one<true>(lines, crossings.line[i], first_at[i], last_at[i], id_at[i], reference, lever_of(i), pulls_of(i));
   }
 }
 

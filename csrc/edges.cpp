@@ -112,8 +112,8 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
     return;
   }
 
-  scratch.lines[0].reserve_lines(W, H, C);
-  scratch.lines[1].reserve_lines(H, W, C);
+  scratch.lines[0].reserve_lines(0, W, H, C);
+  scratch.lines[1].reserve_lines(1, H, W, C);
   // Several threads: bands of columns, then bands of rows.
   const int64_t longer = std::max(H, W), band = num_threads > 1 ? std::max<int64_t>(longer / num_threads, 64) : longer;
   const int64_t column_bands = (W + band - 1) / band, row_bands = (H + band - 1) / band;

@@ -306,6 +306,19 @@ NMR_INLINE Lanes32 gather_lanes(const int32_t* p, Lanes32 offset) {
 #endif
 }
 
+// The same of values.
+template <class T>
+NMR_INLINE Lanes<T> gather_values(const T* p, Lanes32 offset) {
+#if defined(__AVX2__) || NMR_AVX2
+  if constexpr (std::is_same_v<T, float>) return (Lanes<T>)_mm256_i32gather_ps(p, (__m256i)offset, 4);
+#endif
+  int32_t at[kLanes];
+  T value[kLanes];
+  store_lanes(at, offset);
+  for (int64_t k = 0; k < kLanes; ++k) value[k] = p[at[k]];
+  return load_lanes<Lanes<T>>(value);
+}
+
 #if defined(__AVX2__) || NMR_AVX2
 // Byte k of entry b: the number of the k-th set bit of b.
 struct SetBits {
