@@ -18,7 +18,7 @@ struct ColorLines {
   // together. The last block is filled with zeros, which have no effect.
   std::vector<T> values;
   std::vector<int32_t> owner;     // [N, blocks, 8]
-  std::vector<int32_t> count;     // [N] number of listed pixels
+  std::vector<int32_t> count;     // [N + pad] number of listed pixels
   // Number of listed pixels of line n before pixel m, for m up to M: before[n * step_n + m * step_m].
   std::vector<int32_t> before;
   std::vector<T> pull_end[2];     // [N + pad] by direction: a crossing before this has a listed pixel beyond its outer one
@@ -34,7 +34,7 @@ struct ColorLines {
     step_m = axis == 0 ? N : 1;
     reserve(values, N * (1 + 2 * C) * stride);
     reserve(owner, N * stride);
-    reserve(count, N);
+    reserve(count, N + kPad);
     reserve(before, axis == 0 ? N * (M + 1) : N * stride);
     for (std::vector<T>* v : {&pull_end[0], &pull_end[1], &gain_start[0], &gain_start[1]}) reserve(*v, N + kPad);
   }

@@ -30,23 +30,18 @@ NMR_INLINE void start_color_lines(ColorLines<T>& lines, int64_t first, int64_t l
   std::fill(lines.gain_start[1].begin() + first, lines.gain_start[1].begin() + last, -infinity);
 }
 
-// Adds pixel m of line n. grad: its gradients, `grad_stride` apart.
+// Writes pixel m as number `at` of line n. grad: its gradients, `grad_stride` apart.
 template <int64_t kChannels, class T>
-NMR_INLINE void append_color(ColorLines<T>& lines, int64_t n, int64_t m, int32_t owner, const T* color, const T* grad,
-                             int64_t grad_stride) {
-  const int64_t C = kChannels ? kChannels : lines.channels, at = lines.count[n]++;
-  const T position = static_cast<T>(m);
-  T* out = lines.at(n, at / kLanes) + at % kLanes;
-  out[0] = position;
+NMR_INLINE void put_color(ColorLines<T>& lines, int64_t n, int64_t at, int64_t m, int32_t owner, const T* color, const T* grad,
+                          int64_t grad_stride) {
+  const int64_t C = kChannels ? kChannels : lines.channels;
+  T* out = lines.values.data() + (n * lines.stride + at / kLanes * kLanes) * (1 + 2 * C) + at % kLanes;
+  out[0] = static_cast<T>(m);
   for (int64_t c = 0; c < C; ++c) {
     out[(1 + c) * kLanes] = color[c];
     out[(1 + C + c) * kLanes] = grad[c * grad_stride];
   }
   lines.owners(n)[at] = owner;
-  if (owner < 0) return;
-  T &first = lines.gain_start[0][n], &last = lines.gain_start[1][n];
-  first = std::min(first, position);
-  last = position;
 }
 
 // Bounds, padding and numbers of lines [first, last), when all their pixels have been seen.
@@ -63,55 +58,78 @@ NMR_INLINE void finish_color_lines(ColorLines<T>& lines, int64_t first, int64_t 
   }
 }
 
-// Writes how many of the pixels of line n before pixel m, ..., m + 7 are listed. bits: which of these eight are; those
-// before them have been counted.
+// Writes how many of the pixels of line n before pixel m, ..., m + 7 are listed. bits: which of these eight are; count: those
+// before them.
 template <class T>
-NMR_INLINE void count_before(ColorLines<T>& lines, int64_t n, int64_t m, uint32_t bits) {
+NMR_INLINE void count_before(ColorLines<T>& lines, int64_t n, int64_t m, int64_t count, uint32_t bits) {
   // Byte k of `each` is bit k, and byte k of `below` the sum of the bytes before it.
   const uint64_t apart = bits * UINT64_C(0x0101010101010101) & UINT64_C(0x8040201008040201);
   const uint64_t each = (apart + UINT64_C(0x7f7f7f7f7f7f7f7f)) >> 7 & UINT64_C(0x0101010101010101);
   const uint64_t below = each * UINT64_C(0x0101010101010100);
-  int32_t before[kLanes];
-  for (int64_t k = 0; k < kLanes; ++k) before[k] = lines.count[n] + static_cast<int32_t>(below >> 8 * k & 0xff);
-  std::memcpy(lines.before.data() + n * lines.step_n + m, before, sizeof before);
+  store_lanes(lines.before.data() + n * lines.step_n + m, splat(static_cast<int32_t>(count)) + byte_lanes(below));
 }
 
-// Fills the lines of a range. grad_row: [C, W + pad] of scratch.
+// Fills the lines of a range: of columns, of rows, or of all. Columns come in groups of eight. grad_row: [C, W + pad] of scratch.
 template <int64_t kChannels, class T>
 NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& range, T* grad_row) {
   const int64_t H = image.raster.height, W = image.raster.width, C = kChannels ? kChannels : image.channels, plane = W + kPad;
-  const bool any_column = range.column_first < range.column_last;
+  const bool in_rows = range.row_first < range.row_last, in_columns = range.column_first < range.column_last;
   ColorLines<T>&columns = image.lines[0], &rows = image.lines[1];
   start_color_lines(columns, range.column_first, range.column_last);
   start_color_lines(rows, range.row_first, range.row_last);
-  const int64_t j_first = any_column ? 0 : range.row_first, j_last = any_column ? H : range.row_last;
+  const Lanes<T> zero = splat(T(0));
+  const int64_t j_first = in_columns ? 0 : range.row_first, j_last = in_columns ? H : range.row_last;
   for (int64_t j = j_first; j < j_last; ++j) {
-    const bool in_rows = j >= range.row_first && j < range.row_last;
     const int64_t row = (H - 1 - j) * W;
     if (j == j_first || !image.anti_aliasing || j % 2 == 0) expand_color_row(image, j, grad_row);
-    if (any_column)
+    if (in_columns)
       std::copy(columns.count.begin() + range.column_first, columns.count.begin() + range.column_last,
                 columns.before.begin() + j * columns.step_m + range.column_first);
+    int64_t in_row = 0;  // number of listed pixels
     const int64_t i_last = in_rows ? W : range.column_last;
     for (int64_t start = in_rows ? 0 : range.column_first; start < i_last; start += kLanes) {
-      uint32_t bits = 0;
+      LaneMask<T> listed = zero < zero;
       for (int64_t c = 0; c < C; ++c) {
         const Lanes<T> g = load_lanes<Lanes<T>>(grad_row + c * plane + start);
-        bits |= lane_bits((g < splat(T(0))) | (g > splat(T(0))));
+        listed = listed | (g < zero) | (g > zero);
       }
-      if (in_rows) count_before(rows, j, start, bits);
-      for (; bits; bits &= bits - 1) {
-        const int64_t i = start + lowest_bit(bits);
+      const uint32_t bits = lane_bits(listed);
+      if (in_rows) count_before(rows, j, start, in_row, bits);
+      if (!bits) continue;
+      Lanes32 id = splat(int32_t(-1));
+      if (start + kLanes <= W)
+        id = load_lanes<Lanes32>(image.owner + row + start);
+      else
+        std::memcpy(&id, image.owner + row + start, (W - start) * sizeof(int32_t));
+      const Lanes32 on_face = id > splat(int32_t(-1));
+      for (uint32_t rest = bits; rest; rest &= rest - 1) {
+        const int64_t i = start + lowest_bit(rest);
         const T* color = image.color(row + i);
         const int32_t owner = image.owner[row + i];
-        if (in_rows) append_color<kChannels>(rows, j, i, owner, color, grad_row + i, plane);
-        if (i >= range.column_first && i < range.column_last)
-          append_color<kChannels>(columns, i, j, owner, color, grad_row + i, plane);
+        if (in_rows) put_color<kChannels>(rows, j, in_row++, i, owner, color, grad_row + i, plane);
+        if (in_columns) put_color<kChannels>(columns, i, columns.count[i], j, owner, color, grad_row + i, plane);
+      }
+      if (in_rows) {
+        const uint32_t gains = bits & lane_bits(on_face);
+        T &first = rows.gain_start[0][j], &last = rows.gain_start[1][j];
+        if (gains) {
+          first = std::min(first, static_cast<T>(start));  // at least that
+          last = static_cast<T>(start + kLanes - 1);       // at most that
+        }
+      }
+      if (in_columns) {
+        const LaneMask<T> gains = listed & widen_mask<T>(on_face);
+        T *first = columns.gain_start[0].data() + start, *last = columns.gain_start[1].data() + start;
+        const Lanes<T> line_first = load_lanes<Lanes<T>>(first), at = splat(static_cast<T>(j));
+        store_lanes(first, select(gains & (line_first > at), at, line_first));
+        store_lanes(last, select(gains, at, load_lanes<Lanes<T>>(last)));
+        int32_t* count = columns.count.data() + start;
+        store_lanes(count, load_lanes<Lanes32>(count) - narrow_mask(listed));
       }
     }
+    if (in_rows) rows.count[j] = static_cast<int32_t>(in_row), rows.before[j * rows.step_n + W] = rows.count[j];
   }
   for (int64_t n = range.column_first; n < range.column_last; ++n) columns.before[H * columns.step_m + n] = columns.count[n];
-  for (int64_t n = range.row_first; n < range.row_last; ++n) rows.before[n * rows.step_n + W] = rows.count[n];
   finish_color_lines(columns, range.column_first, range.column_last, H);
   finish_color_lines(rows, range.row_first, range.row_last, W);
 }

@@ -114,8 +114,9 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
 
   scratch.lines[0].reserve_lines(0, W, H, C);
   scratch.lines[1].reserve_lines(1, H, W, C);
-  // Several threads: bands of columns, then bands of rows.
-  const int64_t longer = std::max(H, W), band = num_threads > 1 ? std::max<int64_t>(longer / num_threads, 64) : longer;
+  // Several threads: bands of columns, in whole lanes, then bands of rows.
+  const int64_t longer = std::max(H, W), share = (longer / std::max(num_threads, 1) + kPad - 1) / kPad * kPad;
+  const int64_t band = num_threads > 1 ? std::max<int64_t>(share, 64) : longer;
   const int64_t column_bands = (W + band - 1) / band, row_bands = (H + band - 1) / band;
   parallel_for(num_threads > 1 ? column_bands + row_bands : 1, num_threads, [&](int64_t n) {
     T* grad_row = reserve(thread_scratch<EdgeTaskScratch<T>>().grad_row, C * (W + kPad));

@@ -306,7 +306,18 @@ NMR_INLINE Lanes32 gather_lanes(const int32_t* p, Lanes32 offset) {
 #endif
 }
 
-// The same of values.
+// The bytes of a word, the lowest in lane 0.
+NMR_INLINE Lanes32 byte_lanes(uint64_t bytes) {
+#if defined(__AVX2__) || NMR_AVX2
+  return (Lanes32)_mm256_cvtepu8_epi32(_mm_cvtsi64_si128(static_cast<int64_t>(bytes)));
+#else
+  int32_t value[kLanes];
+  for (int64_t k = 0; k < kLanes; ++k) value[k] = static_cast<int32_t>(bytes >> 8 * k & 0xff);
+  return load_lanes<Lanes32>(value);
+#endif
+}
+
+// p[offset[0]], ..., p[offset[7]] of values.
 template <class T>
 NMR_INLINE Lanes<T> gather_values(const T* p, Lanes32 offset) {
 #if defined(__AVX2__) || NMR_AVX2
