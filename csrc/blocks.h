@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <cstring>
 #include <utility>
 #include <vector>
 
@@ -48,7 +49,10 @@ struct VisibleFaces {
     std::fill_n(slot, 2 * num_faces + 1, 0);
     int64_t n = 0;
     for (; n + kLanes <= pixels; n += kLanes) {
-      if (!lane_bits(load_lanes<Lanes32>(owner + n) >= 0)) continue;  // background
+      uint64_t pairs[kLanes / 2];
+      std::memcpy(pairs, owner + n, sizeof pairs);
+      const uint64_t signs = pairs[0] & pairs[1] & pairs[2] & pairs[3];
+      if ((~signs & UINT64_C(0x8000000080000000)) == 0) continue;  // background
       for (int64_t k = 0; k < kLanes; ++k) slot[owner[n + k] + 1] = 1;
     }
     for (; n < pixels; ++n) slot[owner[n] + 1] = 1;

@@ -27,7 +27,7 @@ struct Direction {
 };
 
 template <class T>
-Direction direction_of(const Vec3& v) {
+NMR_INLINE Direction direction_of(const Vec3& v) {
   const double scale = v.cwiseAbs().maxCoeff();
   if (!(scale >= kShortest<T>)) return {Vec3::Zero(), 0};
   const double length = (v / scale).norm() * scale;
@@ -35,19 +35,19 @@ Direction direction_of(const Vec3& v) {
 }
 
 // dL/dv from dL/d(v / |v|).
-Vec3 direction_backward(const Direction& d, const Vec3& grad) {
+NMR_INLINE Vec3 direction_backward(const Direction& d, const Vec3& grad) {
   if (d.length == 0) return Vec3::Zero();
   return (grad - d.unit * d.unit.dot(grad)) / d.length;
 }
 
 // The meshes' vertices as they count.
 template <class T>
-bool counts(const T* vertex) {
+NMR_INLINE bool counts(const T* vertex) {
   return std::abs(vertex[0]) < T(kLargest) && std::abs(vertex[1]) < T(kLargest) && std::abs(vertex[2]) < T(kLargest);
 }
 
 template <class T>
-Vec3 vertex_of(const T* vertex) {
+NMR_INLINE Vec3 vertex_of(const T* vertex) {
   return counts(vertex) ? Vec3(vertex[0], vertex[1], vertex[2]) : Vec3(Vec3::Zero());
 }
 
@@ -57,7 +57,7 @@ struct Sides {
 };
 
 template <class T>
-Sides sides_of(const T* vertices, const int64_t* face) {
+NMR_INLINE Sides sides_of(const T* vertices, const int64_t* face) {
   const Vec3 v1 = vertex_of(vertices + 3 * face[1]);
   Sides s{vertex_of(vertices + 3 * face[0]) - v1, vertex_of(vertices + 3 * face[2]) - v1, {}};
   s.across = s.a.cross(s.b);
@@ -65,7 +65,7 @@ Sides sides_of(const T* vertices, const int64_t* face) {
 }
 
 // Adds the gradient of the product to the corners.
-void sides_backward(const Sides& s, const int64_t* face, const Vec3& grad_across, Vec3* grad_vertices) {
+NMR_INLINE void sides_backward(const Sides& s, const int64_t* face, const Vec3& grad_across, Vec3* grad_vertices) {
   const Vec3 grad_a = s.b.cross(grad_across), grad_b = grad_across.cross(s.a);
   grad_vertices[face[0]] += grad_a;
   grad_vertices[face[2]] += grad_b;
@@ -85,12 +85,12 @@ std::vector<Vec3> vertex_sums(const MeshBatch<T>& mesh, int64_t b) {
 }
 
 template <class T>
-void store(T* to, const Vec3& v) {
+NMR_INLINE void store(T* to, const Vec3& v) {
   for (int k = 0; k < 3; ++k) to[k] = static_cast<T>(v[k]);
 }
 
 template <class T>
-Vec3 load(const T* from) {
+NMR_INLINE Vec3 load(const T* from) {
   return Vec3(from[0], from[1], from[2]);
 }
 
