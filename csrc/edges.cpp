@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "color_lines.h"
+#include "corner_values.h"
 #include "geometry.h"
 #include "parallel.h"
 #include "pull_lines.h"
@@ -23,24 +24,64 @@
 
 namespace nmr {
 
+namespace {
+
+// A row of the image, w pixels wide, from the raster rows `pixels` [2 or 1, W, C]. behind: the background and the mean of four
+// background pixels [2, C], or nullptr. kChannels: C, or 0 if it is known only at run time.
+template <int64_t kChannels, class T>
+NMR_INLINE void resolve_row(const int32_t* owner, const T* pixels, const T* behind, int64_t w, bool anti_aliasing, int64_t channels,
+                            T* out) {
+  const int64_t C = kChannels ? kChannels : channels, W = 2 * w;
+  if (!anti_aliasing) {
+    for (int64_t x = 0; x < w; ++x)
+      for (int64_t c = 0; c < C; ++c) out[x * C + c] = behind && owner[x] < 0 ? behind[c] : pixels[x * C + c];
+    return;
+  }
+  for (int64_t x = 0; x < w; ++x, out += C) {
+    const T *upper = pixels + 2 * x * C, *lower = upper + W * C;
+    const int32_t* corner = owner + 2 * x;
+    if (!behind || (corner[0] | corner[1] | corner[W] | corner[W + 1]) >= 0) {
+      for (int64_t c = 0; c < C; ++c) out[c] = (upper[c] + upper[C + c] + lower[c] + lower[C + c]) / 4;
+    } else if ((corner[0] & corner[1] & corner[W] & corner[W + 1]) < 0) {
+      for (int64_t c = 0; c < C; ++c) out[c] = behind[C + c];
+    } else {
+      const T *a = corner[0] < 0 ? behind : upper, *b = corner[1] < 0 ? behind : upper + C;
+      const T *d = corner[W] < 0 ? behind : lower, *e = corner[W + 1] < 0 ? behind : lower + C;
+      for (int64_t c = 0; c < C; ++c) out[c] = (a[c] + b[c] + d[c] + e[c]) / 4;
+    }
+  }
+}
+
+// Its gradient for one raster row [W, C]: `grad` is that of the image row, owner nullptr if no background is mixed in.
+template <int64_t kChannels, class T>
+NMR_INLINE void resolve_row_backward(const int32_t* owner, const T* grad, int64_t w, bool anti_aliasing, int64_t channels, T* out) {
+  const int64_t C = kChannels ? kChannels : channels, scale = anti_aliasing ? 2 : 1;
+  const T share = T(1) / static_cast<T>(scale * scale);  // a power of two: exact
+  for (int64_t x = 0; x < w; ++x, grad += C)
+    for (int64_t k = 0; k < scale; ++k, out += C) {
+      const bool drawn = !owner || owner[scale * x + k] >= 0;
+      for (int64_t c = 0; c < C; ++c) out[c] = drawn ? grad[c] * share : T(0);
+    }
+}
+
+}  // namespace
+
 // The mean of 2x2 pixels, or a copy; pixels without a face have the background's colour, where there is one.
 template <class T>
 void resolve_forward(const Resolve<T>& args) {
   const int64_t h = args.image.height, w = args.image.width, C = args.channels, scale = args.anti_aliasing ? 2 : 1, W = scale * w;
-  parallel_for(args.batch * h, args.num_threads, [&](int64_t n) {  // n: image b, row y
-    const int64_t first = n * scale * W;
-    const T* background = args.background ? args.background + (args.background_batch == 1 ? 0 : n / h * C) : nullptr;
-    T* out = args.resolved + n * w * C;
-    const auto color = [&](int64_t pixel) { return background && args.owner[pixel] < 0 ? background : args.pixels + pixel * C; };
-    for (int64_t x = 0; x < w; ++x, out += C) {
-      const T* upper = color(first + scale * x);
-      if (scale == 1) {
-        std::copy_n(upper, C, out);
-        continue;
-      }
-      const T *right = color(first + 2 * x + 1), *lower = color(first + W + 2 * x), *last = color(first + W + 2 * x + 1);
-      for (int64_t c = 0; c < C; ++c) out[c] = (upper[c] + right[c] + lower[c] + last[c]) / 4;
-    }
+  std::vector<T> behind;  // of each background, as resolve_row takes it
+  for (int64_t b = 0; args.background && b < args.background_batch; ++b) {
+    const T* color = args.background + b * C;
+    behind.insert(behind.end(), color, color + C);
+    for (int64_t c = 0; c < C; ++c) behind.push_back((color[c] + color[c] + color[c] + color[c]) / 4);
+  }
+  with_channels(C, [&](auto known) {
+    parallel_for(args.batch * h, args.num_threads, [&](int64_t n) {  // n: image b, row y
+      const T* background = args.background ? behind.data() + (args.background_batch == 1 ? 0 : n / h * 2 * C) : nullptr;
+      const int32_t* owner = args.background ? args.owner + n * scale * W : nullptr;
+      resolve_row<known()>(owner, args.pixels + n * scale * W * C, background, w, args.anti_aliasing, C, args.resolved + n * w * C);
+    });
   });
 }
 
@@ -51,12 +92,11 @@ void resolve_backward(const Resolve<T>& args) {
   const int64_t H = scale * h, W = scale * w;
   const T share = T(1) / static_cast<T>(scale * scale);  // a power of two: exact
   if (args.grad_pixels)
-    parallel_for(args.batch * H, args.num_threads, [&](int64_t n) {  // n: image b, raster row
-      const T* grad = args.grad_resolved + n / scale * w * C;
-      const int32_t* owner = args.background ? args.owner + n * W : nullptr;
-      T* out = args.grad_pixels + n * W * C;
-      for (int64_t x = 0; x < W; ++x, out += C)
-        for (int64_t c = 0; c < C; ++c) out[c] = owner && owner[x] < 0 ? T(0) : grad[x / scale * C + c] * share;
+    with_channels(C, [&](auto known) {
+      parallel_for(args.batch * H, args.num_threads, [&](int64_t n) {  // n: image b, raster row
+        resolve_row_backward<known()>(args.background ? args.owner + n * W : nullptr, args.grad_resolved + n / scale * w * C, w,
+                                      args.anti_aliasing, C, args.grad_pixels + n * W * C);
+      });
     });
   if (args.grad_background)
     parallel_for(args.batch, args.num_threads, [&](int64_t b) {

@@ -357,7 +357,43 @@ void find_visible(const Lit<T>& args, const View<T>& view, const RowBlocks& bloc
   sums.visible.find(args.at.owner + begin, end - begin, view.image.num_faces);
 }
 
-// kColors: channels of colours, 0: none, white.
+// Pixels [begin, end) where the light depends only on the face. kColors: channels of colours, 0: none, white.
+template <int64_t kColors, class T>
+void lit_faces_forward(const Lit<T>& args, int64_t begin, int64_t end, const LitSums<T>& sums) {
+  const int32_t *owner = args.at.owner, *slots = sums.visible.slots.data() + 1;
+  const T *faces = sums.faces.data(), *colors = args.colors;
+  T* lit = args.lit + 3 * begin;
+  for (int64_t n = begin; n < end; ++n, lit += 3) {
+    const bool drawn = owner[n] >= 0;
+    const T* face = faces + 3 * (drawn ? slots[owner[n]] : 0);  // 0: any values
+    T light[3];
+    for (int k = 0; k < 3; ++k) light[k] = kColors ? colors[kColors * n + (kColors == 3 ? k : 0)] * face[k] : face[k];
+    for (int k = 0; k < 3; ++k) lit[k] = drawn ? light[k] : T(0);
+  }
+}
+
+// Their gradients: those of colours, and in sums.values from number 9 on those of the light of each face.
+template <int64_t kColors, class T>
+void lit_faces_backward(const Lit<T>& args, int64_t begin, int64_t end, LitSums<T>& sums) {
+  const int32_t *owner = args.at.owner, *slots = sums.visible.slots.data() + 1;
+  const T *faces = sums.faces.data(), *grads = args.grad_lit, *colors = args.colors;
+  T *grad_colors = kColors ? args.grad_colors : nullptr, *values = sums.values.data() + 9;
+  if (args.at.grad_weights) std::fill_n(args.at.grad_weights + 3 * begin, 3 * (end - begin), T(0));
+  if (grad_colors) std::fill_n(grad_colors + kColors * begin, kColors * (end - begin), T(0));
+  for (int64_t n = begin; n < end; ++n) {
+    if (owner[n] < 0) continue;
+    const int64_t slot = slots[owner[n]];
+    const T *grad = grads + 3 * n, *face = faces + 3 * slot;
+    T* sum = values + kSums * slot;
+    for (int k = 0; k < 3; ++k) {
+      const int64_t at = kColors * n + (kColors == 3 ? k : 0);
+      sum[k] += kColors ? colors[at] * grad[k] : grad[k];
+      if (grad_colors) grad_colors[at] += face[k] * grad[k];
+    }
+  }
+}
+
+// Pixels of a block.
 template <int64_t kColors, class T>
 void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, int64_t block, LitSums<T>& sums) {
   const int64_t H = args.at.raster.height, W = args.at.raster.width;
@@ -368,6 +404,7 @@ void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, i
   if (per_face) {
     find_visible(args, view, blocks, begin, end, sums);
     light_faces(args, view, lamps, sums);
+    return lit_faces_forward<kColors>(args, begin, end, sums);
   }
   for (int64_t n = begin; n < end; ++n) {
     const int64_t id = args.at.owner[n];
@@ -377,11 +414,6 @@ void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, i
       continue;
     }
     const T* color = kColors ? args.colors + kColors * n : nullptr;
-    if (per_face) {
-      const T* face = sums.faces.data() + 3 * sums.visible.slots[id + 1];
-      for (int k = 0; k < 3; ++k) lit[k] = kColors ? color[kColors == 3 ? k : 0] * face[k] : face[k];
-      continue;
-    }
     const Pixel<T> p = pixel_of(args, view, id, args.at.weights + 3 * n, position);
     const PixelLight<T> light = args.parameters ? light_at(lamps, p.spot, lamps.highlights) : PixelLight<T>{p.spot.normal, Vec3<T>::Zero()};
     for (int k = 0; k < 3; ++k)
@@ -401,8 +433,11 @@ void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, 
   find_visible(args, view, blocks, begin, end, sums);
   const int64_t count = sums.visible.count;
   std::fill_n(reserve(sums.values, kSums * count), kSums * count, T(0));
-  if (per_face) light_faces(args, view, lamps, sums);
-  for (int64_t n = begin; n < end; ++n) {
+  if (per_face) {
+    light_faces(args, view, lamps, sums);
+    lit_faces_backward<kColors>(args, begin, end, sums);
+  }
+  for (int64_t n = begin; !per_face && n < end; ++n) {
     const int64_t id = args.at.owner[n];
     T* grad_color = kColors && args.grad_colors ? args.grad_colors + kColors * n : nullptr;
     T* grad_weights = args.at.grad_weights ? args.at.grad_weights + 3 * n : nullptr;
@@ -412,14 +447,6 @@ void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, 
     const T *color = kColors ? args.colors + kColors * n : nullptr, *grad = args.grad_lit + 3 * n;
     const int64_t slot = sums.visible.slots[id + 1];
     T* sum = sums.values.data() + kSums * slot;
-    if (per_face) {
-      const T* face = sums.faces.data() + 3 * slot;
-      for (int k = 0; k < 3; ++k) {
-        sum[9 + k] += kColors ? color[kColors == 3 ? k : 0] * grad[k] : grad[k];
-        if (grad_color) grad_color[kColors == 3 ? k : 0] += face[k] * grad[k];
-      }
-      continue;
-    }
     const T* weights = args.at.weights + 3 * n;
     const Pixel<T> p = pixel_of(args, view, id, weights, position);
     PixelLight<T> grads{load3(grad), load3(grad)};
