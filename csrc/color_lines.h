@@ -10,18 +10,18 @@
 
 namespace nmr {
 
-// The pixels with a gradient, for the lines of one axis: N lines of M pixels, C channels. Others cannot pull. Sweeps go up the line
-// (direction 0) or down (direction 1).
+// The pixels with a gradient, for the lines of one axis: N lines of M pixels, C channels. Others cannot pull.
+// Sweeps go up the line (direction 0) or down (direction 1).
 template <class T>
 struct ColorLines {
-  // [N, blocks, 1 + 2 C, 8] position on the line in pixels, ascending; colour; gradient. What belongs to eight pixels lies
-  // together. The last block is filled with zeros, which have no effect.
+  // [N, blocks, 1 + 2 C, 8] position on the line in pixels, ascending; colour; gradient. What belongs to eight
+  // pixels lies together. The last block is filled with zeros, which have no effect.
   std::vector<T> values;
   std::vector<int32_t> owner;     // [N, blocks, 8]
   std::vector<int32_t> count;     // [N + pad] number of listed pixels
   // Number of listed pixels of line n before pixel m, for m up to M: before[n * step_n + m * step_m].
   std::vector<int32_t> before;
-  std::vector<T> pull_end[2];     // [N + pad] by direction: a crossing before this has a listed pixel beyond its outer one
+  std::vector<T> pull_end[2];  // [N + pad] by direction: a crossing before this has a listed pixel beyond its outer one
   std::vector<T> gain_start[2];   // [N + pad] by direction: a crossing before this has no listed pixel of a face inside
   int64_t stride, channels;       // stride: 8 blocks
   int64_t step_n, step_m;         // of before
@@ -40,7 +40,9 @@ struct ColorLines {
   }
   // Block `block` of line n: eight positions, then as many of each colour and of each gradient.
   T* at(int64_t n, int64_t block) { return values.data() + (n * stride + block * kPad) * (1 + 2 * channels); }
-  const T* at(int64_t n, int64_t block) const { return values.data() + (n * stride + block * kPad) * (1 + 2 * channels); }
+  const T* at(int64_t n, int64_t block) const {
+    return values.data() + (n * stride + block * kPad) * (1 + 2 * channels);
+  }
   T position(int64_t n, int64_t k) const { return at(n, k / kPad)[k % kPad]; }
   int32_t* owners(int64_t n) { return owner.data() + n * stride; }
   const int32_t* owners(int64_t n) const { return owner.data() + n * stride; }
@@ -64,7 +66,9 @@ struct ColorImage {
   T largest_lever;         // above this, or with a tiny eps, the product of two distances could overflow or underflow
   static constexpr bool kFarSides = true;  // whether sweeps need Crossings::far_side
 
-  const T* color(int64_t pixel) const { return background && owner[pixel] < 0 ? background : pixels + pixel * channels; }
+  const T* color(int64_t pixel) const {
+    return background && owner[pixel] < 0 ? background : pixels + pixel * channels;
+  }
 };
 
 }  // namespace nmr

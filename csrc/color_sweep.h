@@ -1,12 +1,12 @@
-// The inner loops of the colour gradient; included by levels.h for every instruction set. Lines, directions and coordinates are those
-// of the silhouette gradient (sweep.h).
+// The inner loops of the colour gradient; included by levels.h for every instruction set. Lines, directions and
+// coordinates are those of the silhouette gradient (sweep.h).
 
 #include "crossings.h"
 
 // --- which pixels can pull
 
-// Gradients of one row of raster pixels (counted from the bottom), a plane [W + pad] for each channel. With a 2x2 mean each pixel gets
-// a quarter of the image's gradient.
+// Gradients of one row of raster pixels (counted from the bottom), a plane [W + pad] for each channel. With a 2x2
+// mean each pixel gets a quarter of the image's gradient.
 template <class T>
 NMR_INLINE void expand_color_row(const ColorImage<T>& image, int64_t j, T* row) {
   const int64_t w = image.size.width, W = image.raster.width, C = image.channels;
@@ -32,8 +32,8 @@ NMR_INLINE void start_color_lines(ColorLines<T>& lines, int64_t first, int64_t l
 
 // Writes pixel m as number `at` of line n. grad: its gradients, `grad_stride` apart.
 template <int64_t kChannels, class T>
-NMR_INLINE void put_color(ColorLines<T>& lines, int64_t n, int64_t at, int64_t m, int32_t owner, const T* color, const T* grad,
-                          int64_t grad_stride) {
+NMR_INLINE void put_color(ColorLines<T>& lines, int64_t n, int64_t at, int64_t m, int32_t owner, const T* color,
+                          const T* grad, int64_t grad_stride) {
   const int64_t C = kChannels ? kChannels : lines.channels;
   T* out = lines.values.data() + (n * lines.stride + at / kLanes * kLanes) * (1 + 2 * C) + at % kLanes;
   out[0] = static_cast<T>(m);
@@ -54,12 +54,13 @@ NMR_INLINE void finish_color_lines(ColorLines<T>& lines, int64_t first, int64_t 
     lines.pull_end[1][n] = count ? -lines.position(n, 0) : -infinity;
     lines.gain_start[1][n] = std::max(static_cast<T>(1 - length), -lines.gain_start[1][n]);
     T* block = lines.at(n, count / kLanes);
-    for (int64_t k = 0; rest && k < 1 + 2 * lines.channels; ++k) std::fill(block + k * kLanes + rest, block + (k + 1) * kLanes, T(0));
+    for (int64_t k = 0; rest && k < 1 + 2 * lines.channels; ++k)
+      std::fill(block + k * kLanes + rest, block + (k + 1) * kLanes, T(0));
   }
 }
 
-// Writes how many of the pixels of line n before pixel m, ..., m + 7 are listed. bits: which of these eight are; count: those
-// before them.
+// Writes how many of the pixels of line n before pixel m, ..., m + 7 are listed. bits: which of these eight are;
+// count: those before them.
 template <class T>
 NMR_INLINE void count_before(ColorLines<T>& lines, int64_t n, int64_t m, int64_t count, uint32_t bits) {
   // Byte k of `each` is bit k, and byte k of `below` the sum of the bytes before it.
@@ -69,10 +70,12 @@ NMR_INLINE void count_before(ColorLines<T>& lines, int64_t n, int64_t m, int64_t
   store_lanes(lines.before.data() + n * lines.step_n + m, splat(static_cast<int32_t>(count)) + byte_lanes(below));
 }
 
-// Fills the lines of a range: of columns, of rows, or of all. Columns come in groups of eight. grad_row: [C, W + pad] of scratch.
+// Fills the lines of a range: of columns, of rows, or of all. Columns come in groups of eight. grad_row: [C, W +
+// pad] of scratch.
 template <int64_t kChannels, class T>
 NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& range, T* grad_row) {
-  const int64_t H = image.raster.height, W = image.raster.width, C = kChannels ? kChannels : image.channels, plane = W + kPad;
+  const int64_t H = image.raster.height, W = image.raster.width, C = kChannels ? kChannels : image.channels,
+                plane = W + kPad;
   const bool in_rows = range.row_first < range.row_last, in_columns = range.column_first < range.column_last;
   ColorLines<T>&columns = image.lines[0], &rows = image.lines[1];
   start_color_lines(columns, range.column_first, range.column_last);
@@ -129,14 +132,16 @@ NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& r
     }
     if (in_rows) rows.count[j] = static_cast<int32_t>(in_row), rows.before[j * rows.step_n + W] = rows.count[j];
   }
-  for (int64_t n = range.column_first; n < range.column_last; ++n) columns.before[H * columns.step_m + n] = columns.count[n];
+  for (int64_t n = range.column_first; n < range.column_last; ++n)
+    columns.before[H * columns.step_m + n] = columns.count[n];
   finish_color_lines(columns, range.column_first, range.column_last, H);
   finish_color_lines(rows, range.row_first, range.row_last, W);
 }
 
 // --- the pulls
 
-// What eight pixels of a list gain if they take the reference colour: sum over channels of (colour - reference) gradient.
+// What eight pixels of a list gain if they take the reference colour: sum over channels of (colour - reference)
+// gradient.
 template <int64_t kChannels, class T>
 NMR_INLINE Lanes<T> color_gains(const T* block, int64_t channels, const T* reference) {
   const int64_t C = kChannels ? kChannels : channels;
@@ -149,8 +154,8 @@ NMR_INLINE Lanes<T> color_gains(const T* block, int64_t channels, const T* refer
   return gain;
 }
 
-// Adds the pulls of eight pixels at these offsets from the crossing where the mask is set. The quotients w / h_p and w / h_q share one
-// division: w / (h_p h_q) times h_q and h_p.
+// Adds the pulls of eight pixels at these offsets from the crossing where the mask is set. The quotients w / h_p
+// and w / h_q share one division: w / (h_p h_q) times h_q and h_p.
 template <class T>
 NMR_INLINE void pull_lanes(LaneMask<T> mask, Lanes<T> weight, Lanes<T> offset, const Lever<T>& lever, Lanes<T>& pulls_p,
                            Lanes<T>& pulls_q) {
@@ -176,10 +181,11 @@ void pull_one_by_one(const ColorLines<T>& lines, int64_t n, int64_t first, int64
   }
 }
 
-// Outside: every listed pixel beyond the crossing, from the outer one to the border, takes the colour of the inner one if the edge
-// moves out to it.
+// Outside: every listed pixel beyond the crossing, from the outer one to the border, takes the colour of the inner
+// one if the edge moves out to it.
 template <bool kUp, int64_t kChannels, class T>
-NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, int64_t blocks, const T* reference, const Lever<T>& lever, T* pulls) {
+NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, int64_t blocks, const T* reference,
+                             const Lever<T>& lever, T* pulls) {
   // All offsets have the same sign, so the signs of both distances are constant.
   const T eps = kUp ? lever.eps : -lever.eps;
   const Lanes<T> crossing = splat(lever.crossing), factor_p = splat(lever.factor_p), factor_q = splat(lever.factor_q);
@@ -203,16 +209,18 @@ NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, int64_t bloc
   add_lane_sums<T>(pulls_p, pulls_q, pulls);
 }
 
-// Inside: the listed pixels [first, last) that face `id` owns take the colour of the outer one if the edge moves in past them.
+// Inside: the listed pixels [first, last) that face `id` owns take the colour of the outer one if the edge moves in
+// past them.
 template <int64_t kChannels, class T>
-NMR_INLINE void pull_own(const ColorLines<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id, const T* reference,
-                         const Lever<T>& lever, T* pulls) {
+NMR_INLINE void pull_own(const ColorLines<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id,
+                         const T* reference, const Lever<T>& lever, T* pulls) {
   const int32_t* owner = lines.owners(n);
   const int64_t C = kChannels ? kChannels : lines.channels;
   T far_color[kChannels ? kChannels : 1];  // a local copy: kept in registers
   if (kChannels) std::copy_n(reference, C, far_color), reference = far_color;
   Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
-  const Lanes32 begin = splat(static_cast<int32_t>(first - 1)), end = splat(static_cast<int32_t>(last)), own = splat(id);
+  const Lanes32 begin = splat(static_cast<int32_t>(first - 1)), end = splat(static_cast<int32_t>(last)),
+                own = splat(id);
   for (int64_t k = first / kLanes * kLanes; k < last; k += kLanes) {
     const Lanes32 number = lane_numbers() + splat(static_cast<int32_t>(k));
     const Lanes32 here = (number > begin) & (number < end) & (load_lanes<Lanes32>(owner + k) == own);
@@ -243,10 +251,12 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
   const Lanes32 step_m = splat(step), all = splat(static_cast<int32_t>(crossings.count));
   const Lanes32 face_of = splat(static_cast<int32_t>(kSweptFaces - 1)), sign = splat(d);
   const Lanes32 last_pixel = splat(static_cast<int32_t>(length - 1)), none = splat(int32_t(0)), one = splat(int32_t(1));
-  const Lanes32 before_n = splat(static_cast<int32_t>(lines.step_n)), before_m = splat(static_cast<int32_t>(lines.step_m));
+  const Lanes32 before_n = splat(static_cast<int32_t>(lines.step_n)),
+                before_m = splat(static_cast<int32_t>(lines.step_m));
   const Lanes<T> largest = splat(image.largest_lever);
   const int32_t* before = lines.before.data();
-  int32_t pixel_at[kCrossings + kPad], first_at[kCrossings + kPad], last_at[kCrossings + kPad], id_at[kCrossings + kPad];
+  int32_t pixel_at[kCrossings + kPad], first_at[kCrossings + kPad], last_at[kCrossings + kPad],
+      id_at[kCrossings + kPad];
   int32_t outer_at[kCrossings + kPad], count_at[kCrossings + kPad];
   int32_t extreme[2][kCrossings + kPad];  // as pulled and gained, where a lever has extreme size
   T factor_p[kCrossings + kPad], factor_q[kCrossings + kPad];
@@ -275,13 +285,16 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
     // In the list of the line.
     const Lanes32 origin_n = line * before_n;
     const Lanes32 first = gather_lanes(before, origin_n + select(low < none, none, low) * before_m);
-    const Lanes32 last = gather_lanes(before, origin_n + (select(high < last_pixel, high, last_pixel) + one) * before_m);
+    const Lanes32 last =
+        gather_lanes(before, origin_n + (select(high < last_pixel, high, last_pixel) + one) * before_m);
     const Lanes<T> reach = gather_values<T>(block.reach[axis], edge), scan = to_values<T>(line);
     const Lanes<T> by_p = reach / (gather_values<T>(block.qs[axis], edge) - scan);
     const Lanes<T> by_q = reach / (scan - gather_values<T>(block.ps[axis], edge));
-    const LaneMask<T> moderate = (by_p < largest) & (by_p > zero - largest) & (by_q < largest) & (by_q > zero - largest);
+    const LaneMask<T> moderate =
+        (by_p < largest) & (by_p > zero - largest) & (by_q < largest) & (by_q > zero - largest);
     // Outside: from the outer pixel on, eight at a time, the first or the last eight together.
-    const Lanes32 outer = gather_lanes(before, origin_n + (inner * sign + splat(kUp ? int32_t(1) : int32_t(0))) * before_m);
+    const Lanes32 outer =
+        gather_lanes(before, origin_n + (inner * sign + splat(kUp ? int32_t(1) : int32_t(0))) * before_m);
     store_lanes(outer_at + i, outer);
     if (kUp) store_lanes(count_at + i, gather_lanes(lines.count.data(), line));
     store_lanes(pixel_at + i, pixel);
@@ -320,12 +333,14 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
   for (int64_t k = 0; k < num_gained; ++k) {
     const int32_t i = crossings.gained[k];
     const T* reference = image.color(pixel_at[i] + step);
-    pull_own<kChannels>(lines, crossings.line[i], first_at[i], last_at[i], id_at[i], reference, lever_of(i), pulls_of(i));
+    pull_own<kChannels>(lines, crossings.line[i], first_at[i], last_at[i], id_at[i], reference, lever_of(i),
+                        pulls_of(i));
   }
   for (int64_t k = 0; k < num_extreme[1]; ++k) {
     const int32_t i = extreme[1][k];
     const T* reference = image.color(pixel_at[i] + step);
-    pull_one_by_one<true>(lines, crossings.line[i], first_at[i], last_at[i], id_at[i], reference, lever_of(i), pulls_of(i));
+    pull_one_by_one<true>(lines, crossings.line[i], first_at[i], last_at[i], id_at[i], reference, lever_of(i),
+                          pulls_of(i));
   }
 }
 
@@ -353,7 +368,8 @@ NMR_INLINE void sweep_colors(const ColorImage<T>& image, int axis, SweepScratch<
 
 // Gradients [3, 2] of x and y of the corners of visible faces [first, last) of the list.
 template <class T>
-void sweep_color_faces(const ColorImage<T>& image, const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block, T* grad) {
+void sweep_color_faces(const ColorImage<T>& image, const int32_t* ids, int64_t first, int64_t last,
+                       SweepScratch<T>& block, T* grad) {
   const auto run = [](const ColorImage<T>& image, int axis, int direction, SweepScratch<T>& block) {
     direction == 0 ? sweep_colors<true>(image, axis, block) : sweep_colors<false>(image, axis, block);
   };

@@ -26,11 +26,11 @@ namespace nmr {
 
 namespace {
 
-// A row of the image, w pixels wide, from the raster rows `pixels` [2 or 1, W, C]. behind: the background and the mean of four
-// background pixels [2, C], or nullptr. kChannels: C, or 0 if it is known only at run time.
+// A row of the image, w pixels wide, from the raster rows `pixels` [2 or 1, W, C]. behind: the background and the
+// mean of four background pixels [2, C], or nullptr. kChannels: C, or 0 if it is known only at run time.
 template <int64_t kChannels, class T>
-NMR_INLINE void resolve_row(const int32_t* owner, const T* pixels, const T* behind, int64_t w, bool anti_aliasing, int64_t channels,
-                            T* out) {
+NMR_INLINE void resolve_row(const int32_t* owner, const T* pixels, const T* behind, int64_t w, bool anti_aliasing,
+                            int64_t channels, T* out) {
   const int64_t C = kChannels ? kChannels : channels, W = 2 * w;
   if (!anti_aliasing) {
     for (int64_t x = 0; x < w; ++x)
@@ -54,7 +54,8 @@ NMR_INLINE void resolve_row(const int32_t* owner, const T* pixels, const T* behi
 
 // Its gradient for one raster row [W, C]: `grad` is that of the image row, owner nullptr if no background is mixed in.
 template <int64_t kChannels, class T>
-NMR_INLINE void resolve_row_backward(const int32_t* owner, const T* grad, int64_t w, bool anti_aliasing, int64_t channels, T* out) {
+NMR_INLINE void resolve_row_backward(const int32_t* owner, const T* grad, int64_t w, bool anti_aliasing,
+                                     int64_t channels, T* out) {
   const int64_t C = kChannels ? kChannels : channels, scale = anti_aliasing ? 2 : 1;
   const T share = T(1) / static_cast<T>(scale * scale);  // a power of two: exact
   for (int64_t x = 0; x < w; ++x, grad += C)
@@ -69,7 +70,8 @@ NMR_INLINE void resolve_row_backward(const int32_t* owner, const T* grad, int64_
 // The mean of 2x2 pixels, or a copy; pixels without a face have the background's colour, where there is one.
 template <class T>
 void resolve_forward(const Resolve<T>& args) {
-  const int64_t h = args.image.height, w = args.image.width, C = args.channels, scale = args.anti_aliasing ? 2 : 1, W = scale * w;
+  const int64_t h = args.image.height, w = args.image.width, C = args.channels, scale = args.anti_aliasing ? 2 : 1,
+                W = scale * w;
   std::vector<T> behind;  // of each background, as resolve_row takes it
   for (int64_t b = 0; args.background && b < args.background_batch; ++b) {
     const T* color = args.background + b * C;
@@ -78,9 +80,11 @@ void resolve_forward(const Resolve<T>& args) {
   }
   with_channels(C, [&](auto known) {
     parallel_for(args.batch * h, args.num_threads, [&](int64_t n) {  // n: image b, row y
-      const T* background = args.background ? behind.data() + (args.background_batch == 1 ? 0 : n / h * 2 * C) : nullptr;
+      const T* background =
+          args.background ? behind.data() + (args.background_batch == 1 ? 0 : n / h * 2 * C) : nullptr;
       const int32_t* owner = args.background ? args.owner + n * scale * W : nullptr;
-      resolve_row<known()>(owner, args.pixels + n * scale * W * C, background, w, args.anti_aliasing, C, args.resolved + n * w * C);
+      resolve_row<known()>(owner, args.pixels + n * scale * W * C, background, w, args.anti_aliasing, C,
+                           args.resolved + n * w * C);
     });
   });
 }
@@ -94,8 +98,9 @@ void resolve_backward(const Resolve<T>& args) {
   if (args.grad_pixels)
     with_channels(C, [&](auto known) {
       parallel_for(args.batch * H, args.num_threads, [&](int64_t n) {  // n: image b, raster row
-        resolve_row_backward<known()>(args.background ? args.owner + n * W : nullptr, args.grad_resolved + n / scale * w * C, w,
-                                      args.anti_aliasing, C, args.grad_pixels + n * W * C);
+        resolve_row_backward<known()>(args.background ? args.owner + n * W : nullptr,
+                                      args.grad_resolved + n / scale * w * C, w, args.anti_aliasing, C,
+                                      args.grad_pixels + n * W * C);
       });
     });
   if (args.grad_background)
@@ -106,7 +111,8 @@ void resolve_backward(const Resolve<T>& args) {
       const T* grad = args.grad_resolved + b * h * w * C;
       for (int64_t y = 0; y < H; ++y)
         for (int64_t x = 0; x < W; ++x)
-          for (int64_t c = 0; c < C && owner[y * W + x] < 0; ++c) sum[c] += grad[(y / scale * w + x / scale) * C + c] * share;
+          for (int64_t c = 0; c < C && owner[y * W + x] < 0; ++c)
+            sum[c] += grad[(y / scale * w + x / scale) * C + c] * share;
     });
 }
 
@@ -133,10 +139,19 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
   const Size raster = raster_of(args.image, args.anti_aliasing);
   const int64_t H = raster.height, W = raster.width, C = args.channels;
   EdgeScratch<T>& scratch = thread_scratch<EdgeScratch<T>>();
-  const ColorImage<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b), raster, args.image,
-                            args.anti_aliasing, args.eps, args.owner + b * raster.pixels(), args.pixels + b * raster.pixels() * C,
+  const ColorImage<T> image{args.mesh.image_vertices(b),
+                            args.mesh.image_faces(b),
+                            args.mesh.face_count(b),
+                            raster,
+                            args.image,
+                            args.anti_aliasing,
+                            args.eps,
+                            args.owner + b * raster.pixels(),
+                            args.pixels + b * raster.pixels() * C,
                             args.background ? args.background + (args.background_batch == 1 ? 0 : b * C) : nullptr,
-                            args.grad_resolved + b * args.image.pixels() * C, C, scratch.lines,
+                            args.grad_resolved + b * args.image.pixels() * C,
+                            C,
+                            scratch.lines,
                             args.eps > T(1e-15) ? T(1e15) : T(0)};
   T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
   std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));
@@ -179,7 +194,8 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
 
 template <class T>
 void edges_backward(const EdgesBackward<T>& args) {
-  // Few images: all threads share the lines and faces of one image. Each face has its own sum, so the result is the same.
+  // Few images: all threads share the lines and faces of one image. Each face has its own sum, so the result is the
+  // same.
   const bool share_images = args.mesh.batch < args.num_threads;
   parallel_for(args.mesh.batch, share_images ? 1 : args.num_threads,
                [&](int64_t b) { edges_backward_image(args, b, share_images ? args.num_threads : 1); });

@@ -157,7 +157,8 @@ struct Highlight {
     value = static_cast<T>(exp2_of(shininess * log2_x));
   }
   // Adds the gradients of the normal, of l and of the direction towards the eye.
-  void backward(const Spot<T>& spot, const Vec3<T>& l, T shininess, T grad, Spot<T>& grads, Vec3<T>& grad_l, T& grad_shininess) const {
+  void backward(const Spot<T>& spot, const Vec3<T>& l, T shininess, T grad, Spot<T>& grads, Vec3<T>& grad_l,
+                T& grad_shininess) const {
     if (!(x > 0)) return;
     grad_shininess += static_cast<T>(grad * value * log2_x * 0.69314718055994531);
     const T grad_x = grad * shininess * (value / x);
@@ -183,14 +184,16 @@ PixelLight<T> light_at(const Lamps<T>& lamps, const Spot<T>& spot, bool highligh
     const Unit<T> l(towards);
     const T strength = lamp.point ? 1 / (1 + lamp.falloff * towards.squaredNorm()) : l.length;
     light.diffuse += (lamp.point ? strength * spot.normal.dot(l.unit) : spot.normal.dot(towards)) * color;
-    if (highlights) light.highlight += lamps.specular * strength * Highlight<T>(spot, l.unit, lamps.shininess).value * color;
+    if (highlights)
+      light.highlight += lamps.specular * strength * Highlight<T>(spot, l.unit, lamps.shininess).value * color;
   }
   return light;
 }
 
 // Adds the gradients of the lamps and of the spot (its normal, point and direction towards the eye).
 template <class T>
-void light_backward(const Lamps<T>& lamps, const Spot<T>& spot, const PixelLight<T>& grad, Lamps<T>& grad_lamps, Spot<T>& grad_spot) {
+void light_backward(const Lamps<T>& lamps, const Spot<T>& spot, const PixelLight<T>& grad, Lamps<T>& grad_lamps,
+                    Spot<T>& grad_spot) {
   grad_lamps.ambient += grad.diffuse.dot(lamps.ambient_color);
   grad_lamps.ambient_color += lamps.ambient * grad.diffuse;
   for (size_t n = 0; n < lamps.lamps.size(); ++n) {
@@ -221,7 +224,8 @@ void light_backward(const Lamps<T>& lamps, const Spot<T>& spot, const PixelLight
       grad_color += lamps.specular * strength * h.value * grad.highlight;
       grad_lamps.specular += shine * strength * h.value;
       grad_strength += shine * lamps.specular * h.value;
-      h.backward(spot, l.unit, lamps.shininess, shine * lamps.specular * strength, grad_spot, grad_l, grad_lamps.shininess);
+      h.backward(spot, l.unit, lamps.shininess, shine * lamps.specular * strength, grad_spot, grad_l,
+                 grad_lamps.shininess);
     }
     grad_lamp.intensity += grad_color.dot(lamp.color);
     grad_lamp.color += lamp.intensity * grad_color;
@@ -250,7 +254,8 @@ struct View {
   int64_t first_normal;  // row of normals
   T side;                // normals are multiplied by this where a face is seen from its front
 
-  View(const Lit<T>& args, int64_t b) : image(image_attributes(args.at, b)), viewer(args.viewer + 5 * b), side(viewer[4]) {
+  View(const Lit<T>& args, int64_t b)
+      : image(image_attributes(args.at, b)), viewer(args.viewer + 5 * b), side(viewer[4]) {
     const int64_t* s = args.at.starts ? args.at.starts + 2 * b : nullptr;
     vertices = args.at.attributes + 3 * image.first_row;
     const int64_t rows = args.smooth ? args.at.num_attributes : args.at.num_faces;
@@ -297,7 +302,8 @@ NMR_INLINE Pixel<T> pixel_of(const Lit<T>& args, const View<T>& view, int64_t id
   return p;
 }
 
-constexpr int64_t kSums = 18;  // per visible face: of the normal (smooth: of three corners), of the positions of the corners
+constexpr int64_t kSums =
+    18;  // per visible face: of the normal (smooth: of three corners), of the positions of the corners
 
 // The sums of a block: of visible faces, and of the lamps.
 template <class T>
@@ -310,8 +316,9 @@ struct LitSums {
 
 // The gradients of one pixel, or of one face where all its pixels are lit alike (weights: nullptr).
 template <class T>
-NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps, const Pixel<T>& p, const T* weights,
-                               const PixelLight<T>& grad, bool position, Lamps<T>& grad_lamps, T* sums, T* grad_weights) {
+NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps, const Pixel<T>& p,
+                               const T* weights, const PixelLight<T>& grad, bool position, Lamps<T>& grad_lamps,
+                               T* sums, T* grad_weights) {
   Spot<T> grad_spot{Vec3<T>::Zero(), Vec3<T>::Zero(), Vec3<T>::Zero()};
   if (args.parameters)
     light_backward(lamps, p.spot, grad, grad_lamps, grad_spot);
@@ -352,7 +359,8 @@ void light_faces(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps,
 }
 
 template <class T>
-void find_visible(const Lit<T>& args, const View<T>& view, const RowBlocks& blocks, int64_t begin, int64_t end, LitSums<T>& sums) {
+void find_visible(const Lit<T>& args, const View<T>& view, const RowBlocks& blocks, int64_t begin, int64_t end,
+                  LitSums<T>& sums) {
   sums.visible.reserve_for(view.image.num_faces, blocks.most_visible(view.image.num_faces));
   sums.visible.find(args.at.owner + begin, end - begin, view.image.num_faces);
 }
@@ -415,7 +423,8 @@ void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, i
     }
     const T* color = kColors ? args.colors + kColors * n : nullptr;
     const Pixel<T> p = pixel_of(args, view, id, args.at.weights + 3 * n, position);
-    const PixelLight<T> light = args.parameters ? light_at(lamps, p.spot, lamps.highlights) : PixelLight<T>{p.spot.normal, Vec3<T>::Zero()};
+    const PixelLight<T> light =
+        args.parameters ? light_at(lamps, p.spot, lamps.highlights) : PixelLight<T>{p.spot.normal, Vec3<T>::Zero()};
     for (int k = 0; k < 3; ++k)
       lit[k] = (kColors ? color[kColors == 3 ? k : 0] * light.diffuse[k] : light.diffuse[k]) + light.highlight[k];
   }
@@ -477,7 +486,8 @@ void scatter_lit(const Lit<T>& args, int64_t b, LitSums<T>& sums) {
     const T* sum = sums.values.data() + kSums * n;
     if (args.grad_normals && !args.smooth) add3(args.grad_normals + 3 * (view.first_normal + face), load3(sum));
     for (int k = 0; k < 3; ++k) {
-      if (args.grad_normals && args.smooth) add3(args.grad_normals + 3 * (view.first_normal + corners[k]), load3(sum + 3 * k));
+      if (args.grad_normals && args.smooth)
+        add3(args.grad_normals + 3 * (view.first_normal + corners[k]), load3(sum + 3 * k));
       if (args.at.grad_attributes && position)
         add3(args.at.grad_attributes + 3 * (view.image.first_row + corners[k]), load3(sum + 9 + 3 * k));
     }
@@ -504,7 +514,8 @@ void lit_forward(const Lit<T>& args) {
     const int64_t b = task / most_blocks, block = task % most_blocks;
     const RowBlocks blocks = blocks_of(b);
     if (block >= blocks.count) return;
-    with_colors(args, [&](auto known) { lit_block_forward<known()>(args, blocks, b, block, thread_scratch<LitSums<T>>()); });
+    with_colors(args,
+                [&](auto known) { lit_block_forward<known()>(args, blocks, b, block, thread_scratch<LitSums<T>>()); });
   });
 }
 

@@ -1,7 +1,7 @@
 // Colours from texture images: mipmaps, the level of each pixel, and sampling.
 //
-// A pixel with weights b has (u, v) = sum_k b_k (u_k, v_k). On a level of height x width texels its position is x = u width - 1/2,
-// y = (1 - v) height - 1/2, with texel centres at the integers and row 0 at the top.
+// A pixel with weights b has (u, v) = sum_k b_k (u_k, v_k). On a level of height x width texels its position is x =
+// u width - 1/2, y = (1 - v) height - 1/2, with texel centres at the integers and row 0 at the top.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -131,8 +131,9 @@ NMR_INLINE Place<T> place_of(const T* uv, const int64_t* corners, const T* weigh
 
 // --- levels
 
-// Derivatives of (u, v) by the pixel coordinates (X, Y). With M the matrix of barycentric weights (geometry.h) and N_k = M_k / z_k,
-// b_k = z (N_k0 X + N_k1 Y + N_k2) and 1 / z = sum_k N_k . (X, Y, 1), so that du/dX = z (sum_k N_k0 u_k - u sum_k N_k0).
+// Derivatives of (u, v) by the pixel coordinates (X, Y). With M the matrix of barycentric weights (geometry.h) and
+// N_k = M_k / z_k, b_k = z (N_k0 X + N_k1 Y + N_k2) and 1 / z = sum_k N_k . (X, Y, 1), so that du/dX = z (sum_k
+// N_k0 u_k - u sum_k N_k0).
 template <class T>
 struct Slopes {
   T u[2], v[2], one[2];  // sums over k of N_k0 and N_k1, times u_k, v_k and 1
@@ -279,7 +280,8 @@ NMR_INLINE void add_taps(const Taps<T>& taps, const T* texels, T share, int64_t 
 
 // Adds the gradient of a color to the texels whose row begins in [first, last).
 template <int64_t kChannels, class T>
-NMR_INLINE void add_texel_gradients(const Taps<T>& taps, T share, const T* grad, int64_t C, int64_t first, int64_t last, T* grad_texels) {
+NMR_INLINE void add_texel_gradients(const Taps<T>& taps, T share, const T* grad, int64_t C, int64_t first, int64_t last,
+                                    T* grad_texels) {
   for (int k = 0; k < 4; ++k) {
     const int64_t row = taps.row[k >> 1];
     if (row < first || row >= last) continue;
@@ -291,8 +293,8 @@ NMR_INLINE void add_texel_gradients(const Taps<T>& taps, T share, const T* grad,
 
 // Adds dL/du and dL/dv of one level.
 template <int64_t kChannels, class T>
-NMR_INLINE void add_place_gradient(const Taps<T>& taps, const Grid& grid, const T* texels, T share, const T* grad, int64_t C, T& grad_u,
-                                   T& grad_v) {
+NMR_INLINE void add_place_gradient(const Taps<T>& taps, const Grid& grid, const T* texels, T share, const T* grad,
+                                   int64_t C, T& grad_u, T& grad_v) {
   const T *a = texels + taps.texel(0) * C, *b = texels + taps.texel(1) * C;
   const T *c = texels + taps.texel(2) * C, *d = texels + taps.texel(3) * C;
   T by_x = 0, by_y = 0;
@@ -306,13 +308,15 @@ NMR_INLINE void add_place_gradient(const Taps<T>& taps, const Grid& grid, const 
 
 constexpr int64_t kNoRow = -1;
 
-// The gradients of a block's pixels: those of weights, the sums of uv per corner, and, if `direct`, those of texels. Otherwise `rows`
-// gets the first texel of the (up to four) rows of each pixel, from which scatter_texels continues.
+// The gradients of a block's pixels: those of weights, the sums of uv per corner, and, if `direct`, those of
+// texels. Otherwise `rows` gets the first texel of the (up to four) rows of each pixel, from which scatter_texels
+// continues.
 template <int64_t kChannels, class T>
-void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>& image, const RowBlocks& blocks, int64_t b,
-                              int64_t block, bool direct, int32_t* rows, CornerSums<T>& sums) {
+void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>& image, const RowBlocks& blocks,
+                              int64_t b, int64_t block, bool direct, int32_t* rows, CornerSums<T>& sums) {
   const Interpolate<T>& at = args.uv;
-  const int64_t H = at.raster.height, W = at.raster.width, C = kChannels ? kChannels : args.channels, F = image.num_faces;
+  const int64_t H = at.raster.height, W = at.raster.width, C = kChannels ? kChannels : args.channels,
+                F = image.num_faces;
   const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
   const int64_t per_pixel = args.level ? 4 : 2;
   const T* uv = at.attributes + 2 * image.first_row;
@@ -346,7 +350,8 @@ void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>&
     for (int k = 0; k < 3; ++k) {
       if (at.grad_weights) {
         const T* row = uv + 2 * corners[k];  // a coordinate that does not count may be NaN
-        at.grad_weights[3 * n + k] = (place.u_counts ? row[0] * grad_u : T(0)) + (place.v_counts ? row[1] * grad_v : T(0));
+        at.grad_weights[3 * n + k] =
+            (place.u_counts ? row[0] * grad_u : T(0)) + (place.v_counts ? row[1] * grad_v : T(0));
       }
       if (at.grad_attributes) {
         T* sum = sums.values.data() + (3 * sums.visible.slots[id + 1] + k) * 2;
@@ -367,15 +372,16 @@ void scatter_texels(const SampleUV<T>& args, const int32_t* rows, int64_t first,
     const int64_t F = image.num_faces;
     for (int64_t n = b * pixels; n < (b + 1) * pixels; ++n) {
       bool inside = false;
-      for (int64_t k = 0; k < per_pixel; ++k) inside |= rows[n * per_pixel + k] >= first && rows[n * per_pixel + k] < last;
+      for (int64_t k = 0; k < per_pixel; ++k)
+        inside |= rows[n * per_pixel + k] >= first && rows[n * per_pixel + k] < last;
       if (!inside) continue;
       const int64_t id = at.owner[n];
       const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);
       const Place<T> place = place_of(at.attributes + 2 * image.first_row, corners, at.weights + 3 * n);
       const Blend<T> blend = blend_of(args, b, n);
       for (int l = 0; l < blend.count; ++l)
-        add_texel_gradients<kChannels>(taps_of(blend.grid[l], place, args.wrap), blend.share[l], args.grad_colors + n * C, C, first,
-                                       last, args.grad_texels);
+        add_texel_gradients<kChannels>(taps_of(blend.grid[l], place, args.wrap), blend.share[l],
+                                       args.grad_colors + n * C, C, first, last, args.grad_texels);
     }
   }
 }
@@ -401,14 +407,16 @@ void sample_uv_forward(const SampleUV<T>& args) {
         const Place<T> place = place_of(uv, image.corners + 3 * (id < F ? id : id - F), at.weights + 3 * n);
         const Blend<T> blend = blend_of(args, b, n);
         add_taps<known(), false>(taps_of(blend.grid[0], place, args.wrap), args.texels, blend.share[0], C, color);
-        if (blend.count == 2) add_taps<known(), true>(taps_of(blend.grid[1], place, args.wrap), args.texels, blend.share[1], C, color);
+        if (blend.count == 2)
+          add_taps<known(), true>(taps_of(blend.grid[1], place, args.wrap), args.texels, blend.share[1], C, color);
       }
     });
   });
 }
 
-// Every texel is summed on one thread, over images and pixels in ascending order: on one thread, or if each image has its own texels
-// and its own uv, directly; otherwise each thread takes ranges of texels, and reads the pixels that touch them.
+// Every texel is summed on one thread, over images and pixels in ascending order: on one thread, or if each image
+// has its own texels and its own uv, directly; otherwise each thread takes ranges of texels, and reads the pixels
+// that touch them.
 template <class T>
 void sample_uv_backward(const SampleUV<T>& args) {
   const Interpolate<T>& at = args.uv;
