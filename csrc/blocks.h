@@ -1,5 +1,5 @@
-// Work on an owner map in blocks of raster rows, with sums that do not depend on the number of threads: the blocks depend only on
-// the sizes, each block has its own sum, and the sums are added in the order of the blocks.
+// Work on an owner map in blocks of raster rows, with sums that do not depend on the number of threads: the blocks
+// depend only on the sizes, each block has its own sum, and the sums are added in the order of the blocks.
 #pragma once
 
 #include <algorithm>
@@ -20,7 +20,8 @@ struct RowBlocks {
   int64_t rows;         // per block
   int64_t count;
 
-  // A block has at least 2^14 pixels, and at least a quarter as many pixels as there are faces, because it reads every face's mark.
+  // A block has at least 2^14 pixels, and at least a quarter as many pixels as there are faces, because it reads every
+  // face's mark.
   RowBlocks(Size raster, int64_t num_faces) : raster(raster) {
     const int64_t pixels = std::max<int64_t>(int64_t(1) << 14, num_faces / 2);
     rows = (pixels + raster.width - 1) / raster.width;
@@ -77,9 +78,9 @@ NMR_INLINE void covered_range(const int32_t* owner, int64_t R, int64_t& first, i
   while (last > first && owner[last - 1] < 0) --last;
 }
 
-// Calls produce(b, block, result) for every block of every image, on several threads, and then consume(b, result) for each block.
-// Blocks that add to the same output are consumed one after the other, in ascending order of (b, block). Each image has its own
-// output, unless the images share one. block_count(b) is the number of blocks of image b.
+// Calls produce(b, block, result) for every block of every image, on several threads, and then consume(b, result) for
+// each block. Blocks that add to the same output are consumed one after the other, in ascending order of (b, block).
+// Each image has its own output, unless the images share one. block_count(b) is the number of blocks of image b.
 template <class Result, class BlockCount, class Produce, class Consume>
 void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& block_count, const Produce& produce,
                 const Consume& consume) {
@@ -131,7 +132,8 @@ struct FaceGradients {
 
 // Adds these gradients to the vertices of one image (faces [F, 3]).
 template <class T>
-void scatter_face_gradients(const FaceGradients<T>& gradients, const int64_t* faces, int64_t num_faces, T* grad_vertices) {
+void scatter_face_gradients(const FaceGradients<T>& gradients, const int64_t* faces, int64_t num_faces,
+                            T* grad_vertices) {
   const T* value = gradients.values.data();
   for (int64_t n = 0; n < gradients.count; ++n) {
     const bool reversed = gradients.ids[n] >= num_faces;

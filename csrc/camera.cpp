@@ -10,12 +10,13 @@
 namespace nmr {
 namespace {
 
-constexpr int kGroup = 16;       // vertices processed together, and partial sums per gradient; the same on every processor
+constexpr int kGroup = 16;  // vertices processed together, and partial sums per gradient; the same on every processor
 constexpr int64_t kChunk = 512;  // vertices per task: sums are taken per chunk, then over chunks
 constexpr int kSums = 12 + 6 + 5;        // sums over vertices per camera: gradients of matrix, intrinsics, distortion
 constexpr int kTotals = kSums + 3 + 1;   // plus the gradients of origin and extent, which follow from the sums
 
-// Derivatives, and gradients multiplied by them, count as infinite beyond this limit. It is small enough that sums cannot overflow.
+// Derivatives, and gradients multiplied by them, count as infinite beyond this limit. It is small enough that sums
+// cannot overflow.
 template <class T> constexpr T kLimit = T(1e200);
 template <> constexpr float kLimit<float> = 1e30f;
 
@@ -26,7 +27,8 @@ struct Lens {
   T largest_a, largest_k, largest_d;  // largest |a|, |k / extent|, |d|; the first and the last at least 1
   bool usable;                        // all of it is finite, and extent is not 0
 
-  Lens(const Project<T>& args, int64_t b) : d{}, o{}, extent(1), largest_a(1), largest_k(0), largest_d(1), usable(true) {
+  Lens(const Project<T>& args, int64_t b)
+      : d{}, o{}, extent(1), largest_a(1), largest_k(0), largest_d(1), usable(true) {
     std::copy_n(args.matrix + 12 * b, 12, a);
     std::copy_n(args.intrinsics + 6 * b, 6, k);
     if (args.distortion) std::copy_n(args.distortion + 5 * b, 5, d);
@@ -54,8 +56,9 @@ NMR_INLINE bool is_finite(T value) {
   return std::abs(value) <= std::numeric_limits<T>::max();
 }
 
-// The image of a vertex. If there is none (the vertex is not finite, in the plane of the eye, or so close to it that x / z^2
-// overflows), `size` is not finite and all else is undefined. (One number, because compilers do not vectorize loops over `&&`.)
+// The image of a vertex. If there is none (the vertex is not finite, in the plane of the eye, or so close to it that x
+// / z^2 overflows), `size` is not finite and all else is undefined. (One number, because compilers do not vectorize
+// loops over `&&`.)
 template <class T>
 struct Sight {
   T inverse_z;
@@ -66,8 +69,8 @@ struct Sight {
   T size;      // |x| + |y| + |z|
 };
 
-// x, y, z are relative to the origin. Images use divisions, which round as the published ones. Derivatives (kExact false) use one
-// reciprocal instead, which saves time.
+// x, y, z are relative to the origin. Images use divisions, which round as the published ones. Derivatives (kExact
+// false) use one reciprocal instead, which saves time.
 template <class T, bool kPerspective, bool kDistorted, bool kExact>
 NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
   Sight<T> s;
@@ -81,7 +84,8 @@ NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
   s.slope = kPerspective ? reach * std::abs(s.inverse_z) : T(1);
   s.qx = s.px;
   s.qy = s.py;
-  if (kDistorted) {  // q = p (1 + k1 r^2 + k2 r^4 + k3 r^6) + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y)
+  // q = p (1 + k1 r^2 + k2 r^4 + k3 r^6) + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y)
+  if (kDistorted) {
     const T r2 = s.px * s.px + s.py * s.py, xy = s.px * s.py;
     const T radial = 1 + r2 * (c.d[0] + r2 * (c.d[1] + r2 * c.d[4]));
     s.qx = s.px * radial + 2 * c.d[2] * xy + c.d[3] * (r2 + 2 * s.px * s.px);
@@ -101,17 +105,17 @@ template <class T, bool kPerspective, bool kDistorted>
 NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T* __restrict points) {
   const T infinity = std::numeric_limits<T>::infinity();
   for (int l = 0; l < kGroup; ++l) {
-    const Sight<T> s = sight_of<T, kPerspective, kDistorted, true>(c, vertices[3 * l] - c.o[0], vertices[3 * l + 1] - c.o[1],
-                                                               vertices[3 * l + 2] - c.o[2]);
+    const Sight<T> s = sight_of<T, kPerspective, kDistorted, true>(
+        c, vertices[3 * l] - c.o[0], vertices[3 * l + 1] - c.o[1], vertices[3 * l + 2] - c.o[2]);
     points[3 * l] = is_finite(s.size) ? s.x : infinity;
     points[3 * l + 1] = is_finite(s.size) ? s.y : infinity;
     points[3 * l + 2] = is_finite(s.z) ? s.z : T(0);
   }
 }
 
-// Adds the gradient of kGroup vertices to grad_vertices, and that of the camera to the partial sums. A vertex without an image, or
-// whose gradient would overflow although the upstream gradient is finite, gets gradient 0 and contributes 0 to the camera. If the
-// upstream gradient is infinite or NaN, that of the vertex and of the camera is NaN.
+// Adds the gradient of kGroup vertices to grad_vertices, and that of the camera to the partial sums. A vertex without
+// an image, or whose gradient would overflow although the upstream gradient is finite, gets gradient 0 and contributes
+// 0 to the camera. If the upstream gradient is infinite or NaN, that of the vertex and of the camera is NaN.
 template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
 NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, const T* __restrict grad_points,
                                T* __restrict grad_vertices, T (*__restrict sums)[kGroup]) {
@@ -129,7 +133,8 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
     const bool keep = is_finite(bound >= kLimit<T> ? std::numeric_limits<T>::infinity() : s.size);
     // Values of skipped vertices are set to 0 before they are multiplied, so that no product is 0 * inf.
     x = keep ? x : T(0), y = keep ? y : T(0), z = keep ? z : T(0);
-    const T nothing = is_finite(s.size) ? gx * T(0) + gy * T(0) + gz * T(0) : T(0);  // NaN if the upstream gradient is not finite
+    const T nothing =
+        is_finite(s.size) ? gx * T(0) + gy * T(0) + gz * T(0) : T(0);  // NaN if the upstream gradient is not finite
     gx = keep ? gx : nothing, gy = keep ? gy : nothing, gz = keep ? gz : nothing;
     s.px = keep ? s.px : T(0), s.py = keep ? s.py : T(0);
     s.qx = keep ? s.qx : T(0), s.qy = keep ? s.qy : T(0);
@@ -199,7 +204,8 @@ NMR_INLINE void forward_run_of(const Project<T>& args, const Lens<T>& lens, cons
   const int64_t whole = run.count / kGroup * kGroup, rest = run.count - whole;
   Padded<T> last(vertices + 3 * whole, rest);
   for (int64_t n = 0; n < run.count; n += kGroup)  // one call, so that it is inlined into each clone
-    forward_lanes<T, kPerspective, kDistorted>(lens, n < whole ? vertices + 3 * n : last.vertices, n < whole ? points + 3 * n : last.out);
+    forward_lanes<T, kPerspective, kDistorted>(lens, n < whole ? vertices + 3 * n : last.vertices,
+                                               n < whole ? points + 3 * n : last.out);
   std::copy_n(last.out, 3 * rest, points + 3 * whole);
 }
 
@@ -222,7 +228,8 @@ NMR_INLINE void forward_run_body(const Project<T>& args, const Run& run) {
 }
 
 template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
-NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run, T* grad_vertices, double* total) {
+NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run, T* grad_vertices,
+                                double* total) {
   T sums[kSums][kGroup] = {};
   const T* vertices = args.vertices + 3 * run.vertices;
   const T* grad_points = args.grad_points + 3 * run.points;
@@ -290,7 +297,8 @@ const std::vector<Run>& runs_of(const Project<T>& args, ProjectScratch& scratch)
     const int64_t points = args.starts ? args.starts[2 * b] : b * args.num_vertices;
     const int64_t vertices = args.starts || args.vertex_batch != 1 ? points : 0;
     const int64_t count = args.starts ? args.starts[2 * b + 2] - points : args.num_vertices;
-    for (int64_t n = 0; n < count; n += kChunk) scratch.runs.push_back({b, vertices + n, points + n, std::min(kChunk, count - n)});
+    for (int64_t n = 0; n < count; n += kChunk)
+      scratch.runs.push_back({b, vertices + n, points + n, std::min(kChunk, count - n)});
   }
   return scratch.runs;
 }
@@ -320,7 +328,8 @@ void project_backward(const Project<T>& args) {
       args.grad_matrix || args.grad_intrinsics || args.grad_distortion || args.grad_origin || args.grad_extent;
   double* totals = sum_camera ? reserve(scratch.totals, num_runs * kTotals) : nullptr;
 
-  if (args.batch == 0 && args.grad_vertices) std::fill_n(args.grad_vertices, 3 * args.vertex_batch * args.num_vertices, T(0));
+  if (args.batch == 0 && args.grad_vertices)
+    std::fill_n(args.grad_vertices, 3 * args.vertex_batch * args.num_vertices, T(0));
 
   // If all images share the vertices, each chunk of vertices belongs to one task, which visits the images in order.
   const bool shared = !args.starts && args.vertex_batch == 1 && args.batch > 1;

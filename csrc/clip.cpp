@@ -1,9 +1,10 @@
-// Near-plane clipping: which faces are drawn in place of those that cross the plane z = near. Only the topology is decided here; the
-// new vertices are computed where the camera is known (nmr/_clip.py).
+// Near-plane clipping: which faces are drawn in place of those that cross the plane z = near. Only the topology is
+// decided here; the new vertices are computed where the camera is known (nmr/_clip.py).
 //
-// A face with one corner in front becomes one triangle, a face with two becomes two triangles. The new vertices lie on the two edges
-// that cross the plane. Faces wholly in front stay as they are, faces wholly behind are left out. Each cut face has new vertices of
-// its own. Neighbours name the ends of their common edge in the same order, so their new vertices have the same bits and leave no gap.
+// A face with one corner in front becomes one triangle, a face with two becomes two triangles. The new vertices lie on
+// the two edges that cross the plane. Faces wholly in front stay as they are, faces wholly behind are left out. Each
+// cut face has new vertices of its own. Neighbours name the ends of their common edge in the same order, so their new
+// vertices have the same bits and leave no gap.
 #include <algorithm>
 
 #include "parallel.h"
@@ -25,10 +26,15 @@ NMR_INLINE bool any_behind_body(const T* vertices, int64_t count, T near) {
   return std::any_of(behind, behind + kLanes, [](int32_t any) { return any != 0; });
 }
 
-NMR_CLONES bool any_behind(const float* vertices, int64_t count, float near) { return any_behind_body(vertices, count, near); }
-NMR_CLONES bool any_behind(const double* vertices, int64_t count, double near) { return any_behind_body(vertices, count, near); }
+NMR_CLONES bool any_behind(const float* vertices, int64_t count, float near) {
+  return any_behind_body(vertices, count, near);
+}
+NMR_CLONES bool any_behind(const double* vertices, int64_t count, double near) {
+  return any_behind_body(vertices, count, near);
+}
 
-constexpr int64_t kPieces[4] = {1, 2, 1, 0};  // triangles that are left of a face with 0, 1, 2, 3 corners behind the plane
+// Triangles that are left of a face with 0, 1, 2, 3 corners behind the plane.
+constexpr int64_t kPieces[4] = {1, 2, 1, 0};
 
 // The corners of a face that lie behind the plane.
 struct Sides {

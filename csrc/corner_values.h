@@ -1,4 +1,5 @@
-// Shared by the stages that read values at the corners of faces: loops over pixels, the rows of an image's values, and sums per corner.
+// Shared by the stages that read values at the corners of faces: loops over pixels, the rows of an image's values, and
+// sums per corner.
 #pragma once
 
 #include <algorithm>
@@ -23,7 +24,8 @@ void for_rows(int64_t batch, int64_t height, int num_threads, const Body& body) 
   });
 }
 
-// Calls body(c) with c the number of channels as a compile-time constant if it is 1, 3 or 4, and with c = 0 for other numbers.
+// Calls body(c) with c the number of channels as a compile-time constant if it is 1, 3 or 4, and with c = 0 for other
+// numbers.
 template <class Body>
 void with_channels(int64_t channels, const Body& body) {
   switch (channels) {
@@ -61,7 +63,8 @@ struct CornerSums {
 
 // Adds these sums to the rows of attributes at the corners.
 template <class T>
-void scatter_corner_sums(const CornerSums<T>& sums, const ImageAttributes<T>& image, int64_t channels, T* grad_attributes) {
+void scatter_corner_sums(const CornerSums<T>& sums, const ImageAttributes<T>& image, int64_t channels,
+                         T* grad_attributes) {
   const int64_t C = channels, F = image.num_faces;
   const T* value = sums.values.data() + 3 * C;  // skips the background's
   for (int64_t n = 1; n < sums.visible.count; ++n) {

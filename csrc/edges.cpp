@@ -1,10 +1,11 @@
-// NMR's gradient of an image with any number of channels. For every edge of a visible face and every raster line that crosses it, let
-// c be the crossing, `in` the pixel just inside and `out` the pixel just outside:
-//   outside: if the face owns `in`, each pixel m from `out` to the border would become I(in) if the edge moved out to it;
+// NMR's gradient of an image with any number of channels. For every edge of a visible face and every raster line that
+// crosses it, let c be the crossing, `in` the pixel just inside and `out` the pixel just outside:
+//   outside: if the face owns `in`, each pixel m from `out` to the border would become I(in) if the edge moved out
+//            to it;
 //   inside:  each pixel m of the face would become I(out) if the edge moved in past it.
-// If this lowers the loss, D = sum over channels of (I(m) - I(in or out)) g(m) > 0, then m pulls both ends of the edge with
-// D / (distance they must travel). Lines of constant x (axis 0) move y, lines of constant y (axis 1) move x. If a gradient of an image
-// is not finite, those of the corners of all its visible faces are NaN.
+// If this lowers the loss, D = sum over channels of (I(m) - I(in or out)) g(m) > 0, then m pulls both ends of the edge
+// with D / (distance they must travel). Lines of constant x (axis 0) move y, lines of constant y (axis 1) move x. If a
+// gradient of an image is not finite, those of the corners of all its visible faces are NaN.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

@@ -24,7 +24,8 @@ NMR_INLINE M without(M a, M b) {
 template <class T>
 NMR_INLINE Lanes<T> gather_values(const T* p, const int32_t* offset) {
 #if defined(__AVX2__) || NMR_AVX2
-  if constexpr (std::is_same_v<T, float>) return (Lanes<T>)_mm256_i32gather_ps(p, (__m256i)load_lanes<Lanes32>(offset), 4);
+  if constexpr (std::is_same_v<T, float>)
+    return (Lanes<T>)_mm256_i32gather_ps(p, (__m256i)load_lanes<Lanes32>(offset), 4);
 #endif
   T value[kLanes];
   for (int64_t k = 0; k < kLanes; ++k) value[k] = p[offset[k]];
@@ -42,8 +43,8 @@ NMR_INLINE int32_t most_lane(Lanes32 v) {
 
 // --- set-up
 
-// The first and the last of `size` pixels along one axis whose centres lie in [lo, hi]: a face covers no centre outside its bounding box.
-// (The published kernels test every pixel, and draw wrong pixels for very thin faces.)
+// The first and the last of `size` pixels along one axis whose centres lie in [lo, hi]: a face covers no centre
+// outside its bounding box. (The published kernels test every pixel, and draw wrong pixels for very thin faces.)
 template <class T>
 NMR_INLINE void pixel_range(Lanes<T> lo, Lanes<T> hi, T size, Lanes32& first, Lanes32& last) {
   const Lanes<T> length = splat(size), below = splat(T(-2)), above = splat(size + 1);
@@ -51,15 +52,19 @@ NMR_INLINE void pixel_range(Lanes<T> lo, Lanes<T> hi, T size, Lanes32& first, La
   const Lanes32 f = truncate(select(from > below, select(from < above, from, above), below));
   const Lanes32 l = truncate(select(to > below, select(to < above, to, above), below));
   const Lanes32 one = splat(int32_t(1)), n = splat(static_cast<int32_t>(size));
-  // The error of pixel_coordinates is much less than one pixel: compare the two centres around it. A mask is -1 where it is set.
+  // The error of pixel_coordinates is much less than one pixel: compare the two centres around it. A mask is -1 where
+  // it is set.
   const Lanes32 from_left = f + f + one - n, to_left = l + l + one - n, two = splat(int32_t(2));
-  const Lanes32 a = f - narrow_mask(to_values<T>(from_left) / length < lo) - narrow_mask(to_values<T>(from_left + two) / length < lo);
-  const Lanes32 b = l - one - narrow_mask(to_values<T>(to_left) / length <= hi) - narrow_mask(to_values<T>(to_left + two) / length <= hi);
+  const Lanes32 a =
+      f - narrow_mask(to_values<T>(from_left) / length < lo) - narrow_mask(to_values<T>(from_left + two) / length < lo);
+  const Lanes32 b = l - one - narrow_mask(to_values<T>(to_left) / length <= hi) -
+                    narrow_mask(to_values<T>(to_left + two) / length <= hi);
   first = max_of(a, splat(int32_t(0)));
   last = min_of(b, n - one);
 }
 
-// Bounds of q = 1 / depth: level + slope_x i + slope_y j +- margin at any pixel (i, j) inside a face, and `nearest`, the largest q.
+// Bounds of q = 1 / depth: level + slope_x i + slope_y j +- margin at any pixel (i, j) inside a face, and `nearest`,
+// the largest q.
 template <class T>
 struct DepthBound {
   Lanes<T> slope_x, slope_y, level, margin, nearest;
@@ -67,18 +72,23 @@ struct DepthBound {
 
 // For faces with corners (x, y, z), whose depths lie in [lo, hi], lo > 0, on a raster of width x height pixels.
 //
-// The published weights come from the inverse of a matrix, clamped and normalised: q' = sum w_k / z_k. Let u be the unit roundoff, D
-// twice the area in pixels and M the largest pixel coordinate (half the longer side at least). To first order, the errors are:
-// - of the determinant 12 u M L, with L <= 2 M the longest side, the same for all three weights; of each weight 32 u M^2 / D more;
+// The published weights come from the inverse of a matrix, clamped and normalised: q' = sum w_k / z_k. Let u be the
+// unit roundoff, D twice the area in pixels and M the largest pixel coordinate (half the longer side at least). To
+// first order, the errors are:
+// - of the determinant 12 u M L, with L <= 2 M the longest side, the same for all three weights; of each weight
+//   32 u M^2 / D more;
 // - a pixel that passes the edge test may lie outside by 48 u M^2 / D in terms of weights;
-// - so each weight before normalisation is off by at most E = 110 u M^2 / D, and all weights together after it by 7.1 E (if E is small);
+// - so each weight before normalisation is off by at most E = 110 u M^2 / D, and all weights together after it by
+//   7.1 E (if E is small);
 // - q' is off by half of that times the range of q at the corners, and by 8 u q for its own rounding;
-// - the plane below adds 80 u M^2 / D times the range and 8 u q, because its coefficients are computed in double and rounded.
-// The margin is larger than the sum: 640 u M^2 / D times the range, and 32 u q. If the bounds of two faces are disjoint, their depths
-// differ even after rounding. If E could be large, and for double, the bounds are those of the corners: q' is a weighted mean of their q.
+// - the plane below adds 80 u M^2 / D times the range and 8 u q, because its coefficients are computed in double and
+//   rounded.
+// The margin is larger than the sum: 640 u M^2 / D times the range, and 32 u q. If the bounds of two faces are
+// disjoint, their depths differ even after rounding. If E could be large, and for double, the bounds are those of the
+// corners: q' is a weighted mean of their q.
 template <class T>
-NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)[3], const Lanes<T> (&z)[3], Lanes<T> lo, Lanes<T> hi,
-                                     T width, T height) {
+NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)[3], const Lanes<T> (&z)[3],
+                                     Lanes<T> lo, Lanes<T> hi, T width, T height) {
   constexpr T eps = std::numeric_limits<T>::epsilon();
   const Lanes<T> zero = splat(T(0)), most = splat(T(1)) / lo, least = splat(T(1)) / hi, range = most - least;
   const Lanes<T> rounding = splat(16 * eps) * most, half = splat(T(0.5));
@@ -86,7 +96,8 @@ NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)
   if constexpr (sizeof(T) < sizeof(double)) {
     using Wide = Lanes<double>;
     Wide X[3], Y[3], q[3];
-    Lanes<T> M = splat((width > height ? width : height) / 2);  // even small pixel coordinates come from sums of this size
+    Lanes<T> M =
+        splat((width > height ? width : height) / 2);  // even small pixel coordinates come from sums of this size
     for (int k = 0; k < 3; ++k) {
       const Lanes<T> px = pixel_coordinates<T>(x[k], splat(width)), py = pixel_coordinates<T>(y[k], splat(height));
       M = max_of(M, max_of(absolute<T>(px), absolute<T>(py)));
@@ -94,8 +105,10 @@ NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)
       Y[k] = convert_lanes<Wide>(py);
       q[k] = splat(1.0) / convert_lanes<Wide>(z[k]);
     }
-    const Wide x1 = X[1] - X[0], x2 = X[2] - X[0], y1 = Y[1] - Y[0], y2 = Y[2] - Y[0], q1 = q[1] - q[0], q2 = q[2] - q[0];
-    const Wide D = x1 * y2 - x2 * y1, M2 = convert_lanes<Wide>(M) * convert_lanes<Wide>(M), unit = splat(double(eps)) * M2;
+    const Wide x1 = X[1] - X[0], x2 = X[2] - X[0], y1 = Y[1] - Y[0], y2 = Y[2] - Y[0], q1 = q[1] - q[0],
+               q2 = q[2] - q[0];
+    const Wide D = x1 * y2 - x2 * y1, M2 = convert_lanes<Wide>(M) * convert_lanes<Wide>(M),
+               unit = splat(double(eps)) * M2;
     const auto is_wide = absolute<double>(D) > splat(2048.0) * unit;
     const Wide scale = select(is_wide, splat(1.0), splat(0.0)) / select(is_wide, D, splat(1.0));
     const Wide slope_x = (q1 * y2 - q2 * y1) * scale, slope_y = (x1 * q2 - x2 * q1) * scale;
@@ -162,7 +175,8 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
     const Lanes<T> det = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]);
     const LaneMask<T> bounded = usable & some_bounds & (absolute<T>(det) >= splat(resolution) * largest * largest) &
                                 (largest * splat(longer) < splat(moderate)) & (lo * splat(1 - 16 * eps) > splat(near)) &
-                                (hi * splat(1 + 16 * eps) < splat(far)) & (lo > splat(smallest)) & (hi < splat(1 / smallest));
+                                (hi * splat(1 + 16 * eps) < splat(far)) & (lo > splat(smallest)) &
+                                (hi < splat(1 / smallest));
     // For faces without bounds, those of an ordinary triangle are computed and not used.
     const Lanes<T> ordinary_x[3] = {zero, one, zero}, ordinary_y[3] = {zero, zero, one};
     Lanes<T> bx[3], by[3], bz[3];
@@ -171,7 +185,8 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
       by[k] = select(bounded, y[k], ordinary_y[k]);
       bz[k] = select(bounded, z[k], one);
     }
-    const DepthBound<T> bound = bound_depth<T>(bx, by, bz, select(bounded, lo, one), select(bounded, hi, one), width, height);
+    const DepthBound<T> bound =
+        bound_depth<T>(bx, by, bz, select(bounded, lo, one), select(bounded, hi, one), width, height);
     const Lanes<T> nearest = select(bounded, bound.nearest, infinity);
     store_lanes(block.slope_x, bound.slope_x);
     store_lanes(block.slope_y, bound.slope_y);
@@ -230,15 +245,17 @@ NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T r
 
 constexpr int32_t kBits[kLanes] = {1, 2, 4, 8, 16, 32, 64, 128};
 
-// For eight pixels (i .. i + 7, j) of a row: which of the contested ones face `id` wins from their owners by exact depth. Of equally near
-// faces the first one wins, in whichever order they are filled.
+// For eight pixels (i .. i + 7, j) of a row: which of the contested ones face `id` wins from their owners by exact
+// depth. Of equally near faces the first one wins, in whichever order they are filled.
 template <class T>
-LaneMask<T> contest(const Image<T>& image, int32_t id, uint32_t contested_bits, int64_t i, int64_t j, const int32_t* owner_at) {
+LaneMask<T> contest(const Image<T>& image, int32_t id, uint32_t contested_bits, int64_t i, int64_t j,
+                    const int32_t* owner_at) {
   const Lanes<T> column = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i)));
   const T row = static_cast<T>(j);
   const Lanes<T> z = exact_depths(face_plane(image, id), column, row);
   const Lanes32 bit = load_lanes<Lanes32>(kBits), among = splat(static_cast<int32_t>(contested_bits)) & bit;
-  const LaneMask<T> contested = widen_mask<T>(among > splat(int32_t(0))) & (z > splat(image.settings.near)) & (z < splat(image.settings.far));  // not NaN either
+  const LaneMask<T> contested = widen_mask<T>(among > splat(int32_t(0))) & (z > splat(image.settings.near)) &
+                                (z < splat(image.settings.far));  // not NaN either
   const Lanes32 owner = load_lanes<Lanes32>(owner_at);
   LaneMask<T> wins = contested & widen_mask<T>(owner < splat(int32_t(0))), open = without(contested, wins);
   for (uint32_t bits = lane_bits(open); bits; bits = lane_bits(open)) {
@@ -278,7 +295,8 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
     store_lanes(row_terms[0], (yp - splat(y0)) * splat(x1 - x0));
     store_lanes(row_terms[1], (yp - splat(y1)) * splat(x2 - x1));
     store_lanes(row_terms[2], (yp - splat(y2)) * splat(x0 - x2));
-    store_lanes(row_terms[3], to_values<T>(lane_numbers() + splat(static_cast<int32_t>(top))) * splat(block.slope_y[n]));
+    store_lanes(row_terms[3],
+                to_values<T>(lane_numbers() + splat(static_cast<int32_t>(top))) * splat(block.slope_y[n]));
     const int64_t rows = std::min(kLanes, j_last - top + 1);
     for (int64_t i = i_first; i <= i_last; i += kLanes) {
       const Lanes<T> xp = load_lanes<Lanes<T>>(band.columns + i);
@@ -292,7 +310,8 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
       uint8_t contested[kLanes];
       uint32_t any_contested = 0;
       for (int64_t r = 0; r < rows; ++r, most += stride, least += stride, owner += stride) {
-        const LaneMask<T> outside = (splat(row_terms[0][r]) < c0) | (splat(row_terms[1][r]) < c1) | (splat(row_terms[2][r]) < c2);
+        const LaneMask<T> outside =
+            (splat(row_terms[0][r]) < c0) | (splat(row_terms[1][r]) < c1) | (splat(row_terms[2][r]) < c2);
         const Lanes<T> q = q_column + splat(row_terms[3][r]), q_most = q + margin, q_least = q - margin;
         const Lanes<T> pixel_most = load_lanes<Lanes<T>>(most), pixel_least = load_lanes<Lanes<T>>(least);
         const LaneMask<T> unsettled = without(q_most >= pixel_least, outside | off_box), clear = q_least > pixel_most;
@@ -360,7 +379,8 @@ NMR_INLINE void bound_blocks(const Band<T>& band, const Window& window, int64_t 
 
 // True if every pixel of the face's box already has a nearer owner.
 template <class T>
-NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& band, int64_t blocks, const T* block_least) {
+NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& band, int64_t blocks,
+                          const T* block_least) {
   constexpr uint32_t kSide = kLanes;  // unsigned, so that divisions are shifts
   const FaceBlock<T>& block = table.blocks[f / kLanes];
   const int64_t lane = f % kLanes;
@@ -369,7 +389,8 @@ NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& b
   const int32_t j_last = std::min(block.row_last[lane], band_last) - band_first;
   if (j_first > j_last) return true;  // outside the band
   const uint32_t n_first = static_cast<uint32_t>(block.column_first[lane]) / kSide;
-  const uint32_t n_last = static_cast<uint32_t>(block.column_last[lane]) / kSide, last = static_cast<uint32_t>(j_last) / kSide;
+  const uint32_t n_last = static_cast<uint32_t>(block.column_last[lane]) / kSide,
+                 last = static_cast<uint32_t>(j_last) / kSide;
   const T nearest = block.nearest[lane];
   const uint32_t first = static_cast<uint32_t>(j_first) / kSide;
   if (last - first <= 1 && n_last - n_first <= 1) {  // most faces; the processor could not foresee when a loop ends
@@ -418,7 +439,8 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
       const int32_t* list = (reversed ? table.back : table.front).data() + c * kChunk;
       const int32_t count = (reversed ? table.num_back : table.num_front)[c];
       for (int32_t n = 0; n < count; ++n)
-        if (pass == 0 || !is_hidden(table, list[n], band, blocks, block_least)) fill_face(image, list[n], reversed, band);
+        if (pass == 0 || !is_hidden(table, list[n], band, blocks, block_least))
+          fill_face(image, list[n], reversed, band);
     }
   }
   const int64_t first = window.column_first, last = std::min(window.column_last, W);

@@ -4,12 +4,14 @@
 
 // --- the faces of a block
 
-// Numbers the block's visible faces and fills in the table. Entry 0, of the background, has weights (1, 0, 0) and depth 1.
+// Numbers the block's visible faces and fills in the table. Entry 0, of the background, has weights (1, 0, 0) and
+// depth 1.
 template <class T>
 NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& scratch) {
   const int64_t W = block.raster.width, F = block.num_faces;
   int32_t *ids = scratch.ids.data(), *slots = scratch.slots.data() + 1;
-  scratch.count = find_visible(block.owner + block.first * W, (block.last - block.first) * W, F, scratch.seen.data(), ids);
+  scratch.count =
+      find_visible(block.owner + block.first * W, (block.last - block.first) * W, F, scratch.seen.data(), ids);
   slots[-1] = 0;
   T* table = scratch.table.data();
   for (int64_t n = 0; n < kEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);
@@ -83,7 +85,8 @@ NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32
     load_quads<T>(entry, column[quad]);
     for (int64_t n = 0; n < kLanes; ++n) entry[n] += 4;
   }
-  const Lanes<T> x = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i))), zero = splat(T(0)), one = splat(T(1));
+  const Lanes<T> x = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i))), zero = splat(T(0)),
+                 one = splat(T(1));
   Lanes<T> raw[3];
   for (int k = 0; k < 3; ++k)  // clamp_weight of geometry.h
     raw[k] = min_of(max_of(column[0][k] * x + column[1][k] * y + column[2][k], zero), one);
@@ -96,10 +99,11 @@ NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32
   return p;
 }
 
-// Calls visit(i, owners, y) for every eight pixels [i, i + 8) of row j (from the top) with a covered one among them, and
-// background(i) for the others.
+// Calls visit(i, owners, y) for every eight pixels [i, i + 8) of row j (from the top) with a covered one among them,
+// and background(i) for the others.
 template <class T, class Visit, class Background>
-NMR_INLINE void for_covered(const FragmentBlock<T>& block, int64_t j, const Visit& visit, const Background& background) {
+NMR_INLINE void for_covered(const FragmentBlock<T>& block, int64_t j, const Visit& visit,
+                            const Background& background) {
   const int64_t W = block.raster.width;
   const Lanes<T> y = splat(static_cast<T>(block.raster.height - 1 - j));
   for (int64_t i = 0; i < W; i += kLanes) {
@@ -113,7 +117,8 @@ NMR_INLINE void for_covered(const FragmentBlock<T>& block, int64_t j, const Visi
 
 // Depths of row j; out has room for eight more.
 template <class T>
-NMR_INLINE void depth_row(const FragmentBlock<T>& block, int64_t j, Lanes<T> far, const FragmentScratch<T>& scratch, T* out) {
+NMR_INLINE void depth_row(const FragmentBlock<T>& block, int64_t j, Lanes<T> far, const FragmentScratch<T>& scratch,
+                          T* out) {
   for_covered(
       block, j,
       [&](int64_t i, Lanes32 owners, Lanes<T> y) {
@@ -127,7 +132,8 @@ NMR_INLINE void depth_row(const FragmentBlock<T>& block, int64_t j, Lanes<T> far
 
 // Fills the block's rows of a depth image.
 template <class T>
-void depth_forward_block(const DepthImage<T>& args, const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch) {
+void depth_forward_block(const DepthImage<T>& args, const FragmentBlock<T>& block, int64_t b,
+                         FragmentScratch<T>& scratch) {
   const int64_t W = block.raster.width, w = args.image.width;
   set_up_faces(block, scratch);
   T* image = args.depth + b * args.image.pixels();
@@ -151,7 +157,8 @@ void depth_forward_block(const DepthImage<T>& args, const FragmentBlock<T>& bloc
 
 // Fills the block's rows of weights and depths.
 template <class T>
-void fragments_forward_block(const Fragments<T>& args, const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch) {
+void fragments_forward_block(const Fragments<T>& args, const FragmentBlock<T>& block, int64_t b,
+                             FragmentScratch<T>& scratch) {
   const int64_t W = block.raster.width;
   set_up_faces(block, scratch);
   const Lanes<T> far = splat(args.far), zero = splat(T(0));
@@ -186,7 +193,8 @@ void fragments_forward_block(const Fragments<T>& args, const FragmentBlock<T>& b
 
 // --- backward
 
-// Values close to an overflow count as 0: a corner in the plane of the eye gets no gradient, and does not change others.
+// Values close to an overflow count as 0: a corner in the plane of the eye gets no gradient, and does not change
+// others.
 template <class T>
 NMR_INLINE Lanes<T> moderate_or_zero(Lanes<T> value) {
   return keep(absolute<T>(value) < splat(std::sqrt(std::numeric_limits<T>::max())), value);
@@ -230,10 +238,11 @@ NMR_INLINE void store_face_gradients(const Lanes<T> (&grad)[9], int64_t slot, Fa
     for (int c = 0; c < 9; ++c) out[c] = value[c][n];
 }
 
-// With c = g z^2 of each pixel, S_k = sum over pixels of c w_k:  grad z_k = S_k / z_k^2,  grad X_k = S_k sum_m M_m0 / z_m.
+// With c = g z^2 of each pixel, S_k = sum over pixels of c w_k:  grad z_k = S_k / z_k^2,  grad X_k = S_k sum_m M_m0 /
+// z_m.
 template <class T>
-void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch,
-                          FaceGradients<T>& result) {
+void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& block, int64_t b,
+                          FragmentScratch<T>& scratch, FaceGradients<T>& result) {
   const int64_t W = block.raster.width, w = args.image.width;
   set_up_faces(block, scratch);
   result.list(scratch.ids.data(), scratch.count);
@@ -257,7 +266,8 @@ void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& blo
         },
         [](int64_t) {});
   }
-  const Lanes<T> half_width = splat(static_cast<T>(W) / 2), half_height = splat(static_cast<T>(block.raster.height) / 2);
+  const Lanes<T> half_width = splat(static_cast<T>(W) / 2),
+                 half_height = splat(static_cast<T>(block.raster.height) / 2);
   for (int64_t slot = 1; slot <= scratch.count; slot += kLanes) {
     Lanes<T> sum[4], mx[4], my[4], z[4], out[9];
     const T* table = scratch.table.data();
@@ -279,8 +289,8 @@ void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& blo
 // With u_m = dL/db_m, g = dL/dz and h_m = z (u_m - sum_k u_k b_k) - g z^2:  dL = sum_m h_m d(w_m / z_m), so that
 // grad z_m = -H_mm / z_m^2 and grad X_k = -sum_m H_mk M_m0 / z_m with H_mk = sum over pixels of h_m w_k.
 template <class T>
-void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch,
-                              FaceGradients<T>& result) {
+void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& block, int64_t b,
+                              FragmentScratch<T>& scratch, FaceGradients<T>& result) {
   const int64_t W = block.raster.width;
   set_up_faces(block, scratch);
   result.list(scratch.ids.data(), scratch.count);
@@ -307,7 +317,8 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
               for (int m = 0; m < 3; ++m) grad[m][n] = args.grad_weights[3 * (row + i + n) + m];
             const LaneMask<T> reversed = widen_mask<T>(owners >= splat(static_cast<int32_t>(block.num_faces)));
             const Lanes<T> first = load_lanes<Lanes<T>>(grad[0]), last = load_lanes<Lanes<T>>(grad[2]);
-            const Lanes<T> u[3] = {choose(reversed, last, first), load_lanes<Lanes<T>>(grad[1]), choose(reversed, first, last)};
+            const Lanes<T> u[3] = {choose(reversed, last, first), load_lanes<Lanes<T>>(grad[1]),
+                                   choose(reversed, first, last)};
             Lanes<T> mean = zero;
             for (int m = 0; m < 3; ++m) mean = mean + u[m] * (p.w[m] * p.z / p.corner_z[m]);
             for (int m = 0; m < 3; ++m) h[m] = h[m] + p.z * (u[m] - mean);
@@ -317,7 +328,8 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
         },
         [](int64_t) {});
   }
-  const Lanes<T> half_width = splat(static_cast<T>(W) / 2), half_height = splat(static_cast<T>(block.raster.height) / 2);
+  const Lanes<T> half_width = splat(static_cast<T>(W) / 2),
+                 half_height = splat(static_cast<T>(block.raster.height) / 2);
   for (int64_t slot = 1; slot <= scratch.count; slot += kLanes) {
     Lanes<T> sum[3][4], mx[4], my[4], z[4], slope_x[3], slope_y[3], out[9];
     const T* table = scratch.table.data();

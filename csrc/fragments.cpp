@@ -1,9 +1,9 @@
-// Barycentric weights and depth of the owner at each pixel. They are computed from the owner map, by the same expressions as
-// in the rasterizer.
+// Barycentric weights and depth of the owner at each pixel. They are computed from the owner map, by the same
+// expressions as in the rasterizer.
 //
-// With w_k the normalised screen weights and q = sum_k w_k / z_k: depth z = 1 / q, perspective-correct weights b_k = z w_k /
-// z_k. Moving corner k by (dX, dY) pixels changes the weights at a fixed pixel by dw_m = -w_k (M_m0 dX + M_m1 dY), M as in
-// geometry.h. The loops over pixels are in fragment_rows.h.
+// With w_k the normalised screen weights and q = sum_k w_k / z_k: depth z = 1 / q, perspective-correct weights b_k = z
+// w_k / z_k. Moving corner k by (dX, dY) pixels changes the weights at a fixed pixel by dw_m = -w_k (M_m0 dX + M_m1
+// dY), M as in geometry.h. The loops over pixels are in fragment_rows.h.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -21,13 +21,15 @@ namespace nmr {
 namespace {
 
 constexpr int64_t kTogether = 8;  // faces or pixels that are worked on together
-constexpr int64_t kEntry = 16;    // numbers per face in the table: columns 0, 1, 2 of M and the depths, each padded to four
+// Numbers per face in the table: columns 0, 1, 2 of M and the depths, each padded to four.
+constexpr int64_t kEntry = 16;
 
 // Memory for one block. Faces that own a pixel are numbered from 1, ascending; the background is number 0.
 template <class T>
 struct FragmentScratch {
   std::vector<uint8_t> seen;   // [2 F + 1 + 8] of find_visible
-  std::vector<int32_t> slots;  // [2 F + 1] number of owner entry id at [id + 1]; defined for visible faces and background
+  // [2 F + 1] number of owner entry id at [id + 1]; defined for visible faces and background.
+  std::vector<int32_t> slots;
   std::vector<int32_t> ids;    // [visible + 8] owner entry of face n at [n - 1]
   int64_t count;               // visible faces
   std::vector<T> table;        // [visible + 1 + 8, kEntry]
@@ -56,7 +58,8 @@ struct FragmentBlock {
 };
 
 template <class T>
-FragmentBlock<T> make_block(const MeshBatch<T>& mesh, const int32_t* owner, const RowBlocks& blocks, int64_t b, int64_t block) {
+FragmentBlock<T> make_block(const MeshBatch<T>& mesh, const int32_t* owner, const RowBlocks& blocks, int64_t b,
+                            int64_t block) {
   return {mesh.image_vertices(b), mesh.image_faces(b), mesh.face_count(b), blocks.raster,
           owner + b * blocks.raster.pixels(), blocks.first(block), blocks.last(block)};
 }
@@ -70,13 +73,14 @@ FragmentBlock<T> make_block(const MeshBatch<T>& mesh, const int32_t* owner, cons
 namespace nmr {
 namespace {
 
-// The blocks of an image depend only on its own number of faces, so that results do not depend on other images of a packed
-// batch. Calls body(block, b, scratch) for each block.
+// The blocks of an image depend only on its own number of faces, so that results do not depend on other images of a
+// packed batch. Calls body(block, b, scratch) for each block.
 template <class Args, class Body, class T = std::remove_pointer_t<decltype(Args::depth)>>
 void forward(const Args& args, Size raster, const Body& body) {
   const MeshBatch<T>& mesh = args.mesh;
   int64_t most_blocks = 1;
-  for (int64_t b = 0; b < mesh.batch; ++b) most_blocks = std::max(most_blocks, RowBlocks(raster, mesh.face_count(b)).count);
+  for (int64_t b = 0; b < mesh.batch; ++b)
+    most_blocks = std::max(most_blocks, RowBlocks(raster, mesh.face_count(b)).count);
   parallel_for(mesh.batch * most_blocks, args.num_threads, [&](int64_t task) {
     const int64_t b = task / most_blocks, block = task % most_blocks, F = mesh.face_count(b);
     const RowBlocks blocks(raster, F);
@@ -106,7 +110,8 @@ void backward(const Args& args, Size raster, int64_t sums, const Body& body) {
         body(make_block(mesh, args.owner, blocks, b, block), b, scratch, result);
       },
       [&](int64_t b, const FaceGradients<T>& result) {
-        scatter_face_gradients(result, mesh.image_faces(b), mesh.face_count(b), args.grad_vertices + 3 * mesh.vertex_start(b));
+        scatter_face_gradients(result, mesh.image_faces(b), mesh.face_count(b),
+                               args.grad_vertices + 3 * mesh.vertex_start(b));
       });
 }
 

@@ -1,5 +1,6 @@
-// Screen geometry: pixel coordinates, facing, barycentric weights. Every expression is evaluated in the written order, in T, without
-// fused multiply-adds: rounding decides which face owns a pixel on an edge, so the order of operations is part of the definition.
+// Screen geometry: pixel coordinates, facing, barycentric weights. Every expression is evaluated in the written order,
+// in T, without fused multiply-adds: rounding decides which face owns a pixel on an edge, so the order of operations
+// is part of the definition.
 #pragma once
 
 #include <cmath>
@@ -39,8 +40,9 @@ NMR_INLINE Triangle<T> load_triangle(const T* vertices, const int64_t* face, boo
   return t;
 }
 
-// Faces with a non-finite x or y, a NaN depth, or no area are not drawn. The area is computed in double, which is almost exact for
-// float coordinates. Otherwise the inclusive edge tests of a collinear face could pass along its whole line.
+// Faces with a non-finite x or y, a NaN depth, or no area are not drawn. The area is computed in double, which is
+// almost exact for float coordinates. Otherwise the inclusive edge tests of a collinear face could pass along its
+// whole line.
 template <class T>
 NMR_INLINE bool is_drawable(const Triangle<T>& t) {
   bool finite = true;
@@ -49,8 +51,8 @@ NMR_INLINE bool is_drawable(const Triangle<T>& t) {
   return finite && ((t.x[1] - x0) * (t.y[2] - y0) != (t.y[1] - y0) * (t.x[2] - x0));
 }
 
-// Rows of the matrix M with barycentric weight w_k = M[k][0] X + M[k][1] Y + M[k][2] at pixel coordinates (X, Y): the inverse
-// of the matrix with columns (X_k, Y_k, 1).
+// Rows of the matrix M with barycentric weight w_k = M[k][0] X + M[k][1] Y + M[k][2] at pixel coordinates (X, Y): the
+// inverse of the matrix with columns (X_k, Y_k, 1).
 template <class T>
 struct BarycentricMatrix {
   T m[3][3];
@@ -82,8 +84,9 @@ NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
   return (bt - at) / (bs - as) * (n - as) + at;
 }
 
-// The last pixel of a sweep into a face: where it leaves the face, in the direction of t = -infinity if d > 0 and of +infinity if
-// d < 0; at most one pixel outside [0, R). Rounded and converted as published: truncated, saturated, NaN to 0.
+// The last pixel of a sweep into a face: where it leaves the face, in the direction of t = -infinity if d > 0 and of
+// +infinity if d < 0; at most one pixel outside [0, R). Rounded and converted as published: truncated, saturated, NaN
+// to 0.
 template <class T>
 NMR_INLINE int64_t sweep_limit(T far_side, int64_t d, int64_t R) {
   const T t = d > 0 ? std::ceil(far_side) : std::floor(far_side);

@@ -1,6 +1,6 @@
-// Eight values that are processed together (lanes). With GCC and Clang these are vector types, which become one or more registers of
-// the processor; elsewhere a struct with loops. Every operation treats each lane separately, so results do not depend on the width
-// of the registers.
+// Eight values that are processed together (lanes). With GCC and Clang these are vector types, which become one or
+// more registers of the processor; elsewhere a struct with loops. Every operation treats each lane separately, so
+// results do not depend on the width of the registers.
 #pragma once
 
 #include <cstdint>
@@ -180,7 +180,8 @@ NMR_INLINE Lanes32 lane_numbers() {
 
 // p[offset[0]], ..., p[offset[7]]
 NMR_INLINE Lanes32 gather_lanes(const int32_t* p, const int32_t* offset) {
-  return Lanes32{p[offset[0]], p[offset[1]], p[offset[2]], p[offset[3]], p[offset[4]], p[offset[5]], p[offset[6]], p[offset[7]]};
+  return Lanes32{p[offset[0]], p[offset[1]], p[offset[2]], p[offset[3]],
+                 p[offset[4]], p[offset[5]], p[offset[6]], p[offset[7]]};
 }
 
 // Bit k is set where lane k of the mask is.

@@ -1,7 +1,8 @@
-// The K nearest faces at each pixel, by the same tests and the same depth as in the rasterizer: the first layer is its owner map.
+// The K nearest faces at each pixel, by the same tests and the same depth as in the rasterizer: the first layer is its
+// owner map.
 //
-// Faces are visited in ascending order, all originals, then all reversed copies, and inserted into the sorted list of each pixel that
-// they cover, behind those that are equally near. Bands of rows are independent.
+// Faces are visited in ascending order, all originals, then all reversed copies, and inserted into the sorted list of
+// each pixel that they cover, behind those that are equally near. Bands of rows are independent.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -113,12 +114,13 @@ void rasterize_layers(const RasterizeLayers<T>& args) {
   std::vector<T> centres(raster.width + kGroup);
   for (int64_t i = 0; i < raster.width + kGroup; ++i) centres[i] = pixel_centre<T>(i, raster.width);
   parallel_for(args.mesh.batch * bands, args.num_threads, [&](int64_t task) {
-    const int64_t b = task / bands, first = task % bands * kBandRows, last = std::min(first + kBandRows, raster.height) - 1;
+    const int64_t b = task / bands, first = task % bands * kBandRows,
+                  last = std::min(first + kBandRows, raster.height) - 1;
     std::vector<T> depth((last - first + 1) * raster.width * K, args.settings.far);
     int32_t* owner = args.owner + b * raster.pixels() * K;
     std::fill_n(owner + (raster.height - 1 - last) * raster.width * K, (last - first + 1) * raster.width * K, -1);
-    fill_layers(LayerBand<T>{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b), args.settings, K, first,
-                             last, centres.data(), depth.data(), owner});
+    fill_layers(LayerBand<T>{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b),
+                             args.settings, K, first, last, centres.data(), depth.data(), owner});
   });
 }
 

@@ -1,4 +1,5 @@
-// Normals of faces and of vertices. Computed in double, so that products of float coordinates neither over- nor underflow.
+// Normals of faces and of vertices. Computed in double, so that products of float coordinates neither over- nor
+// underflow.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -114,7 +115,8 @@ void normals_forward(const Normals<T>& args) {
       return;
     }
     for (int64_t f = 0; f < mesh.face_count(b); ++f)
-      store(normals + 3 * f, direction_of<T>(sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f).across).unit);
+      store(normals + 3 * f,
+            direction_of<T>(sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f).across).unit);
   });
 }
 
@@ -133,14 +135,16 @@ void normals_backward(const Normals<T>& args) {
     }
     for (int64_t f = 0; f < mesh.face_count(b); ++f, face += 3) {
       const Sides sides = sides_of(vertices, face);
-      const Vec3 grad_across = args.smooth ? Vec3(grad_sums[face[0]] + grad_sums[face[1]] + grad_sums[face[2]])
-                                           : direction_backward(direction_of<T>(sides.across), load(grad_normals + 3 * f));
+      const Vec3 grad_across = args.smooth
+                                   ? Vec3(grad_sums[face[0]] + grad_sums[face[1]] + grad_sums[face[2]])
+                                   : direction_backward(direction_of<T>(sides.across), load(grad_normals + 3 * f));
       sides_backward(sides, face, grad_across, grads.data());
     }
     T* grad_vertices = args.grad_vertices + 3 * mesh.vertex_start(b);
     for (int64_t v = 0; v < V; ++v)
       for (int k = 0; k < 3; ++k)
-        grad_vertices[3 * v + k] = counts(vertices + 3 * v) ? static_cast<T>(std::clamp(grads[v][k], -largest, largest)) : T(0);
+        grad_vertices[3 * v + k] =
+            counts(vertices + 3 * v) ? static_cast<T>(std::clamp(grads[v][k], -largest, largest)) : T(0);
   });
 }
 

@@ -1,5 +1,5 @@
-// The pose of a camera that looks along a direction, forward and backward: one call instead of about twenty tensor operations. Poses
-// that are not finite are handled here.
+// The pose of a camera that looks along a direction, forward and backward: one call instead of about twenty tensor
+// operations. Poses that are not finite are handled here.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -19,8 +19,8 @@ using Matrix34 = Eigen::Matrix<T, 3, 4, Eigen::RowMajor>;
 constexpr double kShortest = 1e-5;  // as published: a shorter vector is divided by this, and stays short
 constexpr double kLargest = 1e15;   // up to this size lengths and their derivatives do not overflow, even in float
 
-// Lengths and cross products round as the published ones, which were compiled with fused multiply-adds. These are the only fused
-// multiply-adds in this library; they are written explicitly, so that every processor gives the same bits.
+// Lengths and cross products round as the published ones, which were compiled with fused multiply-adds. These are the
+// only fused multiply-adds in this library; they are written explicitly, so that every processor gives the same bits.
 template <class T>
 T length(const Vec3<T>& v) {
   return std::sqrt(std::fma(v[2], v[2], std::fma(v[1], v[1], v[0] * v[0])));
@@ -28,7 +28,8 @@ T length(const Vec3<T>& v) {
 
 template <class T>
 Vec3<T> cross(const Vec3<T>& a, const Vec3<T>& b) {
-  return {std::fma(a[1], b[2], -(a[2] * b[1])), std::fma(a[2], b[0], -(a[0] * b[2])), std::fma(a[0], b[1], -(a[1] * b[0]))};
+  return {std::fma(a[1], b[2], -(a[2] * b[1])), std::fma(a[2], b[0], -(a[0] * b[2])),
+          std::fma(a[0], b[1], -(a[1] * b[0]))};
 }
 
 template <class T>
@@ -77,8 +78,8 @@ void pose_forward(const Pose<T>& args) {
   }
 }
 
-// In double: for float inputs, divisions by numbers as small as 1e-5 then cannot overflow. An upstream gradient that is infinite or
-// NaN makes the gradient NaN.
+// In double: for float inputs, divisions by numbers as small as 1e-5 then cannot overflow. An upstream gradient that
+// is infinite or NaN makes the gradient NaN.
 template <class T>
 void pose_backward(const Pose<T>& args) {
   const double largest = std::numeric_limits<T>::max();
@@ -92,12 +93,15 @@ void pose_backward(const Pose<T>& args) {
     } else if (axes.usable) {
       const Vec3<double> up = axes.up.template cast<double>();
       const Vec3<double> x = axes.x.template cast<double>(), z = axes.z.template cast<double>();
-      const Eigen::Matrix<double, 3, 3> grad_rows = grad_matrix.template leftCols<3>().transpose().template cast<double>();
+      const Eigen::Matrix<double, 3, 3> grad_rows =
+          grad_matrix.template leftCols<3>().transpose().template cast<double>();
       Vec3<double> grad_x = grad_rows.col(0), grad_z = grad_rows.col(2);
-      const Vec3<double> grad_upright = normalized_backward(axes.upright.template cast<double>(), -grad_rows.col(1));  // of z x x
+      const Vec3<double> grad_upright =
+          normalized_backward(axes.upright.template cast<double>(), -grad_rows.col(1));  // of z x x
       grad_x += cross(grad_upright, z);
       grad_z += cross(x, grad_upright);
-      const Vec3<double> grad_sideways = normalized_backward(axes.sideways.template cast<double>(), grad_x);  // of up x z
+      const Vec3<double> grad_sideways =
+          normalized_backward(axes.sideways.template cast<double>(), grad_x);  // of up x z
       grad_z += cross(grad_sideways, up);
       grad_up = cross(z, grad_sideways);
       grad_forward = normalized_backward(axes.forward.template cast<double>(), grad_z);

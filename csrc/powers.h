@@ -1,4 +1,5 @@
-// Powers and logarithms with the same bits on every processor. (The C library chooses between versions that round differently.)
+// Powers and logarithms with the same bits on every processor. (The C library chooses between versions that round
+// differently.)
 #pragma once
 
 #include <cmath>

@@ -1,9 +1,10 @@
 // Which face is nearest at each pixel of each image.
 //
-// Three steps per image. Set-up: for each face, the vertex orders that face the camera, its box of pixels, bounds of its depth. Fill:
-// for each face (all originals, then all reversed copies), mark the pixels inside. Copy: to the owner map. The published depth needs
-// sixteen divisions per pixel, and its rounding decides which face is nearer; it is computed only where the bounds do not decide.
-// Several threads can share one image: set-up by chunks of faces, fill by bands of rows.
+// Three steps per image. Set-up: for each face, the vertex orders that face the camera, its box of pixels, bounds of
+// its depth. Fill: for each face (all originals, then all reversed copies), mark the pixels inside. Copy: to the owner
+// map. The published depth needs sixteen divisions per pixel, and its rounding decides which face is nearer; it is
+// computed only where the bounds do not decide. Several threads can share one image: set-up by chunks of faces, fill
+// by bands of rows.
 //
 // The bounds are those of q = 1 / depth, which is linear on the screen: at a pixel (i, j) inside a face, q differs from
 // slope_x i + slope_y j + level by at most `margin`. See `bound_depth` in fill.h, where the loops are.
@@ -20,7 +21,8 @@
 namespace nmr {
 namespace {
 
-constexpr int64_t kTogether = 8;  // faces or pixels of a row that are worked on together, and pixels per side of a block
+// Faces or pixels of a row that are worked on together, and pixels per side of a block.
+constexpr int64_t kTogether = 8;
 constexpr int64_t kChunk = 2048;  // faces that one thread sets up together
 
 // Data of eight faces for the fill.
@@ -30,7 +32,8 @@ struct FaceBlock {
   T slope_x[kTogether], slope_y[kTogether], level[kTogether];        // of q = 1 / depth
   T margin[kTogether];                                               // infinity: no bounds
   T nearest[kTogether];                                              // largest q at any pixel
-  int32_t column_first[kTogether], column_last[kTogether], row_first[kTogether], row_last[kTogether];  // pixels inside the box
+  // Pixels inside the box.
+  int32_t column_first[kTogether], column_last[kTogether], row_first[kTogether], row_last[kTogether];
 };
 
 // Pixels from the first to the last column and row, inclusive.
@@ -61,9 +64,11 @@ template <class T>
 struct BandScratch {
   std::vector<T> columns, rows;  // [W + 8] and [H + 8] pixel centres in [-1, 1]
   Size raster{0, 0};             // for which they are computed
-  std::vector<T> most, least;    // [rows, W + 8] bounds of the owner's q = 1 / depth; -infinity on background; 8 more at the end
+  // [rows, W + 8] bounds of the owner's q = 1 / depth; -infinity on background; 8 more at the end.
+  std::vector<T> most, least;
   std::vector<int32_t> owner;    // the same of the owner
-  std::vector<T> block_least;    // [rows / 8, W / 8] the smallest of `least` in a block: the second pass skips what lies behind
+  // [rows / 8, W / 8] the smallest of `least` in a block: the second pass skips what lies behind.
+  std::vector<T> block_least;
 };
 
 template <class T>
@@ -135,8 +140,15 @@ void rasterize(const Rasterize<T>& args) {
         for (int64_t j = 0; j < H + kTogether; ++j) scratch.rows[j] = pixel_centre<T>(j, H);
         scratch.raster = raster;
       }
-      Band<T> band{n * H / bands, (n + 1) * H / bands - 1, raster, W + kTogether, scratch.columns.data(), scratch.rows.data(),
-                   nullptr, nullptr, nullptr};
+      Band<T> band{n * H / bands,
+                   (n + 1) * H / bands - 1,
+                   raster,
+                   W + kTogether,
+                   scratch.columns.data(),
+                   scratch.rows.data(),
+                   nullptr,
+                   nullptr,
+                   nullptr};
       const int64_t rows = band.row_last - band.row_first + 1, blocks = (W + kTogether - 1) / kTogether;
       band.most = reserve(scratch.most, rows * band.stride + kTogether);
       band.least = reserve(scratch.least, rows * band.stride + kTogether);

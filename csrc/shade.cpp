@@ -1,5 +1,5 @@
-// Colours from texture cubes, and interpolation of values given at the corners of faces. Both read the owner map and the
-// perspective-correct weights, in the vertex order of the original face, so that reversed copies are not special.
+// Colours from texture cubes, and interpolation of values given at the corners of faces. Both read the owner map and
+// the perspective-correct weights, in the vertex order of the original face, so that reversed copies are not special.
 #include <algorithm>
 #include <vector>
 
@@ -8,8 +8,8 @@
 namespace nmr {
 namespace {
 
-// The texels around one pixel: texture = sum over the 8 corners c of weight[c] texel[offset[c]], trilinear at t_k = b_k (ts - 1)
-// clamped to [0, ts - 1 - eps].
+// The texels around one pixel: texture = sum over the 8 corners c of weight[c] texel[offset[c]], trilinear at t_k =
+// b_k (ts - 1) clamped to [0, ts - 1 - eps].
 template <class T>
 struct Texels {
   int64_t offset[8];  // of texels, within one face's cube
@@ -39,7 +39,8 @@ NMR_INLINE Texels<T> texels_of(const T* weights, int64_t texture_size, T eps) {
   return texels;
 }
 
-// color = sum over the corners of weight texel; kChannels is the number of channels, or 0 if it is known only at run time.
+// color = sum over the corners of weight texel; kChannels is the number of channels, or 0 if it is known only at run
+// time.
 template <int64_t kChannels, class T>
 NMR_INLINE void blend(const Texels<T>& texels, const T* texture, int64_t channels, T* color) {
   if constexpr (kChannels > 0) {
@@ -70,7 +71,8 @@ int64_t first_cube(const TextureCubes<T>& args, int64_t b) {
 template <class T>
 void texture_cubes_forward(const TextureCubes<T>& args) {
   with_channels(args.channels, [&](auto known) {
-    const int64_t W = args.raster.width, C = known ? known() : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
+    const int64_t W = args.raster.width, C = known ? known() : args.channels, ts = args.texture_size,
+                  cube = ts * ts * ts * C;
     for_rows(args.batch, args.raster.height, args.num_threads, [&](int64_t b, int64_t row) {
       const int64_t start = (b * args.raster.height + row) * W, F = face_count(args, b);
       const T* textures = args.textures + first_cube(args, b) * cube;
@@ -78,7 +80,8 @@ void texture_cubes_forward(const TextureCubes<T>& args) {
       for (int64_t n = start; n < start + W; ++n, color += C) {
         const int64_t id = args.owner[n];
         if (id >= 0)
-          blend<known()>(texels_of(args.weights + 3 * n, ts, args.eps), textures + (id < F ? id : id - F) * cube, C, color);
+          blend<known()>(texels_of(args.weights + 3 * n, ts, args.eps), textures + (id < F ? id : id - F) * cube, C,
+                         color);
         else
           for (int64_t k = 0; k < C; ++k) color[k] = 0;
       }
@@ -107,13 +110,14 @@ void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first
 
 }  // namespace
 
-// Every texel is summed on one thread, over images and pixels in ascending order. If images share their textures, or if there are
-// fewer images than threads, each thread reads all pixels and uses those of its own range of faces.
+// Every texel is summed on one thread, over images and pixels in ascending order. If images share their textures, or
+// if there are fewer images than threads, each thread reads all pixels and uses those of its own range of faces.
 template <class T>
 void texture_cubes_backward(const TextureCubes<T>& args) {
   const int64_t ts = args.texture_size, cube = ts * ts * ts * args.channels;
   const bool shared = !args.starts && args.texture_batch == 1;
-  const int64_t sets = shared ? 1 : args.batch, images = shared ? args.batch : 1;  // sets of textures; images of each set
+  const int64_t sets = shared ? 1 : args.batch,
+                images = shared ? args.batch : 1;  // sets of textures; images of each set
   const int64_t parts = sets >= args.num_threads ? 1 : 2 * static_cast<int64_t>(args.num_threads);
   parallel_for(sets * parts, args.num_threads, [&](int64_t task) {
     const int64_t set = task / parts, part = task % parts;
@@ -130,9 +134,10 @@ namespace {
 
 // grad_weights of a block's pixels, and its sums of b_k g.
 template <int64_t kChannels, class T>
-void interpolate_block_backward(const Interpolate<T>& args, const ImageAttributes<T>& image, const RowBlocks& blocks, int64_t b,
-                                int64_t block, CornerSums<T>& sums) {
-  const int64_t H = args.raster.height, W = args.raster.width, C = kChannels ? kChannels : args.channels, F = image.num_faces;
+void interpolate_block_backward(const Interpolate<T>& args, const ImageAttributes<T>& image, const RowBlocks& blocks,
+                                int64_t b, int64_t block, CornerSums<T>& sums) {
+  const int64_t H = args.raster.height, W = args.raster.width, C = kChannels ? kChannels : args.channels,
+                F = image.num_faces;
   const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
   if (args.grad_attributes) {
     sums.visible.reserve_for(F, blocks.most_visible(F));
@@ -192,14 +197,16 @@ void interpolate_backward(const Interpolate<T>& args) {
   if (args.grad_attributes) std::fill_n(args.grad_attributes, rows * args.channels, T(0));
   const auto blocks_of = [&](int64_t b) { return RowBlocks(args.raster, image_attributes(args, b).num_faces); };
   sum_blocks<CornerSums<T>>(
-      args.batch, !args.starts && args.attribute_batch == 1, args.num_threads, [&](int64_t b) { return blocks_of(b).count; },
+      args.batch, !args.starts && args.attribute_batch == 1, args.num_threads,
+      [&](int64_t b) { return blocks_of(b).count; },
       [&](int64_t b, int64_t block, CornerSums<T>& sums) {
         with_channels(args.channels, [&](auto known) {
           interpolate_block_backward<known()>(args, image_attributes(args, b), blocks_of(b), b, block, sums);
         });
       },
       [&](int64_t b, const CornerSums<T>& sums) {
-        if (args.grad_attributes) scatter_corner_sums(sums, image_attributes(args, b), args.channels, args.grad_attributes);
+        if (args.grad_attributes)
+          scatter_corner_sums(sums, image_attributes(args, b), args.channels, args.grad_attributes);
       });
 }
 

@@ -1,9 +1,10 @@
-// Smoothness loss: sum over edges of (1 + cos(theta))^2, where theta is the angle between the two faces at the edge (cos = -1 when
-// flat), with Kato's guards against division by zero. theta is the angle between the heights of the two faces over the edge.
+// Smoothness loss: sum over edges of (1 + cos(theta))^2, where theta is the angle between the two faces at the edge
+// (cos = -1 when flat), with Kato's guards against division by zero. theta is the angle between the heights of the two
+// faces over the edge.
 //
-// All meshes share the edges, so kGroup meshes are processed together, one per lane: their vertices are interleaved first, and every
-// load and every sum of the gradient is a whole vector. The remaining meshes are processed one by one, kGroup edges at a time. Both
-// ways sum a mesh's edges in the same order, and give the same bits.
+// All meshes share the edges, so kGroup meshes are processed together, one per lane: their vertices are interleaved
+// first, and every load and every sum of the gradient is a whole vector. The remaining meshes are processed one by
+// one, kGroup edges at a time. Both ways sum a mesh's edges in the same order, and give the same bits.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -105,8 +106,8 @@ NMR_INLINE T edge_loss(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>&
 
 // The gradients of end, left and right; that of origin is minus their sum.
 template <class T>
-NMR_INLINE void edge_backward(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>& left, const Vec3<T>& right, T grad_loss,
-                              Vec3<T>& grad_end, Vec3<T>& grad_left, Vec3<T>& grad_right) {
+NMR_INLINE void edge_backward(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>& left, const Vec3<T>& right,
+                              T grad_loss, Vec3<T>& grad_end, Vec3<T>& grad_left, Vec3<T>& grad_right) {
   const Base<T> a = base(end - origin);
   const Vec3<T> b1 = left - origin, b2 = right - origin;
   const Height<T> h1 = height(a, b1), h2 = height(a, b2);
@@ -134,7 +135,8 @@ NMR_INLINE void set_point(T* points, int l, const Vec3<T>& p) {
 template <class T>
 NMR_INLINE void lanes_forward(const T* __restrict origin, const T* __restrict end, const T* __restrict left,
                               const T* __restrict right, T* __restrict loss) {
-  for (int l = 0; l < kGroup; ++l) loss[l] = edge_loss(point(origin, l), point(end, l), point(left, l), point(right, l));
+  for (int l = 0; l < kGroup; ++l)
+    loss[l] = edge_loss(point(origin, l), point(end, l), point(left, l), point(right, l));
 }
 
 template <class T>
@@ -180,7 +182,8 @@ NMR_INLINE void meshes_forward_body(const Smoothness<T>& args, int64_t b, T* ver
     const int64_t* e = args.edges + 4 * n;
     constexpr int64_t stride = 3 * kGroup;
     T loss[kGroup];
-    lanes_forward(vertices + stride * e[0], vertices + stride * e[1], vertices + stride * e[2], vertices + stride * e[3], loss);
+    lanes_forward(vertices + stride * e[0], vertices + stride * e[1], vertices + stride * e[2],
+                  vertices + stride * e[3], loss);
     for (int l = 0; l < kGroup; ++l) sum[l] += static_cast<double>(loss[l]);
   }
   for (int l = 0; l < kGroup; ++l) args.loss[b + l] = static_cast<T>(sum[l]);
@@ -197,8 +200,8 @@ NMR_INLINE void meshes_backward_body(const Smoothness<T>& args, int64_t b, T* ve
     const int64_t* e = args.edges + 4 * n;
     constexpr int64_t stride = 3 * kGroup;
     T g[kCoordinates][kGroup];
-    lanes_backward(vertices + stride * e[0], vertices + stride * e[1], vertices + stride * e[2], vertices + stride * e[3],
-                   grad_loss, g[0]);
+    lanes_backward(vertices + stride * e[0], vertices + stride * e[1], vertices + stride * e[2],
+                   vertices + stride * e[3], grad_loss, g[0]);
     for (int i = 0; i < 4; ++i) add<stride>(g[3 * i], grad + stride * e[i]);
   }
   separate(grad, rows, args.grad_vertices + b * rows);
@@ -247,9 +250,15 @@ NMR_INLINE void mesh_backward_body(const Smoothness<T>& args, int64_t b) {
 }
 
 NMR_CLONES void meshes_forward(const Smoothness<float>& args, int64_t b, float* v) { meshes_forward_body(args, b, v); }
-NMR_CLONES void meshes_forward(const Smoothness<double>& args, int64_t b, double* v) { meshes_forward_body(args, b, v); }
-NMR_CLONES void meshes_backward(const Smoothness<float>& args, int64_t b, float* v, float* g) { meshes_backward_body(args, b, v, g); }
-NMR_CLONES void meshes_backward(const Smoothness<double>& args, int64_t b, double* v, double* g) { meshes_backward_body(args, b, v, g); }
+NMR_CLONES void meshes_forward(const Smoothness<double>& args, int64_t b, double* v) {
+  meshes_forward_body(args, b, v);
+}
+NMR_CLONES void meshes_backward(const Smoothness<float>& args, int64_t b, float* v, float* g) {
+  meshes_backward_body(args, b, v, g);
+}
+NMR_CLONES void meshes_backward(const Smoothness<double>& args, int64_t b, double* v, double* g) {
+  meshes_backward_body(args, b, v, g);
+}
 NMR_CLONES void mesh_forward(const Smoothness<float>& args, int64_t b) { mesh_forward_body(args, b); }
 NMR_CLONES void mesh_forward(const Smoothness<double>& args, int64_t b) { mesh_forward_body(args, b); }
 NMR_CLONES void mesh_backward(const Smoothness<float>& args, int64_t b) { mesh_backward_body(args, b); }

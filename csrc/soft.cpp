@@ -1,12 +1,12 @@
 // The soft silhouette of SoftRas (Liu et al. 2019) and its derivative.
 //
-// At pixel centre p, face j has the probability D_j = 1 / (1 + exp(-x_j)) with x_j = +-d^2 / sigma: d is the distance from p to the
-// border of the triangle, + inside and - outside. Faces outside with d^2 >= reach are left out. alpha = 1 - clear, where
-// clear = prod_j (1 - D_j). The derivative needs no division: d alpha / d x_j = clear D_j.
+// At pixel centre p, face j has the probability D_j = 1 / (1 + exp(-x_j)) with x_j = +-d^2 / sigma: d is the distance
+// from p to the border of the triangle, + inside and - outside. Faces outside with d^2 >= reach are left out. alpha =
+// 1 - clear, where clear = prod_j (1 - D_j). The derivative needs no division: d alpha / d x_j = clear D_j.
 //
-// Distances are measured in units of half the shorter side of the raster. The nearest point of the border lies on one of the three
-// sides, at p_a + t (p_b - p_a); the derivative of d^2 with respect to p_a is -2 (1 - t) (p - nearest), and with respect to p_b
-// -2 t (p - nearest), because the nearest point itself is stationary.
+// Distances are measured in units of half the shorter side of the raster. The nearest point of the border lies on one
+// of the three sides, at p_a + t (p_b - p_a); the derivative of d^2 with respect to p_a is -2 (1 - t) (p - nearest),
+// and with respect to p_b -2 t (p - nearest), because the nearest point itself is stationary.
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -25,8 +25,9 @@ constexpr int64_t kBandRows = 32;   // rows per task, forward
 constexpr int64_t kFaceChunk = 64;  // faces per task, backward
 constexpr int64_t kSums = 6;        // x and y of three corners
 
-// exp(-x) for x >= 0: 2^-n times the Taylor series of exp on [-ln 2 / 2, ln 2 / 2]. Written out because the library's function is not
-// the same on all processors, and the compiler does not vectorize it. Values below 1e-37 become 1e-37 (double: 1e-300).
+// exp(-x) for x >= 0: 2^-n times the Taylor series of exp on [-ln 2 / 2, ln 2 / 2]. Written out because the library's
+// function is not the same on all processors, and the compiler does not vectorize it. Values below 1e-37 become 1e-37
+// (double: 1e-300).
 NMR_INLINE float exp_negative(float x) {
   x = x < 85 ? x : 85;
   const float n = static_cast<float>(static_cast<int32_t>(x * 1.44269504f + 0.5f));
@@ -44,8 +45,8 @@ NMR_INLINE double exp_negative(double x) {
   const double n = static_cast<double>(static_cast<int64_t>(x * 1.4426950408889634 + 0.5));
   const double r = n * 0.693145751953125 - x + n * 1.42860682030941723212e-6;
   double sum = 1.0 / 6227020800;
-  for (const double c : {1.0 / 479001600, 1.0 / 39916800, 1.0 / 3628800, 1.0 / 362880, 1.0 / 40320, 1.0 / 5040, 1.0 / 720, 1.0 / 120,
-                         1.0 / 24, 1.0 / 6, 0.5, 1.0, 1.0})
+  for (const double c : {1.0 / 479001600, 1.0 / 39916800, 1.0 / 3628800, 1.0 / 362880, 1.0 / 40320, 1.0 / 5040,
+                         1.0 / 720, 1.0 / 120, 1.0 / 24, 1.0 / 6, 0.5, 1.0, 1.0})
     sum = sum * r + c;
   const uint64_t bits = static_cast<uint64_t>(1023 - static_cast<int64_t>(n)) << 52;
   double scale;
@@ -83,7 +84,8 @@ NMR_INLINE void reached(T lo, T hi, int64_t size, int64_t& first, int64_t& last)
   last = std::min<int64_t>(size - 1, static_cast<int64_t>(to > -1 ? (to < n ? to : n) : T(-2)) + 1);
 }
 
-// Whether face f counts: finite, not wholly in front of `near` or behind `far`, and, without fill_back, seen from its front.
+// Whether face f counts: finite, not wholly in front of `near` or behind `far`, and, without fill_back, seen from its
+// front.
 template <class T>
 NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& face) {
   const T largest = std::sqrt(std::sqrt(std::numeric_limits<T>::max()));  // squares of squares stay finite
@@ -178,7 +180,8 @@ NMR_INLINE void forward_body(const SoftImage<T>& image, int64_t first, int64_t l
   }
 }
 
-// The gradient of one face, x and y of its corners; pull [H, W] is the gradient of x_j without the factor D_j: grad alpha * clear.
+// The gradient of one face, x and y of its corners; pull [H, W] is the gradient of x_j without the factor D_j: grad
+// alpha * clear.
 template <class T>
 NMR_INLINE void backward_body(const SoftImage<T>& image, const SoftFace<T>& face, const T* pull, T* grad) {
   const Size raster = image.settings.raster;
@@ -243,7 +246,8 @@ void soft_forward(const SoftForward<T>& args) {
   const std::vector<T> columns = scaled_columns<T>(raster);
   const int64_t bands = (raster.height + kBandRows - 1) / kBandRows;
   parallel_for(args.mesh.batch * bands, args.num_threads, [&](int64_t task) {
-    const int64_t b = task / bands, first = task % bands * kBandRows, last = std::min(first + kBandRows, raster.height) - 1;
+    const int64_t b = task / bands, first = task % bands * kBandRows,
+                  last = std::min(first + kBandRows, raster.height) - 1;
     T* clear = args.clear + b * raster.pixels();
     std::fill_n(clear + (raster.height - 1 - last) * raster.width, (last - first + 1) * raster.width, T(1));
     soft_forward_band(soft_image(args.mesh, args.settings, b, columns.data()), first, last, clear);
@@ -264,7 +268,8 @@ void soft_backward(const SoftBackward<T>& args) {
     first_face.push_back(first_face[b] + mesh.face_count(b));
   }
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
-    for (int64_t n = b * raster.pixels(); n < (b + 1) * raster.pixels(); ++n) pull[n] = -args.grad_clear[n] * args.clear[n];
+    for (int64_t n = b * raster.pixels(); n < (b + 1) * raster.pixels(); ++n)
+      pull[n] = -args.grad_clear[n] * args.clear[n];
   });
   std::vector<T> grads(kSums * first_face.back());
   std::vector<unsigned char> drawn(first_face.back());

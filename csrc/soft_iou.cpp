@@ -1,7 +1,7 @@
 // Soft intersection over union of each pair of images: I / U with I = sum p t and U = sum (p + t - p t); 1 if U = 0.
 //
-// Two vectors of partial sums run side by side. After every kChunk values they are added, in order, to totals in double precision. The
-// order depends on the number of values alone.
+// Two vectors of partial sums run side by side. After every kChunk values they are added, in order, to totals in
+// double precision. The order depends on the number of values alone.
 #include <algorithm>
 
 #include "lanes.h"
@@ -85,7 +85,8 @@ void soft_iou_backward(const SoftIou<T>& args) {
     const double scale = either == 0 ? 0 : static_cast<double>(args.grad_iou[b]) / either / either;
     const T factor = static_cast<T>(scale * (either + both)), offset = static_cast<T>(scale * both);
     const int64_t first = b * args.count;
-    if (args.grad_prediction) gradient_of(args.target + first, factor, offset, args.grad_prediction + first, args.count);
+    if (args.grad_prediction)
+      gradient_of(args.target + first, factor, offset, args.grad_prediction + first, args.count);
     if (args.grad_target) gradient_of(args.prediction + first, factor, offset, args.grad_target + first, args.count);
   });
 }

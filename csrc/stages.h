@@ -1,6 +1,6 @@
-// The argument struct of each stage: inputs, outputs, sizes, settings. Raw arrays only, row-major. Every image has row 0 at the top.
-// Stages in the order of a render: camera, clip, rasterize, then those that use the owner map: silhouette, fragments, depth, shading,
-// resolve.
+// The argument struct of each stage: inputs, outputs, sizes, settings. Raw arrays only, row-major. Every image has row
+// 0 at the top. Stages in the order of a render: camera, clip, rasterize, then those that use the owner map:
+// silhouette, fragments, depth, shading, resolve.
 #pragma once
 
 #include <cstdint>
@@ -24,7 +24,8 @@ inline Size raster_of(Size image, bool anti_aliasing) {
 template <class T>
 struct MeshBatch {
   const T* vertices;       // [B, V, 3], or packed [N, 3]
-  const int64_t* faces;    // [F, 3] shared, [B, F, 3], or packed [M, 3]; vertex numbers count from the mesh's own first vertex
+  const int64_t* faces;    // [F, 3] shared, [B, F, 3], or packed [M, 3]; vertex numbers count from the mesh's own first
+                           // vertex
   int64_t batch;           // B
   int64_t num_vertices;    // V (packed: N)
   int64_t num_faces;       // F (packed: M)
@@ -39,9 +40,9 @@ struct MeshBatch {
   const int64_t* image_faces(int64_t b) const { return faces + 3 * face_start(b); }
 };
 
-// The pose of a camera that looks along `forward` (pose.cpp): rows x, -y, z of A (camera axes: x right, y down, z forward);
-// z = n(forward), x = n(up x z), y = n(z x x), n(v) = v / max(|v|, 1e-5). If an input is not finite or beyond 1e15, the whole pose is
-// NaN and gets no gradient.
+// The pose of a camera that looks along `forward` (pose.cpp): rows x, -y, z of A (camera axes: x right, y down, z
+// forward); z = n(forward), x = n(up x z), y = n(z x x), n(v) = v / max(|v|, 1e-5). If an input is not finite or
+// beyond 1e15, the whole pose is NaN and gets no gradient.
 template <class T>
 struct Pose {
   const T* forward;      // [B, 3]
@@ -54,12 +55,14 @@ struct Pose {
 };
 
 // World space to renderer space (camera.cpp). Per image b: u = A (v - origin) + t with [A | t] = matrix; then
-//   perspective:   p = (u_x / u_z, u_y / u_z), distorted as OpenCV does; q = p / extent; out = (K00 q_x + K01 q_y + K02, K10 q_x + ...,
+//   perspective:   p = (u_x / u_z, u_y / u_z), distorted as OpenCV does; q = p / extent;
+//                  out = (K00 q_x + K01 q_y + K02, K10 q_x + ...,
 //                  u_z), K = intrinsics
 //   orthographic:  the same with p = (u_x, u_y), without distortion.
-// Origin and extent are separate arguments so that look-at cameras round as the published ones: images and gradients then have the
-// same bits. A vertex has no finite image if it is not finite itself, if it lies in the plane of the eye, if x / z^2 overflows, or
-// if the camera is not finite. It then gets out = (inf, inf, any finite number), so that its faces are not drawn, and gradient 0.
+// Origin and extent are separate arguments so that look-at cameras round as the published ones: images and gradients
+// then have the same bits. A vertex has no finite image if it is not finite itself, if it lies in the plane of the
+// eye, if x / z^2 overflows, or if the camera is not finite. It then gets out = (inf, inf, any finite number), so that
+// its faces are not drawn, and gradient 0.
 template <class T>
 struct Project {
   const T* vertices;     // [B or 1, V, 3], or packed [N, 3]
@@ -102,7 +105,8 @@ struct ClipFaces {
   int64_t* faces;         // out [M, 3]: vertices of the mesh; its new vertices are numbered after its own
   int32_t* source;        // out [M]: the face of the mesh that a drawn face is part of
   int64_t* corners;       // out [M, 3]: k < 3: corner k of that face; 3 + p: new vertex p of the mesh
-  int64_t* ends;          // out [P, 4]: a new vertex lies between two rows of `vertices`, which are these two corners of its face
+  int64_t* ends;          // out [P, 4]: a new vertex lies between two rows of `vertices`, which are these two corners
+                          // of its face
   int num_threads;
 };
 
@@ -150,7 +154,8 @@ struct SilhouetteBackward {
   MeshBatch<T> mesh;
   Size image;           // h x w
   bool anti_aliasing;
-  T eps;                // NMR's: keeps the distance to an edge away from zero; local: if rates differ by less, the gradient is 0
+  T eps;                // NMR's: keeps the distance to an edge away from zero; local: if rates differ by less, the
+                        // gradient is 0
   const int32_t* owner; // [B, H, W]
   const T* grad_alpha;  // [B, h, w]
   T* grad_vertices;     // out, like mesh.vertices; z gets 0
@@ -190,7 +195,8 @@ struct Fragments {
   Size raster;           // H x W
   T far;                 // depth of the background
   const int32_t* owner;  // [B, H, W]
-  T* weights;            // forward out [B, H, W, 3]: of the face's own vertices 0, 1, 2, perspective-correct; 0 on background
+  T* weights;            // forward out [B, H, W, 3]: of the face's own vertices 0, 1, 2, perspective-correct; 0 on
+                         // background
   T* depth;              // forward out [B, H, W]
   const T* grad_weights; // backward in [B, H, W, 3], or nullptr
   const T* grad_depth;   // backward in [B, H, W], or nullptr
@@ -243,7 +249,8 @@ struct Interpolate {
   int64_t attribute_batch;   // 1 or B when not packed
   int64_t num_attributes;    // N
   int64_t channels;          // C
-  const int64_t* corners;    // [F, 3] shared, [B, F, 3], or packed [M, 3]: rows of attributes, counted from the mesh's first
+  const int64_t* corners;    // [F, 3] shared, [B, F, 3], or packed [M, 3]: rows of attributes, counted from the mesh's
+                             // first
   int64_t num_faces;         // F (packed: M)
   bool corners_per_image;
   const int64_t* starts;     // packed: [B + 1, 2], first attribute row and first face of each mesh; else nullptr
@@ -257,8 +264,9 @@ struct Interpolate {
 // How a texture continues outside [0, 1].
 enum class Wrap : int { repeat, clamp, mirror };
 
-// Mipmaps of texture images (texture.cpp): each level has half the size of the one before, rounded down, until it is one texel. A
-// texel is the mean of the part of the finer level that it covers. Smaller images repeat their last level.
+// Mipmaps of texture images (texture.cpp): each level has half the size of the one before, rounded down, until it is
+// one texel. A texel is the mean of the part of the finer level that it covers. Smaller images repeat their last
+// level.
 template <class T>
 struct Mipmaps {
   int64_t images, levels;  // I, L
@@ -271,8 +279,8 @@ struct Mipmaps {
   int num_threads;
 };
 
-// Colours from texture images at interpolated uv coordinates (texture.cpp); bilinear, and linear between mipmaps if level is given.
-// A coordinate that is not finite, or not below 1e6, counts as 0.
+// Colours from texture images at interpolated uv coordinates (texture.cpp); bilinear, and linear between mipmaps if
+// level is given. A coordinate that is not finite, or not below 1e6, counts as 0.
 template <class T>
 struct SampleUV {
   Interpolate<T> uv;       // attributes: the uv coordinates, 2 channels
@@ -288,8 +296,8 @@ struct SampleUV {
   T* grad_texels;          // backward out, like texels, or nullptr
 };
 
-// The mipmap level of each pixel (texture.cpp), as OpenGL defines it: log2 of the number of texels that the pixel spans, from the
-// derivatives of uv on the screen, clamped to the levels that there are.
+// The mipmap level of each pixel (texture.cpp), as OpenGL defines it: log2 of the number of texels that the pixel
+// spans, from the derivatives of uv on the screen, clamped to the levels that there are.
 template <class T>
 struct UVLevels {
   Interpolate<T> uv;       // as in SampleUV
@@ -299,9 +307,9 @@ struct UVLevels {
   T* level;                // out [B, H, W]; 0 on background
 };
 
-// Unit normals of meshes in world space (normals.cpp): n((v0 - v1) x (v2 - v1)) of faces, or of vertices the direction of the sum of
-// these products over the faces around them. 0 where there is no area. A vertex that is not finite, or beyond 1e12, counts as the
-// origin and gets no gradient.
+// Unit normals of meshes in world space (normals.cpp): n((v0 - v1) x (v2 - v1)) of faces, or of vertices the direction
+// of the sum of these products over the faces around them. 0 where there is no area. A vertex that is not finite, or
+// beyond 1e12, counts as the origin and gets no gradient.
 template <class T>
 struct Normals {
   MeshBatch<T> mesh;
@@ -312,23 +320,30 @@ struct Normals {
   int num_threads;
 };
 
-// The parameters of lights, in this order in `layout`; those of each kind have a row per image or one for all, and per light.
+// The parameters of lights, in this order in `layout`; those of each kind have a row per image or one for all, and per
+// light.
 enum class Light : int {
-  ambient, ambient_color, directional, directional_color, direction, point, point_color, position, falloff, specular, shininess, count
+  ambient, ambient_color, directional, directional_color, direction, point, point_color, position, falloff,
+  specular, shininess, count
 };
 
-// Lit colours, or the normals themselves, at each pixel (lights.cpp). With n the unit normal of the side that is seen, x the point:
+// Lit colours, or the normals themselves, at each pixel (lights.cpp). With n the unit normal of the side that is seen,
+// x the point:
 //   lit = color (ambient ambient_color + sum over lights of c relu(n . l)) + highlight,
-//   highlight = specular sum over lights with n . l > 0 of c relu(r . v)^shininess, r = 2 (n . l) n - l, v towards the eye;
-// a directional light has l = direction, c = directional directional_color (in highlights l is the unit vector, and c is multiplied
-// by its length); a point light has l towards position, of length 1, and c = point point_color / (1 + falloff |position - x|^2).
+//   highlight = specular sum over lights with n . l > 0 of c relu(r . v)^shininess, r = 2 (n . l) n - l,
+//               v towards the eye;
+// a directional light has l = direction, c = directional directional_color (in highlights l is the unit vector, and c
+// is multiplied by its length); a point light has l towards position, of length 1, and c = point point_color / (1 +
+// falloff |position - x|^2).
 template <class T>
 struct Lit {
-  Interpolate<T> at;         // attributes: vertices in world space, 3 channels, corners: the faces; grad_attributes, grad_weights
+  Interpolate<T> at;         // attributes: vertices in world space, 3 channels, corners: the faces; grad_attributes,
+                             // grad_weights
   const T* normals;          // [B or 1, F, 3], packed [M, 3]; smooth: like the vertices
   int64_t normal_batch;      // 1 or B when not packed
   bool smooth;               // normals of vertices, interpolated: sum of b_k n_k, divided by its length or 1e-5
-  const T* viewer;           // [B, 5]: place of the eye, 1; or direction towards the viewer, 0; then -1 if the camera mirrors, else 1
+  const T* viewer;           // [B, 5]: place of the eye, 1; or direction towards the viewer, 0; then -1 if the camera
+                             // mirrors, else 1
   const T* parameters;       // all lights, or nullptr: the result is the normal
   const int64_t* layout;     // [Light::count, 3]: first value, rows (1 or B), lights (0: there are none)
   int64_t num_parameters;
@@ -359,7 +374,8 @@ struct Resolve {
   int num_threads;
 };
 
-// NMR's gradient of an image with any channels (edges.cpp): pixels pull every visible edge whose motion over them lowers the loss.
+// NMR's gradient of an image with any channels (edges.cpp): pixels pull every visible edge whose motion over them
+// lowers the loss.
 template <class T>
 struct EdgesBackward {
   MeshBatch<T> mesh;

@@ -1,6 +1,7 @@
-// The unit cells that a triangle touches, by the separating axis test of a triangle and a box. Both include their borders: a triangle
-// in the plane between two cells touches both. Cells are enlarged by kSlack on each side, so that this does not depend on rounding. Of
-// the 13 axes, the three of the box are the bounds of the search; the others are below. All in double.
+// The unit cells that a triangle touches, by the separating axis test of a triangle and a box. Both include their
+// borders: a triangle in the plane between two cells touches both. Cells are enlarged by kSlack on each side, so that
+// this does not depend on rounding. Of the 13 axes, the three of the box are the bounds of the search; the others are
+// below. All in double.
 #pragma once
 
 #include <algorithm>
@@ -15,7 +16,8 @@ class TriangleCells {
  public:
   // A face with a corner that is not finite, or farther than this from the first cell on some axis, touches nothing.
   static constexpr double kFarthest = 1048576;
-  // Larger than the rounding error of coordinates within kFarthest, smaller than the distance of neighbouring float coordinates.
+  // Larger than the rounding error of coordinates within kFarthest, smaller than the distance of neighbouring float
+  // coordinates.
   static constexpr double kSlack = 1e-9;
 
   // Corners in units of cells. They are sorted first, so that their order does not change any bit.
@@ -39,7 +41,8 @@ class TriangleCells {
     const Eigen::Vector3d e = v[1] - v[0], f = v[2] - v[0];
     origin_ = v[0];
     normal_ = Eigen::Vector3d(e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0]);
-    // Rounding may have changed the direction of the normal of a very thin face. Treated as a segment: the other axes suffice.
+    // Rounding may have changed the direction of the normal of a very thin face. Treated as a segment: the other axes
+    // suffice.
     if (normal_.cwiseAbs().maxCoeff() <= 1e-10 * e.cwiseAbs().maxCoeff() * f.cwiseAbs().maxCoeff()) normal_.setZero();
     for (double n : normal_) {
       (n > 0 ? plane_low_ : plane_high_) -= n;
@@ -50,8 +53,8 @@ class TriangleCells {
       if (std::abs(normal_[a]) > std::abs(normal_[inner_])) inner_ = a;
   }
 
-  // Calls visit(i, j, k) for each touched cell of [0, size)^3. Cells are visited in columns along the largest component of the normal:
-  // there the plane meets few cells of each column.
+  // Calls visit(i, j, k) for each touched cell of [0, size)^3. Cells are visited in columns along the largest
+  // component of the normal: there the plane meets few cells of each column.
   template <class Visit>
   void for_each(const Visit& visit) const {
     const int p = (inner_ + 1) % 3, q = (inner_ + 2) % 3;
@@ -68,8 +71,8 @@ class TriangleCells {
   }
 
  private:
-  // The axis (unit vector a) x (edge e from s to t), which is -e_q along p and e_p along q with p, q the axes after a: the cell at c
-  // overlaps the triangle along it if low <= -e_q (c_p - s_p) + e_p (c_q - s_q) <= high.
+  // The axis (unit vector a) x (edge e from s to t), which is -e_q along p and e_p along q with p, q the axes after a:
+  // the cell at c overlaps the triangle along it if low <= -e_q (c_p - s_p) + e_p (c_q - s_q) <= high.
   struct EdgeTest {
     double s_p, s_q, along_p, along_q, low = 0, high = 0;
 
@@ -110,7 +113,8 @@ class TriangleCells {
     const double slope = normal_[inner_];
     if (slope == 0) return;  // a face without area has no plane
     const int p = (inner_ + 1) % 3, q = (inner_ + 2) % 3;
-    const double base = normal_[p] * (static_cast<double>(c_p) - origin_[p]) + normal_[q] * (static_cast<double>(c_q) - origin_[q]);
+    const double base =
+        normal_[p] * (static_cast<double>(c_p) - origin_[p]) + normal_[q] * (static_cast<double>(c_q) - origin_[q]);
     double low = origin_[inner_] + (plane_low_ - base) / slope, high = origin_[inner_] + (plane_high_ - base) / slope;
     if (slope < 0) std::swap(low, high);
     const double end = static_cast<double>(last);

@@ -1,7 +1,7 @@
 // The faces that own a pixel; all others have gradient 0. Part of a level file (levels.h).
 
-// Writes their owner entries to ids, ascending, and returns their number; ids has room for kLanes more. seen: [2 F + 1 +
-// kLanes] of scratch.
+// Writes their owner entries to ids, ascending, and returns their number; ids has room for kLanes more. seen: [2 F + 1
+// + kLanes] of scratch.
 int64_t find_visible(const int32_t* owner, int64_t pixels, int64_t num_faces, uint8_t* seen, int32_t* ids) {
   const int64_t entries = 2 * num_faces + 1;  // entry 0 is the background
   std::memset(seen, 0, entries + kLanes);

@@ -1,6 +1,6 @@
-// Occupancy grids: the surface cells, and all cells that cannot be reached from the border of the grid through empty cells. Surface
-// cells are those of Kato et al. 2018 ("kato18", used for most published voxel IoU) or of Kato and Harada 2019 ("kato19"): every cell
-// that a face touches.
+// Occupancy grids: the surface cells, and all cells that cannot be reached from the border of the grid through empty
+// cells. Surface cells are those of Kato et al. 2018 ("kato18", used for most published voxel IoU) or of Kato and
+// Harada 2019 ("kato19"): every cell that a face touches.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -23,7 +23,8 @@ struct VoxelScratch {
   std::vector<int32_t> frontier;
 };
 
-// The cells of the grid, surrounded by a layer of outside cells, so that code that visits neighbours needs no test for the border.
+// The cells of the grid, surrounded by a layer of outside cells, so that code that visits neighbours needs no test for
+// the border.
 struct Grid {
   uint8_t* cells;
   int64_t size;
@@ -54,8 +55,8 @@ void lattice_range(float lo, float hi, int64_t size, int64_t& first, int64_t& la
   last = static_cast<int64_t>(std::floor(std::min(std::max(hi, -1.f), end - 1)));
 }
 
-// Rays along `axis` through the integer points (p, q) of the other two axes. Each hit marks the four cells around the ray at the
-// depth of the hit.
+// Rays along `axis` through the integer points (p, q) of the other two axes. Each hit marks the four cells around the
+// ray at the depth of the hit.
 void mark_ray_hits(const Vec3f (&v)[3], int axis, Grid& grid) {
   const int pa = (axis + 1) % 3, qa = (axis + 2) % 3;
   const float p0 = v[0][pa], p1 = v[1][pa], p2 = v[2][pa], q0 = v[0][qa], q1 = v[1][qa], q2 = v[2][qa];
@@ -100,7 +101,9 @@ void mark_rays_and_vertices(const Vec3f (&corners)[3], Grid& grid) {
 }
 
 void mark_touched(const Vec3f (&corners)[3], Grid& grid) {
-  TriangleCells(corners, grid.size).for_each([&](int64_t x, int64_t y, int64_t z) { grid.cells[grid.index(x, y, z)] = kSurface; });
+  TriangleCells(corners, grid.size).for_each([&](int64_t x, int64_t y, int64_t z) {
+    grid.cells[grid.index(x, y, z)] = kSurface;
+  });
 }
 
 // Floods the empty cells from the border (6-connected) and marks them as outside.

@@ -1,5 +1,5 @@
-// Shared by all bindings: NumPy arrays as raw pointers. Shapes and indices are checked again after the Python layer, so that no call
-// can read or write outside an array. Only the files in this folder know Python.
+// Shared by all bindings: NumPy arrays as raw pointers. Shapes and indices are checked again after the Python layer,
+// so that no call can read or write outside an array. Only the files in this folder know Python.
 #pragma once
 
 #include <optional>
@@ -65,18 +65,21 @@ T* optional_out(std::optional<Array<T>>& grad, const char* name, const std::vect
 inline void require_indices(const int64_t* index, int64_t count, int64_t limit, const char* name, const char* what,
                             const char* plural) {
   const uint64_t last = static_cast<uint64_t>(limit) - 1;
-  uint64_t wrong = 0;  // its highest bit: the signs of i and limit - 1 - i (without branches, so that the loop is vectorized)
-  for (int64_t n = 0; n < count; ++n) wrong |= static_cast<uint64_t>(index[n]) | (last - static_cast<uint64_t>(index[n]));
+  // Its highest bit: the signs of i and limit - 1 - i (without branches, so that the loop is vectorized).
+  uint64_t wrong = 0;
+  for (int64_t n = 0; n < count; ++n)
+    wrong |= static_cast<uint64_t>(index[n]) | (last - static_cast<uint64_t>(index[n]));
   if (!(wrong >> 63)) return;
   for (int64_t n = 0; n < count; ++n)
     if (index[n] < 0 || index[n] >= limit)
-      throw std::invalid_argument(std::string(name) + " refer to " + what + " " + std::to_string(index[n]) + ", but a mesh has " +
-                                  std::to_string(limit) + " " + plural + " (the first is 0)");
+      throw std::invalid_argument(std::string(name) + " refer to " + what + " " + std::to_string(index[n]) +
+                                  ", but a mesh has " + std::to_string(limit) + " " + plural + " (the first is 0)");
 }
 
 // [B + 1, 2]: ascending from (0, 0) to (rows, faces).
 inline void require_starts(const Indices& starts, int64_t rows, int64_t faces) {
-  require(starts.ndim() == 2 && starts.shape(0) >= 1 && starts.shape(1) == 2, "starts must have shape [B + 1, 2], got " + shape_of(starts));
+  require(starts.ndim() == 2 && starts.shape(0) >= 1 && starts.shape(1) == 2,
+          "starts must have shape [B + 1, 2], got " + shape_of(starts));
   const int64_t* s = starts.data();
   const int64_t last = 2 * (starts.shape(0) - 1);
   bool valid = s[0] == 0 && s[1] == 0 && s[last] == rows && s[last + 1] == faces;
@@ -90,12 +93,21 @@ MeshBatch<T> mesh_batch(const Array<T>& vertices, const Indices& faces, const st
   const bool packed = starts.has_value(), per_image = faces.ndim() == 3;
   require(vertices.ndim() == (packed ? 2 : 3) && vertices.shape(vertices.ndim() - 1) == 3,
           std::string("vertices must have shape ") + (packed ? "[N, 3]" : "[B, V, 3]") + ", got " + shape_of(vertices));
-  require((faces.ndim() == 2 || (per_image && !packed && faces.shape(0) == vertices.shape(0))) && faces.shape(faces.ndim() - 1) == 3,
-          "faces must have shape [F, 3], or [B, F, 3] with the B of vertices " + shape_of(vertices) + ", got " + shape_of(faces));
-  MeshBatch<T> mesh{vertices.data(), faces.data(), 0, vertices.shape(packed ? 0 : 1), faces.shape(per_image ? 1 : 0), per_image,
+  require((faces.ndim() == 2 || (per_image && !packed && faces.shape(0) == vertices.shape(0))) &&
+              faces.shape(faces.ndim() - 1) == 3,
+          "faces must have shape [F, 3], or [B, F, 3] with the B of vertices " + shape_of(vertices) + ", got " +
+              shape_of(faces));
+  MeshBatch<T> mesh{vertices.data(),
+                    faces.data(),
+                    0,
+                    vertices.shape(packed ? 0 : 1),
+                    faces.shape(per_image ? 1 : 0),
+                    per_image,
                     packed ? starts->data() : nullptr};
   require(mesh.num_faces < (int64_t(1) << 30), "at most 2^30 faces per mesh");
-  const auto require_vertices = [](int64_t count) { require(count < (int64_t(1) << 29), "at most 2^29 vertices per mesh"); };
+  const auto require_vertices = [](int64_t count) {
+    require(count < (int64_t(1) << 29), "at most 2^29 vertices per mesh");
+  };
   if (packed) {
     require_starts(*starts, mesh.num_vertices, mesh.num_faces);
     mesh.batch = starts->shape(0) - 1;

@@ -40,9 +40,9 @@ template <class T>
 using Optional = std::optional<Array<T>>;
 
 template <class T>
-Project<T> project_args(const Array<T>& vertices, const Array<T>& matrix, const Array<T>& intrinsics, const Optional<T>& distortion,
-                        const Optional<T>& origin, const Optional<T>& extent, const std::optional<Indices>& starts, bool perspective,
-                        int num_threads) {
+Project<T> project_args(const Array<T>& vertices, const Array<T>& matrix, const Array<T>& intrinsics,
+                        const Optional<T>& distortion, const Optional<T>& origin, const Optional<T>& extent,
+                        const std::optional<Indices>& starts, bool perspective, int num_threads) {
   Project<T> args{};
   require(matrix.ndim() == 3 && matrix.shape(1) == 3 && matrix.shape(2) == 4,
           "matrix must have shape [B, 3, 4], got " + shape_of(matrix));
@@ -52,15 +52,18 @@ Project<T> project_args(const Array<T>& vertices, const Array<T>& matrix, const 
   if (origin) require_shape(*origin, "origin", {args.batch, 3});
   if (extent) require_shape(*extent, "extent", {args.batch});
   if (starts) {
-    require(vertices.ndim() == 2 && vertices.shape(1) == 3, "packed vertices must have shape [N, 3], got " + shape_of(vertices));
+    require(vertices.ndim() == 2 && vertices.shape(1) == 3,
+            "packed vertices must have shape [N, 3], got " + shape_of(vertices));
     require_starts(*starts, vertices.shape(0), starts->size() ? starts->data()[starts->size() - 1] : 0);
     require(starts->shape(0) - 1 == args.batch, "starts are those of " + std::to_string(starts->shape(0) - 1) +
                                                     " meshes, but matrix has shape " + shape_of(matrix));
     args.starts = starts->data();
     args.num_vertices = vertices.shape(0);
   } else {
-    require(vertices.ndim() == 3 && vertices.shape(2) == 3 && (vertices.shape(0) == 1 || vertices.shape(0) == args.batch),
-            "vertices must have shape [1, V, 3] or [B, V, 3] with the B of matrix " + shape_of(matrix) + ", got " + shape_of(vertices));
+    require(
+        vertices.ndim() == 3 && vertices.shape(2) == 3 && (vertices.shape(0) == 1 || vertices.shape(0) == args.batch),
+        "vertices must have shape [1, V, 3] or [B, V, 3] with the B of matrix " + shape_of(matrix) + ", got " +
+            shape_of(vertices));
     args.vertex_batch = vertices.shape(0);
     args.num_vertices = vertices.shape(1);
   }
@@ -84,10 +87,11 @@ void require_points(const Array<T>& points, const char* name, const Project<T>& 
 }
 
 template <class T>
-void project_forward_py(const Array<T>& vertices, const Array<T>& matrix, const Array<T>& intrinsics, const Optional<T>& distortion,
-                        const Optional<T>& origin, const Optional<T>& extent, const std::optional<Indices>& starts,
-                        Array<T>& points, bool perspective, int num_threads) {
-  Project<T> args = project_args(vertices, matrix, intrinsics, distortion, origin, extent, starts, perspective, num_threads);
+void project_forward_py(const Array<T>& vertices, const Array<T>& matrix, const Array<T>& intrinsics,
+                        const Optional<T>& distortion, const Optional<T>& origin, const Optional<T>& extent,
+                        const std::optional<Indices>& starts, Array<T>& points, bool perspective, int num_threads) {
+  Project<T> args =
+      project_args(vertices, matrix, intrinsics, distortion, origin, extent, starts, perspective, num_threads);
   require_points(points, "points", args);
   args.points = points.mutable_data();
   py::gil_scoped_release release;
@@ -100,10 +104,12 @@ void project_backward_py(const Array<T>& vertices, const Array<T>& matrix, const
                          const std::optional<Indices>& starts, const Array<T>& grad_points, Optional<T> grad_vertices,
                          Optional<T> grad_matrix, Optional<T> grad_intrinsics, Optional<T> grad_distortion,
                          Optional<T> grad_origin, Optional<T> grad_extent, bool perspective, int num_threads) {
-  Project<T> args = project_args(vertices, matrix, intrinsics, distortion, origin, extent, starts, perspective, num_threads);
+  Project<T> args =
+      project_args(vertices, matrix, intrinsics, distortion, origin, extent, starts, perspective, num_threads);
   require_points(grad_points, "grad_points", args);
   args.grad_points = grad_points.data();
-  args.grad_vertices = optional_out(grad_vertices, "grad_vertices", {vertices.shape(), vertices.shape() + vertices.ndim()});
+  args.grad_vertices =
+      optional_out(grad_vertices, "grad_vertices", {vertices.shape(), vertices.shape() + vertices.ndim()});
   args.grad_matrix = optional_out(grad_matrix, "grad_matrix", {args.batch, 3, 4});
   args.grad_intrinsics = optional_out(grad_intrinsics, "grad_intrinsics", {args.batch, 2, 3});
   args.grad_distortion = optional_out(grad_distortion, "grad_distortion", {args.batch, 5});
@@ -118,14 +124,15 @@ void define_camera(py::module_& m) {
   const auto array = [](const char* name) { return py::arg(name).noconvert(); };
   const auto optional = [](const char* name) { return py::arg(name).noconvert().none(true); };
   m.def("pose_forward", &pose_forward_py<T>, array("forward"), array("up"), array("matrix"));
-  m.def("pose_backward", &pose_backward_py<T>, array("forward"), array("up"), array("grad_matrix"), array("grad_forward"),
-        array("grad_up"));
-  m.def("project_forward", &project_forward_py<T>, array("vertices"), array("matrix"), array("intrinsics"), optional("distortion"),
-        optional("origin"), optional("extent"), optional("starts"), array("points"), py::arg("perspective"), py::arg("num_threads"));
-  m.def("project_backward", &project_backward_py<T>, array("vertices"), array("matrix"), array("intrinsics"), optional("distortion"),
-        optional("origin"), optional("extent"), optional("starts"), array("grad_points"), optional("grad_vertices"),
-        optional("grad_matrix"), optional("grad_intrinsics"), optional("grad_distortion"), optional("grad_origin"),
-        optional("grad_extent"), py::arg("perspective"), py::arg("num_threads"));
+  m.def("pose_backward", &pose_backward_py<T>, array("forward"), array("up"), array("grad_matrix"),
+        array("grad_forward"), array("grad_up"));
+  m.def("project_forward", &project_forward_py<T>, array("vertices"), array("matrix"), array("intrinsics"),
+        optional("distortion"), optional("origin"), optional("extent"), optional("starts"), array("points"),
+        py::arg("perspective"), py::arg("num_threads"));
+  m.def("project_backward", &project_backward_py<T>, array("vertices"), array("matrix"), array("intrinsics"),
+        optional("distortion"), optional("origin"), optional("extent"), optional("starts"), array("grad_points"),
+        optional("grad_vertices"), optional("grad_matrix"), optional("grad_intrinsics"), optional("grad_distortion"),
+        optional("grad_origin"), optional("grad_extent"), py::arg("perspective"), py::arg("num_threads"));
 }
 
 }  // namespace

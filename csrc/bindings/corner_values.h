@@ -11,7 +11,8 @@ void require_fragments(const Array<int32_t>& owner, const Array<T>& weights, con
                        int64_t num_faces, int num_threads) {
   const int64_t batch = starts ? starts->shape(0) - 1 : owner.ndim() == 3 ? owner.shape(0) : 0;
   const int64_t* s = starts ? starts->data() : nullptr;
-  const Size raster = require_owner(owner, batch, [&](int64_t b) { return s ? s[2 * b + 3] - s[2 * b + 1] : num_faces; }, num_threads);
+  const Size raster =
+      require_owner(owner, batch, [&](int64_t b) { return s ? s[2 * b + 3] - s[2 * b + 1] : num_faces; }, num_threads);
   require_shape(weights, "weights", {batch, raster.height, raster.width, 3});
 }
 
@@ -21,9 +22,11 @@ Interpolate<T> interpolate_args(const Array<T>& attributes, const Indices& corne
                                 const Array<T>& weights, const std::optional<Indices>& starts, int num_threads) {
   const bool packed = starts.has_value(), per_image = corners.ndim() == 3;
   require(attributes.ndim() == (packed ? 2 : 3) && attributes.shape(attributes.ndim() - 1) >= 1,
-          std::string("attributes must have shape ") + (packed ? "[N, C]" : "[B or 1, N, C]") + ", got " + shape_of(attributes));
+          std::string("attributes must have shape ") + (packed ? "[N, C]" : "[B or 1, N, C]") + ", got " +
+              shape_of(attributes));
   require((corners.ndim() == 2 || (per_image && !packed)) && corners.shape(corners.ndim() - 1) == 3,
-          std::string("corners must have shape ") + (packed ? "[M, 3]" : "[F, 3] or [B, F, 3]") + ", got " + shape_of(corners));
+          std::string("corners must have shape ") + (packed ? "[M, 3]" : "[F, 3] or [B, F, 3]") + ", got " +
+              shape_of(corners));
   const int64_t num_attributes = attributes.shape(packed ? 0 : 1), num_faces = corners.shape(per_image ? 1 : 0);
   if (packed) require_starts(*starts, num_attributes, num_faces);
   require_fragments(owner, weights, starts, num_faces, num_threads);

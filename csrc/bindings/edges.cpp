@@ -12,7 +12,8 @@ struct Background {
 
   Background(const std::optional<Array<T>>& background, int64_t images, int64_t channels) {
     if (!background) return;
-    require(background->ndim() == 2 && (background->shape(0) == 1 || background->shape(0) == images) && background->shape(1) == channels,
+    require(background->ndim() == 2 && (background->shape(0) == 1 || background->shape(0) == images) &&
+                background->shape(1) == channels,
             "background must have shape [1 or " + std::to_string(images) + ", " + std::to_string(channels) + "], got " +
                 shape_of(*background));
     values = background->data();
@@ -22,8 +23,8 @@ struct Background {
 
 // `pixels` is [B, H, W, C], `resolved` [B, h, w, C]; the owner map belongs to the pixels.
 template <class T>
-Resolve<T> resolve_args(const Array<int32_t>& owner, const Array<T>& resolved, const std::optional<Array<T>>& background,
-                        bool anti_aliasing, int num_threads) {
+Resolve<T> resolve_args(const Array<int32_t>& owner, const Array<T>& resolved,
+                        const std::optional<Array<T>>& background, bool anti_aliasing, int num_threads) {
   require(resolved.ndim() == 4, "a resolved image must have shape [B, h, w, C], got " + shape_of(resolved));
   const int64_t batch = resolved.shape(0), channels = resolved.shape(3);
   const Size image{resolved.shape(1), resolved.shape(2)}, raster = raster_of(image, anti_aliasing);
@@ -61,9 +62,9 @@ void resolve_forward_py(const Array<T>& image, const std::optional<Array<T>>& ba
 }
 
 template <class T>
-void resolve_backward_py(const Array<T>& grad_resolved, const std::optional<Array<T>>& background, const Array<int32_t>& owner,
-                         std::optional<Array<T>>& grad_image, std::optional<Array<T>>& grad_background, bool anti_aliasing,
-                         int num_threads) {
+void resolve_backward_py(const Array<T>& grad_resolved, const std::optional<Array<T>>& background,
+                         const Array<int32_t>& owner, std::optional<Array<T>>& grad_image,
+                         std::optional<Array<T>>& grad_background, bool anti_aliasing, int num_threads) {
   Resolve<T> args = resolve_args(owner, grad_resolved, background, anti_aliasing, num_threads);
   args.grad_resolved = grad_resolved.data();
   if (grad_image) {
@@ -81,7 +82,8 @@ void resolve_backward_py(const Array<T>& grad_resolved, const std::optional<Arra
 template <class T>
 void edges_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
                        const Array<int32_t>& owner, const Array<T>& image, const std::optional<Array<T>>& background,
-                       const Array<T>& grad_resolved, Array<T>& grad_vertices, bool anti_aliasing, double eps, int num_threads) {
+                       const Array<T>& grad_resolved, Array<T>& grad_vertices, bool anti_aliasing, double eps,
+                       int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
   const Size raster = require_owner(owner, mesh, num_threads), size = require_image(owner, raster, anti_aliasing);
   require(image.ndim() == 4 && image.shape(3) >= 1, "image must have shape [B, H, W, C], got " + shape_of(image));
@@ -99,14 +101,15 @@ void edges_backward_py(const Array<T>& vertices, const Indices& faces, const std
 template <class T>
 void define_edges(py::module_& m) {
   m.def("resolve_forward", &resolve_forward_py<T>, py::arg("image").noconvert(), py::arg("background").noconvert(),
-        py::arg("owner").noconvert(), py::arg("resolved").noconvert(), py::arg("anti_aliasing"), py::arg("num_threads"));
-  m.def("resolve_backward", &resolve_backward_py<T>, py::arg("grad_resolved").noconvert(), py::arg("background").noconvert(),
-        py::arg("owner").noconvert(), py::arg("grad_image").noconvert(), py::arg("grad_background").noconvert(),
-        py::arg("anti_aliasing"), py::arg("num_threads"));
-  m.def("edges_backward", &edges_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("image").noconvert(), py::arg("background").noconvert(),
-        py::arg("grad_resolved").noconvert(), py::arg("grad_vertices").noconvert(), py::arg("anti_aliasing"), py::arg("eps"),
+        py::arg("owner").noconvert(), py::arg("resolved").noconvert(), py::arg("anti_aliasing"),
         py::arg("num_threads"));
+  m.def("resolve_backward", &resolve_backward_py<T>, py::arg("grad_resolved").noconvert(),
+        py::arg("background").noconvert(), py::arg("owner").noconvert(), py::arg("grad_image").noconvert(),
+        py::arg("grad_background").noconvert(), py::arg("anti_aliasing"), py::arg("num_threads"));
+  m.def("edges_backward", &edges_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("image").noconvert(),
+        py::arg("background").noconvert(), py::arg("grad_resolved").noconvert(), py::arg("grad_vertices").noconvert(),
+        py::arg("anti_aliasing"), py::arg("eps"), py::arg("num_threads"));
 }
 
 }  // namespace

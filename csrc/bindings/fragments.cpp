@@ -14,7 +14,8 @@ Fragments<T> fragments_args(const Array<T>& vertices, const Indices& faces, cons
 
 template <class T>
 void fragments_forward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
-                          const Array<int32_t>& owner, Array<T>& weights, Array<T>& depth, double far, int num_threads) {
+                          const Array<int32_t>& owner, Array<T>& weights, Array<T>& depth, double far,
+                          int num_threads) {
   Fragments<T> args = fragments_args(vertices, faces, starts, owner, far, num_threads);
   require_shape(weights, "weights", {args.mesh.batch, args.raster.height, args.raster.width, 3});
   require_shape(depth, "depth", {args.mesh.batch, args.raster.height, args.raster.width});
@@ -63,8 +64,8 @@ void depth_forward_py(const Array<T>& vertices, const Indices& faces, const std:
 
 template <class T>
 void depth_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
-                       const Array<int32_t>& owner, const Array<T>& grad_depth, Array<T>& grad_vertices, bool anti_aliasing,
-                       int num_threads) {
+                       const Array<int32_t>& owner, const Array<T>& grad_depth, Array<T>& grad_vertices,
+                       bool anti_aliasing, int num_threads) {
   DepthImage<T> args = depth_args(vertices, faces, starts, owner, anti_aliasing, 0, num_threads);
   require_shape(grad_depth, "grad_depth", {args.mesh.batch, args.image.height, args.image.width});
   require_like(grad_vertices, "grad_vertices", vertices);
@@ -77,14 +78,14 @@ void depth_backward_py(const Array<T>& vertices, const Indices& faces, const std
 template <class T>
 void define_fragments(py::module_& m) {
   m.def("fragments_forward", &fragments_forward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("weights").noconvert(), py::arg("depth").noconvert(),
-        py::arg("far"), py::arg("num_threads"));
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("weights").noconvert(),
+        py::arg("depth").noconvert(), py::arg("far"), py::arg("num_threads"));
   m.def("fragments_backward", &fragments_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
         py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("grad_weights").noconvert(),
         py::arg("grad_depth").noconvert(), py::arg("grad_vertices").noconvert(), py::arg("num_threads"));
   m.def("depth_forward", &depth_forward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("depth").noconvert(), py::arg("anti_aliasing"),
-        py::arg("far"), py::arg("num_threads"));
+        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("depth").noconvert(),
+        py::arg("anti_aliasing"), py::arg("far"), py::arg("num_threads"));
   m.def("depth_backward", &depth_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
         py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("grad_depth").noconvert(),
         py::arg("grad_vertices").noconvert(), py::arg("anti_aliasing"), py::arg("num_threads"));

@@ -7,8 +7,8 @@ namespace {
 // --- normals
 
 template <class T>
-Normals<T> normals_args(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts, bool smooth,
-                        const Array<T>& normals, const char* name, int num_threads) {
+Normals<T> normals_args(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
+                        bool smooth, const Array<T>& normals, const char* name, int num_threads) {
   Normals<T> args{};
   args.mesh = mesh_batch(vertices, faces, starts);
   args.smooth = smooth;
@@ -23,8 +23,8 @@ Normals<T> normals_args(const Array<T>& vertices, const Indices& faces, const st
 }
 
 template <class T>
-void normals_forward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts, bool smooth,
-                        Array<T>& normals, int num_threads) {
+void normals_forward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
+                        bool smooth, Array<T>& normals, int num_threads) {
   Normals<T> args = normals_args(vertices, faces, starts, smooth, normals, "normals", num_threads);
   args.normals = normals.mutable_data();
   py::gil_scoped_release release;
@@ -32,8 +32,8 @@ void normals_forward_py(const Array<T>& vertices, const Indices& faces, const st
 }
 
 template <class T>
-void normals_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts, bool smooth,
-                         const Array<T>& grad_normals, Array<T>& grad_vertices, int num_threads) {
+void normals_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
+                         bool smooth, const Array<T>& grad_normals, Array<T>& grad_vertices, int num_threads) {
   Normals<T> args = normals_args(vertices, faces, starts, smooth, grad_normals, "grad_normals", num_threads);
   require_like(grad_vertices, "grad_vertices", vertices);
   args.grad_normals = grad_normals.data();
@@ -67,17 +67,18 @@ inline void require_layout(const Indices& layout, int64_t num_parameters, int64_
       none = none || layout.data()[3 * n + 2] == 0;
     }
     for (int64_t n = static_cast<int64_t>(from); n <= static_cast<int64_t>(to) && !none; ++n)
-      require(layout.data()[3 * n + 2] == 1 || layout.data()[3 * n + 2] == most, "parameters of different numbers of lights");
+      require(layout.data()[3 * n + 2] == 1 || layout.data()[3 * n + 2] == most,
+              "parameters of different numbers of lights");
   };
   require_group(Light::directional, Light::direction);
   require_group(Light::point, Light::falloff);
 }
 
 template <class T>
-Lit<T> lit_args(const std::optional<Array<T>>& colors, const Array<T>& normals, const std::optional<Array<T>>& parameters,
-                const Indices& layout, const Array<T>& viewer, const Array<T>& vertices, const Indices& faces,
-                const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts, bool smooth,
-                int num_threads) {
+Lit<T> lit_args(const std::optional<Array<T>>& colors, const Array<T>& normals,
+                const std::optional<Array<T>>& parameters, const Indices& layout, const Array<T>& viewer,
+                const Array<T>& vertices, const Indices& faces, const Array<int32_t>& owner, const Array<T>& weights,
+                const std::optional<Indices>& starts, bool smooth, int num_threads) {
   Lit<T> args{};
   args.at = interpolate_args(vertices, faces, owner, weights, starts, num_threads);
   require(args.at.channels == 3, "vertices must have 3 coordinates, got " + shape_of(vertices));
@@ -86,7 +87,8 @@ Lit<T> lit_args(const std::optional<Array<T>>& colors, const Array<T>& normals, 
     require_shape(normals, "normals", {rows, 3});
   } else {
     args.normal_batch = normals.ndim() == 3 ? normals.shape(0) : 0;
-    require(args.normal_batch == 1 || args.normal_batch == batch, "normals must have the batch size 1 or " + std::to_string(batch));
+    require(args.normal_batch == 1 || args.normal_batch == batch,
+            "normals must have the batch size 1 or " + std::to_string(batch));
     require_shape(normals, "normals", {args.normal_batch, rows, 3});
   }
   args.normals = normals.data();
@@ -111,11 +113,13 @@ Lit<T> lit_args(const std::optional<Array<T>>& colors, const Array<T>& normals, 
 }
 
 template <class T>
-void lit_forward_py(const std::optional<Array<T>>& colors, const Array<T>& normals, const std::optional<Array<T>>& parameters,
-                    const Indices& layout, const Array<T>& viewer, const Array<T>& vertices, const Indices& faces,
-                    const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts, bool smooth,
-                    Array<T>& lit, int num_threads) {
-  Lit<T> args = lit_args(colors, normals, parameters, layout, viewer, vertices, faces, owner, weights, starts, smooth, num_threads);
+void lit_forward_py(const std::optional<Array<T>>& colors, const Array<T>& normals,
+                    const std::optional<Array<T>>& parameters, const Indices& layout, const Array<T>& viewer,
+                    const Array<T>& vertices, const Indices& faces, const Array<int32_t>& owner,
+                    const Array<T>& weights, const std::optional<Indices>& starts, bool smooth, Array<T>& lit,
+                    int num_threads) {
+  Lit<T> args = lit_args(colors, normals, parameters, layout, viewer, vertices, faces, owner, weights, starts, smooth,
+                         num_threads);
   require_shape(lit, "lit", {args.at.batch, args.at.raster.height, args.at.raster.width, 3});
   args.lit = lit.mutable_data();
   py::gil_scoped_release release;
@@ -123,13 +127,15 @@ void lit_forward_py(const std::optional<Array<T>>& colors, const Array<T>& norma
 }
 
 template <class T>
-void lit_backward_py(const std::optional<Array<T>>& colors, const Array<T>& normals, const std::optional<Array<T>>& parameters,
-                     const Indices& layout, const Array<T>& viewer, const Array<T>& vertices, const Indices& faces,
-                     const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts, bool smooth,
-                     const Array<T>& grad_lit, std::optional<Array<T>> grad_colors, std::optional<Array<T>> grad_normals,
-                     std::optional<Array<T>> grad_parameters, std::optional<Array<T>> grad_vertices,
-                     std::optional<Array<T>> grad_weights, int num_threads) {
-  Lit<T> args = lit_args(colors, normals, parameters, layout, viewer, vertices, faces, owner, weights, starts, smooth, num_threads);
+void lit_backward_py(const std::optional<Array<T>>& colors, const Array<T>& normals,
+                     const std::optional<Array<T>>& parameters, const Indices& layout, const Array<T>& viewer,
+                     const Array<T>& vertices, const Indices& faces, const Array<int32_t>& owner,
+                     const Array<T>& weights, const std::optional<Indices>& starts, bool smooth,
+                     const Array<T>& grad_lit, std::optional<Array<T>> grad_colors,
+                     std::optional<Array<T>> grad_normals, std::optional<Array<T>> grad_parameters,
+                     std::optional<Array<T>> grad_vertices, std::optional<Array<T>> grad_weights, int num_threads) {
+  Lit<T> args = lit_args(colors, normals, parameters, layout, viewer, vertices, faces, owner, weights, starts, smooth,
+                         num_threads);
   require_shape(grad_lit, "grad_lit", {args.at.batch, args.at.raster.height, args.at.raster.width, 3});
   args.grad_lit = grad_lit.data();
   const auto output = [](std::optional<Array<T>>& grad, const char* name, const Array<T>& like) -> T* {
@@ -150,17 +156,17 @@ py::arg array(const char* name) { return py::arg(name).noconvert(); }
 
 template <class T>
 void define_lights(py::module_& m) {
-  m.def("normals_forward", &normals_forward_py<T>, array("vertices"), array("faces"), array("starts"), py::arg("smooth"),
-        array("normals"), py::arg("num_threads"));
-  m.def("normals_backward", &normals_backward_py<T>, array("vertices"), array("faces"), array("starts"), py::arg("smooth"),
-        array("grad_normals"), array("grad_vertices"), py::arg("num_threads"));
-  m.def("lit_forward", &lit_forward_py<T>, array("colors"), array("normals"), array("parameters"), array("layout"), array("viewer"),
-        array("vertices"), array("faces"), array("owner"), array("weights"), array("starts"), py::arg("smooth"), array("lit"),
-        py::arg("num_threads"));
+  m.def("normals_forward", &normals_forward_py<T>, array("vertices"), array("faces"), array("starts"),
+        py::arg("smooth"), array("normals"), py::arg("num_threads"));
+  m.def("normals_backward", &normals_backward_py<T>, array("vertices"), array("faces"), array("starts"),
+        py::arg("smooth"), array("grad_normals"), array("grad_vertices"), py::arg("num_threads"));
+  m.def("lit_forward", &lit_forward_py<T>, array("colors"), array("normals"), array("parameters"), array("layout"),
+        array("viewer"), array("vertices"), array("faces"), array("owner"), array("weights"), array("starts"),
+        py::arg("smooth"), array("lit"), py::arg("num_threads"));
   m.def("lit_backward", &lit_backward_py<T>, array("colors"), array("normals"), array("parameters"), array("layout"),
-        array("viewer"), array("vertices"), array("faces"), array("owner"), array("weights"), array("starts"), py::arg("smooth"),
-        array("grad_lit"), array("grad_colors"), array("grad_normals"), array("grad_parameters"), array("grad_vertices"),
-        array("grad_weights"), py::arg("num_threads"));
+        array("viewer"), array("vertices"), array("faces"), array("owner"), array("weights"), array("starts"),
+        py::arg("smooth"), array("grad_lit"), array("grad_colors"), array("grad_normals"), array("grad_parameters"),
+        array("grad_vertices"), array("grad_weights"), py::arg("num_threads"));
 }
 
 }  // namespace

@@ -6,7 +6,8 @@ namespace {
 
 template <class T>
 Smoothness<T> smoothness_args(const Array<T>& vertices, const Array<int64_t>& edges, int num_threads) {
-  require(vertices.ndim() == 3 && vertices.shape(2) == 3, "vertices must have shape [B, V, 3], got " + shape_of(vertices));
+  require(vertices.ndim() == 3 && vertices.shape(2) == 3,
+          "vertices must have shape [B, V, 3], got " + shape_of(vertices));
   require(edges.ndim() == 2 && edges.shape(1) == 4, "edges must have shape [E, 4], got " + shape_of(edges));
   Smoothness<T> args{vertices.data(), edges.data(), vertices.shape(0), vertices.shape(1), edges.shape(0),
                      nullptr,         nullptr,      nullptr,           num_threads};
@@ -41,12 +42,21 @@ SoftIou<T> soft_iou_args(const Array<T>& prediction, const Array<T>& target, Arr
   require(prediction.ndim() == 2, "prediction must have shape [B, N], got " + shape_of(prediction));
   require_like(target, "target", prediction);
   require_shape(areas, "areas", {prediction.shape(0), 2});
-  return {prediction.data(), target.data(), prediction.shape(0), prediction.shape(1), areas.mutable_data(), nullptr, nullptr, nullptr,
-          nullptr, num_threads};
+  return {prediction.data(),
+          target.data(),
+          prediction.shape(0),
+          prediction.shape(1),
+          areas.mutable_data(),
+          nullptr,
+          nullptr,
+          nullptr,
+          nullptr,
+          num_threads};
 }
 
 template <class T>
-void soft_iou_forward_py(const Array<T>& prediction, const Array<T>& target, Array<double>& areas, Array<T>& iou, int num_threads) {
+void soft_iou_forward_py(const Array<T>& prediction, const Array<T>& target, Array<double>& areas, Array<T>& iou,
+                         int num_threads) {
   SoftIou<T> args = soft_iou_args(prediction, target, areas, num_threads);
   require_shape(iou, "iou", {args.batch});
   args.iou = iou.mutable_data();
@@ -55,8 +65,9 @@ void soft_iou_forward_py(const Array<T>& prediction, const Array<T>& target, Arr
 }
 
 template <class T>
-void soft_iou_backward_py(const Array<T>& prediction, const Array<T>& target, Array<double>& areas, const Array<T>& grad_iou,
-                          std::optional<Array<T>> grad_prediction, std::optional<Array<T>> grad_target, int num_threads) {
+void soft_iou_backward_py(const Array<T>& prediction, const Array<T>& target, Array<double>& areas,
+                          const Array<T>& grad_iou, std::optional<Array<T>> grad_prediction,
+                          std::optional<Array<T>> grad_target, int num_threads) {
   SoftIou<T> args = soft_iou_args(prediction, target, areas, num_threads);
   require_shape(grad_iou, "grad_iou", {args.batch});
   args.grad_iou = grad_iou.data();
@@ -80,13 +91,15 @@ template <class T>
 void define_losses(py::module_& m) {
   m.def("smoothness_forward", &smoothness_forward_py<T>, py::arg("vertices").noconvert(), py::arg("edges").noconvert(),
         py::arg("loss").noconvert(), py::arg("num_threads"));
-  m.def("smoothness_backward", &smoothness_backward_py<T>, py::arg("vertices").noconvert(), py::arg("edges").noconvert(),
-        py::arg("grad_loss").noconvert(), py::arg("grad_vertices").noconvert(), py::arg("num_threads"));
+  m.def("smoothness_backward", &smoothness_backward_py<T>, py::arg("vertices").noconvert(),
+        py::arg("edges").noconvert(), py::arg("grad_loss").noconvert(), py::arg("grad_vertices").noconvert(),
+        py::arg("num_threads"));
   m.def("soft_iou_forward", &soft_iou_forward_py<T>, py::arg("prediction").noconvert(), py::arg("target").noconvert(),
         py::arg("areas").noconvert(), py::arg("iou").noconvert(), py::arg("num_threads"));
   m.def("soft_iou_backward", &soft_iou_backward_py<T>, py::arg("prediction").noconvert(), py::arg("target").noconvert(),
-        py::arg("areas").noconvert(), py::arg("grad_iou").noconvert(), py::arg("grad_prediction").noconvert().none(true),
-        py::arg("grad_target").noconvert().none(true), py::arg("num_threads"));
+        py::arg("areas").noconvert(), py::arg("grad_iou").noconvert(),
+        py::arg("grad_prediction").noconvert().none(true), py::arg("grad_target").noconvert().none(true),
+        py::arg("num_threads"));
 }
 
 }  // namespace

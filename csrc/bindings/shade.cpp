@@ -16,7 +16,9 @@ TextureCubes<T> texture_args(const Array<T>& textures, const Array<int32_t>& own
   require(ts >= 1 && textures.shape(lead + 1) == ts && textures.shape(lead + 2) == ts && channels >= 1,
           "textures must be cubes of the same size in all three directions, with channels, got " + shape_of(textures));
   // Textures have no rows, so the number of rows at the end of starts is not checked.
-  if (starts) require_starts(*starts, starts->ndim() == 2 && starts->size() >= 2 ? starts->data()[starts->size() - 2] : 0, num_faces);
+  if (starts)
+    require_starts(*starts, starts->ndim() == 2 && starts->size() >= 2 ? starts->data()[starts->size() - 2] : 0,
+                   num_faces);
   require_fragments(owner, weights, starts, num_faces, num_threads);
   const int64_t texture_batch = starts ? 1 : textures.shape(0);
   require(starts || texture_batch == 1 || texture_batch == owner.shape(0),
@@ -49,8 +51,9 @@ void texture_cubes_forward_py(const Array<T>& textures, const Array<int32_t>& ow
 
 // The gradient has the shape of the textures; their values are not needed.
 template <class T>
-void texture_cubes_backward_py(const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts,
-                               const Array<T>& grad_colors, Array<T>& grad_textures, double eps, int num_threads) {
+void texture_cubes_backward_py(const Array<int32_t>& owner, const Array<T>& weights,
+                               const std::optional<Indices>& starts, const Array<T>& grad_colors,
+                               Array<T>& grad_textures, double eps, int num_threads) {
   TextureCubes<T> args = texture_args(grad_textures, owner, weights, starts, eps, num_threads);
   require_shape(grad_colors, "grad_colors", {args.batch, args.raster.height, args.raster.width, args.channels});
   args.textures = nullptr;
@@ -64,7 +67,8 @@ void texture_cubes_backward_py(const Array<int32_t>& owner, const Array<T>& weig
 
 template <class T>
 void interpolate_forward_py(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner,
-                            const Array<T>& weights, const std::optional<Indices>& starts, Array<T>& values, int num_threads) {
+                            const Array<T>& weights, const std::optional<Indices>& starts, Array<T>& values,
+                            int num_threads) {
   Interpolate<T> args = interpolate_args(attributes, corners, owner, weights, starts, num_threads);
   require_shape(values, "values", {args.batch, args.raster.height, args.raster.width, args.channels});
   args.values = values.mutable_data();
@@ -75,7 +79,8 @@ void interpolate_forward_py(const Array<T>& attributes, const Indices& corners, 
 template <class T>
 void interpolate_backward_py(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner,
                              const Array<T>& weights, const std::optional<Indices>& starts, const Array<T>& grad_values,
-                             std::optional<Array<T>> grad_attributes, std::optional<Array<T>> grad_weights, int num_threads) {
+                             std::optional<Array<T>> grad_attributes, std::optional<Array<T>> grad_weights,
+                             int num_threads) {
   Interpolate<T> args = interpolate_args(attributes, corners, owner, weights, starts, num_threads);
   require_shape(grad_values, "grad_values", {args.batch, args.raster.height, args.raster.width, args.channels});
   args.grad_values = grad_values.data();
@@ -93,19 +98,19 @@ void interpolate_backward_py(const Array<T>& attributes, const Indices& corners,
 
 template <class T>
 void define_shade(py::module_& m) {
-  m.def("texture_cubes_forward", &texture_cubes_forward_py<T>, py::arg("textures").noconvert(), py::arg("owner").noconvert(),
-        py::arg("weights").noconvert(), py::arg("starts").noconvert(), py::arg("colors").noconvert(), py::arg("eps"),
-        py::arg("num_threads"));
-  m.def("texture_cubes_backward", &texture_cubes_backward_py<T>, py::arg("owner").noconvert(), py::arg("weights").noconvert(),
-        py::arg("starts").noconvert(), py::arg("grad_colors").noconvert(), py::arg("grad_textures").noconvert(), py::arg("eps"),
-        py::arg("num_threads"));
-  m.def("interpolate_forward", &interpolate_forward_py<T>, py::arg("attributes").noconvert(), py::arg("corners").noconvert(),
-        py::arg("owner").noconvert(), py::arg("weights").noconvert(), py::arg("starts").noconvert(), py::arg("values").noconvert(),
-        py::arg("num_threads"));
-  m.def("interpolate_backward", &interpolate_backward_py<T>, py::arg("attributes").noconvert(), py::arg("corners").noconvert(),
+  m.def("texture_cubes_forward", &texture_cubes_forward_py<T>, py::arg("textures").noconvert(),
         py::arg("owner").noconvert(), py::arg("weights").noconvert(), py::arg("starts").noconvert(),
-        py::arg("grad_values").noconvert(), py::arg("grad_attributes").noconvert(), py::arg("grad_weights").noconvert(),
-        py::arg("num_threads"));
+        py::arg("colors").noconvert(), py::arg("eps"), py::arg("num_threads"));
+  m.def("texture_cubes_backward", &texture_cubes_backward_py<T>, py::arg("owner").noconvert(),
+        py::arg("weights").noconvert(), py::arg("starts").noconvert(), py::arg("grad_colors").noconvert(),
+        py::arg("grad_textures").noconvert(), py::arg("eps"), py::arg("num_threads"));
+  m.def("interpolate_forward", &interpolate_forward_py<T>, py::arg("attributes").noconvert(),
+        py::arg("corners").noconvert(), py::arg("owner").noconvert(), py::arg("weights").noconvert(),
+        py::arg("starts").noconvert(), py::arg("values").noconvert(), py::arg("num_threads"));
+  m.def("interpolate_backward", &interpolate_backward_py<T>, py::arg("attributes").noconvert(),
+        py::arg("corners").noconvert(), py::arg("owner").noconvert(), py::arg("weights").noconvert(),
+        py::arg("starts").noconvert(), py::arg("grad_values").noconvert(), py::arg("grad_attributes").noconvert(),
+        py::arg("grad_weights").noconvert(), py::arg("num_threads"));
 }
 
 }  // namespace

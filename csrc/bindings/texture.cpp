@@ -6,12 +6,14 @@ namespace {
 
 // [I, L, 3]: every level lies inside the array of texels.
 int64_t require_grids(const Indices& grids, int64_t num_texels) {
-  require(grids.ndim() == 3 && grids.shape(1) >= 1 && grids.shape(2) == 3, "grids must have shape [I, L, 3], got " + shape_of(grids));
+  require(grids.ndim() == 3 && grids.shape(1) >= 1 && grids.shape(2) == 3,
+          "grids must have shape [I, L, 3], got " + shape_of(grids));
   const int64_t largest = int64_t(1) << 31;
   require(num_texels < largest, "at most 2^31 texels");
   for (int64_t n = 0; n < grids.shape(0) * grids.shape(1); ++n) {
     const int64_t *g = grids.data() + 3 * n, first = g[0], height = g[1], width = g[2];
-    require(height >= 1 && width >= 1 && height < largest && width < largest && first >= 0 && first + height * width <= num_texels,
+    require(height >= 1 && width >= 1 && height < largest && width < largest && first >= 0 &&
+                first + height * width <= num_texels,
             "a level of a texture lies outside the " + std::to_string(num_texels) + " texels");
   }
   return grids.shape(0);
@@ -19,7 +21,8 @@ int64_t require_grids(const Indices& grids, int64_t num_texels) {
 
 template <class T>
 int64_t require_texels(const Array<T>& texels, const char* name) {
-  require(texels.ndim() == 2 && texels.shape(1) >= 1, std::string(name) + " must have shape [N, C], got " + shape_of(texels));
+  require(texels.ndim() == 2 && texels.shape(1) >= 1,
+          std::string(name) + " must have shape [N, C], got " + shape_of(texels));
   return texels.shape(0);
 }
 
@@ -35,7 +38,8 @@ Mipmaps<T> mipmaps_args(const Array<T>& texels, const Indices& grids, const Arra
     for (int64_t l = 0; l < levels; ++l) {
       const int64_t *grid = g + 3 * (i * levels + l), *finer = grid - 3;
       const auto follows = [&](int axis) { return grid[axis] == std::max<int64_t>(finer[axis] / 2, 1); };
-      require(grid[0] == first && (l == 0 || (follows(1) && follows(2))), "every level must follow the one before, with half its size");
+      require(grid[0] == first && (l == 0 || (follows(1) && follows(2))),
+              "every level must follow the one before, with half its size");
       first += grid[1] * grid[2];
     }
     whole += g[3 * i * levels + 1] * g[3 * i * levels + 2];
@@ -79,13 +83,14 @@ Interpolate<T> uv_args(const Array<T>& uv, const Indices& corners, const Array<i
 }
 
 inline void require_images(int64_t images, int64_t batch) {
-  require(images == 1 || images == batch, "there must be one texture or " + std::to_string(batch) + ", got " + std::to_string(images));
+  require(images == 1 || images == batch,
+          "there must be one texture or " + std::to_string(batch) + ", got " + std::to_string(images));
 }
 
 template <class T>
-void uv_levels_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& mesh_starts, const Array<T>& uv,
-                  const Indices& corners, const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts,
-                  const Indices& grids, Array<T>& level, int num_threads) {
+void uv_levels_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& mesh_starts,
+                  const Array<T>& uv, const Indices& corners, const Array<int32_t>& owner, const Array<T>& weights,
+                  const std::optional<Indices>& starts, const Indices& grids, Array<T>& level, int num_threads) {
   UVLevels<T> args{};
   args.mesh = mesh_batch(vertices, faces, mesh_starts);
   args.uv = uv_args(uv, corners, owner, weights, starts, num_threads);
@@ -104,9 +109,9 @@ void uv_levels_py(const Array<T>& vertices, const Indices& faces, const std::opt
 // --- sampling
 
 template <class T>
-SampleUV<T> sample_args(const Array<T>& texels, const Indices& grids, const std::optional<Array<T>>& level, const Array<T>& uv,
-                        const Indices& corners, const Array<int32_t>& owner, const Array<T>& weights,
-                        const std::optional<Indices>& starts, int wrap, int num_threads) {
+SampleUV<T> sample_args(const Array<T>& texels, const Indices& grids, const std::optional<Array<T>>& level,
+                        const Array<T>& uv, const Indices& corners, const Array<int32_t>& owner,
+                        const Array<T>& weights, const std::optional<Indices>& starts, int wrap, int num_threads) {
   SampleUV<T> args{};
   args.uv = uv_args(uv, corners, owner, weights, starts, num_threads);
   args.texels = texels.data();
@@ -126,9 +131,10 @@ SampleUV<T> sample_args(const Array<T>& texels, const Indices& grids, const std:
 }
 
 template <class T>
-void sample_uv_forward_py(const Array<T>& texels, const Indices& grids, const std::optional<Array<T>>& level, const Array<T>& uv,
-                          const Indices& corners, const Array<int32_t>& owner, const Array<T>& weights,
-                          const std::optional<Indices>& starts, int wrap, Array<T>& colors, int num_threads) {
+void sample_uv_forward_py(const Array<T>& texels, const Indices& grids, const std::optional<Array<T>>& level,
+                          const Array<T>& uv, const Indices& corners, const Array<int32_t>& owner,
+                          const Array<T>& weights, const std::optional<Indices>& starts, int wrap, Array<T>& colors,
+                          int num_threads) {
   SampleUV<T> args = sample_args(texels, grids, level, uv, corners, owner, weights, starts, wrap, num_threads);
   require_shape(colors, "colors", {args.uv.batch, args.uv.raster.height, args.uv.raster.width, args.channels});
   args.colors = colors.mutable_data();
@@ -137,13 +143,14 @@ void sample_uv_forward_py(const Array<T>& texels, const Indices& grids, const st
 }
 
 template <class T>
-void sample_uv_backward_py(const Array<T>& texels, const Indices& grids, const std::optional<Array<T>>& level, const Array<T>& uv,
-                           const Indices& corners, const Array<int32_t>& owner, const Array<T>& weights,
-                           const std::optional<Indices>& starts, int wrap, const Array<T>& grad_colors,
-                           std::optional<Array<T>> grad_texels, std::optional<Array<T>> grad_uv, std::optional<Array<T>> grad_weights,
-                           int num_threads) {
+void sample_uv_backward_py(const Array<T>& texels, const Indices& grids, const std::optional<Array<T>>& level,
+                           const Array<T>& uv, const Indices& corners, const Array<int32_t>& owner,
+                           const Array<T>& weights, const std::optional<Indices>& starts, int wrap,
+                           const Array<T>& grad_colors, std::optional<Array<T>> grad_texels,
+                           std::optional<Array<T>> grad_uv, std::optional<Array<T>> grad_weights, int num_threads) {
   SampleUV<T> args = sample_args(texels, grids, level, uv, corners, owner, weights, starts, wrap, num_threads);
-  require_shape(grad_colors, "grad_colors", {args.uv.batch, args.uv.raster.height, args.uv.raster.width, args.channels});
+  require_shape(grad_colors, "grad_colors",
+                {args.uv.batch, args.uv.raster.height, args.uv.raster.width, args.channels});
   args.grad_colors = grad_colors.data();
   if (grad_texels) {
     require_like(*grad_texels, "grad_texels", texels);
@@ -165,13 +172,16 @@ py::arg array(const char* name) { return py::arg(name).noconvert(); }
 
 template <class T>
 void define_texture(py::module_& m) {
-  m.def("mipmaps_forward", &mipmaps_forward_py<T>, array("texels"), array("grids"), array("pyramid"), py::arg("num_threads"));
+  m.def("mipmaps_forward", &mipmaps_forward_py<T>, array("texels"), array("grids"), array("pyramid"),
+        py::arg("num_threads"));
   m.def("mipmaps_backward", &mipmaps_backward_py<T>, array("grad_pyramid"), array("grids"), array("grad_texels"),
         py::arg("num_threads"));
-  m.def("uv_levels", &uv_levels_py<T>, array("vertices"), array("faces"), array("mesh_starts"), array("uv"), array("corners"),
-        array("owner"), array("weights"), array("starts"), array("grids"), array("level"), py::arg("num_threads"));
-  m.def("sample_uv_forward", &sample_uv_forward_py<T>, array("texels"), array("grids"), array("level"), array("uv"), array("corners"),
-        array("owner"), array("weights"), array("starts"), py::arg("wrap"), array("colors"), py::arg("num_threads"));
+  m.def("uv_levels", &uv_levels_py<T>, array("vertices"), array("faces"), array("mesh_starts"), array("uv"),
+        array("corners"), array("owner"), array("weights"), array("starts"), array("grids"), array("level"),
+        py::arg("num_threads"));
+  m.def("sample_uv_forward", &sample_uv_forward_py<T>, array("texels"), array("grids"), array("level"), array("uv"),
+        array("corners"), array("owner"), array("weights"), array("starts"), py::arg("wrap"), array("colors"),
+        py::arg("num_threads"));
   m.def("sample_uv_backward", &sample_uv_backward_py<T>, array("texels"), array("grids"), array("level"), array("uv"),
         array("corners"), array("owner"), array("weights"), array("starts"), py::arg("wrap"), array("grad_colors"),
         array("grad_texels"), array("grad_uv"), array("grad_weights"), py::arg("num_threads"));
