@@ -93,6 +93,10 @@ class Fragments:
         owner, weights, depth = self.owner.flatten(2), self.weights.flatten(2, 3), self.depth.flatten(2)
         return replace(self, owner=owner, weights=weights, depth=depth)
 
+    def _require_one_layer(self, what: str) -> None:
+        if self.layers:
+            raise ValueError(f"{what} take one layer at a time: pass fragments.layer(k), k from 0 to {self.layers - 1}")
+
     def _each_layer(self, raster: Tensor) -> Tensor:
         """Values ``[B, H, W K, C]`` of :meth:`_wide` as ``[B, H, W, K, C]``."""
         return raster.unflatten(2, self.owner.shape[2:])

@@ -131,6 +131,7 @@ class Lights:
 
     def shade(self, fragments: Fragments, colors: Tensor | None = None) -> Tensor:
         """``colors`` ``[B, H, W, 3 or 1]``, lit: ``[B, H, W, 3]``; 0 on background. Without colours a white surface."""
+        fragments._require_one_layer("lights")
         batch, values, layout, first = fragments.mesh.batch, [], [], 0
         for name in _SHAPES:
             if name in self._unused:

@@ -132,6 +132,7 @@ class TextureCubes:
 
     def sample(self, fragments: Fragments) -> Tensor:
         """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
+        fragments._require_one_layer("texture cubes")
         textures = check_values(self.textures, "textures", "F, ts, ts, ts, C")
         textures = fragments.mesh.values(textures, "textures", "face")
         return ops.sample_texture_cubes(
@@ -204,6 +205,7 @@ class UVTexture:
 
     def sample(self, fragments: Fragments) -> Tensor:
         """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
+        fragments._require_one_layer("texture images")
         attributes, corners, starts = fragments._corner_values(self.uv, self.uv_faces, "uv", "uv_faces")
         at = attributes, corners, fragments.owner, fragments.weights, starts
         texels, grids, count = self._texels(fragments)

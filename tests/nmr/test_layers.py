@@ -142,6 +142,10 @@ def test_errors():
         layers.layer(2)
     with pytest.raises(IndexError, match="faces_per_pixel"):
         layers.layer(0).layer(0)
+    image, uv, cubes = torch.rand(4, 4, 3), torch.rand(len(vertices), 2), torch.rand(len(faces), 2, 2, 2, 3)
+    for use in (nmr.UVTexture(image, uv).sample, nmr.TextureCubes(cubes).sample, nmr.Lights().shade):
+        with pytest.raises(ValueError, match=r"layer\(k\)"):
+            use(layers)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
