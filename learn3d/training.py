@@ -15,6 +15,7 @@ from learn3d.config import TrainConfig
 from learn3d.data.augment import augment
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
+from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import sample_indices
 from learn3d.device import crowding, keep_freed_memory, resolve_precision
 from learn3d.files.worker import together
@@ -55,7 +56,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
 
         train_set, val_set = load_splits(config)
         found = (train_set.check_masks(), crowding(torch.get_num_threads(), ranks.local_world))
-        shape = DataShape(train_set.num_views, train_set.num_classes, train_set.pose_features, train_set.inverted)
+        shape = _shape_of(train_set, config)
         precision = resolve_precision(config.precision, config.device)
         how = {"device": config.device, "precision": precision, "seed": config.seed, "plan": config.plan}
         method = create_method(config.settings, shape, **how)
@@ -104,6 +105,12 @@ def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:
     train = functools.partial(load, "train", views_per_object=config.views_per_object)
     train_set, val_set = together([train, functools.partial(load, config.val_split)])
     return train_set, val_set
+
+
+def _shape_of(train_set: ViewDataset, config: TrainConfig) -> DataShape:
+    wanted = getattr(config.settings, "symmetry", None) == "auto"
+    plane = find_mirror_plane(train_set) if wanted else None
+    return DataShape(train_set.num_views, train_set.num_classes, train_set.pose_features, train_set.inverted, plane)
 
 
 @dataclass(frozen=True)

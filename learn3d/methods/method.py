@@ -19,7 +19,7 @@ from learn3d.data.poses import Poses
 from learn3d.device import autocast
 from learn3d.methods.optimization import CONSTANT, Average, Plan, adam, backpropagate
 from learn3d.methods.surfaces import Grids, Meshes
-from learn3d.networks import GENERATORS, MeshGenerator, create_encoder, network_input
+from learn3d.networks import GENERATORS, MeshGenerator, Symmetry, SymmetryOption, create_encoder, network_input
 from learn3d.parallel.ranks import ALONE, Ranks, sum_gradients
 from learn3d.parallel.whole_batch_norm import use_whole_batch
 from learn3d.settings import checked
@@ -33,6 +33,12 @@ class DataShape:
     num_classes: Annotated[int, Field(ge=1, le=10_000)] = 1  # categories in the set
     pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # of a camera: eye position 3, rotation 9, unknown 0
     inverted: bool = False  # colours are stored as 255 - colour
+    mirror_plane_deg: float | None = None  # what `data.mirror_plane` found; None: nothing, or it was not asked for
+
+
+def plane_of(symmetry: SymmetryOption, shape: DataShape) -> Symmetry | None:
+    """The mirror plane of the shapes: the one that the settings name, or with "auto" the one that the data have."""
+    return shape.mirror_plane_deg if symmetry == "auto" else symmetry
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +190,7 @@ class MeshMethod(Method):
 
     def create_networks(self) -> dict[str, nn.Module]:
         encoder = create_encoder(self.settings.encoder, inverted=self.shape.inverted)
-        generator = GENERATORS[self.settings.generator](symmetry=self.settings.symmetry)
+        generator = GENERATORS[self.settings.generator](symmetry=plane_of(self.settings.symmetry, self.shape))
         return {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:

@@ -9,7 +9,7 @@ from learn3d.data.batch import Batch
 from learn3d.device import Download
 from learn3d.methods.adam import SparseGradientAdam
 from learn3d.methods.method import MeshMethod
-from learn3d.networks import ENCODERS, EncoderName, GeneratorName, Symmetry
+from learn3d.networks import ENCODERS, EncoderName, GeneratorName, SymmetryOption
 from learn3d.settings import Positive, Weight, checked
 
 CENTROID_LEARNING_RATE = 0.1  # of the centroid's layer, relative to all others
@@ -24,9 +24,9 @@ class MultiViewSettings:
     the ReLU. conv-small: conv with a fifteenth of the weights. resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "bounded"
     """bounded: that of Kato et al. sphere: 642 free vertices. The others: see PoseInvariantSettings."""
-    symmetry: Symmetry | None = None
+    symmetry: SymmetryOption = None
     """Mirror shapes at a vertical plane: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
-    it (0 is x = 0). None: shapes are free."""
+    it (0 is x = 0). auto: the plane that the training masks show, or none. None: shapes are free."""
     learning_rate: Positive = 1e-4
     """Adam's full step size. The preset's schedule "step" takes a tenth of it in the last 5 % of all iterations."""
     lambda_smooth: Weight = 0.001

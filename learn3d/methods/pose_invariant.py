@@ -12,7 +12,7 @@ from learn3d.device import Download, upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod
 from learn3d.methods.optimization import frozen
-from learn3d.networks import ENCODERS, EncoderName, GeneratorName, PoseDiscriminator, Symmetry
+from learn3d.networks import ENCODERS, EncoderName, GeneratorName, PoseDiscriminator, SymmetryOption
 from learn3d.networks.resnet import check_pretrained, load_pretrained
 from learn3d.settings import FilePath, Positive, Weight, checked
 
@@ -27,9 +27,10 @@ class PoseInvariantSettings:
     generator: GeneratorName = "sphere"
     """sphere: 642 free vertices. sphere-small: from fewer weights. bounded: that of Kato et al. 2018. cube-conv,
     cube-fc: those of Kato and Harada 2019."""
-    symmetry: Symmetry | None = None
+    symmetry: SymmetryOption = None
     """Mirror shapes at a vertical plane: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
-    it (0 is x = 0). None: shapes are free."""
+    it (0 is x = 0). auto: the plane at which the training masks mirror each other, or none where they do not. None:
+    shapes are free."""
     pretrained: FilePath | None = None
     """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's. None: random.
     The encoder gets natural colours, R, G, B, normalised as ImageNet's, however the data set stores them."""

@@ -21,9 +21,9 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
 from learn3d.device import Download, upload
 from learn3d.losses import silhouette_pyramid_loss
-from learn3d.methods.method import DataShape, MeshMethod
+from learn3d.methods.method import DataShape, MeshMethod, plane_of
 from learn3d.methods.optimization import adam, frozen
-from learn3d.networks import ENCODERS, GENERATORS, GeneratorName, MeshGenerator, Symmetry
+from learn3d.networks import ENCODERS, GENERATORS, GeneratorName, MeshGenerator, SymmetryOption
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
 from learn3d.networks.flat_resnet import FlatResNet18
 from learn3d.networks.layers import reverse_gradient
@@ -52,9 +52,9 @@ class VPLSettings:
     generator: GeneratorName = "sphere"
     """sphere: 642 free vertices. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or not. The
     others: see PoseInvariantSettings."""
-    symmetry: Symmetry | None = None
+    symmetry: SymmetryOption = None
     """Mirror shapes at a vertical plane: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
-    it (0 is x = 0). None: shapes are free."""
+    it (0 is x = 0). auto: the plane that the training masks show, or none. None: shapes are free."""
     vertex_scale: Positive = 0.01
     """Cube generators only: s, the factor of the last layer's output."""
     object_scale: Positive = 0.5
@@ -120,7 +120,7 @@ class VPL(MeshMethod):
         if settings.class_conditional and shape.num_classes < 2:
             raise ValueError("class_conditional needs data of several categories, got one")
         encoder = _create_encoder(settings, shape).to(memory_format=torch.channels_last)
-        networks = {"encoder": encoder, "generator": _create_generator(settings)}
+        networks = {"encoder": encoder, "generator": _create_generator(settings, self.shape)}
         if settings.lambda_discriminator > 0:
             networks["discriminator"] = _create_discriminator(settings, shape)
         return networks
@@ -257,11 +257,11 @@ def _create_encoder(settings: VPLSettings, shape: DataShape) -> nn.Module:
     return ENCODERS[settings.encoder]()
 
 
-def _create_generator(settings: VPLSettings) -> MeshGenerator:
+def _create_generator(settings: VPLSettings, shape: DataShape) -> MeshGenerator:
     scales = {}
     if settings.generator.startswith("cube"):
         scales = {"scale": settings.vertex_scale, "object_scale": settings.object_scale}
-    return GENERATORS[settings.generator](symmetry=settings.symmetry, **scales)
+    return GENERATORS[settings.generator](symmetry=plane_of(settings.symmetry, shape), **scales)
 
 
 def _create_discriminator(settings: VPLSettings, shape: DataShape) -> nn.Module:

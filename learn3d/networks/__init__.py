@@ -6,7 +6,7 @@ from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenera
 from learn3d.networks.discriminators import PoseDiscriminator
 from learn3d.networks.encoders import CODE_SIZE, ENCODERS, EncoderName, create_encoder, network_input
 from learn3d.networks.generators import BoundedGenerator, SmallSphereGenerator, SphereGenerator
-from learn3d.networks.mesh_generator import MeshGenerator, Symmetry
+from learn3d.networks.mesh_generator import MeshGenerator, Symmetry, SymmetryOption
 
 __all__ = [
     "CODE_SIZE",
@@ -17,6 +17,7 @@ __all__ = [
     "MeshGenerator",
     "PoseDiscriminator",
     "Symmetry",
+    "SymmetryOption",
     "create_encoder",
     "network_input",
 ]

@@ -14,6 +14,8 @@ import nmr
 #: x, z: mirrored at x = 0 or z = 0. A number: at the vertical plane that a camera of this azimuth in degrees looks
 #: along (x = 0 is 0, z = 0 is 90).
 Symmetry = Literal["x", "z"] | Annotated[float, Field(ge=-360, le=360)]
+#: As settings have it; auto: the plane that the training masks show (`data.mirror_plane`). None: shapes are free.
+SymmetryOption = Symmetry | Literal["auto"] | None
 
 
 class MeshGenerator(nn.Module):

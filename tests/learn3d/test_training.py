@@ -496,3 +496,20 @@ def test_another_precision_is_compared_with_what_auto_was(tiny_run, run_folder) 
 @pytest.mark.parametrize(("threads", "processes", "named"), [(10**4, 1, True), (1, 1, False), (10**4, 2, True)])
 def test_more_threads_than_cores_are_named(threads: int, processes: int, named: bool) -> None:
     assert ("--threads" in crowding(threads, processes)) == named
+
+
+@pytest.mark.parametrize("preset", ["peng2020-kato", "peng2020-kato-vpl", "kato2018-kato"])
+@pytest.mark.parametrize(("plane", "fixed"), [(37.5, True), (None, False)])
+def test_symmetry_auto_is_the_plane_that_the_data_have(preset: str, plane: float | None, fixed: bool) -> None:
+    settings = dataclasses.replace(PRESETS[preset].settings, symmetry="auto", generator="sphere-small")
+    shape = DataShape(24, mirror_plane_deg=plane)
+    generator = create_method(settings, shape, device="cpu", precision="fp32", seed=0).networks["generator"]
+    assert (generator.mirror is not None) == fixed
+
+
+def test_the_plane_is_found_before_the_first_step_and_kept(tiny_config, run_folder, monkeypatch) -> None:
+    monkeypatch.setattr(training, "find_mirror_plane", lambda dataset: 37.5)
+    train(tiny_config(run_folder, symmetry="auto"))
+    method, config, metadata = checkpoint.load_method(run_folder / "best.safetensors")
+    assert (config.settings.symmetry, metadata.shape.mirror_plane_deg) == ("auto", 37.5)
+    assert method.generator.mirror is not None

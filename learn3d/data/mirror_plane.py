@@ -1,0 +1,54 @@
+"""Finds the vertical plane at which the objects of a data set are mirror images of themselves, from masks and poses.
+
+If the objects are symmetric about the plane that a camera of azimuth p looks along, an object looks from azimuth
+2 p - a as its mirror image does from azimuth a, at the same elevation. So the mean mask of the views around 2 p - a,
+flipped left-right, is that of the views around a. Of any single object nothing is assumed, and no two views of an
+object are needed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from learn3d.data.dataset import ViewDataset
+from learn3d.data.poses import LookAtPoses
+
+SECTOR_DEG = 15.0  # width of the sectors of azimuth whose masks are averaged; planes are found to half of it
+_SECTORS = round(360 / SECTOR_DEG)
+_ENOUGH = 8  # images that a sector must have
+_CLEAR = 0.1  # how much smaller than the median over all planes the difference at the mirror plane must be
+
+
+def find_mirror_plane(dataset: ViewDataset) -> float | None:
+    """Azimuth in degrees, 0 .. 172.5, of a camera that looks along the mirror plane; None: there is none to be seen.
+
+    For each plane p the squared difference of mean masks of sectors v and 2 p - v is summed over pixels and sectors.
+    What the difference of two means of so many masks has by chance is subtracted. A plane is found where the smallest
+    of the 24 sums is below a tenth of their median. (Bodies of revolution look the same at every plane; any will do.)
+    With fewer than eight images in a sector nothing is found.
+
+    Raises ValueError where poses are not known, or not given by azimuth and elevation.
+    """
+    if not isinstance(dataset.poses, LookAtPoses):
+        raise ValueError(
+            "symmetry 'auto' needs camera poses given by azimuth and elevation; give the plane (x, z, degrees) or None"
+        )
+    masks = dataset.images[:, 3] if dataset.masks is None else dataset.masks
+    sectors = np.rint(dataset.poses.azimuth_deg.numpy() / SECTOR_DEG).astype(int) % _SECTORS
+    means = np.zeros((_SECTORS, *masks.shape[1:]))
+    noise = np.zeros(_SECTORS)  # expected squared error of each mean, summed over pixels
+    for sector in range(_SECTORS):
+        seen = masks[sectors == sector] / np.float32(255)
+        if len(seen) < _ENOUGH:
+            return None
+        means[sector] = seen.mean(axis=0)
+        noise[sector] = seen.var(axis=0).sum() / (len(seen) - 1)
+    differences = np.zeros(_SECTORS)
+    for plane in range(_SECTORS):  # at plane * SECTOR_DEG / 2
+        other = (plane - np.arange(_SECTORS)) % _SECTORS
+        moved = other != np.arange(_SECTORS)  # a sector that is its own mirror image has one mean, and less noise
+        squares = np.square(means - means[other][..., ::-1]).sum(axis=(1, 2))
+        differences[plane] = np.mean(squares - np.where(moved, noise + noise[other], 2 * noise))
+    best = int(differences.argmin())
+    clear = differences[best] < _CLEAR * np.median(differences)
+    return best * SECTOR_DEG / 2 if clear else None

@@ -1,0 +1,68 @@
+"""The mirror plane that masks and poses show."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import nmr
+from learn3d.data.dataset import ViewDataset
+from learn3d.data.mirror_plane import find_mirror_plane
+from learn3d.data.poses import RotationPoses
+from learn3d.data.readers import kato
+
+
+def reflected(vertices: torch.Tensor, azimuth_deg: float) -> torch.Tensor:
+    """Mirrored at the vertical plane that a camera of this azimuth, at (sin a, -cos a) in x and z, looks along."""
+    angle = math.radians(azimuth_deg)
+    normal = torch.tensor([math.cos(angle), 0.0, math.sin(angle)])
+    return vertices - 2 * (vertices @ normal)[:, None] * normal
+
+
+def triangles_seen(plane: float | None, objects: int) -> ViewDataset:
+    """Sets of random triangles at two places, with their mirror images if there is a plane, from Kato's 24 views."""
+    rng = torch.Generator().manual_seed(3)
+    images = np.zeros((objects, 24, 4, 64, 64), np.uint8)
+    empty = kato.from_arrays(images, np.zeros((objects, 32, 32, 32), bool), category="chair", split="train")
+    cameras = empty.poses[torch.arange(24)].cameras()
+    for i in range(objects):
+        vertices = 0.25 * torch.rand(36, 3, generator=rng)
+        vertices[:18] += torch.tensor([0.2, -0.3, -0.1])  # below, to the front
+        vertices[18:] += torch.tensor([-0.1, 0.1, 0.2])  # above, to the side
+        faces = torch.arange(36).reshape(12, 3)
+        if plane is not None:
+            vertices = torch.cat([vertices, reflected(vertices, plane)])
+            faces = torch.cat([faces, faces + 36])
+        masks = nmr.render_silhouette(vertices[None].expand(24, -1, -1), faces, cameras, image_size=64)
+        images[i, :, 3] = (255 * masks).byte().numpy()
+    return dataclasses.replace(empty, images=images.reshape(-1, 4, 64, 64))
+
+
+@pytest.mark.parametrize("plane", [0.0, 37.5, 90.0, 135.0])
+def test_finds_the_plane(plane: float) -> None:
+    assert find_mirror_plane(triangles_seen(plane, objects=12)) == plane
+
+
+def test_one_view_of_each_object_is_enough() -> None:
+    whole = triangles_seen(90.0, objects=480)
+    one_each = np.arange(480) * 24 + np.random.default_rng(0).permutation(np.arange(480) % 24)
+    assert find_mirror_plane(whole.select(one_each)) == 90.0
+
+
+def test_finds_nothing_where_there_is_nothing() -> None:
+    assert find_mirror_plane(triangles_seen(None, objects=60)) is None
+
+
+def test_finds_nothing_in_a_few_images() -> None:
+    assert find_mirror_plane(triangles_seen(0.0, objects=7)) is None
+
+
+def test_needs_azimuths() -> None:
+    dataset = triangles_seen(0.0, objects=1)
+    poses = RotationPoses(torch.eye(3).expand(24, 3, 3))
+    with pytest.raises(ValueError, match="azimuth and elevation"):
+        find_mirror_plane(dataclasses.replace(dataset, poses=poses))
