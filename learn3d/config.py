@@ -21,6 +21,9 @@ from learn3d.settings import Count, FilePath, Items, Step, checked
 
 DEFAULT_PRESET = next(iter(PRESETS))
 
+_FROM_PRESET = ("settings", "layout", "view_bins", "sampling", "augment", "iterations", "batch_size", "schedule")
+_FROM_PRESET += ("warmup_steps", "average")  # options that the preset decides where they are None
+
 
 def _known_preset(name: str) -> str:
     if name not in PRESETS:
@@ -62,11 +65,11 @@ class TrainConfig:
     schedule: Schedule | None = None
     """How the step size changes over the run. linear, cosine: it falls to 0. step: to a tenth in the last 5 % of all
     iterations. None: the preset's, constant for most."""
-    warmup_steps: Annotated[int, Field(ge=0, le=10**9)] = 0
-    """Steps at the beginning in which the step size grows from 0 to its full size."""
-    average: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    warmup_steps: Annotated[int, Field(ge=0, le=10**9)] | None = None
+    """Steps at the beginning in which the step size grows from 0 to its full size. None: the preset's, 0 for most."""
+    average: Annotated[float, Field(ge=0, lt=1)] | None = None
     """Also keep an exponential moving average of all weights, with this decay a step, such as 0.999. Validation, the
-    best checkpoint, evaluation and reconstruction use it. 0: no average."""
+    best checkpoint, evaluation and reconstruction use it. 0: no average. None: the preset's, 0 for most."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial weights and of the order of the images."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -93,7 +96,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         preset = PRESETS[self.preset]
-        for name in ("settings", "layout", "view_bins", "sampling", "augment", "iterations", "batch_size", "schedule"):
+        for name in _FROM_PRESET:
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(preset, name))
         if type(self.settings) is not type(preset.settings):

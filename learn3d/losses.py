@@ -16,9 +16,9 @@ from torch import Tensor
 def pose_classification_loss(logits: Tensor, view_ids: Tensor) -> Tensor:
     """L_cls: mean over the batch of -log p(view | code) (the paper's eq. 3).
 
-    logits [B,K]; view_ids int64 [B] in 0..K-1. Differentiable in logits.
+    logits [B,K]; view_ids int64 [B] in 0..K-1. Differentiable in logits. 0 for B = 0.
     """
-    return F.cross_entropy(logits.float(), view_ids)
+    return F.cross_entropy(logits.float(), view_ids, reduction="sum") / max(1, len(view_ids))
 
 
 def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -> Tensor:
@@ -72,6 +72,28 @@ def silhouette_pyramid_loss(prediction: Tensor, target: Tensor, levels: int = 5)
         p, t = F.normalize(pair.flatten(2), dim=2)
         total = total + (p - t).square().sum(1).mean()
     return total
+
+
+def silhouette_energy_distance(drawn: Tensor, real: Tensor) -> Tensor:
+    """How differently two sets of silhouettes are distributed: their energy distance (Szekely and Rizzo 2013).
+
+    2 mean_ij d(p_i, t_j) - mean_(i != k) d(p_i, p_k), with d(a, b) = 1 - a.b / (a.a + b.b - a.b). That is 1 - IoU where
+    silhouettes are 0 or 1 (Tanimoto's similarity, a positive definite kernel: Ralaivola et al. 2005). The third term,
+    which has only real silhouettes, is constant and left out. Differentiable in drawn, float [N,D] with N >= 2; real
+    is float [M,D] with M >= 1. Two empty silhouettes are alike: d = 0.
+    """
+    if len(drawn) < 2 or len(real) < 1 or drawn.ndim != 2 or drawn.shape[1] != real.shape[1]:
+        raise ValueError(f"want [N, D] with N >= 2 and [M, D] with M >= 1, got {list(drawn.shape)}, {list(real.shape)}")
+    across, within = _tanimoto_distances(drawn, real), _tanimoto_distances(drawn, drawn)
+    pairs = len(drawn) * (len(drawn) - 1)
+    return 2 * across.mean() - (within.sum() - within.diagonal().sum()) / pairs
+
+
+def _tanimoto_distances(x: Tensor, y: Tensor) -> Tensor:
+    """1 - a.b / (a.a + b.b - a.b) for all pairs of rows: [N,D] and [M,D] -> [N,M]."""
+    product = x @ y.T
+    union = x.square().sum(1)[:, None] + y.square().sum(1) - product
+    return torch.where(union > 0, 1 - product / union.clamp_min(1e-12), 0)
 
 
 def mmd(

@@ -12,6 +12,7 @@ from learn3d.data.layouts import Layout
 from learn3d.data.sampling import Sampling
 from learn3d.methods import Schedule, Settings
 from learn3d.methods.multi_view import MultiViewSettings
+from learn3d.methods.plus import PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.methods.prgan import PrGANSettings
 from learn3d.methods.vpl import VPLSettings
@@ -30,12 +31,15 @@ class Preset:
     sampling: Sampling = "views"
     augment: tuple[Augmentation, ...] = ()  # what is done to every training batch
     schedule: Schedule = "constant"  # of the step size
+    warmup_steps: int = 0  # in which it grows to its full size
+    average: float = 0.0  # decay of the average of the weights, 0: there is none
     view_bins: str | None = None  # cells of azimuth and elevation, None: the data set's own view classes
 
 
 #: Short names of the methods, accepted wherever a preset is: those on Kato's data.
 METHODS = {
     "proposed": "peng2020-kato",
+    "plus": "plus-kato",
     "vanilla": "peng2020-kato-vanilla",
     "multi-view": "kato2018-kato",
     "vpl": "peng2020-kato-vpl",
@@ -142,6 +146,16 @@ _PASCAL = Preset(
     augment=("crop", "flip-image"),
 )
 
+_PLUS = replace(
+    _KATO,
+    label="Plus",
+    settings=PlusSettings(),
+    source="docs/methods/plus.md",
+    schedule="cosine",
+    warmup_steps=100,
+    average=0.99,
+)
+
 #: The first one is the default. "peng2020-kato" is what the published code computes (and what the paper's tables were
 #: made with); "-printed" is every equation as printed, with the sign slip of the projection loss corrected. Both place
 #: the vertices at 0.5 * (unit sphere + displacement), as the published code does: the text's unit sphere is larger than
@@ -155,8 +169,10 @@ PRESETS: dict[str, Preset] = {
         source=f"{_PAPER}, eqs. 4 and 5 as printed; the generator keeps the factor 0.5",
     ),
     "peng2020-kato-vanilla": _vanilla(_KATO, f"{_PAPER}: the baseline trained on single views"),
+    "plus-kato": _PLUS,
     "peng2020-kar": _KAR,
     "peng2020-kar-vanilla": _vanilla(_KAR, f"{_PAPER}: the baseline on the same images"),
+    "plus-kar": replace(_PLUS, layout="kar", view_bins="15x20"),
     # The figures are those of airplanes: docs/methods/vanilla-ae.md has the other categories.
     "kato2018-kato": Preset(
         "Vanilla-AE (multi-view)",

@@ -10,6 +10,7 @@ from learn3d.device import check_device
 from learn3d.methods.method import DataShape, Estimate, MeshMethod, Method
 from learn3d.methods.multi_view import MultiView, MultiViewSettings
 from learn3d.methods.optimization import CONSTANT, Plan, Schedule
+from learn3d.methods.plus import Plus, PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.prgan import PrGAN, PrGANSettings
 from learn3d.methods.surfaces import Grids, Meshes
@@ -28,10 +29,11 @@ __all__ = [
     "create_method",
 ]
 
-Settings = PoseInvariantSettings | MultiViewSettings | VPLSettings | PrGANSettings
+Settings = PoseInvariantSettings | PlusSettings | MultiViewSettings | VPLSettings | PrGANSettings
 
 _METHODS: dict[type, type[Method]] = {
     PoseInvariantSettings: PoseInvariant,
+    PlusSettings: Plus,
     MultiViewSettings: MultiView,
     VPLSettings: VPL,
     PrGANSettings: PrGAN,

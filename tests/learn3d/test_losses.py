@@ -13,6 +13,7 @@ from learn3d.losses import (
     gaussian_prior_loss,
     mmd,
     pose_classification_loss,
+    silhouette_energy_distance,
     silhouette_pyramid_loss,
 )
 from learn3d.networks import PoseDiscriminator
@@ -196,3 +197,44 @@ def test_silhouette_pyramid_of_equal_and_of_empty_images() -> None:
 def test_silhouette_pyramid_refuses(prediction, target, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         silhouette_pyramid_loss(prediction, target)
+
+
+def test_energy_distance_equals_its_sum() -> None:
+    generator = torch.Generator().manual_seed(0)
+    drawn, real = (torch.rand(n, 20, generator=generator, dtype=torch.float64) for n in (4, 3))
+    drawn.requires_grad_()
+
+    def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        return 1 - a @ b / (a @ a + b @ b - a @ b)
+
+    across = torch.stack([distance(p, t) for p in drawn for t in real]).mean()
+    within = torch.stack([distance(p, q) for p, q in itertools.permutations(drawn, 2)]).mean()
+    found = silhouette_energy_distance(drawn, real)
+    torch.testing.assert_close(found, 2 * across - within)
+    torch.testing.assert_close(
+        torch.autograd.grad(found, drawn, retain_graph=True), torch.autograd.grad(2 * across - within, drawn)
+    )
+
+
+def test_energy_distance_is_least_for_the_same_distribution() -> None:
+    """Two kinds of masks, half and half: copies of the mean, of one kind, or of other shares are all farther away."""
+    kinds = torch.zeros(2, 16)
+    kinds[0, :8], kinds[1, 4:] = 1, 1
+    real = kinds.repeat(50, 1)
+    same = silhouette_energy_distance(real, real)
+    for other in (kinds.mean(0).repeat(100, 1), kinds[:1].repeat(100, 1), kinds[[0, 0, 0, 1]].repeat(25, 1)):
+        assert silhouette_energy_distance(other, real) > same + 0.01
+
+
+def test_energy_distance_of_empty_silhouettes() -> None:
+    drawn = torch.zeros(3, 9, requires_grad=True)
+    loss = silhouette_energy_distance(drawn, torch.zeros(2, 9))
+    assert loss == 0
+    (gradient,) = torch.autograd.grad(loss, drawn)
+    assert torch.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize(("drawn", "real"), [((1, 4), (3, 4)), ((2, 4), (0, 4)), ((2, 4), (2, 5)), ((2, 2, 4), (2, 4))])
+def test_energy_distance_refuses(drawn: tuple[int, ...], real: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="N >= 2"):
+        silhouette_energy_distance(torch.zeros(drawn), torch.zeros(real))

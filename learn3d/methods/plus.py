@@ -1,0 +1,137 @@
+"""Plus: the pose-invariant method, with mirror symmetry and with what masks of other objects say about unseen views.
+
+The supervision is that of Peng et al. 2020: images taken singly, each with its mask and its pose.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+import nmr
+from learn3d.data.batch import Batch
+from learn3d.data.dataset import MASK_SIZE
+from learn3d.device import Download
+from learn3d.losses import silhouette_energy_distance
+from learn3d.methods.optimization import adam
+from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
+from learn3d.networks import SymmetryOption
+from learn3d.settings import Count, Positive, Weight, checked
+
+REDUCED = MASK_SIZE // 2  # side of the masks that are remembered and compared
+
+
+@checked
+class PlusSettings(PoseInvariantSettings):
+    """Networks, weights and forms of the terms of the loss; a weight of 0 means that the term is not computed."""
+
+    symmetry: SymmetryOption = "auto"
+    """Mirror shapes at a vertical plane: auto: the one at which the training masks mirror each other, or none where
+    they do not; x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along it. None: shapes are
+    free."""
+    learning_rate: Positive = 1e-3
+    """Adam's step size, the same for the three networks. The preset warms it up and lets it fall to 0."""
+    lambda_unseen: Weight = 0.5
+    """Weight of the loss at unseen views."""
+    remembered: Count = 2048
+    """Number of masks that are remembered for it."""
+
+    @property
+    def reads_view_ids(self) -> bool:
+        return self.uses_discriminator or self.lambda_unseen > 0
+
+
+class MaskMemory(nn.Module):
+    """The last masks of the training, at half their resolution, with their view classes. It has no weights.
+
+    It is a network so that it is saved in checkpoints with them.
+    """
+
+    masks: Tensor  # uint8 [N, REDUCED^2], 255 inside
+    view_ids: Tensor  # int64 [N], -1: none yet; the oldest come first
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("masks", torch.zeros(size, REDUCED**2, dtype=torch.uint8))
+        self.register_buffer("view_ids", torch.full((size,), -1))
+
+    @property
+    def full(self) -> bool:
+        """Whether it has as many masks as it can hold."""
+        return bool(self.view_ids[0] >= 0)
+
+    def add(self, masks: Tensor, view_ids: Tensor) -> None:
+        """Take in masks float [B, REDUCED^2] of these classes, and forget the B oldest."""
+        size = len(self.masks)
+        self.masks.copy_(torch.cat([self.masks, (255 * masks).round().to(self.masks)])[-size:])
+        self.view_ids.copy_(torch.cat([self.view_ids, view_ids.to(self.view_ids)])[-size:])
+
+    def of_view(self, view_id: int) -> Tensor:
+        """The masks of one class, float32 [M, REDUCED^2]."""
+        return self.masks[self.view_ids == view_id] / 255
+
+
+class Plus(PoseInvariant):
+    """Encoder, mesh generator, pose discriminator and a memory of masks."""
+
+    settings: PlusSettings
+    memory: MaskMemory
+
+    def create_networks(self) -> dict[str, nn.Module]:
+        networks = super().create_networks()
+        if self.settings.lambda_unseen > 0:
+            networks["memory"] = MaskMemory(self.settings.remembered)
+        return networks
+
+    def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        trained = {name: network for name, network in self.networks.items() if name != "memory"}
+        return {name: adam(network, self.settings.learning_rate) for name, network in trained.items()}
+
+    @property
+    def weights(self) -> dict[str, float]:
+        return super().weights | {"unseen": self.settings.lambda_unseen}
+
+    def learn(self, batch: Batch, step: int) -> dict[str, float]:
+        """A step of `PoseInvariant`, in which every second image is flipped where shapes are symmetric, and with
+        lambda_unseen times the loss at an unseen view, once the memory is full.
+
+        The flipped image of a symmetric object has the same shape: mask and pose stay. Only its view is another one,
+        so the discriminator learns from the other half; the confusion is of all codes.
+        """
+        flipped = self._flipped(batch)
+        images = torch.where(flipped[:, None, None, None], batch.images.flip(3), batch.images)
+        codes, vertices = self.predict(images)
+        download = Download(vertices)  # a GPU computes the losses on codes while the CPU waits and renders
+        on_codes = self._losses_on_codes(codes, batch.view_ids, step, labelled=~flipped)
+        vertices = download.wait()
+        silhouettes = self.render(vertices, batch.poses)
+        losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks)}
+        if self.settings.lambda_unseen > 0:
+            losses |= self._unseen(vertices, batch)
+        losses |= self.surface_losses(vertices) | on_codes
+        trained = ["encoder", "generator"] + ["discriminator"] * ("classification" in losses)
+        return self.descend(losses, step, *trained)
+
+    def _flipped(self, batch: Batch) -> Tensor:
+        """Which images are flipped, bool [B]: none where shapes are free. (Batches are in random order already.)"""
+        return (batch.step_views.rows % 2 == 1) & (self.generator.mirror is not None)
+
+    def _unseen(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
+        """All shapes of the batch are seen from one of its cameras. Their silhouettes are to be distributed as the
+        masks that are remembered of this view, which show other objects: the energy distance of the two sets.
+        """
+        views = batch.step_views
+        self._remember(batch)
+        seen_by = int(torch.randint(len(views), ()))
+        if not self.memory.full:
+            return {}
+        real = self.memory.of_view(int(views.view_ids[seen_by]))
+        poses = views.poses[torch.full((len(vertices),), seen_by)]
+        drawn = F.avg_pool2d(self.render(vertices, poses)[:, None], MASK_SIZE // REDUCED).flatten(1)
+        return {"unseen": silhouette_energy_distance(drawn, real)}
+
+    def _remember(self, batch: Batch) -> None:
+        views = batch.step_views
+        masks = F.avg_pool2d(batch.masks[:, None], MASK_SIZE // REDUCED).flatten(1)
+        self.memory.add(self.ranks.gather([masks], views.rows, len(views)), views.view_ids)

@@ -1,0 +1,110 @@
+"""Plus: its memory, what its terms reach, and that runs of it resume."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from learn3d.methods import DataShape, create_method
+from learn3d.methods.plus import MaskMemory, Plus, PlusSettings
+from learn3d.presets import PRESETS
+from learn3d.runs.checkpoint import load
+from learn3d.training import train
+
+SMALL = PlusSettings(encoder="conv-small", generator="sphere-small", remembered=4)
+
+
+def make(plane: float | None = None, **settings: object) -> Plus:
+    shape = DataShape(24, mirror_plane_deg=plane)
+    return create_method(dataclasses.replace(SMALL, **settings), shape, device="cpu", precision="fp32", seed=0)
+
+
+@pytest.fixture
+def batch(tiny_set):
+    return tiny_set.batch(torch.tensor([0, 25, 48, 24]))  # views 0, 1, 0, 0
+
+
+def test_the_memory_keeps_the_newest() -> None:
+    memory = MaskMemory(5)
+    assert not memory.full
+    masks = torch.eye(7, 1024)
+    memory.add(masks[:3], torch.tensor([0, 1, 0]))
+    assert not memory.full
+    assert torch.equal(memory.of_view(0), masks[[0, 2]])
+    memory.add(masks[3:], torch.tensor([1, 1, 2, 0]))
+    assert memory.full
+    assert memory.view_ids.tolist() == [0, 1, 1, 2, 0]
+    assert torch.equal(memory.of_view(1), masks[[3, 4]])
+
+
+def test_losses(batch) -> None:
+    method = make()
+    first, second = method.train_step(batch, 1), method.train_step(batch, 2)
+    assert {"projection", "smoothness", "prior", "classification", "unseen"} <= set(first)
+    assert {"confusion", "unseen"} <= set(second)
+    weights = method.weights
+    for losses in (first, second):
+        total = sum(weights[name] * value for name, value in losses.items() if name != "total")
+        assert losses["total"] == pytest.approx(total, rel=1e-5)
+
+
+def test_the_loss_at_unseen_views_waits_for_a_full_memory(batch) -> None:
+    method = make(remembered=6)
+    assert "unseen" not in method.train_step(batch, 1)
+    assert "unseen" in method.train_step(batch, 2)
+
+
+def test_without_its_weight_nothing_is_remembered(batch) -> None:
+    method = make(lambda_unseen=0.0)
+    assert "memory" not in method.networks
+    assert "unseen" not in method.train_step(batch, 1)
+
+
+def test_the_loss_at_unseen_views_moves_vertices_where_the_projection_does_not(batch) -> None:
+    method = make()
+    method._remember(batch)
+    vertices = (0.5 * method.generator.sphere).repeat(4, 1, 1).requires_grad_()
+    (gradient,) = torch.autograd.grad(method._unseen(vertices, batch)["unseen"], vertices)
+    assert torch.isfinite(gradient).all()
+    assert gradient.abs().sum() > 0
+
+
+def test_every_second_image_is_flipped_where_shapes_are_symmetric(batch) -> None:
+    assert make(None)._flipped(batch).tolist() == [False] * 4
+    assert make(90.0)._flipped(batch).tolist() == [False, True, False, True]
+
+
+def test_a_process_whose_images_are_all_flipped(batch) -> None:
+    method = make(90.0)
+    codes, view_ids = method.encode(batch.images), batch.view_ids
+    losses = method._losses_on_codes(codes, view_ids, 1, labelled=torch.zeros(4, dtype=torch.bool))
+    assert losses["classification"] == 0
+
+
+def test_the_discriminator_learns_from_unflipped_images_alone(batch, monkeypatch) -> None:
+    method, seen = make(90.0), []
+    original = method.discriminator.forward
+    monkeypatch.setattr(method.discriminator, "forward", lambda codes: seen.append(len(codes)) or original(codes))
+    method.train_step(batch, 1)
+    assert seen == [2]
+
+
+def test_an_interrupted_run_resumes_bit_for_bit(tiny_config, run_folder, tmp_path) -> None:
+    options = {"preset": "plus-kato", "remembered": 8, "warmup_steps": 1, "iterations": 6, "schedule": "constant"}
+    whole = tiny_config(tmp_path / "whole", **options)
+    train(whole)
+    train(dataclasses.replace(whole, output=run_folder, iterations=3))
+    train(dataclasses.replace(whole, output=run_folder), resume=True)
+    tensors = [load(folder / "last.safetensors")[0] for folder in (tmp_path / "whole", run_folder)]
+    assert tensors[0].keys() == tensors[1].keys()
+    assert "network.memory.masks" in tensors[0]
+    assert all(torch.equal(a, tensors[1][name]) for name, a in tensors[0].items())
+
+
+def test_presets() -> None:
+    for name in ("plus-kato", "plus-kar"):
+        preset = PRESETS[name]
+        assert (preset.schedule, preset.warmup_steps, preset.average) == ("cosine", 100, 0.99)
+        assert preset.settings.symmetry == "auto"
