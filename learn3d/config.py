@@ -66,7 +66,8 @@ class TrainConfig:
     """How the step size changes over the run. linear, cosine: it falls to 0. step: to a tenth in the last 5 % of all
     iterations. None: the preset's, constant for most."""
     warmup_steps: Annotated[int, Field(ge=0, le=10**9)] | None = None
-    """Steps at the beginning in which the step size grows from 0 to its full size. None: the preset's, 0 for most."""
+    """Steps at the beginning in which the step size grows from 0 to its full size. None: the preset's, 0 for most, and
+    never more than a tenth of the iterations."""
     average: Annotated[float, Field(ge=0, lt=1)] | None = None
     """Also keep an exponential moving average of all weights, with this decay a step, such as 0.999. Validation, the
     best checkpoint, evaluation and reconstruction use it. 0: no average. None: the preset's, 0 for most."""
@@ -96,9 +97,12 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         preset = PRESETS[self.preset]
+        given_warmup = self.warmup_steps is not None
         for name in _FROM_PRESET:
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(preset, name))
+        if not given_warmup:
+            object.__setattr__(self, "warmup_steps", min(self.warmup_steps, self.iterations // 10))
         if type(self.settings) is not type(preset.settings):
             raise ValueError(
                 f"preset {self.preset!r} takes {type(preset.settings).__name__}, got {type(self.settings).__name__}"

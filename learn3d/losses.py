@@ -16,9 +16,9 @@ from torch import Tensor
 def pose_classification_loss(logits: Tensor, view_ids: Tensor) -> Tensor:
     """L_cls: mean over the batch of -log p(view | code) (the paper's eq. 3).
 
-    logits [B,K]; view_ids int64 [B] in 0..K-1. Differentiable in logits. 0 for B = 0.
+    logits [B,K]; view_ids int64 [B] in 0..K-1. Differentiable in logits.
     """
-    return F.cross_entropy(logits.float(), view_ids, reduction="sum") / max(1, len(view_ids))
+    return F.cross_entropy(logits.float(), view_ids)
 
 
 def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -> Tensor:

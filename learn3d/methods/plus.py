@@ -16,7 +16,7 @@ from learn3d.device import Download
 from learn3d.losses import silhouette_energy_distance
 from learn3d.methods.optimization import adam
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
-from learn3d.networks import SymmetryOption
+from learn3d.networks import PoseDiscriminator, SymmetryOption
 from learn3d.settings import Count, Positive, Weight, checked
 
 REDUCED = MASK_SIZE // 2  # side of the masks that are remembered and compared
@@ -80,6 +80,8 @@ class Plus(PoseInvariant):
 
     def create_networks(self) -> dict[str, nn.Module]:
         networks = super().create_networks()
+        if self.settings.uses_discriminator and networks["generator"].mirror is not None:
+            networks["discriminator"] = PoseDiscriminator(2 * self.shape.num_views)  # flipped views are other views
         if self.settings.lambda_unseen > 0:
             networks["memory"] = MaskMemory(self.settings.remembered)
         return networks
@@ -96,14 +98,14 @@ class Plus(PoseInvariant):
         """A step of `PoseInvariant`, in which every second image is flipped where shapes are symmetric, and with
         lambda_unseen times the loss at an unseen view, once the memory is full.
 
-        The flipped image of a symmetric object has the same shape: mask and pose stay. Only its view is another one,
-        so the discriminator learns from the other half; the confusion is of all codes.
+        The flipped image of a symmetric object has the same shape, so its mask and its pose stay as they are. To the
+        discriminator it is of another view, K + k for view k.
         """
         flipped = self._flipped(batch)
         images = torch.where(flipped[:, None, None, None], batch.images.flip(3), batch.images)
         codes, vertices = self.predict(images)
         download = Download(vertices)  # a GPU computes the losses on codes while the CPU waits and renders
-        on_codes = self._losses_on_codes(codes, batch.view_ids, step, labelled=~flipped)
+        on_codes = self._losses_on_codes(codes, batch.view_ids + self.shape.num_views * flipped, step)
         vertices = download.wait()
         silhouettes = self.render(vertices, batch.poses)
         losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks)}
@@ -122,16 +124,17 @@ class Plus(PoseInvariant):
         masks that are remembered of this view, which show other objects: the energy distance of the two sets.
         """
         views = batch.step_views
-        self._remember(batch)
+        masks = self.ranks.join_rows(_reduced(batch.masks), views.rows, len(views))
+        self.memory.add(masks, views.view_ids)
         seen_by = int(torch.randint(len(views), ()))
         if not self.memory.full:
             return {}
+        silhouettes = self.render(vertices, views.poses[torch.full((len(vertices),), seen_by)])
+        drawn = self.ranks.join_rows(_reduced(silhouettes), views.rows, len(views))
         real = self.memory.of_view(int(views.view_ids[seen_by]))
-        poses = views.poses[torch.full((len(vertices),), seen_by)]
-        drawn = F.avg_pool2d(self.render(vertices, poses)[:, None], MASK_SIZE // REDUCED).flatten(1)
         return {"unseen": silhouette_energy_distance(drawn, real)}
 
-    def _remember(self, batch: Batch) -> None:
-        views = batch.step_views
-        masks = F.avg_pool2d(batch.masks[:, None], MASK_SIZE // REDUCED).flatten(1)
-        self.memory.add(self.ranks.gather([masks], views.rows, len(views)), views.view_ids)
+
+def _reduced(silhouettes: Tensor) -> Tensor:
+    """Silhouettes [B, MASK_SIZE, MASK_SIZE] at the resolution of the memory, [B, REDUCED^2]."""
+    return F.avg_pool2d(silhouettes[:, None], MASK_SIZE // REDUCED).flatten(1)

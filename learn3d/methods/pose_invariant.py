@@ -110,16 +110,13 @@ class PoseInvariant(MeshMethod):
         trained = ["encoder", "generator"] + ["discriminator"] * ("classification" in losses)
         return self.descend(losses, step, *trained)
 
-    def _losses_on_codes(
-        self, codes: Tensor, view_ids: Tensor, step: int, labelled: Tensor | slice = slice(None)
-    ) -> dict[str, Tensor]:
-        """Prior, classification, confusion. labelled, bool [B]: which codes are of the class in view_ids."""
+    def _losses_on_codes(self, codes: Tensor, view_ids: Tensor, step: int) -> dict[str, Tensor]:
         settings, losses = self.settings, {}
         if settings.lambda_prior > 0:
             losses["prior"] = gaussian_prior_loss(codes, settings.prior_form)
         discriminator_turn = step % 2 == 1
         if discriminator_turn and settings.lambda_classification > 0:
-            logits, views = self.discriminator(codes[labelled].detach()), upload(view_ids[labelled], self.device)
+            logits, views = self.discriminator(codes.detach()), upload(view_ids, self.device)
             losses["classification"] = pose_classification_loss(logits, views)
         if not discriminator_turn and settings.lambda_adversarial > 0:
             logits = frozen(self.discriminator, codes)

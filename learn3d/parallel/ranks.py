@@ -108,6 +108,16 @@ class Ranks:
             values[rows] = torch.cat(parts).double()
         return _all_reduce(values)
 
+    def join_rows(self, values: Tensor, rows: Tensor, count: int) -> Tensor:
+        """float [count, C]: the rows of all processes, of which `values` [b, C] are this one's, numbers `rows`.
+
+        Differentiable, where each process differentiates its share of a loss.
+        """
+        if self.alone:
+            return values
+        padded = values.new_zeros((count, *values.shape[1:])).index_copy(0, rows, values)
+        return _Sum.apply(padded)
+
     def any(self, value: bool) -> bool:
         """Whether it is true in at least one process."""
         return value if self.alone else bool(self._largest(int(value)))

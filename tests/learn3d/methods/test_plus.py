@@ -64,7 +64,7 @@ def test_without_its_weight_nothing_is_remembered(batch) -> None:
 
 def test_the_loss_at_unseen_views_moves_vertices_where_the_projection_does_not(batch) -> None:
     method = make()
-    method._remember(batch)
+    method._unseen(0.5 * method.generator.sphere.expand(4, -1, -1), batch)
     vertices = (0.5 * method.generator.sphere).repeat(4, 1, 1).requires_grad_()
     (gradient,) = torch.autograd.grad(method._unseen(vertices, batch)["unseen"], vertices)
     assert torch.isfinite(gradient).all()
@@ -76,19 +76,18 @@ def test_every_second_image_is_flipped_where_shapes_are_symmetric(batch) -> None
     assert make(90.0)._flipped(batch).tolist() == [False, True, False, True]
 
 
-def test_a_process_whose_images_are_all_flipped(batch) -> None:
-    method = make(90.0)
-    codes, view_ids = method.encode(batch.images), batch.view_ids
-    losses = method._losses_on_codes(codes, view_ids, 1, labelled=torch.zeros(4, dtype=torch.bool))
-    assert losses["classification"] == 0
+def test_flipped_images_are_views_of_their_own(batch, monkeypatch) -> None:
+    seen, original = [], Plus._losses_on_codes
 
+    def losses_on_codes(self, codes, views, step):
+        seen.append(views)
+        return original(self, codes, views, step)
 
-def test_the_discriminator_learns_from_unflipped_images_alone(batch, monkeypatch) -> None:
-    method, seen = make(90.0), []
-    original = method.discriminator.forward
-    monkeypatch.setattr(method.discriminator, "forward", lambda codes: seen.append(len(codes)) or original(codes))
-    method.train_step(batch, 1)
-    assert seen == [2]
+    monkeypatch.setattr(Plus, "_losses_on_codes", losses_on_codes)
+    make(90.0).train_step(batch, 1)
+    assert seen[0].tolist() == [0, 25, 0, 24]
+    make(None).train_step(batch, 1)
+    assert seen[1].tolist() == [0, 1, 0, 0]
 
 
 def test_an_interrupted_run_resumes_bit_for_bit(tiny_config, run_folder, tmp_path) -> None:
@@ -108,3 +107,9 @@ def test_presets() -> None:
         preset = PRESETS[name]
         assert (preset.schedule, preset.warmup_steps, preset.average) == ("cosine", 100, 0.99)
         assert preset.settings.symmetry == "auto"
+
+
+def test_warm_up_of_a_short_run(tiny_config, tmp_path) -> None:
+    assert tiny_config(tmp_path, preset="plus-kato", iterations=40).warmup_steps == 4
+    assert tiny_config(tmp_path, preset="plus-kato", iterations=40, warmup_steps=30).warmup_steps == 30
+    assert tiny_config(tmp_path, preset="plus-kato", iterations=3000).warmup_steps == 100

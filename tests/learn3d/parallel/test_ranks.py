@@ -49,6 +49,8 @@ RUNS: dict[str, tuple[dict[str, object], float, float]] = {
     # Batch norms, and for each image a random view of another one, which may be with the other process.
     "vpl": (VPL | {"preset": "peng2020-kato-vpl", "batch_size": 5}, 1e-4, 1e-4),
     "reversal": (PATCH | {"preset": "kato2019-kar", "batch_size": 5, "augment": ()}, 1e-4, 1e-4),
+    # Shapes of both processes are compared with each other.
+    "plus": (SMALL | {"preset": "plus-kato", "batch_size": 5, "remembered": 8, "symmetry": "x"}, 1e-5, 1e-5),
     "prgan": (PRGAN | {"preset": "gadelha2017-kato", "batch_size": 5}, 1e-5, 1e-3),
 }
 
