@@ -98,7 +98,7 @@ def test_the_help_of_evaluate_explains_every_column(command, monkeypatch) -> Non
         ("train --resume", "--resume needs --output: the folder of the run"),
         ("train --out {tmp} --resume", "--resume needs --output"),
         ("train --data {tmp}/no --category chair --output {tmp}/run", "data set is with --data"),
-        ("train --output {tmp} --preset kato", "there is no preset 'kato'; choose one of proposed, vanilla,"),
+        ("train --output {tmp} --preset kato", "there is no preset 'kato'; choose one of proposed, plus, vanilla,"),
         ("train --data x --category chair --output {tmp} --resume --overwrite", "folder of a"),
         ("train --data {data} --category lamp --output {tmp}/run", "the folder holds: airplane train"),
         ("evaluate {tmp}", "there is no checkpoint"),
