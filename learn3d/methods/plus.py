@@ -30,7 +30,7 @@ class PlusSettings(PoseInvariantSettings):
     """Mirror shapes at a vertical plane: auto: the one at which the training masks mirror each other, or none where
     they do not; x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along it. None: shapes are
     free."""
-    learning_rate: Positive = 1e-3
+    learning_rate: Positive = 4e-4
     """Adam's step size, the same for the three networks. The preset warms it up and lets it fall to 0."""
     lambda_unseen: Weight = 0.5
     """Weight of the loss at unseen views."""
