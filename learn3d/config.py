@@ -52,7 +52,8 @@ class TrainConfig:
     """Pose classes as cells of azimuth and elevation in degrees, such as 15x20. None: the preset's, which for data sets
     of fixed views are these views."""
     views_per_object: Count | None = None
-    """Train on so many views of every object. None: what the layout's protocol uses, one for Kar's, else all."""
+    """Train on so many views of every object (kar, r2n2: the first; else drawn at random, the same in every run). None:
+    what the layout's protocol uses, one for Kar's, else all."""
     sampling: Sampling | None = None
     """What a batch is made of: views (each on its own), pairs (two views of an object) or classes (drawn uniformly).
     None: the preset's."""
@@ -107,8 +108,7 @@ class TrainConfig:
             raise ValueError(
                 f"preset {self.preset!r} takes {type(preset.settings).__name__}, got {type(self.settings).__name__}"
             )
-        options = {name: getattr(self, name) for name in ("view_bins", "views_per_object")}
-        check_options(self.layout, image_size=self.settings.image_size, **options)
+        check_options(self.layout, image_size=self.settings.image_size, view_bins=self.view_bins)
         if self.val_split == "val" and not LAYOUTS[self.layout].validation:
             raise ValueError(f"the layout {self.layout!r} has no split val; validate on test (val_split test)")
         if "flip" in self.augment and getattr(self.settings, "reads_view_ids", False):

@@ -176,6 +176,19 @@ class ViewDataset:
             raise ValueError(f"cells of azimuth and elevation need look-at cameras; this data set has {got}")
         return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), view_names=tuple(bins.names()))
 
+    def with_few_views(self, count: int) -> ViewDataset:
+        """`count` views of every object, drawn at random for each, the same ones in every run; all, where it has fewer.
+
+        Raises ValueError where no object has so many.
+        """
+        order = np.random.default_rng(0).permutation(len(self))
+        order = order[np.argsort(self.object_ids[order], kind="stable")]  # by object, the views of each shuffled
+        _, starts, sizes = np.unique(self.object_ids[order], return_index=True, return_counts=True)
+        if not 1 <= count <= sizes.max(initial=0):
+            raise ValueError(f"views_per_object must lie in 1 .. {sizes.max(initial=0)}, got {count}")
+        number = np.arange(len(self)) - np.repeat(starts, sizes)
+        return self.select(np.sort(order[number < count]))
+
     def select(self, samples: np.ndarray) -> ViewDataset:
         """Only the samples `samples`, int64; all objects stay."""
         return dataclasses.replace(

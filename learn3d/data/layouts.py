@@ -19,9 +19,7 @@ Layout = Literal[tuple(READERS)]
 LAYOUTS: dict[str, LayoutProperties] = {name: reader.PROPERTIES for name, reader in READERS.items()}
 
 
-def check_options(
-    layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str | None = None, views_per_object: int | None = None
-) -> None:
+def check_options(layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str | None = None) -> None:
     """Raise a ValueError for an unknown layout and for an option of `load_dataset` that does not go with it."""
     if not isinstance(layout, str) or layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
@@ -29,8 +27,6 @@ def check_options(
     if "image_size" not in properties.options and image_size != IMAGE_SIZE:
         size = f"{IMAGE_SIZE}x{IMAGE_SIZE}"
         raise ValueError(f"images of the layout {layout!r} have {size} pixels, but {image_size} are wanted")
-    if "views_per_object" not in properties.options and views_per_object is not None:
-        raise ValueError(f"views_per_object cannot be chosen with the layout {layout!r}: it uses all there are")
     if view_bins is not None:
         AngleBins.parse(view_bins)
         if not properties.angles:
@@ -69,13 +65,14 @@ def load_dataset(
 
     image_size: side of the network's images in pixels, for layouts that keep larger ones; Kato's renderings are 64x64.
     view_bins: pose classes from cells of azimuth and elevation, see `AngleBins.parse`; None: the layout's own.
-    views_per_object: use only so many views of every object; None: what the layout's published protocol uses.
+    views_per_object: use only so many views of every object (kar, r2n2: the first; other layouts: drawn at random, the
+    same in every run); None: what the layout's published protocol uses.
     progress: show a bar where many files are read.
 
     Raises ValueError for an unknown layout, an option that the layout does not have, and damaged files (named);
     FileNotFoundError for missing ones.
     """
-    check_options(layout, image_size=image_size, view_bins=view_bins, views_per_object=views_per_object)
+    check_options(layout, image_size=image_size, view_bins=view_bins)
     require_folder(folder)
     names = [name.strip() for name in category.split(",")]
     if len(set(names)) != len(names) or not all(names):
@@ -96,6 +93,8 @@ def load_dataset(
         raise type(error)(
             error.path, f"{error.message}. All that is wrong with the data set is listed by: {check}"
         ) from error
+    if views_per_object is not None and "views_per_object" not in LAYOUTS[layout].options:
+        dataset = dataset.with_few_views(views_per_object)
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
 
 

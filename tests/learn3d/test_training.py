@@ -146,7 +146,6 @@ def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
         ({"augment": ("channels", "flip")}, "the discriminator of 'peng2020-kato' is told the class of the original"),
         ({"layout": "r2n2"}, "the layout 'r2n2' has no split val; validate on test"),
         ({"encoder": "resnet18"}, "images of the layout 'kato' have 64x64 pixels, but 224 are wanted"),
-        ({"views_per_object": 1}, "views_per_object cannot be chosen with the layout 'kato'"),
         ({"layout": "pascal3d", "view_bins": "15x20"}, "view_bins '15x20': .* of the layout 'pascal3d' are rotations"),
         ({"preset": "gadelha2017-kato"}, "encoder_from_step=53051 lies beyond the 4 iterations: .* such as 3"),
         ({"view_bins": "15"}, "view bins are written as AZIMUTHxELEVATION"),

@@ -251,3 +251,23 @@ def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
 def test_methods_that_need_poses_say_so(preset: str) -> None:
     with pytest.raises(ValueError, match="has no poses"):
         create_method(PRESETS[preset].settings, DataShape(1, pose_features=0), device="cpu", precision="fp32", seed=0)
+
+
+def test_few_views_of_every_object(tiny_set) -> None:
+    few = tiny_set.with_few_views(2)
+    assert few.object_ids.tolist() == [0, 0, 1, 1, 2, 2]
+    assert len({tuple(few.view_ids[i : i + 2]) for i in (0, 2, 4)}) == 3  # not the same views of every object
+    np.testing.assert_array_equal(few.view_ids, tiny_set.with_few_views(2).view_ids)
+    for sample in range(6):
+        of_all = 24 * few.object_ids[sample] + few.view_ids[sample]
+        np.testing.assert_array_equal(few.images[sample], tiny_set.images[of_all])
+        assert few.poses.azimuth_deg[sample] == tiny_set.poses.azimuth_deg[of_all]
+    assert len(tiny_set.with_few_views(24)) == len(tiny_set)
+    for wrong in (0, 25):
+        with pytest.raises(ValueError, match=r"views_per_object must lie in 1 \.\. 24"):
+            tiny_set.with_few_views(wrong)
+
+
+def test_objects_that_have_fewer_views_keep_them(tiny_set) -> None:
+    uneven = tiny_set.select(np.array([0, 1, 2, 24, 50, 51]))
+    assert uneven.with_few_views(2).object_ids.tolist() == [0, 0, 1, 2, 2]
