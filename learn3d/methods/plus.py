@@ -94,6 +94,11 @@ class Plus(PoseInvariant):
     def weights(self) -> dict[str, float]:
         return super().weights | {"unseen": self.settings.lambda_unseen}
 
+    def encode(self, images: Tensor) -> Tensor:
+        """Shape codes; where shapes are symmetric, the mean of the codes of an image and of its mirror image."""
+        codes = super().encode(images)
+        return codes if self.generator.mirror is None else (codes + super().encode(images.flip(3))) / 2
+
     def learn(self, batch: Batch, step: int) -> dict[str, float]:
         """A step of `PoseInvariant`, in which every second image is flipped where shapes are symmetric, and with
         lambda_unseen times the loss at an unseen view, once the memory is full.

@@ -90,6 +90,13 @@ def test_flipped_images_are_views_of_their_own(batch, monkeypatch) -> None:
     assert seen[1].tolist() == [0, 1, 0, 0]
 
 
+def test_an_image_and_its_mirror_image_have_one_code(batch) -> None:
+    free, symmetric = make(None), make(90.0)
+    with torch.no_grad():
+        torch.testing.assert_close(symmetric.encode(batch.images), symmetric.encode(batch.images.flip(3)))
+        assert not torch.equal(free.encode(batch.images), free.encode(batch.images.flip(3)))
+
+
 def test_an_interrupted_run_resumes_bit_for_bit(tiny_config, run_folder, tmp_path) -> None:
     options = {"preset": "plus-kato", "remembered": 8, "warmup_steps": 1, "iterations": 6, "schedule": "constant"}
     whole = tiny_config(tmp_path / "whole", **options)
