@@ -10,15 +10,19 @@ import numpy as np
 import skimage.transform
 import torch
 import trimesh
+from torch import nn
 
 from learn3d import figures
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.crops import Crops
+from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
+from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.figures import Surface
 from learn3d.files import limits, writing
-from learn3d.methods import Method
+from learn3d.methods import MeshMethod, Method
+from learn3d.refinement import refine
 from learn3d.runs import checkpoint
 
 STRIP_SIZE = 160
@@ -78,9 +82,20 @@ def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
 
 
 @torch.no_grad()
-def reconstruct(method: Method, images: np.ndarray) -> list[Surface]:
-    """Meshes, in the object frame, of images uint8 [B,4,S,S] as stored."""
-    return figures.as_meshes(method.decode(method.encode(torch.from_numpy(images))))
+def reconstruct(
+    method: Method, images: np.ndarray, masks: torch.Tensor | None = None, poses: Poses | None = None
+) -> list[Surface]:
+    """Meshes, in the object frame, of images uint8 [B,4,S,S] as stored.
+
+    With masks float32 [B,64,64] and poses, shapes are fitted to them (`refinement.refine`). Raises ValueError for
+    methods whose shapes are not meshes.
+    """
+    pixels = torch.from_numpy(images)
+    if poses is None:
+        return figures.as_meshes(method.decode(method.encode(pixels)))
+    if not isinstance(method, MeshMethod):
+        raise ValueError("only meshes can be fitted to masks, and this run predicts voxels; leave out --refine")
+    return figures.as_meshes(refine(method, pixels, masks, poses))
 
 
 def export_mesh(path: Path, surface: Surface) -> None:
@@ -145,17 +160,20 @@ def reconstruct_files(
     masks: Sequence[Path] = (),
     *,
     crop: bool = True,
+    poses: LookAtPoses | None = None,
     which: str = "last",
     **options: Any,
 ) -> list[Path]:
     """Reconstruct image files with the networks of a run and save each result under the image's name in `folder`.
 
-    `masks` is empty (the images have transparency) or as long as `images`; `options` go to `save_reconstruction`.
-    Returns the files written.
+    `masks` is empty (the images have transparency) or as long as `images`. Where `poses` are given, one of each image,
+    shapes are fitted to the masks. `options` go to `save_reconstruction`. Returns the files written.
     """
     _check(options)
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
+    if poses is not None and len(poses) != len(images):
+        raise ValueError(f"there are {len(images)} images but {len(poses)} poses; give one azimuth per image")
     pairs = zip(images, masks or [None] * len(images), strict=True)
     method, config, metadata = checkpoint.load_method(checkpoint.find(run, which))
     share = metadata.progress.object_share or OBJECT_SHARE
@@ -164,7 +182,10 @@ def reconstruct_files(
     names = [Path(image).stem for image in images]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]
-    return _save_all(method, folder, names, np.stack(prepared), LAYOUTS[config.layout].inverted, options)
+    stored = np.stack(prepared)
+    shown = torch.from_numpy(stored[:, 3:]).float() / 255
+    fitted = reconstruct(method, stored, nn.functional.interpolate(shown, MASK_SIZE, mode="area")[:, 0], poses)
+    return _save_all(fitted, folder, names, stored, LAYOUTS[config.layout].inverted, options)
 
 
 def reconstruct_dataset(
@@ -176,11 +197,13 @@ def reconstruct_dataset(
     category: str | None = None,
     split: str = "test",
     which: str = "last",
+    refined: bool = False,
     **options: Any,
 ) -> list[Path]:
     """Reconstruct images of a data set (indices object * views + view) and save the results in `folder`.
 
-    Files are named after the object and its view class; where several of the images agree in both, after their index.
+    refined: fit the shapes to the masks, with the data set's poses. Files are named after the object and its view
+    class; where several of the images agree in both, after their index.
     """
     _check(options)
     if not Path(data).is_dir():
@@ -193,7 +216,11 @@ def reconstruct_dataset(
     names = [f"{dataset.category}_{split}_object{number:04}_view{view:02}" for number, view in numbers]
     if len(set(names)) < len(names):
         names = [f"{dataset.category}_{split}_image{index:06}" for index in indices]
-    return _save_all(method, folder, names, batch.images.numpy(), dataset.inverted, options)
+    if refined and batch.poses is None:
+        raise ValueError(f"{dataset.category} has no poses, and shapes are fitted to masks of known pose")
+    images = batch.images.numpy()
+    surfaces = reconstruct(method, images, *(batch.masks, batch.poses) if refined else ())
+    return _save_all(surfaces, folder, names, images, dataset.inverted, options)
 
 
 def _check(options: dict[str, Any]) -> None:
@@ -202,11 +229,16 @@ def _check(options: dict[str, Any]) -> None:
 
 
 def _save_all(
-    method: Method, folder: Path, names: list[str], images: np.ndarray, inverted: bool, options: dict[str, Any]
+    surfaces: list[Surface],
+    folder: Path,
+    names: list[str],
+    images: np.ndarray,
+    inverted: bool,
+    options: dict[str, Any],
 ) -> list[Path]:
     written = []
     pictures = figures.natural_colors(images, inverted=inverted)
-    for name, picture, surface in zip(names, pictures, reconstruct(method, images), strict=True):
+    for name, picture, surface in zip(names, pictures, surfaces, strict=True):
         written += save_reconstruction(folder, name, picture, surface, **options)
     return written
 

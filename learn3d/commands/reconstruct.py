@@ -45,6 +45,13 @@ class Command:
     """Which networks of a run: the last ones, or those with the best validation IoU."""
     crop: bool = True
     """Leave the images as they are. Without it the object is centred and scaled as in the data set."""
+    refine: bool = False
+    """Fit each shape to its mask afterwards, a few seconds for each image; the camera must be known: that of the data
+    set, or --azimuths."""
+    azimuths: tuple[float, ...] = ()
+    """With --refine, where the camera of each image file stands, in degrees: one for each image."""
+    elevation: float = 30.0
+    """Its height above the object's plane in degrees, the same for all image files."""
     frames: int = 36
     """Pictures of the turntable."""
     image_size: int = 256
@@ -56,6 +63,12 @@ def run(arguments: Sequence[str]) -> int:
     command = parse(Command, arguments, name="reconstruct", about=__doc__)
     if bool(command.images) == (command.data is not None):
         raise ValueError("give either image files, or --data with --indices")
+    if command.images and command.refine != bool(command.azimuths):
+        raise ValueError("--refine takes the azimuth of the camera of each image file: give --refine --azimuths A ...")
+    import torch
+
+    from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG
+    from learn3d.data.poses import LookAtPoses
     from learn3d.files.writing import check_target
     from learn3d.reconstruction import reconstruct_dataset, reconstruct_files
 
@@ -64,10 +77,13 @@ def run(arguments: Sequence[str]) -> int:
     options |= {"frames": command.frames, "image_size": command.image_size}
     where = (command.run, command.output)
     if command.data is not None:
-        chosen = {"category": command.category, "split": command.split}
+        chosen = {"category": command.category, "split": command.split, "refined": command.refine}
         paths = reconstruct_dataset(*where, command.data, command.indices, **chosen, **options)
     else:
-        paths = reconstruct_files(*where, command.images, command.masks, crop=command.crop, **options)
+        azimuths = torch.tensor(command.azimuths)
+        poses = LookAtPoses(azimuths, command.elevation, DISTANCE, HALF_FOV_DEG) if command.refine else None
+        how = {"crop": command.crop, "poses": poses}
+        paths = reconstruct_files(*where, command.images, command.masks, **how, **options)
     for path in paths:
         say(str(path))
     return 0

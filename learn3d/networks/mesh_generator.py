@@ -44,6 +44,15 @@ class MeshGenerator(nn.Module):
             return vertices
         return (vertices[..., None] * self.rotation).sum(-2)  # not a matrix product, which autocast would round to bf16
 
+    def symmetrized(self, vertices: Tensor) -> Tensor:
+        """The mean of placed vertices [B,V,3] and their mirror images; the vertices where shapes are free."""
+        if self.mirror is None:
+            return vertices
+        turn = torch.eye(3) if self.rotation is None else self.rotation.cpu()  # rows: the axes as they are placed
+        reflection = (turn.T @ torch.diag(torch.tensor([1.0, 1.0, -1.0])) @ turn).to(vertices)
+        mirrored = (vertices[:, self.mirror.to(vertices.device), :, None] * reflection).sum(-2)
+        return (vertices + mirrored) / 2
+
 
 def mirror_images(points: Tensor) -> Tensor:
     """For each of the points [V,3] the one that is its mirror image at z = 0, int64 [V]."""

@@ -44,6 +44,19 @@ def test_shapes_are_their_own_mirror_images(name: str, symmetry: Symmetry) -> No
         assert torch.equal(vertices[:, generator.mirror], vertices * torch.tensor([1.0, 1.0, -1.0]))
 
 
+@pytest.mark.parametrize("symmetry", PLANES)
+def test_any_vertices_can_be_made_symmetric(symmetry: Symmetry) -> None:
+    generator = narrow("sphere-small", symmetry)
+    vertices = torch.randn(2, 642, 3)
+    symmetric = generator.symmetrized(vertices)
+    mirrored = reflected(symmetric, PLANES[symmetry])
+    torch.testing.assert_close(symmetric[:, generator.mirror], mirrored, atol=1e-6, rtol=0)
+    torch.testing.assert_close(generator.symmetrized(symmetric), symmetric)
+    own = generator(torch.randn(2, 512)).detach()
+    torch.testing.assert_close(generator.symmetrized(own), own, atol=1e-6, rtol=0)
+    assert narrow("sphere-small", None).symmetrized(vertices) is vertices
+
+
 @pytest.mark.parametrize("name", ["sphere", "bounded"])
 def test_the_camera_along_the_plane_sees_a_symmetric_silhouette(name: str) -> None:
     generator = narrow(name, 37.5)

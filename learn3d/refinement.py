@@ -1,0 +1,64 @@
+"""Fits a predicted shape to the image's own mask, where the camera is known: first its code, then its vertices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+import nmr
+from learn3d.data.poses import Poses
+from learn3d.device import upload
+from learn3d.methods import Meshes, MeshMethod
+
+CODE_STEPS = 40
+CODE_STEP_SIZE = 0.1  # of Adam, in units of the root mean square of the codes' entries
+VERTEX_STEPS = 40
+VERTEX_STEP_SIZE = 0.002  # of Adam, in units of the object frame
+SMOOTHNESS = 0.001  # weight of the smoothness loss, that of the methods
+
+
+def refine(
+    method: MeshMethod,
+    images: Tensor,
+    masks: Tensor,
+    poses: Poses,
+    *,
+    code_steps: int = CODE_STEPS,
+    vertex_steps: int = VERTEX_STEPS,
+) -> Meshes:
+    """Meshes of stored images uint8 [B,4,S,S], fitted to masks float32 [B,64,64] that the B cameras of `poses` see.
+
+    Both parts minimise soft IoU loss + 0.001 smoothness, as training does: over the codes, so that shapes stay among
+    those that the generator knows, then over the vertices. Symmetric shapes stay symmetric.
+    """
+
+    def decode(codes: Tensor) -> Tensor:
+        with method.autocast():
+            return method.generator(upload(codes, method.device))
+
+    def loss(vertices: Tensor) -> Tensor:
+        vertices = vertices.float().cpu()
+        fit = nmr.losses.soft_iou_loss(method.render(vertices, poses), masks)
+        return fit + SMOOTHNESS * nmr.losses.smoothness_loss(vertices, method.edges)
+
+    with torch.no_grad():
+        codes = method.encode(images).float().cpu()
+    step_size = CODE_STEP_SIZE * float(codes.square().mean().sqrt())
+    codes = _descend(lambda codes: loss(decode(codes)), codes, step_size, code_steps)
+    with torch.no_grad():
+        vertices = decode(codes).float().cpu()
+    symmetrized = method.generator.symmetrized
+    vertices = _descend(lambda vertices: loss(symmetrized(vertices)), vertices, VERTEX_STEP_SIZE, vertex_steps)
+    return Meshes(symmetrized(vertices), method.faces)
+
+
+@torch.enable_grad()
+def _descend(loss: Callable[[Tensor], Tensor], start: Tensor, step_size: float, steps: int) -> Tensor:
+    values = start.clone().requires_grad_()
+    optimizer = torch.optim.Adam([values], lr=step_size)
+    for _ in range(steps):
+        (values.grad,) = torch.autograd.grad(loss(values), values)
+        optimizer.step()
+    return values.detach()
