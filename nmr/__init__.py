@@ -46,6 +46,8 @@ from .render import (
 from .textures import Colors, FaceColors, TextureCubes, UVTexture, VertexColors
 from .voxels import voxelize
 
+__version__ = "0.1.0"
+
 __all__ = [
     "Camera",
     "Colors",
