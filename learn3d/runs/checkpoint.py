@@ -189,12 +189,14 @@ def network_tensors(method: Method) -> dict[str, Tensor]:
 def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path, kind: str = "network") -> None:
     """Copy the weights of a checkpoint, or with the kind "average" their averages, into the networks of a method.
 
-    Raises ValueError where they do not fit.
+    Weights at half precision (`runs.export`) become float32. Raises ValueError where they do not fit.
     """
     for name, network in method.networks.items():
         state = starting_with(f"{kind}.{name}.", tensors)
         try:
             for key, own in network.state_dict().items():
+                if key in state and (state[key].dtype, own.dtype) == (torch.float16, torch.float32):
+                    state[key] = state[key].float()
                 if key in state and state[key].dtype != own.dtype:
                     raise ValueError(f"{name}.{key} is {state[key].dtype}, wanted {own.dtype}")
             check_finite(name, state)
