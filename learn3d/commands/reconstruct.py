@@ -1,7 +1,6 @@
 """Turn images into meshes, each with a turntable animation and a strip of views.
 
 Examples:
-  learn3d reconstruct photo.png --output meshes    (with the small model that comes with the package)
   learn3d reconstruct photo.png --run runs/airplane --output meshes    (transparent background)
   learn3d reconstruct photo.jpg --masks mask.png --run runs/airplane --output meshes
   learn3d reconstruct --data DATA --indices 0 31 62 --run runs/airplane --output meshes
@@ -24,11 +23,10 @@ from learn3d.terminal import say
 class Command:
     """What is asked for."""
 
+    run: Path
+    """Run folder (or checkpoint file) of the trained model."""
     output: Path
     """Folder for the results: of each image a mesh, a turntable GIF and a PNG strip."""
-    run: Path | None = None
-    """Run folder (or checkpoint file) of the trained model. None: the small model that comes with the package, which
-    knows generated airplanes, cars, chairs, lamps, sofas and tables."""
     images: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Images of any size, with a transparent background (or with --masks)."""
     masks: tuple[Path, ...] = ()
@@ -73,12 +71,11 @@ def run(arguments: Sequence[str]) -> int:
     from learn3d.data.poses import LookAtPoses
     from learn3d.files.writing import check_target
     from learn3d.reconstruction import reconstruct_dataset, reconstruct_files
-    from learn3d.runs.export import SMALL_MODEL
 
     check_target(command.output, "--output", folder=True)
     options = {"which": command.checkpoint, "mesh_format": command.format}
     options |= {"frames": command.frames, "image_size": command.image_size}
-    where = (command.run or SMALL_MODEL, command.output)
+    where = (command.run, command.output)
     if command.data is not None:
         chosen = {"category": command.category, "split": command.split, "refined": command.refine}
         paths = reconstruct_dataset(*where, command.data, command.indices, **chosen, **options)

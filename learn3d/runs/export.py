@@ -10,8 +10,6 @@ import torch
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
 
-#: The model that comes with the package; tools/small_model.sh makes it.
-SMALL_MODEL = Path(__file__).parents[1] / "models" / "small.safetensors"
 _TRAINING_ONLY = ("lambda_classification", "lambda_adversarial", "lambda_unseen")  # weights of what needs more networks
 
 
@@ -32,6 +30,5 @@ def export(source: Path, target: Path, *, which: str = "last") -> int:
         for name, tensor in checkpoint.network_tensors(method).items()
         if name.startswith(("network.encoder.", "network.generator."))
     }
-    target.parent.mkdir(parents=True, exist_ok=True)
     checkpoint.save(target, tensors, dataclasses.replace(metadata, config=config, optimizers={}))
     return target.stat().st_size
