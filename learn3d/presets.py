@@ -151,6 +151,7 @@ _PLUS = replace(
     label="Plus",
     settings=PlusSettings(),
     source="docs/methods/plus.md",
+    augment=("colors",),
     schedule="cosine",
     warmup_steps=100,
     average=0.99,

@@ -271,3 +271,18 @@ def test_few_views_of_every_object(tiny_set) -> None:
 def test_objects_that_have_fewer_views_keep_them(tiny_set) -> None:
     uneven = tiny_set.select(np.array([0, 1, 2, 24, 50, 51]))
     assert uneven.with_few_views(2).object_ids.tolist() == [0, 0, 1, 2, 2]
+
+
+def test_colours_are_permuted_scaled_or_left_out(tiny_set) -> None:
+    batch = tiny_set.batch(torch.arange(72))
+    changed = augment(batch, ("colors",), 0, 1)
+    assert torch.equal(changed.images[:, 3], batch.images[:, 3])
+    assert torch.equal(changed.masks, batch.masks)
+    assert torch.equal(augment(batch, ("colors",), 0, 1).images, changed.images)
+    means, before = (b.images[:, :3].double().mean((2, 3)).sort(dim=1).values for b in (changed, batch))
+    without = (means == 0).all(1)
+    assert 8 < without.sum() < 36  # 30 % of 72
+    ratio = means[~without] / before[~without]
+    assert ratio.min() > 0.6
+    assert ratio.max() < 1.4
+    assert ratio.std() > 0.05

@@ -89,7 +89,7 @@ def test_too_many_processes_are_refused_before_data_are_read(tiny_config, tmp_pa
         train(tiny_config(tmp_path / "run", data=tmp_path / "nowhere"), ranks=Ranks(1, 5))
 
 
-@pytest.mark.parametrize("names", [("flip",), ("flip-image", "channels"), ("channels", "flip")])
+@pytest.mark.parametrize("names", [("flip",), ("flip-image", "channels"), ("channels", "flip"), ("colors",)])
 def test_parts_of_a_batch_are_changed_as_the_whole_is(tiny_set, names: tuple[str, ...]) -> None:
     indices = torch.tensor([3, 50, 7, 30, 31])
     whole = augmentation.augment(tiny_set.batch(indices), names, 0, 1)
