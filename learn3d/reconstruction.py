@@ -22,7 +22,7 @@ from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.figures import Surface
 from learn3d.files import limits, writing
 from learn3d.methods import MeshMethod, Method
-from learn3d.refinement import refine
+from learn3d.methods.refinement import refine
 from learn3d.runs import checkpoint
 
 STRIP_SIZE = 160
@@ -87,7 +87,7 @@ def reconstruct(
 ) -> list[Surface]:
     """Meshes, in the object frame, of images uint8 [B,4,S,S] as stored.
 
-    With masks float32 [B,64,64] and poses, shapes are fitted to them (`refinement.refine`). Raises ValueError for
+    With masks float32 [B,64,64] and poses, shapes are fitted to them (`methods.refinement`). Raises ValueError for
     methods whose shapes are not meshes.
     """
     pixels = torch.from_numpy(images)

@@ -10,7 +10,8 @@ from torch import Tensor
 import nmr
 from learn3d.data.poses import Poses
 from learn3d.device import upload
-from learn3d.methods import Meshes, MeshMethod
+from learn3d.methods.method import MeshMethod
+from learn3d.methods.surfaces import Meshes
 
 CODE_STEPS = 40
 CODE_STEP_SIZE = 0.1  # of Adam, in units of the root mean square of the codes' entries

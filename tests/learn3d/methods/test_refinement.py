@@ -12,9 +12,9 @@ from PIL import Image
 import nmr
 from learn3d.data.poses import LookAtPoses
 from learn3d.methods import DataShape, create_method
+from learn3d.methods.refinement import refine
 from learn3d.presets import PRESETS
 from learn3d.reconstruction import reconstruct, reconstruct_dataset, reconstruct_files
-from learn3d.refinement import refine
 
 
 def make(plane: float | None):
