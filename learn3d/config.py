@@ -175,14 +175,22 @@ def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
     """What makes `config` another run than `saved`: one line per option that a resumed run may not change."""
     old, new = (_flat(c) for c in (saved, config))
     allowed = RESUME_MAY_CHANGE
-    if config.schedule != "constant":  # the step size of every step depends on the number of steps
+    dependent = _what_depends_on_iterations(config)
+    if dependent is not None:
         allowed -= {"iterations"}
     return [
         f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"
-        + f" (the schedule {config.schedule} depends on it)" * (name == "iterations")
+        + f" ({dependent} depends on it)" * (name == "iterations")
         for name in dict.fromkeys([*old, *new])
         if name not in allowed and old.get(name) != new.get(name)
     ]
+
+
+def _what_depends_on_iterations(config: TrainConfig) -> str | None:
+    """What makes every step depend on the number of steps of the whole run."""
+    if config.schedule != "constant":
+        return f"the schedule {config.schedule}"
+    return None if getattr(config.settings, "lambda_smooth_end", None) is None else "lambda_smooth_end"
 
 
 def check_resume(config: TrainConfig, saved: TrainConfig) -> None:

@@ -107,6 +107,10 @@ class Method(abc.ABC):
         """The weight of every loss that `descend` is given, by the name of the loss."""
         return {}
 
+    def weights_at(self, step: int) -> Mapping[str, float]:
+        """`weights` in training step `step` (from 1), where they change during a run."""
+        return self.weights
+
     def estimate(self, images: Tensor) -> Estimate:
         """Codes of images as `encode` takes them, and the poses, by methods that estimate them."""
         return Estimate(self.encode(images))
@@ -136,7 +140,7 @@ class Method(abc.ABC):
     def descend(self, losses: Mapping[str, Tensor], step: int, *names: str) -> dict[str, float]:
         """Backpropagate the weighted sum of the losses and let the optimizers `names` step; see `backpropagate`."""
         self._clear_gradients()
-        values = backpropagate(losses, self.weights, step, self.ranks)
+        values = backpropagate(losses, self.weights_at(step), step, self.ranks)
         for name in names:
             self.optimizers[name].step()
         return values
@@ -216,10 +220,12 @@ class MeshMethod(Method):
         return nmr.render_silhouette(vertices, self.faces, poses.cameras(), image_size=MASK_SIZE)
 
     def surface_losses(self, vertices: Tensor) -> dict[str, Tensor]:
-        """The losses on the surface alone, smoothness and inflation, where they have a weight."""
+        """The losses on the surface alone, smoothness, volume and inflation, where they have a weight."""
         losses = {}
         if self.weights.get("smoothness", 0.0) > 0:
             losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.edges)
+        if self.weights.get("volume", 0.0) > 0:
+            losses["volume"] = nmr.losses.volume_loss(vertices, self.faces)
         if self.weights.get("inflation", 0.0) > 0:
             losses["inflation"] = nmr.losses.inflation_loss(vertices, self.faces)
         return losses

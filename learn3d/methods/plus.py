@@ -16,7 +16,7 @@ from learn3d.device import Download
 from learn3d.losses import silhouette_energy_distance
 from learn3d.methods.optimization import adam
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
-from learn3d.networks import PoseDiscriminator, SymmetryOption
+from learn3d.networks import EncoderName, PoseDiscriminator, SymmetryOption
 from learn3d.settings import Count, Positive, Weight, checked
 
 REDUCED = MASK_SIZE // 2  # side of the masks that are remembered and compared
@@ -26,12 +26,16 @@ REDUCED = MASK_SIZE // 2  # side of the masks that are remembered and compared
 class PlusSettings(PoseInvariantSettings):
     """Networks, weights and forms of the terms of the loss; a weight of 0 means that the term is not computed."""
 
+    encoder: EncoderName = "conv-narrow"
+    """As for the proposed method."""
     symmetry: SymmetryOption = "auto"
     """Mirror shapes at a vertical plane: auto: the one at which the training masks mirror each other, or none where
     they do not; x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along it. None: shapes are
     free."""
     learning_rate: Positive = 4e-4
     """Adam's step size, the same for the three networks. The preset warms it up and lets it fall to 0."""
+    lambda_smooth_end: Positive | None = 1e-4
+    """As for the proposed method."""
     lambda_unseen: Weight = 0.5
     """Weight of the loss at unseen views."""
     remembered: Count = 2048

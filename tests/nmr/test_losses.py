@@ -13,6 +13,7 @@ from nmr.losses import (
     normal_consistency_loss,
     smoothness_loss,
     soft_iou_loss,
+    volume_loss,
 )
 
 
@@ -268,7 +269,13 @@ def test_batches_are_means_over_their_meshes():
     vertices, faces = octahedron()
     edges = nmr.edge_table(faces)
     batch = torch.stack([vertices, 3 * vertices, vertices * torch.tensor([1.0, 2, 3])])
-    tables = {normal_consistency_loss: edges, laplacian_loss: edges, edge_length_loss: edges, inflation_loss: faces}
+    tables = {
+        normal_consistency_loss: edges,
+        laplacian_loss: edges,
+        edge_length_loss: edges,
+        inflation_loss: faces,
+        volume_loss: faces,
+    }
     for loss, table in tables.items():
         mean = sum(loss(x, table) for x in batch) / 3
         torch.testing.assert_close(loss(batch, table), mean)
@@ -319,13 +326,25 @@ def test_inflation_pulls_every_corner_along_the_normal():
     torch.testing.assert_close(vertices.grad, -4 / 3**0.5 * vertices.detach())
 
 
+def test_volume_of_boxes():
+    """The octahedron with half axes a, b, c has the volume 4 abc / 3, wherever it is."""
+    vertices, faces = octahedron()
+    boxes = torch.stack([vertices, vertices * torch.tensor([1.0, 2, 3]) + 5]).requires_grad_()
+    loss = volume_loss(boxes, faces)
+    assert loss.item() == pytest.approx((4 / 3 + 8) / 2)
+    assert volume_loss(boxes[0], faces.flip(1)).item() == pytest.approx(-4 / 3)
+    loss.backward()
+    torch.testing.assert_close(boxes.grad[0], 2 / 3 * vertices.to(boxes.grad) / 2)
+    torch.autograd.gradcheck(lambda x: volume_loss(x, faces), boxes)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_collapsed_meshes_have_finite_gradients(dtype):
     vertices, faces = nmr.icosphere(0)
     edges = nmr.edge_table(faces)
     for x in (0 * vertices, vertices * torch.tensor([1.0, 0, 0])):
         x = x.to(dtype).requires_grad_()
-        total = inflation_loss(x, faces)
+        total = inflation_loss(x, faces) + volume_loss(x, faces)
         for loss in (laplacian_loss, edge_length_loss, normal_consistency_loss, smoothness_loss):
             total = total + loss(x, edges)
         total.backward()
@@ -340,10 +359,15 @@ def test_vertices_without_edges_count_nothing():
     assert loss.item() == pytest.approx(6) and not more.grad[-1].any()
 
 
-@pytest.mark.parametrize("loss", [laplacian_loss, edge_length_loss, normal_consistency_loss, inflation_loss])
+@pytest.mark.parametrize(
+    "loss", [laplacian_loss, edge_length_loss, normal_consistency_loss, inflation_loss, volume_loss]
+)
 def test_mesh_loss_errors(loss):
-    vertices, table = torch.zeros(1, 4, 3), torch.zeros(1, 3 if loss is inflation_loss else 4, dtype=torch.long)
-    name = "faces" if loss is inflation_loss else "edges"
+    vertices, table = (
+        torch.zeros(1, 4, 3),
+        torch.zeros(1, 3 if loss in (inflation_loss, volume_loss) else 4, dtype=torch.long),
+    )
+    name = "faces" if loss in (inflation_loss, volume_loss) else "edges"
     with pytest.raises(ValueError, match=f"{name} refer to vertex 9, but a mesh has 4 vertices"):
         loss(vertices, table + 9)
     with pytest.raises(ValueError, match=f"{name} refer to vertex -1, but a mesh has 4 vertices"):

@@ -7,7 +7,9 @@ import dataclasses
 import pytest
 import torch
 
+from learn3d.config import differences
 from learn3d.methods import DataShape, create_method
+from learn3d.methods.optimization import Plan
 from learn3d.methods.plus import MaskMemory, Plus, PlusSettings
 from learn3d.presets import PRESETS
 from learn3d.runs.checkpoint import load
@@ -44,10 +46,26 @@ def test_losses(batch) -> None:
     first, second = method.train_step(batch, 1), method.train_step(batch, 2)
     assert {"projection", "smoothness", "prior", "classification", "unseen"} <= set(first)
     assert {"confusion", "unseen"} <= set(second)
-    weights = method.weights
-    for losses in (first, second):
-        total = sum(weights[name] * value for name, value in losses.items() if name != "total")
+    for step, losses in enumerate((first, second), 1):
+        total = sum(method.weights_at(step)[name] * value for name, value in losses.items() if name != "total")
         assert losses["total"] == pytest.approx(total, rel=1e-5)
+
+
+def test_the_weight_of_the_smoothness_falls_over_the_run(tiny_set, batch) -> None:
+    settings = dataclasses.replace(SMALL, lambda_smooth=1e-2, lambda_smooth_end=1e-4)
+    method = create_method(settings, DataShape(24), device="cpu", precision="fp32", seed=0, plan=Plan(iterations=5))
+    weights = [method.weights_at(step)["smoothness"] for step in (1, 3, 5, 6)]
+    assert weights == pytest.approx([1e-2, 1e-3, 1e-4, 1e-4])
+    losses = method.train_step(batch, 3)
+    total = sum(method.weights_at(3)[name] * value for name, value in losses.items() if name != "total")
+    assert losses["total"] == pytest.approx(total, rel=1e-5)
+    assert make(lambda_smooth_end=None).weights_at(5) == make().weights
+
+
+def test_a_weight_on_the_volume(batch) -> None:
+    assert "volume" not in make().train_step(batch, 1)
+    method = make(lambda_volume=0.1)
+    assert method.train_step(batch, 1)["volume"] > 0
 
 
 def test_the_loss_at_unseen_views_waits_for_a_full_memory(batch) -> None:
@@ -99,6 +117,7 @@ def test_an_image_and_its_mirror_image_have_one_code(batch) -> None:
 
 def test_an_interrupted_run_resumes_bit_for_bit(tiny_config, run_folder, tmp_path) -> None:
     options = {"preset": "plus-kato", "remembered": 8, "warmup_steps": 1, "iterations": 6, "schedule": "constant"}
+    options["lambda_smooth_end"] = None
     whole = tiny_config(tmp_path / "whole", **options)
     train(whole)
     train(dataclasses.replace(whole, output=run_folder, iterations=3))
@@ -107,6 +126,13 @@ def test_an_interrupted_run_resumes_bit_for_bit(tiny_config, run_folder, tmp_pat
     assert tensors[0].keys() == tensors[1].keys()
     assert "network.memory.masks" in tensors[0]
     assert all(torch.equal(a, tensors[1][name]) for name, a in tensors[0].items())
+
+
+def test_the_length_of_a_run_whose_smoothness_falls_is_kept(tiny_config, tmp_path) -> None:
+    config = tiny_config(tmp_path, preset="plus-kato", schedule="constant", iterations=6)
+    assert differences(dataclasses.replace(config, iterations=7), config) == [
+        "iterations: 6 in the run, 7 asked for (lambda_smooth_end depends on it)"
+    ]
 
 
 def test_presets() -> None:
