@@ -86,13 +86,15 @@ def test_names_of_objects_are_text(tmp_path, runs, tiny_set, monkeypatch) -> Non
 
 @pytest.mark.parametrize("which", ["last", "best"])
 def test_figures_are_those_of_evaluate(tmp_path, runs, which) -> None:
-    write_report(runs, tmp_path / "page.html", split="train", which=which)
+    path = tmp_path / "page.html"
+    write_report(runs, path, split="train", which=which)
     wanted = evaluate_runs(runs, split="train", which=which)["results"]
-    found = Page(tmp_path / "page.html")
-    rows = [text.strip() for text in found.texts]
-    for result in wanted:
-        assert f"{result['voxel_iou_kato18']:.3f}" in rows
-        assert f"{result['mmd']:.3f}" in rows if result["mmd"] is not None else "–" in rows
+    found = Page(path)
+    rows = re.findall(r"<b>(.+)</b> \[(.+), (.+)\]</td>\n<td>[^<]*</td><td>([^<]+)</td>", path.read_text())
+    assert len(rows) == 2 and rows[0] != rows[1]
+    for (iou, low, high, mmd), result in zip(rows, wanted, strict=True):
+        assert (iou, mmd) == (f"{result['voxel_iou_kato18']:.3f}", f"{result['mmd']:.3f}")
+        assert float(low) <= float(iou) <= float(high)
     method, config, _ = checkpoint.load_method(checkpoint.find(runs[0], which))
     dataset = checkpoint.load_data(config, "train")
     ious = evaluate(method, dataset).ious["kato18"].numpy()
@@ -107,7 +109,7 @@ def test_figures_are_those_of_evaluate(tmp_path, runs, which) -> None:
 def test_objects_go_from_the_best_to_the_worst(page) -> None:
     items = Page(page).data["items"]
     means = [np.mean(item["means"]) for item in items]
-    rows = re.findall(
+    rows = re.findall(r"<b>(.+)</b> \[(.+), (.+)\]</td>\n<td>[^<]*</td><td>([^<]+)</td>", path.read_text())
         r"<tr( data-item=\"\d+\")?><th scope=\"row\">(?:<button type=\"button\">)?(\d+)", page.read_text()
     )
     assert len(items) == 2 and means[0] > means[1]
