@@ -61,7 +61,7 @@ function makePanes(chosen) {
   });
 }
 
-async function drawPanes() {
+function drawPanes() {
   const shown = page.items[item], reach = shown.reach;
   const axis = { visible: false, range: [-reach, reach], autorange: false };
   for (const { mesh, scene, title } of panes) {
@@ -72,15 +72,14 @@ async function drawPanes() {
     if (run) element(title, "i").style.background = run.color;
     title.append(name + score + (empty ? " (empty)" : ""));
     scene.setAttribute("aria-label", `${name}${score}: 3D shape; arrow keys turn it, plus and minus bring it nearer`);
-    const trace = { type: "mesh3d", x, y, z, ...page.faces[faces], color: color("--clay"), flatshading: true, hoverinfo: "skip",
+    const trace = { type: "mesh3d", x, y, z, ...page.faces[faces], color: color("--clay"), hoverinfo: "skip",
       lighting: { ambient: 0.35, diffuse: 0.7, specular: 0.05, roughness: 0.8, fresnel: 0.05 }, lightposition: { x: -1e5, y: 1e5, z: 5e4 } };
-    const drawn = Plotly.react(scene, empty ? [] : [trace], layout(() => ({ margin: { l: 0, r: 0, t: 0, b: 0 },
+    Plotly.react(scene, empty ? [] : [trace], layout(() => ({ margin: { l: 0, r: 0, t: 0, b: 0 },
       scene: { xaxis: axis, yaxis: axis, zaxis: axis, aspectmode: "cube", dragmode: "turntable", camera } })), config);
     if (!scene.ready) {
       scene.ready = true;
       for (const event of ["plotly_relayouting", "plotly_relayout"]) scene.on(event, moved => follow(scene, moved["scene.camera"]));
     }
-    await drawn;
   }
 }
 
@@ -115,7 +114,7 @@ function show(number) {
   Object.assign(find("picture"), { src: image, alt: `Input image: ${name}, view ${view}` });
   find("items").querySelectorAll("input")[item].checked = true;
   for (const row of find("objects").tBodies[0].rows) row.classList.toggle("chosen", Number(row.dataset.item ?? -1) === item);
-  return drawPanes();
+  drawPanes();
 }
 
 // Choosing: images, objects of the table, runs where there are more than scenes.

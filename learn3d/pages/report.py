@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-import io
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -14,33 +13,27 @@ import jinja2
 import numpy as np
 import torch
 from markupsafe import Markup
-from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from learn3d.config import TrainConfig
-from learn3d.data.conventions import mesh_to_object
-from learn3d.data.dataset import ViewDataset
-from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.experiments.evaluation_report import MEANINGS
 from learn3d.experiments.plan import command_line
 from learn3d.experiments.statistics import Interval, percentile_interval, resampled_means
-from learn3d.figures import Surface, as_meshes, azimuths_deg, natural_colors
+from learn3d.figures import azimuths_deg
 from learn3d.figures.curves import TITLES, panels, read_metrics
 from learn3d.figures.plots import COLORS
 from learn3d.figures.polar import profile
 from learn3d.figures.runs import Run, open_runs
 from learn3d.files import writing
-from learn3d.methods.surfaces import grid_surface
+from learn3d.pages.shapes import Faces, pack_shapes
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.runs.checkpoint import Metadata
 from learn3d.terminal import plain
 
 POINTS = 500  # of a curve; of more, every n-th is drawn
-UNIT = 1e-4  # of stored coordinates, which are int16: they reach to 3.3, objects to 1
-#: From the object frame to the browser's axes: those of mesh files, turned so that z is up.
-_TO_PAGE = mesh_to_object() @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+MOST_SHOWN = 100  # images with shapes; each takes some 40 kB
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +53,7 @@ class Measured:
         sums = np.bincount(ids[known], weights=self.ious[known], minlength=size)
         return sums, np.bincount(ids[known], minlength=size).astype(np.float64)
 
+    @functools.cached_property
     def object_means(self) -> np.ndarray:
         """Mean IoU of each object, float64 [N], NaN where it has none."""
         sums, counts = self.by_object()
@@ -92,8 +86,8 @@ def write_report(
     where = {"data": data, "category": category, "split": split, "which": which, "device": device}
     runs = open_runs(paths, labels=labels, report_progress=report_progress, **where)
     _check_same_images(runs)
-    if objects < 1:
-        raise ValueError(f"objects must be at least 1, the number of objects with shapes, got {objects}")
+    if not 1 <= (count := len(indices) or objects) <= MOST_SHOWN:
+        raise ValueError(f"shapes can be shown of 1 to {MOST_SHOWN} images, and {count} are asked for")
     runs[0].dataset.batch(torch.tensor(indices, dtype=torch.int64))  # says which indices there are
     measured = []
     for run, about, path in zip(runs, abouts, paths, strict=True):
@@ -102,7 +96,8 @@ def write_report(
         values = next(iter(result.ious.values()), result.silhouette_iou)
         ious = np.full(len(run.dataset), np.nan) if values is None else values.double().numpy()
         measured.append(Measured(run, about, Path(path), result, ious))
-    page = _page(measured, _chosen(measured, objects, indices)) | {"split": split, "which": which}
+    ranked = _ranked(measured)
+    page = _page(measured, ranked, _chosen(measured, ranked, objects, indices)) | {"split": split, "which": which}
     page["data"] = plain(Path(data or abouts[0].config.data).name)
     content = _render(page).encode()
     writing.write_bytes(output, content)
@@ -130,67 +125,73 @@ def _check_same_images(runs: Sequence[Run]) -> None:
             raise ValueError(f"{run.label} and {runs[0].label} read different images of this data; report them apart")
 
 
-def _chosen(measured: Sequence[Measured], objects: int, indices: Sequence[int]) -> list[int]:
-    """The images whose shapes are shown, from the best object to the worst by the mean over the runs."""
-    dataset = measured[0].run.dataset
-    means, ious = _mean([m.object_means() for m in measured]), _mean([m.ious for m in measured])
-    present = np.unique(dataset.object_ids)
-    ranked = present[np.argsort(-np.nan_to_num(means[present], nan=-1.0), kind="stable")]
+def _ranked(measured: Sequence[Measured]) -> np.ndarray:
+    """The objects that have images, int64 [n], from the best to the worst by the mean over the runs."""
+    present = np.unique(measured[0].run.dataset.object_ids)
+    means = _mean([m.object_means for m in measured])[present]
+    return present[np.argsort(-np.nan_to_num(means, nan=-1.0), kind="stable")]
+
+
+def _chosen(measured: Sequence[Measured], ranked: np.ndarray, objects: int, indices: Sequence[int]) -> list[int]:
+    """The images whose shapes are shown, the best object first."""
+    ids, ious = measured[0].run.dataset.object_ids, _mean([m.ious for m in measured])
     if not indices:
-        numbers = ranked[np.unique(np.linspace(0, len(ranked) - 1, min(objects, len(ranked))).round().astype(int))]
-        for number in numbers:
-            samples = np.flatnonzero(dataset.object_ids == number)
+        means = _mean([m.object_means for m in measured])
+        for number in ranked[np.unique(np.linspace(0, len(ranked) - 1, min(objects, len(ranked))).round().astype(int))]:
+            samples = np.flatnonzero(ids == number)
             indices = [*indices, samples[np.nan_to_num(np.abs(ious[samples] - means[number]), nan=9.0).argmin()]]
     place = {number: rank for rank, number in enumerate(ranked)}
-    return sorted(map(int, dict.fromkeys(indices)), key=lambda sample: place[dataset.object_ids[sample]])
+    return sorted(map(int, dict.fromkeys(indices)), key=lambda sample: place[ids[sample]])
 
 
-def _page(measured: Sequence[Measured], samples: Sequence[int]) -> dict[str, Any]:
+def _page(measured: Sequence[Measured], ranked: np.ndarray, samples: Sequence[int]) -> dict[str, Any]:
     """All that the template is filled with; "browser" is for its script."""
-    dataset, kind = measured[0].run.dataset, measured[0].result.chosen_by[0]
+    dataset, first = measured[0].run.dataset, measured[0]
+    kind = "silhouette IoU" if dataset.voxels is None else "voxel IoU"
     colors = [COLORS[number % (len(COLORS) - 1)] for number in range(len(measured))]  # the last is black
-    names = [plain(m.run.label) for m in measured]
-    sums = [resampled_means(*([part] for part in m.by_object())) for m in measured]
-    rows = [_row(m, resampled, sums[0], measured[0]) for m, resampled in zip(measured, sums, strict=True)]
-    means = [m.object_means() for m in measured]
-    item = {int(dataset.object_ids[sample]): number for number, sample in reversed(list(enumerate(samples)))}
-    order = np.argsort(-np.nan_to_num(_mean(means), nan=-1.0), kind="stable")
+    runs = [{"name": plain(m.run.label), "color": color} for m, color in zip(measured, colors, strict=True)]
+    faces: Faces = {}
+    items = pack_shapes([m.run for m in measured], samples, faces)
+    for item in items:
+        item["ious"] = [_number(m.ious[item["index"]], 4) for m in measured]
+        item["means"] = [_number(m.object_means[dataset.object_ids[item["index"]]], 4) for m in measured]
+    place = {int(dataset.object_ids[sample]): number for number, sample in reversed(list(enumerate(samples)))}
     objects = [
-        {"name": _object_name(dataset, n), "ious": [_number(mean[n], 4) for mean in means], "item": item.get(n)}
-        for n in map(int, order)
-        if (dataset.object_ids == n).any()
+        {
+            "name": plain(dataset.object_names[number]),
+            "ious": [_number(m.object_means[number], 4) for m in measured],
+            "item": place.get(number),
+        }
+        for number in map(int, ranked)
     ]
-    faces: dict[tuple, int] = {}
-    shown = _shapes(measured, samples, faces)
     profiles = []
     if dataset.poses is not None:
         azimuths, none = azimuths_deg(dataset.poses).numpy(), np.full(len(dataset), np.nan)
-        profiles = [profile(m.run.label, azimuths, m.ious, none, dataset.object_ids).to_json() for m in measured]
+        profiles = [profile(m.run.label, azimuths, m.ious, none, dataset.object_ids) for m in measured]
     browser = {
-        "runs": [{"name": name, "color": color} for name, color in zip(names, colors, strict=True)],
-        "items": shown,
+        "runs": runs,
+        "items": items,
         "faces": [{axis: {"dtype": k[0], "bdata": k[1 + n]} for n, axis in enumerate("ijk")} for k in faces],
-        "unit": UNIT,
         "kind": kind,
-        "views": [{"azimuths": p["azimuths_deg"], "ious": [_number(x, 4) for x in p["iou"]]} for p in profiles],
+        "views": [{"azimuths": p.azimuths_deg.tolist(), "ious": [_number(x, 4) for x in p.iou]} for p in profiles],
         "curves": _curves([m.path for m in measured]),
     }
     return {
-        "runs": [row | run for row, run in zip(rows, browser["runs"], strict=True)],
+        "runs": [_row(m, first) | run for m, run in zip(measured, runs, strict=True)],
         "category": plain(dataset.category),
         "images": len(dataset),
         "objects": objects,
         "kind": kind,
-        "meaning": MEANINGS["silhouette_iou" if kind == "silhouette IoU" else "voxel_iou_kato18"],
+        "meaning": MEANINGS["silhouette_iou" if dataset.voxels is None else "voxel_iou_kato18"],
         "mmd": MEANINGS["mmd"],
-        "items": shown,
         "truth": dataset.voxels is not None,
         "browser": browser,
     }
 
 
-def _row(m: Measured, resampled: np.ndarray, first: np.ndarray, baseline: Measured) -> dict[str, Any]:
+def _row(m: Measured, baseline: Measured) -> dict[str, Any]:
     """A run as the page's first table has it."""
+    resampled, first = (resampled_means(*([part] for part in of.by_object())) for of in (m, baseline))
     config, step, kept = m.about.config, m.about.progress.step, m.about.versions
     commit = kept.get("commit") or ""
     code = [kept.get("nmr-learn3d"), commit[:9] + "-dirty" * commit.endswith("-dirty"), f"torch {kept.get('torch')}"]
@@ -215,72 +216,6 @@ def _row(m: Measured, resampled: np.ndarray, first: np.ndarray, baseline: Measur
     }
 
 
-def _shapes(measured: Sequence[Measured], samples: Sequence[int], faces: dict[tuple, int]) -> list[dict[str, Any]]:
-    """For each of the images the picture, the true shape and that of each run; their triangles go into `faces`."""
-    largest = max((m.run.dataset for m in measured), key=lambda dataset: dataset.image_size)
-    batch = largest.batch(torch.tensor(samples))
-    with torch.no_grad():
-        chosen = [m.run.dataset.batch(torch.tensor(samples)).images for m in measured]
-        shapes = [
-            as_meshes(m.run.method.decode(m.run.method.encode(images)))
-            for m, images in zip(measured, chosen, strict=True)
-        ]
-    if batch.voxels is not None:
-        grids = largest.convention.to_object(batch.voxels).float()
-        shapes.append([Surface(*grid_surface(grid, box=largest.convention.box)) for grid in grids])
-    pictures = natural_colors(batch.images.numpy(), inverted=largest.inverted)
-    eyes = _eyes(batch.poses, len(samples))
-    items = []
-    for number, sample in enumerate(samples):
-        surfaces = [of_run[number] for of_run in shapes]
-        points = [np.rint(s.vertices.double().numpy() @ _TO_PAGE / UNIT).clip(-32767, 32767) for s in surfaces]
-        items.append(
-            {
-                "name": _object_name(largest, int(batch.object_ids[number])),
-                "view": plain(largest.view_names[int(batch.view_ids[number])]),
-                "index": sample,
-                "image": _picture(pictures[number]),
-                "eye": [_number(x, 4) for x in eyes[number]],
-                "reach": max([float(np.linalg.norm(p, axis=1).max()) for p in points if len(p)], default=1.0),
-                "ious": [_number(m.ious[sample], 4) for m in measured],
-                "means": [_number(m.object_means()[int(batch.object_ids[number])], 4) for m in measured],
-                "meshes": [_mesh(p, s.faces.numpy(), faces) for p, s in zip(points, surfaces, strict=True)],
-            }
-        )
-    return items
-
-
-def _mesh(points: np.ndarray, triangles: np.ndarray, faces: dict[tuple, int]) -> dict[str, Any]:
-    """A mesh in plotly's form. Triangles are stored once: the meshes of most runs have them in common.
-
-    points [V, 3] in units of `UNIT`; triangles int64 [F, 3], turned over here as the object frame is left-handed.
-    """
-    dtype = "u2" if len(points) <= 2**16 else "u4"
-    key = (dtype, *(_base64(triangles[:, corner], dtype) for corner in (0, 2, 1)))
-    packed = {axis: {"dtype": "i2", "bdata": _base64(points[:, n], "i2")} for n, axis in enumerate("xyz")}
-    return packed | {"faces": faces.setdefault(key, len(faces)), "empty": len(triangles) == 0}
-
-
-def _base64(values: np.ndarray, dtype: str) -> str:
-    return base64.b64encode(values.astype(f"<{dtype}").tobytes()).decode()
-
-
-def _picture(rgb: np.ndarray) -> str:
-    """An image uint8 [S, S, 3] as the address of a PNG."""
-    file = io.BytesIO()
-    Image.fromarray(rgb).save(file, "png")
-    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
-
-
-def _eyes(poses: Poses | None, count: int) -> np.ndarray:
-    """Directions from the objects to their cameras in the page's axes, float64 [count, 3]; oblique where not known."""
-    if poses is None:
-        poses = LookAtPoses(torch.full((count,), -30.0), 20.0, 1.0, 15.0)
-    eyes = poses.features() if isinstance(poses, LookAtPoses) else -poses.rotation[:, 2]
-    eyes = eyes.double().numpy() @ _TO_PAGE
-    return eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
-
-
 def _curves(paths: Sequence[Path]) -> list[dict[str, Any]]:
     """The logged numbers as panels, validation first, with a line of each run; a checkpoint file has no log."""
     logs = [read_metrics(path) if path.is_dir() else {} for path in paths]
@@ -294,10 +229,6 @@ def _curves(paths: Sequence[Path]) -> list[dict[str, Any]]:
         title = plain(f"{TITLES.get(name, name)}, {split}")
         found.append({"title": title, "steps": steps, "values": known, "log": log_scale})
     return found
-
-
-def _object_name(dataset: ViewDataset, number: int) -> str:
-    return plain(dataset.object_names[number])
 
 
 def _mean(values: Sequence[np.ndarray]) -> np.ndarray:

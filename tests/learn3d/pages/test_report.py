@@ -21,7 +21,8 @@ from learn3d.evaluation import evaluate
 from learn3d.experiments.evaluation_report import evaluate_runs
 from learn3d.methods import Grids
 from learn3d.pages import report
-from learn3d.pages.report import UNIT, write_report
+from learn3d.pages.report import write_report
+from learn3d.pages.shapes import UNIT
 from learn3d.runs import checkpoint
 
 
@@ -201,7 +202,8 @@ def test_the_command_writes_the_page(tmp_path, runs, tiny_folder, command) -> No
         ("{run} --category chair,sofa --output {tmp}/page.html", "one class"),
         ("{run} --data {tmp}/no --output {tmp}/page.html", "--data"),
         ("{run} --indices 24 --output {tmp}/page.html", "indices must lie in 0 .. 23"),
-        ("{run} --objects 0 --output {tmp}/page.html", "objects must be at least 1"),
+        ("{run} --objects 0 --output {tmp}/page.html", "of 1 to 100 images, and 0 are"),
+        ("{run} --objects 101 --output {tmp}/page.html", "of 1 to 100 images, and 101 are"),
         ("{run} --labels a b --output {tmp}/page.html", "one label per run"),
     ],
 )
