@@ -21,6 +21,7 @@ COMMANDS = {
     "check-dataset": "list everything that is wrong with a data set",
     "experiment": "make a table of the paper: train, measure, report",
     "figures": "draw the paper's figures from trained models",
+    "report": "write a page about trained models, with shapes to turn",
     "fetch-debian-models": "get meshes out of Debian packages",
 }
 HELP = """usage: learn3d COMMAND [OPTIONS]
@@ -71,6 +72,8 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
         from learn3d.commands.experiment import run
     elif name == "figures":
         from learn3d.commands.figures import run
+    elif name == "report":
+        from learn3d.commands.report import run
     else:
         from learn3d.commands.fetch_debian_models import run
     return run

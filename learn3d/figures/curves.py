@@ -102,7 +102,7 @@ def plot_curves(runs: Mapping[str, Sequence[Mapping[Key, Curve]]]) -> Figure:
     """
     from matplotlib.figure import Figure
 
-    keys = _panels(runs)
+    keys = panels(runs)
     columns = min(3, len(keys))
     rows = math.ceil(len(keys) / columns)
     figure = Figure(figsize=(3.5 * columns, 2.5 * rows + 0.4))
@@ -121,7 +121,7 @@ def plot_curves(runs: Mapping[str, Sequence[Mapping[Key, Curve]]]) -> Figure:
     return figure
 
 
-def _panels(runs: Mapping[str, Sequence[Mapping[Key, Curve]]]) -> list[Key]:
+def panels(runs: Mapping[str, Sequence[Mapping[Key, Curve]]]) -> list[Key]:
     """Which numbers to show, in order: validation first, then losses."""
     keys = list(dict.fromkeys(key for curves in runs.values() for run in curves for key in run))
     if not keys:

@@ -12,6 +12,7 @@ SOURCES = Path(learn3d.__file__).parent
 FLOORS = (
     {"__main__"},
     {"commands"},
+    {"pages"},
     {"experiments"},
     {"training", "reconstruction"},
     {"validation"},

@@ -1,0 +1,1 @@
+"""Pages about trained runs that open in a browser, each one HTML file that needs nothing else."""
