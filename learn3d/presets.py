@@ -150,6 +150,8 @@ _PLUS = replace(
     _KATO,
     label="Plus",
     settings=PlusSettings(),
+    iterations=80_000,
+    batch_size=32,
     source="docs/methods/plus.md",
     augment=("colors",),
     schedule="cosine",

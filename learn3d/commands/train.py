@@ -70,6 +70,7 @@ def _options_of(name: str) -> TrainConfig:
         value = tyro.MISSING if field.default is dataclasses.MISSING else field.default
         object.__setattr__(options, field.name, getattr(preset, field.name, value))
     object.__setattr__(options, "preset", name)
+    object.__setattr__(options, "warmup_steps", None)  # the preset's, but at most a tenth of the run
     return options
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d.config import TrainConfig
+from learn3d.config import DEFAULT_PRESET, TrainConfig
 from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.experiments.tables import Row, Table, Variant
 from learn3d.presets import PRESETS
@@ -125,7 +125,12 @@ def _configure(
     preset = PRESETS[variant.preset]
     changes = dict(variant.changes) | given
     setting_names = {field.name for field in dataclasses.fields(preset.settings)}
-    iterations = options.iterations or preset.iterations
+    parts = variant.smaller_batches
+    whole = PRESETS[DEFAULT_PRESET] if parts > 1 else preset
+    iterations = (options.iterations or whole.iterations) * parts
+    batch_size = options.batch_size or whole.batch_size
+    if batch_size % parts:
+        raise ValueError(f"{variant.name} divides batches by {parts}: batch_size must be a multiple, got {batch_size}")
     # PrGAN's encoder is trained in the second half, however long it is.
     settings = {"encoder_from_step": iterations // 2 + 1} if "encoder_from_step" in setting_names else {}
     settings |= {name: value for name, value in changes.items() if name in setting_names}
@@ -136,8 +141,8 @@ def _configure(
         preset=variant.preset,
         settings=dataclasses.replace(preset.settings, **settings),
         layout=options.layout or table.layout,
-        iterations=options.iterations,
-        batch_size=options.batch_size,
+        iterations=iterations,
+        batch_size=batch_size // parts,
         seed=seed,
         device=options.device,
         threads=options.threads,

@@ -34,6 +34,8 @@ class PlusSettings(PoseInvariantSettings):
     free."""
     learning_rate: Positive = 4e-4
     """Adam's step size, the same for the three networks. The preset warms it up and lets it fall to 0."""
+    lambda_smooth: Weight = 5e-4
+    """As for the proposed method."""
     lambda_smooth_end: Positive | None = 1e-4
     """As for the proposed method."""
     lambda_unseen: Weight = 0.5

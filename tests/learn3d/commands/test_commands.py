@@ -280,3 +280,9 @@ def test_interrupting_the_command_saves_and_ends_well(tiny_folder, run_folder) -
     assert "--resume" in err
     assert out.startswith("stopped at step ")
     assert (run_folder / "last.safetensors").exists()
+
+
+@pytest.mark.parametrize(("options", "steps"), [([], 100), (["--iterations", "60"], 6), (["--warmup-steps", "9"], 9)])
+def test_the_warm_up_of_a_preset_is_a_tenth_of_a_short_run(options: list[str], steps: int) -> None:
+    given = ["--data", "d", "--category", "chair", "--output", "o", "--preset", "plus"]
+    assert train_command.read([*given, *options]).config.warmup_steps == steps

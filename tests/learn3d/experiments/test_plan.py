@@ -47,6 +47,18 @@ def test_schedules_follow_the_number_of_iterations(tmp_path, options) -> None:
             ), "what is not changed is as published"
 
 
+def test_smaller_batches_show_as_many_images(tmp_path) -> None:
+    def sizes(**asked: int) -> set[tuple[str, int, int]]:
+        options = Options(tmp_path, tmp_path, ("chair",), ("proposed", "proposed-shared", "plus"), seeds=1, **asked)
+        return {(r.variant.name, r.config.iterations, r.config.batch_size) for r in plan_runs(TABLES["plus"], options)}
+
+    small = {("proposed-shared", 80_000, 32), ("plus", 80_000, 32)}
+    assert sizes() == {("proposed", 20_000, 128)} | small
+    assert sizes(iterations=50, batch_size=8) == {("proposed", 50, 8), ("proposed-shared", 200, 2), ("plus", 200, 2)}
+    with pytest.raises(ValueError, match="divides batches by 4: batch_size must be a multiple, got 6"):
+        sizes(batch_size=6)
+
+
 def test_changes_reach_the_methods_that_they_name(options) -> None:
     changes = ("precision=fp32", "Vanilla-AE:learning-rate=3e-4", "lambda_smooth=0.5", "augment=flip-image,channels")
     vanilla, proposed = plan_runs(TABLES["kato"], options(changes=changes))
