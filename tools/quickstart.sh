@@ -7,35 +7,43 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . tools/setup.sh
 
 category=${1:-airplane}
-steps=${STEPS:-800}
+steps=${STEPS:-2400} # of 32 images; Vanilla-AE takes a quarter of the steps, of 128 images, as published
 objects=${OBJECTS:-250}
 out=$PWD/quickstart
 [ -z "${OUT:-}" ] || case $OUT in /*) out=$OUT ;; *) out=$here/$OUT ;; esac
 trap 'echo; echo "stopped; what is finished is in $out"; exit 130' INT
 
-setup train
+setup report
 mkdir -p "$out" || fail "cannot make the folder $out"
 
 step "Making $objects ${category}s, each rendered from 24 views"
 "$python" tools/make_dataset.py --output "$out/data" --category "$category" --procedural "$objects" --overwrite
 
-for method in proposed vanilla; do
-    step "Training the method '$method' for $steps steps"
-    "$python" tools/train.py --data "$out/data" --category "$category" --preset "$method" --output "$out/$method" \
-        --overwrite --iterations "$steps" --validate-every 200 --pictures-every 200 --checkpoint-every 200
-done
+train() { # method, steps
+    step "Training the method '$1' for $2 steps"
+    "$python" tools/train.py --data "$out/data" --category "$category" --preset "$1" --output "$out/$1" \
+        --overwrite --iterations "$2" --validate-every $(($2 / 4)) --pictures-every $(($2 / 4)) --checkpoint-every $(($2 / 4))
+}
+train plus "$steps"
+train vanilla $((steps / 4))
 
 step "Measuring both on the test objects, which neither has seen"
-"$python" tools/evaluate.py "$out/proposed" "$out/vanilla" --data "$out/data" --json "$out/evaluation.json"
+"$python" tools/evaluate.py "$out/plus" "$out/vanilla" --data "$out/data" --json "$out/evaluation.json"
 
 step "Reconstructing four test images"
-"$python" tools/reconstruct.py --run "$out/proposed" --data "$out/data" --indices 31 85 58 15 --output "$out/meshes"
+"$python" tools/reconstruct.py --run "$out/plus" --data "$out/data" --indices 31 85 58 15 --output "$out/meshes"
+
+step "Writing the report"
+"$python" tools/report.py "$out/plus" "$out/vanilla" --data "$out/data" --output "$out/report.html"
 
 cat <<TEXT
 
-Look at:
+Open in a browser:
+  $out/report.html    both methods on test objects: figures, curves, and meshes to turn by hand
+
+Also there:
   the data           $(ls "$out"/data/*_contact.png)
-  while it learned   $out/proposed/pictures/   (rows: input, target, rendering, new views; beside it $out/vanilla/pictures/)
-  reconstructions    $out/meshes/              (a mesh, a turntable GIF and a strip of views for each image)
+  while it learned   $out/plus/pictures/   (rows: input, target, rendering, new views; beside it $out/vanilla/pictures/)
+  reconstructions    $out/meshes/          (a mesh, a turntable GIF and a strip of views for each image)
   the figures        $out/evaluation.json
 TEXT

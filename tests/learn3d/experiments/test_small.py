@@ -1,6 +1,6 @@
 """Every table of the paper in small: `learn3d experiment` from its command line to its reports.
 
-Procedural airplanes in three layouts, small networks, two steps of batch 8: the figures say nothing, but each of the 23
+Procedural airplanes in three layouts, small networks, two steps of batch 8: the figures say nothing, but each of the
 runs is planned, trained, measured, shared between tables and reported as in the real thing. Then the one preset that
 no table has, on two categories. (Runs in processes of their own are the matter of `test_runs`.)
 """
@@ -57,7 +57,7 @@ SMALLER = {
     "multi-view": _SMALL,
     **dict.fromkeys(("plus", "plus-without-symmetry", "plus-without-unseen"), (*_SMALL, "remembered=4")),
     **{f"{name}-schedule-symmetry": (*_SMALL, "warmup_steps=1") for name in ("vanilla", "proposed")},
-    "proposed-schedule": (*_SMALL, "warmup_steps=1"),
+    **dict.fromkeys(("proposed-schedule", "vanilla-shared", "proposed-shared"), (*_SMALL, "warmup_steps=1")),
     **{f"single-{name}": _SMALL for name in ("vanilla", "proposed", "plus")},
     "kar-vanilla": _SMALL,
     **{f"bins-{widths}": _SMALL for widths in VIEW_CLASSES},
