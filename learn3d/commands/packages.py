@@ -1,6 +1,6 @@
 """Optional packages: what to say where one is not installed."""
 
-_EXTRAS = {"matplotlib": "figures", "sklearn": "figures"}  # the others belong to "train"
+_EXTRAS = {"matplotlib": "figures", "sklearn": "figures", "gradio": "demo"}  # the others belong to "train"
 
 
 def missing_package(package: str) -> str:
