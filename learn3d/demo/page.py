@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -26,6 +27,9 @@ from learn3d.terminal import stop_on_signal
 os.environ |= {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_OFFLINE": "1"}  # before gradio is imported
 import gradio as gr  # noqa: E402
 
+if TYPE_CHECKING:
+    from gradio.data_classes import FileData
+
 UPLOAD_BYTES = 32 * 2**20
 WAITING = 16  # visitors; the next one is asked to come back
 _MASK = (230, 50, 60)
@@ -33,38 +37,32 @@ _CANVAS = 320  # pixels of a silhouette
 _STRENGTH = 0.55  # opacity of the mask over the picture
 _PICTURES = [".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"]
 _ALONE = {"concurrency_limit": 1, "concurrency_id": "networks", "show_progress": "minimal"}  # one visitor at a time
-_DRAWING = {
-    "sources": [],
-    "transforms": [],
-    "layers": False,
-    "brush": gr.Brush(20, [(f"rgb{_MASK}", _STRENGTH)], color_mode="fixed"),
-    "eraser": gr.Eraser(20),
-    "buttons": [],
-    "format": "png",
-    "fixed_canvas": True,
-}
+_EDITOR = {"sources": [], "transforms": [], "layers": False, "buttons": [], "format": "png", "fixed_canvas": True}
+_EDITOR |= {"brush": gr.Brush(20, [(f"rgb{_MASK}", _STRENGTH)], color_mode="fixed"), "eraser": gr.Eraser(20)}
 _THEME = gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
 
 
-class Drawing(gr.ImageEditor):
-    """A picture to draw on. Of what a browser sends only the layers are read, as any stranger's picture."""
+def _layer(file: bytes | FileData | None, flatten_on_white: bool = False) -> np.ndarray | None:
+    """Opacity uint8 [H,W] of a layer that a browser sends; None for the background and the composite."""
+    if file is None or flatten_on_white:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "drawing") if isinstance(file, bytes) else Path(file.path)
+        if isinstance(file, bytes):
+            path.write_bytes(file)
+        colors, alpha = read_picture(path, picture_tab.SIDE)
+    return np.full(colors.shape[:2], 255, np.uint8) if alpha is None else alpha
 
-    is_template = True  # of gradio: it looks and works as ImageEditor does
 
-    def convert_and_format_image(self, file, flatten_on_white: bool = False):  # noqa: ANN001, ANN201
-        """Opacity uint8 [H,W] of a layer (bytes, or gradio's FileData); None for the background and the composite."""
-        if file is None or flatten_on_white:
-            return None
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, "drawing") if isinstance(file, bytes) else Path(file.path)
-            if isinstance(file, bytes):
-                path.write_bytes(file)
-            colors, alpha = read_picture(path, picture_tab.SIDE)
-        return np.full(colors.shape[:2], 255, np.uint8) if alpha is None else alpha
+def _drawing(**options: Any) -> gr.ImageEditor:
+    """A picture to paint a mask on, which is read as any stranger's picture."""
+    editor = gr.ImageEditor(**_EDITOR, **options)
+    editor.convert_and_format_image = _layer  # gradio's own opens what the browser sends in this process
+    return editor
 
 
 def drawn(value: dict | None) -> np.ndarray | None:
-    """What is painted in any layer of a `Drawing`, uint8 [H,W], 0 or 255; None: there is nothing to paint on."""
+    """What is painted in any layer of a drawing, uint8 [H,W], 0 or 255; None: there is nothing to paint on."""
     layers = value["layers"] if value else []
     return 255 * (np.max(layers, axis=0) > 64).astype(np.uint8) if layers else None
 
@@ -144,11 +142,7 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
             given = gr.File(label="Picture", height=140, file_types=_PICTURES)
             with gr.Row():
                 examples = [gr.Button(category, size="sm", min_width=60) for category in CATEGORIES]
-            editor = Drawing(
-                label="Mask: paint the object red",
-                canvas_size=(picture_tab.SIDE, picture_tab.SIDE),
-                **_DRAWING,
-            )
+            editor = _drawing(label="Mask: paint the object red", canvas_size=(picture_tab.SIDE, picture_tab.SIDE))
             tolerance = gr.Slider(0, 1, picture_tab.TOLERANCE, label="Threshold: how far from the background's colour")
             removed = gr.Button("Find the object (rembg)", visible=find_spec("rembg") is not None)
         with gr.Column(scale=3, min_width=320):
@@ -195,7 +189,7 @@ def fit_page(root: Path) -> None:
         examples = [gr.Button(category, size="sm", min_width=60) for category in CATEGORIES]
     with gr.Row():
         value, size = {"background": white, "layers": [], "composite": None}, (_CANVAS, _CANVAS)
-        drawings = [Drawing(value, label=side, canvas_size=size, min_width=240, **_DRAWING) for side in SIDES]
+        drawings = [_drawing(value=value, label=side, canvas_size=size, min_width=240) for side in SIDES]
     with gr.Row():
         start = gr.Button("Fit", variant="primary")
         stop = gr.Button("Stop")
