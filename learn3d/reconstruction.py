@@ -227,8 +227,7 @@ def reconstruct_files(
     """Reconstruct image files with the networks of a run (see `load_model`) and save the results in `folder`.
 
     `masks` is empty (the images have transparency) or as long as `images`. Where `poses` are given, one of each image,
-    shapes are fitted to the masks. Results have the images' names. `options` go to `save_reconstruction`. Returns the files
-    written.
+    shapes are fitted to the masks. `options` go to `save_reconstruction`. Returns the files, named after the images.
     """
     _check(options)
     if masks and len(masks) != len(images):

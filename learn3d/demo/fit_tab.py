@@ -20,8 +20,8 @@ from learn3d.make_data.shapes import make_shape
 SIDES = {"front": ((0, 0, -5), (0, 1, 0)), "side": ((5, 0, 0), (0, 1, 0)), "top": ((0, 5, 0), (0, 0, 1))}
 SIZE = 96  # pixels
 STEPS = 160
-_EVERY = 4  # steps, between two pictures
-_SMOOTHNESS = 3e-4
+_EVERY = 8  # steps, between two pictures
+_SMOOTHNESS = 1e-4
 _TARGET, _FITTED, _BOTH = (240, 170, 60), (70, 120, 200), (150, 150, 150)
 
 
@@ -51,7 +51,7 @@ def example_silhouettes(category: str, seed: int) -> dict[str, np.ndarray]:
 def fit(masks: Mapping[str, np.ndarray], steps: int = STEPS) -> Iterator[Moment]:
     """Fit a sphere to masks uint8 [H,W] (255: object), named by `SIDES`; empty ones are left out.
 
-    Minimises soft IoU loss + smoothness. The variable is (1 + 10 L) vertices with the Laplacian L: what pulls at one
+    Minimises soft IoU loss + smoothness. The variable is (1 + 3 L) vertices with the Laplacian L: what pulls at one
     vertex then moves its region (Nicolet et al. 2021). Raises ValueError where fewer than two sides are drawn.
     """
     masks = {side: mask for side, mask in masks.items() if mask is not None and (mask > 127).any()}
@@ -62,7 +62,7 @@ def fit(masks: Mapping[str, np.ndarray], steps: int = STEPS) -> Iterator[Moment]
     edges = nmr.edge_table(faces)
     neighbours = torch.zeros(len(sphere), len(sphere))
     neighbours[edges[:, :2], edges[:, :2].flip(1)] = 1
-    stiffness = torch.eye(len(sphere)) + 10 * (torch.diag(neighbours.sum(1)) - neighbours)
+    stiffness = torch.eye(len(sphere)) + 3 * (torch.diag(neighbours.sum(1)) - neighbours)
     softness = torch.linalg.inv(stiffness)
     shape = (stiffness @ (0.4 * sphere)).requires_grad_()
     optimizer = torch.optim.Adam([shape], lr=0.03)
@@ -72,7 +72,7 @@ def fit(masks: Mapping[str, np.ndarray], steps: int = STEPS) -> Iterator[Moment]
         loss = nmr.losses.soft_iou_loss(images, target)
         if step % _EVERY == 0 or step == steps:
             surface = Surface(vertices.detach(), faces)
-            yield Moment(step, 1 - float(loss), surface, _picture(surface, names, images.detach(), target, step))
+            yield Moment(step, 1 - loss.item(), surface, _picture(surface, names, images.detach(), target, step))
         optimizer.zero_grad()
         (loss + _SMOOTHNESS * nmr.losses.smoothness_loss(vertices, edges)).backward()
         optimizer.step()
@@ -87,5 +87,10 @@ def _small(mask: np.ndarray) -> Tensor:
 def _picture(surface: Surface, names: list[str], images: Tensor, target: Tensor, step: int) -> np.ndarray:
     palette = np.array([(255, 255, 255), _TARGET, _FITTED, _BOTH], np.uint8)
     overlays = palette[((target > 0.5) + 2 * (images > 0.5)).int().numpy()]
-    view = figures.draw_around(surface, [-30.0 - 2.0 * step], image_size=2 * SIZE)
-    return figures.tile([[*overlays, *view]], [*names, "mesh"], tile_size=2 * SIZE)
+    (view,) = figures.draw_around(surface, [-30.0 - 2.0 * step], image_size=2 * SIZE)
+    tiles = [
+        figures.tile([[picture]], [title], tile_size=2 * SIZE)
+        for picture, title in zip([*overlays, view], [*names, "mesh"], strict=True)
+    ]
+    rows = [np.concatenate(tiles[k : k + 2], axis=1) for k in range(0, len(tiles), 2)]
+    return figures.drawing.stacked(rows)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import gc
+import logging
 import os
 import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,17 +18,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
+from learn3d import figures
 from learn3d.data.framing import read_picture
 from learn3d.demo import fit_tab, picture_tab
 from learn3d.demo.fit_tab import SIDES
 from learn3d.demo.picture_tab import Picture
+from learn3d.figures import Surface
 from learn3d.files.findings import DamagedFile
 from learn3d.make_data.shapes import CATEGORIES
 from learn3d.reconstruction import Model, load_model
 from learn3d.terminal import stop_on_signal
 
 os.environ |= {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_OFFLINE": "1"}  # before gradio is imported
-import gradio as gr  # noqa: E402
+import gradio as gr
 
 if TYPE_CHECKING:
     from gradio.data_classes import FileData
@@ -46,7 +51,7 @@ def _layer(file: bytes | FileData | None, flatten_on_white: bool = False) -> np.
     """Opacity uint8 [H,W] of a layer that a browser sends; None for the background and the composite."""
     if file is None or flatten_on_white:
         return None
-    with tempfile.TemporaryDirectory() as folder:
+    with _told(), tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "drawing") if isinstance(file, bytes) else Path(file.path)
         if isinstance(file, bytes):
             path.write_bytes(file)
@@ -74,7 +79,7 @@ def _painted(mask: np.ndarray) -> np.ndarray:
     return layer
 
 
-def _editor(background: np.ndarray, mask: np.ndarray) -> dict:
+def _editor(background: np.ndarray | str, mask: np.ndarray) -> dict:
     return {"background": background, "layers": [_painted(mask)], "composite": None}
 
 
@@ -88,119 +93,138 @@ def _told() -> Iterator[None]:
         raise gr.Error(text, title="Not like this", print_exception=False) from None
 
 
-def _new_folder(root: Path) -> Path:
-    return Path(tempfile.mkdtemp(dir=root))
+def _files(surface_paths: tuple[Path, Path], azimuth_deg: float) -> tuple:
+    """What shows a GLB from this azimuth, and two buttons for GLB and OBJ."""
+    glb, obj = map(str, surface_paths)
+    camera = (180 + azimuth_deg, 70, None)  # degrees in the viewer's axes
+    return gr.Model3D(glb, camera_position=camera), *(gr.DownloadButton(value=f, interactive=True) for f in (glb, obj))
+
+
+def _viewer(label: str) -> list:
+    """A place for a mesh, and for its files."""
+    mesh = gr.Model3D(label=label, height=440, interactive=False)
+    with gr.Row():
+        return [mesh, *(gr.DownloadButton(k, size="sm", min_width=60, interactive=False) for k in ("GLB", "OBJ"))]
+
+
+def _example_buttons() -> dict[str, gr.Button]:
+    with gr.Row():
+        return {category: gr.Button(category, size="sm", min_width=60) for category in CATEGORIES}
+
+
+def _seed() -> int:
+    return time.time_ns() % 2**32
 
 
 def picture_page(models: dict[str, Model], root: Path) -> None:
-    """Tab 1."""
-    picture = gr.State()
-
-    def show(new: Picture) -> tuple:
-        return new, _editor(*new), *[None] * (3 * len(models))
+    """Tab 1: a picture and its mask on the left, the meshes of all models on the right."""
 
     def upload(path: str | None, tolerance: float) -> tuple:
-        if path is None:
-            return None, None, *[None] * (3 * len(models))
         with _told():
-            return show(picture_tab.open_picture(Path(path), tolerance))
+            new = picture_tab.open_picture(Path(path), tolerance)
+        return new, _editor(new.colors, new.mask)
 
     def threshold(old: Picture | None, tolerance: float) -> tuple:
         if old is None:
             return None, None
-        new = Picture(old.colors, picture_tab.threshold_mask(old.colors, tolerance))
-        return new, _editor(*new)
+        new = old._replace(mask=picture_tab.threshold_mask(old.colors, tolerance))
+        return new, _editor(new.colors, new.mask)
 
     def cut_out(old: Picture | None) -> tuple:
         import rembg
 
-        with _told():
-            if old is None:
-                raise ValueError("Give a picture first")
-            new = Picture(old.colors, np.asarray(rembg.remove(Image.fromarray(old.colors), only_mask=True)))
-            return new, _editor(*new)
+        if old is None:
+            return None, None
+        new = old._replace(mask=np.asarray(rembg.remove(Image.fromarray(old.colors), only_mask=True)))
+        return new, _editor(new.colors, new.mask)
 
-    def make(old: Picture | None, drawing: dict | None, chosen: list[str]) -> Iterator[tuple]:
+    def draw_example(category: str) -> tuple:
+        new = picture_tab.example(category, _seed())
+        return new, _editor(new.colors, new.mask)
+
+    def make(old: Picture | None, chosen: list[str], drawing: dict | None = None) -> list:
+        outputs = []
         with _told():
             if old is None:
                 raise ValueError("Give a picture first, or take an example")
             mask = drawn(drawing)
-            new = old if mask is None else Picture(old.colors, mask)
-            outputs = []
+            new = old if mask is None else old._replace(mask=mask)
             for label, model in models.items():
                 if label not in chosen:
-                    outputs += [gr.Model3D(visible=False), *[gr.DownloadButton(visible=False)] * 2]
+                    outputs += [gr.skip()] * 3
                     continue
-                found = picture_tab.make_mesh(model, new, _new_folder(root), label)
-                camera = (180 + found.azimuth_deg, 70, None)
-                outputs.append(gr.Model3D(str(found.glb), camera_position=camera, visible=True))
-                outputs += [gr.DownloadButton(value=str(path), visible=True) for path in (found.glb, found.obj)]
-            return tuple(outputs)
+                name = new.name if len(models) == 1 else f"{new.name} {label}"
+                outputs += _files(*picture_tab.make_mesh(model, new, Path(tempfile.mkdtemp(dir=root)), name))
+        return outputs
 
+    picture = gr.State()
     with gr.Row():
         with gr.Column(scale=2, min_width=320):
             given = gr.File(label="Picture", height=140, file_types=_PICTURES)
-            with gr.Row():
-                examples = [gr.Button(category, size="sm", min_width=60) for category in CATEGORIES]
-            editor = _drawing(label="Mask: paint the object red", canvas_size=(picture_tab.SIDE, picture_tab.SIDE))
-            tolerance = gr.Slider(0, 1, picture_tab.TOLERANCE, label="Threshold: how far from the background's colour")
+            examples = _example_buttons()
+            side = picture_tab.SIDE
+            editor = _drawing(label="Mask: paint the object red", canvas_size=(side, side))
+            tolerance = gr.Slider(0, 1, picture_tab.TOLERANCE, label="Threshold", info="Difference to the background")
             removed = gr.Button("Find the object (rembg)", visible=find_spec("rembg") is not None)
         with gr.Column(scale=3, min_width=320):
-            several = len(models) > 1
-            chosen = gr.CheckboxGroup(list(models), value=list(models), label="Models", visible=several)
+            chosen = gr.CheckboxGroup(list(models), value=list(models), label="Models", visible=len(models) > 1)
             button = gr.Button("Make the mesh", variant="primary")
-            meshes = []
+            columns, meshes = [], []
             with gr.Row():
                 for label in models:
-                    with gr.Column(min_width=240):
-                        meshes.append(gr.Model3D(label=label, height=480, interactive=False))
-                        with gr.Row():
-                            meshes += [gr.DownloadButton(kind, size="sm", min_width=60) for kind in ("GLB", "OBJ")]
-    making = {"fn": make, "inputs": [picture, editor, chosen], "outputs": meshes, **_ALONE}
-    given.upload(upload, [given, tolerance], [picture, editor, *meshes], **_ALONE)
-    for number, category in enumerate(CATEGORIES):
-        draw = lambda category=category: show(picture_tab.example(category, time.time_ns() % 2**32))  # noqa: E731
-        examples[number].click(draw, None, [picture, editor, *meshes], **_ALONE)
-    tolerance.release(threshold, [picture, tolerance], [picture, editor], **_ALONE)
-    removed.click(cut_out, [picture], [picture, editor], **_ALONE)
-    button.click(**making)
+                    with gr.Column(min_width=240) as column:
+                        meshes += _viewer(label)
+                    columns.append(column)
+    chosen.change(lambda names: [gr.Column(visible=label in names) for label in models], [chosen], columns)
+    masks = [
+        given.upload(upload, [given, tolerance], [picture, editor], **_ALONE),
+        tolerance.release(threshold, [picture, tolerance], [picture, editor], **_ALONE),
+        removed.click(cut_out, [picture], [picture, editor], **_ALONE),
+    ]
+    for category, example in examples.items():
+        masks.append(example.click(partial(draw_example, category), None, [picture, editor], **_ALONE))
+    for done in masks[:1] + masks[3:]:  # of a new picture a mesh is made at once
+        done.success(make, [picture, chosen], meshes, **_ALONE)
+    button.click(make, [picture, chosen, editor], meshes, **_ALONE)
 
 
 def fit_page(root: Path) -> None:
-    """Tab 2."""
-    white = np.full((_CANVAS, _CANVAS, 3), 255, np.uint8)
+    """Tab 2: silhouettes above, the fit and its mesh below."""
 
-    def choose(category: str) -> list[dict]:
-        masks = fit_tab.example_silhouettes(category, time.time_ns() % 2**32).values()
+    def draw_example(category: str) -> list[dict]:
+        masks = fit_tab.example_silhouettes(category, _seed()).values()
         large = (np.asarray(Image.fromarray(mask).resize((_CANVAS, _CANVAS))) for mask in masks)
-        return [_editor(white, mask) for mask in large]
+        return [_editor(paper, mask) for mask in large]
 
     def fit(*drawings: dict | None) -> Iterator[tuple]:
         with _told():
-            masks = dict(zip(SIDES, map(drawn, drawings), strict=True))
-            nothing = [gr.skip()] * 3
-            for moment in fit_tab.fit(masks):
-                yield moment.picture, f"step {moment.step}, IoU {moment.iou:.2f}", *nothing
-            glb, obj = picture_tab.write_mesh(moment.surface, _new_folder(root), "fitted")
-            yield moment.picture, gr.skip(), str(glb), str(glb), str(obj)
+            for moment in fit_tab.fit(dict(zip(SIDES, map(drawn, drawings), strict=True))):
+                yield moment.picture, f"step {moment.step}, IoU {moment.iou:.2f}", moment.surface
 
-    gr.Markdown("Paint the same object from two or three sides, or take an example. A sphere is then fitted to it.")
+    def show(surface: Surface) -> tuple:
+        return _files(picture_tab.write_mesh(surface, Path(tempfile.mkdtemp(dir=root)), "fitted"), -30)
+
+    paper = str(root / "paper.png")  # a file: each picture that is given as an array is written anew while it is sent
+    figures.save_png(Path(paper), np.full((_CANVAS, _CANVAS, 3), 255, np.uint8))
+    gr.Markdown("Paint one object from two or three sides, or take an example: a sphere is then fitted to it.")
+    examples = _example_buttons()
     with gr.Row():
-        examples = [gr.Button(category, size="sm", min_width=60) for category in CATEGORIES]
-    with gr.Row():
-        value, size = {"background": white, "layers": [], "composite": None}, (_CANVAS, _CANVAS)
-        drawings = [_drawing(value=value, label=side, canvas_size=size, min_width=240) for side in SIDES]
+        how = {"value": {"background": paper, "layers": [], "composite": None}, "canvas_size": (_CANVAS, _CANVAS)}
+        drawings = [_drawing(label=f"From the {side}", min_width=240, **how) for side in SIDES]
     with gr.Row():
         start = gr.Button("Fit", variant="primary")
         stop = gr.Button("Stop")
-    live = gr.Image(label="Yours orange, the mesh blue, both grey", buttons=[], format="png", interactive=False)
-    said = gr.Markdown()
-    mesh = gr.Model3D(label="Fitted mesh", height=360, interactive=False)
     with gr.Row():
-        files = [gr.DownloadButton(kind, size="sm", min_width=60) for kind in ("GLB", "OBJ")]
-    for number, category in enumerate(CATEGORIES):
-        examples[number].click(lambda category=category: choose(category), None, drawings, **_ALONE)
-    fitting = start.click(fit, drawings, [live, said, mesh, *files], **_ALONE)
+        with gr.Column(min_width=320):
+            live = gr.Image(label="Orange: yours; blue: the mesh; grey: both", buttons=[], height=440, format="png")
+            said = gr.Markdown()
+        with gr.Column(min_width=320):
+            fitted = _viewer("Fitted mesh")
+    for category, example in examples.items():
+        example.click(partial(draw_example, category), None, drawings, **_ALONE)
+    surface = gr.State()
+    fitting = start.click(fit, drawings, [live, said, surface], **_ALONE)
+    fitting.success(show, [surface], fitted, **_ALONE)
     stop.click(None, cancels=[fitting])
 
 
@@ -261,4 +285,7 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool, report: 
         report(f"the page is at {url} (Ctrl-C ends it)")
         while not stop.name:
             time.sleep(0.1)
+        blocks.server.force_exit = True  # it would wait for pages that are open,
+        logging.disable()  # and tells of what it gives up
         blocks.close(verbose=False)
+    gc.freeze()  # taking all of it apart when Python ends would take seconds

@@ -26,14 +26,7 @@ class Picture(NamedTuple):
 
     colors: np.ndarray  # uint8 [SIDE, SIDE, 3]
     mask: np.ndarray  # uint8 [SIDE, SIDE], 255: object
-
-
-class Result(NamedTuple):
-    """The files of a mesh, and the azimuth from which it looks like the picture."""
-
-    glb: Path
-    obj: Path
-    azimuth_deg: float
+    name: str = "picture"
 
 
 def open_picture(path: Path, tolerance: float = TOLERANCE) -> Picture:
@@ -43,7 +36,8 @@ def open_picture(path: Path, tolerance: float = TOLERANCE) -> Picture:
     top, left = (SIDE - height) // 2, (SIDE - width) // 2
     around = (top, SIDE - height - top), (left, SIDE - width - left)
     padded = np.pad(colors, (*around, (0, 0)), mode="edge")  # the background goes on
-    return Picture(padded, threshold_mask(padded, tolerance) if alpha is None else np.pad(alpha, around))
+    mask = threshold_mask(padded, tolerance) if alpha is None else np.pad(alpha, around)
+    return Picture(padded, mask, path.stem)
 
 
 def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
@@ -68,18 +62,21 @@ def example(category: str, seed: int) -> Picture:
     vertices = torch.from_numpy(np.asarray(mesh.vertices @ mesh_to_object("y", "z").T, np.float32))
     camera = nmr.LookAt.from_angles(DISTANCE, 30.0, [rng.uniform(0, 360)], half_fov_deg=HALF_FOV_DEG)
     rgb, alpha = photograph(vertices, torch.tensor(mesh.faces), rng.uniform(0.3, 0.9, 3), camera, image_size=SIDE)
-    return Picture(rgb[0], alpha[0])
+    return Picture(rgb[0], alpha[0], category)
 
 
-def make_mesh(model: Model, picture: Picture, folder: Path, name: str) -> Result:
-    """The model's mesh of a picture, as GLB and OBJ in `folder`. Raises ValueError for masks that cannot be right."""
+def make_mesh(model: Model, picture: Picture, folder: Path, name: str) -> tuple[tuple[Path, Path], float]:
+    """The model's mesh of a picture, as `write_mesh` does, and the azimuth from which it looks like the picture.
+
+    Raises ValueError for masks that cannot be right.
+    """
     try:
         check_mask(picture.mask)
     except ValueError as error:
-        raise ValueError(f"{error}. Correct it with threshold or brush") from None
-    stored = model.prepare(*picture)
+        raise ValueError(f"{error}. Correct it with the threshold or the brush") from None
+    stored = model.prepare(picture.colors, picture.mask)
     (surface,) = reconstruct(model.method, stored[None])
-    return Result(*write_mesh(surface, folder, name), input_azimuth_deg(surface, stored[3]))
+    return write_mesh(surface, folder, name), input_azimuth_deg(surface, stored[3])
 
 
 def write_mesh(surface: Surface, folder: Path, name: str) -> tuple[Path, Path]:
