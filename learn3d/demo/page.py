@@ -96,7 +96,7 @@ def _told() -> Iterator[None]:
 def _files(surface_paths: tuple[Path, Path], azimuth_deg: float) -> tuple:
     """What shows a GLB from this azimuth, and two buttons for GLB and OBJ."""
     glb, obj = map(str, surface_paths)
-    camera = (180 + azimuth_deg, 70, None)  # degrees in the viewer's axes
+    camera = (-azimuth_deg, 70, None)  # degrees in the viewer's axes
     return gr.Model3D(glb, camera_position=camera), *(gr.DownloadButton(value=f, interactive=True) for f in (glb, obj))
 
 
