@@ -90,14 +90,15 @@ def _told() -> Iterator[None]:
         yield
     except (ValueError, OSError) as error:
         text = f"{error.path.name}: {error.message}" if isinstance(error, DamagedFile) else str(error)
-        raise gr.Error(text, title="Not like this", print_exception=False) from None
+        raise gr.Error(text, print_exception=False) from None
 
 
-def _files(surface_paths: tuple[Path, Path], azimuth_deg: float) -> tuple:
-    """What shows a GLB from this azimuth, and two buttons for GLB and OBJ."""
-    glb, obj = map(str, surface_paths)
-    camera = (-azimuth_deg, 70, None)  # degrees in the viewer's axes
-    return gr.Model3D(glb, camera_position=camera), *(gr.DownloadButton(value=f, interactive=True) for f in (glb, obj))
+def _shown(surface: Surface, name: str, azimuth_deg: float, root: Path) -> tuple:
+    """What a `_viewer` is to show: a mesh from this azimuth, and its files, in a new folder of `root`."""
+    glb, obj = map(str, picture_tab.write_mesh(surface, Path(tempfile.mkdtemp(dir=root)), name))
+    radius = 3.3 * float(surface.vertices.norm(dim=1).max())  # all of it is seen in a narrow window, too
+    mesh = gr.Model3D(glb, camera_position=(-azimuth_deg, 70, radius))
+    return mesh, *(gr.DownloadButton(value=file, interactive=True) for file in (glb, obj))
 
 
 def _viewer(label: str) -> list:
@@ -154,7 +155,8 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
                     outputs += [gr.skip()] * 3
                     continue
                 name = new.name if len(models) == 1 else f"{new.name} {label}"
-                outputs += _files(*picture_tab.make_mesh(model, new, Path(tempfile.mkdtemp(dir=root)), name))
+                surface, azimuth = picture_tab.make_mesh(model, new)
+                outputs += _shown(surface, name, azimuth, root)
         return outputs
 
     picture = gr.State()
@@ -163,7 +165,7 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
             given = gr.File(label="Picture", height=140, file_types=_PICTURES)
             examples = _example_buttons()
             side = picture_tab.SIDE
-            editor = _drawing(label="Mask: paint the object red", canvas_size=(side, side))
+            editor = _drawing(label="Mask (red)", canvas_size=(side, side))
             tolerance = gr.Slider(0, 1, picture_tab.TOLERANCE, label="Threshold", info="Difference to the background")
             removed = gr.Button("Find the object (rembg)", visible=find_spec("rembg") is not None)
         with gr.Column(scale=3, min_width=320):
@@ -202,7 +204,7 @@ def fit_page(root: Path) -> None:
                 yield moment.picture, f"step {moment.step}, IoU {moment.iou:.2f}", moment.surface
 
     def show(surface: Surface) -> tuple:
-        return _files(picture_tab.write_mesh(surface, Path(tempfile.mkdtemp(dir=root)), "fitted"), -30)
+        return _shown(surface, "fitted", -30, root)
 
     paper = str(root / "paper.png")  # a file: each picture that is given as an array is written anew while it is sent
     figures.save_png(Path(paper), np.full((_CANVAS, _CANVAS, 3), 255, np.uint8))

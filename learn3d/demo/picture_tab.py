@@ -65,8 +65,8 @@ def example(category: str, seed: int) -> Picture:
     return Picture(rgb[0], alpha[0], category)
 
 
-def make_mesh(model: Model, picture: Picture, folder: Path, name: str) -> tuple[tuple[Path, Path], float]:
-    """The model's mesh of a picture, as `write_mesh` does, and the azimuth from which it looks like the picture.
+def make_mesh(model: Model, picture: Picture) -> tuple[Surface, float]:
+    """The model's mesh of a picture and, in degrees, the azimuth from which it looks like the picture.
 
     Raises ValueError for masks that cannot be right.
     """
@@ -76,7 +76,7 @@ def make_mesh(model: Model, picture: Picture, folder: Path, name: str) -> tuple[
         raise ValueError(f"{error}. Correct it with the threshold or the brush") from None
     stored = model.prepare(picture.colors, picture.mask)
     (surface,) = reconstruct(model.method, stored[None])
-    return write_mesh(surface, folder, name), input_azimuth_deg(surface, stored[3])
+    return surface, input_azimuth_deg(surface, stored[3])
 
 
 def write_mesh(surface: Surface, folder: Path, name: str) -> tuple[Path, Path]:

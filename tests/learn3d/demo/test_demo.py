@@ -63,14 +63,15 @@ def test_broken_pictures_are_one_sentence(content: bytes, tmp_path) -> None:
 def test_a_picture_becomes_a_mesh(finished_run, tmp_path) -> None:
     picture = picture_tab.example("chair", 3)
     assert 0.05 < (picture.mask > 127).mean() < 0.5
-    (glb, obj), azimuth = picture_tab.make_mesh(load_model(finished_run), picture, tmp_path / "new", "my chair")
+    surface, azimuth = picture_tab.make_mesh(load_model(finished_run), picture)
+    glb, obj = picture_tab.write_mesh(surface, tmp_path / "new", "my chair")
     meshes = [trimesh.load(path, force="mesh", process=False) for path in (glb, obj)]
     assert glb.name == "my chair.glb" and list(trimesh.load(glb).geometry) == ["my chair"]
     assert np.allclose(meshes[0].vertices, meshes[1].vertices, atol=1e-6)
     assert len(meshes[0].faces) > 100 and azimuth % 15 == 0
     for mask in (np.zeros_like(picture.mask), np.full_like(picture.mask, 255)):
         with pytest.raises(ValueError, match=r"mask is .* Correct it"):
-            picture_tab.make_mesh(load_model(finished_run), picture._replace(mask=mask), tmp_path, "a")
+            picture_tab.make_mesh(load_model(finished_run), picture._replace(mask=mask))
 
 
 def test_the_side_of_the_input_is_found() -> None:
