@@ -35,7 +35,6 @@ import gradio as gr
 if TYPE_CHECKING:
     from gradio.data_classes import FileData
 
-UPLOAD_BYTES = 32 * 2**20
 WAITING = 16  # visitors; the next one is asked to come back
 _MASK = (230, 50, 60)
 _CANVAS = 320  # pixels of a silhouette
@@ -44,7 +43,10 @@ _PICTURES = [".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"]
 _ALONE = {"concurrency_limit": 1, "concurrency_id": "networks", "show_progress": "minimal"}  # one visitor at a time
 _EDITOR = {"sources": [], "transforms": [], "layers": False, "buttons": [], "format": "png", "fixed_canvas": True}
 _EDITOR |= {"brush": gr.Brush(20, [(f"rgb{_MASK}", _STRENGTH)], color_mode="fixed"), "eraser": gr.Eraser(20)}
-_THEME = gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
+_LAUNCH = {"share": False, "ssr_mode": False, "mcp_server": False, "enable_monitoring": False, "run_history": False}
+_LAUNCH |= {"prevent_thread_lock": True, "quiet": True, "footer_links": []}
+_LAUNCH |= {"max_file_size": 32 * 2**20, "state_session_capacity": WAITING}
+_LAUNCH["theme"] = gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
 
 
 def _layer(file: bytes | FileData | None, flatten_on_white: bool = False) -> np.ndarray | None:
@@ -113,35 +115,24 @@ def _example_buttons() -> dict[str, gr.Button]:
         return {category: gr.Button(category, size="sm", min_width=60) for category in CATEGORIES}
 
 
-def _seed() -> int:
-    return time.time_ns() % 2**32
-
-
 def picture_page(models: dict[str, Model], root: Path) -> None:
     """Tab 1: a picture and its mask on the left, the meshes of all models on the right."""
 
-    def upload(path: str | None, tolerance: float) -> tuple:
+    def show(new: Picture | None) -> tuple:
+        return new, new and _editor(new.colors, new.mask)
+
+    def upload(path: str, tolerance: float) -> tuple:
         with _told():
-            new = picture_tab.open_picture(Path(path), tolerance)
-        return new, _editor(new.colors, new.mask)
+            return show(picture_tab.open_picture(Path(path), tolerance))
 
     def threshold(old: Picture | None, tolerance: float) -> tuple:
-        if old is None:
-            return None, None
-        new = old._replace(mask=picture_tab.threshold_mask(old.colors, tolerance))
-        return new, _editor(new.colors, new.mask)
+        return show(old and old._replace(mask=picture_tab.threshold_mask(old.colors, tolerance)))
 
     def cut_out(old: Picture | None) -> tuple:
-        import rembg
-
-        if old is None:
-            return None, None
-        new = old._replace(mask=np.asarray(rembg.remove(Image.fromarray(old.colors), only_mask=True)))
-        return new, _editor(new.colors, new.mask)
+        return show(old and old._replace(mask=picture_tab.object_mask(old.colors)))
 
     def draw_example(category: str) -> tuple:
-        new = picture_tab.example(category, _seed())
-        return new, _editor(new.colors, new.mask)
+        return show(picture_tab.example(category, time.time_ns() % 2**32))
 
     def make(old: Picture | None, chosen: list[str], drawing: dict | None = None) -> list:
         outputs = []
@@ -164,8 +155,7 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
         with gr.Column(scale=2, min_width=320):
             given = gr.File(label="Picture", height=140, file_types=_PICTURES)
             examples = _example_buttons()
-            side = picture_tab.SIDE
-            editor = _drawing(label="Mask (red)", canvas_size=(side, side))
+            editor = _drawing(label="Mask (red)", canvas_size=(picture_tab.SIDE, picture_tab.SIDE))
             tolerance = gr.Slider(0, 1, picture_tab.TOLERANCE, label="Threshold", info="Difference to the background")
             removed = gr.Button("Find the object (rembg)", visible=find_spec("rembg") is not None)
         with gr.Column(scale=3, min_width=320):
@@ -178,15 +168,12 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
                         meshes += _viewer(label)
                     columns.append(column)
     chosen.change(lambda names: [gr.Column(visible=label in names) for label in models], [chosen], columns)
-    masks = [
-        given.upload(upload, [given, tolerance], [picture, editor], **_ALONE),
-        tolerance.release(threshold, [picture, tolerance], [picture, editor], **_ALONE),
-        removed.click(cut_out, [picture], [picture, editor], **_ALONE),
-    ]
-    for category, example in examples.items():
-        masks.append(example.click(partial(draw_example, category), None, [picture, editor], **_ALONE))
-    for done in masks[:1] + masks[3:]:  # of a new picture a mesh is made at once
-        done.success(make, [picture, chosen], meshes, **_ALONE)
+    shown = [picture, editor]
+    tolerance.release(threshold, [picture, tolerance], shown, **_ALONE)
+    removed.click(cut_out, [picture], shown, **_ALONE)
+    arrivals = [example.click(partial(draw_example, name), None, shown, **_ALONE) for name, example in examples.items()]
+    for arrival in (given.upload(upload, [given, tolerance], shown, **_ALONE), *arrivals):
+        arrival.success(make, [picture, chosen], meshes, **_ALONE)
     button.click(make, [picture, chosen, editor], meshes, **_ALONE)
 
 
@@ -194,7 +181,7 @@ def fit_page(root: Path) -> None:
     """Tab 2: silhouettes above, the fit and its mesh below."""
 
     def draw_example(category: str) -> list[dict]:
-        masks = fit_tab.example_silhouettes(category, _seed()).values()
+        masks = fit_tab.example_silhouettes(category, time.time_ns() % 2**32).values()
         large = (np.asarray(Image.fromarray(mask).resize((_CANVAS, _CANVAS))) for mask in masks)
         return [_editor(paper, mask) for mask in large]
 
@@ -232,7 +219,7 @@ def fit_page(root: Path) -> None:
 
 def page(models: dict[str, Model], root: Path) -> gr.Blocks:
     """The page; files of meshes are written below `root`."""
-    with gr.Blocks(title="learn3d demo", analytics_enabled=False, delete_cache=(600, 3600)) as blocks:
+    with gr.Blocks(title="learn3d demo", analytics_enabled=False) as blocks:
         gr.Markdown("# learn3d demo")
         with gr.Tab("Picture to mesh"):
             picture_page(models, root)
@@ -267,23 +254,8 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool, report: 
     with tempfile.TemporaryDirectory(prefix="learn3d-demo-") as folder, stop_on_signal() as stop:
         os.environ["GRADIO_TEMP_DIR"] = folder  # uploads go there, too
         blocks = page(models, Path(folder))
-        _, url, _ = blocks.launch(
-            server_name=host,
-            server_port=port,
-            inbrowser=browser,
-            prevent_thread_lock=True,
-            share=False,
-            quiet=True,
-            allowed_paths=[folder],
-            max_file_size=UPLOAD_BYTES,
-            footer_links=[],
-            run_history=False,
-            enable_monitoring=False,
-            ssr_mode=False,
-            mcp_server=False,
-            state_session_capacity=WAITING,
-            theme=_THEME,
-        )
+        where = {"server_name": host, "server_port": port, "inbrowser": browser, "allowed_paths": [folder]}
+        _, url, _ = blocks.launch(**where, **_LAUNCH)
         report(f"the page is at {url} (Ctrl-C ends it)")
         while not stop.name:
             time.sleep(0.1)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from PIL import Image
 from scipy import ndimage
 
 import nmr
@@ -53,6 +54,13 @@ def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarr
         return np.zeros(colors.shape[:2], np.uint8)
     largest = regions == 1 + np.bincount(regions.ravel())[1:].argmax()
     return 255 * ndimage.binary_fill_holes(largest).astype(np.uint8)
+
+
+def object_mask(colors: np.ndarray) -> np.ndarray:
+    """What the package rembg takes for the object in a picture uint8 [H,W,3]: uint8 [H,W]."""
+    import rembg  # optional, and slow to import
+
+    return np.asarray(rembg.remove(Image.fromarray(colors), only_mask=True))
 
 
 def example(category: str, seed: int) -> Picture:

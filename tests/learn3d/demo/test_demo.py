@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -50,6 +52,15 @@ def test_pictures_are_laid_on_a_square(photo, tmp_path) -> None:
     mask = picture_tab.open_picture(tmp_path / "alpha.png").mask
     top, left = (side - 40) // 2, (side - 20) // 2
     assert np.array_equal(mask[top : top + 40, left : left + 20], alpha) and mask.sum() == alpha.sum()
+
+
+def test_rembg_makes_the_mask_where_it_is_installed(photo, monkeypatch) -> None:
+    def remove(image: Image.Image, *, only_mask: bool) -> Image.Image:
+        assert only_mask
+        return image.getchannel("R")
+
+    monkeypatch.setitem(sys.modules, "rembg", SimpleNamespace(remove=remove))
+    assert np.array_equal(picture_tab.object_mask(photo), photo[..., 0])
 
 
 @pytest.mark.parametrize("content", [b"", b"no picture", b"\x89PNG\r\n\x1a\n" + bytes(99)])
