@@ -256,10 +256,10 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool, report: 
         blocks = page(models, Path(folder))
         where = {"server_name": host, "server_port": port, "inbrowser": browser, "allowed_paths": [folder]}
         _, url, _ = blocks.launch(**where, **_LAUNCH)
+        logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)  # tracebacks where a visitor leaves early
         report(f"the page is at {url} (Ctrl-C ends it)")
         while not stop.name:
             time.sleep(0.1)
-        blocks.server.force_exit = True  # it would wait for pages that are open,
-        logging.disable()  # and tells of what it gives up
+        blocks.server.force_exit = True  # it would wait for pages that are open
         blocks.close(verbose=False)
     gc.freeze()  # taking all of it apart when Python ends would take seconds
