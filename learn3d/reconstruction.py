@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import skimage.transform
 import torch
 import trimesh
+from PIL import Image
 from torch import nn
 
+import nmr
 from learn3d import figures
-from learn3d.data.conventions import mesh_to_object
+from learn3d.config import TrainConfig
+from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.crops import Crops
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo
@@ -24,8 +27,9 @@ from learn3d.files import limits, writing
 from learn3d.methods import MeshMethod, Method
 from learn3d.methods.refinement import refine
 from learn3d.runs import checkpoint
+from learn3d.runs.export import small_model
 
-STRIP_SIZE = 160
+STRIP_SIZE = 192
 LARGEST_PICTURE = 2048  # pixels: shapes are drawn four times as fine, and the renderer goes up to 8192
 
 
@@ -37,13 +41,15 @@ def prepare_image(
     object_share: float = OBJECT_SHARE,
     size: int = 64,
     layout: Layout = "kato",
+    nearest: bool = False,
 ) -> np.ndarray:
     """Bring an image of any size into the form that a data set of the layout has, uint8 [4,size,size]: colours, mask.
 
     The object is laid over white and, with `crop`, centred in a square so that its larger side takes `object_share` of
     it, as in the data set; without, the image must be framed like that already and is only made square and scaled.
     Colours are inverted where the layout inverts them. Where images are stretched (Pascal3D+), the background stays,
-    and `crop` takes the mask's box, padded and stretched as the reader does it (`learn3d.data.crops`).
+    and `crop` takes the mask's box, padded and stretched as the reader does it (`learn3d.data.crops`). nearest: small
+    images keep their pixels when enlarged, for people to look at.
     """
     if colors.ndim != 3 or colors.shape[2] != 3 or mask.shape != colors.shape[:2]:
         raise ValueError(f"colors must be [H, W, 3] and mask [H, W], got {list(colors.shape)} and {list(mask.shape)}")
@@ -67,7 +73,7 @@ def prepare_image(
     else:
         centre_y, centre_x = mask.shape[0] / 2, mask.shape[1] / 2
         side = float(max(mask.shape))
-    resized = _resample(stored, centre_x - side / 2, centre_y - side / 2, side, size)
+    resized = _resample(stored, centre_x - side / 2, centre_y - side / 2, side, size, nearest)
     if not LAYOUTS[layout].inverted:
         resized[..., :3] = 255 - resized[..., :3]
     return np.rint(resized.transpose(2, 0, 1)).clip(0, 255).astype(np.uint8)
@@ -79,6 +85,29 @@ def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
     if not mask.any():
         raise ValueError(f"the mask of {path} is empty: no pixel belongs to the object")
     return colors, mask
+
+
+class Model(NamedTuple):
+    """A trained model, ready to turn pictures into meshes."""
+
+    method: Method
+    config: TrainConfig
+    object_share: float  # of the side of its training images that objects take
+
+    def prepare(self, colors: np.ndarray, mask: np.ndarray, **options: Any) -> np.ndarray:
+        """`prepare_image` for these networks; the options may have another size."""
+        form = {"object_share": self.object_share, "size": self.method.image_size, "layout": self.config.layout}
+        return prepare_image(colors, mask, **form | options)
+
+    def shown(self, stored: np.ndarray) -> np.ndarray:
+        """Images uint8 [..., 4, S, S] as stored -> uint8 [..., S, S, 3] for people."""
+        return figures.natural_colors(stored, inverted=LAYOUTS[self.config.layout].inverted)
+
+
+def load_model(run: Path | None, which: str = "last") -> Model:
+    """The model of a run folder or checkpoint file; None: the small one that comes with the package."""
+    method, config, metadata = checkpoint.load_method(checkpoint.find(run or small_model(), which))
+    return Model(method, config, metadata.progress.object_share or OBJECT_SHARE)
 
 
 @torch.no_grad()
@@ -96,6 +125,27 @@ def reconstruct(
     if not isinstance(method, MeshMethod):
         raise ValueError("only meshes can be fitted to masks, and this run predicts voxels; leave out --refine")
     return figures.as_meshes(refine(method, pixels, masks, poses))
+
+
+@torch.no_grad()
+def input_azimuth_deg(surface: Surface, mask: np.ndarray) -> float:
+    """From where the shape's silhouette agrees best with the mask uint8 [S,S] of its image; a multiple of 15 degrees.
+
+    The camera of an image is not known: this is a guess for pictures. Azimuths are compared at three elevations.
+    """
+    target = nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, (64, 64), mode="area")[0]
+    azimuths = [15.0 * k for k in range(24)]
+    loss = [
+        nmr.losses.soft_iou_loss(image[None], target)
+        for elevation in (0.0, 15.0, 30.0)
+        for image in nmr.render_silhouette(
+            surface.vertices,
+            surface.faces,
+            nmr.LookAt.from_angles(DISTANCE, elevation, azimuths, half_fov_deg=HALF_FOV_DEG),
+            image_size=64,
+        )
+    ]
+    return azimuths[int(torch.stack(loss).argmin()) % len(azimuths)]
 
 
 def export_mesh(path: Path, surface: Surface) -> None:
@@ -130,15 +180,17 @@ def save_reconstruction(
     folder: Path,
     name: str,
     picture: np.ndarray,
+    mask: np.ndarray,
     surface: Surface,
     *,
+    azimuth_deg: float | None = None,
     mesh_format: Literal["obj", "glb", "ply"] = "glb",
     frames: int = 36,
     image_size: int = 256,
 ) -> list[Path]:
-    """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input and six views); returns the three paths.
+    """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input, mask, six views); returns the three paths.
 
-    picture: the input, uint8 [S,S,3].
+    picture: the input, uint8 [S,S,3]; mask: uint8 [S,S]. azimuth_deg: where its camera stood; None: it is guessed.
     """
     check_pictures(frames, image_size)
     folder = Path(folder)
@@ -146,15 +198,23 @@ def save_reconstruction(
     paths = [folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png")]
     export_mesh(paths[0], surface)
     figures.save_gif(paths[1], figures.turntable(surface, frames=frames, image_size=image_size))
-    azimuths = [-15 - 60 * k for k in range(6)]
-    views = figures.draw_around(surface, azimuths, image_size=STRIP_SIZE)
-    titles = ["input", *(f"azimuth {azimuth % 360}°" for azimuth in azimuths)]
-    figures.save_png(paths[2], figures.tile([[picture, *views]], titles, tile_size=STRIP_SIZE))
+    start = input_azimuth_deg(surface, mask) if azimuth_deg is None else azimuth_deg
+    views = figures.draw_around(surface, [start - 60 * k for k in range(6)], image_size=STRIP_SIZE)
+    titles = ["input", "mask", "from the input's side", *(f"turned by {60 * k}°" for k in range(1, 6))]
+    shown = [_pixels(picture), _pixels(np.repeat(mask[..., None], 3, axis=2))]
+    figures.save_png(paths[2], figures.tile([[*shown, *views]], titles, tile_size=STRIP_SIZE))
     return paths
 
 
+def _pixels(picture: np.ndarray) -> np.ndarray:
+    """A picture smaller than a tile of the strip, enlarged so that its pixels are seen."""
+    if picture.shape[0] >= STRIP_SIZE:
+        return picture
+    return np.asarray(Image.fromarray(picture).resize((STRIP_SIZE, STRIP_SIZE), Image.Resampling.NEAREST))
+
+
 def reconstruct_files(
-    run: Path,
+    run: Path | None,
     folder: Path,
     images: Sequence[Path],
     masks: Sequence[Path] = (),
@@ -164,32 +224,30 @@ def reconstruct_files(
     which: str = "last",
     **options: Any,
 ) -> list[Path]:
-    """Reconstruct image files with the networks of a run and save each result under the image's name in `folder`.
+    """Reconstruct image files with the networks of a run (see `load_model`) and save the results in `folder`.
 
     `masks` is empty (the images have transparency) or as long as `images`. Where `poses` are given, one of each image,
-    shapes are fitted to the masks. `options` go to `save_reconstruction`. Returns the files written.
+    shapes are fitted to the masks. `options` go to `save_reconstruction`. Returns the files, named after the images.
     """
     _check(options)
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
     if poses is not None and len(poses) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(poses)} poses; give one azimuth per image")
-    pairs = zip(images, masks or [None] * len(images), strict=True)
-    method, config, metadata = checkpoint.load_method(checkpoint.find(run, which))
-    share = metadata.progress.object_share or OBJECT_SHARE
-    form = {"object_share": share, "size": method.image_size, "layout": config.layout}
-    prepared = [prepare_image(*_read(image, mask), crop=crop, **form) for image, mask in pairs]
+    photos = [_read(image, mask) for image, mask in zip(images, masks or [None] * len(images), strict=True)]
+    model = load_model(run, which)
+    stored = np.stack([model.prepare(*photo, crop=crop) for photo in photos])
+    fine = np.stack([model.prepare(*photo, crop=crop, size=STRIP_SIZE, nearest=True) for photo in photos])
     names = [Path(image).stem for image in images]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]
-    stored = np.stack(prepared)
-    shown = torch.from_numpy(stored[:, 3:]).float() / 255
-    fitted = reconstruct(method, stored, nn.functional.interpolate(shown, MASK_SIZE, mode="area")[:, 0], poses)
-    return _save_all(fitted, folder, names, stored, LAYOUTS[config.layout].inverted, options)
+    small = nn.functional.interpolate(torch.from_numpy(stored[:, 3:]).float() / 255, MASK_SIZE, mode="area")[:, 0]
+    surfaces = reconstruct(model.method, stored, small, poses)
+    return _save_all(surfaces, folder, names, model.shown(fine), fine[:, 3], poses, options)
 
 
 def reconstruct_dataset(
-    run: Path,
+    run: Path | None,
     folder: Path,
     data: Path,
     indices: Sequence[int],
@@ -208,9 +266,9 @@ def reconstruct_dataset(
     _check(options)
     if not Path(data).is_dir():
         raise FileNotFoundError(f"there is no folder {data}; say where the data set is with --data")
-    method, config, _ = checkpoint.load_method(checkpoint.find(run, which))
-    name = category or config.category
-    dataset = load_dataset(config.layout, data, name, split, image_size=method.image_size)
+    model = load_model(run, which)
+    name = category or model.config.category
+    dataset = load_dataset(model.config.layout, data, name, split, image_size=model.method.image_size)
     batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
     numbers = zip(batch.object_ids.tolist(), batch.view_ids.tolist(), strict=True)
     names = [f"{dataset.category}_{split}_object{number:04}_view{view:02}" for number, view in numbers]
@@ -219,8 +277,8 @@ def reconstruct_dataset(
     if refined and batch.poses is None:
         raise ValueError(f"{dataset.category} has no poses, and shapes are fitted to masks of known pose")
     images = batch.images.numpy()
-    surfaces = reconstruct(method, images, *(batch.masks, batch.poses) if refined else ())
-    return _save_all(surfaces, folder, names, images, dataset.inverted, options)
+    surfaces = reconstruct(model.method, images, *(batch.masks, batch.poses) if refined else ())
+    return _save_all(surfaces, folder, names, model.shown(images), images[:, 3], batch.poses, options)
 
 
 def _check(options: dict[str, Any]) -> None:
@@ -232,14 +290,15 @@ def _save_all(
     surfaces: list[Surface],
     folder: Path,
     names: list[str],
-    images: np.ndarray,
-    inverted: bool,
+    pictures: np.ndarray,
+    masks: np.ndarray,
+    poses: Poses | None,
     options: dict[str, Any],
 ) -> list[Path]:
     written = []
-    pictures = figures.natural_colors(images, inverted=inverted)
-    for name, picture, surface in zip(names, pictures, surfaces, strict=True):
-        written += save_reconstruction(folder, name, picture, surface, **options)
+    azimuths = [None] * len(names) if poses is None else figures.azimuths_deg(poses).tolist()
+    for name, picture, mask, surface, azimuth in zip(names, pictures, masks, surfaces, azimuths, strict=True):
+        written += save_reconstruction(folder, name, picture, mask, surface, azimuth_deg=azimuth, **options)
     return written
 
 
@@ -255,9 +314,10 @@ def _stretched(colors: np.ndarray, mask: np.ndarray, crop: bool, size: int) -> n
     return np.concatenate([cut, cut_mask[:1]])
 
 
-def _resample(stored: np.ndarray, left: float, top: float, side: float, size: int) -> np.ndarray:
+def _resample(stored: np.ndarray, left: float, top: float, side: float, size: int, nearest: bool) -> np.ndarray:
     """The square with that corner and side (whole pixels), scaled to [size,size,C], anti-aliased; zero outside."""
     left, top, side = round(left), round(top), max(1, round(side))
     pad = max(0, -left, -top, left + side - stored.shape[1], top + side - stored.shape[0])
     square = np.pad(stored, ((pad, pad), (pad, pad), (0, 0)))[top + pad :, left + pad :][:side, :side]
-    return skimage.transform.resize(square, (size, size), order=1, anti_aliasing=side > size)
+    order = 0 if nearest and side <= size else 1
+    return skimage.transform.resize(square, (size, size), order=order, anti_aliasing=side > size)

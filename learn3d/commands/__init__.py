@@ -17,6 +17,7 @@ COMMANDS = {
     "evaluate": "measure trained models on a test set",
     "reconstruct": "turn images into meshes with a trained model",
     "export": "write a trained model into one small file",
+    "demo": "a page that turns pictures into meshes",
     "make-dataset": "render a data set from meshes",
     "check-dataset": "list everything that is wrong with a data set",
     "experiment": "make a table of the paper: train, measure, report",
@@ -64,6 +65,8 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
         from learn3d.commands.reconstruct import run
     elif name == "export":
         from learn3d.commands.export import run
+    elif name == "demo":
+        from learn3d.commands.demo import run
     elif name == "make-dataset":
         from learn3d.commands.make_dataset import run
     elif name == "check-dataset":

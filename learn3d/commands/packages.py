@@ -1,6 +1,7 @@
 """Optional packages: what to say where one is not installed."""
 
-_EXTRAS = {"matplotlib": "figures", "sklearn": "figures", "plotly": "report"}  # the others belong to "train"
+#: The extra that a package belongs to; the others belong to "train".
+_EXTRAS = {"matplotlib": "figures", "sklearn": "figures", "plotly": "report", "gradio": "demo"}
 
 
 def missing_package(package: str) -> str:

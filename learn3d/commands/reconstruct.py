@@ -1,7 +1,7 @@
 """Turn images into meshes, each with a turntable animation and a strip of views.
 
 Examples:
-  learn3d reconstruct photo.png --run runs/airplane --output meshes    (transparent background)
+  learn3d reconstruct photo.png --output meshes    (transparent background; the small model of the package)
   learn3d reconstruct photo.jpg --masks mask.png --run runs/airplane --output meshes
   learn3d reconstruct --data DATA --indices 0 31 62 --run runs/airplane --output meshes
 """
@@ -23,10 +23,10 @@ from learn3d.terminal import say
 class Command:
     """What is asked for."""
 
-    run: Path
-    """Run folder (or checkpoint file) of the trained model."""
     output: Path
     """Folder for the results: of each image a mesh, a turntable GIF and a PNG strip."""
+    run: Path | None = None
+    """Run folder (or checkpoint file) of the trained model; without it, the small one that comes with the package."""
     images: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Images of any size, with a transparent background (or with --masks)."""
     masks: tuple[Path, ...] = ()

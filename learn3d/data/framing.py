@@ -37,6 +37,15 @@ def read_photo(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, n
     return worker.read(_read, Path(path), mask_path, wanted="a photograph")
 
 
+def read_picture(path: Path, most_side: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Colours uint8 [H, W, 3] and transparency uint8 [H, W] of an image file, upright; None: nothing is transparent.
+
+    Made smaller where a side has more than `most_side` pixels. Raises FileNotFoundError, and ValueError for what cannot
+    be read.
+    """
+    return worker.read(_read_picture, Path(path), most_side, wanted="a photograph")
+
+
 class Framed(NamedTuple):
     """A photograph as a network sees it."""
 
@@ -62,10 +71,24 @@ def read_framed(
     return Framed(image, small_mask, half_fov, mask_box(mask), mask.shape)
 
 
-def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
+def _read_picture(path: Path, most_side: int) -> tuple[np.ndarray, np.ndarray | None]:
+    image = _open_photo(path)
+    alpha = _transparency(image)
+    image = image.convert("RGBA")
+    image.thumbnail((most_side, most_side))
+    pixels = np.asarray(image)
+    return pixels[..., :3], None if alpha is None else pixels[..., 3]
+
+
+def _open_photo(path: Path) -> Image.Image:
     image = _open(path)
     if image.mode.startswith(("I", "F")):  # Pillow would make white of all that is above 255
         raise DamagedFile(path, f"has more than 8 bits a pixel and channel ({image.mode}); save it with 8")
+    return image
+
+
+def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
+    image = _open_photo(path)
     if mask_path is None:
         mask = _transparency(image)
         if mask is None:

@@ -10,6 +10,8 @@ import torch
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
 
+SMALL_MODEL = Path(__file__).parents[1] / "models" / "small.safetensors"
+NO_SMALL_MODEL = "this installation has no small model of its own; name a trained one with --run"
 _TRAINING_ONLY = ("lambda_classification", "lambda_adversarial", "lambda_unseen")  # weights of what needs more networks
 
 
@@ -32,3 +34,10 @@ def export(source: Path, target: Path, *, which: str = "last") -> int:
     }
     checkpoint.save(target, tensors, dataclasses.replace(metadata, config=config, optimizers={}))
     return target.stat().st_size
+
+
+def small_model() -> Path:
+    """The exported model that comes with the package; FileNotFoundError where it does not."""
+    if not SMALL_MODEL.is_file():
+        raise FileNotFoundError(NO_SMALL_MODEL)
+    return SMALL_MODEL

@@ -12,7 +12,7 @@ SOURCES = Path(learn3d.__file__).parent
 FLOORS = (
     {"__main__"},
     {"commands"},
-    {"pages"},
+    {"pages", "demo"},
     {"experiments"},
     {"training", "reconstruction"},
     {"validation"},

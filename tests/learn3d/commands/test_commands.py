@@ -132,7 +132,9 @@ def test_a_photograph_without_a_mask_leads_to_the_option(finished_run, tmp_path,
     assert status == 1 and "--masks" in said
 
 
-@pytest.mark.parametrize(("package", "extra"), [("tyro", "train"), ("sklearn", "figures"), ("plotly", "report")])
+@pytest.mark.parametrize(
+    ("package", "extra"), [("tyro", "train"), ("sklearn", "figures"), ("plotly", "report"), ("gradio", "demo")]
+)
 def test_missing_packages_are_named_with_the_command_that_installs_them(package, extra, command, monkeypatch) -> None:
     def refuse(name: str) -> None:
         raise ModuleNotFoundError(f"No module named {package!r}", name=package)

@@ -1,0 +1,99 @@
+"""From a picture to meshes: a mask by the colour of the background, and the files of each model's mesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy import ndimage
+
+import nmr
+from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
+from learn3d.data.framing import check_mask, read_picture
+from learn3d.figures import CLAY, Surface
+from learn3d.make_data.shapes import make_shape
+from learn3d.make_data.studio import photograph
+from learn3d.reconstruction import Model, export_mesh, input_azimuth_deg, reconstruct
+
+SIDE = 512  # pixels of the square on which pictures lie; the networks see 64 to 224
+TOLERANCE = 0.12
+
+
+class Picture(NamedTuple):
+    """A picture on a square, and where its object is."""
+
+    colors: np.ndarray  # uint8 [SIDE, SIDE, 3]
+    mask: np.ndarray  # uint8 [SIDE, SIDE], 255: object
+    name: str = "picture"
+
+
+def open_picture(path: Path, tolerance: float = TOLERANCE) -> Picture:
+    """A visitor's file; its transparency is the mask, or else what `threshold_mask` finds. ValueError: no picture."""
+    colors, alpha = read_picture(path, SIDE)
+    height, width = colors.shape[:2]
+    top, left = (SIDE - height) // 2, (SIDE - width) // 2
+    around = (top, SIDE - height - top), (left, SIDE - width - left)
+    padded = np.pad(colors, (*around, (0, 0)), mode="edge")  # the background goes on
+    mask = threshold_mask(padded, tolerance) if alpha is None else np.pad(alpha, around)
+    return Picture(padded, mask, path.stem)
+
+
+def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+    """The largest region, without its holes, whose colour is not that of the picture's border: uint8 [H,W], 0 or 255.
+
+    colors: uint8 [H,W,3]. The background's colour is the median of the border; what differs from it by less than
+    `tolerance` (0 .. 1, of the largest difference in any channel) is background.
+    """
+    border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]])
+    difference = np.abs(colors - np.median(border, axis=0)).max(axis=2)
+    regions, count = ndimage.label(difference > 255 * tolerance)
+    if count == 0:
+        return np.zeros(colors.shape[:2], np.uint8)
+    largest = regions == 1 + np.bincount(regions.ravel())[1:].argmax()
+    return 255 * ndimage.binary_fill_holes(largest).astype(np.uint8)
+
+
+def object_mask(colors: np.ndarray) -> np.ndarray:
+    """What the package rembg takes for the object in a picture uint8 [H,W,3]: uint8 [H,W]."""
+    import rembg  # optional, and slow to import
+
+    return np.asarray(rembg.remove(Image.fromarray(colors), only_mask=True))
+
+
+def example(category: str, seed: int) -> Picture:
+    """A generated object of `make_data.shapes.CATEGORIES`, as Kato's camera sees it from some side."""
+    rng = np.random.default_rng(seed)
+    mesh = make_shape(category, rng)
+    vertices = torch.from_numpy(np.asarray(mesh.vertices @ mesh_to_object("y", "z").T, np.float32))
+    camera = nmr.LookAt.from_angles(DISTANCE, 30.0, [rng.uniform(0, 360)], half_fov_deg=HALF_FOV_DEG)
+    rgb, alpha = photograph(vertices, torch.tensor(mesh.faces), rng.uniform(0.3, 0.9, 3), camera, image_size=SIDE)
+    return Picture(rgb[0], alpha[0], category)
+
+
+def make_mesh(model: Model, picture: Picture) -> tuple[Surface, float]:
+    """The model's mesh of a picture and, in degrees, the azimuth from which it looks like the picture.
+
+    Raises ValueError for masks that cannot be right.
+    """
+    try:
+        check_mask(picture.mask)
+    except ValueError as error:
+        raise ValueError(f"{error}. Correct it with the threshold or the brush") from None
+    stored = model.prepare(picture.colors, picture.mask)
+    (surface,) = reconstruct(model.method, stored[None])
+    return surface, input_azimuth_deg(surface, stored[3])
+
+
+def write_mesh(surface: Surface, folder: Path, name: str) -> tuple[Path, Path]:
+    """Write <name>.glb (in clay where the shape has no colours) and <name>.obj; returns both paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if surface.colors is None:
+        clay = torch.tensor(CLAY) ** 2.2  # colours of a GLB are linear
+        surface = surface._replace(colors=clay.expand_as(surface.vertices))
+    paths = folder / f"{name}.glb", folder / f"{name}.obj"
+    for path in paths:
+        export_mesh(path, surface)
+    return paths

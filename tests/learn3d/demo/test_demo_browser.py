@@ -1,0 +1,195 @@
+"""The page of `learn3d demo` in a browser: the real command, a real page, and the end of both."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+pytest.importorskip("gradio", reason="needs the extra demo")
+api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+CHROMIUM = shutil.which("chromium")
+if CHROMIUM is None:
+    pytest.skip("needs Chromium (apt-get install chromium)", allow_module_level=True)
+if os.name != "posix":
+    pytest.skip("sends SIGINT to another process", allow_module_level=True)
+
+TOOL = Path(__file__).parents[3] / "tools" / "demo.py"
+ARGUMENTS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+NO_WEBGPU = "WebGPU"  # the viewer of meshes tries it first, says so, and takes WebGL
+PATIENCE = 90_000  # milliseconds
+
+
+@pytest.fixture(scope="module")
+def server(finished_run, tmp_path_factory) -> Iterator[tuple[subprocess.Popen, str]]:
+    """The command with two runs, and the address of its page."""
+    folder = tmp_path_factory.mktemp("demo")
+    shutil.copytree(finished_run, folder / "other")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    words = [sys.executable, str(TOOL), "--port", str(port), "--no-browser", "--run", str(finished_run)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": (folder / "errors.txt").open("w"), "text": True}
+    environment = os.environ | {"TMPDIR": str(folder)}
+    with subprocess.Popen([*words, str(folder / "other")], env=environment, **pipes) as process:
+        process.folder = folder
+        line = process.stdout.readline()
+        assert "the page is at" in line, (folder / "errors.txt").read_text()
+        yield process, line.split()[4]
+        process.kill()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[api.Browser]:
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(browser, server) -> Iterator[api.Page]:
+    """The open page; afterwards it must have had no errors, and have asked for nothing from elsewhere."""
+    page = browser.new_page(viewport={"width": 1280, "height": 1100})
+    page.set_default_timeout(PATIENCE)
+    said, asked = [], []
+    page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(server[1])
+    page.get_by_role("button", name="Make the mesh").wait_for()
+    yield page
+    page.close()
+    assert [text for text in said if NO_WEBGPU not in text] == []
+    assert [url for url in asked if not url.startswith((server[1], "data:", "blob:"))] == []
+
+
+def settled(place: api.Locator) -> np.ndarray:
+    """The pixels of a viewer, once its mesh has come and stays the same: int [H,W,3]."""
+    deadline, last = time.monotonic() + PATIENCE / 1000, None
+    path = Path(os.environ.get("TMPDIR", "/tmp"), f"viewer-{os.getpid()}.png")
+    try:
+        while time.monotonic() < deadline:
+            place.screenshot(path=path)
+            with Image.open(path) as image:
+                pixels = np.asarray(image.convert("RGB")).astype(int)
+            if last is not None and np.ptp(pixels[40:]) > 60 and np.array_equal(pixels, last):
+                return pixels
+            last = pixels
+            time.sleep(0.5)
+    finally:
+        path.unlink(missing_ok=True)
+    raise AssertionError("no mesh is shown")
+
+
+def give(page: api.Page, path: Path) -> None:
+    page.locator("input[type=file]").first.set_input_files(path)
+
+
+def test_an_upload_becomes_meshes_that_turn_and_can_be_kept(page, tmp_path) -> None:
+    colors = np.full((200, 300, 3), 200, np.uint8)
+    colors[60:140, 80:220] = (40, 60, 120)
+    Image.fromarray(colors).save(tmp_path / "box.png")
+    give(page, tmp_path / "box.png")
+    canvas = page.locator(".model3D canvas")
+    canvas.nth(1).wait_for()
+    assert canvas.count() == 2, "one for each run"
+    before = settled(canvas.first)
+    box = canvas.first.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 90, y + 30, steps=5)
+    page.mouse.up()
+    assert (np.abs(settled(canvas.first) - before).max(axis=2) > 20).mean() > 0.01
+    for kind in ("GLB", "OBJ"):
+        with page.expect_download() as download:
+            page.get_by_role("button", name=kind).first.click()
+        name = download.value.suggested_filename
+        assert name.startswith("box ") and name.endswith(f".{kind.lower()}")
+        download.value.save_as(tmp_path / name)
+        assert len(trimesh.load(tmp_path / name, force="mesh").faces) > 100
+    page.get_by_role("checkbox", name="other").uncheck()
+    api.expect(canvas.locator("visible=true")).to_have_count(1)
+
+
+def test_the_mask_is_corrected_with_the_brush(page) -> None:
+    page.get_by_role("button", name="table").first.click()
+    page.locator(".model3D canvas").first.wait_for()
+    first = settled(page.locator(".model3D canvas").first)
+    box = page.locator("canvas").first.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y - 90)
+    page.mouse.down()
+    page.mouse.move(x, y + 90, steps=8)
+    page.mouse.up()
+    page.get_by_role("button", name="Make the mesh").click()
+    time.sleep(2)
+    assert not np.array_equal(settled(page.locator(".model3D canvas").first), first)
+
+
+def test_a_broken_picture_gets_a_sentence(page, tmp_path) -> None:
+    page.get_by_role("button", name="Make the mesh").click()
+    page.get_by_text("Give a picture first").wait_for()
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+    give(page, tmp_path / "broken.png")
+    page.get_by_text("broken.png: cannot be decoded as an image").wait_for()
+    Image.fromarray(np.full((50, 50, 3), 90, np.uint8)).save(tmp_path / "grey.png")
+    page.get_by_label("Remove this file").or_(page.get_by_label("Clear")).first.click()
+    give(page, tmp_path / "grey.png")
+    page.get_by_text("Correct it with the threshold or the brush").wait_for()
+
+
+def test_a_mesh_is_fitted_while_one_watches(page) -> None:
+    page.get_by_role("tab", name="Fit a mesh").click()
+    page.get_by_role("button", name="Fit", exact=True).click()
+    page.get_by_text("two sides at least").wait_for()
+    page.get_by_role("button", name="sofa").locator("visible=true").click()
+    time.sleep(3)
+    page.get_by_role("button", name="Fit", exact=True).click()
+    page.get_by_text("step 160, IoU 0.").wait_for()
+    settled(page.locator(".model3D canvas").locator("visible=true"))
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_narrow_windows_and_dark_mode(browser, server, scheme) -> None:
+    page = browser.new_page(viewport={"width": 380, "height": 800}, color_scheme=scheme)
+    page.goto(server[1])
+    page.get_by_role("button", name="Make the mesh").wait_for()
+    for tab in ("Picture to mesh", "Fit a mesh"):
+        page.get_by_role("tab", name=tab).click()
+        assert page.evaluate("document.documentElement.scrollWidth") <= 380, "nothing sticks out"
+    background = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    light = np.mean([int(part) for part in background[background.index("(") + 1 : -1].split(",")[:3]])
+    assert (light < 80) == (scheme == "dark")
+    page.close()
+
+
+def test_an_interrupt_ends_it_while_the_page_is_open_and_busy(browser, server) -> None:
+    process, address = server
+    page = browser.new_page()
+    page.goto(address)
+    page.get_by_role("tab", name="Fit a mesh").click()
+    page.get_by_role("button", name="sofa").locator("visible=true").click()
+    time.sleep(3)
+    page.get_by_role("button", name="Fit", exact=True).click()
+    page.get_by_text(re.compile(r"step \d+, IoU")).wait_for()
+    start = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=30) in (0, 130)
+    assert time.monotonic() - start < 10, "a second or two, where the machine is idle"
+    page.close()
+    errors = (process.folder / "errors.txt").read_text()
+    assert "Traceback" not in errors and "ERROR" not in errors, errors
+    assert not list(process.folder.glob("learn3d-demo-*")), "what visitors gave is gone"
