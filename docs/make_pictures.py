@@ -1,0 +1,93 @@
+"""Makes the pictures of README and docs, and records commit and sources of each in docs/images/made.json.
+
+python docs/make_pictures.py views.png     # draw this one (without names: list them, and say which are out of date)
+python docs/make_pictures.py views.png --record     # the picture is there already: only record it
+"""
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+IMAGES = ROOT / "docs" / "images"
+RECORDS = IMAGES / "made.json"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """How a picture is made."""
+
+    command: str  # run in the repository's root; {folder} is an empty folder
+    result: str  # what it leaves there: a path in {folder} or in the repository, the last match of a pattern
+    sources: tuple[str, ...]  # files that decide what it shows
+
+
+_QUICKSTART = ("tools/quickstart.sh", "learn3d/figures/grids.py", "learn3d/methods/plus.py")
+_FIGURES = "learn3d figures {kind} RUNS --data DATA --output {{folder}}  # RUNS, DATA: those of docs/results.md"
+PICTURES = {
+    "views.png": Picture(
+        "python docs/examples/draw_views.py --output {folder}", "{folder}/views.png", ("docs/examples/draw_views.py",)
+    ),
+    "quickstart.png": Picture("bash tools/quickstart.sh", "quickstart/plus/pictures/*.png", _QUICKSTART),
+    **{
+        f"results-{kind}.png": Picture(
+            _FIGURES.format(kind=kind), f"{{folder}}/{kind}.png", (f"learn3d/figures/{file}.py",)
+        )
+        for kind, file in {"curves": "curves", "polar": "polar", "tsne": "codes"}.items()
+    },
+}
+
+
+def digest(picture: Picture) -> str:
+    """Of the sources of a picture."""
+    return hashlib.sha256(b"\0".join((ROOT / source).read_bytes() for source in picture.sources)).hexdigest()[:16]
+
+
+def records() -> dict[str, dict[str, str]]:
+    """What made.json says: command, commit and digest of the sources by name of the picture."""
+    return json.loads(RECORDS.read_text())
+
+
+def out_of_date() -> list[str]:
+    """Pictures whose sources have changed since they were made, or that nobody has recorded."""
+    made = records()
+    return [name for name, picture in PICTURES.items() if made.get(name, {}).get("sources") != digest(picture)]
+
+
+def make(name: str) -> None:
+    """Run the command of a picture and put what it leaves in docs/images."""
+    picture = PICTURES[name]
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run(picture.command.format(folder=folder), shell=True, cwd=ROOT, check=True)
+        found = Path(picture.result.format(folder=folder))
+        last = max((ROOT / found.parent).glob(found.name), key=lambda path: path.stat().st_mtime)
+        shutil.copyfile(last, IMAGES / name)
+
+
+def record(name: str) -> None:
+    """Note the commit and the sources that the picture was made with."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    picture = PICTURES[name]
+    made = records() if RECORDS.exists() else {}
+    made[name] = {"command": picture.command, "commit": commit.stdout.strip(), "sources": digest(picture)}
+    RECORDS.write_text(json.dumps(dict(sorted(made.items())), indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    names = [word for word in sys.argv[1:] if word != "--record"]
+    if unknown := [name for name in names if name not in PICTURES]:
+        sys.exit(f"there is no picture {unknown[0]}; there are {', '.join(PICTURES)}")
+    for name in names:
+        if "--record" not in sys.argv:
+            make(name)
+        record(name)
+    if not names:
+        old = out_of_date()
+        print("\n".join(f"{name}{'  (out of date)' * (name in old)}: {p.command}" for name, p in PICTURES.items()))
