@@ -1,0 +1,17 @@
+#!/usr/bin/env bash
+# Makes the small model that comes with the package, learn3d/models/small.safetensors: one network for 250 generated objects of each of six
+# categories. Usage: bash tools/small_model.sh. Settings: STEPS, OBJECTS, OUT (environment). Half an hour on two cores.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+python=${PYTHON:-.venv/bin/python}
+out=${OUT:-output/small-model}
+categories=airplane,car,chair,lamp,sofa,table
+
+for category in ${categories//,/ }; do
+    "$python" tools/make_dataset.py --output "$out/data" --category "$category" --procedural "${OBJECTS:-250}" --overwrite
+done
+"$python" tools/train.py --data "$out/data" --category "$categories" --preset plus --output "$out/run" --overwrite \
+    --encoder conv-small --generator sphere-small --iterations "${STEPS:-24000}" --validate-every 6000
+"$python" tools/evaluate.py "$out/run" --data "$out/data" --json "$out/evaluation.json"
+mkdir -p learn3d/models
+"$python" tools/export.py --run "$out/run" --output learn3d/models/small.safetensors
