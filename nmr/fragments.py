@@ -42,9 +42,9 @@ class Fragments:
     vertices, faces
         The meshes in renderer space, ``[B, V, 3]``; for a list of meshes ``[N, 3]``, one mesh after the other.
 
-    With ``faces_per_pixel`` K > 1 these have one more axis: owner and depth ``[B, H, W, K]``, weights ``[B, H, W, K,
-    3]``, nearest first. So do the results of :meth:`interpolate`, :meth:`per_face`, :meth:`normals` and of the
-    properties. For colours, lights and :meth:`resolve` take one :meth:`layer` at a time.
+    With ``faces_per_pixel`` K > 1 these have one more axis: owner and depth ``[B, H, W, K]``, weights
+    ``[B, H, W, K, 3]``, nearest first. So do the results of :meth:`interpolate`, :meth:`per_face`, :meth:`normals` and
+    of the properties. For colours, lights and :meth:`resolve` take one :meth:`layer` at a time.
     """
 
     owner: Tensor

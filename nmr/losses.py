@@ -84,9 +84,10 @@ def smoothness_loss(vertices: Tensor, edges: Tensor) -> Tensor:
 
     The form is that of Kato et al. 2018; SoftRas calls it the flattening loss.
 
-    theta_e is the angle between the two faces at edge e: pi (cos = -1) when flat. With a = v1 - v0 along the edge and
-    b = v_k - v0 to an opposite corner, each face has the height h = b - a (a.b) / (|a|^2 + e) of length
-    ``|b| sqrt(1 - cos(a, b)^2 + e)``, and cos(theta) = h.h' / (|h| |h'| + e), e = 1e-6 in every root and denominator.
+    theta_e is the angle between the two faces at edge e: pi (cos = -1) when flat. With ``a = v1 - v0`` along the edge
+    and ``b = v_k - v0`` to an opposite corner, each face has the height ``h = b - a (a.b) / (|a|^2 + e)`` of length
+    ``|b| sqrt(1 - cos(a, b)^2 + e)``, and ``cos(theta) = h.h' / (|h| |h'| + e)``, e = 1e-6 in every root and
+    denominator.
 
     Parameters
     ----------

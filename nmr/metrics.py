@@ -92,7 +92,7 @@ def sample_surface(
 def chamfer_distance(points_a: Tensor, points_b: Tensor, form: Literal["squared", "l1"] = "squared") -> Tensor:
     """How far two sets of points are from each other, in both directions.
 
-    With d(x, Y) = min_{y in Y} |x - y|:
+    With ``d(x, Y) = min_{y in Y} |x - y|``:
 
     - "squared": ``mean_a d(a, B)^2 + mean_b d(b, A)^2``, the usual loss (PyTorch3D's default);
     - "l1": ``(mean_a d(a, B) + mean_b d(b, A)) / 2``, the "Chamfer-L1" of Occupancy Networks: mean of accuracy and

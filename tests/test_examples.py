@@ -108,21 +108,80 @@ def test_fit_packed(tmp_path):
     check_picture(imageio.imread(tmp_path / "fit_packed.png"), 2 * 192, 2 * 192)
 
 
-def test_notebook():
-    notebook = json.loads((EXAMPLES / "quick_tour.ipynb").read_text())
-    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
-    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
+NOTEBOOKS = {  # how many pictures each shows
+    "quick_tour": 6,
+    "shape_from_silhouettes": 4,
+    "texture_and_light": 4,
+    "photographs_to_glb": 3,
+}
+
+
+def read_notebook(name):
+    return json.loads((EXAMPLES / f"{name}.ipynb").read_text())
+
+
+def code_cells(name):
+    return [cell for cell in read_notebook(name)["cells"] if cell["cell_type"] == "code"]
+
+
+def run_notebook(name):
+    """Executes the cells; the variables at the end, and the pictures that Jupyter would show below cells."""
     names, pictures = {}, []
-    for cell in cells:
+    for cell in code_cells(name):
         body = ast.parse("".join(cell["source"])).body
         last = body.pop() if isinstance(body[-1], ast.Expr) else None
-        exec(compile(ast.Module(body, []), "quick_tour.ipynb", "exec"), names)
-        if last is not None:  # what Jupyter shows below the cell
-            value = eval(compile(ast.Expression(last.value), "quick_tour.ipynb", "eval"), names)
-            if value is not None:
-                pictures.append(value)
-    assert len(pictures) == 6 and all(isinstance(picture, Image.Image) for picture in pictures)
-    for picture in pictures:
-        pixels = np.asarray(picture)
+        exec(compile(ast.Module(body, []), f"{name}.ipynb", "exec"), names)
+        if last is not None:
+            value = eval(compile(ast.Expression(last.value), f"{name}.ipynb", "eval"), names)
+            if isinstance(value, Image.Image):
+                pictures.append(np.asarray(value))
+    return names, pictures
+
+
+def test_every_notebook_is_tested():
+    assert {path.stem for path in EXAMPLES.glob("*.ipynb")} == {*NOTEBOOKS}
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_notebooks_carry_the_outputs_of_one_run(name):
+    cells = code_cells(name)
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = [output for cell in cells for output in cell["outputs"]]
+    assert not [output for output in outputs if output["output_type"] == "error" or output.get("name") == "stderr"]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == NOTEBOOKS[name]
+    for cell in cells:  # what prints has printed
+        assert ("print(" not in "".join(cell["source"]).replace("    print(", "")) or cell["outputs"]
+    assert (EXAMPLES / f"{name}.ipynb").stat().st_size < 1_500_000
+
+
+def test_quick_tour():
+    names, pictures = run_notebook("quick_tour")
+    assert len(pictures) == NOTEBOOKS["quick_tour"]
+    for pixels in pictures:
         assert pixels.shape[1] == 4 * 128 and 20 < pixels.std()
     assert names["losses"][-1] < names["losses"][0] / 3
+
+
+def test_shape_from_silhouettes():
+    names, pictures = run_notebook("shape_from_silhouettes")
+    assert len(pictures) == NOTEBOOKS["shape_from_silhouettes"]
+    one, many, staged = (names[result] for result in ("of_one_view", "of_many", "staged"))
+    assert one[0] < 0.7 < many[0] and staged[0] > 0.88  # unused silhouettes
+    assert one[1] < many[1] - 0.2 and many[1] < staged[1] - 0.1  # volume
+
+
+def test_texture_and_light():
+    names, pictures = run_notebook("texture_and_light")
+    assert len(pictures) == NOTEBOOKS["texture_and_light"]
+    together, alone = ((names[images] - names["truth"]).abs().mean() for images in ("found", "wrong"))
+    assert together < alone / 4
+    assert abs(names["ambient"] - names["true_ambient"]) < 0.05
+    assert torch.cosine_similarity(names["direction"], names["true_direction"], dim=0) > 0.99
+
+
+def test_photographs_to_glb(monkeypatch):
+    monkeypatch.chdir(EXAMPLES)  # where Jupyter runs a notebook
+    names, pictures = run_notebook("photographs_to_glb")
+    assert len(pictures) == NOTEBOOKS["photographs_to_glb"]
+    assert names["mesh"].is_watertight and names["files"][0].suffix == ".glb"
+    names["temporary"].cleanup()

@@ -1,0 +1,59 @@
+"""Settings of the site, which `bash tools/site.sh` builds with Sphinx."""
+
+import os
+import re
+from pathlib import Path
+
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+
+import nmr
+
+project = "nmr + learn3d"
+author = "the authors of nmr and learn3d"
+release = nmr.__version__
+html_title = f"nmr + learn3d {release}"
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+default_role = "literal"  # `name` in a docstring
+
+myst_heading_anchors = 4  # [text](page.md#a-heading), as in the repository's view
+nb_execution_mode = "off"  # notebooks are shown with the outputs that they carry; tests/test_examples.py runs them
+
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+python_maximum_signature_line_length = 80
+
+html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_copyright = False
+html_show_sphinx = False
+
+
+def start_with_readme(app: Sphinx, page: str, text: list[str]) -> None:
+    """The start page is the README, whose relative links start one folder higher."""
+    if page == "index":
+        readme = Path(app.srcdir).parent / "README.md"
+        app.env.note_dependency(readme)
+        text[0] = re.sub(r"\]\((?!\w+:|#)", "](../", readme.read_text()) + "\n" + text[0]
+
+
+def hand_out_files(app: Sphinx, doctree: nodes.document) -> None:
+    """Links to Markdown files outside of docs become downloads. MyST does the same with links to all other files."""
+    for link in list(doctree.findall(addnodes.pending_xref)):
+        target = Path(f"{link['reftarget']}.md")
+        if link.get("refdomain") == "doc" and target.is_absolute() and target.is_file():
+            relative = os.path.relpath(target, Path(app.env.doc2path(link["refdoc"])).parent)
+            link.replace_self(addnodes.download_reference("", *link.children, reftarget=relative))
+
+
+def setup(app: Sphinx) -> None:
+    app.connect("source-read", start_with_readme)
+    app.connect("doctree-read", hand_out_files, priority=400)  # before Sphinx collects the downloads

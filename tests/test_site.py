@@ -1,0 +1,86 @@
+"""The site builds without a warning, its links lead somewhere, and a page asks no other server for anything."""
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+import nmr
+
+pytest.importorskip("sphinx", reason='needs the extra "site"')
+pytest.importorskip("myst_nb", reason='needs the extra "site"')
+
+DOCS = Path(__file__).parent.parent / "docs"
+
+
+class Page(HTMLParser):
+    """What a page links to, what it loads, and the names of its places."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.links, self.loads, self.places = [], [], set()
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        self.places |= {attributes[name] for name in ("id", "name") if attributes.get(name)}
+        if tag == "a" and attributes.get("href"):
+            self.links.append(attributes["href"])
+        if tag in ("script", "img", "iframe", "source", "link") and attributes.get("rel") not in ("next", "prev"):
+            self.loads += [attributes[name] for name in ("src", "href") if attributes.get(name)]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the built site. In a folder of its own, so that the installed package is described."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet", DOCS, folder / "html"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder / "html"
+
+
+@pytest.fixture(scope="module")
+def pages(site):
+    return {path: Page(path) for path in site.rglob("*.html")}
+
+
+def test_every_page_of_the_docs_is_there(site):
+    for page in [*DOCS.rglob("*.md"), *DOCS.rglob("*.rst"), *DOCS.rglob("*.ipynb")]:
+        assert (site / page.relative_to(DOCS)).with_suffix(".html").exists()
+
+
+def test_links_lead_to_places_that_exist(pages):
+    lost = []
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            place = unquote(parts.fragment)
+            if not target.is_file() or (place and target in pages and place not in pages[target].places):
+                lost.append((path.name, link))
+    assert lost == []
+
+
+def test_pages_load_nothing_from_elsewhere(site, pages):
+    loads = [(path.name, load) for path, page in pages.items() for load in page.loads]
+    assert len(loads) > 100
+    assert [(name, load) for name, load in loads if urlsplit(load).netloc] == []
+    for sheet in site.rglob("*.css"):
+        assert not re.findall(r"(?:url\(|@import)\s*['\"]?(?:https?:)?//", sheet.read_text()), sheet.name
+
+
+def test_every_public_name_is_described(pages):
+    places = set().union(*(page.places for page in pages.values()))
+    for module in (nmr, nmr.cameras, nmr.losses, nmr.metrics):
+        names = {f"{module.__name__}.{name}" for name in module.__all__} - {"nmr.cameras", "nmr.losses", "nmr.metrics"}
+        if module is nmr.cameras:
+            names -= {f"nmr.cameras.{name}" for name in nmr.__all__}  # described as nmr.LookAt and so on
+            places |= {"nmr.cameras.LookAt"}
+        assert names <= places, sorted(names - places)
