@@ -15,18 +15,17 @@ author = "the authors of nmr and learn3d"
 release = nmr.__version__
 html_title = f"nmr + learn3d {release}"
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc"]
 exclude_patterns = ["_build"]
 default_role = "literal"  # `name` in a docstring
 
 myst_heading_anchors = 4  # [text](page.md#a-heading), as in the repository's view
+nb_merge_streams = True
 nb_execution_mode = "off"  # notebooks are shown with the outputs that they carry; tests/test_examples.py runs them
 
 autodoc_member_order = "bysource"
-autodoc_typehints_format = "short"
-autodoc_preserve_defaults = True
-napoleon_google_docstring = False
-napoleon_use_rtype = False
+autodoc_typehints = "none"  # docstrings say types and shapes
+numpydoc_show_class_members = False
 python_maximum_signature_line_length = 80
 
 html_theme = "furo"
