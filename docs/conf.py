@@ -19,6 +19,7 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc"]
 exclude_patterns = ["_build"]
 default_role = "literal"  # `name` in a docstring
 
+highlight_language = "none"  # blocks without a language are drawings and tables
 myst_heading_anchors = 4  # [text](page.md#a-heading), as in the repository's view
 nb_merge_streams = True
 nb_execution_mode = "off"  # notebooks are shown with the outputs that they carry; tests/test_examples.py runs them
