@@ -4,7 +4,9 @@ python docs/make_pictures.py views.png     # draw this one (without names: list 
 python docs/make_pictures.py views.png --record     # the picture is there already: only record it
 """
 
+import base64
 import hashlib
+import io
 import json
 import shutil
 import subprocess
@@ -12,6 +14,8 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+
+from PIL import Image
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
@@ -23,17 +27,27 @@ class Picture:
     """How a picture is made."""
 
     command: str  # run in the repository's root; {folder} is an empty folder
-    result: str  # what it leaves there: a path in {folder} or in the repository, the last match of a pattern
+    result: str  # what it leaves there: a path in {folder} or in the repository, the last match of a pattern; or
+    # NOTEBOOK#K: picture K of its outputs, made small
     sources: tuple[str, ...]  # files that decide what it shows
 
 
 _QUICKSTART = ("tools/quickstart.sh", "learn3d/figures/grids.py", "learn3d/methods/plus.py")
 _FIGURES = "learn3d figures {kind} RUNS --data DATA --output {{folder}}  # RUNS, DATA: those of docs/results.md"
+_NOTEBOOKS = {"quick_tour": 5, "shape_from_silhouettes": 4, "texture_and_light": 4, "photographs_to_glb": 1}
 PICTURES = {
     "views.png": Picture(
         "python docs/examples/draw_views.py --output {folder}", "{folder}/views.png", ("docs/examples/draw_views.py",)
     ),
     "quickstart.png": Picture("bash tools/quickstart.sh", "quickstart/plus/pictures/*.png", _QUICKSTART),
+    **{
+        f"gallery-{name.replace('_', '-')}.png": Picture(
+            f"jupyter execute --inplace docs/examples/{name}.ipynb",
+            f"docs/examples/{name}.ipynb#{number}",
+            (f"docs/examples/{name}.ipynb",),
+        )
+        for name, number in _NOTEBOOKS.items()
+    },
     **{
         f"results-{kind}.png": Picture(
             _FIGURES.format(kind=kind), f"{{folder}}/{kind}.png", (f"learn3d/figures/{file}.py",)
@@ -64,9 +78,22 @@ def make(name: str) -> None:
     picture = PICTURES[name]
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run(picture.command.format(folder=folder), shell=True, cwd=ROOT, check=True)
+        if "#" in picture.result:
+            picture_of_notebook(*picture.result.split("#")).save(IMAGES / name)
+            return
         found = Path(picture.result.format(folder=folder))
         last = max((ROOT / found.parent).glob(found.name), key=lambda path: path.stat().st_mtime)
         shutil.copyfile(last, IMAGES / name)
+
+
+def picture_of_notebook(notebook: str, number: str) -> Image.Image:
+    """Picture `number` (from 1) among the outputs of a notebook, at most 320 pixels wide."""
+    cells = json.loads((ROOT / notebook).read_text())["cells"]
+    data = [output.get("data", {}).get("image/png") for cell in cells for output in cell.get("outputs", [])]
+    pictures = ["".join(text) for text in data if text]
+    image = Image.open(io.BytesIO(base64.b64decode(pictures[int(number) - 1]))).convert("RGB")
+    image.thumbnail((320, 240))
+    return image
 
 
 def record(name: str) -> None:

@@ -31,7 +31,8 @@ def test_a_changed_source_is_noticed(monkeypatch, tmp_path) -> None:
     source.write_text("1")
     picture = make_pictures.Picture("", "", (str(source),))
     monkeypatch.setattr(make_pictures, "PICTURES", {"a.png": picture})
-    monkeypatch.setattr(make_pictures, "records", lambda: {"a.png": {"sources": make_pictures.digest(picture)}})
+    made = {"a.png": {"sources": make_pictures.digest(picture)}}
+    monkeypatch.setattr(make_pictures, "records", lambda: made)
     assert make_pictures.out_of_date() == []
     source.write_text("2")
     assert make_pictures.out_of_date() == ["a.png"]
