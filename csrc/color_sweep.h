@@ -234,9 +234,20 @@ NMR_INLINE void pull_own(const ColorLines<T>& lines, int64_t n, int64_t first, i
 
 // --- the sweeps
 
-// Sweeps all crossings of one axis and direction, and empties them.
-template <bool kUp, int64_t kChannels, class T>
-void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& block) {
+// Crossings of one axis and direction, before their pixels are pulled.
+template <class T>
+struct PlacedCrossings {
+  // The pixel inside, the listed pixels of the face, its owner entry, the first listed pixel outside, all of the line.
+  int32_t pixel_at[kCrossings + kPad], first_at[kCrossings + kPad], last_at[kCrossings + kPad],
+      id_at[kCrossings + kPad], outer_at[kCrossings + kPad], count_at[kCrossings + kPad];
+  int32_t extreme[2][kCrossings + kPad];  // as pulled and gained, where a lever has extreme size
+  T factor_p[kCrossings + kPad], factor_q[kCrossings + kPad];
+  int64_t num_pulled, num_gained, num_extreme[2];
+};
+
+// Places all crossings, and empties them; this does not depend on the channels.
+template <bool kUp, class T>
+void place_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& block, PlacedCrossings<T>& placed) {
   const int64_t H = image.raster.height, W = image.raster.width, length = axis == 0 ? H : W;
   const ColorLines<T>& lines = image.lines[axis];
   Crossings<T>& crossings = block.crossings[axis][kUp ? 0 : 1];
@@ -255,11 +266,6 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
                 before_m = splat(static_cast<int32_t>(lines.step_m));
   const Lanes<T> largest = splat(image.largest_lever);
   const int32_t* before = lines.before.data();
-  int32_t pixel_at[kCrossings + kPad], first_at[kCrossings + kPad], last_at[kCrossings + kPad],
-      id_at[kCrossings + kPad];
-  int32_t outer_at[kCrossings + kPad], count_at[kCrossings + kPad];
-  int32_t extreme[2][kCrossings + kPad];  // as pulled and gained, where a lever has extreme size
-  T factor_p[kCrossings + kPad], factor_q[kCrossings + kPad];
   int64_t num_pulled = 0, num_gained = 0, num_extreme[2] = {0, 0};
   for (int64_t i = 0; i < crossings.count; i += kLanes) {
     const Lanes<T> at = load_lanes<Lanes<T>>(crossings.at + i);
@@ -295,52 +301,64 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
     // Outside: from the outer pixel on, eight at a time, the first or the last eight together.
     const Lanes32 outer =
         gather_lanes(before, origin_n + (inner * sign + splat(kUp ? int32_t(1) : int32_t(0))) * before_m);
-    store_lanes(outer_at + i, outer);
-    if (kUp) store_lanes(count_at + i, gather_lanes(lines.count.data(), line));
-    store_lanes(pixel_at + i, pixel);
-    store_lanes(first_at + i, first);
-    store_lanes(last_at + i, last);
-    store_lanes(id_at + i, id);
-    store_lanes(factor_p + i, by_p);
-    store_lanes(factor_q + i, by_q);
+    store_lanes(placed.outer_at + i, outer);
+    if (kUp) store_lanes(placed.count_at + i, gather_lanes(lines.count.data(), line));
+    store_lanes(placed.pixel_at + i, pixel);
+    store_lanes(placed.first_at + i, first);
+    store_lanes(placed.last_at + i, last);
+    store_lanes(placed.id_at + i, id);
+    store_lanes(placed.factor_p + i, by_p);
+    store_lanes(placed.factor_q + i, by_q);
     const uint32_t regular = lane_bits(moderate);
     const uint32_t pulls = lane_bits(may_pull & (inner_owner == id)), gains = lane_bits(may_gain & (first < last));
     num_pulled += compress_lanes(number, pulls & regular, crossings.pulled + num_pulled);
     num_gained += compress_lanes(number, gains & regular, crossings.gained + num_gained);
     if (!((pulls | gains) & ~regular)) continue;
-    num_extreme[0] += compress_lanes(number, pulls & ~regular, extreme[0] + num_extreme[0]);
-    num_extreme[1] += compress_lanes(number, gains & ~regular, extreme[1] + num_extreme[1]);
+    num_extreme[0] += compress_lanes(number, pulls & ~regular, placed.extreme[0] + num_extreme[0]);
+    num_extreme[1] += compress_lanes(number, gains & ~regular, placed.extreme[1] + num_extreme[1]);
   }
   crossings.count = 0;
+  placed.num_pulled = num_pulled, placed.num_gained = num_gained;
+  placed.num_extreme[0] = num_extreme[0], placed.num_extreme[1] = num_extreme[1];
+}
 
+// Sweeps all crossings of one axis and direction, and empties them.
+template <bool kUp, int64_t kChannels, class T>
+void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& block) {
+  PlacedCrossings<T> placed;
+  place_crossings<kUp>(image, axis, block, placed);
+  const ColorLines<T>& lines = image.lines[axis];
+  const Crossings<T>& crossings = block.crossings[axis][kUp ? 0 : 1];
+  const int32_t* before = lines.before.data();
+  const int32_t d = kUp ? 1 : -1, step = axis == 0 ? static_cast<int32_t>(-image.raster.width) * d : d;
   const auto lever_of = [&](int32_t i) {
-    return Lever<T>{kUp ? crossings.at[i] : -crossings.at[i], factor_p[i], factor_q[i], image.eps};
+    return Lever<T>{kUp ? crossings.at[i] : -crossings.at[i], placed.factor_p[i], placed.factor_q[i], image.eps};
   };
   const auto pulls_of = [&](int32_t i) { return block.pulls[axis][crossings.edge[i]]; };
-  for (int64_t k = 0; k < num_pulled; ++k) {
+  for (int64_t k = 0; k < placed.num_pulled; ++k) {
     const int32_t i = crossings.pulled[k];
-    const T* reference = image.pixels + pixel_at[i] * image.channels;  // of the face
-    const int64_t blocks = kUp ? (count_at[i] + 7) / 8 - outer_at[i] / 8 : (outer_at[i] + 7) / 8;
+    const T* reference = image.pixels + placed.pixel_at[i] * image.channels;  // of the face
+    const int64_t blocks = kUp ? (placed.count_at[i] + 7) / 8 - placed.outer_at[i] / 8 : (placed.outer_at[i] + 7) / 8;
     pull_outside<kUp, kChannels>(lines, crossings.line[i], blocks, reference, lever_of(i), pulls_of(i));
   }
-  for (int64_t k = 0; k < num_extreme[0]; ++k) {
-    const int32_t i = extreme[0][k], n = crossings.line[i];
+  for (int64_t k = 0; k < placed.num_extreme[0]; ++k) {
+    const int32_t i = placed.extreme[0][k], n = crossings.line[i];
     const int64_t outer = d * static_cast<int64_t>(std::floor(crossings.at[i])) + d;
     const int64_t first = kUp ? before[n * lines.step_n + outer * lines.step_m] : 0;
     const int64_t last = kUp ? lines.count[n] : before[n * lines.step_n + (outer + 1) * lines.step_m];
-    pull_one_by_one<false>(lines, n, first, last, 0, image.color(pixel_at[i]), lever_of(i), pulls_of(i));
+    pull_one_by_one<false>(lines, n, first, last, 0, image.color(placed.pixel_at[i]), lever_of(i), pulls_of(i));
   }
-  for (int64_t k = 0; k < num_gained; ++k) {
+  for (int64_t k = 0; k < placed.num_gained; ++k) {
     const int32_t i = crossings.gained[k];
-    const T* reference = image.color(pixel_at[i] + step);
-    pull_own<kChannels>(lines, crossings.line[i], first_at[i], last_at[i], id_at[i], reference, lever_of(i),
-                        pulls_of(i));
+    const T* reference = image.color(placed.pixel_at[i] + step);
+    pull_own<kChannels>(lines, crossings.line[i], placed.first_at[i], placed.last_at[i], placed.id_at[i], reference,
+                        lever_of(i), pulls_of(i));
   }
-  for (int64_t k = 0; k < num_extreme[1]; ++k) {
-    const int32_t i = extreme[1][k];
-    const T* reference = image.color(pixel_at[i] + step);
-    pull_one_by_one<true>(lines, crossings.line[i], first_at[i], last_at[i], id_at[i], reference, lever_of(i),
-                          pulls_of(i));
+  for (int64_t k = 0; k < placed.num_extreme[1]; ++k) {
+    const int32_t i = placed.extreme[1][k];
+    const T* reference = image.color(placed.pixel_at[i] + step);
+    pull_one_by_one<true>(lines, crossings.line[i], placed.first_at[i], placed.last_at[i], placed.id_at[i], reference,
+                          lever_of(i), pulls_of(i));
   }
 }
 

@@ -80,12 +80,13 @@ void resolve_forward(const Resolve<T>& args) {
     for (int64_t c = 0; c < C; ++c) behind.push_back((color[c] + color[c] + color[c] + color[c]) / 4);
   }
   with_channels(C, [&](auto known) {
+    constexpr int64_t kChannels = known();
     parallel_for(args.batch * h, args.num_threads, [&](int64_t n) {  // n: image b, row y
       const T* background =
           args.background ? behind.data() + (args.background_batch == 1 ? 0 : n / h * 2 * C) : nullptr;
       const int32_t* owner = args.background ? args.owner + n * scale * W : nullptr;
-      resolve_row<known()>(owner, args.pixels + n * scale * W * C, background, w, args.anti_aliasing, C,
-                           args.resolved + n * w * C);
+      resolve_row<kChannels>(owner, args.pixels + n * scale * W * C, background, w, args.anti_aliasing, C,
+                             args.resolved + n * w * C);
     });
   });
 }
@@ -98,10 +99,11 @@ void resolve_backward(const Resolve<T>& args) {
   const T share = T(1) / static_cast<T>(scale * scale);  // a power of two: exact
   if (args.grad_pixels)
     with_channels(C, [&](auto known) {
+      constexpr int64_t kChannels = known();
       parallel_for(args.batch * H, args.num_threads, [&](int64_t n) {  // n: image b, raster row
-        resolve_row_backward<known()>(args.background ? args.owner + n * W : nullptr,
-                                      args.grad_resolved + n / scale * w * C, w, args.anti_aliasing, C,
-                                      args.grad_pixels + n * W * C);
+        resolve_row_backward<kChannels>(args.background ? args.owner + n * W : nullptr,
+                                        args.grad_resolved + n / scale * w * C, w, args.anti_aliasing, C,
+                                        args.grad_pixels + n * W * C);
       });
     });
   if (args.grad_background)

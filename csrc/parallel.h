@@ -27,6 +27,8 @@
 
 #if defined(__GNUC__)
 #define NMR_INLINE inline __attribute__((always_inline))
+#elif defined(_MSC_VER)
+#define NMR_INLINE __forceinline
 #else
 #define NMR_INLINE inline
 #endif

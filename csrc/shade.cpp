@@ -71,7 +71,8 @@ int64_t first_cube(const TextureCubes<T>& args, int64_t b) {
 template <class T>
 void texture_cubes_forward(const TextureCubes<T>& args) {
   with_channels(args.channels, [&](auto known) {
-    const int64_t W = args.raster.width, C = known ? known() : args.channels, ts = args.texture_size,
+    constexpr int64_t kChannels = known();
+    const int64_t W = args.raster.width, C = kChannels ? kChannels : args.channels, ts = args.texture_size,
                   cube = ts * ts * ts * C;
     for_rows(args.batch, args.raster.height, args.num_threads, [&](int64_t b, int64_t row) {
       const int64_t start = (b * args.raster.height + row) * W, F = face_count(args, b);
@@ -80,8 +81,8 @@ void texture_cubes_forward(const TextureCubes<T>& args) {
       for (int64_t n = start; n < start + W; ++n, color += C) {
         const int64_t id = args.owner[n];
         if (id >= 0)
-          blend<known()>(texels_of(args.weights + 3 * n, ts, args.eps), textures + (id < F ? id : id - F) * cube, C,
-                         color);
+          blend<kChannels>(texels_of(args.weights + 3 * n, ts, args.eps), textures + (id < F ? id : id - F) * cube, C,
+                           color);
         else
           for (int64_t k = 0; k < C; ++k) color[k] = 0;
       }

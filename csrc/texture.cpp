@@ -392,7 +392,8 @@ template <class T>
 void sample_uv_forward(const SampleUV<T>& args) {
   const Interpolate<T>& at = args.uv;
   with_channels(args.channels, [&](auto known) {
-    const int64_t W = at.raster.width, C = known ? known() : args.channels;
+    constexpr int64_t kChannels = known();
+    const int64_t W = at.raster.width, C = kChannels ? kChannels : args.channels;
     for_rows(at.batch, at.raster.height, at.num_threads, [&](int64_t b, int64_t row) {
       const ImageAttributes<T> image = image_attributes(at, b);
       const T* uv = at.attributes + 2 * image.first_row;
@@ -406,9 +407,9 @@ void sample_uv_forward(const SampleUV<T>& args) {
         }
         const Place<T> place = place_of(uv, image.corners + 3 * (id < F ? id : id - F), at.weights + 3 * n);
         const Blend<T> blend = blend_of(args, b, n);
-        add_taps<known(), false>(taps_of(blend.grid[0], place, args.wrap), args.texels, blend.share[0], C, color);
+        add_taps<kChannels, false>(taps_of(blend.grid[0], place, args.wrap), args.texels, blend.share[0], C, color);
         if (blend.count == 2)
-          add_taps<known(), true>(taps_of(blend.grid[1], place, args.wrap), args.texels, blend.share[1], C, color);
+          add_taps<kChannels, true>(taps_of(blend.grid[1], place, args.wrap), args.texels, blend.share[1], C, color);
       }
     });
   });

@@ -11,6 +11,7 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include "../indices.h"
 #include "../parallel.h"
 #include "../stages.h"
 
@@ -22,6 +23,8 @@ namespace nmr {
 template <class T>
 using Array = py::array_t<T, py::array::c_style>;
 using Indices = Array<int64_t>;
+
+inline py::arg array(const char* name) { return py::arg(name).noconvert(); }
 
 inline void require(bool condition, const std::string& message) {
   if (!condition) throw std::invalid_argument(message);
@@ -64,12 +67,7 @@ T* optional_out(std::optional<Array<T>>& grad, const char* name, const std::vect
 // Every index must lie in 0..limit-1. Callers release the GIL.
 inline void require_indices(const int64_t* index, int64_t count, int64_t limit, const char* name, const char* what,
                             const char* plural) {
-  const uint64_t last = static_cast<uint64_t>(limit) - 1;
-  // Its highest bit: the signs of i and limit - 1 - i (without branches, so that the loop is vectorized).
-  uint64_t wrong = 0;
-  for (int64_t n = 0; n < count; ++n)
-    wrong |= static_cast<uint64_t>(index[n]) | (last - static_cast<uint64_t>(index[n]));
-  if (!(wrong >> 63)) return;
+  if (are_indices(index, count, limit)) return;
   for (int64_t n = 0; n < count; ++n)
     if (index[n] < 0 || index[n] >= limit)
       throw std::invalid_argument(std::string(name) + " refer to " + what + " " + std::to_string(index[n]) +
@@ -133,11 +131,7 @@ Size require_owner(const Array<int32_t>& owner, int64_t batch, const FaceCount& 
   const int32_t* entries = owner.data();
   const py::gil_scoped_release release;
   parallel_for(batch, num_threads, [&](int64_t b) {
-    const uint32_t limit = static_cast<uint32_t>(2 * face_count(b));
-    const int32_t* entry = entries + b * pixels;
-    uint32_t wrong = 0;
-    for (int64_t n = 0; n < pixels; ++n) wrong |= static_cast<uint32_t>(entry[n]) + 1 > limit;
-    require(!wrong, "the owner map does not belong to these faces");
+    require(are_owners(entries + b * pixels, pixels, face_count(b)), "the owner map does not belong to these faces");
   });
   return {owner.shape(1), owner.shape(2)};
 }

@@ -121,7 +121,6 @@ void project_backward_py(const Array<T>& vertices, const Array<T>& matrix, const
 
 template <class T>
 void define_camera(py::module_& m) {
-  const auto array = [](const char* name) { return py::arg(name).noconvert(); };
   const auto optional = [](const char* name) { return py::arg(name).noconvert().none(true); };
   m.def("pose_forward", &pose_forward_py<T>, array("forward"), array("up"), array("matrix"));
   m.def("pose_backward", &pose_backward_py<T>, array("forward"), array("up"), array("grad_matrix"),

@@ -152,8 +152,6 @@ void lit_backward_py(const std::optional<Array<T>>& colors, const Array<T>& norm
   lit_backward(args);
 }
 
-py::arg array(const char* name) { return py::arg(name).noconvert(); }
-
 template <class T>
 void define_lights(py::module_& m) {
   m.def("normals_forward", &normals_forward_py<T>, array("vertices"), array("faces"), array("starts"),

@@ -168,8 +168,6 @@ void sample_uv_backward_py(const Array<T>& texels, const Indices& grids, const s
   sample_uv_backward(args);
 }
 
-py::arg array(const char* name) { return py::arg(name).noconvert(); }
-
 template <class T>
 void define_texture(py::module_& m) {
   m.def("mipmaps_forward", &mipmaps_forward_py<T>, array("texels"), array("grids"), array("pyramid"),
