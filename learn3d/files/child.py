@@ -74,7 +74,7 @@ def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def serve() -> None:
-    """Answer requests on the standard input, lists of calls, until it is closed."""
+    """Answer requests on the standard input, current folders and lists of calls, until it is closed."""
     global _shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interruption ends
     _shared = {}
@@ -87,7 +87,9 @@ def serve() -> None:
         os.dup2(silence, stream)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
-            calls = pickle.load(requests)
+            folder, calls = pickle.load(requests)
+            if folder is not None:
+                os.chdir(folder)
             results = [_attempt(call) for call in calls]
             _limit(None, None)
             data, files = _pickled(results)

@@ -153,7 +153,7 @@ if hasattr(os, "register_at_fork"):
 
 def _run(calls: list[Call]) -> list[Any]:
     """The results of calls in one worker."""
-    request, patience, slots = pickle.dumps(calls, 5), sum(map(_patience, calls)), _slots
+    request, patience, slots = pickle.dumps((_folder(), calls), 5), sum(map(_patience, calls)), _slots
     worker, started = slots.get(), time.monotonic()
     try:
         if worker is not None and worker.process.poll() is not None:
@@ -181,6 +181,14 @@ def _run(calls: list[Call]) -> list[Any]:
     else:
         fault = f"the process that read it crashed (status {status})"
     return [DamagedFile(calls[0].path, f"{fault}; expected {calls[0].wanted}. {FETCH_AGAIN}")]
+
+
+def _folder() -> str | None:
+    """The current folder, which relative paths begin at; it may have changed since a worker was started."""
+    try:
+        return os.getcwd()
+    except OSError:  # it has been removed
+        return None
 
 
 def _patience(call: Call) -> float:

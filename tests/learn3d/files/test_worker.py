@@ -198,3 +198,9 @@ def test_copy_of_the_process_starts_its_own_workers(path: Path) -> None:
     numbers = [process.stdout.readline() for _ in range(3)]
     process.communicate(timeout=20)
     assert len(set(numbers)) == 2
+
+
+def test_relative_paths_begin_at_the_folder_of_the_moment(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert read(strange.size, path) == 5  # by a worker that was started elsewhere
+    monkeypatch.chdir(path.parent)
+    assert read(strange.size, path.name) == 5
