@@ -38,7 +38,7 @@ html_show_sphinx = False
 
 
 def start_with_readme(app: Sphinx, page: str, text: list[str]) -> None:
-    """The start page is the README, whose relative links start one folder higher."""
+    """Put the README on the start page. Its links are relative to the folder above docs."""
     if page == "index":
         readme = Path(app.srcdir).parent / "README.md"
         app.env.note_dependency(readme)

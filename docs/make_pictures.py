@@ -2,6 +2,7 @@
 
 python docs/make_pictures.py views.png     # draw this one (without names: list them, and say which are out of date)
 python docs/make_pictures.py views.png --record     # the picture is there already: only record it
+OUTPUT=results python docs/make_pictures.py results-polar.png     # from the runs of `learn3d experiment plus`
 """
 
 import base64
@@ -33,7 +34,7 @@ class Picture:
 
 
 _QUICKSTART = ("tools/quickstart.sh", "learn3d/figures/grids.py", "learn3d/methods/plus.py")
-_FIGURES = "learn3d figures {kind} RUNS --data DATA --output {{folder}}  # RUNS, DATA: those of docs/results.md"
+_RUNS = "$OUTPUT/runs/airplane/proposed-seed0 $OUTPUT/runs/airplane/plus-seed0"
 _NOTEBOOKS = {"quick_tour": 5, "shape_from_silhouettes": 4, "texture_and_light": 4, "photographs_to_glb": 1}
 PICTURES = {
     "views.png": Picture(
@@ -50,7 +51,9 @@ PICTURES = {
     },
     **{
         f"results-{kind}.png": Picture(
-            _FIGURES.format(kind=kind), f"{{folder}}/{kind}.png", (f"learn3d/figures/{file}.py",)
+            f"learn3d figures {kind} --runs {_RUNS} --output {{folder}}/{kind}.png",
+            f"{{folder}}/{kind}.png",
+            (f"learn3d/figures/{file}.py",),
         )
         for kind, file in {"curves": "curves", "polar": "polar", "tsne": "codes"}.items()
     },

@@ -41,7 +41,8 @@ class Command:
     objects: int = 12
     """How many objects to show shapes of, spread from the best IoU to the worst."""
     indices: tuple[int, ...] = ()
-    """Images of the data set to show instead: object * V + view, of V views of each object."""
+    """Numbers of the images to show, in place of --objects. With V views of each object, image n * V + k is view k of
+    object n."""
 
 
 def run(arguments: Sequence[str]) -> int:

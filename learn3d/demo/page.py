@@ -87,7 +87,7 @@ def _editor(background: np.ndarray | str, mask: np.ndarray) -> dict:
 
 @contextlib.contextmanager
 def _told() -> Iterator[None]:
-    """What is wrong with a visitor's picture is said on the page, in a sentence."""
+    """Show errors about a visitor's picture on the page, as one sentence."""
     try:
         yield
     except (ValueError, OSError) as error:

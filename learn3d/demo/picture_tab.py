@@ -31,7 +31,10 @@ class Picture(NamedTuple):
 
 
 def open_picture(path: Path, tolerance: float = TOLERANCE) -> Picture:
-    """A visitor's file; its transparency is the mask, or else what `threshold_mask` finds. ValueError: no picture."""
+    """Read a picture file. Its mask is its transparency or, if it has none, what `threshold_mask` finds.
+
+    Raises ValueError for a file that is no picture.
+    """
     colors, alpha = read_picture(path, SIDE)
     height, width = colors.shape[:2]
     top, left = (SIDE - height) // 2, (SIDE - width) // 2

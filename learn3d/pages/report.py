@@ -1,4 +1,4 @@
-"""One HTML file about trained runs: what was trained, how well it does, shapes that can be turned by hand."""
+"""Writes one HTML file about trained runs: their settings and curves, their IoU, and meshes to turn by hand."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def write_report(
 
 
 def _check_comparable(configs: Sequence[TrainConfig], data: Path | None, category: str | None) -> None:
-    """Raise a ValueError where runs were trained on different things, and nothing says on what to measure them."""
+    """Raise ValueError where the runs have different data or categories and the user has not chosen one."""
     classes = list(dict.fromkeys(category or config.category for config in configs))
     if len(classes) > 1 or any("," in name for name in classes):
         raise ValueError(f"a report is about one class, and these runs are of {', '.join(classes)}; give --category")
@@ -126,7 +126,7 @@ def _check_same_images(runs: Sequence[Run]) -> None:
 
 
 def _ranked(measured: Sequence[Measured]) -> np.ndarray:
-    """The objects that have images, int64 [n], from the best to the worst by the mean over the runs."""
+    """Numbers of the objects that have images, int64 [n], sorted by their mean IoU over all runs, the best first."""
     present = np.unique(measured[0].run.dataset.object_ids)
     means = _mean([m.object_means for m in measured])[present]
     return present[np.argsort(-np.nan_to_num(means, nan=-1.0), kind="stable")]
@@ -232,7 +232,7 @@ def _curves(paths: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 def _mean(values: Sequence[np.ndarray]) -> np.ndarray:
-    """Mean over the runs of what is defined, NaN where nothing is."""
+    """Mean over the runs, without NaN; NaN where all runs have NaN."""
     stacked = np.stack(values)
     known = ~np.isnan(stacked)
     total = np.where(known, stacked, 0.0).sum(0)

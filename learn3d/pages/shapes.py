@@ -19,7 +19,7 @@ from learn3d.methods.surfaces import grid_surface
 from learn3d.terminal import plain
 
 UNIT = 1e-4  # of stored coordinates, which are int16: they reach to 3.3, objects to 1
-#: From the object frame to the browser's axes: those of mesh files, turned so that z is up.
+#: Turns row vectors of the object frame into the page's axes, where z is up (in mesh files y is up).
 _TO_PAGE = mesh_to_object() @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 Faces = dict[tuple[str, str, str, str], int]  # (dtype, corners 0, 2, 1 of all triangles) of meshes, and its number

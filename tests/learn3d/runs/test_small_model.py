@@ -1,4 +1,4 @@
-"""The small model that comes with the package: its size, and that it knows what it was trained for."""
+"""The small model in the package: its file is small, and its shapes of generated objects are right."""
 
 from __future__ import annotations
 
