@@ -27,6 +27,8 @@ from learn3d.data.framing import read_photo
 from learn3d.files import meshes, npz, renderings, volumes, worker
 
 SECONDS, BYTES = 10.0, 700e6
+if sys.gettrace() is not None:  # the coverage of lines is measured, which slows Python down
+    SECONDS *= 4
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and measured on Linux only")
 
 
