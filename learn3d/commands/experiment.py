@@ -51,6 +51,8 @@ class Command:
     """Number of seeds, 0 .. seeds - 1. None given: the table's."""
     jobs: int = 1
     """Runs at a time, each in a process of its own with its share of the cores."""
+    cluster: str | None = None
+    """Runs on a Dask cluster: the address or the scheduler file of its scheduler (docs/scale.md). None given: here."""
     threads: int | None = None
     """CPU threads of each run. None given: cores / jobs."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -77,4 +79,5 @@ def run(arguments: Sequence[str]) -> int:
     options = Options(
         categories=names(command.category), changes=command.set, **{name: getattr(command, name) for name in shared}
     )
-    return run_experiment(Call(command.table, options, command.jobs, command.overwrite, command.report_only))
+    how = {name: getattr(command, name) for name in ("jobs", "cluster", "overwrite", "report_only")}
+    return run_experiment(Call(command.table, options, **how))

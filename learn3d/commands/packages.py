@@ -1,10 +1,10 @@
 """Optional packages: what to say where one is not installed."""
 
-#: The extra that a package belongs to; the others belong to "train".
-_EXTRAS = {"matplotlib": "figures", "sklearn": "figures", "plotly": "report", "gradio": "demo"}
+#: Names on the package index, where they are not those that are imported.
+_NAMES = {"sklearn": "scikit-learn", "skimage": "scikit-image", "PIL": "pillow"}
 
 
 def missing_package(package: str) -> str:
     """Which package is needed, and the command that installs it."""
-    extra = _EXTRAS.get(package, "train")
-    return f'needs the package {package}, which is not installed; install it: pip install "nmr-learn3d[{extra}]"'
+    name = _NAMES.get(package, package)
+    return f"needs the package {name}, which is not installed; install it: pip install {name}"

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from learn3d.device import cores
+from learn3d.experiments import results
 from learn3d.experiments.formats import to_text, write_report
 from learn3d.experiments.plan import Options, Run, plan_runs
-from learn3d.experiments.pool import Work, carry_out, carry_out_all
 from learn3d.experiments.report import make_report
 from learn3d.experiments.results import conflicts_with, read_results
 from learn3d.experiments.tables import TABLES
+from learn3d.parallel.engine import Task, carry_out_all
+from learn3d.runs import folder as run_folder
 from learn3d.terminal import INTERRUPTED, note, say
+from learn3d.training import train
+
+LOG_FILE = "log.txt"  # in a run's folder
+
+#: Carries out a run, anew if the second argument says so; False where it was stopped.
+Work = Callable[[Run, bool], bool]
 
 
 @dataclass(frozen=True)
@@ -23,8 +31,25 @@ class Call:
     table: str
     options: Options
     jobs: int = 1
+    cluster: str | None = None
     overwrite: bool = False
     report_only: bool = False
+
+
+def carry_out(run: Run, fresh: bool) -> bool:
+    """Train and measure; False when a signal stopped the training. Raises what `train` and `measure` raise.
+
+    A run that is there goes on, unless `fresh` replaces it. If it only needs measuring, `train` finds that it is
+    complete and still of the same options and data.
+    """
+    resume = not fresh and run_folder.is_run(run.folder)
+    if not resume:
+        (run.folder / results.RESULT_FILE).unlink(missing_ok=True)
+    if not train(run.config, resume=resume, overwrite=not resume).finished:
+        return False
+    record = results.measure(run)
+    print(f"tested: voxel IoU {record['voxel_iou_kato18']:.4f} (kato18)", flush=True)
+    return True
 
 
 def run_experiment(call: Call, *, work: Work = carry_out) -> int:
@@ -66,12 +91,17 @@ def _complete(runs: Sequence[Run], call: Call, threads: int, work: Work) -> dict
         advice = "ask for the same options, choose another --output, or give --overwrite"
         raise ValueError("\n  ".join([*conflicts.values(), advice]))
     done = read_results([run for run in runs if run.name not in conflicts])
+    where = f"on the cluster {call.cluster}" if call.cluster else f"{call.jobs} at a time"
+    logs = call.options.output / "runs/*/*" / LOG_FILE
     note(
-        f"{call.table}: {len(runs)} runs, of which {len(done)} are done; {call.jobs} at a time, {threads} threads each"
+        f"{call.table}: {len(runs)} runs, of which {len(done)} are done; {where}, {threads} threads each; logs: {logs}"
     )
-    missing = [run for run in runs if run.folder not in done]
-    fresh = [run for run in runs if run.name in conflicts]
-    return carry_out_all(missing, jobs=call.jobs, fresh=fresh, work=work)
+    tasks = [
+        Task(run.name, work, (run, run.name in conflicts), run.folder / LOG_FILE)
+        for run in runs
+        if run.folder not in done
+    ]
+    return carry_out_all(tasks, call.options.output, jobs=call.jobs, cluster=call.cluster)
 
 
 def describe_tables() -> str:

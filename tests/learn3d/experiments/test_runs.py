@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -11,16 +12,19 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
 import pytest
 import stub_work
 
-from learn3d.experiments import pool, results
-from learn3d.experiments.experiment import Call, run_experiment
+from learn3d.experiments import experiment, results
+from learn3d.experiments.experiment import Call, carry_out, run_experiment
 from learn3d.experiments.plan import Options, plan_runs
 from learn3d.experiments.tables import TABLES
+from learn3d.parallel import engine
 from learn3d.training import Summary
 
 
@@ -68,9 +72,16 @@ def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, optio
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals")
 @pytest.mark.parametrize(("nohup", "status"), [(True, 0), (False, 130)])
 def test_a_closed_terminal_stops_the_runs_except_under_nohup(monkeypatch, nohup, status, options) -> None:
-    start = pool._start
+    executor = engine._executor
+
+    @contextlib.contextmanager
+    def hang_up(*given: object) -> Iterator[Executor]:
+        with executor(*given) as threads:
+            signal.raise_signal(signal.SIGHUP)
+            yield threads
+
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN if nohup else signal.SIG_DFL)
-    monkeypatch.setattr(pool, "_start", lambda *given: (signal.raise_signal(signal.SIGHUP), start(*given))[1])
+    monkeypatch.setattr(engine, "_executor", hang_up)
     try:
         assert run_experiment(Call("kato", options(methods=("vanilla",))), work=stub_work.work) == status
     finally:
@@ -92,7 +103,7 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, capsys) -> No
 
     (folder / "test.json").unlink()
     run = plan_runs(TABLES["kato"], given)[0]
-    assert pool.carry_out(run, fresh=False)
+    assert carry_out(run, fresh=False)
     assert json.loads((folder / "test.json").read_text())["voxel_iou_kato18"] == result["voxel_iou_kato18"]
     assert (folder / "log.txt").read_text().count("training: ") == 1, "only measured again"
 
@@ -101,7 +112,7 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, capsys) -> No
         shutil.copy(tiny_folder / f"02691156_{name}.npz", tmp_path)
     moved = dataclasses.replace(run, config=dataclasses.replace(run.config, data=tmp_path))
     with pytest.raises(ValueError, match="other training data"):
-        pool.carry_out(moved, fresh=False)
+        carry_out(moved, fresh=False)
 
 
 def test_a_run_goes_on_or_starts_anew(finished_run, tiny_folder, options, tmp_path, monkeypatch) -> None:
@@ -116,14 +127,14 @@ def test_a_run_goes_on_or_starts_anew(finished_run, tiny_folder, options, tmp_pa
         calls.append(how)
         return Summary(config.output, 5, False, 0.0, 0, 0.0, 0.0)
 
-    monkeypatch.setattr(pool, "train", train)
+    monkeypatch.setattr(experiment, "train", train)
     monkeypatch.setattr(results, "measure", lambda run: pytest.fail("a stopped run is not measured"))
-    assert not pool.carry_out(run, fresh=False)
-    assert not pool.carry_out(run, fresh=True)
+    assert not carry_out(run, fresh=False)
+    assert not carry_out(run, fresh=True)
     (run.folder / "config.json").unlink()
-    assert not pool.carry_out(run, fresh=False), "a checkpoint alone is a run, too"
+    assert not carry_out(run, fresh=False), "a checkpoint alone is a run, too"
     shutil.rmtree(run.folder)
-    assert not pool.carry_out(run, fresh=False)
+    assert not carry_out(run, fresh=False)
     goes_on, new = {"resume": True, "overwrite": False}, {"resume": False, "overwrite": True}
     assert calls == [goes_on, new, goes_on, new]
 

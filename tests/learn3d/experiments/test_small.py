@@ -25,10 +25,10 @@ import trimesh
 
 from learn3d import commands
 from learn3d.data.layouts import Layout
-from learn3d.experiments import experiment, pool
-from learn3d.experiments.plan import Run
+from learn3d.experiments import experiment
 from learn3d.experiments.tables import TABLES
 from learn3d.make_data.render import DatasetConfig, make_dataset
+from learn3d.parallel.engine import Task
 from learn3d.runs import checkpoint
 
 pytestmark = pytest.mark.slow
@@ -121,12 +121,12 @@ def call_tool(name: str, *words: object) -> tuple[int, str, str]:
     return status, out.getvalue(), err.getvalue()
 
 
-def carry_out_here(runs: Sequence[Run], **options: object) -> dict[str, str]:
-    """What the pool does, in this process: starting Python and torch takes longer than two steps."""
-    for run in runs:
-        run.folder.mkdir(parents=True, exist_ok=True)
-        with open(run.folder / "log.txt", "a") as log, contextlib.redirect_stderr(log):
-            assert pool.carry_out(run, fresh=False)
+def carry_out_here(tasks: Sequence[Task], folder: Path, **how: object) -> dict[str, str]:
+    """What the engine does, in this process: starting Python and torch takes longer than two steps."""
+    for task in tasks:
+        task.log.parent.mkdir(parents=True, exist_ok=True)
+        with open(task.log, "a") as log, contextlib.redirect_stderr(log):
+            assert task.function(*task.arguments)
     return {}
 
 
