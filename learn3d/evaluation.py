@@ -165,12 +165,12 @@ def evaluate(
     forms = ("released", "paper") if paper_mmd else ("released",)
     own = torch.cat(rows) if rows else torch.empty(0, dtype=torch.int64)
     samples = torch.cat(chunks).numpy()
-    view_ids = torch.from_numpy(dataset.view_ids[samples])
+    view_ids = torch.from_numpy(dataset.view_ids[samples]).to(torch.int64)
     means = mean_mmd(ranks.gather(codes, own, count), view_ids, forms=forms, ranks=ranks)
     chamfer, f_score = torch.tensor(distances).T if distances else (None, None)
     seen = ranks.any(bool(silhouettes))
     return Evaluation(
-        object_ids=torch.from_numpy(dataset.object_ids[samples]),
+        object_ids=torch.from_numpy(dataset.object_ids[samples]).to(torch.int64),
         view_ids=view_ids,
         ious={name: ranks.gather(values, own, count) for name, values in ious.items()},
         chamfer_l1=chamfer,

@@ -55,7 +55,12 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
         ranks = ranks.divide(config.batch_size, config.sampling)
 
         train_set, val_set = load_splits(config)
-        found = (train_set.check_masks(), crowding(torch.get_num_threads(), ranks.local_world))
+        found = (
+            *train_set.notes,
+            *val_set.notes,
+            train_set.check_masks(),
+            crowding(torch.get_num_threads(), ranks.local_world),
+        )
         shape = _shape_of(train_set, config)
         precision = resolve_precision(config.precision, config.device)
         how = {"device": config.device, "precision": precision, "seed": config.seed, "plan": config.plan}
@@ -70,9 +75,12 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
             for warning in filter(None, (*notes, *found)):
                 log.say(f"warning: {warning}")
             log.say(_describe(config, precision, train_set, val_set, progress, ranks))
+            sample = functools.partial(sample_indices, train_set, config.sampling, config.batch_size, config.seed)
+            indices = sample(progress.step + 1)
             for step in range(progress.step + 1, config.iterations + 1):
-                indices = sample_indices(train_set, config.sampling, config.batch_size, config.seed, step)
                 batch = train_set.batch(indices, ranks.rows, voxels=False)
+                indices = sample(step + 1)
+                train_set.prepare(indices, ranks.rows)
                 losses = method.train_step(augment(batch, config.augment, config.seed, step), step)
                 # With those of the step before: methods that take turns compute other ones in odd and in even steps.
                 recent = progress.losses | losses

@@ -19,6 +19,7 @@ COMMANDS = {
     "export": "write a trained model into one small file",
     "demo": "a page that turns pictures into meshes",
     "make-dataset": "render a data set from meshes",
+    "convert-dataset": "keep a data set in shards, for data larger than memory",
     "check-dataset": "list everything that is wrong with a data set",
     "experiment": "make a table of the paper: train, measure, report",
     "figures": "draw the paper's figures from trained models",
@@ -69,6 +70,8 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
         from learn3d.commands.demo import run
     elif name == "make-dataset":
         from learn3d.commands.make_dataset import run
+    elif name == "convert-dataset":
+        from learn3d.commands.convert_dataset import run
     elif name == "check-dataset":
         from learn3d.commands.check_dataset import run
     elif name == "experiment":

@@ -4,6 +4,7 @@ Examples:
   learn3d make-dataset --output data --category chair --source my_chairs --augment 5
   learn3d make-dataset --output data --category airplane --procedural 300
   learn3d make-dataset --output kar --category chair --source my_chairs --layout kar --views 20
+  learn3d make-dataset --output big --category chair --source my_chairs --shards --jobs 8
   learn3d make-dataset --output pascal --category car --procedural 100 --layout pascal3d
 """
 
@@ -13,10 +14,14 @@ from collections.abc import Sequence
 
 from learn3d.commands.parsing import parse
 from learn3d.make_data.render import DatasetConfig, make_dataset
+from learn3d.make_data.sharded import make_shards
 from learn3d.terminal import say
 
 
 def run(arguments: Sequence[str]) -> int:
     """Make the data set, and say what was made."""
-    say(make_dataset(parse(DatasetConfig, arguments, name="make-dataset", about=__doc__)).text())
+    config = parse(DatasetConfig, arguments, name="make-dataset", about=__doc__)
+    if config.shards:
+        return make_shards(config)
+    say(make_dataset(config).text())
     return 0

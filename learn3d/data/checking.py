@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from learn3d.data import shards
 from learn3d.data.categories import synset_of
 from learn3d.data.layouts import LAYOUTS, layouts_in
 from learn3d.data.readers import READERS
@@ -93,7 +94,7 @@ def check_folder(
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder}")
-    reader = READERS[layout]
+    reader = shards if shards.contents(folder) else READERS[layout]
     found = reader.contents(folder)
     if not found and not categories:
         others = layouts_in(folder, layout)

@@ -1,4 +1,4 @@
-"""A data set in memory: a flat list of views of objects, whatever layout it was read from."""
+"""A data set: a flat list of views of objects, whatever layout it was read from."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from learn3d.data.batch import Batch, StepViews
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
 from learn3d.data.crops import Crops, join
 from learn3d.data.poses import LookAtPoses, Poses
+from learn3d.data.stored import StoredArray
 from learn3d.data.view_bins import AngleBins
 
 MASK_SIZE = 64
@@ -25,25 +26,35 @@ SPLITS = ("train", "val", "test")
 class ViewDataset:
     """One split of one category, or of several: M views (samples) of N objects. What every reader returns.
 
+    Images, masks, voxels and points are in memory, or on disk where they were read from shards (`data.shards`).
+
     Raises ValueError where the parts do not fit each other.
     """
 
     category: str  # what the user called it; several names are joined by commas
     split: str
-    images: np.ndarray  # uint8 [M, 4, S, S]: R, G, B and the mask
+    images: np.ndarray | StoredArray  # uint8 [M, 4, S, S]: R, G, B and the mask
     poses: Poses | None  # M camera poses; None where they are not known
-    view_ids: np.ndarray  # int64 [M] in 0 .. K-1: pose classes
+    view_ids: np.ndarray  # int64 (int32 where on disk) [M] in 0 .. K-1: pose classes
     view_names: tuple[str, ...]  # K names of the pose classes
-    object_ids: np.ndarray  # int64 [M] in 0 .. N-1
+    object_ids: np.ndarray  # likewise, in 0 .. N-1
     object_names: tuple[str, ...]  # N names, as in the files
-    voxels: np.ndarray | None  # bool [N, 32, 32, 32] in the data set's own axes; None where there is no ground truth
+    voxels: (
+        np.ndarray | StoredArray | None
+    )  # bool [N, 32, 32, 32] in the data set's own axes; None where there is no ground truth
     convention: VoxelConvention  # how predictions are brought into those axes
-    masks: np.ndarray | None = None  # uint8 [M, 64, 64] silhouettes to be matched; None: the images' fourth channel
+    masks: np.ndarray | StoredArray | None = (
+        None  # uint8 [M, 64, 64] silhouettes to be matched; None: the images' fourth channel
+    )
     class_ids: np.ndarray | None = None  # int64 [N]: category of each object, None for a single category
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
-    points: np.ndarray | None = None  # float32 [N, P, 3]: points on the true surfaces in the object frame, where known
+    points: np.ndarray | StoredArray | None = (
+        None  # float32 [N, P, 3]: points on the true surfaces in the object frame, where known
+    )
     inverted: bool = True  # colours stored as 255 - colour over black (Kato's form), or as they are
     crops: Crops | None = None  # M: what the augmentation "crop" cuts the images' colours from; None: it is not known
+    sides: np.ndarray | None = None  # float32 [M]: `object_sides`, where they are known already
+    notes: tuple[str, ...] = ()  # what to warn of: shards that could not be read
 
     def __post_init__(self) -> None:
         m, n = len(self.images), len(self.object_names)
@@ -51,7 +62,7 @@ class ViewDataset:
             raise ValueError(f"images must be uint8 [M, 4, S, S], got {self.images.dtype} {list(self.images.shape)}")
         if self.masks is None and self.images.shape[2:] != (MASK_SIZE, MASK_SIZE):
             raise ValueError(f"images of {self.images.shape[2:]} pixels need masks [M, {MASK_SIZE}, {MASK_SIZE}]")
-        wanted = dict.fromkeys(("poses", "view_ids", "object_ids", "masks", "crops"), m)
+        wanted = dict.fromkeys(("poses", "view_ids", "object_ids", "masks", "crops", "sides"), m)
         wanted |= dict.fromkeys(("voxels", "points", "class_ids"), n)
         sizes = {name: len(getattr(self, name)) for name in wanted if getattr(self, name) is not None}
         if wrong := {name: size for name, size in sizes.items() if size != wanted[name]}:
@@ -106,18 +117,18 @@ class ViewDataset:
                 f"got {int(indices.min())} .. {int(indices.max())}"
             )
         if rows is not None:
-            view_ids = torch.from_numpy(self.view_ids[indices.numpy()])
+            view_ids = torch.from_numpy(self.view_ids[indices.numpy()]).to(torch.int64)
             views = StepViews(rows, self._poses(indices), view_ids, self._classes(indices))
             return dataclasses.replace(self.batch(indices[rows], voxels=voxels), part_of=views)
         samples = indices.numpy()
         images = torch.from_numpy(self.images[samples])
         masks = images[:, 3] if self.masks is None else torch.from_numpy(self.masks[samples])
-        objects = self.object_ids[samples]
+        objects = self.object_ids[samples].astype(np.int64)
         return Batch(
             images=images,
             masks=masks.to(torch.float32) / 255,
             poses=self._poses(indices),
-            view_ids=torch.from_numpy(self.view_ids[samples]),
+            view_ids=torch.from_numpy(self.view_ids[samples]).to(torch.int64),
             object_ids=torch.from_numpy(objects),
             class_ids=self._classes(indices),
             voxels=torch.from_numpy(self.voxels[objects]) if voxels and self.voxels is not None else None,
@@ -136,30 +147,52 @@ class ViewDataset:
         """Occupancy bool [B, 32, 32, 32] of predictions in the data set's voxel axes; see `VoxelConvention`."""
         return self.convention.voxelize(vertices, faces, definition)
 
+    def prepare(self, indices: Tensor, rows: Tensor | None = None) -> None:
+        """Begin to read what `batch` will be asked for next, where it is on disk."""
+        samples = (indices if rows is None else indices[rows]).numpy()
+        for array in (self.images, self.masks):
+            if isinstance(array, StoredArray):
+                array.prepare(samples)
+
+    def images_crc(self) -> int:
+        """CRC-32 of the images; of those on disk, of their checksums."""
+        return _crc(self.images, 0)
+
     def digest(self) -> int:
         """CRC-32 of all that is learnt from or compared with: images, masks, poses, classes, voxels."""
         parts = (self.images, self.masks, self.view_ids, self.object_ids, self.class_ids, self.voxels)
-        crc = 0 if self.poses is None else zlib.crc32(np.ascontiguousarray(self.poses.features().numpy()))
+        crc = 0
+        for some in torch.arange(len(self)).split(2**20) if self.poses is not None else ():
+            crc = zlib.crc32(np.ascontiguousarray(self.poses[some].features().numpy()), crc)
         for part in parts:
-            crc = zlib.crc32(np.ascontiguousarray(part), crc) if part is not None else crc
+            crc = _crc(part, crc) if part is not None else crc
         return crc
 
     def check_masks(self) -> str:
         """What to warn of where some images show nothing; "" for none. Raises ValueError where all of them do."""
-        masks = self.images[:, 3] if self.masks is None else self.masks
-        empty = len(masks) - int(masks.any(axis=(1, 2)).sum())
-        if empty == len(masks):
+        if self.sides is not None:
+            empty = int((self.sides == 0).sum())
+        else:
+            masks = self.images[:, 3] if self.masks is None else self.masks
+            empty = len(masks) - int(masks.any(axis=(1, 2)).sum())
+        if empty == len(self):
             raise ValueError(
                 f"all {empty} {self.split} images of {self.category} have an empty mask, so that there is nothing to "
                 "learn; look at the data (learn3d check-dataset)"
             )
-        return f"{empty} of {len(masks)} {self.split} images have an empty mask" if empty else ""
+        return f"{empty} of {len(self)} {self.split} images have an empty mask" if empty else ""
 
     def object_share(self) -> float:
-        """Mean over the images of the larger side of the mask's bounding box, as a share of the picture's side.
+        """Mean of `object_sides`.
 
         Kept in checkpoints, so that photographs can be framed like the images that the networks know.
         """
+        return float(self.object_sides().mean(dtype=np.float64))
+
+    def object_sides(self) -> np.ndarray:
+        """The larger side of each mask's bounding box, as a share of the picture's side: floats [M], 0 where empty."""
+        if self.sides is not None:
+            return self.sides
         masks = self.images[:, 3] > 127
         sides = []
         for axis in (1, 2):
@@ -167,7 +200,11 @@ class ViewDataset:
             size = seen.shape[1]
             first, last = seen.argmax(axis=1), size - 1 - seen[:, ::-1].argmax(axis=1)
             sides.append(np.where(seen.any(axis=1), last - first + 1, 0) / size)
-        return float(np.maximum(*sides).mean())
+        return np.maximum(*sides)
+
+    def mask_pixels(self, samples: np.ndarray) -> np.ndarray:
+        """The masks of the samples, uint8 [B, 64, 64]."""
+        return self.images[samples][:, 3] if self.masks is None else self.masks[samples]
 
     def with_bins(self, bins: AngleBins) -> ViewDataset:
         """The same views with pose classes from cells of azimuth and elevation."""
@@ -193,8 +230,9 @@ class ViewDataset:
         """Only the samples `samples`, int64; all objects stay."""
         return dataclasses.replace(
             self,
-            images=self.images[samples],
-            masks=None if self.masks is None else self.masks[samples],
+            images=_taken(self.images, samples),
+            masks=None if self.masks is None else _taken(self.masks, samples),
+            sides=None if self.sides is None else self.sides[samples],
             poses=self._poses(torch.from_numpy(samples)),
             view_ids=self.view_ids[samples],
             object_ids=self.object_ids[samples],
@@ -211,22 +249,39 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
         if other.view_names != first.view_names or other.images.shape[1:] != first.images.shape[1:]:
             raise ValueError(f"{other.category} and {first.category} differ in view classes or image size")
 
-    def joined(name: str) -> np.ndarray | None:
+    def joined(name: str) -> np.ndarray | StoredArray | None:
         parts = [getattr(d, name) for d in datasets]
-        return None if any(part is None for part in parts) else np.concatenate(parts)
+        if any(part is None for part in parts):
+            return None
+        stored = [isinstance(part, StoredArray) for part in parts]
+        if any(stored) and not all(stored):
+            raise ValueError(f"of {', '.join(d.category for d in datasets)} some are in shards; convert all, or none")
+        return StoredArray.join(parts) if all(stored) else np.concatenate(parts)
 
     starts = np.cumsum([0] + [d.num_objects for d in datasets])[:-1]
     return dataclasses.replace(
         first,
         category=",".join(d.category for d in datasets),
-        **{name: joined(name) for name in ("images", "masks", "view_ids", "voxels", "points")},
+        **{name: joined(name) for name in ("images", "masks", "view_ids", "voxels", "points", "sides")},
         poses=_join_poses([d.poses for d in datasets]),
         object_ids=np.concatenate([d.object_ids + start for d, start in zip(datasets, starts, strict=True)]),
         object_names=tuple(name for d in datasets for name in d.object_names),
         crops=None if any(d.crops is None for d in datasets) else join([d.crops for d in datasets]),
         class_ids=np.repeat(np.arange(len(datasets)), [d.num_objects for d in datasets]),
         class_names=tuple(d.category for d in datasets),
+        notes=tuple(note for d in datasets for note in d.notes),
     )
+
+
+def _crc(array: np.ndarray | StoredArray, crc: int) -> int:
+    if isinstance(array, StoredArray):
+        return zlib.crc32(array.crc().to_bytes(4, "little"), crc)
+    return zlib.crc32(np.ascontiguousarray(array), crc)
+
+
+def _taken(array: np.ndarray | StoredArray, samples: np.ndarray) -> np.ndarray | StoredArray:
+    """Rows of an array, which stay where they are."""
+    return array.select(samples) if isinstance(array, StoredArray) else array[samples]
 
 
 def _join_poses(poses: list[Poses | None]) -> Poses | None:

@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 from typing import Literal
 
+from learn3d.data import shards
 from learn3d.data.conventions import IMAGE_SIZE
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.readers import READERS
@@ -63,6 +64,8 @@ def load_dataset(
 ) -> ViewDataset:
     """Read one split ("train", "val" or "test") of one category, or of several joined by commas, of a folder.
 
+    Categories that the folder has in shards (`data.shards`) are read from these, and their images stay on disk.
+
     image_size: side of the network's images in pixels, for layouts that keep larger ones; Kato's renderings are 64x64.
     view_bins: pose classes from cells of azimuth and elevation, see `AngleBins.parse`; None: the layout's own.
     views_per_object: use only so many views of every object (kar, r2n2: the first; other layouts: drawn at random, the
@@ -80,8 +83,14 @@ def load_dataset(
     given = {"image_size": image_size, "views_per_object": views_per_object, "progress": progress}
     options = {name: given[name] for name in LAYOUTS[layout].options}
     load = functools.partial(READERS[layout].load, folder, split=split, **options)
+    in_shards = functools.partial(shards.load, folder, split=split, layout=layout)
+    if "image_size" in options:
+        in_shards = functools.partial(in_shards, image_size=image_size)
+    stored = {name: shards.holds(folder, name, split) for name in names}
     try:
-        dataset = concatenate(together([functools.partial(load, name) for name in names]))
+        dataset = concatenate(
+            together([functools.partial(in_shards if stored[name] else load, name) for name in names])
+        )
     except (DamagedFile, FileNotFoundError) as error:
         if others := layouts_in(Path(folder), layout):
             hint = f"this is a data set of the layout {others[0]!r}, not {layout!r}; give another folder, or train "
@@ -93,7 +102,7 @@ def load_dataset(
         raise type(error)(
             error.path, f"{error.message}. All that is wrong with the data set is listed by: {check}"
         ) from error
-    if views_per_object is not None and "views_per_object" not in LAYOUTS[layout].options:
+    if views_per_object is not None and (any(stored.values()) or "views_per_object" not in LAYOUTS[layout].options):
         dataset = dataset.with_few_views(views_per_object)
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import LookAtPoses
 
 SECTOR_DEG = 15.0  # width of the sectors of azimuth whose masks are averaged; planes are found to half of it
 _SECTORS = round(360 / SECTOR_DEG)
-_ENOUGH = 8  # images that a sector must have
+_ENOUGH, _MOST = 8, 2048  # images that a sector must have, and that are looked at
 _CLEAR = 0.1  # how much smaller than the median over all planes the difference at the mirror plane must be
 
 
@@ -33,14 +33,15 @@ def find_mirror_plane(dataset: ViewDataset) -> float | None:
         raise ValueError(
             "symmetry 'auto' needs camera poses given by azimuth and elevation; give the plane (x, z, degrees) or None"
         )
-    masks = dataset.images[:, 3] if dataset.masks is None else dataset.masks
     sectors = np.rint(dataset.poses.azimuth_deg.numpy() / SECTOR_DEG).astype(int) % _SECTORS
-    means = np.zeros((_SECTORS, *masks.shape[1:]))
+    means = np.zeros((_SECTORS, MASK_SIZE, MASK_SIZE))
     noise = np.zeros(_SECTORS)  # expected squared error of each mean, summed over pixels
     for sector in range(_SECTORS):
-        seen = masks[sectors == sector] / np.float32(255)
-        if len(seen) < _ENOUGH:
+        samples = np.flatnonzero(sectors == sector)
+        if len(samples) < _ENOUGH:
             return None
+        some = np.linspace(0, len(samples) - 1, min(len(samples), _MOST)).round().astype(int)
+        seen = dataset.mask_pixels(samples[some]) / np.float32(255)
         means[sector] = seen.mean(axis=0)
         noise[sector] = seen.var(axis=0).sum() / (len(seen) - 1)
     differences = np.zeros(_SECTORS)

@@ -35,9 +35,7 @@ def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, se
         second = (first + rng.integers(1, sizes[objects])) % sizes[objects]
         return torch.from_numpy(np.concatenate([order[starts[objects] + first], order[starts[objects] + second]]))
     if sampling == "classes":
-        classes = np.zeros(dataset.num_objects, np.int64) if dataset.class_ids is None else dataset.class_ids
-        of_sample = classes[dataset.object_ids]
-        members = [np.flatnonzero(of_sample == c) for c in range(dataset.num_classes)]
+        members = _views_by_class(dataset)
         drawn = rng.integers(dataset.num_classes, size=batch_size)
         return torch.from_numpy(np.array([members[c][rng.integers(len(members[c]))] for c in drawn]))
     raise ValueError(f"sampling must be views, pairs or classes, got {sampling!r}")
@@ -65,3 +63,12 @@ def _views_by_object(dataset: ViewDataset) -> tuple[np.ndarray, np.ndarray]:
     """(starts [N+1], samples ordered by object [M])."""
     order = np.argsort(dataset.object_ids, kind="stable")
     return np.searchsorted(dataset.object_ids[order], np.arange(dataset.num_objects + 1)), order
+
+
+@functools.lru_cache(maxsize=2)
+def _views_by_class(dataset: ViewDataset) -> list[np.ndarray]:
+    """The samples of each category."""
+    if dataset.class_ids is None:
+        return [np.arange(len(dataset))]
+    of_sample = dataset.class_ids[dataset.object_ids]
+    return [np.flatnonzero(of_sample == c) for c in range(dataset.num_classes)]

@@ -14,6 +14,7 @@ from learn3d.make_data.writers import writer_of
 from learn3d.settings import Count, FilePath, Weight, checked
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+HOW = ("shards", "jobs", "cluster")  # options that say how it is made, not what
 Amount = Annotated[int, Field(ge=0)]
 
 
@@ -52,12 +53,26 @@ class DatasetConfig:
     """Seed of the splits, scales, colours, views and procedural shapes."""
     overwrite: bool = False
     """Replace files of this category that are already in the folder."""
+    shards: bool = False
+    """Write shards, which training reads piece by piece: for data sets that do not fit into memory (docs/scale.md).
+    Only for the layout kato. A killed call is continued by the same command."""
+    jobs: Count = 1
+    """Shards that are made at a time, each in a process of its own."""
+    cluster: str | None = None
+    """Make shards on a Dask cluster: the address or the scheduler file of its scheduler. None: on this machine."""
 
     def __post_init__(self) -> None:
         if (self.source is None) == (self.procedural == 0):
             raise ValueError(
                 "give either --source (a folder of meshes or a mesh pack .npz) or --procedural (a number of shapes)"
             )
+        if self.shards and self.layout != "kato":
+            raise ValueError(
+                f"shards are made in the layout kato, not {self.layout}; make the data set without --shards, and "
+                "convert it (learn3d convert-dataset)"
+            )
+        if not self.shards and (self.jobs > 1 or self.cluster):
+            raise ValueError("--jobs and --cluster are for shards: add --shards")
         synset_of(self.category)
         conventions.mesh_to_object(self.up, self.facing)
 

@@ -6,6 +6,7 @@ ValueError where the file cannot be read, and `checked` where a mesh cannot be u
 
 from __future__ import annotations
 
+import functools
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -26,7 +27,7 @@ class MeshSource:
     """A mesh that can be read when its turn comes."""
 
     name: str  # unique within its source: path relative to the folder, or the number in the pack
-    read: Callable[[], RawMesh]
+    read: Callable[[], RawMesh]  # it can be pickled
 
 
 def folder_sources(folder: Path) -> tuple[list[MeshSource], Counter[str]]:
@@ -42,7 +43,9 @@ def folder_sources(folder: Path) -> tuple[list[MeshSource], Counter[str]]:
             f"no mesh file in {folder} or below it: wanted {', '.join(EXTENSIONS)}, "
             f"found {dict(ignored) or 'nothing'}; convert the meshes to one of these, or give another folder"
         )
-    return [MeshSource(p.relative_to(folder).as_posix(), lambda p=p: read_mesh(p, folder)) for p in meshes], ignored
+    return [
+        MeshSource(p.relative_to(folder).as_posix(), functools.partial(read_mesh, p, folder)) for p in meshes
+    ], ignored
 
 
 def pack_sources(path: Path) -> list[MeshSource]:
@@ -61,26 +64,28 @@ def pack_sources(path: Path) -> list[MeshSource]:
     if count < 1 or missing:
         raise ValueError(f"{path} is no mesh pack: it must be {wanted}; n is {number}, missing keys: {missing}")
     width = len(str(count - 1))
+    return [MeshSource(f"{i:0{width}d}", functools.partial(_packed, path, i, wanted)) for i in range(count)]
 
-    def read(i: int) -> RawMesh:
-        vertices, faces = (worker.read(npz.read, path, f"{kind}{i}", wanted=wanted) for kind in "vf")
-        return RawMesh(vertices, faces)
 
-    return [MeshSource(f"{i:0{width}d}", lambda i=i: read(i)) for i in range(count)]
+def _packed(path: Path, number: int, wanted: str) -> RawMesh:
+    vertices, faces = (worker.read(npz.read, path, f"{kind}{number}", wanted=wanted) for kind in "vf")
+    return RawMesh(vertices, faces)
 
 
 def procedural_sources(category: str, count: int, seed: int) -> list[MeshSource]:
     """`count` shapes of the procedural generator; shape i depends on the seed and i alone."""
-    from learn3d.make_data.shapes import CATEGORIES, make_shape
+    from learn3d.make_data.shapes import CATEGORIES
 
     if category not in CATEGORIES:
         raise ValueError(f"the procedural generator makes {', '.join(CATEGORIES)}; got category {category!r}")
+    return [MeshSource(f"{category}_{i:05d}", functools.partial(_procedural, category, seed, i)) for i in range(count)]
 
-    def read(i: int) -> RawMesh:
-        shape = make_shape(category, np.random.default_rng([seed, 0, i]))
-        return RawMesh(shape.vertices, shape.faces)
 
-    return [MeshSource(f"{category}_{i:05d}", lambda i=i: read(i)) for i in range(count)]
+def _procedural(category: str, seed: int, number: int) -> RawMesh:
+    from learn3d.make_data.shapes import make_shape
+
+    shape = make_shape(category, np.random.default_rng([seed, 0, number]))
+    return RawMesh(shape.vertices, shape.faces)
 
 
 def object_names(sources: list[MeshSource]) -> list[str]:

@@ -19,7 +19,7 @@ from learn3d.data import conventions
 from learn3d.data.categories import synset_of
 from learn3d.files.writing import write_json
 from learn3d.make_data import meshes
-from learn3d.make_data.config import DatasetConfig
+from learn3d.make_data.config import HOW, DatasetConfig
 from learn3d.make_data.contact_sheet import draw_sheet, make_row
 from learn3d.make_data.folders import check_room, existing, publish
 from learn3d.make_data.report import DatasetReport, lacking
@@ -68,7 +68,7 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
     """
     config = config.complete()
     prefix, writer_class = synset_of(config.category), writer_of(config.layout)
-    sources, ignored = _list_sources(config)
+    sources, ignored = list_sources(config)
     names = meshes.object_names(sources)
     splits = split_objects(len(sources), config.test, config.val, config.seed)
     copies = {"train": 1 + config.augment, "val": 1, "test": 1}
@@ -89,7 +89,7 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
                 try:
                     mesh = meshes.checked(sources[number].read(), config.max_faces)
                     own = [names[number], *(f"{names[number]}-{copy}" for copy in range(1, copies[split]))]
-                    items = [_render(config, writer, mesh, number, k, name, split) for k, name in enumerate(own)]
+                    items = [render(config, writer, mesh, number, k, name, split) for k, name in enumerate(own)]
                 except ValueError as error:  # it cannot be read, rendered or seen: the others go on
                     done.skipped.append({"name": sources[number].name, "split": split, "reason": str(error)})
                 else:
@@ -145,7 +145,7 @@ class _Done:
                 self.rows[item.name] = make_row(item.rgb, item.alpha, grid)
 
 
-def _render(
+def render(
     config: DatasetConfig, writer: Writer, mesh: meshes.RawMesh, number: int, copy: int, name: str, split: str
 ) -> RenderedObject:
     """Object `copy` of mesh `number`: scaled, coloured, placed, looked at."""
@@ -169,7 +169,14 @@ def _render(
     return RenderedObject(name, split, vertices, faces, poses, rgb, alpha, voxels, rng)
 
 
-def _list_sources(config: DatasetConfig) -> tuple[list[meshes.MeshSource], Counter[str]]:
+def settings_of(config: DatasetConfig) -> dict:
+    """What the files depend on, as plain values."""
+    settings = {k: v for k, v in asdict(config).items() if k not in {"output", "overwrite", *HOW}}
+    return settings | {"source": None if config.source is None else Path(config.source).name}
+
+
+def list_sources(config: DatasetConfig) -> tuple[list[meshes.MeshSource], Counter[str]]:
+    """The meshes that `config` names, and the files beside them that are no meshes."""
     if config.procedural:
         return meshes.procedural_sources(config.category, config.procedural, config.seed), Counter()
     source = Path(config.source)
@@ -205,15 +212,14 @@ def _prepare_folder(config: DatasetConfig, writer: type[Writer], objects: int) -
 
 def _card(config: DatasetConfig, writer: Writer, objects: dict[str, int], used: list[dict]) -> dict:
     """The data set's card: everything needed to make it again, and which mesh went where."""
-    left_out = {"output", "overwrite", "layout"} | ({"views"} if writer.fixed_views else set())
-    settings = {k: v for k, v in asdict(config).items() if k not in left_out}
-    settings["source"] = None if config.source is None else Path(config.source).name
+    settings = settings_of(config)
+    left_out = {"layout"} | ({"views"} if writer.fixed_views else set())
     return {
         **({} if config.layout == "kato" else {"layout": config.layout}),
         **writer.card,
         "objects_fill": writer.objects_fill,
         "object_from_mesh": (writer.turn @ conventions.mesh_to_object(config.up, config.facing)).tolist(),
-        "settings": settings,
+        "settings": {k: v for k, v in settings.items() if k not in left_out},
         "objects": objects,
         "augmented": f"in train, each mesh is followed by its {config.augment} scaled copies",
         "splits": {split: [mesh["name"] for mesh in used if mesh["split"] == split] for split in objects},

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,7 +24,7 @@ from learn3d.runs.versions import versions
 
 def conditions_of(train_set: ViewDataset, precision: str) -> Conditions:
     """The conditions of a run on these training images."""
-    return Conditions(len(train_set), f"{zlib.crc32(np.ascontiguousarray(train_set.images)):08x}", precision)
+    return Conditions(len(train_set), f"{train_set.images_crc():08x}", precision)
 
 
 @dataclass(frozen=True, eq=False)
