@@ -17,10 +17,13 @@ from learn3d.make_data.render import DatasetConfig, make_dataset
 from learn3d.make_data.sharded import make_shards
 from learn3d.terminal import say
 
+COMMON = ("output", "category", "layout", "views", "source", "procedural", "test", "val", "augment", "up", "front")
+COMMON += ("overwrite", "shards", "jobs")
+
 
 def run(arguments: Sequence[str]) -> int:
     """Make the data set, and say what was made."""
-    config = parse(DatasetConfig, arguments, name="make-dataset", about=__doc__)
+    config = parse(DatasetConfig, arguments, name="make-dataset", about=__doc__, common=COMMON)
     if config.shards:
         return make_shards(config)
     say(make_dataset(config).text())

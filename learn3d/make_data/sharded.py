@@ -19,7 +19,6 @@ from learn3d.data.categories import synset_of
 from learn3d.data.layouts import load_dataset
 from learn3d.data.readers import kato
 from learn3d.data.shards import finish_set, made, split_folder, write_shard
-from learn3d.device import cores
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.files.writing import write_json
 from learn3d.make_data import meshes
@@ -61,7 +60,7 @@ def make_shards(config: DatasetConfig) -> int:
     _prepare(config, folder, settings)
     sources, _ = list_sources(config)
     names = meshes.object_names(sources)
-    threads = max(1, cores() // config.jobs)
+    threads = max(1, torch.get_num_threads() // config.jobs)
     tasks, shards = [], {}
     for split, numbers in split_objects(len(sources), config.test, config.val, config.seed).items():
         step = OBJECTS_PER_SHARD // (_copies(config, split))  # meshes of a shard
