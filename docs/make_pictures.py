@@ -40,6 +40,11 @@ PICTURES = {
     "views.png": Picture(
         "python docs/examples/draw_views.py --output {folder}", "{folder}/views.png", ("docs/examples/draw_views.py",)
     ),
+    "fitting.gif": Picture(
+        "python docs/examples/draw_fitting.py --output {folder}",
+        "{folder}/fitting.gif",
+        ("docs/examples/draw_fitting.py",),
+    ),
     "quickstart.png": Picture("bash tools/quickstart.sh", "quickstart/plus/pictures/*.png", _QUICKSTART),
     **{
         f"gallery-{name.replace('_', '-')}.png": Picture(

@@ -54,7 +54,7 @@ def check_movie(path, width, height):
 def test_every_example_is_tested_and_short():
     scripts = sorted(path.stem for path in EXAMPLES.glob("*.py"))
     fits = ["fit_lit_vase", "fit_packed", "fit_silhouette", "fit_texture"]
-    assert scripts == ["draw_surfaces", "draw_views", "find_camera", *fits, "make_photo_folder"]
+    assert scripts == ["draw_fitting", "draw_surfaces", "draw_views", "find_camera", *fits, "make_photo_folder"]
     assert all(len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 80 for name in scripts)
 
 
@@ -63,6 +63,12 @@ def test_draw_views_from_the_command_line(tmp_path):
     done = subprocess.run([*command, "--image-size", "64"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     check_picture(imageio.imread(tmp_path / "new" / "views.png"), 2 * 64, 3 * 64)
+
+
+def test_draw_fitting(tmp_path):
+    ious = run("draw_fitting", tmp_path, "--frames", "12", "--size", "48", "--steps", "30")
+    assert len(ious) == 6 and min(ious.values()) > 0.3 and max(ious.values()) > 0.6
+    check_movie(tmp_path / "fitting.gif", 316, 126)
 
 
 def test_draw_surfaces(tmp_path):
