@@ -61,17 +61,17 @@ def carry_out_all(
     state, nothing new is started, and what was running counts as stopped; a second SIGINT ends them at once. Returns
     the end of the log of every task that failed, by the task's name.
 
-    folder: where the file is put that stops the tasks on all machines. cluster: the address of
-    a Dask scheduler (tcp://HOST:8786), or the file that it was told to write (--scheduler-file). A worker that dies is
-    replaced by another one, three times at most for a task.
+    folder: where a file is put that stops the tasks, which all machines must see. cluster: the address of a Dask
+    scheduler (tcp://HOST:8786), or the file that it was told to write (--scheduler-file). When a worker dies another
+    one carries out its task, three times at most; when the scheduler ends, its tasks have failed.
 
-    Raises OSError where there is no such cluster, or where its scheduler has ended.
+    Raises OSError where no scheduler answers.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for old in folder.glob(".stop-*"):
+    for old in folder.glob(".stop-*"):  # left where tasks were lost
         if time.time() - old.stat().st_mtime > SECONDS_KEPT:
             old.unlink(missing_ok=True)
-    stop = folder / f".stop-{uuid.uuid4().hex}"
+    stop = folder / f".stop-{uuid.uuid4().hex}"  # its content says how: soon, or now
     received: list[int] = []
     failed: dict[str, str] = {}
     started = last_report = time.time()
