@@ -42,7 +42,7 @@ class ReluConvEncoder(ConvEncoder):
 class NarrowConvEncoder(ConvEncoder):
     """The same with a 1x1 convolution from 256 to 32 channels before the linear layers: 5.2 million weights, not 19.
 
-    It learns as fast and as well in two thirds of the time; no paper's. It starts from He's initial weights: with
+    It learns as well in two thirds of the time; no paper's. Its convolutions start from He's initial weights: with
     torch's, images hardly change the codes of the first hundred steps, and all shapes may become one and stay so.
     """
 
@@ -51,7 +51,7 @@ class NarrowConvEncoder(ConvEncoder):
         channels = 32
         self.convolutions = _convolutions(64, 128, 256).extend([nn.Conv2d(256, channels, 1), nn.ReLU()])
         self.layers = linear_layers(channels * (self.image_size // 8) ** 2, 1024, 1024, CODE_SIZE)
-        initialize_he(self)
+        initialize_he(self.convolutions)
 
 
 class SmallConvEncoder(ConvEncoder):
