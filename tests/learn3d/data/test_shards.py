@@ -230,11 +230,12 @@ else:
     dataset = load_dataset("kato", folder, "chair", "train")
     for step in range(100):
         batch = dataset.batch(torch.randint(len(dataset), (128,)))
-        assert set(batch.images.unique().tolist()) == {128, 129, 130, 131}
+        assert (batch.images.min(), batch.images.max()) == (128, 131)
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
     for words in (["make"], []):
         done = subprocess.run(
-            [sys.executable, "-c", code, tmp_path, *words], capture_output=True, text=True, check=True, timeout=300
+            [sys.executable, "-c", code, tmp_path, *words], capture_output=True, text=True, cwd=tmp_path
         )
+        assert done.returncode == 0, done.stderr
     assert int(done.stdout) < 60_000, f"{done.stdout} kB more"
