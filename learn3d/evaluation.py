@@ -140,13 +140,16 @@ def evaluate(
     truth = _true_surfaces(dataset, generator) if surfaces else None
     ious: dict[Definition, list[Tensor]] = {name: [] for name in definitions if dataset.voxels is not None}
     codes, distances, silhouettes = [], [], []
-    others = _other_images(dataset.object_ids)
-    chunks = spread_samples(dataset.object_ids, dataset.view_ids, count).split(batch_size)
+    others = _other_images(dataset.object_ids) if dataset.voxels is None else None
+    samples = spread_samples(dataset.object_ids, dataset.view_ids, count)
+    view_ids = torch.from_numpy(dataset.view_ids[samples.numpy()]).to(torch.int64)
+    compared = _first_of_each_view(view_ids)
+    chunks = samples.split(batch_size)
     rows = torch.arange(count).split(batch_size)[ranks.rank :: ranks.world]
     was_training = method.training
     method.set_training(False)
     try:
-        for chosen in chunks[ranks.rank :: ranks.world]:
+        for numbers, chosen in zip(rows, chunks[ranks.rank :: ranks.world], strict=True):
             batch = dataset.batch(chosen)
             code = method.estimate(batch.images).codes
             shapes = method.decode(code)
@@ -159,18 +162,18 @@ def evaluate(
                 distances += [_compare(a, truth[b]) for a, b in zip(points, batch.object_ids.tolist(), strict=True)]
             if dataset.voxels is None and dataset.poses is not None and isinstance(shapes, Meshes):
                 silhouettes.append(_silhouette_ious(shapes, dataset.batch(others[chosen])))
-            codes.append(code.float().cpu())
+            codes.append(code.float().cpu()[compared[numbers]])
     finally:
         method.set_training(was_training)
     forms = ("released", "paper") if paper_mmd else ("released",)
     own = torch.cat(rows) if rows else torch.empty(0, dtype=torch.int64)
-    samples = torch.cat(chunks).numpy()
-    view_ids = torch.from_numpy(dataset.view_ids[samples]).to(torch.int64)
-    means = mean_mmd(ranks.gather(codes, own, count), view_ids, forms=forms, ranks=ranks)
+    place = (compared.cumsum(0) - 1)[own[compared[own]]]  # of this process's codes among all that are compared
+    all_codes = ranks.gather(codes, place, int(compared.sum()))
+    means = mean_mmd(all_codes, view_ids[compared], forms=forms, ranks=ranks)
     chamfer, f_score = torch.tensor(distances).T if distances else (None, None)
     seen = ranks.any(bool(silhouettes))
     return Evaluation(
-        object_ids=torch.from_numpy(dataset.object_ids[samples]).to(torch.int64),
+        object_ids=torch.from_numpy(dataset.object_ids[samples.numpy()]).to(torch.int64),
         view_ids=view_ids,
         ious={name: ranks.gather(values, own, count) for name, values in ious.items()},
         chamfer_l1=chamfer,
@@ -232,6 +235,16 @@ def _silhouette_ious(shapes: Meshes, batch: Batch) -> Tensor:
     seen = nmr.render_silhouette(shapes.vertices, shapes.faces, batch.cameras, image_size=size).flatten(1)
     masks = batch.masks.flatten(1)
     return torch.minimum(seen, masks).sum(1) / torch.maximum(seen, masks).sum(1)
+
+
+def _first_of_each_view(view_ids: Tensor) -> Tensor:
+    """The images whose codes `mean_mmd` compares, bool [M]: the first of each view. Others need not be kept."""
+    order = view_ids.argsort(stable=True)
+    counts = view_ids.unique(return_counts=True)[1]
+    begin = counts.cumsum(0) - counts
+    first = torch.empty(len(view_ids), dtype=torch.bool)
+    first[order] = torch.arange(len(view_ids)) - begin.repeat_interleave(counts) < CODES_PER_VIEW
+    return first
 
 
 def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> Tensor:
@@ -311,11 +324,12 @@ def _mean(values: Tensor | None) -> float | None:
 
 def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Tensor] | None:
     """Points [P, 3] on the true surface of every object, in the object frame; None where nothing is known."""
+    parts = np.split(np.arange(dataset.num_objects), range(256, dataset.num_objects, 256))
     if dataset.points is not None:
-        return list(torch.from_numpy(dataset.points).float())
+        return [points.float() for part in parts for points in torch.from_numpy(dataset.points[part])]
     if dataset.voxels is None:
         return None
-    grids = dataset.convention.to_object(torch.from_numpy(dataset.voxels))
+    grids = (grid for part in parts for grid in dataset.convention.to_object(torch.from_numpy(dataset.voxels[part])))
     return [_sample(*grid_surface(grid.float(), box=dataset.convention.box), generator) for grid in grids]
 
 

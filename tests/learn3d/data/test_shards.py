@@ -92,6 +92,15 @@ def test_training_has_the_same_bits(options, tiny_config, stored, tmp_path) -> N
     same_networks(tmp_path / "memory", tmp_path / "disk")
 
 
+def test_a_run_is_measured_alike(finished_run, stored, tiny_folder, command, tmp_path) -> None:
+    found = []
+    for name, folder in {"memory": tiny_folder, "disk": stored}.items():
+        words = ("--data", folder, "--json", tmp_path / f"{name}.json")
+        assert command("evaluate", finished_run, *words)[0] == 0
+        found.append(json.loads((tmp_path / f"{name}.json").read_text()))
+    assert str(found[0]).replace(str(tiny_folder), "") == str(found[1]).replace(str(stored), "")
+
+
 def test_a_stopped_run_goes_on(tiny_config, stored, tmp_path) -> None:
     whole = dataclasses.replace(tiny_config(tmp_path / "whole"), data=stored)
     train(whole)
