@@ -82,8 +82,11 @@ def split_folder(folder: Path | str, category: str, split: str) -> Path:
 
 
 def holds(folder: Path | str, category: str, split: str) -> bool:
-    """Whether the folder has this split in shards."""
-    return (split_folder(folder, category, split) / SET_FILE).is_file()
+    """Whether the folder has this split in shards; not for a name that is no category, of which the reader says so."""
+    try:
+        return (split_folder(folder, category, split) / SET_FILE).is_file()
+    except (ValueError, OSError):
+        return False
 
 
 def made(folder: Path, number: int) -> ShardFile | None:
