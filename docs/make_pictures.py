@@ -33,12 +33,8 @@ class Picture:
     sources: tuple[str, ...]  # files that decide what it shows
 
 
-_QUICKSTART = (
-    "tools/quickstart.sh",
-    "learn3d/figures/grids.py",
-    "learn3d/methods/plus.py",
-    "learn3d/networks/encoders.py",
-)
+_QUICKSTART = ("tools/quickstart.sh", "learn3d/figures/grids.py")
+_QUICKSTART += ("learn3d/methods/plus.py", "learn3d/networks/encoders.py")
 _RUNS = "$OUTPUT/runs/airplane/proposed-seed0 $OUTPUT/runs/airplane/plus-seed0"
 _NOTEBOOKS = {"quick_tour": 5, "shape_from_silhouettes": 4, "texture_and_light": 4, "photographs_to_glb": 1}
 PICTURES = {
