@@ -9,7 +9,6 @@ Then give SHARDS instead of DATA, with the same layout, to train, evaluate, expe
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,8 +57,8 @@ def run(arguments: Sequence[str]) -> int:
 
 def _convert(command: Command, category: str, split: str) -> None:
     folder = shards.split_folder(command.output, category, split)
-    if command.overwrite and folder.is_dir():
-        shutil.rmtree(folder)
+    if command.overwrite:
+        shards.remove(folder)
     if shards.holds(command.output, category, split):
         say(f"{folder}: is there (--overwrite replaces it)")
         return

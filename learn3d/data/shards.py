@@ -134,8 +134,15 @@ def finish_set(folder: Path, layout: str, shards: int, part: ViewDataset) -> Non
     write_json(folder / SET_FILE, together.model_dump(), sync=True)
 
 
+def remove(folder: Path) -> None:
+    """Remove the shards of a split's folder, and nothing else that may lie there."""
+    for pattern in (SET_FILE, "[0-9]*.npy", "[0-9]*.views.npz", "[0-9]*.json"):
+        for path in folder.glob(pattern):
+            path.unlink()
+
+
 def write_set(folder: Path, layout: str, dataset: ViewDataset) -> int:
-    """Write a whole split as shards of `SHARD_BYTES`; the number of shards.
+    """Write a whole split as shards of about `SHARD_BYTES` each; returns how many.
 
     The crops of Pascal3D+ (`ViewDataset.crops`) are not kept.
     """

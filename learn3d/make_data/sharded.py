@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,9 +15,10 @@ import numpy as np
 import torch
 
 from learn3d.data.categories import synset_of
+from learn3d.data.dataset import SPLITS
 from learn3d.data.layouts import load_dataset
 from learn3d.data.readers import kato
-from learn3d.data.shards import finish_set, made, split_folder, write_shard
+from learn3d.data.shards import finish_set, made, remove, split_folder, write_shard
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.files.writing import write_json
 from learn3d.make_data import meshes
@@ -129,8 +129,10 @@ def _copies(config: DatasetConfig, split: str) -> int:
 
 def _prepare(config: DatasetConfig, folder: Path, settings: dict) -> None:
     """The category's folder, with the settings of its shards."""
-    if config.overwrite and folder.is_dir():
-        shutil.rmtree(folder)
+    if config.overwrite:
+        for split in SPLITS:
+            remove(folder / split)
+        (folder / SETTINGS).unlink(missing_ok=True)
     check_room(folder, 2**24, "a data set")
     path = folder / SETTINGS
     if path.is_file():

@@ -93,7 +93,7 @@ def carry_out_all(
                     for future in ended:
                         task = waiting.pop(future)
                         count = f"[{len(tasks) - len(waiting)}/{len(tasks)}]"
-                        if text := _ending(task, future, bool(received), failed):
+                        if text := _ending(task, future, bool(received), failed, LOST if cluster else ""):
                             say(f"{count} {task.name}: {text}")
                     if waiting and time.time() - last_report >= SECONDS_BETWEEN_LINES:
                         last_report = time.time()
@@ -110,7 +110,7 @@ def carry_out_all(
 
 @contextlib.contextmanager
 def _executor(jobs: int, cluster: str | None) -> Iterator[concurrent.futures.Executor]:
-    """What runs `_carry_out`: threads of this process, or the workers of a cluster."""
+    """Where tasks are started: in threads of this process, or by the workers of a cluster."""
     if cluster is None:
         with concurrent.futures.ThreadPoolExecutor(jobs) as threads:
             yield threads
@@ -177,14 +177,17 @@ def _stop_with_parent() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _ending(task: Task, future: concurrent.futures.Future, stopping: bool, failed: dict[str, str]) -> str:
-    """How a task ended, in a line; "" where it was never begun. Failures are added to `failed`."""
+def _ending(task: Task, future: concurrent.futures.Future, stopping: bool, failed: dict[str, str], lost: str) -> str:
+    """How a task ended, in a line; "" where it was never begun. Failures are added to `failed`.
+
+    lost: what is said of a task whose process could not be started or watched; "": the error itself.
+    """
     try:
         status, seconds = future.result()
-    except (Exception, concurrent.futures.CancelledError) as error:  # of the cluster
+    except (Exception, concurrent.futures.CancelledError) as error:
         if stopping:
             return "stopped"
-        failed[task.name] = LOST
+        failed[task.name] = lost or f"error: {error}"
         return f"lost ({type(error).__name__}: {error})"
     if status == STOPPED and not seconds:
         return ""

@@ -278,8 +278,11 @@ def find(path: Path, which: str = "last") -> Path:
 
 
 def load_data(config: TrainConfig, split: str, *, data: Path | None = None, category: str | None = None) -> ViewDataset:
-    """A split of the data that a run was trained on, or of another folder or category, in the form of its networks."""
-    return load_dataset(
+    """A split of the data that a run was trained on, or of another folder or category, in the form of its networks.
+
+    Raises ValueError also where some of its shards cannot be read: what is measured is measured on the whole split.
+    """
+    dataset = load_dataset(
         config.layout,
         data or config.data,
         category or config.category,
@@ -287,6 +290,9 @@ def load_data(config: TrainConfig, split: str, *, data: Path | None = None, cate
         image_size=config.settings.image_size,
         view_bins=config.view_bins,
     )
+    if dataset.notes:
+        raise ValueError(f"{split} is not whole: {'; '.join(dataset.notes)}")
+    return dataset
 
 
 def load_method(path: Path, *, device: str = "cpu", precision: str = "fp32") -> tuple[Method, TrainConfig, Metadata]:

@@ -149,6 +149,29 @@ def test_a_damaged_shard_is_named_and_left_out(stored, tiny_config, tmp_path, ca
     assert status == 1 and str(images) in out
 
 
+def test_nothing_is_measured_on_a_part_of_a_split(finished_run, stored, command) -> None:
+    path = stored / "02691156" / "test" / "00000.views.npz"
+    other = stored / "02691156" / "train"
+    for file in other.glob("00001.*"):
+        (path.parent / file.name).write_bytes(file.read_bytes())
+    description = path.with_name("set.json")
+    description.write_text(description.read_text().replace('"shards": 1', '"shards": 2'))
+    assert command("evaluate", finished_run, "--data", stored)[0] == 0
+    path.unlink()
+    status, _, said = command("evaluate", finished_run, "--data", stored)
+    assert status == 1 and "test is not whole: left out shard 0 of 2" in said and str(path) in said
+
+
+def test_overwriting_leaves_what_is_not_a_shard(stored, tiny_folder, command) -> None:
+    folder = stored / "02691156" / "train"
+    (folder / "photograph.png").write_bytes(b"mine")
+    (folder / "00007.images.npy").write_bytes(b"of an earlier, larger set")
+    assert command("convert-dataset", "--data", tiny_folder, "--output", stored, "--overwrite")[0] == 0
+    assert (folder / "photograph.png").read_bytes() == b"mine"
+    assert not (folder / "00007.images.npy").exists()
+    assert load_dataset("kato", stored, "airplane", "train").num_objects == 3
+
+
 @pytest.mark.parametrize("name", ["00000.json", "00000.views.npz", "00000.voxels.npy"])
 @pytest.mark.parametrize("content", [None, b"", b"{}", b"\x93NUMPY\x01\x00v\x00{'descr': '<f8'}"])
 def test_damage_of_every_file(stored, name, content) -> None:

@@ -76,7 +76,10 @@ def test_a_second_call_makes_nothing_and_other_settings_are_refused(config, here
     assert contents(config.output) == before
     with pytest.raises(ValueError, match="were made with another seed; ask for the same"):
         sharded.make_shards(dataclasses.replace(config, seed=1))
+    photograph = config.output / "03001627" / "photograph.png"
+    photograph.write_bytes(b"mine")
     assert sharded.make_shards(dataclasses.replace(config, seed=1, overwrite=True)) == 0
+    assert photograph.read_bytes() == b"mine", "only shards are replaced"
     assert contents(config.output) != before
 
 

@@ -54,6 +54,13 @@ def test_tasks_of_all_kinds(tmp_path) -> None:
     assert not list(tmp_path.glob(".stop*"))
 
 
+def test_a_task_whose_log_cannot_be_written_has_failed(tmp_path) -> None:
+    (tmp_path / "a.log").mkdir()
+    failed = carry_out_all(tasks(tmp_path, "a", "b"), tmp_path)
+    assert set(failed) == {"a"} and "Is a directory" in failed["a"]
+    assert finished(tmp_path, "b")
+
+
 def test_a_second_interruption_ends_tasks_at_once(tmp_path) -> None:
     (tmp_path / "a.log").touch()
 
