@@ -238,7 +238,7 @@ def _silhouette_ious(shapes: Meshes, batch: Batch) -> Tensor:
 
 
 def _first_of_each_view(view_ids: Tensor) -> Tensor:
-    """Which images are the first `CODES_PER_VIEW` of their view, bool [M]: `mean_mmd` compares the codes of these alone."""
+    """Which images are the first 512 of their view, bool [M]: `mean_mmd` compares the codes of these alone."""
     order = view_ids.argsort(stable=True)
     counts = view_ids.unique(return_counts=True)[1]
     begin = counts.cumsum(0) - counts
