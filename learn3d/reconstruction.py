@@ -30,6 +30,7 @@ from learn3d.runs import checkpoint
 from learn3d.runs.export import small_model
 
 STRIP_SIZE = 192
+_FINE = 4  # at least as many pixels, per side, are kept for one of a prepared image
 LARGEST_PICTURE = 2048  # pixels: shapes are drawn four times as fine, and the renderer goes up to 8192
 
 
@@ -55,9 +56,6 @@ def prepare_image(
         raise ValueError(f"colors must be [H, W, 3] and mask [H, W], got {list(colors.shape)} and {list(mask.shape)}")
     if LAYOUTS[layout].stretched:
         return _stretched(colors, mask, crop, size)
-    alpha = mask.astype(np.float32)[..., None] / 255
-    composite = colors * alpha + 255 * (1 - alpha)
-    stored = np.concatenate([255 - composite, 255 * alpha], axis=2)  # zero outside the object, so padding is plain
     if crop:
         rows, columns = (np.flatnonzero(mask.max(axis=axis) > 127) for axis in (1, 0))
         if len(rows) == 0:
@@ -73,7 +71,9 @@ def prepare_image(
     else:
         centre_y, centre_x = mask.shape[0] / 2, mask.shape[1] / 2
         side = float(max(mask.shape))
-    resized = _resample(stored, centre_x - side / 2, centre_y - side / 2, side, size, nearest)
+    reduction = max(1, int(side / (_FINE * size)))  # photographs are averaged in blocks first, which is much faster
+    left, top, side = (x / reduction for x in (centre_x - side / 2, centre_y - side / 2, side))
+    resized = _resample(_over_white(colors, mask, reduction), left, top, side, size, nearest)
     if not LAYOUTS[layout].inverted:
         resized[..., :3] = 255 - resized[..., :3]
     return np.rint(resized.transpose(2, 0, 1)).clip(0, 255).astype(np.uint8)
@@ -312,6 +312,16 @@ def _stretched(colors: np.ndarray, mask: np.ndarray, crop: bool, size: int) -> n
     planes = (colors, np.repeat(mask[..., None], 3, axis=2))
     cut, cut_mask = (Crops.from_images([np.ascontiguousarray(p)], box, size).cut()[0] for p in planes)
     return np.concatenate([cut, cut_mask[:1]])
+
+
+def _over_white(colors: np.ndarray, mask: np.ndarray, reduction: int) -> np.ndarray:
+    """255 - colour over white, then the mask, float32 [H/r, W/r, 4], averaged over blocks of r x r pixels.
+
+    It is zero outside the object, so padding is plain.
+    """
+    alpha = mask.astype(np.float32) / 255
+    planes = [(255 - colors[..., channel]) * alpha for channel in range(3)] + [255 * alpha]
+    return np.stack([np.asarray(Image.fromarray(plane).reduce(reduction)) for plane in planes], axis=2)
 
 
 def _resample(stored: np.ndarray, left: float, top: float, side: float, size: int, nearest: bool) -> np.ndarray:

@@ -35,6 +35,16 @@ def test_data_set_image_survives_the_way_out_and_back(tiny_set) -> None:
     assert np.array_equal(again, stored)
 
 
+def test_a_large_photograph_is_prepared_like_a_small_one() -> None:
+    y, x = np.mgrid[:150, :200]
+    colors = np.stack([x, y, x + y], axis=2).astype(np.uint8) // 2
+    mask = (255 * (((x - 110) / 60) ** 2 + ((y - 70) / 50) ** 2 < 1)).astype(np.uint8)
+    large = (np.kron(colors, np.ones((16, 16, 1), np.uint8)), np.kron(mask, np.ones((16, 16), np.uint8)))
+    for options in ({}, {"crop": False}, {"size": 32}):
+        difference = prepare_image(*large, **options).astype(int) - prepare_image(colors, mask, **options)
+        assert np.abs(difference).mean() < 2, options
+
+
 @pytest.mark.parametrize("corner", [(0, 0), (40, 100), (199, 260)])
 def test_crop_centres_and_scales_the_object(corner: tuple[int, int]) -> None:
     mask = np.zeros((300, 400), np.uint8)
