@@ -109,7 +109,9 @@ def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor,
         return values
     values = cast_under_autocast(values)
     if not isinstance(values, Tensor) or values.dtype not in _FLOATS:
-        raise TypeError(f"{wanted}, got {describe(values)}; use torch.as_tensor() and .float()")
+        bytes_given = isinstance(values, Tensor) and values.dtype == torch.uint8
+        remedy = "divide 0..255 by 255" if bytes_given else "use torch.as_tensor() and .float()"
+        raise TypeError(f"{wanted}, got {describe(values)}; {remedy}")
     if values.ndim not in (ndim, ndim + 1) or values.shape[-1] == 0:
         raise ValueError(f"{wanted}, got {describe(values)}")
     return values if values.ndim == ndim + 1 else values.unsqueeze(0)

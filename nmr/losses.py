@@ -44,7 +44,7 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     Raises
     ------
     TypeError, ValueError
-        If the shapes differ, or the batch is empty.
+        If the shapes differ, the batch is empty, or the target is far outside [0, 1], as masks of 0 and 255 are.
 
     Examples
     --------
@@ -62,6 +62,7 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
             "prediction and target must have the same shape [B, ...] with B >= 1, "
             f"got {describe(prediction)} and {describe(target)}"
         )
+    _check_mask(target)
     dtype = torch.float64 if prediction.dtype == torch.float64 else torch.float32
     prediction, target = prediction.flatten(1).to(dtype), target.flatten(1).to(dtype)
     if prediction.is_cpu and target.is_cpu and forward_ad._current_level < 0:
@@ -69,6 +70,20 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     else:
         iou = _soft_iou(prediction, target)
     return 1 - iou.mean()
+
+
+def _check_mask(target: Tensor) -> None:
+    """Refuses a mask of 0 and 255; not when compiled, traced or on a GPU. What resampling adds to [0, 1] is allowed."""
+    if torch.compiler.is_compiling() or not target.is_cpu or target.numel() == 0 or target.dtype == torch.bool:
+        return
+    try:
+        low, high = (x.item() for x in target.detach().aminmax())
+    except RuntimeError:  # inside torch.func.vmap values cannot be read
+        return
+    if low < -0.5 or high > 1.5:
+        raise ValueError(
+            f"target must lie in [0, 1], got values from {low:.4g} to {high:.4g}; divide a mask of 0..255 by 255"
+        )
 
 
 def _soft_iou(prediction: Tensor, target: Tensor) -> Tensor:

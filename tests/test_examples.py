@@ -15,6 +15,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+import trimesh
 import tyro
 from PIL import Image
 
@@ -53,7 +54,7 @@ def check_movie(path, width, height):
 
 def test_every_example_is_tested_and_short():
     scripts = sorted(path.stem for path in EXAMPLES.glob("*.py"))
-    fits = ["fit_lit_vase", "fit_packed", "fit_silhouette", "fit_texture"]
+    fits = ["fit_lit_vase", "fit_masks", "fit_packed", "fit_silhouette", "fit_texture"]
     assert scripts == ["draw_fitting", "draw_surfaces", "draw_views", "find_camera", *fits, "make_photo_folder"]
     assert all(len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 80 for name in scripts)
 
@@ -69,6 +70,15 @@ def test_draw_fitting(tmp_path):
     ious = run("draw_fitting", tmp_path, "--frames", "12", "--size", "48", "--steps", "30")
     assert len(ious) == 6 and min(ious.values()) > 0.3 and max(ious.values()) > 0.6
     check_movie(tmp_path / "fitting.gif", 316, 126)
+
+
+def test_fit_masks(tmp_path):
+    assert run("fit_masks", tmp_path, "--steps", "60") > 0.9
+    ring = trimesh.load(tmp_path / "fit_masks.glb", force="mesh")
+    assert ring.is_watertight and ring.euler_number == 0 and ring.volume > 0
+    again = ["--folder", str(tmp_path / "masks"), "--start", str(tmp_path / "fit_masks.glb"), "--steps", "2"]
+    assert run("fit_masks", tmp_path / "again", *again) > 0.9
+    assert imageio.imread(tmp_path / "fit_masks.png").shape == (2 * 90, 12 * 120)
 
 
 def test_draw_surfaces(tmp_path):

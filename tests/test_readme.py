@@ -4,11 +4,16 @@ Our own code is in blocks marked ``python``. Code of other libraries is not run;
 """
 
 import re
+import shlex
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 import trimesh
+import tyro
+
+from learn3d.commands import main
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -91,3 +96,31 @@ def test_pages_run_and_what_they_name_exists(page):
     missing += [link for link in {*links} if "://" not in link and not (page.parent / link).exists()]
     assert missing == []
     assert page != README or len(named) > 5
+
+
+def commands():
+    """The command lines `learn3d ...` in the blocks of all pages."""
+    for page in [*PAGES, *sorted((ROOT / "docs" / "methods").glob("*.md"))]:
+        for block in re.findall(r"```sh\n(.*?)```", page.read_text(), flags=re.DOTALL):
+            for line in block.replace("\\\n", " ").splitlines():
+                words = shlex.split(line.replace("SEED", "0"), comments=True)
+                if words[:1] == ["learn3d"] and not {"...", "COMMAND", "--list"} & set(words):
+                    yield pytest.param(words[1:], id=f"{page.name}: {' '.join(words)}")
+
+
+class Understood(Exception):
+    pass
+
+
+@pytest.mark.parametrize("words", list(commands()))
+def test_documented_commands_are_understood(words, monkeypatch):
+    parse = tyro.cli
+
+    def parse_only(*args, **options):
+        parse(*args, **options)
+        raise Understood
+
+    monkeypatch.setattr(tyro, "cli", parse_only)
+    monkeypatch.setattr(sys, "argv", ["learn3d"])
+    with pytest.raises(Understood):
+        main(*words)

@@ -32,6 +32,7 @@ def take_photo(vertices: np.ndarray, faces: np.ndarray, color: np.ndarray, camer
 
 def main(output: Path = Path("photos"), category: str = "chair", objects: int = 60, photos: int = 4, seed: int = 0):
     """Writes OUTPUT/CATEGORY/images, masks and poses.csv: some photographs of each object from random sides."""
+    make_shape(category, np.random.default_rng(seed))  # raises ValueError for an unknown category
     folder = output / category
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True, exist_ok=True)

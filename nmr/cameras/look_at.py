@@ -81,11 +81,14 @@ def _check_pose(camera: ProjectingCamera, *names: str, **scalar: float | Tensor)
 
 
 def _warn_if_up_is_ahead(forward: Tensor, up: Tensor) -> None:
-    """Warns of cameras that look along their up vector, and so see nothing; not when compiled, traced or on a GPU."""
+    """Warns of cameras that look along their up vector, or at their own place, and so see nothing.
+
+    Not when compiled, traced or on a GPU.
+    """
     if torch.compiler.is_compiling() or forward.device.type != "cpu" or up.device.type != "cpu":
         return
     forward, up = (batched(x.detach(), torch.float64, 3) for x in (forward, up))
-    forward = forward / forward.norm(dim=-1, keepdim=True)
+    forward = forward / forward.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
     sideways = torch.linalg.cross(*torch.broadcast_tensors(up, forward))
     ahead = sideways.norm(dim=-1) < _SHORTEST  # False for NaN
     try:
@@ -94,8 +97,9 @@ def _warn_if_up_is_ahead(forward: Tensor, up: Tensor) -> None:
         return
     if which:
         warnings.warn(
-            f"camera {which[0]} of {len(ahead)} looks along its up vector ({len(which)} in all): it has no left and "
-            "right, and its image is empty. Give it another up, for example up=(0, 0, 1) to look straight down.",
+            f"camera {which[0]} of {len(ahead)} looks along its up vector, or at its own place ({len(which)} in all): "
+            "it has no left and right, and its image is empty. Give it another up, for example up=(0, 0, 1) to look "
+            "straight down, or another place.",
             stacklevel=4,
         )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 _PILLOW = (
     "reading and writing texture images needs Pillow, which is not installed; run `pip install pillow`, or install "
-    "nmr-learn3d[data]"
+    "nmr with the extra data"
 )
 
 

@@ -289,9 +289,14 @@ def test_eye_on_the_up_axis_is_degenerate_but_finite():
     assert camera.transform(torch.rand(1, 4, 3)).isfinite().all()
 
 
+def test_an_eye_at_the_place_that_it_looks_at_warns():
+    with pytest.warns(UserWarning, match="or at its own place"):
+        nmr.LookAt([[0.0, 1.0, 2.0], [0.0, 0.0, 0.0]])
+
+
 def test_looking_straight_down_warns_and_another_up_shows_the_object():
     sphere, faces = nmr.icosphere(1)
-    with pytest.warns(UserWarning, match="camera 1 of 2 looks along its up vector .* up="):
+    with pytest.warns(UserWarning, match="camera 1 of 2 looks along its up vector, .* up="):
         camera = nmr.LookAt.from_angles(3.0, [30.0, 90.0], 0.0)
     alpha = nmr.render_silhouette(sphere, faces, camera, image_size=16)
     assert alpha[0].any() and not alpha[1].any()

@@ -216,6 +216,14 @@ def test_soft_iou_same_bits_for_any_number_of_threads_and_any_batch():
     assert all(torch.equal(results[0], other) for other in results[1:])
 
 
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_soft_iou_refuses_masks_of_255(dtype):
+    mask = torch.tensor([[0, 255, 255]], dtype=dtype)
+    with pytest.raises(ValueError, match=r"values from 0 to 255; divide a mask of 0\.\.255 by 255"):
+        nmr.losses.soft_iou_loss(torch.rand(1, 3), mask)
+    assert nmr.losses.soft_iou_loss(torch.ones(1, 3), mask / 240).isfinite(), "what resampling may add"
+
+
 def test_soft_iou_error():
     for a, b in (((1, 4, 4), (1, 5, 4)), ((0, 4, 4), (0, 4, 4)), ((4,), (4,))):
         with pytest.raises(ValueError, match=r"same shape \[B, \.\.\.\] with B >= 1, got float32"):

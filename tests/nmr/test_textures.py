@@ -460,7 +460,7 @@ def test_colours_take_the_type_of_the_vertices():
         (lambda: nmr.VertexColors([[0.0]]), TypeError, r"colors must be a float tensor \[V, C\].*the list holds list"),
         (lambda: nmr.VertexColors("red"), TypeError, "got str; use torch.as_tensor"),
         (lambda: nmr.VertexColors([]), TypeError, "got list"),
-        (lambda: nmr.VertexColors(torch.zeros(4, 3).byte()), TypeError, r"got uint8 \[4, 3\].*\.float\(\)"),
+        (lambda: nmr.VertexColors(torch.zeros(4, 3).byte()), TypeError, r"got uint8 \[4, 3\]; divide 0..255 by 255"),
         (lambda: nmr.VertexColors(torch.zeros(4)), ValueError, r"\[V, C\] or \[B, V, C\].*got float32 \[4\]"),
         (lambda: nmr.VertexColors(torch.zeros(4, 0)), ValueError, r"got float32 \[4, 0\]"),
         (lambda: nmr.FaceColors(torch.zeros(2)), ValueError, r"colors must be a float tensor \[F, C\]"),
