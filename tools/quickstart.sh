@@ -7,7 +7,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . tools/setup.sh
 
 category=${1:-airplane}
-steps=${STEPS:-2400} # of 32 images; Vanilla-AE takes a quarter of the steps, of 128 images, as published
+steps=${STEPS:-1600} # of 32 images; Vanilla-AE takes a quarter of the steps, of 128 images, as published
 objects=${OBJECTS:-250}
 out=$PWD/quickstart
 [ -z "${OUT:-}" ] || case $OUT in /*) out=$OUT ;; *) out=$here/$OUT ;; esac

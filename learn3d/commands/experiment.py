@@ -54,7 +54,7 @@ class Command:
     cluster: str | None = None
     """Runs on a Dask cluster: the address or the scheduler file of its scheduler (docs/scale.md). None given: here."""
     threads: int | None = None
-    """CPU threads of each run. None given: cores / jobs."""
+    """CPU threads of each run. None given: cores (or OMP_NUM_THREADS) / jobs."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the networks run."""
     layout: Layout | None = None

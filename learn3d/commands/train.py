@@ -5,8 +5,6 @@ Examples:
   learn3d train --data DATA --category airplane,car --preset vanilla --output runs/vanilla
   learn3d train --resume --output runs/airplane
   torchrun --nproc-per-node 2 -m learn3d train --data DATA --category airplane --output runs/airplane
-
-Methods (--preset): proposed, vanilla, multi-view, vpl, prgan; --help-all has the presets for other data sets.
 """
 
 from __future__ import annotations
@@ -59,7 +57,7 @@ def read(arguments: Sequence[str]) -> Command:
             raise ValueError(f"{known.output} was started with the preset {default.preset}, got {preset}")
     else:
         default = _options_of(preset or DEFAULT_PRESET)
-    about = {"name": "train", "about": __doc__, "more": _presets(), "common": COMMON}
+    about = {"name": "train", "about": f"{__doc__}\n{_methods()}", "more": _presets(), "common": COMMON}
     return parse(Command, arguments, **about, default=Command(config=default))
 
 
@@ -72,6 +70,10 @@ def _options_of(name: str) -> TrainConfig:
     object.__setattr__(options, "preset", name)
     object.__setattr__(options, "warmup_steps", None)  # the preset's, but at most a tenth of the run
     return options
+
+
+def _methods() -> str:
+    return f"Methods (--preset): {', '.join(METHODS)}; --help-all has the presets for other data sets."
 
 
 def _presets() -> str:

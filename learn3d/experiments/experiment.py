@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import torch
+
 from learn3d.device import cores
 from learn3d.experiments import results
 from learn3d.experiments.formats import to_text, write_report
@@ -65,7 +67,7 @@ def run_experiment(call: Call, *, work: Work = carry_out) -> int:
     if call.report_only and call.overwrite:
         raise ValueError("--report-only trains nothing and --overwrite trains anew; give one of them")
     table, failed = TABLES[call.table], {}
-    threads = call.options.threads or max(1, cores() // call.jobs)
+    threads = call.options.threads or max(1, min(cores(), torch.get_num_threads()) // call.jobs)
     runs = plan_runs(table, dataclasses.replace(call.options, threads=threads))
     if not call.report_only:
         failed = _complete(runs, call, threads, work)

@@ -58,7 +58,8 @@ class Table:
 
 _BATCHES = 4  # Plus learns from a quarter of the images a step, in four times the steps
 PROPOSED, PLUS, VANILLA, MULTI_VIEW, VPL, PRGAN = (
-    Variant(name, preset, smaller_batches=_BATCHES if name == "plus" else 1) for name, preset in METHODS.items()
+    Variant(name, METHODS[name], smaller_batches=_BATCHES if name == "plus" else 1)
+    for name in ("proposed", "plus", "vanilla", "multi-view", "vpl", "prgan")
 )
 
 _NO_PRIOR = Variant("without-prior", "peng2020-kato", {"lambda_prior": 0.0})

@@ -1,4 +1,4 @@
-"""What code made a result: versions, and the git commit when it runs from a checkout."""
+"""What code made a result: versions, and the git commit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of the package and of torch, and the git commit when the code runs from a checkout."""
+    """Versions of the package and of torch, and the git commit that the code is of, where that is known."""
     try:
         package = importlib.metadata.version("nmr-learn3d")
     except importlib.metadata.PackageNotFoundError:
@@ -19,7 +19,7 @@ def versions() -> dict[str, str | None]:
 
 
 def _git_commit() -> str | None:
-    """Commit of the checkout that holds this file (with "-dirty" after changes), None for an installed copy."""
+    """Commit of the checkout that holds this file (with "-dirty" after changes), or that it was installed from."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(Path(__file__).parent), *arguments]
@@ -29,4 +29,5 @@ def _git_commit() -> str | None:
         git("ls-files", "--error-unmatch", Path(__file__).name)
         return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.CalledProcessError):
-        return None
+        built_from = Path(__file__).parents[1] / "commit.txt"  # CMakeLists.txt writes it
+        return (built_from.read_text().strip() if built_from.exists() else "") or None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import runpy
+
 import numpy as np
 import pytest
 
 from learn3d.experiments import published
 from learn3d.experiments.experiment import describe_tables
 from learn3d.experiments.tables import TABLES
+from learn3d.presets import METHODS
 
 
 @pytest.mark.parametrize("name", ["KATO", "PRGAN", "KAR", "ABLATION", "MMD", "PASCAL"])
@@ -15,6 +18,11 @@ def test_printed_means_agree_with_the_printed_rows(name: str) -> None:
     for label, row in getattr(published, name).items():
         if row.mean is not None:
             assert np.mean(list(row.values.values())) == pytest.approx(row.mean, abs=0.001), label
+
+
+def test_a_method_of_ones_own_leaves_the_tables_alone(monkeypatch) -> None:
+    monkeypatch.setitem(METHODS, "mine", "plus-kato")
+    assert runpy.run_module("learn3d.experiments.tables")["TABLES"].keys() == TABLES.keys()
 
 
 def test_tables_take_rows_of_the_paper_and_share_runs() -> None:
