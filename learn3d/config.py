@@ -19,7 +19,7 @@ from learn3d.methods import Plan, Schedule, Settings
 from learn3d.presets import PRESETS
 from learn3d.settings import Count, FilePath, Items, Step, checked
 
-DEFAULT_PRESET = next(iter(PRESETS))
+DEFAULT_PRESET = "plus-kato"
 
 _FROM_PRESET = ("settings", "layout", "view_bins", "sampling", "augment", "iterations", "batch_size", "schedule")
 _FROM_PRESET += ("warmup_steps", "average")  # options that the preset decides where they are None

@@ -159,7 +159,7 @@ _PLUS = replace(
     average=0.99,
 )
 
-#: The first one is the default. "peng2020-kato" is what the published code computes (and what the paper's tables were
+#: "peng2020-kato" is what the published code computes (and what the paper's tables were
 #: made with); "-printed" is every equation as printed, with the sign slip of the projection loss corrected. Both place
 #: the vertices at 0.5 * (unit sphere + displacement), as the published code does: the text's unit sphere is larger than
 #: the image at the data set's camera, so that no edge is visible and the silhouette gives no gradient.

@@ -19,7 +19,7 @@ from learn3d.config import TrainConfig
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.crops import Crops
 from learn3d.data.dataset import MASK_SIZE
-from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo
+from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo, read_picture, threshold_mask
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.figures import Surface
@@ -30,6 +30,7 @@ from learn3d.runs import checkpoint
 from learn3d.runs.export import small_model
 
 STRIP_SIZE = 192
+_LARGE = 1024  # pixels a side in which an object is searched for
 _FINE = 4  # at least as many pixels, per side, are kept for one of a prepared image
 LARGEST_PICTURE = 2048  # pixels: shapes are drawn four times as fine, and the renderer goes up to 8192
 
@@ -79,9 +80,13 @@ def prepare_image(
     return np.rint(resized.transpose(2, 0, 1)).clip(0, 255).astype(np.uint8)
 
 
-def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
-    """Colours uint8 [H,W,3] and a mask uint8 [H,W] that shows something; see `read_photo`."""
-    colors, mask = read_photo(path, mask_path)
+def _read(path: Path, mask_path: Path | None, plain_background: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Colours uint8 [H,W,3] and a mask uint8 [H,W] that shows something; see `read_photo` and `threshold_mask`."""
+    if plain_background and mask_path is None:
+        colors, mask = read_picture(path, _LARGE)
+        mask = threshold_mask(colors) if mask is None else mask
+    else:
+        colors, mask = read_photo(path, mask_path)
     if not mask.any():
         raise ValueError(f"the mask of {path} is empty: no pixel belongs to the object")
     return colors, mask
@@ -221,12 +226,14 @@ def reconstruct_files(
     *,
     crop: bool = True,
     poses: LookAtPoses | None = None,
+    plain_background: bool = False,
     which: str = "last",
     **options: Any,
 ) -> list[Path]:
     """Reconstruct image files with the networks of a run (see `load_model`) and save the results in `folder`.
 
-    `masks` is empty (the images have transparency) or as long as `images`. Where `poses` are given, one of each image,
+    `masks` is empty (the images have transparency, or with `plain_background` what differs from the border's colour is
+    the object) or as long as `images`. Where `poses` are given, one of each image,
     shapes are fitted to the masks. `options` go to `save_reconstruction`. Returns the files, named after the images.
     """
     _check(options)
@@ -234,10 +241,12 @@ def reconstruct_files(
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
     if poses is not None and len(poses) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(poses)} poses; give one azimuth per image")
-    photos = [_read(image, mask) for image, mask in zip(images, masks or [None] * len(images), strict=True)]
-    model = load_model(run, which)
-    stored = np.stack([model.prepare(*photo, crop=crop) for photo in photos])
-    fine = np.stack([model.prepare(*photo, crop=crop, size=STRIP_SIZE, nearest=True) for photo in photos])
+    model, prepared = load_model(run, which), []
+    for image, mask in zip(images, masks or [None] * len(images), strict=True):
+        photo = _read(image, mask, plain_background)  # one at a time: they may be large
+        strip = model.prepare(*photo, crop=crop, size=STRIP_SIZE, nearest=True)
+        prepared.append((model.prepare(*photo, crop=crop), strip))
+    stored, fine = map(np.stack, zip(*prepared, strict=True))
     names = [Path(image).stem for image in images]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]

@@ -31,6 +31,8 @@ class Command:
     """Images of any size, with a transparent background (or with --masks)."""
     masks: tuple[Path, ...] = ()
     """Mask images (white = object), one for each image, where the background is not transparent."""
+    plain_background: bool = False
+    """The background has one colour: what differs from that of the border is the object."""
     data: Path | None = None
     """Take the images from this data set instead."""
     category: str | None = None
@@ -82,7 +84,7 @@ def run(arguments: Sequence[str]) -> int:
     else:
         azimuths = torch.tensor(command.azimuths)
         poses = LookAtPoses(azimuths, command.elevation, DISTANCE, HALF_FOV_DEG) if command.refine else None
-        how = {"crop": command.crop, "poses": poses}
+        how = {"crop": command.crop, "poses": poses, "plain_background": command.plain_background}
         paths = reconstruct_files(*where, command.images, command.masks, **how, **options)
     for path in paths:
         say(str(path))

@@ -94,7 +94,8 @@ def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
         if mask is None:
             raise DamagedFile(
                 path,
-                "has no transparency and no mask: give a mask image, white where the object is (reconstruct: --masks)",
+                "has no transparency and no mask: give a mask image, white where the object is "
+                "(reconstruct: --masks, or --plain-background)",
             )
     else:
         mask_image = _open(mask_path)
@@ -121,7 +122,27 @@ def check_mask(mask: np.ndarray) -> None:
         raise ValueError("its mask is all white: white must be the object, black the background")
     border = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
     if border.mean() > 0.5:
-        raise ValueError(f"its mask covers {border.mean():.0%} of the border; is it black where the object is?")
+        raise ValueError(
+            f"its mask covers {border.mean():.0%} of the border; is it black where the object is, or is the background "
+            "in it?"
+        )
+
+
+def threshold_mask(colors: np.ndarray, tolerance: float = 0.12) -> np.ndarray:
+    """The largest region, without its holes, whose colour is not that of the picture's border: uint8 [H,W], 0 or 255.
+
+    colors: uint8 [H,W,3]. The background's colour is the median of the border; what differs from it by less than
+    `tolerance` (0 .. 1, of the largest difference in any channel) is background.
+    """
+    from scipy import ndimage  # here, as workers import this module
+
+    border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]])
+    difference = np.abs(colors - np.median(border, axis=0)).max(axis=2)
+    regions, count = ndimage.label(difference > 255 * tolerance)
+    if count == 0:
+        return np.zeros(colors.shape[:2], np.uint8)
+    largest = regions == 1 + np.bincount(regions.ravel())[1:].argmax()
+    return 255 * ndimage.binary_fill_holes(largest).astype(np.uint8)
 
 
 def mask_box(mask: np.ndarray) -> tuple[int, int, int, int]:

@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 from learn3d import figures
-from learn3d.data.framing import read_picture
+from learn3d.data.framing import read_picture, threshold_mask
 from learn3d.demo import fit_tab, picture_tab
 from learn3d.demo.fit_tab import SIDES
 from learn3d.demo.picture_tab import Picture
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from gradio.data_classes import FileData
 
 WAITING = 16  # visitors; the next one is asked to come back
-_MASK = (230, 50, 60)
+_MASK = (0, 200, 235)  # few objects have this colour
 _CANVAS = 320  # pixels of a silhouette
 _STRENGTH = 0.55  # opacity of the mask over the picture
 _PICTURES = [".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"]
@@ -126,7 +126,7 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
             return show(picture_tab.open_picture(Path(path), tolerance))
 
     def threshold(old: Picture | None, tolerance: float) -> tuple:
-        return show(old and old._replace(mask=picture_tab.threshold_mask(old.colors, tolerance)))
+        return show(old and old._replace(mask=threshold_mask(old.colors, tolerance)))
 
     def cut_out(old: Picture | None) -> tuple:
         return show(old and old._replace(mask=picture_tab.object_mask(old.colors)))
@@ -150,13 +150,24 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
                 outputs += _shown(surface, name, azimuth, root)
         return outputs
 
+    def clear() -> list:
+        return [None, None, *(gr.DownloadButton(interactive=False) if k % 3 else None for k in range(3 * len(models)))]
+
+    def empty(old: Picture | None) -> tuple:
+        return show(old and old._replace(mask=np.zeros_like(old.mask)))
+
     picture = gr.State()
+    gr.Markdown(
+        "1. Give a picture of an object, or press a category. 2. See that the mask covers the object. 3. Turn the mesh."
+    )
     with gr.Row():
         with gr.Column(scale=2, min_width=320):
             given = gr.File(label="Picture", height=140, file_types=_PICTURES)
             examples = _example_buttons()
-            editor = _drawing(label="Mask (red)", canvas_size=(picture_tab.SIDE, picture_tab.SIDE))
+            editor = _drawing(label="Mask (bright blue)", canvas_size=(picture_tab.SIDE, picture_tab.SIDE))
             tolerance = gr.Slider(0, 1, picture_tab.TOLERANCE, label="Threshold", info="Difference to the background")
+            with gr.Row():
+                emptied, again = gr.Button("Empty mask", size="sm"), gr.Button("Mask as at first", size="sm")
             removed = gr.Button("Find the object (rembg)", visible=find_spec("rembg") is not None)
         with gr.Column(scale=3, min_width=320):
             chosen = gr.CheckboxGroup(list(models), value=list(models), label="Models", visible=len(models) > 1)
@@ -170,9 +181,12 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
     chosen.change(lambda names: [gr.Column(visible=label in names) for label in models], [chosen], columns)
     shown = [picture, editor]
     tolerance.release(threshold, [picture, tolerance], shown, **_ALONE)
+    again.click(threshold, [picture, tolerance], shown, **_ALONE)
+    emptied.click(empty, [picture], shown, **_ALONE)
     removed.click(cut_out, [picture], shown, **_ALONE)
     arrivals = [example.click(partial(draw_example, name), None, shown, **_ALONE) for name, example in examples.items()]
-    for arrival in (given.upload(upload, [given, tolerance], shown, **_ALONE), *arrivals):
+    uploaded = given.upload(clear, None, [*shown, *meshes]).then(upload, [given, tolerance], shown, **_ALONE)
+    for arrival in (uploaded, *arrivals):
         arrival.success(make, [picture, chosen], meshes, **_ALONE)
     button.click(make, [picture, chosen, editor], meshes, **_ALONE)
 

@@ -8,11 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from PIL import Image
-from scipy import ndimage
 
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
-from learn3d.data.framing import check_mask, read_picture
+from learn3d.data.framing import check_mask, read_picture, threshold_mask
 from learn3d.figures import CLAY, Surface
 from learn3d.make_data.shapes import make_shape
 from learn3d.make_data.studio import photograph
@@ -40,23 +39,11 @@ def open_picture(path: Path, tolerance: float = TOLERANCE) -> Picture:
     top, left = (SIDE - height) // 2, (SIDE - width) // 2
     around = (top, SIDE - height - top), (left, SIDE - width - left)
     padded = np.pad(colors, (*around, (0, 0)), mode="edge")  # the background goes on
-    mask = threshold_mask(padded, tolerance) if alpha is None else np.pad(alpha, around)
+    if alpha is None:
+        return Picture(padded, threshold_mask(padded, tolerance), path.stem)
+    mask = np.pad(alpha, around)
+    padded[mask == 0] = 255
     return Picture(padded, mask, path.stem)
-
-
-def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-    """The largest region, without its holes, whose colour is not that of the picture's border: uint8 [H,W], 0 or 255.
-
-    colors: uint8 [H,W,3]. The background's colour is the median of the border; what differs from it by less than
-    `tolerance` (0 .. 1, of the largest difference in any channel) is background.
-    """
-    border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]])
-    difference = np.abs(colors - np.median(border, axis=0)).max(axis=2)
-    regions, count = ndimage.label(difference > 255 * tolerance)
-    if count == 0:
-        return np.zeros(colors.shape[:2], np.uint8)
-    largest = regions == 1 + np.bincount(regions.ravel())[1:].argmax()
-    return 255 * ndimage.binary_fill_holes(largest).astype(np.uint8)
 
 
 def object_mask(colors: np.ndarray) -> np.ndarray:
@@ -84,7 +71,8 @@ def make_mesh(model: Model, picture: Picture) -> tuple[Surface, float]:
     try:
         check_mask(picture.mask)
     except ValueError as error:
-        raise ValueError(f"{error}. Correct it with the threshold or the brush") from None
+        text = str(error).rstrip("?").replace("its mask", "The mask", 1)
+        raise ValueError(f"{text}? Correct it with the threshold or the brush") from None
     stored = model.prepare(picture.colors, picture.mask)
     (surface,) = reconstruct(model.method, stored[None])
     return surface, input_azimuth_deg(surface, stored[3])

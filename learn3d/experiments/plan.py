@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d.config import DEFAULT_PRESET, TrainConfig
+from learn3d.config import TrainConfig
 from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.experiments.tables import Row, Table, Variant
 from learn3d.presets import PRESETS
@@ -126,7 +126,7 @@ def _configure(
     changes = dict(variant.changes) | given
     setting_names = {field.name for field in dataclasses.fields(preset.settings)}
     parts = variant.smaller_batches
-    whole = PRESETS[DEFAULT_PRESET] if parts > 1 else preset
+    whole = PRESETS["peng2020-kato"] if parts > 1 else preset
     iterations = (options.iterations or whole.iterations) * parts
     batch_size = options.batch_size or whole.batch_size
     if batch_size % parts:

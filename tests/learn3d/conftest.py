@@ -15,7 +15,7 @@ import tiny_networks
 import torch
 
 from learn3d import commands, validation
-from learn3d.config import DEFAULT_PRESET, TrainConfig
+from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
 from learn3d.methods.pose_invariant import PoseInvariantSettings
@@ -74,7 +74,8 @@ def tiny_config(tiny_folder: Path) -> Callable[..., TrainConfig]:
 
     def make(output: Path, **options: object) -> TrainConfig:
         defaults = {"iterations": 4, "batch_size": 4, "precision": "fp32", "log_every": 1, "max_val_images": 4}
-        preset = PRESETS.get(options.get("preset", DEFAULT_PRESET), PRESETS[DEFAULT_PRESET]).settings
+        options = {"preset": "peng2020-kato"} | options
+        preset = PRESETS.get(options["preset"], PRESETS["peng2020-kato"]).settings
         names = {field.name for field in dataclasses.fields(preset)} & set(options)
         settings = {name: options.pop(name) for name in names}
         if isinstance(preset, PoseInvariantSettings) and preset.encoder == "conv":

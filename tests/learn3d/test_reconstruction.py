@@ -35,6 +35,19 @@ def test_data_set_image_survives_the_way_out_and_back(tiny_set) -> None:
     assert np.array_equal(again, stored)
 
 
+def test_a_plain_background_is_cut_away(finished_run, tmp_path) -> None:
+    picture = np.full((120, 160, 3), 240, np.uint8)
+    picture[30:90, 50:110] = (180, 40, 30)
+    Image.fromarray(picture).save(tmp_path / "box.png")
+    where = (finished_run, tmp_path / "out", [tmp_path / "box.png"])
+    with pytest.raises(ValueError, match="--plain-background"):
+        reconstruct_files(*where, frames=2, image_size=32)
+    written = reconstruct_files(*where, plain_background=True, frames=2, image_size=32)
+    assert len(trimesh.load(written[0], force="mesh").faces) > 100
+    mask = _read(tmp_path / "box.png", None, True)[1]
+    assert mask[30:90, 50:110].all() and mask.sum() == 255 * 60 * 60
+
+
 def test_a_large_photograph_is_prepared_like_a_small_one() -> None:
     y, x = np.mgrid[:150, :200]
     colors = np.stack([x, y, x + y], axis=2).astype(np.uint8) // 2

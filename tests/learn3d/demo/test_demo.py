@@ -13,6 +13,7 @@ import trimesh
 from PIL import Image
 
 import nmr
+from learn3d.data.framing import threshold_mask
 from learn3d.demo import fit_tab, picture_tab
 from learn3d.figures import Surface
 from learn3d.reconstruction import input_azimuth_deg, load_model
@@ -32,11 +33,11 @@ def photo() -> np.ndarray:
 
 
 def test_the_mask_is_the_largest_region_without_holes(photo) -> None:
-    mask = picture_tab.threshold_mask(photo, 0.2)
+    mask = threshold_mask(photo, 0.2)
     rows, columns = np.ogrid[:100, :160]
     assert mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}
     assert np.array_equal(mask > 0, np.hypot(rows - 50, columns - 80) < 30)
-    assert not picture_tab.threshold_mask(photo, 0.9).any()
+    assert not threshold_mask(photo, 0.9).any()
 
 
 def test_pictures_are_laid_on_a_square(photo, tmp_path) -> None:
