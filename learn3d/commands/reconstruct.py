@@ -65,6 +65,8 @@ def run(arguments: Sequence[str]) -> int:
     command = parse(Command, arguments, name="reconstruct", about=__doc__)
     if bool(command.images) == (command.data is not None):
         raise ValueError("give either image files, or --data with --indices")
+    if command.output.suffix.lower() in (".glb", ".obj", ".ply"):
+        raise ValueError(f"--output is a folder, got {command.output}; the files in it are named after the images")
     if command.images and command.refine != bool(command.azimuths):
         raise ValueError("--refine takes the azimuth of the camera of each image file: give --refine --azimuths A ...")
     import torch

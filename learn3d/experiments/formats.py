@@ -30,8 +30,8 @@ def write_report(folder: Path, report: dict[str, Any]) -> list[Path]:
 
 def to_text(report: dict[str, Any]) -> str:
     """The table for the terminal, and how long our runs were trained."""
-    trained = f"\nhere: trained for {_trained(report)}" if report["runs"] else ""
-    return f"{align(main_table(report))}\n{REFERENCE}{trained}"
+    trained = [f"here: trained for {_trained(report)}"] if report["runs"] else []
+    return "\n".join([align(main_table(report)), *_reference(report), *trained])
 
 
 def to_markdown(report: dict[str, Any]) -> str:
@@ -102,8 +102,12 @@ def commands(report: dict[str, Any]) -> list[str]:
     return list(dict.fromkeys(run["general_command"] for run in report["runs"]))
 
 
+def _reference(report: dict[str, Any]) -> list[str]:
+    return [REFERENCE] if any(line[1].startswith("paper") for line in main_table(report)[1:]) else []
+
+
 def _notes(report: dict[str, Any]) -> list[str]:
-    notes = [REFERENCE, *([report["note"]] if report["note"] else [])]
+    notes = [*_reference(report), *([report["note"]] if report["note"] else [])]
     seeds = sorted({seed for row in report["rows"] for seed in row["cells"].get(MEAN, {}).get("seeds", [])})
     if report["runs"]:
         over_seeds = f"; ±: over {len(seeds)} seeds (Student's t)" if len(seeds) > 1 else ""

@@ -21,7 +21,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "output": (BASE | {"output": "a\0b"}, "output must be the path"),
     "category": (BASE | {"category": 3}, "category must be text, got 3"),
     "preset": (BASE | {"preset": {}}, "preset must be"),
-    "settings": (BASE | {"settings": 3}, "takes PoseInvariantSettings, got int"),
+    "settings": (BASE | {"settings": 3}, "takes PlusSettings, got int"),
     "rate": (BASE | {"settings": {"learning_rate": "x"}}, "learning_rate must be a number, got 'x'"),
     "huge rate": (BASE | {"settings": {"learning_rate": 10**200}}, "learning_rate must be at most"),
     "weight": (BASE | {"settings": {"lambda_smooth": -1}}, "lambda_smooth must be at least 0, got -1"),

@@ -20,7 +20,8 @@ from learn3d.data.sampling import shuffled_epochs
 from learn3d.device import crowding
 from learn3d.methods import DataShape, create_method
 from learn3d.methods.multi_view import MultiViewSettings
-from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
+from learn3d.methods.plus import PlusSettings
+from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.parallel.ranks import ALONE
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint, state
@@ -126,20 +127,22 @@ def weights(config: TrainConfig) -> tuple[float, ...]:
 
 
 def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
-    config = TrainConfig(data=tmp_path, category="airplane", output=tmp_path)
+    best = TrainConfig(data=tmp_path, category="airplane", output=tmp_path)
+    assert (best.preset, best.iterations, best.batch_size, best.augment) == ("plus-kato", 80_000, 32, ("colors",))
+    config = TrainConfig(data=tmp_path, category="airplane", output=tmp_path, preset="peng2020-kato")
     assert weights(config) == (0.001, 1, 1, 1)
     assert weights(TrainConfig(data=tmp_path, category="airplane", output=tmp_path, preset=VANILLA)) == (0.001, 0, 0, 0)
     assert (config.iterations, config.batch_size, config.settings.learning_rate) == (20_000, 128, 1e-4)
     assert (config.layout, config.sampling, config.augment, config.view_bins) == ("kato", "views", (), None)
     given = TrainConfig(data=tmp_path, category="airplane", output=tmp_path, iterations=7, view_bins="15x20")
-    assert (given.iterations, given.batch_size, given.view_bins) == (7, 128, "15x20")
+    assert (given.iterations, given.batch_size, given.view_bins) == (7, 32, "15x20")
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"preset": "kato"}, "preset must be one of peng2020-kato, "),
-        ({"settings": MultiViewSettings()}, "'peng2020-kato' takes PoseInvariantSettings, got MultiViewSettings"),
+        ({"settings": MultiViewSettings()}, "'plus-kato' takes PlusSettings, got MultiViewSettings"),
         ({"layout": "shapenet"}, "layout must be 'kato'"),
         ({"sampling": "all"}, "sampling must be 'views'"),
         ({"augment": ("zoom",)}, "augment must be 'flip'"),
@@ -171,7 +174,7 @@ def test_config_survives_json_and_names_unknown_options(tmp_path) -> None:
         data=tmp_path,
         category="chair",
         output=tmp_path / "run",
-        settings=PoseInvariantSettings(lambda_prior=0.5),
+        settings=PlusSettings(lambda_prior=0.5),
         threads=2,
         augment=("channels",),
     )

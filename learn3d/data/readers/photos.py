@@ -38,6 +38,7 @@ AZIMUTH_WIDTHS_DEG = (15, 20, 30, 45, 60, 90)
 ELEVATION_WIDTH_DEG = 20
 PHOTOS_PER_CLASS = 8  # on average, at least: fewer tell a discriminator nothing
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"}
+_SCALE_ODD = 1.7  # the same, worth a warning: half an angle for a whole one makes 2
 _SCALE_OFF = 5.0  # times larger or smaller than the distances say: then they are in another unit
 
 
@@ -119,6 +120,11 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
         _check_scale(table, scales)
     except ValueError as error:
         yield Problem(str(table), str(error).removeprefix(f"{table}: "))
+    else:
+        middle = float(np.median(scales)) if scales else 1.0
+        if not 1 / _SCALE_ODD < middle < _SCALE_ODD:
+            text = f"the objects are {middle:.2g} times as large in the photographs as distance and fov_deg say"
+            yield Problem(str(table), f"{text}; is fov_deg the full angle across the longer side?", "warning")
     images, listed = table.parent / "images", {photo.file for photo in photos}
     for path in sorted(images.iterdir()) if split == "train" and images.is_dir() and not faults else []:
         if path.suffix.lower() in _SUFFIXES and path not in listed:

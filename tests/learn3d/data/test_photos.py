@@ -38,6 +38,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_best_networks_are_those_with_the_best_silhouettes(made: Path, tmp_path: Path) -> None:
     settings = PoseInvariantSettings(encoder="conv-small", generator="sphere-small", learning_rate=0.01)
     about = {"data": made, "category": "chair", "layout": "photos", "settings": settings, "output": tmp_path / "run"}
+    about["preset"] = "peng2020-kato"
     summary = train(TrainConfig(**about, iterations=3, batch_size=4, precision="fp32", validate_every=1))
     lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     measured = {line["step"]: line["silhouette_iou"] for line in lines if line["split"] == "val"}

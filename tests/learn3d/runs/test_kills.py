@@ -55,7 +55,7 @@ def killed_config(tiny_folder, tmp_path_factory) -> TrainConfig:
     settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **small)
     often = {"log_every": 1, "validate_every": 2, "checkpoint_every": 3, "pictures_every": 4}
     fixed = {"batch_size": 2, "precision": "fp32", "threads": 1, "max_val_images": 4}
-    where = {"data": folder, "category": "airplane", "output": folder / "uninterrupted"}
+    where = {"data": folder, "category": "airplane", "output": folder / "uninterrupted", "preset": "peng2020-kato"}
     return TrainConfig(**where, settings=settings, iterations=10, seed=1, **fixed, **often)
 
 
@@ -153,7 +153,7 @@ def test_the_command_killed_at_any_time(killed_config, tmp_path, monkeypatch) ->
     names += ("log_every", "validate_every", "checkpoint_every", "pictures_every")
     options = [f"--{name.replace('_', '-')}={getattr(killed_config, name)}" for name in names]
     options += ["--encoder=conv-small", "--generator=sphere-small", "--learning-rate=1e-2"]
-    options += [f"--data={killed_config.data}", "--category=airplane"]
+    options += [f"--data={killed_config.data}", "--category=airplane", "--preset=peng2020-kato"]
     run = tmp_path / "run"
     script = [sys.executable, str(Path(__file__).parents[3] / "tools" / "train.py"), f"--output={run}"]
     packages = [str(Path(learn3d.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
