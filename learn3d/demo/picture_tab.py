@@ -27,6 +27,7 @@ class Picture(NamedTuple):
     colors: np.ndarray  # uint8 [SIDE, SIDE, 3]
     mask: np.ndarray  # uint8 [SIDE, SIDE], 255: object
     name: str = "picture"
+    framed: bool = False  # as the networks' training images are: the object is as large in it as its distance makes it
 
 
 def open_picture(path: Path, tolerance: float = TOLERANCE) -> Picture:
@@ -60,7 +61,7 @@ def example(category: str, seed: int) -> Picture:
     vertices = torch.from_numpy(np.asarray(mesh.vertices @ mesh_to_object("y", "z").T, np.float32))
     camera = nmr.LookAt.from_angles(DISTANCE, 30.0, [rng.uniform(0, 360)], half_fov_deg=HALF_FOV_DEG)
     rgb, alpha = photograph(vertices, torch.tensor(mesh.faces), rng.uniform(0.3, 0.9, 3), camera, image_size=SIDE)
-    return Picture(rgb[0], alpha[0], category)
+    return Picture(rgb[0], alpha[0], category, framed=True)
 
 
 def make_mesh(model: Model, picture: Picture) -> tuple[Surface, float]:
@@ -73,7 +74,7 @@ def make_mesh(model: Model, picture: Picture) -> tuple[Surface, float]:
     except ValueError as error:
         text = str(error).rstrip("?").replace("its mask", "The mask", 1)
         raise ValueError(f"{text}? Correct it with the threshold or the brush") from None
-    stored = model.prepare(picture.colors, picture.mask)
+    stored = model.prepare(picture.colors, picture.mask, crop=not picture.framed)
     (surface,) = reconstruct(model.method, stored[None])
     return surface, input_azimuth_deg(surface, stored[3])
 

@@ -86,6 +86,22 @@ def test_a_picture_becomes_a_mesh(finished_run, tmp_path) -> None:
             picture_tab.make_mesh(load_model(finished_run), picture._replace(mask=mask))
 
 
+def test_generated_examples_keep_their_size() -> None:
+    seen = []
+
+    class Watched:
+        method = None
+
+        def prepare(self, colors, mask, **options):
+            seen.append(options)
+            raise KeyError
+
+    for picture in (picture_tab.example("car", 3), picture_tab.example("car", 3)._replace(framed=False)):
+        with pytest.raises(KeyError):
+            picture_tab.make_mesh(Watched(), picture)
+    assert seen == [{"crop": False}, {"crop": True}]
+
+
 def test_the_side_of_the_input_is_found() -> None:
     vertices, faces = nmr.icosphere(3)
     bumps = torch.stack([torch.tensor(bump) for bump in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0])])
