@@ -19,7 +19,7 @@ from learn3d.config import TrainConfig
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.crops import Crops
 from learn3d.data.dataset import MASK_SIZE
-from learn3d.data.framing import OBJECT_SHARE, mask_box, read_photo, read_picture, threshold_mask
+from learn3d.data.framing import OBJECT_SHARE, check_mask, mask_box, read_photo, read_picture, threshold_mask
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.figures import Surface
@@ -85,6 +85,10 @@ def _read(path: Path, mask_path: Path | None, plain_background: bool = False) ->
     if plain_background and mask_path is None:
         colors, mask = read_picture(path, _LARGE)
         mask = threshold_mask(colors) if mask is None else mask
+        try:
+            check_mask(mask)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error} (or give --masks)") from None
     else:
         colors, mask = read_photo(path, mask_path)
     if not mask.any():

@@ -73,7 +73,11 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def _check_mask(target: Tensor) -> None:
-    """Refuses a mask of 0 and 255; not when compiled, traced or on a GPU. What resampling adds to [0, 1] is allowed."""
+    """Raises ValueError for a target such as a mask of 0 and 255.
+
+    Values a little outside of [0, 1], as resampling makes them, are allowed. Nothing is checked when compiled, traced
+    or on a GPU.
+    """
     if torch.compiler.is_compiling() or not target.is_cpu or target.numel() == 0 or target.dtype == torch.bool:
         return
     try:

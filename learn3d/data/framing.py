@@ -23,6 +23,7 @@ from learn3d.files.images import PHOTOGRAPHS, open_image
 
 Framing = Literal["whole", "object"]
 OBJECT_SHARE = 0.65  # of the side of the square that the object takes with "object", about what Kato's renderings have
+TOLERANCE = 0.12  # of colours, for `threshold_mask`
 _MEMORY_PER_PIXEL = 40  # bytes, for masking and framing
 _PIXELS_PER_SECOND = 2e7
 _SUPERSAMPLE = 4  # pixels, per side, that are averaged to one where the camera is turned
@@ -128,7 +129,7 @@ def check_mask(mask: np.ndarray) -> None:
         )
 
 
-def threshold_mask(colors: np.ndarray, tolerance: float = 0.12) -> np.ndarray:
+def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
     """The largest region, without its holes, whose colour is not that of the picture's border: uint8 [H,W], 0 or 255.
 
     colors: uint8 [H,W,3]. The background's colour is the median of the border; what differs from it by less than

@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 from learn3d import figures
-from learn3d.data.framing import read_picture, threshold_mask
+from learn3d.data.framing import TOLERANCE, read_picture, threshold_mask
 from learn3d.demo import fit_tab, picture_tab
 from learn3d.demo.fit_tab import SIDES
 from learn3d.demo.picture_tab import Picture
@@ -165,7 +165,7 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
             given = gr.File(label="Picture", height=140, file_types=_PICTURES)
             examples = _example_buttons()
             editor = _drawing(label="Mask (bright blue)", canvas_size=(picture_tab.SIDE, picture_tab.SIDE))
-            tolerance = gr.Slider(0, 1, picture_tab.TOLERANCE, label="Threshold", info="Difference to the background")
+            tolerance = gr.Slider(0, 1, TOLERANCE, label="Threshold", info="Difference to the background")
             with gr.Row():
                 emptied, again = gr.Button("Empty mask", size="sm"), gr.Button("Mask as at first", size="sm")
             removed = gr.Button("Find the object (rembg)", visible=find_spec("rembg") is not None)

@@ -11,14 +11,13 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
-from learn3d.data.framing import check_mask, read_picture, threshold_mask
+from learn3d.data.framing import TOLERANCE, check_mask, read_picture, threshold_mask
 from learn3d.figures import CLAY, Surface
 from learn3d.make_data.shapes import make_shape
 from learn3d.make_data.studio import photograph
 from learn3d.reconstruction import Model, export_mesh, input_azimuth_deg, reconstruct
 
 SIDE = 512  # pixels of the square on which pictures lie; the networks see 64 to 224
-TOLERANCE = 0.12
 
 
 class Picture(NamedTuple):
@@ -72,8 +71,9 @@ def make_mesh(model: Model, picture: Picture) -> tuple[Surface, float]:
     try:
         check_mask(picture.mask)
     except ValueError as error:
-        text = str(error).rstrip("?").replace("its mask", "The mask", 1)
-        raise ValueError(f"{text}? Correct it with the threshold or the brush") from None
+        text = str(error).replace("its mask", "The mask", 1)
+        end = "" if text.endswith("?") else "."
+        raise ValueError(f"{text}{end} Correct it with the threshold or the brush") from None
     stored = model.prepare(picture.colors, picture.mask, crop=not picture.framed)
     (surface,) = reconstruct(model.method, stored[None])
     return surface, input_azimuth_deg(surface, stored[3])

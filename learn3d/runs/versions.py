@@ -10,7 +10,7 @@ import torch
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of the package and of torch, and the git commit that the code is of, where that is known."""
+    """Versions of the package and of torch, and the git commit of the code (None where it is not known)."""
     try:
         package = importlib.metadata.version("nmr-learn3d")
     except importlib.metadata.PackageNotFoundError:

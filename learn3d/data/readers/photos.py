@@ -121,10 +121,9 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
     except ValueError as error:
         yield Problem(str(table), str(error).removeprefix(f"{table}: "))
     else:
-        middle = float(np.median(scales)) if scales else 1.0
-        if not 1 / _SCALE_ODD < middle < _SCALE_ODD:
-            text = f"the objects are {middle:.2g} times as large in the photographs as distance and fov_deg say"
-            yield Problem(str(table), f"{text}; is fov_deg the full angle across the longer side?", "warning")
+        if not 1 / _SCALE_ODD < _middle(scales) < _SCALE_ODD:
+            text = f"{_said_of(scales)}; is fov_deg the full angle across the longer side?"
+            yield Problem(str(table), text, "warning")
     images, listed = table.parent / "images", {photo.file for photo in photos}
     for path in sorted(images.iterdir()) if split == "train" and images.is_dir() and not faults else []:
         if path.suffix.lower() in _SUFFIXES and path not in listed:
@@ -207,11 +206,18 @@ def _scale(photo: Photo, framed: Framed) -> float:
     return share * 2 * photo.distance * math.tan(math.radians(photo.fov_deg) / 2)
 
 
+def _middle(scales: list[float]) -> float:
+    return float(np.median(scales)) if scales else 1.0
+
+
+def _said_of(scales: list[float]) -> str:
+    return f"the objects are {_middle(scales):.2g} times as large in the photographs as distance and fov_deg say"
+
+
 def _check_scale(table: Path, scales: list[float]) -> None:
-    middle = float(np.median(scales)) if scales else 1.0
-    if not 1 / _SCALE_OFF < middle < _SCALE_OFF:
+    if not 1 / _SCALE_OFF < _middle(scales) < _SCALE_OFF:
         raise ValueError(
-            f"{table}: the objects are {middle:.2g} times as large in the photographs as distance and fov_deg say; "
+            f"{table}: {_said_of(scales)}; "
             "distance must be in lengths of the object's longest side (a mug of 12 cm from 60 cm: 5), and fov_deg the "
             "full field of view in degrees"
         )

@@ -330,6 +330,16 @@ def test_distances_in_another_unit_are_noticed(chairs: Path) -> None:
     assert [name for name, text in scan(chairs) if "times as large" in text] == ["poses.csv"] * 3
 
 
+def test_half_of_the_field_of_view_is_warned_of(chairs: Path) -> None:
+    assert not [text for _, text in scan(chairs) if "times as large" in text]
+    rows = read_rows(chairs)
+    for row in rows:
+        row["fov_deg"] = str(float(row["fov_deg"]) / 2)
+    write_rows(chairs, rows)
+    assert any("is fov_deg the full angle" in text for _, text in scan(chairs))
+    photos.load(chairs, "chair", "train")
+
+
 def test_the_scan_also_tells_of_cut_objects_and_forgotten_files(chairs: Path) -> None:
     path = chairs / "masks" / "chair002_0.png"
     mask = np.array(Image.open(path))
