@@ -37,6 +37,8 @@ class Evaluation:
     object_ids: Tensor  # int64 [M]
     view_ids: Tensor  # int64 [M]
     ious: dict[Definition, Tensor]  # [M] per voxeliser; NaN where prediction and truth are empty; {} without truth
+    precision: Tensor | None  # float64 [M]: part of the predicted voxels that is true, by the first voxeliser
+    recall: Tensor | None  # float64 [M]: part of the true voxels that is predicted; both NaN where there are none
     chamfer_l1: Tensor | None  # float [M], NaN where a surface is empty; None when not asked for or without truth
     f_score: Tensor | None  # float [M], 0 where the prediction alone is empty; likewise
     silhouette_iou: Tensor | None  # float [M], where there are no voxels and shapes are meshes
@@ -88,6 +90,8 @@ class Evaluation:
         return {
             "voxel_iou": self.voxel_iou,
             **{f"voxel_iou_{name}": _mean(values) for name, values in self.ious.items()},
+            "precision": _mean(self.precision),
+            "recall": _mean(self.recall),
             "chamfer_l1": _mean(self.chamfer_l1),
             "f_score": _mean(self.f_score),
             "silhouette_iou": _mean(self.silhouette_iou),
@@ -139,7 +143,7 @@ def evaluate(
     generator = torch.Generator().manual_seed(0)
     truth = _true_surfaces(dataset, generator) if surfaces else None
     ious: dict[Definition, list[Tensor]] = {name: [] for name in definitions if dataset.voxels is not None}
-    codes, distances, silhouettes = [], [], []
+    codes, distances, silhouettes, overlaps = [], [], [], []
     others = _other_images(dataset.object_ids) if dataset.voxels is None else None
     samples = spread_samples(dataset.object_ids, dataset.view_ids, count)
     view_ids = torch.from_numpy(dataset.view_ids[samples.numpy()]).to(torch.int64)
@@ -155,8 +159,12 @@ def evaluate(
             shapes = method.decode(code)
             if align is not None:
                 shapes = align(shapes, batch, dataset)
-            for name in ious:
-                ious[name].append(nmr.metrics.voxel_iou(occupancy(shapes, dataset, name), batch.voxels))
+            for number, name in enumerate(ious):
+                filled = occupancy(shapes, dataset, name)
+                ious[name].append(nmr.metrics.voxel_iou(filled, batch.voxels))
+                if number == 0:
+                    overlap = nmr.metrics.voxel_precision_recall(filled, batch.voxels)
+                    overlaps.append(torch.stack(overlap, dim=1))
             if truth is not None:
                 points = _surface_points(shapes, generator)
                 distances += [_compare(a, truth[b]) for a, b in zip(points, batch.object_ids.tolist(), strict=True)]
@@ -172,10 +180,13 @@ def evaluate(
     means = mean_mmd(all_codes, view_ids[compared], forms=forms, ranks=ranks)
     chamfer, f_score = torch.tensor(distances).T if distances else (None, None)
     seen = ranks.any(bool(silhouettes))
+    precision, recall = ranks.gather(overlaps, own, count).T if ious else (None, None)
     return Evaluation(
         object_ids=torch.from_numpy(dataset.object_ids[samples.numpy()]).to(torch.int64),
         view_ids=view_ids,
         ious={name: ranks.gather(values, own, count) for name, values in ious.items()},
+        precision=precision,
+        recall=recall,
         chamfer_l1=chamfer,
         f_score=f_score,
         silhouette_iou=ranks.gather(silhouettes, own, count) if seen else None,

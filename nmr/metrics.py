@@ -16,7 +16,7 @@ from torch import Tensor
 from ._validate import check_number, check_size, check_vertices, describe
 from .mesh import _face_cross, _gather, _unit, face_vertices
 
-__all__ = ["SurfacePoints", "chamfer_distance", "f_score", "sample_surface", "voxel_iou"]
+__all__ = ["SurfacePoints", "chamfer_distance", "f_score", "sample_surface", "voxel_iou", "voxel_precision_recall"]
 
 try:
     from scipy.spatial import cKDTree
@@ -193,6 +193,42 @@ def voxel_iou(prediction: Tensor, target: Tensor) -> Tensor:
     >>> a, b = (nmr.voxelize(r * vertices + 0.5, faces) for r in (0.3, 0.4))
     >>> nmr.metrics.voxel_iou(a, b)  # about (3 / 4)^3
     """
+    _check_grids(prediction, target)
+    both = _count(prediction & target)
+    return both / (_count(prediction) + _count(target) - both)
+
+
+def voxel_precision_recall(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """What part of a predicted grid is in the true one, and what part of the true one it covers.
+
+    Shapes that are too full have a low precision, those that lack parts a low recall.
+
+    Parameters
+    ----------
+    prediction, target : bool Tensor [B, ...], of one shape, as made by :func:`nmr.voxelize`
+
+    Returns
+    -------
+    precision, recall : float64 Tensor [B] each
+        ``|A & B| / |A|`` and ``|A & B| / |B|`` of prediction A and target B; NaN where A, or B, is empty.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If they are not bool tensors, or their shapes differ.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> a, b = (nmr.voxelize(r * vertices + 0.5, faces) for r in (0.4, 0.3))
+    >>> nmr.metrics.voxel_precision_recall(a, b)  # about (3 / 4)^3, and 1
+    """
+    _check_grids(prediction, target)
+    both = _count(prediction & target)
+    return both / _count(prediction), both / _count(target)
+
+
+def _check_grids(prediction: Tensor, target: Tensor) -> None:
     for grid in (prediction, target):
         if not isinstance(grid, Tensor) or grid.dtype != torch.bool:
             raise TypeError(
@@ -204,8 +240,6 @@ def voxel_iou(prediction: Tensor, target: Tensor) -> Tensor:
             "prediction and target must have the same shape [B, ...], "
             f"got {describe(prediction)} and {describe(target)}"
         )
-    both = _count(prediction & target)
-    return both / (_count(prediction) + _count(target) - both)
 
 
 def _count(grids: Tensor) -> Tensor:

@@ -16,6 +16,8 @@ from learn3d.terminal import align
 COLUMNS = {
     "voxel_iou_kato18": "voxel IoU",
     "voxel_iou_kato19": "IoU (kato19)",
+    "precision": "precision",
+    "recall": "recall",
     "chamfer_l1": "Chamfer-L1",
     "f_score": "F-score",
     "silhouette_iou": "silhouette IoU",
@@ -26,6 +28,8 @@ COLUMNS = {
 MEANINGS = {
     "voxel_iou_kato18": "of predicted and true 32^3 grids, by the voxeliser of Kato et al. 2018, as in the paper",
     "voxel_iou_kato19": "the same by that of Kato and Harada 2019: every cell that a face touches; not comparable",
+    "precision": "part of the predicted voxels (kato18) that is in the true shape: low where shapes are too full",
+    "recall": "part of the true shape's voxels that is predicted: low where parts are missing",
     "chamfer_l1": f"mean distance of {SURFACE_POINTS} points of either surface to the other, units of the object; "
     "none for an empty prediction, which is left out",
     "f_score": f"of the shares of these points within {F_SCORE_DISTANCE} of the other surface (harmonic mean), "

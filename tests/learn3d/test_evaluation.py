@@ -72,6 +72,8 @@ def test_perfect_prediction_has_iou_one(tiny_set) -> None:
     worse = evaluate(perfect, smaller, max_images=5, surfaces=True)
     assert 0.3 < worse.voxel_iou < 0.6  # near 0.75^3
     assert worse.images == 5
+    assert worse.recall.tolist() == [1] * 5, "all of the truth is in the larger prediction"
+    assert torch.equal(worse.precision, worse.ious["kato18"])
     assert worse.summary()["chamfer_l1"] > 0.04
 
 

@@ -7,7 +7,7 @@ import torch
 
 import nmr
 from nmr import metrics
-from nmr.metrics import chamfer_distance, f_score, sample_surface, voxel_iou
+from nmr.metrics import chamfer_distance, f_score, sample_surface, voxel_iou, voxel_precision_recall
 
 
 @pytest.fixture(params=["tree", "all pairs"])
@@ -160,7 +160,7 @@ def test_distance_errors():
             f_score(a, a, threshold)
 
 
-# --- voxel_iou
+# --- grids
 
 
 def test_voxel_iou_of_boxes():
@@ -169,6 +169,17 @@ def test_voxel_iou_of_boxes():
     a[1, :4] = b[1, :4] = True
     iou = voxel_iou(a, b)
     assert iou[:2].tolist() == [1 / 3, 1] and iou[2].isnan()
+
+
+def test_precision_and_recall_of_boxes():
+    a, b = torch.zeros(2, 3, 8, 8, 8, dtype=torch.bool)
+    a[0, :4] = b[0, 2:8] = True  # 2 of 4 predicted slices are right, which are 2 of 6
+    a[1, 1] = True
+    precision, recall = voxel_precision_recall(a, b)
+    assert precision[:2].tolist() == [1 / 2, 0] and precision[2].isnan()
+    assert recall[0] == 1 / 3 and recall[1:].isnan().all()
+    with pytest.raises(ValueError, match=r"same shape \[B, \.\.\.\]"):
+        voxel_precision_recall(a, b[:1])
 
 
 def test_voxel_iou_errors():
