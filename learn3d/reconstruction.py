@@ -26,6 +26,7 @@ from learn3d.figures import Surface
 from learn3d.files import limits, writing
 from learn3d.methods import MeshMethod, Method
 from learn3d.methods.refinement import refine
+from learn3d.networks.encoders import centre
 from learn3d.runs import checkpoint
 from learn3d.runs.export import small_model
 
@@ -140,21 +141,30 @@ def reconstruct(
 def input_azimuth_deg(surface: Surface, mask: np.ndarray) -> float:
     """From where the shape's silhouette agrees best with the mask uint8 [S,S] of its image; a multiple of 15 degrees.
 
-    The camera of an image is not known: this is a guess for pictures. Azimuths are compared at three elevations.
+    The camera of an image is not known: this is a guess for pictures. Azimuths are compared at four elevations, and
+    outlines at one size, as the distance is not known either.
     """
-    target = nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, (64, 64), mode="area")[0]
+    small = nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, (64, 64), mode="area")
+    target = _centred(small[:, 0])
     azimuths = [15.0 * k for k in range(24)]
     loss = [
-        nmr.losses.soft_iou_loss(image[None], target)
-        for elevation in (0.0, 15.0, 30.0)
-        for image in nmr.render_silhouette(
-            surface.vertices,
-            surface.faces,
-            nmr.LookAt.from_angles(DISTANCE, elevation, azimuths, half_fov_deg=HALF_FOV_DEG),
-            image_size=64,
+        nmr.losses.soft_iou_loss(silhouette[None], target)
+        for elevation in (0.0, 10.0, 20.0, 30.0)
+        for silhouette in _centred(
+            nmr.render_silhouette(
+                surface.vertices,
+                surface.faces,
+                nmr.LookAt.from_angles(DISTANCE, elevation, azimuths, half_fov_deg=HALF_FOV_DEG),
+                image_size=64,
+            )
         )
     ]
     return azimuths[int(torch.stack(loss).argmin()) % len(azimuths)]
+
+
+def _centred(masks: torch.Tensor) -> torch.Tensor:
+    """Masks float [B,64,64], moved and scaled so that their boxes lie in the middle and have one size."""
+    return centre(masks[:, None].expand(-1, 4, -1, -1))[:, 3]
 
 
 def export_mesh(path: Path, surface: Surface) -> None:

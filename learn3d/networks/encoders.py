@@ -6,6 +6,7 @@ import itertools
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.device import upload
@@ -13,6 +14,7 @@ from learn3d.networks.layers import initialize_he, linear_layers
 from learn3d.networks.resnet import ResNet18Encoder
 
 CODE_SIZE = 512
+CENTRED_SHARE = 0.8  # of the side of an image, that the object takes for the encoder conv-centred
 
 
 class ConvEncoder(nn.Module):
@@ -66,6 +68,46 @@ class SmallConvEncoder(ConvEncoder):
         self.layers = linear_layers(64 * (self.image_size // 8) ** 2, 256, CODE_SIZE)
 
 
+class CentredConvEncoder(ConvEncoder):
+    """Image [B,4,64,64] -> code [B,512] of images that are cut out so that the object takes the same part of each.
+
+    How far away a camera stood cannot be seen in a picture that somebody has cut out. This encoder does not see it in
+    training either: it learns from what an object looks like how large it is. 1.7 million weights; no paper's.
+    """
+
+    def __init__(self) -> None:
+        nn.Module.__init__(self)
+        channels = 32
+        self.convolutions = _convolutions(32, 64, 128).extend([nn.Conv2d(128, channels, 1), nn.ReLU()])
+        self.layers = linear_layers(channels * (self.image_size // 8) ** 2, 512, CODE_SIZE)
+        initialize_he(self.convolutions)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return super().forward(centre(images))
+
+
+def centre(images: Tensor, share: float = CENTRED_SHARE) -> Tensor:
+    """Scale and shift images float [B,4,S,S], the mask last, so that the box of the mask lies in the middle and its
+    longer side takes `share` of the image. Colours continue an image beyond its border, the mask does not. An image
+    with an empty mask stays as it is.
+    """
+    size = images.shape[-1]
+    inside = images[:, 3] > 0.5
+    extents, middles = [], []
+    for axis in (1, 2):  # over rows: columns that the mask touches; over columns: rows
+        touched = inside.any(axis)
+        first, last = touched.int().argmax(1), size - touched.flip(1).int().argmax(1)  # excluded
+        extents.append(last - first)
+        middles.append((first + last) / size - 1)
+    scale = torch.maximum(*extents) / (size * share)
+    steps = (torch.arange(size, device=images.device) + 0.5) * (2 / size) - 1
+    x, y = (scale[:, None] * steps + middle[:, None] for middle in middles)
+    grid = torch.stack(torch.broadcast_tensors(x[:, None, :], y[:, :, None]), dim=-1)
+    centred = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
+    centred[:, 3] *= grid.abs().amax(-1) < 1
+    return torch.where(inside.any((1, 2))[:, None, None, None], centred, images)
+
+
 def _convolutions(*channels: int) -> nn.Sequential:
     """5x5 convolutions of stride 2 with ReLU, from four channels to those given."""
     layers: list[nn.Module] = []
@@ -74,11 +116,12 @@ def _convolutions(*channels: int) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-EncoderName = Literal["conv", "conv-narrow", "conv-small", "conv-relu", "resnet18"]
+EncoderName = Literal["conv", "conv-narrow", "conv-small", "conv-centred", "conv-relu", "resnet18"]
 ENCODERS: dict[str, type[nn.Module]] = {
     "conv": ConvEncoder,
     "conv-narrow": NarrowConvEncoder,
     "conv-small": SmallConvEncoder,
+    "conv-centred": CentredConvEncoder,
     "conv-relu": ReluConvEncoder,
     "resnet18": ResNet18Encoder,
 }
