@@ -36,6 +36,7 @@ class Picture:
 _QUICKSTART = ("tools/quickstart.sh", "learn3d/figures/grids.py")
 _QUICKSTART += ("learn3d/methods/plus.py", "learn3d/networks/encoders.py")
 _RUNS = "$OUTPUT/runs/airplane/proposed-seed0 $OUTPUT/runs/airplane/plus-seed0"
+_THREE = " ".join(f"$OUTPUT/runs/airplane/{method}-seed0" for method in ("vanilla", "proposed", "plus"))
 _NOTEBOOKS = {"quick_tour": 5, "shape_from_silhouettes": 4, "texture_and_light": 4, "photographs_to_glb": 1}
 PICTURES = {
     "views.png": Picture(
@@ -55,6 +56,11 @@ PICTURES = {
         )
         for name, number in _NOTEBOOKS.items()
     },
+    "results-grid.png": Picture(
+        f"learn3d figures grid --truth --images 3 --runs {_THREE} --output {{folder}}/grid.png",
+        "{folder}/grid.png",
+        ("learn3d/figures/grids.py",),
+    ),
     **{
         f"results-{kind}.png": Picture(
             f"learn3d figures {kind} --runs {_RUNS} --output {{folder}}/{kind}.png",
