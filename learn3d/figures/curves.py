@@ -28,6 +28,8 @@ TITLES = {
     "total": "total loss (weighted)",
     "voxel_iou": "voxel IoU",
     "voxel_iou_kato19": "voxel IoU (kato19)",
+    "precision": "precision of voxels",
+    "recall": "recall of voxels",
     "chamfer_l1": "Chamfer-L1 distance",
     "f_score": "F-score",
     "silhouette_iou": "silhouette IoU",
