@@ -164,7 +164,7 @@ def input_azimuth_deg(surface: Surface, mask: np.ndarray) -> float:
 
 def _centred(masks: torch.Tensor) -> torch.Tensor:
     """Masks float [B,64,64], moved and scaled so that their boxes lie in the middle and have one size."""
-    return centre(masks[:, None].expand(-1, 4, -1, -1))[:, 3]
+    return centre(masks[:, None])[:, 0]
 
 
 def export_mesh(path: Path, surface: Surface) -> None:

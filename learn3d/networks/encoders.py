@@ -69,10 +69,10 @@ class SmallConvEncoder(ConvEncoder):
 
 
 class CentredConvEncoder(ConvEncoder):
-    """Image [B,4,64,64] -> code [B,512] of images that are cut out so that the object takes the same part of each.
+    """Image [B,4,64,64] -> code [B,512]. Each image is scaled first, so that every object has the same size in it.
 
-    How far away a camera stood cannot be seen in a picture that somebody has cut out. This encoder does not see it in
-    training either: it learns from what an object looks like how large it is. 1.7 million weights; no paper's.
+    A picture that somebody has cut out does not show how far away the camera stood. With this encoder, training images
+    do not show it either: the size of an object is learnt from what it looks like. 1.6 million weights; no paper's.
     """
 
     def __init__(self) -> None:
@@ -87,12 +87,12 @@ class CentredConvEncoder(ConvEncoder):
 
 
 def centre(images: Tensor, share: float = CENTRED_SHARE) -> Tensor:
-    """Scale and shift images float [B,4,S,S], the mask last, so that the box of the mask lies in the middle and its
+    """Scale and shift images float [B,C,S,S], the mask last, so that the box of the mask lies in the middle and its
     longer side takes `share` of the image. Colours continue an image beyond its border, the mask does not. An image
     with an empty mask stays as it is.
     """
     size = images.shape[-1]
-    inside = images[:, 3] > 0.5
+    inside = images[:, -1] > 0.5
     extents, middles = [], []
     for axis in (1, 2):  # over rows: columns that the mask touches; over columns: rows
         touched = inside.any(axis)
@@ -104,7 +104,7 @@ def centre(images: Tensor, share: float = CENTRED_SHARE) -> Tensor:
     x, y = (scale[:, None] * steps + middle[:, None] for middle in middles)
     grid = torch.stack(torch.broadcast_tensors(x[:, None, :], y[:, :, None]), dim=-1)
     centred = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
-    centred[:, 3] *= grid.abs().amax(-1) < 1
+    centred[:, -1] *= grid.abs().amax(-1) < 1
     return torch.where(inside.any((1, 2))[:, None, None, None], centred, images)
 
 

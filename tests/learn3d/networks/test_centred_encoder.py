@@ -1,4 +1,4 @@
-"""The encoder that does not see how large an object is in its image."""
+"""The encoder for which every object is scaled to one size (conv-centred)."""
 
 from __future__ import annotations
 
