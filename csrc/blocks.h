@@ -8,7 +8,6 @@
 #include <utility>
 #include <vector>
 
-#include "lanes.h"
 #include "parallel.h"
 #include "stages.h"
 
@@ -20,7 +19,7 @@ struct RowBlocks {
   int64_t rows;         // per block
   int64_t count;
 
-  // A block has at least 2^14 pixels, and at least a quarter as many pixels as there are faces, because it reads every
+  // A block has at least 2^14 pixels, and at least half as many pixels as there are faces, because it reads every
   // face's mark.
   RowBlocks(Size raster, int64_t num_faces) : raster(raster) {
     const int64_t pixels = std::max<int64_t>(int64_t(1) << 14, num_faces / 2);
@@ -49,12 +48,12 @@ struct VisibleFaces {
     int32_t *slot = slots.data(), *id = ids.data();
     std::fill_n(slot, 2 * num_faces + 1, 0);
     int64_t n = 0;
-    for (; n + kLanes <= pixels; n += kLanes) {
-      uint64_t pairs[kLanes / 2];
+    for (; n + 8 <= pixels; n += 8) {
+      uint64_t pairs[4];
       std::memcpy(pairs, owner + n, sizeof pairs);
       const uint64_t signs = pairs[0] & pairs[1] & pairs[2] & pairs[3];
       if ((~signs & UINT64_C(0x8000000080000000)) == 0) continue;  // background
-      for (int64_t k = 0; k < kLanes; ++k) slot[owner[n + k] + 1] = 1;
+      for (int64_t k = 0; k < 8; ++k) slot[owner[n + k] + 1] = 1;
     }
     for (; n < pixels; ++n) slot[owner[n] + 1] = 1;
     int32_t found = 1;
@@ -69,14 +68,6 @@ struct VisibleFaces {
     count = found;
   }
 };
-
-// First and one past the last covered pixel of a row; equal if there is none.
-NMR_INLINE void covered_range(const int32_t* owner, int64_t R, int64_t& first, int64_t& last) {
-  first = 0;
-  last = R;
-  while (first < R && owner[first] < 0) ++first;
-  while (last > first && owner[last - 1] < 0) --last;
-}
 
 // Calls produce(b, block, result) for every block of every image, on several threads, and then consume(b, result) for
 // each block. Blocks that add to the same output are consumed one after the other, in ascending order of (b, block).

@@ -21,15 +21,6 @@ NMR_INLINE void expand_color_row(const ColorImage<T>& image, int64_t j, T* row) 
   }
 }
 
-// Empties lines [first, last). Until they are finished, gain_start holds the first and the last listed pixel of a face.
-template <class T>
-NMR_INLINE void start_color_lines(ColorLines<T>& lines, int64_t first, int64_t last) {
-  const T infinity = std::numeric_limits<T>::infinity();
-  std::fill(lines.count.begin() + first, lines.count.begin() + last, 0);
-  std::fill(lines.gain_start[0].begin() + first, lines.gain_start[0].begin() + last, infinity);
-  std::fill(lines.gain_start[1].begin() + first, lines.gain_start[1].begin() + last, -infinity);
-}
-
 // Writes pixel m as number `at` of line n. grad: its gradients, `grad_stride` apart.
 template <int64_t kChannels, class T>
 NMR_INLINE void put_color(ColorLines<T>& lines, int64_t n, int64_t at, int64_t m, int32_t owner, const T* color,
@@ -78,8 +69,8 @@ NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& r
                 plane = W + kPad;
   const bool in_rows = range.row_first < range.row_last, in_columns = range.column_first < range.column_last;
   ColorLines<T>&columns = image.lines[0], &rows = image.lines[1];
-  start_color_lines(columns, range.column_first, range.column_last);
-  start_color_lines(rows, range.row_first, range.row_last);
+  start_lines(columns, range.column_first, range.column_last);
+  start_lines(rows, range.row_first, range.row_last);
   const Lanes<T> zero = splat(T(0));
   const int64_t j_first = in_columns ? 0 : range.row_first, j_last = in_columns ? H : range.row_last;
   for (int64_t j = j_first; j < j_last; ++j) {

@@ -14,6 +14,16 @@ bool all_finite(const T* values, int64_t count) {
   return zero == T(0) && lane_bits(zeros == splat(T(0))) == 0xff;
 }
 
+// Empties lines [first, last) (PullLines or ColorLines). Until they are finished, gain_start holds the first and the
+// last pixel that gains.
+template <template <class> class Lines, class T>
+NMR_INLINE void start_lines(Lines<T>& lines, int64_t first, int64_t last) {
+  const T infinity = std::numeric_limits<T>::infinity();
+  std::fill(lines.count.begin() + first, lines.count.begin() + last, 0);
+  std::fill(lines.gain_start[0].begin() + first, lines.gain_start[0].begin() + last, infinity);
+  std::fill(lines.gain_start[1].begin() + first, lines.gain_start[1].begin() + last, -infinity);
+}
+
 // --- how an edge follows a pull
 
 // How the crossing c of an edge P-Q and a line n of M pixels moves with each end of the edge.

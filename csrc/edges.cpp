@@ -19,6 +19,7 @@
 #include "parallel.h"
 #include "pull_lines.h"
 #include "stages.h"
+#include "swept_image.h"
 
 #define NMR_LEVEL_FILE "color_sweep.h"
 #include "levels.h"
@@ -121,27 +122,16 @@ void resolve_backward(const Resolve<T>& args) {
 
 namespace {
 
-// Memory for one image.
 template <class T>
-struct EdgeScratch {
-  ColorLines<T> lines[2];
-  std::vector<uint8_t> seen;  // [2 F + 1 + pad]
-  std::vector<int32_t> ids;   // [visible faces + pad] their owner entries
-  std::vector<T> grad;        // [visible faces, 3, 2] of x and y of their corners, in the order in which they are drawn
-};
-
-// Memory for one task.
-template <class T>
-struct EdgeTaskScratch {
-  std::vector<T> grad_row;              // [C, W + pad]
-  std::vector<SweepScratch<T>> blocks;  // [1]
+struct EdgeLines {
+  ColorLines<T> lines[2];  // [0] columns: lines of constant x, swept along y; [1] rows
 };
 
 template <class T>
 void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threads) {
   const Size raster = raster_of(args.image, args.anti_aliasing);
   const int64_t H = raster.height, W = raster.width, C = args.channels;
-  EdgeScratch<T>& scratch = thread_scratch<EdgeScratch<T>>();
+  ColorLines<T>* lines = thread_scratch<EdgeLines<T>>().lines;
   const ColorImage<T> image{args.mesh.image_vertices(b),
                             args.mesh.image_faces(b),
                             args.mesh.face_count(b),
@@ -154,43 +144,23 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
                             args.background ? args.background + (args.background_batch == 1 ? 0 : b * C) : nullptr,
                             args.grad_resolved + b * args.image.pixels() * C,
                             C,
-                            scratch.lines,
+                            lines,
                             args.eps > T(1e-15) ? T(1e15) : T(0)};
   T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
   std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));
-
-  uint8_t* seen = reserve(scratch.seen, 2 * image.num_faces + 1 + kPad);
-  int32_t* ids = reserve(scratch.ids, std::min(2 * image.num_faces, raster.pixels()) + kPad);
-  const int64_t count = NMR_AT_BEST_LEVEL(find_visible, image.owner, raster.pixels(), image.num_faces, seen, ids);
-  if (count == 0) return;
-  T* grad = reserve(scratch.grad, 6 * count);
-  if (!NMR_AT_BEST_LEVEL(all_finite, image.grad_resolved, args.image.pixels() * C)) {
-    std::fill_n(grad, 6 * count, std::numeric_limits<T>::quiet_NaN());
-    scatter_corners(image, ids, count, grad, grad_vertices);
-    return;
-  }
-
-  scratch.lines[0].reserve_lines(0, W, H, C);
-  scratch.lines[1].reserve_lines(1, H, W, C);
-  // Several threads: bands of columns, in whole lanes, then bands of rows.
-  const int64_t longer = std::max(H, W), share = (longer / std::max(num_threads, 1) + kPad - 1) / kPad * kPad;
-  const int64_t band = num_threads > 1 ? std::max<int64_t>(share, 64) : longer;
-  const int64_t column_bands = (W + band - 1) / band, row_bands = (H + band - 1) / band;
-  parallel_for(num_threads > 1 ? column_bands + row_bands : 1, num_threads, [&](int64_t n) {
-    T* grad_row = reserve(thread_scratch<EdgeTaskScratch<T>>().grad_row, C * (W + kPad));
-    const auto part = [band](int64_t k, int64_t lines) { return std::min(k * band, lines); };
-    const int64_t k = n - column_bands;  // number of a band of rows
-    const LineRange range = num_threads <= 1 ? LineRange{0, H, 0, W}
-                            : k < 0          ? LineRange{0, 0, part(n, W), part(n + 1, W)}
-                                             : LineRange{part(k, H), part(k + 1, H), 0, 0};
-    NMR_AT_BEST_LEVEL(collect_colors, image, range, grad_row);
-  });
-  const int64_t chunk = num_threads > 1 ? 2 * kSweptFaces : count;
-  parallel_for((count + chunk - 1) / chunk, num_threads, [&](int64_t n) {
-    SweepScratch<T>& block = *reserve(thread_scratch<EdgeTaskScratch<T>>().blocks, 1);
-    NMR_AT_BEST_LEVEL(sweep_color_faces, image, ids, n * chunk, std::min((n + 1) * chunk, count), block, grad);
-  });
-  scatter_corners(image, ids, count, grad, grad_vertices);
+  lines[0].reserve_lines(0, W, H, C);
+  lines[1].reserve_lines(1, H, W, C);
+  sweep_image(
+      image, C, num_threads,
+      [&](uint8_t* seen, int32_t* ids) {
+        return NMR_AT_BEST_LEVEL(find_visible, image.owner, raster.pixels(), image.num_faces, seen, ids);
+      },
+      [&] { return NMR_AT_BEST_LEVEL(all_finite, image.grad_resolved, args.image.pixels() * C); },
+      [&](const LineRange& range, T* grad_row) { NMR_AT_BEST_LEVEL(collect_colors, image, range, grad_row); },
+      [&](const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block, T* grad) {
+        NMR_AT_BEST_LEVEL(sweep_color_faces, image, ids, first, last, block, grad);
+      },
+      grad_vertices);
 }
 
 }  // namespace

@@ -20,18 +20,6 @@ NMR_INLINE M without(M a, M b) {
 #endif
 }
 
-// p[offset[0]], ..., p[offset[7]]
-template <class T>
-NMR_INLINE Lanes<T> gather_values(const T* p, const int32_t* offset) {
-#if defined(__AVX2__) || NMR_AVX2
-  if constexpr (std::is_same_v<T, float>)
-    return (Lanes<T>)_mm256_i32gather_ps(p, (__m256i)load_lanes<Lanes32>(offset), 4);
-#endif
-  T value[kLanes];
-  for (int64_t k = 0; k < kLanes; ++k) value[k] = p[offset[k]];
-  return load_lanes<Lanes<T>>(value);
-}
-
 NMR_INLINE int32_t least_lane(Lanes32 v) {
   const LaneArray<int32_t, Lanes32> each(v);
   return *std::min_element(each.lane, each.lane + kLanes);

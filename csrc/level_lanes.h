@@ -195,7 +195,7 @@ NMR_INLINE V max_of(V a, V b) {
   return select(a > b, a, b);
 }
 
-// select(), which the compiler precedes by a comparison of the mask with 0.
+// select() without the comparison of the mask with 0 that the compiler puts before it.
 template <class M, class V>
 NMR_INLINE V choose(M mask, V yes, V no) {
 #if defined(__AVX2__) || NMR_AVX2
@@ -319,15 +319,23 @@ NMR_INLINE Lanes32 byte_lanes(uint64_t bytes) {
 
 // p[offset[0]], ..., p[offset[7]] of values.
 template <class T>
+NMR_INLINE Lanes<T> gather_values(const T* p, const int32_t* offset) {
+#if defined(__AVX2__) || NMR_AVX2
+  if constexpr (std::is_same_v<T, float>)
+    return (Lanes<T>)_mm256_i32gather_ps(p, (__m256i)load_lanes<Lanes32>(offset), 4);
+#endif
+  T value[kLanes];
+  for (int64_t k = 0; k < kLanes; ++k) value[k] = p[offset[k]];
+  return load_lanes<Lanes<T>>(value);
+}
+template <class T>
 NMR_INLINE Lanes<T> gather_values(const T* p, Lanes32 offset) {
 #if defined(__AVX2__) || NMR_AVX2
   if constexpr (std::is_same_v<T, float>) return (Lanes<T>)_mm256_i32gather_ps(p, (__m256i)offset, 4);
 #endif
   int32_t at[kLanes];
-  T value[kLanes];
   store_lanes(at, offset);
-  for (int64_t k = 0; k < kLanes; ++k) value[k] = p[at[k]];
-  return load_lanes<Lanes<T>>(value);
+  return gather_values(p, at);
 }
 
 #if defined(__AVX2__) || NMR_AVX2

@@ -46,17 +46,6 @@ NMR_INLINE int64_t lowest_bit(uint32_t bits) {
 #endif
 }
 
-// Number of bits that are set.
-NMR_INLINE int32_t set_bits(uint64_t bits) {
-#if defined(__GNUC__)
-  return __builtin_popcountll(bits);
-#else
-  int32_t count = 0;
-  for (; bits; bits &= bits - 1) ++count;
-  return count;
-#endif
-}
-
 // The level of this processor that lane code is compiled for (levels.h): 3 for x86-64-v3, else 1.
 inline int cpu_level() {
 #if NMR_LEVELS

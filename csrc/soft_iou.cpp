@@ -1,54 +1,27 @@
 // Soft intersection over union of each pair of images: I / U with I = sum p t and U = sum (p + t - p t); 1 if U = 0.
-//
-// Two vectors of partial sums run side by side. After every kChunk values they are added, in order, to totals in
-// double precision. The order depends on the number of values alone.
 #include <algorithm>
 
-#include "lanes.h"
 #include "parallel.h"
 #include "stages.h"
 
 namespace nmr {
 namespace {
 
-constexpr int64_t kChunk = 4096;  // a multiple of 2 kLanes
+constexpr int64_t kChunk = 4096;  // a multiple of 16
 
 struct Totals {
   double product = 0;  // sum p t
   double sum = 0;      // sum (p + t)
 };
 
-// Adds p t and p + t of kLanes pairs to partial sums.
-template <class T>
-NMR_INLINE void add(const T* p, const T* t, Lanes<T>& product, Lanes<T>& sum) {
-  const Lanes<T> a = load_lanes<Lanes<T>>(p), b = load_lanes<Lanes<T>>(t);
-  product = product + a * b;
-  sum = sum + (a + b);
-}
+}  // namespace
+}  // namespace nmr
 
-template <class T>
-NMR_INLINE Totals totals_body(const T* p, const T* t, int64_t count) {
-  Totals totals;
-  for (int64_t begin = 0; begin < count; begin += kChunk) {
-    const int64_t end = std::min(begin + kChunk, count), whole = end - (end - begin) % (2 * kLanes);
-    Lanes<T> product[2] = {splat(T(0)), splat(T(0))}, sum[2] = {splat(T(0)), splat(T(0))};
-    for (int64_t n = begin; n < whole; n += 2 * kLanes) {
-      add(p + n, t + n, product[0], sum[0]);
-      add(p + n + kLanes, t + n + kLanes, product[1], sum[1]);
-    }
-    T rest_p[2 * kLanes] = {}, rest_t[2 * kLanes] = {};  // the last, incomplete vectors, filled up with zeros
-    std::copy(p + whole, p + end, rest_p);
-    std::copy(t + whole, t + end, rest_t);
-    for (int k = 0; k < 2; ++k) {
-      if (whole < end) add(rest_p + k * kLanes, rest_t + k * kLanes, product[k], sum[k]);
-      for (int64_t l = 0; l < kLanes; ++l) {
-        totals.product += static_cast<double>(product[k][l]);
-        totals.sum += static_cast<double>(sum[k][l]);
-      }
-    }
-  }
-  return totals;
-}
+#define NMR_LEVEL_FILE "soft_iou_sums.h"
+#include "levels.h"
+
+namespace nmr {
+namespace {
 
 // d (I / U) / dp = (t (U + I) - I) / U^2, and the same with p and t exchanged.
 template <class T>
@@ -56,8 +29,6 @@ NMR_INLINE void gradient_body(const T* __restrict other, T factor, T offset, T* 
   for (int64_t n = 0; n < count; ++n) grad[n] = factor * other[n] - offset;
 }
 
-NMR_CLONES Totals totals_of(const float* p, const float* t, int64_t count) { return totals_body(p, t, count); }
-NMR_CLONES Totals totals_of(const double* p, const double* t, int64_t count) { return totals_body(p, t, count); }
 NMR_CLONES void gradient_of(const float* other, float factor, float offset, float* grad, int64_t count) {
   gradient_body(other, factor, offset, grad, count);
 }
@@ -70,7 +41,8 @@ NMR_CLONES void gradient_of(const double* other, double factor, double offset, d
 template <class T>
 void soft_iou_forward(const SoftIou<T>& args) {
   parallel_for(args.batch, args.num_threads, [&](int64_t b) {
-    const Totals totals = totals_of(args.prediction + b * args.count, args.target + b * args.count, args.count);
+    const T *prediction = args.prediction + b * args.count, *target = args.target + b * args.count;
+    const Totals totals = NMR_AT_BEST_LEVEL(totals_of, prediction, target, args.count);
     const double both = totals.product, either = totals.sum - totals.product;
     args.areas[2 * b] = both;
     args.areas[2 * b + 1] = either;

@@ -343,7 +343,7 @@ struct Lit {
   int64_t normal_batch;      // 1 or B when not packed
   bool smooth;               // normals of vertices, interpolated: sum of b_k n_k, divided by its length or 1e-5
   const T* viewer;           // [B, 5]: place of the eye, 1; or direction towards the viewer, 0; then -1 if the camera
-                             // mirrors, else 1
+                             // sees a right-handed world (Pinhole), else 1
   const T* parameters;       // all lights, or nullptr: the result is the normal
   const int64_t* layout;     // [Light::count, 3]: first value, rows (1 or B), lights (0: there are none)
   int64_t num_parameters;
@@ -363,7 +363,7 @@ struct Resolve {
   Size image;               // h x w
   bool anti_aliasing;
   int64_t channels;         // C
-  const int32_t* owner;     // [B, H, W], or nullptr without a background
+  const int32_t* owner;     // [B, H, W]
   const T* pixels;          // [B, H, W, C] of the raster
   const T* background;      // [B or 1, C] colour of pixels without a face, or nullptr: that in `pixels`
   int64_t background_batch; // 1 or B

@@ -39,15 +39,6 @@ NMR_INLINE void expand_row(const SweepImage<T>& image, int64_t j, T* row) {
   std::fill_n(row + image.raster.width, kLanes, T(0));
 }
 
-// Empties lines [first, last). Until they are finished, gain_start holds the first and the last pixel that gains.
-template <class T>
-NMR_INLINE void start_lines(PullLines<T>& lines, int64_t first, int64_t last) {
-  const T infinity = std::numeric_limits<T>::infinity();
-  std::fill(lines.count.begin() + first, lines.count.begin() + last, 0);
-  std::fill(lines.gain_start[0].begin() + first, lines.gain_start[0].begin() + last, infinity);
-  std::fill(lines.gain_start[1].begin() + first, lines.gain_start[1].begin() + last, -infinity);
-}
-
 // Adds pixel m to the list of line n.
 template <class T>
 NMR_INLINE void append_pull(PullLines<T>& lines, int64_t n, int64_t m, T weight) {

@@ -17,8 +17,9 @@ from ._packing import MeshBatch, packed_starts
 from .cameras import Camera
 from .cameras.projection import ProjectingCamera
 
-# With near = 0, faces are cut at this part of far: the image of a point in the plane of the eye is infinitely large.
-_NEAREST = 1e-5
+# Parts of far at which faces are cut: with near = 0 (the image of a point in the plane of the eye is infinitely large),
+# and with a positive near that is smaller than the second part (nearer new vertices are too large for float32).
+_NEAREST, _SMALLEST = 1e-5, 1e-8
 # Beyond this a new vertex counts as not finite: products with gradients could overflow.
 _LARGEST = 1e12
 
@@ -58,7 +59,7 @@ def clip_near(world: Tensor, mesh: MeshBatch, camera: Camera | None, near: float
     ``world`` and ``mesh`` are the meshes before and after the camera. The new vertices are interpolated in the world
     and then go through the camera, so that gradients reach the corners of the cut edges.
     """
-    plane = float(near) or _NEAREST * float(far)
+    plane = max(float(near), (_SMALLEST if near else _NEAREST) * float(far))
     room = _room(mesh, plane)
     if room is None:
         return None

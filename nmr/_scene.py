@@ -179,7 +179,10 @@ def background_rows(background: object, channels: int, batch: int, like: Tensor)
     wanted = f"a number, [{channels}] or [{batch}, {channels}]"
     behind = as_floats(background, "background", wanted).to(like)
     if behind.ndim > 2 or any(n not in (1, m) for n, m in zip(behind.shape[::-1], (channels, batch), strict=False)):
-        raise ValueError(f"background must be {wanted}, got {describe(behind)}")
+        raise ValueError(
+            f"background must be {wanted}, got {describe(behind)}; for a picture behind the meshes render rgb and "
+            "alpha with background 0, and add (1 - alpha)[..., None] * picture"
+        )
     return behind.expand(channels).unsqueeze(0) if behind.ndim < 2 else behind.expand(-1, channels)
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import inspect
 import operator
+import sys
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-_INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+_INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32, torch.uint64)
 _FLOATS = (torch.float32, torch.float64)
 
 
@@ -19,6 +20,14 @@ def describe(value: object) -> str:
     if isinstance(value, Tensor):
         return f"{str(value.dtype).removeprefix('torch.')} {list(value.shape)}"
     return type(value).__name__
+
+
+def callers_level() -> int:
+    """``stacklevel`` for a warning that is to name the line outside of this package which called it."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == __package__:
+        level, frame = level + 1, frame.f_back
+    return level
 
 
 def cast_under_autocast(tensor: object) -> object:
@@ -32,9 +41,10 @@ def cast_under_autocast(tensor: object) -> object:
 def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
     """``vertices`` as ``[B, V, 3]`` float32 or float64; ``otherwise``: what else is accepted, for the error."""
     if not isinstance(vertices, Tensor):
+        remedy = ", or one call for each mesh where their sizes differ" if isinstance(vertices, (list, tuple)) else ""
         raise TypeError(
             f"vertices must be a float tensor [B, V, 3] or [V, 3]{otherwise}, got {describe(vertices)}; "
-            "use torch.as_tensor()"
+            f"use torch.as_tensor(){remedy}"
         )
     if vertices.ndim not in (2, 3) or vertices.shape[-1] != 3:
         raise ValueError(f"vertices must have shape [B, V, 3] or [V, 3], got {describe(vertices)}")
@@ -45,7 +55,10 @@ def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
 
 
 def check_faces(faces: object, batch: int, device: torch.device, name: str = "faces") -> Tensor:
-    """``faces`` as int64 ``[F, 3]`` or ``[B, F, 3]`` on ``device``; their indices are checked by the kernels."""
+    """``faces`` as int64 ``[F, 3]`` or ``[B, F, 3]`` on ``device``; their indices are checked by the kernels.
+
+    ``[1, F, 3]`` is shared by all meshes.
+    """
     if not isinstance(faces, Tensor):
         raise TypeError(
             f"{name} must be an integer tensor [F, 3] or [B, F, 3], got {describe(faces)}; use torch.as_tensor()"
@@ -56,6 +69,8 @@ def check_faces(faces: object, batch: int, device: torch.device, name: str = "fa
         )
     if faces.ndim not in (2, 3) or faces.shape[-1] != 3:
         raise ValueError(f"{name} must have shape [F, 3] or [B, F, 3], got {describe(faces)}")
+    if faces.ndim == 3 and faces.shape[0] == 1 and batch > 1:
+        faces = faces[0]
     if faces.ndim == 3 and faces.shape[0] != batch:
         raise ValueError(
             f"{name} [B, F, 3] must have the batch size of the vertices, {batch}, got {describe(faces)}; "

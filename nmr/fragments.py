@@ -168,8 +168,8 @@ class Fragments:
         """Unit normals in world space of the side that is seen, ``[B, H, W, 3]``, 0 on background.
 
         Flat: the normal of the face. Smooth: the normals of its vertices (means over the adjacent faces, weighted by
-        area), interpolated. If the camera does not mirror the world (LookAt does not), the front of face (v0, v1, v2)
-        has the normal ``(v0 - v1) x (v2 - v1)``, as in the published renderer; otherwise the opposite one.
+        area), interpolated. In a left-handed world (LookAt) the front of face (v0, v1, v2) has the normal
+        ``(v0 - v1) x (v2 - v1)``, as in the published renderer, in a right-handed one (Pinhole) the opposite one.
         Differentiable in the world-space vertices and, if smooth, in weights.
         """
         if self.layers:
@@ -205,7 +205,7 @@ class Fragments:
             matrix, intrinsics, _, origin, _ = (x if x is None else x.detach() for x in projection.parameters())
             viewer = ops.viewer_of(matrix, intrinsics, origin, projection.perspective)
             return viewer.to(self.weights).expand(batch, 5)
-        side = torch.where(self._probe_mirrored(), -1.0, 1.0).to(self.weights)
+        side = torch.where(self._probe_right_handed(), -1.0, 1.0).to(self.weights)
         eye = getattr(self.camera, "eye", None)
         if eye is None and needs_eye:
             raise ValueError(
@@ -216,8 +216,8 @@ class Fragments:
         eye = eye.reshape(-1, 3).expand(batch, 3)
         return torch.cat([eye, torch.ones_like(side), side], dim=1)
 
-    def _probe_mirrored(self) -> Tensor:
-        """Whether a camera that is not one of nmr's mirrors the world: bool ``[B, 1]``.
+    def _probe_right_handed(self) -> Tensor:
+        """Whether a camera that is not one of nmr's sees a right-handed world: bool ``[B, 1]``.
 
         Tested by transforming three short perpendicular edges at the farthest point that is seen. They are tried in
         several lengths; the longest counts that lies in front of the eye as a whole.
@@ -226,8 +226,9 @@ class Fragments:
             batch, pixels = self.owner.shape[0], self.owner[0].numel()
             depth = torch.where(self.covered, self.depth, -1.0).reshape(batch, pixels)
             farthest = depth.argmax(1)
-            weights = self.weights.reshape(batch, pixels, 3)[torch.arange(batch), farthest]
-            owner = self.owner.reshape(batch, pixels)[torch.arange(batch), farthest]
+            images = torch.arange(batch, device=self.owner.device)
+            weights = self.weights.reshape(batch, pixels, 3)[images, farthest]
+            owner = self.owner.reshape(batch, pixels)[images, farthest]
             world = usable(self.world)
             at = weights.view(batch, 1, 1, 3), self.mesh.starts
             point = ops.interpolate(world, self.faces, owner.view(batch, 1, 1).contiguous(), *at).view(batch, 1, 3)

@@ -39,5 +39,11 @@ class Images:
     def __iter__(self) -> Iterator[Tensor | Fragments]:
         return iter(self.__dict__.values())
 
+    def __len__(self) -> int:
+        return len(self.__dict__)
+
+    def __getitem__(self, index: int) -> Tensor | Fragments:
+        return tuple(self)[index]
+
     def __repr__(self) -> str:
         return f"Images({', '.join(f'{name}: {describe(value)}' for name, value in self.__dict__.items())})"

@@ -140,7 +140,7 @@ class Lights:
             value = _rows(getattr(self, name), name)
             if value.shape[0] not in (1, batch):
                 raise ValueError(
-                    f"{name} is given for {value.shape[0]} images, but {batch} are drawn; give one or {batch}"
+                    f"{name} is given for {value.shape[0]} images, but {batch} are drawn; give it once or for each"
                 )
             values.append(value.reshape(-1).to(fragments.weights))
             layout.append((first, *value.shape[:2]))

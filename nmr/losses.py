@@ -33,6 +33,7 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     Parameters
     ----------
     prediction : float Tensor [B, ...], in [0, 1]
+        One image needs its batch axis, ``image[None]``: the rows of ``[H, W]`` would count as H images.
     target : Tensor of the same shape, in [0, 1] (not 0..255), of any type
 
     Returns

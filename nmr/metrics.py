@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ._validate import check_number, check_size, check_vertices, describe
+from ._validate import cast_under_autocast, check_number, check_size, check_vertices, describe
 from .mesh import _face_cross, _gather, _unit, face_vertices
 
 __all__ = ["SurfacePoints", "chamfer_distance", "f_score", "sample_surface", "voxel_iou", "voxel_precision_recall"]
@@ -250,6 +250,7 @@ def _count(grids: Tensor) -> Tensor:
 
 def _check_points(a: object, b: object) -> tuple[Tensor, Tensor]:
     """Both sets as [B, N, 3]."""
+    a, b = cast_under_autocast(a), cast_under_autocast(b)
     for points in (a, b):
         if not isinstance(points, Tensor) or points.dtype not in (torch.float32, torch.float64):
             raise TypeError(

@@ -33,6 +33,7 @@ def render(
     far: float = 100.0,
     clip: bool = True,
     eps: float = 1e-4,
+    gradient: str = "nmr",
     smooth_normals: bool = False,
     interpolation_gradient: bool = False,
 ) -> Images:
@@ -40,8 +41,8 @@ def render(
 
     Parameters
     ----------
-    vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps
-        As :func:`render_silhouette`.
+    vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps, gradient
+        As :func:`render_silhouette`. The gradient "local" is that of alpha and of white meshes; colours have none.
     outputs : sequence of "rgb", "alpha", "depth", "normals", "fragments"
         What to draw. These are also the names of the attributes of the result.
     colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
@@ -73,7 +74,8 @@ def render(
     Raises
     ------
     TypeError, ValueError
-        As :func:`render_silhouette`; for unknown outputs; for colours, lights and backgrounds that do not fit.
+        As :func:`render_silhouette`; for unknown outputs; for colours, lights and backgrounds that do not fit; for the
+        gradient "local" of colours.
 
     Examples
     --------
@@ -84,14 +86,17 @@ def render(
     listed = is_list(outputs) and all(name in OUTPUTS for name in outputs)
     if not listed or not outputs or len(set(outputs)) != len(outputs):
         raise ValueError(f"outputs must be a tuple of one or more different names out of {OUTPUTS}, got {outputs!r}")
+    check_choice(gradient, "gradient", ("nmr", "local"))
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
     images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the requested order
     white = "rgb" in images and colors is None and lights is None
     if white:
         behind = background_rows(background, 3, scene.mesh.batch, scene.mesh.vertices)
-        white = not behind.requires_grad  # rgb then follows from alpha
+        white = not behind.requires_grad and _finite(behind)  # rgb then follows from alpha
+    if gradient == "local" and "rgb" in images and not white:
+        raise ValueError("gradient 'local' is that of silhouettes: render rgb by itself, or with gradient 'nmr'")
     if white or ("alpha" in images and "rgb" not in images):
-        alpha, owner = scene.silhouette(anti_aliasing, fill_back, near, far, eps)
+        alpha, owner = scene.silhouette(anti_aliasing, fill_back, near, far, eps, gradient == "local")
         if "alpha" in images:
             images["alpha"] = alpha
         if white:
@@ -118,6 +123,16 @@ def render(
         if "fragments" in images:
             images["fragments"] = fragments
     return Images(images)
+
+
+def _finite(values: Tensor) -> bool:
+    """True also where values cannot be read yet, in torch.compile and torch.func.vmap."""
+    if torch.compiler.is_compiling():
+        return True
+    try:
+        return bool(values.isfinite().all())
+    except RuntimeError:
+        return True
 
 
 def render_rgb(
@@ -202,17 +217,19 @@ def render_silhouette(
         Render 2h x 2w pixels and average 2x2 of them.
     fill_back : bool
         Also draw faces that are seen from behind (clockwise on the screen). LookAt, Look and Orthographic show mesh
-        files mirrored, so that their outsides are clockwise.
+        files mirrored, so that their outsides are clockwise, unless they are ``right_handed``.
     near, far : float
         A pixel is covered only where near < depth < far.
     clip : bool
         Cut the faces that reach behind the plane at depth ``near``, so that their part in front is drawn where it is
         seen, with gradients to their corners. Without this, as in the published renderer, corners behind the eye land
         mirrored on the image, and the whole face is drawn wrongly. Scenes in front of the plane are the same. With near
-        = 0 the cut is at far / 100000. Without a camera, x and y are taken as divided by z (perspective).
+        = 0 the cut is at far / 1e5, with a smaller near than far / 1e8 there. Without a camera, x and y are taken as
+        divided by z (perspective).
     eps : float
         In NMR's gradient, added to the distance between an edge and a pixel (in units of [-1, 1]). In the local one,
         the gradient is 0 if the two directions lower the loss at rates that differ by less than eps. Both as published.
+        (It also ends the lookup in :class:`nmr.TextureCubes`.)
     gradient : "nmr" or "local"
         The definition of the gradient. The images are the same.
 
@@ -450,7 +467,7 @@ def render_fragments(
     >>> fragments = nmr.render_fragments(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), anti_aliasing=True)
     >>> image = fragments.resolve(fragments.interpolate(vertices).sin())
 
-    The thickness of a body, from its two surfaces:
+    The thickness of a body, from its two surfaces (a pixel whose centre lies on an edge may see one of them twice):
 
     >>> layers = nmr.render_fragments(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), faces_per_pixel=2)
     >>> thickness = layers.depth[..., 1] - layers.depth[..., 0]

@@ -56,11 +56,17 @@ void require_like(const Array<T>& array, const char* name, const Array<U>& other
   require_shape(array, name, std::vector<int64_t>(other.shape(), other.shape() + other.ndim()));
 }
 
-// The storage of a gradient of this shape, or nullptr if the gradient is not wanted.
+// The storage of a gradient of this shape, or of that of another array; nullptr if the gradient is not wanted.
 template <class T>
 T* optional_out(std::optional<Array<T>>& grad, const char* name, const std::vector<int64_t>& shape) {
   if (!grad) return nullptr;
   require_shape(*grad, name, shape);
+  return grad->mutable_data();
+}
+template <class T>
+T* optional_like(std::optional<Array<T>>& grad, const char* name, const Array<T>& other) {
+  if (!grad) return nullptr;
+  require_like(*grad, name, other);
   return grad->mutable_data();
 }
 

@@ -108,8 +108,7 @@ void project_backward_py(const Array<T>& vertices, const Array<T>& matrix, const
       project_args(vertices, matrix, intrinsics, distortion, origin, extent, starts, perspective, num_threads);
   require_points(grad_points, "grad_points", args);
   args.grad_points = grad_points.data();
-  args.grad_vertices =
-      optional_out(grad_vertices, "grad_vertices", {vertices.shape(), vertices.shape() + vertices.ndim()});
+  args.grad_vertices = optional_like(grad_vertices, "grad_vertices", vertices);
   args.grad_matrix = optional_out(grad_matrix, "grad_matrix", {args.batch, 3, 4});
   args.grad_intrinsics = optional_out(grad_intrinsics, "grad_intrinsics", {args.batch, 2, 3});
   args.grad_distortion = optional_out(grad_distortion, "grad_distortion", {args.batch, 5});
@@ -121,17 +120,16 @@ void project_backward_py(const Array<T>& vertices, const Array<T>& matrix, const
 
 template <class T>
 void define_camera(py::module_& m) {
-  const auto optional = [](const char* name) { return py::arg(name).noconvert().none(true); };
   m.def("pose_forward", &pose_forward_py<T>, array("forward"), array("up"), array("matrix"));
   m.def("pose_backward", &pose_backward_py<T>, array("forward"), array("up"), array("grad_matrix"),
         array("grad_forward"), array("grad_up"));
   m.def("project_forward", &project_forward_py<T>, array("vertices"), array("matrix"), array("intrinsics"),
-        optional("distortion"), optional("origin"), optional("extent"), optional("starts"), array("points"),
-        py::arg("perspective"), py::arg("num_threads"));
+        array("distortion"), array("origin"), array("extent"), array("starts"), array("points"), py::arg("perspective"),
+        py::arg("num_threads"));
   m.def("project_backward", &project_backward_py<T>, array("vertices"), array("matrix"), array("intrinsics"),
-        optional("distortion"), optional("origin"), optional("extent"), optional("starts"), array("grad_points"),
-        optional("grad_vertices"), optional("grad_matrix"), optional("grad_intrinsics"), optional("grad_distortion"),
-        optional("grad_origin"), optional("grad_extent"), py::arg("perspective"), py::arg("num_threads"));
+        array("distortion"), array("origin"), array("extent"), array("starts"), array("grad_points"),
+        array("grad_vertices"), array("grad_matrix"), array("grad_intrinsics"), array("grad_distortion"),
+        array("grad_origin"), array("grad_extent"), py::arg("perspective"), py::arg("num_threads"));
 }
 
 }  // namespace

@@ -53,12 +53,11 @@ void clip_faces_py(const Array<T>& vertices, const Indices& faces, const std::op
 
 template <class T>
 void define_clip(py::module_& m) {
-  m.def("clip_count", &clip_count_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("near"), py::arg("counts").noconvert(), py::arg("num_threads"));
-  m.def("clip_faces", &clip_faces_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("near"), py::arg("new_starts").noconvert(),
-        py::arg("new_faces").noconvert(), py::arg("source").noconvert(), py::arg("corners").noconvert(),
-        py::arg("ends").noconvert(), py::arg("num_threads"));
+  m.def("clip_count", &clip_count_py<T>, array("vertices"), array("faces"), array("starts"), py::arg("near"),
+        array("counts"), py::arg("num_threads"));
+  m.def("clip_faces", &clip_faces_py<T>, array("vertices"), array("faces"), array("starts"), py::arg("near"),
+        array("new_starts"), array("new_faces"), array("source"), array("corners"), array("ends"),
+        py::arg("num_threads"));
 }
 
 }  // namespace

@@ -71,10 +71,7 @@ void resolve_backward_py(const Array<T>& grad_resolved, const std::optional<Arra
     require_pixels(*grad_image, "grad_image", args);
     args.grad_pixels = grad_image->mutable_data();
   }
-  if (grad_background) {
-    require_shape(*grad_background, "grad_background", {args.batch, args.channels});
-    args.grad_background = grad_background->mutable_data();
-  }
+  args.grad_background = optional_out(grad_background, "grad_background", {args.batch, args.channels});
   py::gil_scoped_release release;
   resolve_backward(args);
 }
@@ -100,16 +97,13 @@ void edges_backward_py(const Array<T>& vertices, const Indices& faces, const std
 
 template <class T>
 void define_edges(py::module_& m) {
-  m.def("resolve_forward", &resolve_forward_py<T>, py::arg("image").noconvert(), py::arg("background").noconvert(),
-        py::arg("owner").noconvert(), py::arg("resolved").noconvert(), py::arg("anti_aliasing"),
-        py::arg("num_threads"));
-  m.def("resolve_backward", &resolve_backward_py<T>, py::arg("grad_resolved").noconvert(),
-        py::arg("background").noconvert(), py::arg("owner").noconvert(), py::arg("grad_image").noconvert(),
-        py::arg("grad_background").noconvert(), py::arg("anti_aliasing"), py::arg("num_threads"));
-  m.def("edges_backward", &edges_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("image").noconvert(),
-        py::arg("background").noconvert(), py::arg("grad_resolved").noconvert(), py::arg("grad_vertices").noconvert(),
-        py::arg("anti_aliasing"), py::arg("eps"), py::arg("num_threads"));
+  m.def("resolve_forward", &resolve_forward_py<T>, array("image"), array("background"), array("owner"),
+        array("resolved"), py::arg("anti_aliasing"), py::arg("num_threads"));
+  m.def("resolve_backward", &resolve_backward_py<T>, array("grad_resolved"), array("background"), array("owner"),
+        array("grad_image"), array("grad_background"), py::arg("anti_aliasing"), py::arg("num_threads"));
+  m.def("edges_backward", &edges_backward_py<T>, array("vertices"), array("faces"), array("starts"), array("owner"),
+        array("image"), array("background"), array("grad_resolved"), array("grad_vertices"), py::arg("anti_aliasing"),
+        py::arg("eps"), py::arg("num_threads"));
 }
 
 }  // namespace

@@ -77,18 +77,14 @@ void depth_backward_py(const Array<T>& vertices, const Indices& faces, const std
 
 template <class T>
 void define_fragments(py::module_& m) {
-  m.def("fragments_forward", &fragments_forward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("weights").noconvert(),
-        py::arg("depth").noconvert(), py::arg("far"), py::arg("num_threads"));
-  m.def("fragments_backward", &fragments_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("grad_weights").noconvert(),
-        py::arg("grad_depth").noconvert(), py::arg("grad_vertices").noconvert(), py::arg("num_threads"));
-  m.def("depth_forward", &depth_forward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("depth").noconvert(),
-        py::arg("anti_aliasing"), py::arg("far"), py::arg("num_threads"));
-  m.def("depth_backward", &depth_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("grad_depth").noconvert(),
-        py::arg("grad_vertices").noconvert(), py::arg("anti_aliasing"), py::arg("num_threads"));
+  m.def("fragments_forward", &fragments_forward_py<T>, array("vertices"), array("faces"), array("starts"),
+        array("owner"), array("weights"), array("depth"), py::arg("far"), py::arg("num_threads"));
+  m.def("fragments_backward", &fragments_backward_py<T>, array("vertices"), array("faces"), array("starts"),
+        array("owner"), array("grad_weights"), array("grad_depth"), array("grad_vertices"), py::arg("num_threads"));
+  m.def("depth_forward", &depth_forward_py<T>, array("vertices"), array("faces"), array("starts"), array("owner"),
+        array("depth"), py::arg("anti_aliasing"), py::arg("far"), py::arg("num_threads"));
+  m.def("depth_backward", &depth_backward_py<T>, array("vertices"), array("faces"), array("starts"), array("owner"),
+        array("grad_depth"), array("grad_vertices"), py::arg("anti_aliasing"), py::arg("num_threads"));
 }
 
 }  // namespace

@@ -138,16 +138,11 @@ void lit_backward_py(const std::optional<Array<T>>& colors, const Array<T>& norm
                          num_threads);
   require_shape(grad_lit, "grad_lit", {args.at.batch, args.at.raster.height, args.at.raster.width, 3});
   args.grad_lit = grad_lit.data();
-  const auto output = [](std::optional<Array<T>>& grad, const char* name, const Array<T>& like) -> T* {
-    if (!grad) return nullptr;
-    require_like(*grad, name, like);
-    return grad->mutable_data();
-  };
-  if (colors) args.grad_colors = output(grad_colors, "grad_colors", *colors);
-  if (parameters) args.grad_parameters = output(grad_parameters, "grad_parameters", *parameters);
-  args.grad_normals = output(grad_normals, "grad_normals", normals);
-  args.at.grad_attributes = output(grad_vertices, "grad_vertices", vertices);
-  args.at.grad_weights = output(grad_weights, "grad_weights", weights);
+  if (colors) args.grad_colors = optional_like(grad_colors, "grad_colors", *colors);
+  if (parameters) args.grad_parameters = optional_like(grad_parameters, "grad_parameters", *parameters);
+  args.grad_normals = optional_like(grad_normals, "grad_normals", normals);
+  args.at.grad_attributes = optional_like(grad_vertices, "grad_vertices", vertices);
+  args.at.grad_weights = optional_like(grad_weights, "grad_weights", weights);
   py::gil_scoped_release release;
   lit_backward(args);
 }

@@ -89,17 +89,14 @@ void voxelize_py(const Array<float>& vertices, const Indices& faces, Array<bool>
 
 template <class T>
 void define_losses(py::module_& m) {
-  m.def("smoothness_forward", &smoothness_forward_py<T>, py::arg("vertices").noconvert(), py::arg("edges").noconvert(),
-        py::arg("loss").noconvert(), py::arg("num_threads"));
-  m.def("smoothness_backward", &smoothness_backward_py<T>, py::arg("vertices").noconvert(),
-        py::arg("edges").noconvert(), py::arg("grad_loss").noconvert(), py::arg("grad_vertices").noconvert(),
+  m.def("smoothness_forward", &smoothness_forward_py<T>, array("vertices"), array("edges"), array("loss"),
         py::arg("num_threads"));
-  m.def("soft_iou_forward", &soft_iou_forward_py<T>, py::arg("prediction").noconvert(), py::arg("target").noconvert(),
-        py::arg("areas").noconvert(), py::arg("iou").noconvert(), py::arg("num_threads"));
-  m.def("soft_iou_backward", &soft_iou_backward_py<T>, py::arg("prediction").noconvert(), py::arg("target").noconvert(),
-        py::arg("areas").noconvert(), py::arg("grad_iou").noconvert(),
-        py::arg("grad_prediction").noconvert().none(true), py::arg("grad_target").noconvert().none(true),
+  m.def("smoothness_backward", &smoothness_backward_py<T>, array("vertices"), array("edges"), array("grad_loss"),
+        array("grad_vertices"), py::arg("num_threads"));
+  m.def("soft_iou_forward", &soft_iou_forward_py<T>, array("prediction"), array("target"), array("areas"), array("iou"),
         py::arg("num_threads"));
+  m.def("soft_iou_backward", &soft_iou_backward_py<T>, array("prediction"), array("target"), array("areas"),
+        array("grad_iou"), array("grad_prediction"), array("grad_target"), py::arg("num_threads"));
 }
 
 }  // namespace
@@ -107,8 +104,8 @@ void define_losses(py::module_& m) {
 void bind_mesh(py::module_& m) {
   define_losses<float>(m);
   define_losses<double>(m);
-  m.def("voxelize", &voxelize_py, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("voxels").noconvert(), py::arg("size"), py::arg("touched"), py::arg("num_threads"));
+  m.def("voxelize", &voxelize_py, array("vertices"), array("faces"), array("voxels"), py::arg("size"),
+        py::arg("touched"), py::arg("num_threads"));
 }
 
 }  // namespace nmr

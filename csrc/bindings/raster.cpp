@@ -61,18 +61,15 @@ void silhouette_backward_py(const Array<T>& vertices, const Indices& faces, cons
 
 template <class T>
 void define_raster(py::module_& m) {
-  m.def("rasterize", &rasterize_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("fill_back"), py::arg("near"),
-        py::arg("far"), py::arg("num_threads"));
-  m.def("rasterize_layers", &rasterize_layers_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("owner").noconvert(), py::arg("fill_back"), py::arg("near"),
-        py::arg("far"), py::arg("num_threads"));
-  m.def("silhouette_forward", &silhouette_forward_py<T>, py::arg("owner").noconvert(), py::arg("alpha").noconvert(),
-        py::arg("anti_aliasing"), py::arg("num_threads"));
+  m.def("rasterize", &rasterize_py<T>, array("vertices"), array("faces"), array("starts"), array("owner"),
+        py::arg("fill_back"), py::arg("near"), py::arg("far"), py::arg("num_threads"));
+  m.def("rasterize_layers", &rasterize_layers_py<T>, array("vertices"), array("faces"), array("starts"), array("owner"),
+        py::arg("fill_back"), py::arg("near"), py::arg("far"), py::arg("num_threads"));
+  m.def("silhouette_forward", &silhouette_forward_py<T>, array("owner"), array("alpha"), py::arg("anti_aliasing"),
+        py::arg("num_threads"));
   const auto define_backward = [&m](const char* name, auto* function) {
-    m.def(name, function, py::arg("vertices").noconvert(), py::arg("faces").noconvert(), py::arg("starts").noconvert(),
-          py::arg("owner").noconvert(), py::arg("grad_alpha").noconvert(), py::arg("grad_vertices").noconvert(),
-          py::arg("anti_aliasing"), py::arg("eps"), py::arg("num_threads"));
+    m.def(name, function, array("vertices"), array("faces"), array("starts"), array("owner"), array("grad_alpha"),
+          array("grad_vertices"), py::arg("anti_aliasing"), py::arg("eps"), py::arg("num_threads"));
   };
   define_backward("silhouette_backward", &silhouette_backward_py<T, silhouette_backward<T>>);
   define_backward("local_gradient", &silhouette_backward_py<T, local_gradient<T>>);

@@ -84,33 +84,23 @@ void interpolate_backward_py(const Array<T>& attributes, const Indices& corners,
   Interpolate<T> args = interpolate_args(attributes, corners, owner, weights, starts, num_threads);
   require_shape(grad_values, "grad_values", {args.batch, args.raster.height, args.raster.width, args.channels});
   args.grad_values = grad_values.data();
-  if (grad_attributes) {
-    require_like(*grad_attributes, "grad_attributes", attributes);
-    args.grad_attributes = grad_attributes->mutable_data();
-  }
-  if (grad_weights) {
-    require_like(*grad_weights, "grad_weights", weights);
-    args.grad_weights = grad_weights->mutable_data();
-  }
+  args.grad_attributes = optional_like(grad_attributes, "grad_attributes", attributes);
+  args.grad_weights = optional_like(grad_weights, "grad_weights", weights);
   py::gil_scoped_release release;
   interpolate_backward(args);
 }
 
 template <class T>
 void define_shade(py::module_& m) {
-  m.def("texture_cubes_forward", &texture_cubes_forward_py<T>, py::arg("textures").noconvert(),
-        py::arg("owner").noconvert(), py::arg("weights").noconvert(), py::arg("starts").noconvert(),
-        py::arg("colors").noconvert(), py::arg("eps"), py::arg("num_threads"));
-  m.def("texture_cubes_backward", &texture_cubes_backward_py<T>, py::arg("owner").noconvert(),
-        py::arg("weights").noconvert(), py::arg("starts").noconvert(), py::arg("grad_colors").noconvert(),
-        py::arg("grad_textures").noconvert(), py::arg("eps"), py::arg("num_threads"));
-  m.def("interpolate_forward", &interpolate_forward_py<T>, py::arg("attributes").noconvert(),
-        py::arg("corners").noconvert(), py::arg("owner").noconvert(), py::arg("weights").noconvert(),
-        py::arg("starts").noconvert(), py::arg("values").noconvert(), py::arg("num_threads"));
-  m.def("interpolate_backward", &interpolate_backward_py<T>, py::arg("attributes").noconvert(),
-        py::arg("corners").noconvert(), py::arg("owner").noconvert(), py::arg("weights").noconvert(),
-        py::arg("starts").noconvert(), py::arg("grad_values").noconvert(), py::arg("grad_attributes").noconvert(),
-        py::arg("grad_weights").noconvert(), py::arg("num_threads"));
+  m.def("texture_cubes_forward", &texture_cubes_forward_py<T>, array("textures"), array("owner"), array("weights"),
+        array("starts"), array("colors"), py::arg("eps"), py::arg("num_threads"));
+  m.def("texture_cubes_backward", &texture_cubes_backward_py<T>, array("owner"), array("weights"), array("starts"),
+        array("grad_colors"), array("grad_textures"), py::arg("eps"), py::arg("num_threads"));
+  m.def("interpolate_forward", &interpolate_forward_py<T>, array("attributes"), array("corners"), array("owner"),
+        array("weights"), array("starts"), array("values"), py::arg("num_threads"));
+  m.def("interpolate_backward", &interpolate_backward_py<T>, array("attributes"), array("corners"), array("owner"),
+        array("weights"), array("starts"), array("grad_values"), array("grad_attributes"), array("grad_weights"),
+        py::arg("num_threads"));
 }
 
 }  // namespace

@@ -44,13 +44,12 @@ void soft_backward_py(const Array<T>& vertices, const Indices& faces, const std:
 
 template <class T>
 void define_soft(py::module_& m) {
-  m.def("soft_forward", &soft_forward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("clear").noconvert(), py::arg("fill_back"), py::arg("near"),
-        py::arg("far"), py::arg("sigma"), py::arg("reach"), py::arg("num_threads"));
-  m.def("soft_backward", &soft_backward_py<T>, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        py::arg("starts").noconvert(), py::arg("clear").noconvert(), py::arg("grad_clear").noconvert(),
-        py::arg("grad_vertices").noconvert(), py::arg("fill_back"), py::arg("near"), py::arg("far"), py::arg("sigma"),
-        py::arg("reach"), py::arg("num_threads"));
+  m.def("soft_forward", &soft_forward_py<T>, array("vertices"), array("faces"), array("starts"), array("clear"),
+        py::arg("fill_back"), py::arg("near"), py::arg("far"), py::arg("sigma"), py::arg("reach"),
+        py::arg("num_threads"));
+  m.def("soft_backward", &soft_backward_py<T>, array("vertices"), array("faces"), array("starts"), array("clear"),
+        array("grad_clear"), array("grad_vertices"), py::arg("fill_back"), py::arg("near"), py::arg("far"),
+        py::arg("sigma"), py::arg("reach"), py::arg("num_threads"));
 }
 
 }  // namespace

@@ -152,18 +152,9 @@ void sample_uv_backward_py(const Array<T>& texels, const Indices& grids, const s
   require_shape(grad_colors, "grad_colors",
                 {args.uv.batch, args.uv.raster.height, args.uv.raster.width, args.channels});
   args.grad_colors = grad_colors.data();
-  if (grad_texels) {
-    require_like(*grad_texels, "grad_texels", texels);
-    args.grad_texels = grad_texels->mutable_data();
-  }
-  if (grad_uv) {
-    require_like(*grad_uv, "grad_uv", uv);
-    args.uv.grad_attributes = grad_uv->mutable_data();
-  }
-  if (grad_weights) {
-    require_like(*grad_weights, "grad_weights", weights);
-    args.uv.grad_weights = grad_weights->mutable_data();
-  }
+  args.grad_texels = optional_like(grad_texels, "grad_texels", texels);
+  args.uv.grad_attributes = optional_like(grad_uv, "grad_uv", uv);
+  args.uv.grad_weights = optional_like(grad_weights, "grad_weights", weights);
   py::gil_scoped_release release;
   sample_uv_backward(args);
 }

@@ -2,9 +2,10 @@
 
 The worlds of these libraries are right-handed. Their cameras, converted to nmr, show the same picture.
 :class:`nmr.LookAt`, :class:`nmr.Look` and :class:`nmr.Orthographic` treat the world as left-handed, as the published
-renderer does: they show the mirror image of what a right-handed look-at camera shows. Converted to another library,
-they put every vertex on the same pixel, so that their rotation has determinant -1. If you need a proper rotation, give
-the other renderer mirrored vertices ``v * (1, 1, -1)`` and ``R @ diag(1, 1, -1)`` (PyTorch3D: ``diag(1, 1, -1) @ R``).
+renderer does: they show the mirror image of what a right-handed look-at camera shows, which they are with
+``right_handed=True``. Converted to another library, they put every vertex on the same pixel, so that the rotation of a
+left-handed one has determinant -1. If you need a proper rotation for it, give the other renderer mirrored vertices
+``v * (1, 1, -1)`` and ``R @ diag(1, 1, -1)`` (PyTorch3D: ``diag(1, 1, -1) @ R``).
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._validate import as_numbers
+from .._validate import as_numbers, callers_level
 from .projection import (
     Numbers,
     ProjectingCamera,
@@ -26,6 +26,7 @@ Scalars = float | Sequence[float] | Tensor
 
 # Camera axes have y down, renderer space has y up.
 _Y_UP = torch.tensor([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]], device="cpu")
+_OTHER_RIGHT = torch.tensor([[-1.0], [1.0], [1.0]], device="cpu")
 _SHORTEST = 1e-5  # a shorter up x forward is not stretched to a unit vector (pose.cpp)
 _NARROWEST_DEG = 1e-9  # float32 can still represent 1 / tan of this angle
 
@@ -100,7 +101,7 @@ def _warn_if_up_is_ahead(forward: Tensor, up: Tensor) -> None:
             f"camera {which[0]} of {len(ahead)} looks along its up vector, or at its own place ({len(which)} in all): "
             "it has no left and right, and its image is empty. Give it another up, for example up=(0, 0, 1) to look "
             "straight down, or another place.",
-            stacklevel=4,
+            stacklevel=callers_level(),
         )
 
 
@@ -108,11 +109,16 @@ def _between(eye: Tensor, at: Tensor) -> Tensor:
     return batched(at, torch.float64, 3) - batched(eye, torch.float64, 3)
 
 
-def _posed(eye: Tensor, forward: Tensor, up: Tensor, dtype: torch.dtype, **rest: Tensor | bool | None) -> Projection:
+def _posed(
+    eye: Tensor, forward: Tensor, up: Tensor, right_handed: bool, dtype: torch.dtype, **rest: Tensor | bool | None
+) -> Projection:
     """The projection of a camera at ``eye`` with the axes of :class:`LookAt`; NaN where they are not finite."""
     eye, forward, up = (batched(x, dtype, 3) for x in (eye, forward, up))
     batch = common_batch(forward=forward, up=up)
-    return Projection(ops.pose(forward.expand(batch, 3), up.expand(batch, 3)), origin=eye, **rest)
+    matrix = ops.pose(forward.expand(batch, 3), up.expand(batch, 3))
+    if right_handed:
+        matrix = matrix * _OTHER_RIGHT.to(matrix)
+    return Projection(matrix, origin=eye, **rest)
 
 
 def _perspective(half_fov_deg: float | Tensor, dtype: torch.dtype) -> dict[str, Tensor]:
@@ -131,7 +137,7 @@ class LookAt(SquarePixels):
     A vertex v maps to ``u = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at - eye)``, then to
     ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``; n(v) = v / max(abs(v), 1e-5). An eye straight above or below ``at``
     gives x = y = 0, as published: an empty image, and a UserWarning that asks for another ``up``. The world
-    is left-handed (x right, y up, z away), as in the published renderer.
+    is left-handed (x right, y up, z away), as in the published renderer, and mesh files appear mirrored.
 
     Parameters
     ----------
@@ -139,6 +145,9 @@ class LookAt(SquarePixels):
         A camera whose pose is not finite, or farther away than 1e15, sees nothing.
     half_fov_deg : float, or Tensor [] or [B]
         a: half of the field of view across the shorter side of the image, in degrees (the published ``viewing_angle``).
+    right_handed : bool
+        The world is right-handed, as that of mesh files: ``x = n(z x up)``. Nothing is mirrored then, and the outside
+        of counter-clockwise faces is their front.
 
     Differentiable in every parameter that is given as a tensor.
 
@@ -158,6 +167,7 @@ class LookAt(SquarePixels):
     at: Numbers = (0.0, 0.0, 0.0)
     up: Numbers = (0.0, 1.0, 0.0)
     half_fov_deg: Scalars = 30.0
+    right_handed: bool = False
 
     def __post_init__(self) -> None:
         _check_pose(self, "eye", "at", "up", half_fov_deg=_fov(self.half_fov_deg))
@@ -172,12 +182,15 @@ class LookAt(SquarePixels):
         *,
         up: Numbers = (0.0, 1.0, 0.0),
         half_fov_deg: Scalars = 30.0,
+        right_handed: bool = False,
     ) -> LookAt:
         """The camera that looks at the origin from :func:`points_from_angles`; straight down needs another ``up``."""
-        return cls(eye=points_from_angles(distance, elevation_deg, azimuth_deg), up=up, half_fov_deg=half_fov_deg)
+        eye = points_from_angles(distance, elevation_deg, azimuth_deg)
+        return cls(eye=eye, up=up, half_fov_deg=half_fov_deg, right_handed=right_handed)
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        return _posed(self.eye, _between(self.eye, self.at), self.up, dtype, **_perspective(self.half_fov_deg, dtype))
+        forward = _between(self.eye, self.at)
+        return _posed(self.eye, forward, self.up, self.right_handed, dtype, **_perspective(self.half_fov_deg, dtype))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,13 +215,15 @@ class Look(SquarePixels):
     direction: Numbers = (0.0, 0.0, 1.0)
     up: Numbers = (0.0, 1.0, 0.0)
     half_fov_deg: Scalars = 30.0
+    right_handed: bool = False
 
     def __post_init__(self) -> None:
         _check_pose(self, "eye", "direction", "up", half_fov_deg=_fov(self.half_fov_deg))
         _warn_if_up_is_ahead(self.direction, self.up)
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        return _posed(self.eye, self.direction, self.up, dtype, **_perspective(self.half_fov_deg, dtype))
+        rest = _perspective(self.half_fov_deg, dtype)
+        return _posed(self.eye, self.direction, self.up, self.right_handed, dtype, **rest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +232,7 @@ class Orthographic(SquarePixels):
 
     ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half of what is seen across the shorter side of
     the image, in world units. The published renderer's ``perspective=False`` has scale 1. Differentiable in every
-    parameter given as a tensor.
+    parameter given as a tensor. ``right_handed`` as in :class:`LookAt`.
 
     Raises
     ------
@@ -235,6 +250,7 @@ class Orthographic(SquarePixels):
     at: Numbers = (0.0, 0.0, 0.0)
     up: Numbers = (0.0, 1.0, 0.0)
     scale: Scalars = 1.0
+    right_handed: bool = False
 
     def __post_init__(self) -> None:
         scale = _scalar(self.scale, "scale", 0, math.inf, "between 0 and infinity")
@@ -244,4 +260,5 @@ class Orthographic(SquarePixels):
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         scale = batched(self.scale, dtype, 1, 1) if isinstance(self.scale, Tensor) else self.scale
         intrinsics = scale * _Y_UP.to(dtype)
-        return _posed(self.eye, _between(self.eye, self.at), self.up, dtype, intrinsics=intrinsics, perspective=False)
+        forward, rest = _between(self.eye, self.at), {"intrinsics": intrinsics, "perspective": False}
+        return _posed(self.eye, forward, self.up, self.right_handed, dtype, **rest)

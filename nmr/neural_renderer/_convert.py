@@ -23,7 +23,7 @@ def like(value: object, name: str, reference: Tensor) -> Tensor:
 def check_batch(vertices: object) -> Tensor:
     """``vertices`` as ``[B, V, 3]``."""
     checked = check_vertices(vertices)
-    if checked is not vertices:
+    if vertices.ndim != 3:
         raise ValueError(f"vertices must have shape [B, V, 3], got {describe(vertices)}; use vertices[None]")
     return checked
 

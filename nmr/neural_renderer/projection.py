@@ -33,8 +33,8 @@ def projection(
     t : [3], [B, 3] or [B, 1, 3]
     dist_coeffs : [5] or [B, 5], or None
         k1, k2, p1, p2, k3.
-    orig_size : number, (height, width), or Tensor [B] or [B, 1]
-        Pixels of the image that K describes.
+    orig_size : number, (height, width), or Tensor or array [B] or [B, 1]
+        Pixels of the image that K describes. An array of two numbers is a pair where K has one matrix.
     eps : float
         Not used; the published one was added to the depth. A vertex in the plane of the eye gets x = y = inf here, so
         that its faces are not drawn.
@@ -46,8 +46,11 @@ def projection(
 
     >>> nr.projection(vertices, K, R, t, None, 256)
     """
+    K = torch.as_tensor(K)
+    if isinstance(orig_size, np.ndarray) and orig_size.shape == (2,) and (K.ndim == 2 or len(K) == 1):
+        orig_size = orig_size.tolist()  # a pair
     if isinstance(orig_size, (Tensor, np.ndarray)):
         # One size per image goes into K, which then describes images of size 1.
-        K = torch.as_tensor(K) / torch.as_tensor(orig_size).reshape(-1, 1, 1)
+        K = K / torch.as_tensor(orig_size).reshape(-1, 1, 1)
         orig_size = 1
     return Pinhole(K, R, t, dist_coeffs, orig_size=orig_size).transform(check_batch(vertices))

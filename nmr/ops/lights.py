@@ -157,8 +157,8 @@ def viewer_of(matrix: Tensor, intrinsics: Tensor, origin: Tensor | None, perspec
     """From where cameras look, ``[B, 5]``; the arguments are those of a :class:`nmr.cameras.Projection`.
 
     Three numbers and 1: the place of the eye; or three numbers and 0: the direction towards the viewer. Then -1 if the
-    camera mirrors the world, else 1. 0 instead of what is not finite. Computed in float64, in single operations, which
-    round alike on every processor. No gradient.
+    camera sees a right-handed world, else 1. 0 instead of what is not finite. Computed in float64, in single
+    operations, which round alike on every processor. No gradient.
     """
     A = host_array(matrix).astype(np.float64)
     x, y, z = A[:, 0, :3], A[:, 1, :3], A[:, 2, :3]

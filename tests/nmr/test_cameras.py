@@ -1,5 +1,6 @@
 """Cameras: geometry, published values and gradients, batches, packed meshes, vertices without an image, errors."""
 
+import functools
 import math
 import warnings
 from dataclasses import replace
@@ -170,6 +171,7 @@ GRADCHECKS = {
     "LookAt, a fov each": (nmr.LookAt, EYES, ATS, UPS, [25.0, 30.0]),
     "Look": (nmr.Look, EYES, [[-0.1, -0.3, 1.0], [-1.0, -0.2, -0.4]], UPS, [25.0]),
     "Orthographic": (nmr.Orthographic, EYES, ATS, UPS, [0.7, 0.8]),
+    "right-handed": (functools.partial(nmr.LookAt, right_handed=True), EYES, ATS, UPS, 25.0),
     "Pinhole": (
         lambda *a: nmr.Pinhole(*a, orig_size=(240, 256)),
         CALIBRATION,
@@ -292,6 +294,45 @@ def test_eye_on_the_up_axis_is_degenerate_but_finite():
 def test_an_eye_at_the_place_that_it_looks_at_warns():
     with pytest.warns(UserWarning, match="or at its own place"):
         nmr.LookAt([[0.0, 1.0, 2.0], [0.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **how: nmr.LookAt.from_angles(3.0, 30.0, [20.0, 90.0], **how),
+        lambda **how: nmr.Look([1.0, 1.0, -3.0], [-0.3, -0.3, 1.0], **how),
+        lambda **how: nmr.Orthographic([1.0, 1.0, -3.0], scale=0.7, **how),
+    ],
+)
+def test_a_right_handed_camera_shows_the_picture_flipped(make):
+    """It sees mesh files as they are: the outside of their faces is the front, and rotations are proper."""
+    vertices, faces = nmr.icosphere(2)
+    vertices = vertices * (1 + 0.5 * torch.tensor([1.0, 0.3, 0.1]) * (vertices[:, :1] > 0))
+    left, right = make(), make(right_handed=True)
+    size = dict(image_size=32)
+    assert torch.equal(right.transform(vertices), left.transform(vertices) * torch.tensor([-1.0, 1.0, 1.0]))
+    depth = nmr.render_depth(vertices, faces, left, **size)
+    assert depth.min() < 90
+    torch.testing.assert_close(nmr.render_depth(vertices, faces, right, **size), depth.flip(2))
+    assert nmr.render_silhouette(vertices, faces, right, fill_back=False, **size).any()
+    front = nmr.render_depth(vertices, faces, right, fill_back=False, **size)
+    torch.testing.assert_close(front, depth.flip(2))
+    normals = nmr.render_normals(vertices, faces, right, **size)
+    torch.testing.assert_close(normals, nmr.render_normals(vertices, faces, left, **size).flip(2))
+    if not isinstance(right, nmr.Orthographic):
+        rotation = nmr.cameras.to_opencv(right, height=32, width=32)[1]
+        torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(len(rotation), dtype=rotation.dtype))
+
+
+def test_warnings_name_the_line_that_made_the_camera():
+    for make in (
+        lambda: nmr.LookAt([0.0, 3.0, 0.0]),
+        lambda: nmr.LookAt.from_angles(3.0, 90.0, 0.0),
+        lambda: nmr.neural_renderer.look_at(torch.rand(1, 4, 3), [0.0, 3.0, 0.0]),
+    ):
+        with pytest.warns(UserWarning, match="up vector") as warned:
+            make()
+        assert warned[0].filename == __file__
 
 
 def test_looking_straight_down_warns_and_another_up_shows_the_object():

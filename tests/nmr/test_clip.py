@@ -247,6 +247,14 @@ def test_near_zero():
     vertices, faces = floor(1)
     alpha = nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=0.0)
     assert torch.equal(alpha, nmr.render_silhouette(*floor(150), CAMERA, image_size=SIZE, near=0.0))
+    tiny = [nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=near) for near in (1e-6, 1e-7, 1e-12)]
+    assert torch.equal(tiny[0], tiny[1]) and torch.equal(tiny[0], tiny[2]) and (tiny[0] >= alpha).all()
+
+
+def test_a_far_plane_at_any_distance_leaves_near_alone():
+    vertices, faces = floor(1)
+    drawn = [nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=0.1, far=far) for far in (1e2, 1e6)]
+    assert drawn[0].any() and torch.equal(*drawn)
 
 
 def test_compile_and_vmap_leave_room_for_every_cut():

@@ -278,6 +278,23 @@ def test_a_gradient_that_is_not_a_number_is_passed_on():
     assert gradient_of(vertices, faces, one_pixel({(2, 5): float("nan")}), anti_aliasing=False)[..., 0].isnan().any()
 
 
+def test_together_with_other_images():
+    vertices, faces = nmr.icosphere(1)
+    vertices = (0.5 * vertices + torch.tensor([0.0, 0.0, 2.0])).requires_grad_()
+    ramp = torch.linspace(-1, 1, 16)
+    alone = nmr.render_silhouette(vertices, faces, image_size=16, gradient="local")
+    (wanted,) = torch.autograd.grad((alone * ramp).sum(), vertices)
+    for name in ("alpha", "rgb"):
+        outputs = nmr.render(vertices, faces, outputs=(name, "depth"), image_size=16, gradient="local")
+        image = outputs.alpha if name == "alpha" else outputs.rgb.mean(-1)
+        (got,) = torch.autograd.grad((image * ramp).sum(), vertices)
+        torch.testing.assert_close(got, wanted)
+    assert wanted.any()
+    with pytest.raises(ValueError, match="gradient 'local' is that of silhouettes"):
+        colors = nmr.VertexColors(torch.rand(len(vertices), 3))
+        nmr.render(vertices, faces, colors=colors, image_size=16, gradient="local")
+
+
 @pytest.mark.parametrize("gradient", ["soft", None, torch.zeros(2)])
 def test_an_unknown_gradient(gradient):
     with pytest.raises(ValueError, match="gradient must be 'nmr' or 'local', got "):

@@ -215,6 +215,7 @@ def test_images_say_what_was_not_asked_for():
     depth, alpha = images
     assert depth is images.depth and alpha is images.alpha and not hasattr(images, "rgb")
     assert repr(images) == "Images(depth: float64 [1, 4, 4], alpha: float64 [1, 4, 4])"
+    assert len(images) == 2 and images[0] is images.depth and images[-1] is images.alpha
     with pytest.raises(AttributeError, match=r"normals was not rendered.*outputs=\('depth', 'alpha', 'normals'\)"):
         images.normals  # noqa: B018
     with pytest.raises(AttributeError, match="cannot be changed, so depth"):
@@ -362,6 +363,19 @@ def test_colours_move_through_weights_only_on_request():
     assert leaf.grad is None or not leaf.grad.any()
     rgb(leaf, colors, True).square().sum().backward()
     assert leaf.grad.any()
+
+
+def test_a_background_that_is_not_finite_stays_behind():
+    vertices, faces = nmr.icosphere(1)
+    white = nmr.render_rgb(vertices, faces, CAMERA, background=float("nan"), image_size=16)
+    alpha = nmr.render_silhouette(vertices, faces, CAMERA, image_size=16)
+    assert torch.equal(white[..., 0].isnan(), alpha < 1) and (white[alpha == 1] == 1).all()
+
+
+def test_a_picture_as_background_is_told_how():
+    vertices, faces = nmr.icosphere(1)
+    with pytest.raises(ValueError, match=r"add \(1 - alpha\)\[..., None\] \* picture"):
+        nmr.render_rgb(vertices, faces, CAMERA, background=torch.rand(1, 16, 16, 3), image_size=16)
 
 
 def test_background_gradient_is_the_uncovered_share():

@@ -56,6 +56,39 @@ def test_half_precision_is_an_error_otherwise(dtype):
         rgb(SPHERE, COLORS.to(dtype))
 
 
+def test_points_and_the_drop_in_under_autocast():
+    half = SPHERE.half()
+    with torch.autocast("cpu", torch.bfloat16):
+        assert nmr.metrics.chamfer_distance(half, half) == 0
+        drawn = nmr.neural_renderer.Renderer(16, camera_mode="look_at").render_silhouettes(half[None], FACES[None])
+    assert drawn.any()
+
+
+# --- faces
+
+
+@pytest.mark.parametrize("dtype", [torch.uint16, torch.uint32, torch.uint64])
+def test_faces_may_be_unsigned(dtype):
+    faces = torch.from_numpy(FACES.numpy().astype(str(dtype).removeprefix("torch.")))
+    wanted = nmr.render_silhouette(SPHERE, FACES, CAMERA, **SIZE)
+    assert torch.equal(nmr.render_silhouette(SPHERE, faces, CAMERA, **SIZE), wanted)
+
+
+def test_one_set_of_faces_may_have_a_batch_axis():
+    two = torch.stack([SPHERE, 0.5 * SPHERE])
+    wanted = nmr.render_silhouette(two, FACES, CAMERA, **SIZE)
+    assert torch.equal(nmr.render_silhouette(two, FACES[None], CAMERA, **SIZE), wanted)
+    image, uv = torch.rand(4, 4, 3), torch.rand(12, 2)
+    colors = [nmr.UVTexture(image, uv, uv_faces=faces % 12) for faces in (FACES, FACES[None])]
+    drawn = [nmr.render_rgb(two, FACES, CAMERA, colors=color, **SIZE) for color in colors]
+    assert torch.equal(*drawn)
+
+
+def test_lists_where_there_is_no_list_are_one_call_for_each():
+    with pytest.raises(TypeError, match=r"got list; .* one call for each mesh where their sizes differ"):
+        nmr.voxelize([SPHERE, SPHERE[:12]], FACES)
+
+
 # --- near and far
 
 
@@ -83,6 +116,14 @@ def test_parameters_of_cameras_are_copies_of_arrays(dtype):
 
 # --- default device
 
+
+class Own:
+    """A camera that is not one of nmr's."""
+
+    def transform(self, vertices):
+        return vertices + torch.tensor([0.0, 0.0, 3.0], device="cpu")
+
+
 DRAWN = {
     "silhouette": lambda: nmr.render_silhouette(SPHERE, FACES, CAMERA, **SIZE),
     "list": lambda: nmr.render_silhouette([SPHERE, SPHERE[:12]], [FACES, FACES[:0]], CAMERA, **SIZE),
@@ -93,6 +134,7 @@ DRAWN = {
     "normals of a list": lambda: nmr.render_normals([SPHERE, SPHERE], [FACES, FACES[1:]], CAMERA, **SIZE),
     "face index": lambda: nmr.render_face_index(SPHERE, FACES, CAMERA, **SIZE),
     "rgb": lambda: rgb(SPHERE),
+    "normals by a camera of one's own": lambda: nmr.render_normals(SPHERE, FACES, Own(), **SIZE),
     "lit": lambda: rgb(SPHERE, lights=nmr.Lights(direction=[0.0, 1.0, -1.0])),
     "background": lambda: nmr.render_rgb(SPHERE, FACES, CAMERA, background=[0.1, 0.2, 0.3], **SIZE),
     "voxels": lambda: nmr.voxelize(0.3 * SPHERE + 0.5, FACES, 8),

@@ -202,6 +202,8 @@ def test_cameras_of_a_call_win_over_those_of_the_renderer():
     renderer = nr.Renderer(16, K=torch.eye(3)[None], R=torch.eye(3)[None], t=torch.zeros(1, 1, 3))
     given = dict(K=torch.from_numpy(K)[None], R=torch.from_numpy(R)[None], t=torch.from_numpy(t), orig_size=64)
     assert torch.equal(renderer(vertices, faces, mode="silhouettes", **given), expected)
+    given["orig_size"] = np.array([64, 64])
+    assert torch.equal(renderer.render_silhouettes(vertices, faces, **given), expected), "a pair, not two images"
     given["dist_coeffs"] = torch.tensor([[0.5, 0, 0, 0, 0]])
     assert not torch.equal(renderer.render_silhouettes(vertices, faces, **given), expected)
 

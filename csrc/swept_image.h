@@ -1,0 +1,74 @@
+// NMR's gradient of one image (silhouette or colours): lists the pixels that can pull, sweeps the visible faces, and
+// adds up at the vertices.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+#include "parallel.h"
+#include "pull_lines.h"
+#include "stages.h"
+
+namespace nmr {
+
+// Memory for one image.
+template <class T>
+struct SweptFaces {
+  std::vector<uint8_t> seen;  // [2 F + 1 + pad]
+  std::vector<int32_t> ids;   // [visible faces + pad] their owner entries
+  std::vector<T> grad;        // [visible faces, 3, 2] of x and y of their corners, in the order in which they are drawn
+};
+
+// Memory for one task.
+template <class T>
+struct SweepTask {
+  std::vector<T> grad_row;              // [C, W + pad]
+  std::vector<SweepScratch<T>> blocks;  // [1]
+};
+
+// Adds the gradients of an image (SweepImage or ColorImage) of C channels to its vertices. If a gradient of the image
+// is not finite, x and y of every vertex of a visible face get NaN.
+//
+//   find(seen, ids)                   writes the owner entries of the visible faces, and returns their number
+//   finite()                          whether all gradients of the image are finite
+//   collect(range, grad_row)          lists the pixels of some lines that can pull
+//   sweep(ids, first, last, block, grad)   writes the gradients of some of these faces
+template <class T, class Image, class Find, class Finite, class Collect, class Sweep>
+void sweep_image(const Image& image, int64_t channels, int num_threads, const Find& find, const Finite& finite,
+                 const Collect& collect, const Sweep& sweep, T* grad_vertices) {
+  const int64_t H = image.raster.height, W = image.raster.width;
+  SweptFaces<T>& faces = thread_scratch<SweptFaces<T>>();
+  uint8_t* seen = reserve(faces.seen, 2 * image.num_faces + 1 + kPad);
+  int32_t* ids = reserve(faces.ids, std::min(2 * image.num_faces, H * W) + kPad);
+  const int64_t count = find(seen, ids);
+  if (count == 0) return;
+  T* grad = reserve(faces.grad, 6 * count);
+  if (!finite()) {
+    std::fill_n(grad, 6 * count, std::numeric_limits<T>::quiet_NaN());
+    scatter_corners(image, ids, count, grad, grad_vertices);
+    return;
+  }
+  // Several threads: bands of columns, then bands of rows, of whole vectors: no two threads write to one vector.
+  const int64_t longer = std::max(H, W), share = (longer / std::max(num_threads, 1) + kPad - 1) / kPad * kPad;
+  const int64_t band = num_threads > 1 ? std::max<int64_t>(share, 64) : longer;
+  const int64_t column_bands = (W + band - 1) / band, row_bands = (H + band - 1) / band;
+  parallel_for(num_threads > 1 ? column_bands + row_bands : 1, num_threads, [&](int64_t n) {
+    T* grad_row = reserve(thread_scratch<SweepTask<T>>().grad_row, channels * (W + kPad));
+    const auto part = [band](int64_t k, int64_t lines) { return std::min(k * band, lines); };
+    const int64_t k = n - column_bands;  // number of a band of rows
+    collect(num_threads <= 1 ? LineRange{0, H, 0, W}
+            : k < 0          ? LineRange{0, 0, part(n, W), part(n + 1, W)}
+                             : LineRange{part(k, H), part(k + 1, H), 0, 0},
+            grad_row);
+  });
+  const int64_t chunk = num_threads > 1 ? 2 * kSweptFaces : count;
+  parallel_for((count + chunk - 1) / chunk, num_threads, [&](int64_t n) {
+    SweepScratch<T>& block = *reserve(thread_scratch<SweepTask<T>>().blocks, 1);
+    sweep(ids, n * chunk, std::min((n + 1) * chunk, count), block, grad);
+  });
+  scatter_corners(image, ids, count, grad, grad_vertices);
+}
+
+}  // namespace nmr
