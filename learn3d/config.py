@@ -83,8 +83,7 @@ class TrainConfig:
     val_split: Literal["val", "test"] = "val"
     """Split used for validation during training (and for choosing the best checkpoint)."""
     validate_every: Step = 2000
-    """Steps between validations (voxel IoU and MMD); the last step is always validated. With 2000 and 16,800 images
-    they take under 3 % of a run of the default preset."""
+    """Steps between validations (voxel IoU and MMD); the last step is always validated."""
     max_val_images: Count | None = None
     """Validate on this many images, spread evenly over the objects and views of the split. None: all."""
     pictures_every: Step = 1000
@@ -94,7 +93,7 @@ class TrainConfig:
     keep_checkpoints: Step = 2
     """Number of checkpoints to keep: last.safetensors and the ones before it, in checkpoints/."""
     log_every: Step = 50
-    """Steps between logged losses, each time with those that only the step before computed: methods may alternate."""
+    """Steps between logged losses. A method that trains its networks in turns logs the losses of the last two steps."""
 
     def __post_init__(self) -> None:
         preset = PRESETS[self.preset]
@@ -119,6 +118,12 @@ class TrainConfig:
         if self.sampling == "pairs" and self.batch_size % 2:
             raise ValueError(
                 f"sampling 'pairs' takes two views of each object: batch_size must be even, got {self.batch_size}"
+            )
+        if getattr(self.settings, "lambda_unseen", 0) > 0 and not 2 <= self.batch_size <= self.settings.remembered:
+            raise ValueError(
+                f"the loss at unseen views compares a batch with the {self.settings.remembered} masks that are "
+                f"remembered (--remembered): batch_size must lie in 2 .. {self.settings.remembered}, got "
+                f"{self.batch_size}; --lambda-unseen 0 leaves it out"
             )
         self.plan  # noqa: B018 (it checks itself)
         if getattr(self.settings, "encoder_from_step", 0) > self.iterations:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -26,7 +26,6 @@ Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]
 
 CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
-YAW_STEPS = 24
 F_SCORE_DISTANCE = 0.05  # units of the object frame, where the longest side is 1 (Pascal3D+: up to 2)
 
 
@@ -39,6 +38,7 @@ class Evaluation:
     ious: dict[Definition, Tensor]  # [M] per voxeliser; NaN where prediction and truth are empty; {} without truth
     precision: Tensor | None  # float64 [M]: part of the predicted voxels that is true, by the first voxeliser
     recall: Tensor | None  # float64 [M]: part of the true voxels that is predicted; both NaN where there are none
+    hollow: int  # meshes that reach beyond the grid, where the first voxeliser finds no inside
     chamfer_l1: Tensor | None  # float [M], NaN where a surface is empty; None when not asked for or without truth
     f_score: Tensor | None  # float [M], 0 where the prediction alone is empty; likewise
     silhouette_iou: Tensor | None  # float [M], where there are no voxels and shapes are meshes
@@ -100,6 +100,7 @@ class Evaluation:
             "mmd_codes": self.mmd_codes,
             "images": self.images,
             "undefined": self.undefined,
+            "hollow": self.hollow,
             "without_distance": self.without_distance,
         }
 
@@ -113,7 +114,7 @@ def evaluate(
     max_images: int | None = None,
     paper_mmd: bool = False,
     surfaces: bool = False,
-    align: Literal["yaw"] | Align | None = None,
+    align: Align | None = None,
     batch_size: int = 256,
 ) -> Evaluation:
     """Voxel IoU of every image of a split, and the mean MMD over all pairs of view classes.
@@ -129,14 +130,12 @@ def evaluate(
     there is nothing to compare with.
 
     `align` is for methods whose shapes may stand otherwise than the true ones: a function of the predicted shapes, the
-    batch and the data set that returns the shapes to be compared. "yaw": the best of 24 rotations about the vertical
-    axis, see `align_yaw`.
+    batch and the data set that returns the shapes to be compared.
 
     Where several processes train the method, all of them call this; they share the work, and all return the result that
     one process gives with these networks. Raises ValueError for `surfaces` there: they are measured in one process.
     """
     ranks = method.ranks
-    align = align_yaw if align == "yaw" else align
     if surfaces and not ranks.alone:
         raise ValueError("surfaces are measured in one process; evaluate the run when it has ended")
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
@@ -155,7 +154,7 @@ def evaluate(
     try:
         for numbers, chosen in zip(rows, chunks[ranks.rank :: ranks.world], strict=True):
             batch = dataset.batch(chosen)
-            code = method.estimate(batch.images).codes
+            code = method.encode(batch.images)
             shapes = method.decode(code)
             if align is not None:
                 shapes = align(shapes, batch, dataset)
@@ -163,8 +162,11 @@ def evaluate(
                 filled = occupancy(shapes, dataset, name)
                 ious[name].append(nmr.metrics.voxel_iou(filled, batch.voxels))
                 if number == 0:
-                    overlap = nmr.metrics.voxel_precision_recall(filled, batch.voxels)
-                    overlaps.append(torch.stack(overlap, dim=1))
+                    precision, recall = nmr.metrics.voxel_precision_recall(filled, batch.voxels)
+                    hollow = torch.zeros(len(filled), dtype=torch.bool)
+                    if isinstance(shapes, Meshes):
+                        hollow = dataset.convention.leaves_grid(shapes.vertices, name)
+                    overlaps.append(torch.stack([precision, recall, hollow.to(precision)], dim=1))
             if truth is not None:
                 points = _surface_points(shapes, generator)
                 distances += [_compare(a, truth[b]) for a, b in zip(points, batch.object_ids.tolist(), strict=True)]
@@ -180,13 +182,14 @@ def evaluate(
     means = mean_mmd(all_codes, view_ids[compared], forms=forms, ranks=ranks)
     chamfer, f_score = torch.tensor(distances).T if distances else (None, None)
     seen = ranks.any(bool(silhouettes))
-    precision, recall = ranks.gather(overlaps, own, count).T if ious else (None, None)
+    precision, recall, hollow = ranks.gather(overlaps, own, count).T if ious else (None, None, torch.zeros(0))
     return Evaluation(
         object_ids=torch.from_numpy(dataset.object_ids[samples.numpy()]).to(torch.int64),
         view_ids=view_ids,
         ious={name: ranks.gather(values, own, count) for name, values in ious.items()},
         precision=precision,
         recall=recall,
+        hollow=int(hollow.sum()),
         chamfer_l1=chamfer,
         f_score=f_score,
         silhouette_iou=ranks.gather(silhouettes, own, count) if seen else None,
@@ -202,27 +205,6 @@ def occupancy(shapes: Meshes | Grids, dataset: ViewDataset, definition: Definiti
     if dataset.convention.box != 1.0:
         raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {dataset.convention.name} voxels")
     return dataset.convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))
-
-
-def align_yaw(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset) -> Meshes | Grids:
-    """Each mesh turned about the vertical axis by that multiple of 15 degrees at which its voxel IoU is the best.
-
-    The first of equals is taken, so that a shape without a better rotation stays as it is. Raises ValueError for grids,
-    and where the data set has no voxels.
-    """
-    if not isinstance(shapes, Meshes) or batch.voxels is None:
-        raise ValueError("align 'yaw' turns meshes and compares them with voxels; leave it out for grids and without")
-    best = torch.full((len(shapes.vertices),), -1.0)
-    aligned = shapes.vertices
-    for k in range(YAW_STEPS):
-        angle = 2 * math.pi * k / YAW_STEPS
-        x, y, z = shapes.vertices.unbind(-1)
-        sine, cosine = math.sin(angle), math.cos(angle)
-        turned = torch.stack([cosine * x + sine * z, y, cosine * z - sine * x], dim=-1)
-        iou = nmr.metrics.voxel_iou(dataset.voxelize(turned, shapes.faces), batch.voxels).nan_to_num(nan=-1.0)
-        better = iou > best
-        best, aligned = best.maximum(iou), torch.where(better[:, None, None], turned, aligned)
-    return replace(shapes, vertices=aligned)
 
 
 def _other_images(object_ids: np.ndarray) -> Tensor:

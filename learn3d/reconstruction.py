@@ -20,7 +20,7 @@ from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.crops import Crops
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.framing import OBJECT_SHARE, check_mask, mask_box, read_photo, read_picture, threshold_mask
-from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
+from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.figures import Surface
 from learn3d.files import limits, writing
@@ -89,11 +89,18 @@ def _read(path: Path, mask_path: Path | None, plain_background: bool = False) ->
         try:
             check_mask(mask)
         except ValueError as error:
-            raise ValueError(f"{path}: {error} (or give --masks)") from None
-    else:
-        colors, mask = read_photo(path, mask_path)
+            raise ValueError(
+                f"{path}: taken by the colour of the border, {error} Cut the object out (transparency), or give --masks"
+            ) from None
+        return colors, mask
+    colors, mask = read_photo(path, mask_path)
     if not mask.any():
         raise ValueError(f"the mask of {path} is empty: no pixel belongs to the object")
+    if not (mask > 127).all():
+        try:
+            check_mask(mask, cropped=True)
+        except ValueError as error:
+            raise ValueError(f"{mask_path or path}: {error}") from None
     return colors, mask
 
 
@@ -291,7 +298,7 @@ def reconstruct_dataset(
         raise FileNotFoundError(f"there is no folder {data}; say where the data set is with --data")
     model = load_model(run, which)
     name = category or model.config.category
-    dataset = load_dataset(model.config.layout, data, name, split, image_size=model.method.image_size)
+    dataset = checkpoint.load_data(model.config, split, data=data, category=name)
     batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
     numbers = zip(batch.object_ids.tolist(), batch.view_ids.tolist(), strict=True)
     names = [f"{dataset.category}_{split}_object{number:04}_view{view:02}" for number, view in numbers]

@@ -69,6 +69,11 @@ def note(text: str) -> None:
             _print(text, sys.stderr, "\n")
 
 
+def is_watched() -> bool:
+    """Whether progress is seen by somebody: stderr is a terminal (it may be closed, or never have been open)."""
+    return sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty()
+
+
 def _print(text: str, stream: TextIO, end: str) -> None:
     try:
         print(plain(text), file=stream, end=end, flush=True)

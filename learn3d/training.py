@@ -27,7 +27,7 @@ from learn3d.runs.checkpoint import Progress
 from learn3d.runs.faults import advice_on_errors
 from learn3d.runs.log import RunLog, SilentLog
 from learn3d.runs.state import Run, conditions_of
-from learn3d.terminal import stop_on_signal
+from learn3d.terminal import is_watched, stop_on_signal
 from learn3d.validation import draw, validate
 
 
@@ -54,7 +54,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
             run_folder.check_free(folder, overwrite)  # it is cleared when all else is well
         ranks = ranks.divide(config.batch_size, config.sampling)
 
-        train_set, val_set = load_splits(config)
+        train_set, val_set = load_splits(config, progress=ranks.main)
         found = (
             *train_set.notes,
             *val_set.notes,
@@ -75,6 +75,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
             for warning in filter(None, (*notes, *found)):
                 log.say(f"warning: {warning}")
             log.say(_describe(config, precision, train_set, val_set, progress, ranks))
+            if getattr(config.settings, "symmetry", None) == "auto":
+                log.say(_about_plane(shape.mirror_plane_deg))
             sample = functools.partial(sample_indices, train_set, config.sampling, config.batch_size, config.seed)
             indices = sample(progress.step + 1)
             for step in range(progress.step + 1, config.iterations + 1):
@@ -82,7 +84,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
                 indices = sample(step + 1)
                 train_set.prepare(indices, ranks.rows)
                 losses = method.train_step(augment(batch, config.augment, config.seed, step), step)
-                # With those of the step before: methods that take turns compute other ones in odd and in even steps.
+                # With the losses of the step before: some methods train one network in odd steps, another in even ones.
                 recent = progress.losses | losses
                 seconds = before + time.monotonic() - started
                 progress = dataclasses.replace(progress, step=step, losses=losses, seconds=seconds)
@@ -106,11 +108,15 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
     return summary
 
 
-def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:
-    """The training and the validation split of a run, read at the same time. Both have the same view classes."""
+def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDataset, ViewDataset]:
+    """The training and the validation split of a run, read at the same time. Both have the same view classes.
+
+    progress: on a terminal, show a bar where many files are read.
+    """
     options = {"image_size": config.settings.image_size, "view_bins": config.view_bins}
     load = functools.partial(load_dataset, config.layout, config.data, config.category, **options)
-    train = functools.partial(load, "train", views_per_object=config.views_per_object)
+    progress = progress and is_watched()
+    train = functools.partial(load, "train", views_per_object=config.views_per_object, progress=progress)
     train_set, val_set = together([train, functools.partial(load, config.val_split)])
     return train_set, val_set
 
@@ -119,6 +125,16 @@ def _shape_of(train_set: ViewDataset, config: TrainConfig) -> DataShape:
     wanted = getattr(config.settings, "symmetry", None) == "auto"
     plane = find_mirror_plane(train_set) if wanted else None
     return DataShape(train_set.num_views, train_set.num_classes, train_set.pose_features, train_set.inverted, plane)
+
+
+def _about_plane(plane_deg: float | None) -> str:
+    """What the symmetry "auto" came to."""
+    if plane_deg is None:
+        return (
+            "no mirror plane: the masks show none (it takes some 150 from all around), so shapes are not mirrored; "
+            "--symmetry names a plane"
+        )
+    return f"mirror plane: the one that a camera of azimuth {plane_deg:g} looks along, as the masks show"
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def main(*given: str) -> int:
         package = (error.name or "").partition(".")[0]
         if package in ("", "learn3d", "nmr"):
             raise
-        note(f"error: learn3d {name} {missing_package(package)}")
+        note(f"error: learn3d {name} {missing_package(package, name)}")
         return 1
 
 

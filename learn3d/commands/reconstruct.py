@@ -28,7 +28,7 @@ class Command:
     run: Path | None = None
     """Run folder (or checkpoint file) of the trained model; without it, the small one that comes with the package."""
     images: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Images of any size, with a transparent background (or with --masks)."""
+    """Images of any size, with a transparent background (or with --masks or --plain-background)."""
     masks: tuple[Path, ...] = ()
     """Mask images (white = object), one for each image, where the background is not transparent."""
     plain_background: bool = False
@@ -51,13 +51,17 @@ class Command:
     """Fit each shape to its mask afterwards, a few seconds for each image; the camera must be known: that of the data
     set, or --azimuths."""
     azimuths: tuple[float, ...] = ()
-    """With --refine, where the camera of each image file stands, in degrees: one for each image."""
+    """With --refine, where the camera of each image file stands, in degrees: one for each image. 0: in front of the
+    object; 90: at the side that the front view shows on its right."""
     elevation: float = 30.0
     """Its height above the object's plane in degrees, the same for all image files."""
     frames: int = 36
     """Pictures of the turntable."""
     image_size: int = 256
     """Side of the turntable in pixels."""
+
+
+_OF_IMAGES = ("masks", "plain_background", "crop", "azimuths", "elevation")
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -67,6 +71,12 @@ def run(arguments: Sequence[str]) -> int:
         raise ValueError("give either image files, or --data with --indices")
     if command.output.suffix.lower() in (".glb", ".obj", ".ply"):
         raise ValueError(f"--output is a folder, got {command.output}; the files in it are named after the images")
+    others = ("category", "split", "indices") if command.images else _OF_IMAGES
+    if ignored := [
+        f"--{name.replace('_', '-')}" for name in others if getattr(command, name) != getattr(Command, name)
+    ]:
+        given, wanted = ("image files", "--data") if command.images else ("--data", "image files")
+        raise ValueError(f"{given} given; leave out what belongs to {wanted}: {', '.join(ignored)}")
     if command.images and command.refine != bool(command.azimuths):
         raise ValueError("--refine takes the azimuth of the camera of each image file: give --refine --azimuths A ...")
     import torch

@@ -22,7 +22,7 @@ from learn3d.config import DEFAULT_PRESET, TrainConfig, load_config
 from learn3d.parallel.launch import label, start
 from learn3d.parallel.ranks import LostPeerError
 from learn3d.presets import METHODS, PRESETS, full_name
-from learn3d.terminal import say, without_traceback
+from learn3d.terminal import INTERRUPTED, say, without_traceback
 from learn3d.training import train
 
 COMMON = ("data", "category", "output", "preset", "layout", "iterations", "batch_size", "seed", "device", "threads")
@@ -84,12 +84,12 @@ def _presets() -> str:
 
 @without_traceback(FloatingPointError, MemoryError, LostPeerError, label=label)
 def run(arguments: Sequence[str]) -> int:
-    """Train, and say how it ended."""
+    """Train, and say how it ended; the exit status is 130 where a signal stopped the only process."""
     command = read(arguments)
     if command.resume and command.overwrite:
         raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
-    with start(command.config.device) as ranks:  # the first Ctrl-C in it saves and ends well
+    with start(command.config.device) as ranks:  # the first Ctrl-C in it saves
         summary = train(command.config, resume=command.resume, overwrite=command.overwrite, ranks=ranks)
     if ranks.main:
         say(str(summary))
-    return 0
+    return 0 if summary.finished or not ranks.alone else INTERRUPTED  # torchrun would take it for a failure

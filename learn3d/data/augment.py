@@ -45,8 +45,8 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -
                 )
             if batch.crops is None:
                 raise ValueError(
-                    "the augmentation crop needs the original images and boxes, which only the layout pascal3d has; "
-                    "leave it out"
+                    "the augmentation crop needs the original images and boxes, which only the layout pascal3d has, "
+                    "and not in shards; leave it out"
                 )
             colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))[rows.numpy()]))
         elif name in ("channels", "colors"):

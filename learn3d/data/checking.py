@@ -15,6 +15,7 @@ from typing import Any
 
 from learn3d.data import shards
 from learn3d.data.categories import synset_of
+from learn3d.data.dataset import SPLITS
 from learn3d.data.layouts import LAYOUTS, layouts_in
 from learn3d.data.readers import READERS
 from learn3d.files.findings import Problem
@@ -94,8 +95,7 @@ def check_folder(
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder}")
-    reader = shards if shards.contents(folder) else READERS[layout]
-    found = reader.contents(folder)
+    found = _contents(layout, folder)
     if not found and not categories:
         others = layouts_in(folder, layout)
         what = f"; it is a data set of the layout {others[0]!r}: add --layout {others[0]}" if others else ""
@@ -104,9 +104,30 @@ def check_folder(
     for category in categories or found:
         there = found.get(category) or found.get(synset_of(category)) or ("train", "val", "test")
         for split in splits or there:
-            problems = tuple(reader.problems(folder, category, split, progress=progress))
-            reports.append(SplitReport(category, split, _count(reader, folder, category, split), problems))
+            reports.append(_check_split(layout, folder, category, split, progress))
     return Report(layout, str(folder), tuple(reports))
+
+
+def _contents(layout: str, folder: Path) -> dict[str, tuple[str, ...]]:
+    """The categories of a folder and their splits, those in shards included."""
+    found = shards.contents(folder)
+    try:
+        others = READERS[layout].contents(folder)
+    except (ValueError, OSError):
+        if not found:
+            raise
+        others = {}  # there are only shards
+    for category, splits in others.items():
+        found[category] = tuple(split for split in SPLITS if split in (*splits, *found.get(category, ())))
+    return found
+
+
+def _check_split(layout: str, folder: Path, category: str, split: str, progress: bool) -> SplitReport:
+    stored = shards.holds(folder, category, split)
+    reader = shards if stored else READERS[layout]
+    options = {"layout": layout} if stored else {}
+    problems = tuple(reader.problems(folder, category, split, progress=progress, **options))
+    return SplitReport(category, split, _count(reader, folder, category, split), problems)
 
 
 def _count(reader: Any, folder: Path, category: str, split: str) -> int:

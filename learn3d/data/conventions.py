@@ -59,9 +59,16 @@ class VoxelConvention:
         2018 and of the paper, "kato19" the conservative one of Kato and Harada 2019 (VPL): every cell that a face
         touches. Not the same metric.
         """
-        scale = (self.kato18_scale if definition == "kato18" else 1.0) / self.box
-        grid = nmr.voxelize(vertices * scale + 0.5, faces, size=VOXEL_SIZE, definition=definition)
+        grid = nmr.voxelize(self._to_unit(vertices, definition), faces, size=VOXEL_SIZE, definition=definition)
         return self.to_axes(grid)
+
+    def leaves_grid(self, vertices: Tensor, definition: Definition = "kato18") -> Tensor:
+        """Which meshes, vertices float [B, V, 3], reach beyond the grid and so count as hollow: bool [B]."""
+        return (self._to_unit(vertices, definition) - 0.5).abs().amax(dim=(1, 2)) > 0.5
+
+    def _to_unit(self, vertices: Tensor, definition: Definition) -> Tensor:
+        """Object frame to the unit cube that the grid spans."""
+        return vertices * ((self.kato18_scale if definition == "kato18" else 1.0) / self.box) + 0.5
 
 
 #: Where a grid's corner lines lie inside the box: `VoxelConvention.kato18_scale` of most data sets.

@@ -154,17 +154,16 @@ class ViewDataset:
             if isinstance(array, StoredArray):
                 array.prepare(samples)
 
-    def images_crc(self) -> int:
-        """CRC-32 of the images; of those on disk, of their checksums."""
-        return _crc(self.images, 0)
+    def digest(self, *, voxels: bool = True) -> int:
+        """CRC-32 of all that is learnt from: images, masks, poses, classes; and of the voxels, if they are wanted.
 
-    def digest(self) -> int:
-        """CRC-32 of all that is learnt from or compared with: images, masks, poses, classes, voxels."""
-        parts = (self.images, self.masks, self.view_ids, self.object_ids, self.class_ids, self.voxels)
+        Of arrays on disk, of their checksums.
+        """
+        fields = () if self.poses is None else dataclasses.fields(self.poses)
+        poses = [np.asarray(getattr(self.poses, field.name)) for field in fields]
+        parts = [self.images, self.masks, *poses, self.view_ids, self.object_ids, self.class_ids]
         crc = 0
-        for some in torch.arange(len(self)).split(2**20) if self.poses is not None else ():
-            crc = zlib.crc32(np.ascontiguousarray(self.poses[some].features().numpy()), crc)
-        for part in parts:
+        for part in parts + [self.voxels] * voxels:
             crc = _crc(part, crc) if part is not None else crc
         return crc
 

@@ -114,15 +114,18 @@ def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(image.convert("RGBA"))[..., :3], mask
 
 
-def check_mask(mask: np.ndarray) -> None:
-    """Raise ValueError for a mask [H, W] that is empty, full, or probably black where the object is."""
+def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
+    """Raise ValueError for a mask [H, W] that is empty, full, or probably black where the object is.
+
+    cropped: the picture may end where the object does, so that much of its border is object.
+    """
     inside = mask > 127
     if not inside.any():
         raise ValueError("its mask is empty: no pixel is brighter than half; white must be the object")
     if inside.all():
         raise ValueError("its mask is all white: white must be the object, black the background")
     border = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
-    if border.mean() > 0.5:
+    if border.mean() > (max(0.5, inside.mean()) if cropped else 0.5):
         raise ValueError(
             f"its mask covers {border.mean():.0%} of the border; is it black where the object is, or is the background "
             "in it?"

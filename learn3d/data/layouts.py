@@ -68,8 +68,8 @@ def load_dataset(
 
     image_size: side of the network's images in pixels, for layouts that keep larger ones; Kato's renderings are 64x64.
     view_bins: pose classes from cells of azimuth and elevation, see `AngleBins.parse`; None: the layout's own.
-    views_per_object: use only so many views of every object (kar, r2n2: the first; other layouts: drawn at random, the
-    same in every run); None: what the layout's published protocol uses.
+    views_per_object: use only so many views of every object (kar, r2n2: the first; other layouts, and shards: drawn at
+    random, the same in every run); None: what the layout's published protocol uses.
     progress: show a bar where many files are read.
 
     Raises ValueError for an unknown layout, an option that the layout does not have, and damaged files (named);

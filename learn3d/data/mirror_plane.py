@@ -15,7 +15,8 @@ from learn3d.data.poses import LookAtPoses
 
 SECTOR_DEG = 15.0  # width of the sectors of azimuth whose masks are averaged; planes are found to half of it
 _SECTORS = round(360 / SECTOR_DEG)
-_ENOUGH, _MOST = 8, 2048  # images that a sector must have, and that are looked at
+_ENOUGH, _MOST = 4, 2048  # images that a sector must have to be compared, and that are looked at
+_COMPARED = _SECTORS // 2  # sectors that must be compared
 _CLEAR = 0.1  # how much smaller than the median over all planes the difference at the mirror plane must be
 
 
@@ -25,7 +26,8 @@ def find_mirror_plane(dataset: ViewDataset) -> float | None:
     For each plane p the squared difference of mean masks of sectors v and 2 p - v is summed over pixels and sectors.
     What the difference of two means of so many masks has by chance is subtracted. A plane is found where the smallest
     of the 24 sums is below a tenth of their median. (Bodies of revolution look the same at every plane; any will do.)
-    With fewer than eight images in a sector nothing is found.
+    Where half of the sectors cannot be compared, because they or their mirror images have fewer than four images,
+    nothing is found: some 150 images from all around are needed.
 
     Raises ValueError where poses are not known, or not given by azimuth and elevation.
     """
@@ -35,21 +37,25 @@ def find_mirror_plane(dataset: ViewDataset) -> float | None:
         )
     sectors = np.rint(dataset.poses.azimuth_deg.numpy() / SECTOR_DEG).astype(int) % _SECTORS
     means = np.zeros((_SECTORS, MASK_SIZE, MASK_SIZE))
+    known = np.zeros(_SECTORS, bool)
     noise = np.zeros(_SECTORS)  # expected squared error of each mean, summed over pixels
     for sector in range(_SECTORS):
         samples = np.flatnonzero(sectors == sector)
         if len(samples) < _ENOUGH:
-            return None
+            continue
         some = np.linspace(0, len(samples) - 1, min(len(samples), _MOST)).round().astype(int)
         seen = dataset.mask_pixels(samples[some]) / np.float32(255)
-        means[sector] = seen.mean(axis=0)
+        means[sector], known[sector] = seen.mean(axis=0), True
         noise[sector] = seen.var(axis=0).sum() / (len(seen) - 1)
     differences = np.zeros(_SECTORS)
     for plane in range(_SECTORS):  # at plane * SECTOR_DEG / 2
         other = (plane - np.arange(_SECTORS)) % _SECTORS
+        compared = known & known[other]
+        if compared.sum() < _COMPARED:
+            return None
         moved = other != np.arange(_SECTORS)  # a sector that is its own mirror image has one mean, and less noise
         squares = np.square(means - means[other][..., ::-1]).sum(axis=(1, 2))
-        differences[plane] = np.mean(squares - np.where(moved, noise + noise[other], 2 * noise))
+        differences[plane] = np.mean((squares - np.where(moved, noise + noise[other], 2 * noise))[compared])
     best = int(differences.argmin())
     clear = differences[best] < _CLEAR * np.median(differences)
     return best * SECTOR_DEG / 2 if clear else None

@@ -337,14 +337,18 @@ def count(folder: Path | str, category: str, split: str) -> int:
     return sum(len(_parsed(ShardFile, path).objects) for path in shards if path.is_file())
 
 
-def problems(folder: Path | str, category: str, split: str, *, progress: bool = False) -> Iterator[Problem]:
+def problems(
+    folder: Path | str, category: str, split: str, *, layout: str, progress: bool = False
+) -> Iterator[Problem]:
     """Everything that is wrong with the files of a split, which are read as a whole. `load` leaves such shards out."""
     where = split_folder(folder, category, split)
     try:
-        together = _set_file(where)
-        dataset = load(folder, category, split, layout=together.layout)
+        dataset = load(folder, category, split, layout=layout)
     except (DamagedFile, MissingFile) as error:
         yield Problem(str(error.path), error.message)
+        return
+    except ValueError as error:  # another layout's
+        yield Problem(str(where), str(error))
         return
     yield from (Problem(str(where), note) for note in dataset.notes)
     files = [

@@ -118,29 +118,40 @@ def _example_buttons() -> dict[str, gr.Button]:
 def picture_page(models: dict[str, Model], root: Path) -> None:
     """Tab 1: a picture and its mask on the left, the meshes of all models on the right."""
 
-    def show(new: Picture | None) -> tuple:
-        return new, new and _editor(new.colors, new.mask)
+    def show(new: Picture) -> tuple:
+        return new, _editor(new.colors, new.mask)
 
     def upload(path: str, tolerance: float) -> tuple:
         with _told():
             return show(picture_tab.open_picture(Path(path), tolerance))
 
-    def threshold(old: Picture | None, tolerance: float) -> tuple:
-        return show(old and old._replace(mask=threshold_mask(old.colors, tolerance)))
+    def paint(given: Picture | None, mask: Callable[[Picture], np.ndarray]) -> dict | None:
+        return given and _editor(given.colors, mask(given))
 
-    def cut_out(old: Picture | None) -> tuple:
-        return show(old and old._replace(mask=picture_tab.object_mask(old.colors)))
+    def threshold(given: Picture | None, tolerance: float) -> dict | None:
+        return paint(given, lambda picture: threshold_mask(picture.colors, tolerance))
+
+    def cut_out(given: Picture | None) -> dict | None:
+        return paint(given, lambda picture: picture_tab.object_mask(picture.colors))
+
+    def empty(given: Picture | None) -> dict | None:
+        return paint(given, lambda picture: np.zeros_like(picture.mask))
+
+    def restore(given: Picture | None) -> dict | None:
+        return paint(given, lambda picture: picture.mask)
 
     def draw_example(category: str) -> tuple:
         return show(picture_tab.example(category, time.time_ns() % 2**32))
 
-    def make(old: Picture | None, chosen: list[str], drawing: dict | None = None) -> list:
+    def make(given: Picture | None, chosen: list[str], drawing: dict | None = None) -> list:
         outputs = []
         with _told():
-            if old is None:
+            if given is None:
                 raise ValueError("Give a picture first, or take an example")
             mask = drawn(drawing)
-            new = old if mask is None else old._replace(mask=mask)
+            new = given if mask is None else given._replace(mask=mask)
+            cutout = picture_tab.write_cutout(new, Path(tempfile.mkdtemp(dir=root)))
+            outputs.append(gr.DownloadButton(value=str(cutout), interactive=True))
             for label, model in models.items():
                 if label not in chosen:
                     outputs += [gr.skip()] * 3
@@ -151,10 +162,8 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
         return outputs
 
     def clear() -> list:
-        return [None, None, *(gr.DownloadButton(interactive=False) if k % 3 else None for k in range(3 * len(models)))]
-
-    def empty(old: Picture | None) -> tuple:
-        return show(old and old._replace(mask=np.zeros_like(old.mask)))
+        off = gr.DownloadButton(interactive=False)
+        return [None, None, off, *[None, off, off] * len(models)]
 
     picture = gr.State()
     gr.Markdown(
@@ -162,16 +171,17 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
     )
     with gr.Row():
         with gr.Column(scale=2, min_width=320):
-            given = gr.File(label="Picture", height=140, file_types=_PICTURES)
+            upload_box = gr.File(label="Picture", height=140, file_types=_PICTURES)
             examples = _example_buttons()
             editor = _drawing(label="Mask (bright blue)", canvas_size=(picture_tab.SIDE, picture_tab.SIDE))
             tolerance = gr.Slider(0, 1, TOLERANCE, label="Threshold", info="Difference to the background")
             with gr.Row():
                 emptied, again = gr.Button("Empty mask", size="sm"), gr.Button("Mask as at first", size="sm")
             removed = gr.Button("Find the object (rembg)", visible=find_spec("rembg") is not None)
+            cutout = gr.DownloadButton("Save the cut-out (PNG)", size="sm", interactive=False)
         with gr.Column(scale=3, min_width=320):
             chosen = gr.CheckboxGroup(list(models), value=list(models), label="Models", visible=len(models) > 1)
-            button = gr.Button("Make the mesh", variant="primary")
+            start = gr.Button("Make the mesh", variant="primary")
             columns, meshes = [], []
             with gr.Row():
                 for label in models:
@@ -179,16 +189,15 @@ def picture_page(models: dict[str, Model], root: Path) -> None:
                         meshes += _viewer(label)
                     columns.append(column)
     chosen.change(lambda names: [gr.Column(visible=label in names) for label in models], [chosen], columns)
-    shown = [picture, editor]
-    tolerance.release(threshold, [picture, tolerance], shown, **_ALONE)
-    again.click(threshold, [picture, tolerance], shown, **_ALONE)
-    emptied.click(empty, [picture], shown, **_ALONE)
-    removed.click(cut_out, [picture], shown, **_ALONE)
+    shown, made = [picture, editor], [cutout, *meshes]
+    tolerance.release(threshold, [picture, tolerance], editor, **_ALONE)
+    for button, mask in ((again, restore), (emptied, empty), (removed, cut_out)):
+        button.click(mask, [picture], editor, **_ALONE)
     arrivals = [example.click(partial(draw_example, name), None, shown, **_ALONE) for name, example in examples.items()]
-    uploaded = given.upload(clear, None, [*shown, *meshes]).then(upload, [given, tolerance], shown, **_ALONE)
+    uploaded = upload_box.upload(clear, None, [*shown, *made]).then(upload, [upload_box, tolerance], shown, **_ALONE)
     for arrival in (uploaded, *arrivals):
-        arrival.success(make, [picture, chosen], meshes, **_ALONE)
-    button.click(make, [picture, chosen, editor], meshes, **_ALONE)
+        arrival.success(make, [picture, chosen], made, **_ALONE)
+    start.click(make, [picture, chosen, editor], made, **_ALONE)
 
 
 def fit_page(root: Path) -> None:

@@ -79,6 +79,13 @@ def make_mesh(model: Model, picture: Picture) -> tuple[Surface, float]:
     return surface, input_azimuth_deg(surface, stored[3])
 
 
+def write_cutout(picture: Picture, folder: Path) -> Path:
+    """Write <name>.png, the square picture with its mask as transparency, which `open_picture` reads; its path."""
+    path = folder / f"{picture.name}.png"
+    Image.fromarray(np.dstack([picture.colors, picture.mask])).save(path)
+    return path
+
+
 def write_mesh(surface: Surface, folder: Path, name: str) -> tuple[Path, Path]:
     """Write <name>.glb (in clay where the shape has no colours) and <name>.obj; returns both paths."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -96,6 +96,8 @@ def evaluate_runs(
 def _warnings(result: Evaluation) -> list[str]:
     """What is not in the means."""
     found = [f"{result.undefined} images have no IoU (both shapes are empty)"] if result.undefined else []
+    if result.hollow:
+        found.append(f"{result.hollow} predicted meshes reach beyond the grid of voxels, and count as hollow there")
     found += [result.without_mmd] if result.without_mmd else []
     if result.without_distance:
         found.append(f"{result.without_distance} images have no Chamfer distance (the predicted surface is empty)")

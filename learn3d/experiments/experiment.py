@@ -71,7 +71,10 @@ def run_experiment(call: Call, *, work: Work = carry_out) -> int:
     runs = plan_runs(table, dataclasses.replace(call.options, threads=threads))
     if not call.report_only:
         failed = _complete(runs, call, threads, work)
-    report = make_report(table, call.options, runs, read_results(runs))
+    unlike = {run.name: text for run in runs if (text := conflicts_with(run))}
+    for text in unlike.values():
+        note(f"left out: {text}")
+    report = make_report(table, call.options, runs, read_results([run for run in runs if run.name not in unlike]))
     paths = write_report(call.options.output, report)
     say(to_text(report))
     note("report: " + ", ".join(map(str, paths)))

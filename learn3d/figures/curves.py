@@ -37,7 +37,7 @@ TITLES = {
     "mmd_paper": "MMD, printed formula",
 }
 _FIRST = ("voxel_iou", "mmd", "projection", "total")  # panels in this order, then as they come
-_NOT_CURVES = {"images", "undefined", "without_distance", "mmd_codes", "seconds"}
+_NOT_CURVES = {"images", "undefined", "hollow", "without_distance", "mmd_codes", "seconds"}
 _NOT_CURVES |= {"voxel_iou_kato18"}  # it is what voxel_iou is
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import nmr
+from learn3d.data.conventions import view_poses
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import wrap_deg
 from learn3d.figures.drawing import (
@@ -46,7 +47,7 @@ def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.nd
     inputs = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
     rows = []
     for i, surface in enumerate(shapes):
-        pose = batch.poses[torch.tensor([i])]
+        pose = view_poses(torch.zeros(1)) if batch.poses is None else batch.poses[torch.tensor([i])]
         flat = [inputs[i], to_uint8(batch.masks[i]), to_uint8(_silhouette(surface, pose.cameras()))]
         rows.append([*flat, *draw_surface(surface, orbit(pose, TURNS_DEG), image_size=TILE)])
     return tile(rows, GRID_COLUMNS)

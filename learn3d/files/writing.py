@@ -55,7 +55,7 @@ def check_target(path: Path, option: str, *, folder: bool = False) -> None:
     there = next(p for p in (path, *path.parents) if os.path.lexists(p)) if folder else path.parent
     try:
         if not there.is_dir():
-            raise OSError(f"there is no folder {there}")
+            raise OSError(f"{there} is a file" if there.is_file() else f"there is no folder {there}")
         if not folder and path.exists() and not path.is_file():
             raise OSError("it is no plain file, and is not replaced")
         with tempfile.TemporaryFile(dir=there):

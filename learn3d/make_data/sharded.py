@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -56,10 +57,9 @@ def make_shards(config: DatasetConfig) -> int:
     """
     config = config.complete()
     folder = config.output / synset_of(config.category)
-    settings = settings_of(config)
-    _prepare(config, folder, settings)
     sources, _ = list_sources(config)
     names = meshes.object_names(sources)
+    _prepare(config, folder, settings_of(config) | {"list of meshes": f"{len(names)}, CRC-32 {_crc(names):08x}"})
     threads = max(1, torch.get_num_threads() // config.jobs)
     tasks, shards = [], {}
     for split, numbers in split_objects(len(sources), config.test, config.val, config.seed).items():
@@ -79,7 +79,7 @@ def make_shards(config: DatasetConfig) -> int:
     if missing:
         note(f"{len(missing)} shards are missing ({', '.join(missing[:5])} ...); the same command makes them")
         return 1 if failed else INTERRUPTED
-    _finish(config, folder, shards, settings)
+    _finish(config, folder, shards)
     return 0
 
 
@@ -127,6 +127,10 @@ def _copies(config: DatasetConfig, split: str) -> int:
     return 1 + config.augment if split == "train" else 1
 
 
+def _crc(names: Sequence[str]) -> int:
+    return zlib.crc32("\n".join(names).encode())
+
+
 def _prepare(config: DatasetConfig, folder: Path, settings: dict) -> None:
     """The category's folder, with the settings of its shards."""
     if config.overwrite:
@@ -145,7 +149,7 @@ def _prepare(config: DatasetConfig, folder: Path, settings: dict) -> None:
     write_json(path, settings)
 
 
-def _finish(config: DatasetConfig, folder: Path, shards: dict[str, int], settings: dict) -> None:
+def _finish(config: DatasetConfig, folder: Path, shards: dict[str, int]) -> None:
     """Declare the splits complete; a report, and a picture to look at."""
     counts, used, skipped, rows = {}, 0, [], {}
     for split, count in shards.items():

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 
 from learn3d.device import check_device
-from learn3d.methods.method import DataShape, Estimate, MeshMethod, Method
+from learn3d.methods.method import DataShape, MeshMethod, Method
 from learn3d.methods.multi_view import MultiView, MultiViewSettings
 from learn3d.methods.optimization import CONSTANT, Plan, Schedule
 from learn3d.methods.plus import Plus, PlusSettings
@@ -18,7 +18,6 @@ from learn3d.methods.vpl import VPL, VPLSettings
 
 __all__ = [
     "DataShape",
-    "Estimate",
     "Grids",
     "MeshMethod",
     "Meshes",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 import contextlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
@@ -39,14 +38,6 @@ class DataShape:
 def plane_of(symmetry: SymmetryOption, shape: DataShape) -> Symmetry | None:
     """The mirror plane of the shapes: the one that the settings name, or with "auto" the one that the data have."""
     return shape.mirror_plane_deg if symmetry == "auto" else symmetry
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """What a method reads from images."""
-
-    codes: Tensor  # float32 [B, C]: shape codes, on the method's device
-    poses: Poses | None = None  # where the B cameras stood, on the CPU; None: the method does not estimate it
 
 
 class Method(abc.ABC):
@@ -110,10 +101,6 @@ class Method(abc.ABC):
     def weights_at(self, step: int) -> Mapping[str, float]:
         """`weights` in training step `step` (from 1), where they change during a run."""
         return self.weights
-
-    def estimate(self, images: Tensor) -> Estimate:
-        """Codes of images as `encode` takes them, and the poses, by methods that estimate them."""
-        return Estimate(self.encode(images))
 
     def start_from_pretrained(self) -> None:  # noqa: B027
         """Copy the weights of the file that the settings name, where they name one, into the encoder.

@@ -79,7 +79,7 @@ def check_pairs(batch: Batch) -> int:
     half = len(batch) // 2
     if len(batch) % 2 or not torch.equal(batch.object_ids[:half], batch.object_ids[half:]):
         raise ValueError(
-            "multi_view learns from pairs of views of one object, [a_1 .. a_n, b_1 .. b_n], but this batch of "
-            f"{len(batch)} views is not made of such pairs; choose sampling 'pairs'"
+            "the method multi-view learns from pairs of views of one object, [a_1 .. a_n, b_1 .. b_n], but this batch "
+            f"of {len(batch)} views is not made of such pairs; choose sampling 'pairs'"
         )
     return half

@@ -27,7 +27,8 @@ class PlusSettings(PoseInvariantSettings):
     """Networks, weights and forms of the terms of the loss; a weight of 0 means that the term is not computed."""
 
     encoder: EncoderName = "conv-narrow"
-    """As for the proposed method."""
+    """conv-narrow: four convolutions, the last one (1x1) to 32 channels. conv, conv-small, conv-centred, conv-relu,
+    resnet18: see the proposed method (--preset proposed --help-all)."""
     symmetry: SymmetryOption = "auto"
     """Mirror shapes at a vertical plane: auto: the one at which the training masks mirror each other, or none where
     they do not; x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along it. None: shapes are
@@ -35,9 +36,9 @@ class PlusSettings(PoseInvariantSettings):
     learning_rate: Positive = 4e-4
     """Adam's step size, the same for the three networks. The preset warms it up and lets it fall to 0."""
     lambda_smooth: Weight = 5e-4
-    """As for the proposed method."""
+    """Weight of the smoothness loss (lambda_1) at the start of the run."""
     lambda_smooth_end: Positive | None = 1e-4
-    """As for the proposed method."""
+    """This weight at the end of the run, approached by a constant factor a step. None: lambda_smooth throughout."""
     lambda_unseen: Weight = 0.5
     """Weight of the loss at unseen views."""
     remembered: Count = 2048
@@ -132,7 +133,7 @@ class Plus(PoseInvariant):
 
     def _unseen(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
         """All shapes of the batch are seen from one of its cameras. Their silhouettes are to be distributed as the
-        masks that are remembered of this view, which show other objects: the energy distance of the two sets.
+        masks that are remembered of this view, mostly of other objects: the energy distance of the two sets.
         """
         views = batch.step_views
         masks = self.ranks.join_rows(_reduced(batch.masks), views.rows, len(views))

@@ -1,4 +1,4 @@
-"""The pose-invariant method (Peng et al. 2020). Vanilla-AE is it with three weights at 0."""
+"""The pose-invariant method (Peng et al. 2020). With three of its weights at 0 it is Vanilla-AE."""
 
 from __future__ import annotations
 

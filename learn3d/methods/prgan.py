@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from learn3d.data.batch import Batch, StepViews
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
 from learn3d.device import autocast, upload
-from learn3d.methods.method import Estimate, Method
+from learn3d.methods.method import Method
 from learn3d.methods.optimization import adam, frozen
 from learn3d.methods.surfaces import Grids
 from learn3d.networks import network_input
@@ -66,6 +66,10 @@ class PrGANSettings:
     """Rays of the projection that meet in the eye, as the data set's do, instead of PrGAN's parallel ones."""
 
     @property
+    def reads_view_ids(self) -> bool:
+        return True
+
+    @property
     def image_size(self) -> int:
         """Side of the images that the encoder takes, in pixels."""
         return IMAGE_SIZE
@@ -107,17 +111,11 @@ class PrGAN(Method):
         own = self.settings
         return ViewCircle(self.shape.num_views, own.elevation_deg, own.distance, own.half_fov_deg, own.perspective)
 
-    def estimate(self, images: Tensor) -> Estimate:
-        """Shape codes [B, 200] of the mask channel alone, and the pose of the view that the encoder sees them from."""
+    def encode(self, images: Tensor) -> Tensor:
+        """Shape codes [B, 200], of the mask channel alone."""
         masks = network_input(images, self.device, self.image_size)[:, 3]
         with self.autocast():
-            z = self.encoder(masks).float()
-        azimuth = self.views.azimuth_deg(self.view_ids(z.cpu()))
-        poses = LookAtPoses(azimuth, self.views.elevation_deg, self.views.distance, self.views.half_fov_deg)
-        return Estimate(z[:, :SHAPE_CODE], poses)
-
-    def encode(self, images: Tensor) -> Tensor:
-        return self.estimate(images).codes
+            return self.encoder(masks).float()[:, :SHAPE_CODE]
 
     def decode(self, codes: Tensor) -> Grids:
         return Grids((self.generator(codes) * TAU).cpu(), self.settings.occupancy_threshold)

@@ -41,7 +41,8 @@ def refine(
 
     def loss(vertices: Tensor) -> Tensor:
         vertices = vertices.float().cpu()
-        fit = nmr.losses.soft_iou_loss(method.render(vertices, poses), masks)
+        seen = nmr.render_silhouette(vertices, method.faces, poses.cameras(), image_size=masks.shape[-1])
+        fit = nmr.losses.soft_iou_loss(seen, masks)
         return fit + SMOOTHNESS * nmr.losses.smoothness_loss(vertices, method.edges)
 
     with torch.no_grad():

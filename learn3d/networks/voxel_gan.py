@@ -15,7 +15,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 SHAPE_CODE = 200  # entries of z that decide the shape; one more decides the view
-VOLUME_SIZE = 64
 IMAGE_SIZE = 64
 TAU = 0.5  # density of a full voxel is 1 / TAU; in the projection it cancels, so that a full voxel lets exp(-1) through
 GENERATOR_CHANNELS = (128, 64, 32, 1)

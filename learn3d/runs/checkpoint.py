@@ -54,7 +54,7 @@ class Conditions:
     """What decides the next steps besides the options and the saved state; a resumed run must find it as it was."""
 
     samples: Count  # training images: their number decides the order
-    images: str  # CRC-32 of the training images, as stored
+    images: str  # `ViewDataset.digest` of the training images: them, their masks, poses and classes
     precision: Literal["bf16", "fp32"]  # what "auto" came to
 
 

@@ -25,7 +25,7 @@ def export(source: Path, target: Path, *, which: str = "last") -> int:
     if not isinstance(config.settings, PoseInvariantSettings):
         raise ValueError(f"only runs of proposed, vanilla and plus can be exported, this one is of {config.preset}")
     names = {field.name for field in dataclasses.fields(config.settings)} & set(_TRAINING_ONLY)
-    settings = dataclasses.replace(config.settings, **dict.fromkeys(names, 0.0))
+    settings = dataclasses.replace(config.settings, pretrained=None, **dict.fromkeys(names, 0.0))
     config = dataclasses.replace(config, settings=settings, data=Path("data"), output=Path("run"))
     tensors = {
         name: tensor.half() if tensor.dtype == torch.float32 else tensor

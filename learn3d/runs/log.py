@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from learn3d.files import writing
 from learn3d.runs.folder import JOURNAL, METRICS, TENSORBOARD
-from learn3d.terminal import note, plain
+from learn3d.terminal import is_watched, note, plain
 
 MEAN_OVER = 20  # steps: those of both turns, where a method trains its networks in turns
 
@@ -50,7 +50,7 @@ class RunLog:
         self._metrics = _Lines(self.folder / METRICS)
         self._journal = _Lines(self.folder / JOURNAL)
         self._bar = None
-        if sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty():
+        if is_watched():
             self._bar = tqdm(total=total, initial=start, unit="step", dynamic_ncols=True)
         self._tensorboard: Any = None
         with self._tensorboard_may_fail():

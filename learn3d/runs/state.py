@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -24,7 +24,7 @@ from learn3d.runs.versions import versions
 
 def conditions_of(train_set: ViewDataset, precision: str) -> Conditions:
     """The conditions of a run on these training images."""
-    return Conditions(len(train_set), f"{train_set.images_crc():08x}", precision)
+    return Conditions(len(train_set), f"{train_set.digest(voxels=False):08x}", precision)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,8 @@ class Run:
     method: Method
     shape: DataShape
     conditions: Conditions
-
     ranks: Ranks
+    versions: dict[str, str | None] = field(default_factory=versions)  # of the code that runs
 
     def begin(
         self, train_set: ViewDataset, val_set: ViewDataset, *, resume: bool, overwrite: bool
@@ -125,6 +125,9 @@ class Run:
                 f"{saved.path} holds no state of the random numbers that this torch can use ({error}); is it the last "
                 "checkpoint of a run?"
             ) from None
+        before = metadata.config
+        if (before.val_split, before.max_val_images) != (self.config.val_split, self.config.max_val_images):
+            return dataclasses.replace(metadata.progress, best_iou=-1.0, best_step=0)  # of other images
         return metadata.progress
 
     def save(self, progress: Progress, log: RunLog | SilentLog) -> None:
@@ -171,7 +174,7 @@ class Run:
             checkpoint.check_finite(name, network.state_dict())
 
     def _metadata(self, progress: Progress, optimizers: dict) -> Metadata:
-        return Metadata(self.config, self.shape, progress, self.conditions, versions(), optimizers)
+        return Metadata(self.config, self.shape, progress, self.conditions, self.versions, optimizers)
 
 
 def load_last(config: TrainConfig, *, repair: bool = True) -> Saved | None:

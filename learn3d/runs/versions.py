@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import subprocess
 from pathlib import Path
@@ -9,8 +10,12 @@ from pathlib import Path
 import torch
 
 
+@functools.cache
 def versions() -> dict[str, str | None]:
-    """Versions of the package and of torch, and the git commit of the code (None where it is not known)."""
+    """Versions of the package and of torch, and the git commit of the code (None where it is not known).
+
+    A process asks once, before it works: a commit made afterwards is not the code that runs.
+    """
     try:
         package = importlib.metadata.version("nmr-learn3d")
     except importlib.metadata.PackageNotFoundError:

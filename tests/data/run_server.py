@@ -64,7 +64,7 @@ def serve() -> None:
     read, sets = training.load_splits, None
     for line in sys.stdin:
         sets = sets or read(config_from_dict(json.loads(line)["config"]))  # once, and not in every copy
-        training.load_splits = lambda config, sets=sets: sets
+        training.load_splits = lambda config, sets=sets, **_: sets
         print(json.dumps(_fork(json.loads(line))), flush=True)
 
 

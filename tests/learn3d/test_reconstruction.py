@@ -45,7 +45,7 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path) -> None:
     written = reconstruct_files(*where, plain_background=True, frames=2, image_size=32)
     assert len(trimesh.load(written[0], force="mesh").faces) > 100
     Image.fromarray(np.full((40, 40, 3), 9, np.uint8)).save(tmp_path / "plain.png")
-    with pytest.raises(ValueError, match=r"plain.png: its mask is empty.*\(or give --masks\)"):
+    with pytest.raises(ValueError, match=r"plain.png: taken by the colour .* its mask is empty.* or give --masks"):
         _read(tmp_path / "plain.png", None, True)
     mask = _read(tmp_path / "box.png", None, True)[1]
     assert mask[30:90, 50:110].all() and mask.sum() == 255 * 60 * 60

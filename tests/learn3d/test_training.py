@@ -151,6 +151,9 @@ def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
         ({"encoder": "resnet18"}, "images of the layout 'kato' have 64x64 pixels, but 224 are wanted"),
         ({"layout": "pascal3d", "view_bins": "15x20"}, "view_bins '15x20': .* of the layout 'pascal3d' are rotations"),
         ({"preset": "gadelha2017-kato"}, "encoder_from_step=53051 lies beyond the 4 iterations: .* such as 3"),
+        ({"preset": "gadelha2017-kato", "augment": ("flip",), "encoder_from_step": 2}, "'gadelha2017-kato' is told"),
+        ({"preset": "plus-kato", "remembered": 3}, r"\(--remembered\): batch_size must lie in 2 .. 3, got 4; --lambda"),
+        ({"preset": "plus-kato", "batch_size": 1}, "batch_size must lie in 2 .. 2048, got 1"),
         ({"view_bins": "15"}, "view bins are written as AZIMUTHxELEVATION"),
         ({"prior_form": "cube"}, "prior_form must be 'squared' or 'norm'"),
         ({"iterations": 0}, "iterations must be at least 1"),
@@ -356,6 +359,23 @@ def test_resume_refuses_other_data(tiny_config, tiny_folder, finished_run, tmp_p
         train(tiny_config(finished_run, data=tmp_path / "data"), resume=True)
 
 
+def test_resume_refuses_other_poses(tiny_config, tiny_set, finished_run, monkeypatch) -> None:
+    moved = dataclasses.replace(tiny_set.poses, azimuth_deg=tiny_set.poses.azimuth_deg + 1)
+    sets = (dataclasses.replace(tiny_set, poses=moved),) * 2
+    monkeypatch.setattr(training, "load_splits", lambda _, **__: sets)
+    with pytest.raises(ValueError, match="other training data: 72 images with the CRC-32"):
+        train(tiny_config(finished_run), resume=True)
+
+
+def test_the_best_of_other_validation_images_is_forgotten(tiny_config, finished_run, tmp_path) -> None:
+    run = shutil.copytree(finished_run, tmp_path / "run")
+    assert train(tiny_config(run), resume=True).best_step > 0
+    other = tiny_config(run, max_val_images=6)
+    assert train(other, resume=True).best_step == 0, "nothing was left to do"
+    summary = train(dataclasses.replace(other, iterations=5), resume=True)
+    assert (summary.step, summary.best_step) == (5, 5)
+
+
 def test_resume_finds_its_data_in_another_folder(tiny_config, tiny_folder, finished_run, tmp_path) -> None:
     shutil.copytree(tiny_folder, tmp_path / "moved")
     check_nothing_to_do(tiny_config(finished_run, data=tmp_path / "moved"))
@@ -457,7 +477,8 @@ def test_empty_masks_are_said_and_nothing_but_empty_ones_refused(tiny_run, run_f
     some, none = tiny_set.images.copy(), np.zeros_like(tiny_set.images)
     some[:5, 3] = 0
     for images in (some, none):
-        monkeypatch.setattr(training, "load_splits", lambda _, i=images: (dataclasses.replace(tiny_set, images=i),) * 2)
+        sets = (dataclasses.replace(tiny_set, images=images),) * 2
+        monkeypatch.setattr(training, "load_splits", lambda _, sets=sets, **__: sets)
         if images is some:
             train(tiny_run(run_folder, iterations=1))
             assert (

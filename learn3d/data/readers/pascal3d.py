@@ -68,7 +68,7 @@ def load(folder: Path | str, category: str, split: str, *, image_size: int = IMA
 
     image_size: side of the network's images, 224 in both papers. View classes are the 45-degree cells of the rotation
     (`rotation_cells`) that occur in training; a photograph of the val files that falls into another cell gets the class
-    of the training photograph with the nearest rotation (they number only in the MMD, by the view class).
+    of the training photograph with the nearest rotation. Only the MMD depends on it.
 
     Raises FileNotFoundError for a missing file and ValueError for a damaged one, both named.
     """

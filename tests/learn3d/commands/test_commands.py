@@ -105,6 +105,11 @@ def test_the_help_of_evaluate_explains_every_column(command, monkeypatch) -> Non
         ("evaluate {tmp}", "there is no checkpoint"),
         ("evaluate", "give at least one run"),
         ("reconstruct --run {tmp} --output {tmp}/out", "either image files, or --data"),
+        (
+            "reconstruct a.png --output {tmp}/out --split val --indices 3",
+            "leave out what belongs to --data: --split, --indices",
+        ),
+        ("reconstruct --data {tmp} --output {tmp}/out --no-crop", "leave out what belongs to image files: --crop"),
         ("check-dataset {tmp}/no", "there is no folder"),
         ("figures plar", "no figure 'plar'; choose one of all, grid"),
         ("experiment kat --data {tmp} --output {tmp}/out", "no table 'kat'; choose one of kato,"),
@@ -153,7 +158,11 @@ def test_the_extra_of_a_missing_package_is_named(monkeypatch) -> None:
         'plotly>=6; extra == "report"',
     ]
     monkeypatch.setattr(packages.metadata, "requires", lambda _: requirements)
-    assert packages.missing_package("plotly").endswith("pip install '.[report]' in a clone")
+    assert packages.missing_package("plotly").endswith(
+        "pip install '.[report]' in a clone, 'FILE.whl[report]' of a wheel"
+    )
+    for name, extra in (("demo", "demo"), ("evaluate", "train"), ("make-dataset", "data")):
+        assert f"pip install '.[{extra}]' in a clone" in packages.missing_package("trimesh", name)
     assert packages.missing_package("gradio").endswith("pip install gradio")
 
 
@@ -191,7 +200,7 @@ def test_best_iou_is_said_where_there_is_one(best_step: int, shown: bool, tmp_pa
     summary = Summary(tmp_path, 700, False, 0.25 if best_step else -1.0, best_step, 60.0, 600.0)
     monkeypatch.setattr(train_command, "train", lambda *_, **__: summary)
     status, out, _ = command("train", "--data", tmp_path, "--category", "chair", "--output", tmp_path)
-    assert status == 0
+    assert status == INTERRUPTED
     assert out.startswith("stopped at step 700 after 1.0 min (10.0 min of training in all); ")
     assert ("best validation IoU 0.2500 at step 500" in out, "IoU" in out) == (shown, shown)
     assert out.endswith(f"everything is in {tmp_path}\n")
@@ -220,7 +229,10 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, command
         ("evaluate {run} --json {tmp}/none/t.json", "there is no folder {tmp}/none; give another"),
         ("evaluate {run} {tmp}/nope", "there is no checkpoint {tmp}/nope"),
         ("evaluate {run} --data {tmp}/nope", "nope: there is no such folder"),
-        ("reconstruct --run {run} --data {data} --output {tmp}/file/x", "there is no folder {tmp}/file; give another"),
+        (
+            "reconstruct --run {run} --data {data} --output {tmp}/file/x",
+            "write {tmp}/file/x: {tmp}/file is a file; give another",
+        ),
         ("reconstruct --run {run} --data {tmp}/nope --output {tmp}/x", "is with --data"),
         ("reconstruct --run {run} --data {data} --output {tmp}/x --frames 0", "frames must"),
         ("reconstruct --run {run} --output {tmp}/x {tmp}/a.png --image-size 0", "image_size must"),
@@ -274,11 +286,12 @@ def test_a_closed_terminal_does_not_change_how_a_run_ended(tmp_path, monkeypatch
     os.close(reading)
     with open(writing, "w") as terminal:
         monkeypatch.setattr(sys, "stdout", terminal)
-        assert train_command.run(["--data", str(tmp_path), "--category", "chair", "--output", str(tmp_path)]) == 0
+        words = ["--data", str(tmp_path), "--category", "chair", "--output", str(tmp_path)]
+        assert train_command.run(words) == INTERRUPTED
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT to another process")
-def test_interrupting_the_command_saves_and_ends_well(tiny_folder, run_folder) -> None:
+def test_interrupting_the_command_saves_and_says_so(tiny_folder, run_folder) -> None:
     command = [sys.executable, str(TOOLS / "train.py"), "--data", str(tiny_folder), "--category", "airplane"]
     command += ["--output", str(run_folder), "--batch-size", "2", "--log-every", "1", "--preset", "vanilla"]
     command += ["--encoder", "conv-small", "--generator", "sphere-small"]
@@ -290,7 +303,7 @@ def test_interrupting_the_command_saves_and_ends_well(tiny_folder, run_folder) -
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+    assert process.returncode == INTERRUPTED, err
     assert "stopped by SIGINT" in err
     assert "--resume" in err
     assert out.startswith("stopped at step ")

@@ -183,3 +183,10 @@ def test_wrong_masks_are_told_apart() -> None:
     with pytest.raises(ValueError, match=r"its mask covers 100% of the border; is it black where the object is, or"):
         check_mask(inverted)
     check_mask(255 - inverted)
+    with pytest.raises(ValueError, match="its mask covers 100% of the border"):
+        check_mask(inverted, cropped=True)
+    tight = np.full((50, 50), 255, np.uint8)
+    tight[:8, :8] = 0  # a cabinet, cut out at its edges
+    check_mask(tight, cropped=True)
+    with pytest.raises(ValueError, match="of the border"):
+        check_mask(tight)

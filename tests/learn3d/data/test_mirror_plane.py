@@ -58,7 +58,17 @@ def test_finds_nothing_where_there_is_nothing() -> None:
 
 
 def test_finds_nothing_in_a_few_images() -> None:
-    assert find_mirror_plane(triangles_seen(0.0, objects=7)) is None
+    assert find_mirror_plane(triangles_seen(0.0, objects=3)) is None
+
+
+def some_views(whole: ViewDataset, of_each: int) -> ViewDataset:
+    rng = np.random.default_rng(1)
+    return whole.select(np.concatenate([24 * k + rng.choice(24, of_each, False) for k in range(whole.num_objects)]))
+
+
+@pytest.mark.parametrize("plane", [37.5, None])
+def test_four_photographs_of_each_of_forty_objects_are_enough(plane: float | None) -> None:
+    assert find_mirror_plane(some_views(triangles_seen(plane, objects=40), 4)) == plane
 
 
 def test_needs_azimuths() -> None:

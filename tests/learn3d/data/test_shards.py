@@ -14,6 +14,7 @@ from lopsided_meshes import write_meshes
 from runs import same_bits
 
 from learn3d.data import shards
+from learn3d.data.checking import check_folder
 from learn3d.data.layouts import load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import sample_indices
@@ -205,6 +206,8 @@ def test_a_file_that_is_cut_short_later_is_an_error(stored) -> None:
 def test_another_layout_or_set_file(stored) -> None:
     with pytest.raises(ValueError, match="is a data set of the layout 'kato', not 'kar'"):
         shards.load(stored, "airplane", "train", layout="kar")
+    assert all(split.errors == 1 for split in check_folder("kar", stored).splits)
+    assert check_folder("kato", stored).errors == 0
     path = stored / "02691156" / "train" / "set.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "shards": 0}))
     with pytest.raises(DamagedFile, match=r"set\.json: is no description of shards \(shards: "):

@@ -55,6 +55,16 @@ def test_pictures_are_laid_on_a_square(photo, tmp_path) -> None:
     assert np.array_equal(mask[top : top + 40, left : left + 20], alpha) and mask.sum() == alpha.sum()
 
 
+def test_a_saved_object_keeps_its_mask(photo, tmp_path) -> None:
+    Image.fromarray(photo).save(tmp_path / "ring.png")
+    picture = picture_tab.open_picture(tmp_path / "ring.png", 0.2)
+    (tmp_path / "saved").mkdir()
+    again = picture_tab.open_picture(picture_tab.write_cutout(picture, tmp_path / "saved"))
+    assert again.name == "ring" and np.array_equal(again.mask, picture.mask)
+    seen = picture.mask > 0
+    assert np.array_equal(again.colors[seen], picture.colors[seen]) and (again.colors[~seen] == 255).all()
+
+
 def test_rembg_makes_the_mask_where_it_is_installed(photo, monkeypatch) -> None:
     def remove(image: Image.Image, *, only_mask: bool) -> Image.Image:
         assert only_mask

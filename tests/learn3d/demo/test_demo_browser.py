@@ -120,6 +120,12 @@ def test_an_upload_becomes_meshes_that_turn_and_can_be_kept(page, tmp_path) -> N
         assert name.startswith("box ") and name.endswith(f".{kind.lower()}")
         download.value.save_as(tmp_path / name)
         assert len(trimesh.load(tmp_path / name, force="mesh").faces) > 100
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save the cut-out").click()
+    download.value.save_as(tmp_path / "saved.png")
+    with Image.open(tmp_path / "saved.png") as image:
+        assert image.mode == "RGBA"
+        assert (np.asarray(image)[..., 3] > 0).sum() == pytest.approx(80 * 140, rel=0.05)
     page.get_by_role("checkbox", name="other").uncheck()
     api.expect(canvas.locator("visible=true")).to_have_count(1)
 
@@ -136,7 +142,13 @@ def test_the_mask_is_corrected_with_the_brush(page) -> None:
     page.mouse.up()
     page.get_by_role("button", name="Make the mesh").click()
     time.sleep(2)
-    assert not np.array_equal(settled(page.locator(".model3D canvas").first), first)
+    painted = np.abs(settled(page.locator(".model3D canvas").first) - first).mean()
+    assert painted > 0
+    page.get_by_role("button", name="Mask as at first").click()
+    time.sleep(1)
+    page.get_by_role("button", name="Make the mesh").click()
+    time.sleep(2)
+    assert np.abs(settled(page.locator(".model3D canvas").first) - first).mean() < painted / 2, "but for soft borders"
 
 
 def test_a_broken_picture_gets_a_sentence(page, tmp_path) -> None:

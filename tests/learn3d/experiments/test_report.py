@@ -79,6 +79,14 @@ def test_report_only_trains_nothing(report, tmp_path, make) -> None:
         assert row["cells"]["airplane"] == before["cells"]["airplane"]
 
 
+def test_runs_of_other_options_are_left_out(make, tmp_path, options, capsys) -> None:
+    assert make(Call("kato", options())) == 0
+    make(Call("kato", dataclasses.replace(options(), batch_size=64), report_only=True))
+    said = capsys.readouterr().err
+    assert "left out: " in said and "vanilla-seed0 has a run with other options: batch_size: 4" in said
+    assert "airplane/vanilla-seed0" in json.loads((tmp_path / "out" / "kato.json").read_text())["missing"]
+
+
 def test_the_table_on_the_terminal_is_aligned_and_says_how_long_ours_were_trained(make, capsys, options) -> None:
     make(Call("kato", options(iterations=5)))
     header, *rows, reference, trained = capsys.readouterr().out.splitlines()

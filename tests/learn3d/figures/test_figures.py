@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -53,6 +54,8 @@ def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set) -> None:
     def resized(picture: np.ndarray) -> np.ndarray:
         return np.asarray(Image.fromarray(picture).resize((figures.TILE,) * 2, Image.Resampling.BICUBIC))
 
+    unknown = figures.picture_grid(method, dataclasses.replace(tiny_set, poses=None), torch.tensor([3, 30]))
+    assert unknown.shape == grid.shape, "drawn from view 0"
     batch = tiny_set.batch(torch.tensor([3, 30]))
     assert np.array_equal(cell(1, 0), resized(figures.natural_colors(batch.images[1].numpy())))
     assert np.array_equal(cell(1, 1), resized(figures.to_uint8(batch.masks[1])))

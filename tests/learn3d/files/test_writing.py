@@ -79,9 +79,9 @@ def test_a_target_is_checked_before_the_work(tmp_path, monkeypatch) -> None:
     for name, folder, why in (
         ("a/t.json", False, "no folder .*a;"),
         (".", False, "no plain file"),
-        ("file/t.json", False, "no folder .*file;"),
-        ("file", True, "no folder .*file;"),
-        ("file/a/b", True, "no folder .*file;"),
+        ("file/t.json", False, "file is a file;"),
+        ("file", True, "file is a file;"),
+        ("file/a/b", True, "file is a file;"),
     ):
         with pytest.raises(OSError, match=rf"^cannot write .*{why}.* give another --x$"):
             writing.check_target(tmp_path / name, "--x", folder=folder)

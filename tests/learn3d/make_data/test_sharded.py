@@ -83,6 +83,17 @@ def test_a_second_call_makes_nothing_and_other_settings_are_refused(config, here
     assert contents(config.output) != before
 
 
+def test_another_list_of_meshes_is_refused(tmp_path, here) -> None:
+    """Their order decides which meshes are kept for the test."""
+    folder = write_meshes(tmp_path)
+    config = DatasetConfig(output=tmp_path / "shards", category="mug", source=folder, test=1, val=0, shards=True)
+    assert sharded.make_shards(config) == 0
+    first = min(folder.iterdir())
+    first.rename(first.with_stem("zzz"))
+    with pytest.raises(ValueError, match="were made with another list of meshes"):
+        sharded.make_shards(config)
+
+
 def test_bad_meshes_are_left_out_and_listed(tmp_path, here, capsys, monkeypatch) -> None:
     monkeypatch.setattr(sharded, "OBJECTS_PER_SHARD", 2)
     (tmp_path / "meshes").mkdir()

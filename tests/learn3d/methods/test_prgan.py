@@ -283,14 +283,3 @@ def test_a_loss_that_is_not_finite_stops_the_training() -> None:
         method.discriminator.last.bias.fill_(float("nan"))
     with pytest.raises(FloatingPointError, match="at iteration 7"):
         method.train_step(make_batch(), 7)
-
-
-def test_the_encoder_also_estimates_the_pose(monkeypatch: pytest.MonkeyPatch) -> None:
-    method = small_prgan()
-    z = torch.zeros(VIEWS, SHAPE_CODE + 1)
-    z[:, -1] = torch.tensor([-0.9, -0.4, 0.1, 0.6])  # a view each
-    monkeypatch.setattr(method, "encoder", lambda masks: z)
-    estimate = method.estimate(make_batch(VIEWS).images)
-    assert torch.equal(estimate.codes, z[:, :SHAPE_CODE])
-    assert estimate.poses.azimuth_deg.tolist() == [0, -90, -180, -270]
-    assert (estimate.poses.elevation_deg, estimate.poses.distance) == (30.0, 2.732)

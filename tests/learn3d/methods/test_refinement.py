@@ -37,6 +37,14 @@ def test_the_silhouette_comes_closer(tiny_set, steps: tuple[int, int]) -> None:
     assert loss(after.vertices) < loss(before) - 0.02
 
 
+def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set) -> None:
+    method = create_method(PRESETS["kato2019-kar"].settings, DataShape(24), device="cpu", precision="fp32", seed=0)
+    batch = tiny_set.batch(torch.tensor([0]))
+    images = torch.zeros(1, 4, method.image_size, method.image_size, dtype=torch.uint8)
+    shapes = refine(method, images, batch.masks, batch.poses, code_steps=1, vertex_steps=1)
+    assert shapes.vertices.shape == (1, 1352, 3) and shapes.vertices.isfinite().all()
+
+
 def test_symmetric_shapes_stay_symmetric(tiny_set) -> None:
     method, batch = make(37.5), tiny_set.batch(torch.tensor([0, 30]))
     vertices = refine(method, batch.images, batch.masks, batch.poses, code_steps=3, vertex_steps=3).vertices

@@ -28,6 +28,19 @@ def test_an_exported_model_gives_the_shapes_of_the_run(tiny_config, tiny_set, ru
     assert str(tmp_path) not in text
 
 
+def test_the_path_of_pretrained_weights_stays_at_home(finished_run, tmp_path, monkeypatch) -> None:
+    load = checkpoint.load_method
+
+    def with_weights(path, **options):
+        method, config, metadata = load(path, **options)
+        object.__setattr__(config.settings, "pretrained", tmp_path / "resnet18.pth")
+        return method, config, metadata
+
+    monkeypatch.setattr(checkpoint, "load_method", with_weights)
+    export(finished_run, tmp_path / "small.safetensors")
+    assert str(tmp_path).encode() not in (tmp_path / "small.safetensors").read_bytes()
+
+
 def test_other_methods_are_refused(tiny_config, run_folder, tmp_path) -> None:
     train(tiny_config(run_folder, preset="kato2018-kato", encoder="conv-small", iterations=1))
     with pytest.raises(ValueError, match="proposed, vanilla and plus"):
