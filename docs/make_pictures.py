@@ -47,6 +47,11 @@ PICTURES = {
         "{folder}/fitting.gif",
         ("docs/examples/draw_fitting.py",),
     ),
+    "small-model.png": Picture(
+        "python docs/examples/draw_small_model.py --output {folder}",
+        "{folder}/small-model.png",
+        ("docs/examples/draw_small_model.py", "learn3d/models/small.safetensors"),
+    ),
     "quickstart.png": Picture("bash tools/quickstart.sh", "quickstart/plus/pictures/*.png", _QUICKSTART),
     **{
         f"gallery-{name.replace('_', '-')}.png": Picture(

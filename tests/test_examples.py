@@ -55,7 +55,8 @@ def check_movie(path, width, height):
 def test_every_example_is_tested_and_short():
     scripts = sorted(path.stem for path in EXAMPLES.glob("*.py"))
     fits = ["fit_lit_vase", "fit_masks", "fit_packed", "fit_silhouette", "fit_texture"]
-    assert scripts == ["draw_fitting", "draw_surfaces", "draw_views", "find_camera", *fits, "make_photo_folder"]
+    draws = ["draw_fitting", "draw_small_model", "draw_surfaces", "draw_views"]
+    assert scripts == [*draws, "find_camera", *fits, "make_photo_folder"]
     assert all(len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 80 for name in scripts)
 
 
@@ -70,6 +71,10 @@ def test_draw_fitting(tmp_path):
     ious = run("draw_fitting", tmp_path, "--frames", "12", "--size", "48", "--steps", "30")
     assert len(ious) == 6 and min(ious.values()) > 0.3 and max(ious.values()) > 0.6
     check_movie(tmp_path / "fitting.gif", 316, 126)
+
+
+def test_draw_small_model(tmp_path):
+    check_picture(imageio.imread(run("draw_small_model", tmp_path)), 925, 766)
 
 
 def test_fit_masks(tmp_path):
