@@ -11,8 +11,8 @@ import tyro
 
 import nmr
 from learn3d.figures.drawing import Surface, draw_around, save_png
-from learn3d.make_data.sheets import tile
 from learn3d.make_data.shapes import CATEGORIES, make_shape
+from learn3d.make_data.sheets import tile
 from learn3d.make_data.studio import photograph
 from learn3d.reconstruction import load_model, reconstruct
 
