@@ -357,22 +357,26 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
 
 template <class T>
 void collect_colors(const ColorImage<T>& image, const LineRange& range, T* grad_row) {
-  switch (image.channels) {
-    case 1: return collect_colors_of<1>(image, range, grad_row);
-    case 3: return collect_colors_of<3>(image, range, grad_row);
-    case 4: return collect_colors_of<4>(image, range, grad_row);
-    default: return collect_colors_of<0>(image, range, grad_row);
+  if constexpr (kOwnChannels<T>) {
+    switch (image.channels) {
+      case 1: return collect_colors_of<1>(image, range, grad_row);
+      case 3: return collect_colors_of<3>(image, range, grad_row);
+      case 4: return collect_colors_of<4>(image, range, grad_row);
+    }
   }
+  collect_colors_of<0>(image, range, grad_row);
 }
 
 template <bool kUp, class T>
 NMR_INLINE void sweep_colors(const ColorImage<T>& image, int axis, SweepScratch<T>& block) {
-  switch (image.channels) {
-    case 1: return sweep_crossings<kUp, 1>(image, axis, block);
-    case 3: return sweep_crossings<kUp, 3>(image, axis, block);
-    case 4: return sweep_crossings<kUp, 4>(image, axis, block);
-    default: return sweep_crossings<kUp, 0>(image, axis, block);
+  if constexpr (kOwnChannels<T>) {
+    switch (image.channels) {
+      case 1: return sweep_crossings<kUp, 1>(image, axis, block);
+      case 3: return sweep_crossings<kUp, 3>(image, axis, block);
+      case 4: return sweep_crossings<kUp, 4>(image, axis, block);
+    }
   }
+  sweep_crossings<kUp, 0>(image, axis, block);
 }
 
 // Gradients [3, 2] of x and y of the corners of visible faces [first, last) of the list.

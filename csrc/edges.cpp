@@ -80,7 +80,7 @@ void resolve_forward(const Resolve<T>& args) {
     behind.insert(behind.end(), color, color + C);
     for (int64_t c = 0; c < C; ++c) behind.push_back((color[c] + color[c] + color[c] + color[c]) / 4);
   }
-  with_channels(C, [&](auto known) {
+  with_channels<T>(C, [&](auto known) {
     constexpr int64_t kChannels = known();
     parallel_for(args.batch * h, args.num_threads, [&](int64_t n) {  // n: image b, row y
       const T* background =
@@ -99,7 +99,7 @@ void resolve_backward(const Resolve<T>& args) {
   const int64_t H = scale * h, W = scale * w;
   const T share = T(1) / static_cast<T>(scale * scale);  // a power of two: exact
   if (args.grad_pixels)
-    with_channels(C, [&](auto known) {
+    with_channels<T>(C, [&](auto known) {
       constexpr int64_t kChannels = known();
       parallel_for(args.batch * H, args.num_threads, [&](int64_t n) {  // n: image b, raster row
         resolve_row_backward<kChannels>(args.background ? args.owner + n * W : nullptr,

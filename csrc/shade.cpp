@@ -70,7 +70,7 @@ int64_t first_cube(const TextureCubes<T>& args, int64_t b) {
 
 template <class T>
 void texture_cubes_forward(const TextureCubes<T>& args) {
-  with_channels(args.channels, [&](auto known) {
+  with_channels<T>(args.channels, [&](auto known) {
     constexpr int64_t kChannels = known();
     const int64_t W = args.raster.width, C = kChannels ? kChannels : args.channels, ts = args.texture_size,
                   cube = ts * ts * ts * C;
@@ -125,7 +125,7 @@ void texture_cubes_backward(const TextureCubes<T>& args) {
     const int64_t F = shared ? args.num_faces : face_count(args, set);
     const int64_t first = part * F / parts, last = (part + 1) * F / parts;
     std::fill_n(args.grad_textures + (first_cube(args, set) + first) * cube, (last - first) * cube, T(0));
-    with_channels(args.channels, [&](auto known) {
+    with_channels<T>(args.channels, [&](auto known) {
       for (int64_t b = set; b < set + images; ++b) add_texture_gradients<known()>(args, b, first, last);
     });
   });
@@ -170,7 +170,7 @@ void interpolate_block_backward(const Interpolate<T>& args, const ImageAttribute
 
 template <class T>
 void interpolate_forward(const Interpolate<T>& args) {
-  with_channels(args.channels, [&](auto known) {
+  with_channels<T>(args.channels, [&](auto known) {
     const int64_t W = args.raster.width, C = known ? known() : args.channels;
     for_rows(args.batch, args.raster.height, args.num_threads, [&](int64_t b, int64_t row) {
       const ImageAttributes<T> image = image_attributes(args, b);
@@ -201,7 +201,7 @@ void interpolate_backward(const Interpolate<T>& args) {
       args.batch, !args.starts && args.attribute_batch == 1, args.num_threads,
       [&](int64_t b) { return blocks_of(b).count; },
       [&](int64_t b, int64_t block, CornerSums<T>& sums) {
-        with_channels(args.channels, [&](auto known) {
+        with_channels<T>(args.channels, [&](auto known) {
           interpolate_block_backward<known()>(args, image_attributes(args, b), blocks_of(b), b, block, sums);
         });
       },

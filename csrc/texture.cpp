@@ -391,7 +391,7 @@ void scatter_texels(const SampleUV<T>& args, const int32_t* rows, int64_t first,
 template <class T>
 void sample_uv_forward(const SampleUV<T>& args) {
   const Interpolate<T>& at = args.uv;
-  with_channels(args.channels, [&](auto known) {
+  with_channels<T>(args.channels, [&](auto known) {
     constexpr int64_t kChannels = known();
     const int64_t W = at.raster.width, C = kChannels ? kChannels : args.channels;
     for_rows(at.batch, at.raster.height, at.num_threads, [&](int64_t b, int64_t row) {
@@ -432,7 +432,7 @@ void sample_uv_backward(const SampleUV<T>& args) {
   sum_blocks<CornerSums<T>>(
       at.batch, shared_uv, at.num_threads, [&](int64_t b) { return blocks_of(b).count; },
       [&](int64_t b, int64_t block, CornerSums<T>& sums) {
-        with_channels(args.channels, [&](auto known) {
+        with_channels<T>(args.channels, [&](auto known) {
           sample_uv_block_backward<known()>(args, image_attributes(at, b), blocks_of(b), b, block, direct,
                                             scatter ? rows.data() : nullptr, sums);
         });
@@ -444,7 +444,7 @@ void sample_uv_backward(const SampleUV<T>& args) {
   const int64_t parts = 2 * static_cast<int64_t>(at.num_threads);
   parallel_for(parts, at.num_threads, [&](int64_t part) {
     const int64_t first = part * args.num_texels / parts, last = (part + 1) * args.num_texels / parts;
-    with_channels(args.channels, [&](auto known) { scatter_texels<known()>(args, rows.data(), first, last); });
+    with_channels<T>(args.channels, [&](auto known) { scatter_texels<known()>(args, rows.data(), first, last); });
   });
 }
 
