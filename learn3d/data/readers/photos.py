@@ -105,7 +105,7 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
         yield Problem(str(folder), str(error))
         return
     yield from (Problem(str(table), fault) for fault in faults)
-    scales = []
+    scales, scaled = [], []
     chosen = [photo for photo in photos if splits is None or splits[photo.object] == split]
     for photo, framed in _read(chosen, MASK_SIZE, f"{category} {split}", progress):
         if isinstance(framed, (DamagedFile, MissingFile)):
@@ -116,6 +116,7 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
             message = "its object touches the border; what lies outside counts as empty"
             yield Problem(str(photo.file), message, "warning")
         scales.append(_scale(photo, framed))
+        scaled.append(photo)
     try:
         _check_scale(table, scales)
     except ValueError as error:
@@ -124,6 +125,11 @@ def problems(folder: Path | str, category: str, split: str, *, progress: bool = 
         if not 1 / _SCALE_ODD < _middle(scales) < _SCALE_ODD:
             text = f"{_said_of(scales)}; is fov_deg the full angle across the longer side?"
             yield Problem(str(table), text, "warning")
+        middle = _middle(scales)
+        for photo, scale in zip(scaled, scales, strict=True):
+            if not 1 / _SCALE_OFF < scale / middle < _SCALE_OFF:
+                text = f"beside the others its object is {scale / middle:.2g} times as large as its row says"
+                yield Problem(str(photo.file), f"{text} ({photo.where}); is the distance right?", "warning")
     images, listed = table.parent / "images", {photo.file for photo in photos}
     for path in sorted(images.iterdir()) if split == "train" and images.is_dir() and not faults else []:
         if path.suffix.lower() in _SUFFIXES and path not in listed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import runpy
 import shutil
 from pathlib import Path
@@ -328,6 +329,17 @@ def test_distances_in_another_unit_are_noticed(chairs: Path) -> None:
     ):
         photos.load(chairs, "chair", "train")
     assert [name for name, text in scan(chairs) if "times as large" in text] == ["poses.csv"] * 3
+
+
+def test_one_wrong_distance_is_warned_of(chairs: Path) -> None:
+    rows = read_rows(chairs)
+    for row in rows:
+        row["split"] = "train"
+    rows[4]["distance"] = str(float(rows[4]["distance"]) * 10)  # a point forgotten
+    write_rows(chairs, rows)
+    [(name, text)] = scan(chairs)
+    assert name == rows[4]["file"] and re.search(r"times as large as its row says \(poses.csv, line 6\)", text)
+    photos.load(chairs, "chair", "train")
 
 
 def test_half_of_the_field_of_view_is_warned_of(chairs: Path) -> None:
