@@ -48,12 +48,20 @@ class NarrowConvEncoder(ConvEncoder):
     torch's, images hardly change the codes of the first hundred steps, and all shapes may become one and stay so.
     """
 
+    channels = (64, 128, 256)
+
     def __init__(self) -> None:
         nn.Module.__init__(self)
-        channels = 32
-        self.convolutions = _convolutions(64, 128, 256).extend([nn.Conv2d(256, channels, 1), nn.ReLU()])
-        self.layers = linear_layers(channels * (self.image_size // 8) ** 2, 1024, 1024, CODE_SIZE)
+        narrow = 32
+        self.convolutions = _convolutions(*self.channels).extend([nn.Conv2d(self.channels[-1], narrow, 1), nn.ReLU()])
+        self.layers = linear_layers(narrow * (self.image_size // 8) ** 2, 1024, 1024, CODE_SIZE)
         initialize_he(self.convolutions)
+
+
+class LightConvEncoder(NarrowConvEncoder):
+    """The same with half the channels: a quarter of the multiplications, 3.9 million weights; no paper's."""
+
+    channels = (32, 64, 128)
 
 
 class SmallConvEncoder(ConvEncoder):
@@ -116,10 +124,11 @@ def _convolutions(*channels: int) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-EncoderName = Literal["conv", "conv-narrow", "conv-small", "conv-centred", "conv-relu", "resnet18"]
+EncoderName = Literal["conv", "conv-narrow", "conv-light", "conv-small", "conv-centred", "conv-relu", "resnet18"]
 ENCODERS: dict[str, type[nn.Module]] = {
     "conv": ConvEncoder,
     "conv-narrow": NarrowConvEncoder,
+    "conv-light": LightConvEncoder,
     "conv-small": SmallConvEncoder,
     "conv-centred": CentredConvEncoder,
     "conv-relu": ReluConvEncoder,

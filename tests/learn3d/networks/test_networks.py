@@ -12,7 +12,7 @@ from learn3d import device as precision_module
 from learn3d.device import autocast, resolve_precision
 from learn3d.methods import DataShape, Method, create_method
 from learn3d.networks import PoseDiscriminator, network_input
-from learn3d.networks.encoders import ConvEncoder, create_encoder
+from learn3d.networks.encoders import ConvEncoder, EncoderName, create_encoder
 from learn3d.networks.generators import SphereGenerator, deform_sphere
 from learn3d.presets import PRESETS
 
@@ -126,12 +126,13 @@ def test_missing_cuda_is_said() -> None:
         create("peng2020-kato", device="cuda")
 
 
-def test_the_narrow_encoder_tells_images_apart_from_the_start() -> None:
+@pytest.mark.parametrize("name", ["conv-narrow", "conv-light"])
+def test_encoders_of_plus_tell_images_apart_from_the_start(name: EncoderName) -> None:
     """Codes vary with the image by a good part of their size, so that shapes can differ in the first steps."""
     images = torch.zeros(16, 4, 64, 64)
     for k, (height, width) in enumerate(torch.randint(4, 60, (16, 2), generator=torch.Generator().manual_seed(0))):
         images[k, :, :height, :width] = 1
     for seed in range(3):
         torch.manual_seed(seed)
-        codes = create_encoder("conv-narrow", inverted=True)(images)
+        codes = create_encoder(name, inverted=True)(images)
         assert codes.std(0).norm() > 0.2 * codes.mean(0).norm()
