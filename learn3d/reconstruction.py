@@ -178,7 +178,8 @@ def export_mesh(path: Path, surface: Surface) -> None:
     """Write a mesh of the object frame as OBJ, GLB or PLY (by the file's ending), y up, right-handed.
 
     The object frame is left-handed; the reflection back turns the faces, whose normals point outwards in the file.
-    GLB and PLY keep the colours of the vertices; a GLB's node has the file's name.
+    GLB and PLY keep the colours of the vertices. A GLB's node has the file's name, and its material shows faces from
+    both sides: learnt surfaces cross themselves, and viewers of glTF files leave out what is seen from behind.
     """
     kind = path.suffix.lower().lstrip(".")
     if kind not in ("obj", "glb", "ply"):
@@ -187,9 +188,19 @@ def export_mesh(path: Path, surface: Surface) -> None:
     mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)
     if surface.colors is not None and kind != "obj":
         mesh.visual.vertex_colors = (surface.colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    scene = trimesh.Scene({path.stem: mesh}) if kind == "glb" else mesh
-    content = scene.export(file_type=kind)
+    if kind == "glb":
+        content = trimesh.Scene({path.stem: mesh}).export(file_type=kind, tree_postprocessor=_seen_from_both_sides)
+    else:
+        content = mesh.export(file_type=kind)
     writing.write_bytes(path, content.encode() if isinstance(content, str) else content)
+
+
+def _seen_from_both_sides(tree: dict) -> None:
+    """Give all meshes of a glTF tree a dull material whose faces are seen from both sides."""
+    tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}]
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            primitive["material"] = 0
 
 
 def check_pictures(frames: int = 36, image_size: int = 256) -> None:
