@@ -179,7 +179,7 @@ def test_colours_of_vertices_are_kept(tmp_path, kind: str) -> None:
     vertices, faces = nmr.icosphere(1)
     colors = (vertices - vertices.min()) / (vertices.max() - vertices.min())
     export_mesh(tmp_path / f"chair.{kind}", Surface(vertices, faces, colors))
-    mesh = trimesh.load(tmp_path / f"chair.{kind}", force="mesh", process=False)
+    (mesh,) = trimesh.load(tmp_path / f"chair.{kind}", force="scene", process=False).geometry.values()
     # beside a material, which a GLB has, trimesh takes the colours for one more attribute of the vertices
     found = mesh.visual.vertex_attributes["color"] if kind == "glb" else mesh.visual.vertex_colors
     assert np.abs(found[:, :3] / 255 - colors.numpy()).max() < 0.01
