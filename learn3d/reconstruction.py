@@ -179,7 +179,7 @@ def export_mesh(path: Path, surface: Surface) -> None:
 
     The object frame is left-handed; the reflection back turns the faces, whose normals point outwards in the file.
     GLB and PLY keep the colours of the vertices. A GLB's node has the file's name, and its material shows faces from
-    both sides: learnt surfaces cross themselves, and viewers of glTF files leave out what is seen from behind.
+    both sides: learnt surfaces cross themselves, and by glTF's rule a viewer leaves out what is seen from behind.
     """
     kind = path.suffix.lower().lstrip(".")
     if kind not in ("obj", "glb", "ply"):

@@ -180,7 +180,7 @@ def test_colours_of_vertices_are_kept(tmp_path, kind: str) -> None:
     colors = (vertices - vertices.min()) / (vertices.max() - vertices.min())
     export_mesh(tmp_path / f"chair.{kind}", Surface(vertices, faces, colors))
     (mesh,) = trimesh.load(tmp_path / f"chair.{kind}", force="scene", process=False).geometry.values()
-    # beside a material, which a GLB has, trimesh takes the colours for one more attribute of the vertices
+    # where a mesh has a material, as in a GLB, trimesh reads the colours as an attribute of the vertices
     found = mesh.visual.vertex_attributes["color"] if kind == "glb" else mesh.visual.vertex_colors
     assert np.abs(found[:, :3] / 255 - colors.numpy()).max() < 0.01
 
@@ -191,7 +191,7 @@ def test_the_node_of_a_glb_has_the_objects_name(tmp_path) -> None:
 
 
 def test_the_faces_of_a_glb_are_seen_from_both_sides(tmp_path) -> None:
-    """A viewer of glTF files leaves out faces seen from behind, unless their material says otherwise."""
+    """By glTF's rule faces are left out where they are seen from behind, unless their material says otherwise."""
     vertices, faces = nmr.icosphere(1)
     for colors in (None, torch.ones_like(vertices)):
         export_mesh(tmp_path / "chair.glb", Surface(vertices, faces, colors))
