@@ -59,7 +59,7 @@ class NarrowConvEncoder(ConvEncoder):
 
 
 class LightConvEncoder(NarrowConvEncoder):
-    """NarrowConvEncoder with half the channels: under a third of its multiplications, 3.9 million weights; no paper's."""
+    """Half the channels of NarrowConvEncoder: under a third of the multiplications, 3.9 million weights; no paper's."""
 
     channels = (32, 64, 128)
 
