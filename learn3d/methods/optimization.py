@@ -89,9 +89,27 @@ class Average:
 
 
 def adam(network: nn.Module, learning_rate: float, betas: tuple[float, float] = (0.9, 0.999)) -> torch.optim.Adam:
-    """Adam for one network, fused (13 ms a step instead of 91 on two cores)."""
+    """Adam for one network, fused (13 ms a step instead of 91 on two cores), without denormal moments."""
     parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
-    return torch.optim.Adam(parameters, lr=learning_rate, betas=betas, fused=True)
+    optimizer = torch.optim.Adam(parameters, lr=learning_rate, betas=betas, fused=True)
+    optimizer.register_step_post_hook(_drop_vanished)
+    return optimizer
+
+
+DROP_EVERY = 20  # steps
+
+
+@torch.no_grad()
+def _drop_vanished(optimizer: torch.optim.Optimizer, *_: object) -> None:
+    """Every 20 steps, set moments to 0 that are far too small to change a weight.
+
+    The gradient of a unit that is never active is 0, so its moments decay, become denormal and stay so. A CPU may
+    take a hundred times as long for denormal numbers; Adam then took 111 ms a step instead of 15.
+    """
+    for parameter, state in optimizer.state.items():
+        if parameter.device.type == "cpu" and state["step"] % DROP_EVERY == 0:
+            for name, least in (("exp_avg", 1e-20), ("exp_avg_sq", 1e-36)):  # beside eps = 1e-8, and its square
+                torch.hardshrink(state[name], least, out=state[name])
 
 
 def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:

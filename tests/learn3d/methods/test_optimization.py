@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from learn3d.methods import DataShape, Method, Plan, create_method
-from learn3d.methods.optimization import Average
+from learn3d.methods.optimization import Average, adam
 from learn3d.networks import ENCODERS
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
@@ -28,6 +28,31 @@ METHODS = {
     "prgan": {"preset": "gadelha2017-kato", "encoder_from_step": 3}
     | {"generator_channels": (2, 2, 2, 1), "discriminator_channels": (2, 2, 2, 2)},
 }
+
+
+# --- Adam
+
+
+def test_moments_of_dead_units_vanish_and_change_no_weight() -> None:
+    """One gradient, then zeros: torch's own moments become denormal and stay so, ours become 0. Weights are equal."""
+    layer = nn.Linear(8, 8)
+    other = nn.Linear(8, 8)
+    other.load_state_dict(layer.state_dict())
+    ours, theirs = adam(layer, 1e-3), torch.optim.Adam(other.parameters(), lr=1e-3, fused=True)
+    gradient = torch.logspace(-12, 3, 64).view(8, 8)
+    for step in range(2000):
+        for optimizer, network in ((ours, layer), (theirs, other)):
+            network.weight.grad = gradient if step == 0 else torch.zeros(8, 8)
+            network.bias.grad = torch.randn(8, generator=torch.Generator().manual_seed(step))
+            optimizer.step()
+    torch.testing.assert_close(layer.state_dict(), other.state_dict(), rtol=0, atol=0)
+    smallest = torch.finfo(torch.float32).tiny
+    assert (theirs.state[other.weight]["exp_avg"].abs() < smallest).sum() > 32
+    for moment in ("exp_avg", "exp_avg_sq"):
+        assert ours.state[layer.bias][moment].all()
+        stuck = ours.state[layer.weight][moment]
+        assert stuck[(stuck.abs() < smallest)].count_nonzero() == 0
+    assert ours.state[layer.weight]["exp_avg"].count_nonzero() == 0
 
 
 # --- step sizes
