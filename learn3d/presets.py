@@ -6,6 +6,7 @@ A preset fills in what the command line leaves out; every setting can be given o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import Layout
@@ -136,9 +137,15 @@ _KAR_SOURCE = f"{_PAPER}: one image per object, K = 72; losses: {_CODE}"
 _KAR = replace(_KATO, layout="kar", view_bins="15x20", source=_KAR_SOURCE)
 # The paper is silent about iterations and batch size: 40,000 is the published training script's, 128 its default.
 # ResNet-18 starts from random weights in the published code; `pretrained` gives it ImageNet's.
+_ON_PASCAL: dict[str, Any] = {
+    "encoder": "resnet18",
+    "symmetry": "z",
+    "lambda_adversarial": 0.01,
+    "lambda_prior": 0.01,
+}
 _PASCAL = Preset(
     "Proposed",
-    PoseInvariantSettings(encoder="resnet18", symmetry="z", lambda_adversarial=0.01, lambda_prior=0.01),
+    PoseInvariantSettings(**_ON_PASCAL),
     "pascal3d",
     40_000,
     128,
@@ -176,6 +183,9 @@ PRESETS: dict[str, Preset] = {
     "peng2020-kar": _KAR,
     "peng2020-kar-vanilla": _vanilla(_KAR, f"{_PAPER}: the baseline on the same images"),
     "plus-kar": replace(_PLUS, layout="kar", view_bins="15x20"),
+    "plus-pascal": replace(  # it flips images itself
+        _PLUS, settings=PlusSettings(**_ON_PASCAL), layout="pascal3d", iterations=160_000, augment=("crop", "colors")
+    ),
     # The figures are those of airplanes: docs/methods/vanilla-ae.md has the other categories.
     "kato2018-kato": Preset(
         "Vanilla-AE (multi-view)",

@@ -78,17 +78,21 @@ def _bins(widths: str) -> Variant:
 
 _KAR_VANILLA = Variant("kar-vanilla", "peng2020-kar-vanilla", checkpoint="best")
 _KAR_VPL = Variant("kar-vpl", "kato2019-kar", checkpoint="best")
+_KAR_PLUS = Variant("kar-plus", "plus-kar", checkpoint="best", smaller_batches=_BATCHES)
 _PASCAL_PROPOSED = Variant("pascal-proposed", "peng2020-pascal", checkpoint="best")
 _PASCAL_BASELINE = Variant("pascal-baseline", "peng2020-pascal-vanilla", checkpoint="best")
 _PASCAL_VPL = Variant("pascal-vpl", "kato2019-pascal")
+_PASCAL_PLUS = Variant("pascal-plus", "plus-pascal", checkpoint="best", smaller_batches=_BATCHES)
 
 #: What Plus has and any method can have: its step sizes, its average of the weights, its symmetry.
-_SCHEDULE = {"schedule": "cosine", "warmup_steps": 100, "average": 0.99, "learning_rate": PlusSettings().learning_rate}
+_OF_PLUS = PlusSettings()
+_SCHEDULE = {"schedule": "cosine", "warmup_steps": 100, "average": 0.99, "learning_rate": _OF_PLUS.learning_rate}
 _SYMMETRY = {"symmetry": "auto"}
 _VANILLA_BOTH = Variant("vanilla-schedule-symmetry", "peng2020-kato-vanilla", _SCHEDULE | _SYMMETRY)
 _PROPOSED_SCHEDULE = Variant("proposed-schedule", "peng2020-kato", _SCHEDULE)
 _PROPOSED_BOTH = Variant("proposed-schedule-symmetry", "peng2020-kato", _SCHEDULE | _SYMMETRY)
-_SHARED = _SCHEDULE | _SYMMETRY | {"encoder": "conv-narrow", "lambda_smooth": 5e-4, "lambda_smooth_end": 1e-4}
+_SHARED = _SCHEDULE | _SYMMETRY
+_SHARED |= {name: getattr(_OF_PLUS, name) for name in ("encoder", "lambda_smooth", "lambda_smooth_end")}
 _PROPOSED_SHARED = Variant("proposed-shared", "peng2020-kato", _SHARED, smaller_batches=_BATCHES)
 _VANILLA_SHARED = Variant("vanilla-shared", "peng2020-kato-vanilla", _SHARED, smaller_batches=_BATCHES)
 _PLUS_FREE = Variant("plus-without-symmetry", "plus-kato", {"symmetry": None}, smaller_batches=_BATCHES)
@@ -129,6 +133,7 @@ _ALL = (
             Row("Vanilla-AE", _KAR_VANILLA, published.KAR["Vanilla-AE"]),
             Row("VPL", _KAR_VPL, published.KAR["VPL"]),
             Row("Proposed", _bins("15x20"), published.KAR["Proposed"]),
+            Row("Plus", _KAR_PLUS),
         ),
         baseline="Vanilla-AE",
         layout="kar",
@@ -188,6 +193,7 @@ _ALL = (
             Row("VPL", _PASCAL_VPL, published.PASCAL["VPL"]),
             Row("Baseline", _PASCAL_BASELINE, published.PASCAL["Baseline"]),
             Row("Proposed", _PASCAL_PROPOSED, published.PASCAL["Proposed"]),
+            Row("Plus", _PASCAL_PLUS),
         ),
         baseline="Baseline",
         layout="pascal3d",

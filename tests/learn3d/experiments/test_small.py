@@ -55,7 +55,7 @@ SMALLER = {
     "without-adversarial": _SMALL,
     "without-smoothness": _SMALL,
     "multi-view": _SMALL,
-    **dict.fromkeys(("plus", "plus-without-symmetry", "plus-without-unseen"), (*_SMALL, "remembered=4")),
+    **dict.fromkeys(("plus", "plus-without-symmetry", "plus-without-unseen", "kar-plus"), (*_SMALL, "remembered=4")),
     **{f"{name}-schedule-symmetry": (*_SMALL, "warmup_steps=1") for name in ("vanilla", "proposed")},
     **dict.fromkeys(("proposed-schedule", "vanilla-shared", "proposed-shared"), (*_SMALL, "warmup_steps=1")),
     **{f"single-{name}": _SMALL for name in ("vanilla", "proposed", "plus")},
@@ -66,6 +66,7 @@ SMALLER = {
     "pascal-vpl": (*_VPL, "generator=cube-conv"),
     "pascal-baseline": _SMALL[:1],
     "pascal-proposed": _SMALL[:1],
+    "pascal-plus": (_SMALL[0], "remembered=4"),
     "proposed-fp32": _SMALL,
     "proposed-bf16": _SMALL,
     "prgan": ("discriminator_channels=4,8,16,32", "generator_channels=16,8,4,1"),
@@ -257,7 +258,7 @@ def test_pascal_has_seeds_and_quoted_rows(laboratory: Laboratory, outcomes: dict
     table = markdown_rows(outcome.files["md"])
     assert row_of(table, "CSDM", "paper, quoted from Kar et al. 2015 (voxeliser not stated)")[2:] == ["0.398", "0.398"]
     assert row_of(table, "CMR", "paper, quoted from Kanazawa et al. 2018 (voxeliser not stated)")[2] == "0.460"
-    for label in ("VPL", "Baseline", "Proposed"):
+    for label in ("VPL", "Baseline", "Proposed", "Plus"):
         cell = outcome.cell(label)
         values = cell["by_seed"]["kato18"]
         assert len(values) == PASCAL_SEEDS and values[0] != values[1]

@@ -31,7 +31,8 @@ def test_tables_take_rows_of_the_paper_and_share_runs() -> None:
     variants: dict[str, object] = {}
     for table in TABLES.values():
         assert table.baseline in [row.label for row in table.rows]
-        assert all(row.published is not None for row in table.rows) or table.name not in of_the_paper
+        quoted = [row.label for row in table.rows if row.published is not None]
+        assert table.name not in of_the_paper or [row.label for row in table.rows if row.label != "Plus"] == quoted
         for variant in table.variants:
             assert variants.setdefault(variant.name, variant) == variant, "one name, two meanings"
     assert len(TABLES["bins"].rows) == 7

@@ -136,10 +136,11 @@ def test_the_length_of_a_run_whose_smoothness_falls_is_kept(tiny_config, tmp_pat
 
 
 def test_presets() -> None:
-    for name in ("plus-kato", "plus-kar"):
+    for name, symmetry in {"plus-kato": "auto", "plus-kar": "auto", "plus-pascal": "z"}.items():
         preset = PRESETS[name]
         assert (preset.schedule, preset.warmup_steps, preset.average) == ("cosine", 100, 0.99)
-        assert preset.settings.symmetry == "auto"
+        assert preset.settings.symmetry == symmetry
+        assert "flip-image" not in preset.augment, "the method flips images itself, and tells the discriminator"
 
 
 def test_warm_up_of_a_short_run(tiny_config, tmp_path) -> None:
