@@ -26,9 +26,9 @@ REDUCED = MASK_SIZE // 2  # side of the masks that are remembered and compared
 class PlusSettings(PoseInvariantSettings):
     """Networks, weights and forms of the terms of the loss; a weight of 0 means that the term is not computed."""
 
-    encoder: EncoderName = "conv-narrow"
-    """conv-narrow: four convolutions, the last one (1x1) to 32 channels. conv-light: with half the channels before it.
-    conv, conv-small, conv-centred, conv-relu, resnet18: see the proposed method (--preset proposed --help-all)."""
+    encoder: EncoderName = "conv-light"
+    """conv-light: four convolutions, the last one (1x1) to 32 channels. conv, conv-small, conv-centred, conv-relu,
+    resnet18: see the proposed method (--preset proposed --help-all)."""
     symmetry: SymmetryOption = "auto"
     """Mirror shapes at a vertical plane: auto: the one at which the training masks mirror each other, or none where
     they do not; x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along it. None: shapes are

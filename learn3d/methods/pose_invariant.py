@@ -22,10 +22,10 @@ class PoseInvariantSettings:
     """Networks, weights and forms of the terms of L_tot; a weight of 0 means that the term is not computed."""
 
     encoder: EncoderName = "conv"
-    """conv: three convolutions, on 64-pixel RGB and mask. conv-narrow: the same, and a fourth (1x1) from 256 to 32
-    channels. conv-light: this with half the channels. conv-small: with a fifteenth of the weights. conv-centred: about
-    as small, on images in which every object is scaled to one size, for pictures from cameras at unknown distances.
-    conv-relu: conv with a ReLU on the code, as in Kato et al. 2018. resnet18: on 224-pixel RGB."""
+    """conv: three convolutions, on 64-pixel RGB and mask. conv-light: with half the channels, and a fourth (1x1) to
+    32 channels. conv-small: with a fifteenth of the weights. conv-centred: about as small, on images in which every
+    object is scaled to one size, for pictures from cameras at unknown distances. conv-relu: conv with a ReLU on the
+    code, as in Kato et al. 2018. resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "sphere"
     """sphere: 642 free vertices. sphere-small: from fewer weights. bounded: that of Kato et al. 2018. cube-conv,
     cube-fc: those of Kato and Harada 2019."""
