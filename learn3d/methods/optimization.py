@@ -103,8 +103,8 @@ DROP_EVERY = 20  # steps
 def _drop_vanished(optimizer: torch.optim.Optimizer, *_: object) -> None:
     """Every 20 steps, set moments to 0 that are far too small to change a weight.
 
-    The gradient of a unit that is never active is 0, so its moments decay, become denormal and stay so. A CPU may
-    take a hundred times as long for denormal numbers; Adam then took 111 ms a step instead of 15.
+    The gradient of a unit that is never active is 0, so its moments decay, become denormal and stay so. Some CPUs
+    are many times slower with denormal numbers: Adam took 111 ms a step of Plus instead of 15.
     """
     for parameter, state in optimizer.state.items():
         if parameter.device.type == "cpu" and state["step"] % DROP_EVERY == 0:
