@@ -135,7 +135,6 @@ def _vanilla(preset: Preset, source: str) -> Preset:
 _KATO = Preset("Proposed", PoseInvariantSettings(), "kato", 20_000, 128, f"{_PAPER}; losses: {_CODE}")
 _KAR_SOURCE = f"{_PAPER}: one image per object, K = 72; losses: {_CODE}"
 _KAR = replace(_KATO, layout="kar", view_bins="15x20", source=_KAR_SOURCE)
-# The paper is silent about iterations and batch size: 40,000 is the published training script's, 128 its default.
 # ResNet-18 starts from random weights in the published code; `pretrained` gives it ImageNet's.
 _ON_PASCAL: dict[str, Any] = {
     "encoder": "resnet18",
@@ -143,6 +142,7 @@ _ON_PASCAL: dict[str, Any] = {
     "lambda_adversarial": 0.01,
     "lambda_prior": 0.01,
 }
+# The paper is silent about iterations and batch size: 40,000 is the published training script's, 128 its default.
 _PASCAL = Preset(
     "Proposed",
     PoseInvariantSettings(**_ON_PASCAL),

@@ -42,8 +42,8 @@ class ReluConvEncoder(ConvEncoder):
 
 
 class LightConvEncoder(ConvEncoder):
-    """Half the channels, and a 1x1 convolution from 128 to 32 channels before the linear layers: 3.9 million weights,
-    not 19, and a quarter of the multiplications; no paper's.
+    """ConvEncoder with half the channels, and a 1x1 convolution to 32 channels before the linear layers: 3.9 million
+    weights, not 19, and a quarter of the multiplications; no paper's.
 
     Its convolutions start from He's initial weights: with torch's, images hardly change the codes of the first hundred
     steps, and all shapes may become one and stay so.
