@@ -84,7 +84,7 @@ NMR_INLINE void reached(T lo, T hi, int64_t size, int64_t& first, int64_t& last)
   last = std::min<int64_t>(size - 1, static_cast<int64_t>(to > -1 ? (to < n ? to : n) : T(-2)) + 1);
 }
 
-// Whether face f counts: finite, not wholly in front of `near` or behind `far`, and, without fill_back, seen from its
+// Whether face f counts: of more than one vertex, finite, not wholly in front of `near` or behind `far`, and, without fill_back, seen from its
 // front.
 template <class T>
 NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& face) {
@@ -100,7 +100,8 @@ NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& f
     beyond_near = beyond_near || v[2] > image.settings.near;
     before_far = before_far || v[2] < image.settings.far;
   }
-  if (!usable || !beyond_near || !before_far) return false;
+  const bool listed = face.corner[0] != face.corner[1] || face.corner[1] != face.corner[2];  // not the padding of a list
+  if (!listed || !usable || !beyond_near || !before_far) return false;
   T *x = face.x, *y = face.y;
   if ((y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0])) {  // clockwise
     if (!image.settings.fill_back) return false;

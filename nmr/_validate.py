@@ -69,7 +69,7 @@ def check_faces(faces: object, batch: int, device: torch.device, name: str = "fa
         )
     if faces.ndim not in (2, 3) or faces.shape[-1] != 3:
         raise ValueError(f"{name} must have shape [F, 3] or [B, F, 3], got {describe(faces)}")
-    if faces.ndim == 3 and faces.shape[0] == 1 and batch > 1:
+    if faces.ndim == 3 and faces.shape[0] == 1 and batch != 1:
         faces = faces[0]
     if faces.ndim == 3 and faces.shape[0] != batch:
         raise ValueError(
@@ -121,6 +121,8 @@ def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor,
                 raise TypeError(f"{wanted}; the list holds {describe(value)}")
             if value.ndim != ndim or value.shape[-1] != values[0].shape[-1] or value.dtype != values[0].dtype:
                 raise ValueError(f"{wanted}; the list holds {describe(values[0])} and {describe(value)}")
+            if value.shape[-1] == 0:
+                raise ValueError(f"{wanted}, with at least one channel; the list holds {describe(value)}")
         return values
     values = cast_under_autocast(values)
     if not isinstance(values, Tensor) or values.dtype not in _FLOATS:

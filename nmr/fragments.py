@@ -223,7 +223,7 @@ class Fragments:
         several lengths; the longest counts that lies in front of the eye as a whole.
         """
         with torch.no_grad():
-            batch, pixels = self.owner.shape[0], self.owner[0].numel()
+            batch, pixels = self.owner.shape[0], self.owner.shape[1:].numel()
             depth = torch.where(self.covered, self.depth, -1.0).reshape(batch, pixels)
             farthest = depth.argmax(1)
             images = torch.arange(batch, device=self.owner.device)
@@ -240,13 +240,13 @@ class Fragments:
             corners = torch.cat([world.new_zeros(1, 3), torch.eye(3, dtype=world.dtype, device=world.device)])
             lengths = 10.0 ** torch.arange(-1, -6, -1, dtype=world.dtype, device=world.device)
             steps = extent.view(-1, 1, 1, 1) * lengths.view(1, -1, 1, 1) * corners  # [B or 1, lengths, 4, 3]
-            probes = (point.unsqueeze(1) + steps).reshape(batch, -1, 3)
+            probes = (point.unsqueeze(1) + steps).flatten(1, 2)
             if self.mesh.starts is None:
                 seen = self.camera.transform(probes)
             else:
                 starts = probes.shape[1] * torch.arange(batch + 1, device="cpu").view(-1, 1).expand(-1, 2)
                 seen = self.camera.transform(probes.reshape(-1, 3), starts=starts.contiguous())
-            seen = seen.reshape(batch, -1, 4, 3)
+            seen = seen.reshape(batch, steps.shape[1], 4, 3)
             sides = seen[:, :, 1:] - seen[:, :, :1]
             a, b, c = sides.unbind(2)
             product = (torch.linalg.cross(a, b, dim=-1) * c).sum(-1)

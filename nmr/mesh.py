@@ -118,13 +118,14 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
     edges, edge_of_side, counts = torch.unique(sides, dim=0, return_inverse=True, return_counts=True)
     if open_mesh:
         wrong, wanted = counts > 2, "at most two faces"
-        remedy = "remove the extra faces, and faces that use a vertex twice"
     else:
         wrong, wanted = counts != 2, "exactly two faces (a closed mesh)"
-        remedy = "close the mesh first (for example with trimesh.repair.fill_holes) or pass open_mesh=True"
     bad = torch.nonzero(wrong | (edges[:, 0] == edges[:, 1])).flatten()
     if len(bad):
         v0, v1 = edges[bad[0]].tolist()
+        remedy = "close the mesh first (for example with trimesh.repair.fill_holes) or pass open_mesh=True"
+        if v0 == v1 or counts[bad[0]] > 2:
+            remedy = "remove the extra faces, and faces that use a vertex twice"
         raise ValueError(
             f"every edge must have two different vertices and {wanted}, but {len(bad)} of {len(edges)} edges do not: "
             f"edge ({v0}, {v1}) has {int(counts[bad[0]])}; {remedy}"
@@ -249,10 +250,13 @@ def _sides(faces: Tensor) -> Tensor:
 
 
 def _check_indices(indices: Tensor, num_vertices: int, name: str = "faces") -> None:
-    """Every index must lie in 0..V-1. (In a compiled graph values are unknown; there gathering raises the error.)"""
+    """Every index must lie in 0..V-1. (When compiled or under vmap values are unknown; there gathering raises it.)"""
     if torch.compiler.is_compiling() or indices.numel() == 0:
         return
-    low, high = (int(x) for x in indices.aminmax())
+    try:
+        low, high = (int(x) for x in indices.aminmax())
+    except RuntimeError:  # inside torch.func.vmap values cannot be read
+        return
     if low < 0 or high >= num_vertices:
         raise ValueError(
             f"{name} refer to vertex {low if low < 0 else high}, "

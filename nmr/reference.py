@@ -278,7 +278,10 @@ def soft_silhouette(
     points = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
     units = torch.tensor([width / shorter, height / shorter], dtype=vertices.dtype)
     clear = torch.ones(height, width).to(vertices)
-    for corners in vertices[faces]:
+    for face in faces:
+        corners = vertices[face]
+        if len(face.unique()) == 1:
+            continue
         z, corners = corners[:, 2], corners[:, :2] * units
         if not corners.isfinite().all() or (z <= near).all() or (z >= far).all():
             continue

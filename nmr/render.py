@@ -94,7 +94,10 @@ def render(
         behind = background_rows(background, 3, scene.mesh.batch, scene.mesh.vertices)
         white = not behind.requires_grad and _finite(behind)  # rgb then follows from alpha
     if gradient == "local" and "rgb" in images and not white:
-        raise ValueError("gradient 'local' is that of silhouettes: render rgb by itself, or with gradient 'nmr'")
+        raise ValueError(
+            "gradient 'local' is that of silhouettes and of white meshes on a finite background without gradient; draw "
+            "other rgb images with gradient 'nmr'"
+        )
     if white or ("alpha" in images and "rgb" not in images):
         alpha, owner = scene.silhouette(anti_aliasing, fill_back, near, far, eps, gradient == "local")
         if "alpha" in images:

@@ -25,9 +25,9 @@ def voxelize(
       both. This is a separating axis test of triangle and cube; cells are enlarged by 1e-9 on each side, so that the
       result does not depend on rounding.
 
-    For a mesh within the grid, kato19 contains kato18. The results differ in few cells, because a surface seldom passes
-    through a cell without crossing one of its edges. The exception are faces in the planes between cells: kato18 marks
-    only the cells on the upper side, so it leaves out a face at coordinate 1.
+    For a mesh within the grid, kato19 contains kato18, but for float32 rounding of the rays. The results differ in few
+    cells, because a surface seldom passes through a cell without crossing one of its edges. The exception are faces in
+    the planes between cells: kato18 marks only the cells on the upper side, so it leaves out a face at coordinate 1.
 
     Parameters
     ----------

@@ -48,7 +48,10 @@ def _plain(camera: ProjectingCamera, height: float, width: float) -> Projection:
     """The camera for an image of this shape."""
     if not isinstance(camera, ProjectingCamera):
         raise TypeError(f"camera must be one of nmr's (nmr.cameras.ProjectingCamera), got {describe(camera)}")
-    return camera.for_image(height, width).projection().plain()
+    plain = camera.for_image(height, width).projection().plain()
+    expanded = (None if x is None else x.expand(plain.batch, *x.shape[1:]) for x in plain.parameters())
+    matrix, intrinsics, distortion, *_ = expanded
+    return Projection(matrix, intrinsics, distortion, plain.perspective)
 
 
 def _without_distortion(camera: ProjectingCamera, target: str, height: float, width: float) -> Projection:

@@ -60,7 +60,10 @@ def _scalar(value: Scalars, name: str, low: float, high: float, wanted: str) -> 
         inside = low < value < high  # no tensor: torch.compile could not read its value
     else:
         value = as_parameter(value, name)
-        inside = ((low < value) & (value < high)).all()
+        try:
+            inside = torch.compiler.is_compiling() or bool(((low < value) & (value < high)).all())
+        except RuntimeError:  # inside torch.func.vmap values cannot be read
+            inside = True
     if not inside:
         raise ValueError(f"{name} must lie {wanted}, got {value}")
     return value

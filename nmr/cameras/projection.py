@@ -66,7 +66,8 @@ class ProjectingCamera:
         Notes
         -----
         Differentiable in the vertices and in the camera's parameters; there are no second derivatives. Results do not
-        depend on the number of threads or on the batch. Gradients are NaN only where the upstream gradient is NaN.
+        depend on the number of threads or on the batch. Gradients are NaN only where the upstream gradient is not
+        finite.
 
         Raises
         ------
@@ -132,6 +133,8 @@ class Projection(ProjectingCamera):
             if not isinstance(value, Tensor) or value.ndim != len(shape) + 1 or value.shape[1:] != shape:
                 wanted = ", ".join(["B", *map(str, shape)])
                 raise ValueError(f"{name} must be a tensor of shape [{wanted}], got {describe(value)}")
+            if not value.is_floating_point():
+                object.__setattr__(self, name, value.double())
         _ = self.batch
 
     @property

@@ -7,6 +7,7 @@ import numbers
 import torch
 from torch import Tensor
 
+from .._validate import as_numbers
 from ..cameras import points_from_angles
 from ._convert import Numbers
 
@@ -23,6 +24,7 @@ def get_points_from_angles(
     """
     given = (distance, elevation, azimuth)
     dtype = next((x.dtype for x in given if isinstance(x, Tensor) and x.is_floating_point()), torch.float64)
-    d, e, a = (torch.as_tensor(x, dtype=dtype) for x in given)
+    names = ("distance", "elevation", "azimuth")
+    d, e, a = (as_numbers(x, name, "a number or [B]").to(dtype) for x, name in zip(given, names, strict=True))
     points = points_from_angles(d, e, a) if degrees else points_from_angles(d, torch.rad2deg(e), torch.rad2deg(a))
     return tuple(points.tolist()) if all(isinstance(x, numbers.Real) for x in given) else points

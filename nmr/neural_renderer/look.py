@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
+from .._validate import as_numbers
 from ..cameras import Orthographic
 from ._convert import Numbers, check_batch
 
 
 def orthographic_look(eye: Numbers, direction: Numbers, up: Numbers) -> Orthographic:
     """The camera at ``eye`` that looks along ``direction``, without perspective."""
-    eye, direction = (torch.as_tensor(x).double() for x in (eye, direction))
+    eye, direction = (
+        as_numbers(x, name, "[3] or [B, 3]").double() for x, name in ((eye, "eye"), (direction, "direction"))
+    )
     return Orthographic(eye, eye + direction, up)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._validate import as_numbers
 from ..cameras import Pinhole
 from ._convert import Numbers, check_batch
 
@@ -46,7 +47,7 @@ def projection(
 
     >>> nr.projection(vertices, K, R, t, None, 256)
     """
-    K = torch.as_tensor(K)
+    K = as_numbers(K, "K", "[3, 3] or [B, 3, 3]")
     if isinstance(orig_size, np.ndarray) and orig_size.shape == (2,) and (K.ndim == 2 or len(K) == 1):
         orig_size = orig_size.tolist()  # a pair
     if isinstance(orig_size, (Tensor, np.ndarray)):

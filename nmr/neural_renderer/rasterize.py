@@ -38,6 +38,8 @@ class _Cubes:
             return colors
         if self.light.shape[0] not in (1, batch):
             raise ValueError(f"light for {self.light.shape[0]} images, but {batch} are drawn; give [3] or [{batch}, 3]")
+        if colors.shape[-1] not in (1, 3):
+            raise ValueError(f"light has three colours: textures must have 1 or 3 channels, got {colors.shape[-1]}")
         # Faces seen from behind have numbers and lights of their own. For this operator they are further faces; the
         # three corners of a face have the same value.
         corners = torch.arange(self.light.shape[1], device=owner.device)[:, None].expand(-1, 3)

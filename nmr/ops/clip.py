@@ -11,7 +11,7 @@ from ._register import operator
 def clip_count(vertices: Tensor, faces: Tensor, starts: Tensor | None, near: float) -> Tensor:
     """Room that the clipped meshes need: int64 ``[B, 2]`` in host memory, new vertices and drawn faces.
 
-    A mesh that is not cut has no new vertices.
+    A mesh that is not cut has no new vertices. All zeros where no vertex lies behind the plane.
     """
     counts = torch.zeros((batch_size(vertices, starts), 2), dtype=torch.int64, device="cpu")
     arrays = host_array(vertices), host_array(faces), host_array(starts)

@@ -65,6 +65,15 @@ def test_opencv_pixels(count, column):
     np.testing.assert_allclose(pixels(camera, points()), opencv_pixels(points(), K, rotation(1), T, d), atol=1e-10)
 
 
+def test_every_result_has_a_row_for_each_camera():
+    eyes = nmr.LookAt([[0.0, 0.0, -3.0], [1.0, 0.0, -3.0]])
+    opencv = nmr.cameras.to_opencv(eyes, height=64, width=48)
+    opengl = nmr.cameras.to_opengl(eyes, near=0.1, far=9.0)
+    pytorch3d = nmr.cameras.to_pytorch3d(eyes).values()
+    found = [len(x) for x in (*opencv, *opengl, *pytorch3d) if isinstance(x, torch.Tensor)]
+    assert set(found) == {2} and len(found) > 7
+
+
 def test_opencv_images_that_are_not_square_are_stretched():
     camera = cameras.from_opencv(K, rotation(1), T, height=SIZE, width=2 * SIZE)
     u, v, _ = opencv_pixels(points(), K, rotation(1), T, np.zeros(5)).T

@@ -282,6 +282,22 @@ def test_compile():
     torch.testing.assert_close(torch.autograd.grad(compiled(points), eye)[0], wanted)
 
 
+def test_fields_of_view_and_scales_under_vmap():
+    points, values = torch.rand(1, 5, 3), torch.tensor([20.0, 30.0])
+    for make in (
+        lambda x: nmr.LookAt([0.0, 0.0, -3.0], half_fov_deg=x),
+        lambda x: nmr.Orthographic([0.0, 0.0, -3.0], scale=x),
+    ):
+        many = torch.func.vmap(lambda x, make=make: make(x).transform(points))(values)
+        assert torch.equal(many, torch.stack([make(x).transform(points) for x in values]))
+
+
+def test_whole_numbers_are_a_camera_too():
+    numbers = torch.tensor([[[2, 0, 0, 0], [0, -2, 0, 0], [0, 0, 2, 3]]]), torch.tensor([[[1, 0, 0], [0, -1, 0]]])
+    camera = nmr.cameras.Projection(*numbers)
+    assert camera.matrix.dtype == camera.intrinsics.dtype == torch.float64
+
+
 # --- vertices and cameras without an image
 
 

@@ -68,8 +68,10 @@ def test_edge_table_of_an_open_mesh_holds_the_inner_edges():
 
 def test_edge_table_refuses_faces_that_name_a_vertex_twice():
     tetrahedron = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2], [0, 0, 1], [0, 0, 1]])
-    with pytest.raises(ValueError, match=r"exactly two faces.*edge \(0, 0\) has 2"):
+    with pytest.raises(ValueError, match=r"exactly two faces.*edge \(0, 0\) has 2; remove the extra faces"):
         nmr.edge_table(tetrahedron)
+    with pytest.raises(ValueError, match="close the mesh first"):
+        nmr.edge_table(tetrahedron[:3])
 
 
 def test_unique_edges():

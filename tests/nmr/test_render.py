@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -438,6 +439,9 @@ def test_empty_batches_and_meshes(batch, num_vertices, num_faces):
     (images.rgb.sum() + images.alpha.sum() + images.depth.sum() + images.normals.sum()).backward()
     assert images.rgb.shape == (batch, 8, 8, 3) and not images.rgb.any() and (images.depth == 9).all()
     assert images.fragments.face_index.shape == (batch, 16, 16) and not vertices.grad.any()
+    if num_faces:
+        own = SimpleNamespace(transform=camera.transform)
+        assert nmr.render_normals(vertices, faces[None], own, image_size=8).shape == (batch, 8, 8, 3)
 
 
 @pytest.mark.parametrize("smooth", [False, True])

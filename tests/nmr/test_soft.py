@@ -39,6 +39,30 @@ def test_equals_the_slow_definition(image_size, sigma, fill_back):
     assert (single_grad - grad).norm() < 1e-3 * grad.norm()
 
 
+def test_vmap_gives_the_same_bits():
+    sphere, faces = nmr.icosphere(1)
+    many = torch.stack([0.5 * sphere, 0.4 * sphere + 0.1])
+    camera = nmr.LookAt([0.0, 0.0, -3.0])
+
+    def draw(vertices):
+        return nmr.render_soft_silhouette(vertices, faces, camera, sigma=1e-3, image_size=32)[0]
+
+    def loss(vertices):
+        return draw(vertices).square().sum()
+
+    assert torch.equal(torch.func.vmap(draw)(many), torch.stack([draw(mesh) for mesh in many]))
+    wanted = torch.stack([torch.func.grad(loss)(mesh) for mesh in many])
+    assert torch.equal(torch.func.vmap(torch.func.grad(loss))(many), wanted)
+
+
+def test_a_face_of_one_vertex_is_none():
+    vertices, faces = soup(2)
+    more = torch.cat([faces, torch.zeros(5, 3, dtype=torch.int64)])
+    images = [nmr.render_soft_silhouette(vertices, f, sigma=0.1, image_size=16)[0] for f in (faces, more)]
+    assert torch.equal(*images)
+    torch.testing.assert_close(images[1], reference.soft_silhouette(vertices, more, 16, sigma=0.1))
+
+
 @pytest.mark.parametrize("anti_aliasing", [False, True])
 def test_gradients_are_the_derivative(anti_aliasing):
     vertices, faces = soup(1)

@@ -141,3 +141,17 @@ def test_gradients_are_derivatives(dtype):
 def test_errors(call, error, message):
     with pytest.raises(error, match=message):
         call(torch.rand(2, 6, 3))
+
+
+def test_gradients_reach_tensors_inside_lists():
+    x = torch.tensor(0.3, requires_grad=True)
+    vertices = torch.rand(1, 4, 3)
+    K = [[x, 0.0, 32.0], [0.0, 30.0, 32.0], [0.0, 0.0, 1.0]]
+    pose = torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]])
+    for made in (
+        nr.projection(vertices, K, *pose, None, 64),
+        nr.look(vertices, [x, 0.0, -3.0], [0.0, 0.0, 1.0]),
+        nr.get_points_from_angles(2.7, [x, 2.0], [1.0, 2.0]),
+    ):
+        (grad,) = torch.autograd.grad(made.sum(), x)
+        assert grad != 0
