@@ -21,7 +21,7 @@ from learn3d.settings import Count, FilePath, Items, Step, checked
 
 DEFAULT_PRESET = "plus-kato"
 
-_FROM_PRESET = ("settings", "layout", "view_bins", "sampling", "augment", "iterations", "batch_size", "schedule")
+_FROM_PRESET = ("settings", "layout", "sampling", "augment", "iterations", "batch_size", "schedule")
 _FROM_PRESET += ("warmup_steps", "average")  # options that the preset decides where they are None
 
 
@@ -49,8 +49,8 @@ class TrainConfig:
     layout: Layout | None = None
     """Layout of the data set. None: the preset's."""
     view_bins: str | None = None
-    """Pose classes as cells of azimuth and elevation in degrees, such as 15x20. None: the preset's, which for data sets
-    of fixed views are these views."""
+    """Pose classes as cells of azimuth and elevation in degrees, such as 15x20. None: the layout's own, 15x20
+    for kar; where cameras are fixed, one class for each."""
     views_per_object: Count | None = None
     """Train on so many views of every object (kar, r2n2: the first; else drawn at random, the same in every run). None:
     what the layout's protocol uses, one for Kar's, else all."""
@@ -112,8 +112,8 @@ class TrainConfig:
             raise ValueError(f"the layout {self.layout!r} has no split val; validate on test (val_split test)")
         if "flip" in self.augment and getattr(self.settings, "reads_view_ids", False):
             raise ValueError(
-                "augment 'flip' moves the camera into another view class, but the discriminator of "
-                f"{self.preset!r} is told the class of the original; leave 'flip' out"
+                "augment 'flip' moves the camera into another view class, but "
+                f"{self.preset!r} learns with the class of the original; leave 'flip' out"
             )
         if self.sampling == "pairs" and self.batch_size % 2:
             raise ValueError(
@@ -195,7 +195,9 @@ def _what_depends_on_iterations(config: TrainConfig) -> str | None:
     """What makes every step depend on the number of steps of the whole run."""
     if config.schedule != "constant":
         return f"the schedule {config.schedule}"
-    return None if getattr(config.settings, "lambda_smooth_end", None) is None else "lambda_smooth_end"
+    settings = config.settings
+    falls = getattr(settings, "lambda_smooth_end", None) is not None and settings.lambda_smooth > 0
+    return "lambda_smooth_end" if falls else None
 
 
 def check_resume(config: TrainConfig, saved: TrainConfig) -> None:

@@ -66,7 +66,8 @@ class Evaluation:
     @property
     def undefined(self) -> int:
         """Images whose prediction and truth are both empty; they are left out of the mean."""
-        return int(next(iter(self.ious.values())).isnan().sum()) if self.ious else 0
+        ious = next(iter(self.ious.values())) if self.ious else self.silhouette_iou
+        return 0 if ious is None else int(ious.isnan().sum())
 
     @property
     def without_distance(self) -> int | None:

@@ -34,7 +34,6 @@ class Preset:
     schedule: Schedule = "constant"  # of the step size
     warmup_steps: int = 0  # in which it grows to its full size
     average: float = 0.0  # decay of the average of the weights, 0: there is none
-    view_bins: str | None = None  # cells of azimuth and elevation, None: the data set's own view classes
 
 
 #: Short names of the methods, accepted wherever a preset is: those on Kato's data.
@@ -105,7 +104,7 @@ _PASCAL_VPL = VPLSettings(
 def _vpl_on_kar(label: str, iterations: int, detail: str, **changes: float | bool) -> Preset:
     settings, source = replace(_KAR_VPL, **changes), f"{_VPL_CODE}: train_shapenet.sh, {detail}"
     augment = ("flip", "channels")
-    return Preset(label, settings, "kar", iterations, 64, source, "classes", augment, view_bins="15x20")
+    return Preset(label, settings, "kar", iterations, 64, source, "classes", augment)
 
 
 def _vpl_on_pascal(label: str, iterations: int, detail: str, **changes: float) -> Preset:
@@ -134,7 +133,7 @@ def _vanilla(preset: Preset, source: str) -> Preset:
 
 _KATO = Preset("Proposed", PoseInvariantSettings(), "kato", 20_000, 128, f"{_PAPER}; losses: {_CODE}")
 _KAR_SOURCE = f"{_PAPER}: one image per object, K = 72; losses: {_CODE}"
-_KAR = replace(_KATO, layout="kar", view_bins="15x20", source=_KAR_SOURCE)
+_KAR = replace(_KATO, layout="kar", source=_KAR_SOURCE)
 # ResNet-18 starts from random weights in the published code; `pretrained` gives it ImageNet's.
 _ON_PASCAL: dict[str, Any] = {
     "encoder": "resnet18",
@@ -182,7 +181,7 @@ PRESETS: dict[str, Preset] = {
     "plus-kato": _PLUS,
     "peng2020-kar": _KAR,
     "peng2020-kar-vanilla": _vanilla(_KAR, f"{_PAPER}: the baseline on the same images"),
-    "plus-kar": replace(_PLUS, layout="kar", view_bins="15x20"),
+    "plus-kar": replace(_PLUS, layout="kar"),
     "plus-pascal": replace(  # it flips images itself
         _PLUS, settings=PlusSettings(**_ON_PASCAL), layout="pascal3d", iterations=160_000, augment=("crop", "colors")
     ),

@@ -35,8 +35,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
     """Train one model and leave everything in `config.output`.
 
     What the folder holds afterwards is listed in `runs.folder`. SIGINT, SIGTERM and SIGHUP end the current step, save
-    and return. With `resume` the run continues from its last checkpoint, bit for bit (same machine, device and numbers
-    of threads and processes), or from the start if it was stopped before its first one. A finished run stays as it is.
+    and return. With `resume` the run continues from its last checkpoint (bit for bit on a CPU: same machine, numbers of
+    threads and processes), or from the start if it was stopped before its first one. A finished run stays as it is.
 
     Several processes, each with its `ranks`, train one model together (`parallel.ranks`); the first one writes.
 
@@ -65,6 +65,9 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
         precision = resolve_precision(config.precision, config.device)
         how = {"device": config.device, "precision": precision, "seed": config.seed, "plan": config.plan}
         method = create_method(config.settings, shape, **how)
+        sample = functools.partial(sample_indices, train_set, config.sampling, config.batch_size, config.seed)
+        first = train_set.batch(sample(1), ranks.rows, voxels=False)
+        method.check_batch(augment(first, config.augment, config.seed, 1))  # before an older run is cleared away
         run = Run(config, method, shape, conditions_of(train_set, precision), ranks)
         progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:  # also after a kill between the last save and the end
@@ -77,7 +80,6 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
             log.say(_describe(config, precision, train_set, val_set, progress, ranks))
             if getattr(config.settings, "symmetry", None) == "auto":
                 log.say(_about_plane(shape.mirror_plane_deg))
-            sample = functools.partial(sample_indices, train_set, config.sampling, config.batch_size, config.seed)
             indices = sample(progress.step + 1)
             for step in range(progress.step + 1, config.iterations + 1):
                 batch = train_set.batch(indices, ranks.rows, voxels=False)

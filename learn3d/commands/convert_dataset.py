@@ -45,12 +45,16 @@ def run(arguments: Sequence[str]) -> int:
     """Convert each category and split; one that is complete already is left as it is."""
     command = parse(Command, arguments, name="convert-dataset", about=__doc__)
     check_target(command.output, "--output", folder=True)
-    there = READERS[command.layout].contents(command.data)
-    wanted = names(command.category) or tuple(there)
+    found = READERS[command.layout].contents(command.data)
+    there = {synset_of(category): splits for category, splits in found.items()}
+    wanted = names(command.category) or tuple(found)
     if not wanted:
         raise ValueError(f"{command.data} holds nothing of the layout {command.layout!r}")
     for category in wanted:
-        for split in there.get(category) or there.get(synset_of(category)) or ("train",):
+        splits = there.get(synset_of(category), ("train",))
+        if command.layout == "pascal3d" and "val" in splits:
+            splits = (*splits, "test")  # the same photographs, which evaluation asks for by this name
+        for split in splits:
             _convert(command, category, split)
     return 0
 

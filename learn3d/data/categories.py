@@ -17,6 +17,7 @@ SYNSETS = {
     "telephone": "04401088",
     "vessel": "04530566",
 }
+_OTHER_NAMES = {"aeroplane": "airplane"}  # what Pascal3D+ says
 
 
 def synset_of(category: str) -> str:
@@ -28,4 +29,4 @@ def synset_of(category: str) -> str:
         raise ValueError(f"category must be a plain name such as 'chair' or a synset id, got {category!r}")
     if not category.isprintable():
         raise ValueError(f"category must be a plain name, without control characters, got {category!r}")
-    return SYNSETS.get(category, category)
+    return SYNSETS.get(_OTHER_NAMES.get(category, category), category)

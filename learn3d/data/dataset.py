@@ -169,11 +169,7 @@ class ViewDataset:
 
     def check_masks(self) -> str:
         """What to warn of where some images show nothing; "" for none. Raises ValueError where all of them do."""
-        if self.sides is not None:
-            empty = int((self.sides == 0).sum())
-        else:
-            masks = self.images[:, 3] if self.masks is None else self.masks
-            empty = len(masks) - int(masks.any(axis=(1, 2)).sum())
+        empty = int((self.object_sides() == 0).sum())
         if empty == len(self):
             raise ValueError(
                 f"all {empty} {self.split} images of {self.category} have an empty mask, so that there is nothing to "

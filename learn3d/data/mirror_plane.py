@@ -16,7 +16,8 @@ from learn3d.data.poses import LookAtPoses
 SECTOR_DEG = 15.0  # width of the sectors of azimuth whose masks are averaged; planes are found to half of it
 _SECTORS = round(360 / SECTOR_DEG)
 _ENOUGH, _MOST = 4, 2048  # images that a sector must have to be compared, and that are looked at
-_COMPARED = _SECTORS // 2  # sectors that must be compared
+_COMPARED = _SECTORS // 2  # sectors that must be compared, or all where cameras stand at fewer azimuths
+_PLANES = 6  # planes that must be compared, and one for every sector with images
 _CLEAR = 0.1  # how much smaller than the median over all planes the difference at the mirror plane must be
 
 
@@ -26,8 +27,9 @@ def find_mirror_plane(dataset: ViewDataset) -> float | None:
     For each plane p the squared difference of mean masks of sectors v and 2 p - v is summed over pixels and sectors.
     What the difference of two means of so many masks has by chance is subtracted. A plane is found where the smallest
     of the 24 sums is below a tenth of their median. (Bodies of revolution look the same at every plane; any will do.)
-    Where half of the sectors cannot be compared, because they or their mirror images have fewer than four images,
-    nothing is found: some 150 images from all around are needed.
+    Cameras that stand at n < 24 azimuths, at equal distances, show n planes, at least 6. A sector is compared if it and
+    its mirror image have four images; where that leaves too few sectors or planes, nothing is found: of random azimuths
+    some 150 images are needed.
 
     Raises ValueError where poses are not known, or not given by azimuth and elevation.
     """
@@ -47,15 +49,18 @@ def find_mirror_plane(dataset: ViewDataset) -> float | None:
         seen = dataset.mask_pixels(samples[some]) / np.float32(255)
         means[sector], known[sector] = seen.mean(axis=0), True
         noise[sector] = seen.var(axis=0).sum() / (len(seen) - 1)
-    differences = np.zeros(_SECTORS)
+    differences = np.full(_SECTORS, np.inf)
     for plane in range(_SECTORS):  # at plane * SECTOR_DEG / 2
         other = (plane - np.arange(_SECTORS)) % _SECTORS
         compared = known & known[other]
-        if compared.sum() < _COMPARED:
-            return None
+        if compared.sum() < max(1, min(_COMPARED, known.sum())):
+            continue
         moved = other != np.arange(_SECTORS)  # a sector that is its own mirror image has one mean, and less noise
         squares = np.square(means - means[other][..., ::-1]).sum(axis=(1, 2))
         differences[plane] = np.mean((squares - np.where(moved, noise + noise[other], 2 * noise))[compared])
+    seen = np.isfinite(differences)
+    if seen.sum() < max(_PLANES, known.sum()):
+        return None
     best = int(differences.argmin())
-    clear = differences[best] < _CLEAR * np.median(differences)
+    clear = differences[best] < _CLEAR * np.median(differences[seen])
     return best * SECTOR_DEG / 2 if clear else None

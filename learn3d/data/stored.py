@@ -123,7 +123,9 @@ class StoredArray:
     def _read(self, rows: np.ndarray) -> np.ndarray:
         rows = self._numbers(rows)
         out = np.empty((len(rows), *self.row), self.dtype)
-        size = out[0].nbytes if len(out) else 0
+        if not len(out):
+            return out
+        size = out[0].nbytes
         bytes_of_rows = out.reshape(len(rows), -1).view(np.uint8)
         file_of = np.searchsorted(self.starts, rows, side="right") - 1
         order = np.argsort(rows, kind="stable")

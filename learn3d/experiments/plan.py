@@ -126,11 +126,13 @@ def _configure(
     changes = dict(variant.changes) | given
     setting_names = {field.name for field in dataclasses.fields(preset.settings)}
     parts = variant.smaller_batches
-    whole = PRESETS["peng2020-kato"] if parts > 1 else preset
+    whole = PRESETS[variant.whole or variant.preset]
     iterations = (options.iterations or whole.iterations) * parts
     batch_size = options.batch_size or whole.batch_size
     if batch_size % parts:
         raise ValueError(f"{variant.name} divides batches by {parts}: batch_size must be a multiple, got {batch_size}")
+    if "warmup_steps" in changes:  # no more than a preset's own
+        changes["warmup_steps"] = min(changes["warmup_steps"], iterations // 10)
     # PrGAN's encoder is trained in the second half, however long it is.
     settings = {"encoder_from_step": iterations // 2 + 1} if "encoder_from_step" in setting_names else {}
     settings |= {name: value for name, value in changes.items() if name in setting_names}

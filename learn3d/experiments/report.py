@@ -137,10 +137,21 @@ def _resampled(metric: str, ours: list[dict[int, dict]]) -> np.ndarray:
     """Means over resampled objects [2000]; the IoUs of an object are those of all seeds together."""
     sums, counts = [], []
     for results in ours:
+        _check_objects(results)
         found = [object_sums(record, metric) for record in results.values()]
         sums.append(sum(s for s, _ in found))
         counts.append(sum(n for _, n in found))
     return resampled_means(sums, counts)
+
+
+def _check_objects(results: dict[int, dict]) -> None:
+    """Raise ValueError where seeds of a row were measured on different objects."""
+    if any(record["objects"]["names"] != _names(results) for record in results.values()):
+        raise ValueError(
+            "these runs were measured on different test objects, so that they have no mean: "
+            + "; ".join(f"seed {seed}: {record['command']}" for seed, record in results.items())
+            + ". Were the data made anew in between? Choose another --output, or --overwrite"
+        )
 
 
 def _names(results: dict[int, dict]) -> list[str]:

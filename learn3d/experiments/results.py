@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, Field, ValidationError
 
-from learn3d.config import config_to_dict, differences, load_config
+from learn3d.config import config_from_dict, config_to_dict, differences, load_config
 from learn3d.evaluation import evaluate
 from learn3d.experiments.plan import Run, command_line
 from learn3d.files import limits, writing
@@ -139,9 +139,12 @@ def _is_current(run: Run, result: dict[str, Any]) -> bool:
 
 def conflicts_with(run: Run) -> str:
     """In what the run in the folder differs from the one that is planned, as a sentence; "" where it can go on."""
-    if not (run.folder / CONFIG).is_file():
+    if (run.folder / CONFIG).is_file():
+        saved = load_config(run.folder / CONFIG)
+    elif (path := run.folder / RESULT_FILE).is_file():
+        saved = config_from_dict(read_result(path)["config"], str(path))
+    else:
         return ""
-    saved = load_config(run.folder / CONFIG)
     changed = differences(run.config, saved)
     if run.variant.checkpoint == "best" and run.config.val_split != saved.val_split:
         changed.append(

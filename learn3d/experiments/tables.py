@@ -25,6 +25,7 @@ class Variant:
     changes: Mapping[str, Any] = field(default_factory=dict)  # by name of a method's setting or a training option
     checkpoint: Literal["last", "best"] = "last"  # which networks are tested: final, or best on the validation split
     smaller_batches: int = 1  # batches divided by this and steps multiplied by it, so that the images are as many
+    whole: str = ""  # the preset whose batches and steps these are; "": its own
 
 
 @dataclass(frozen=True)
@@ -57,10 +58,17 @@ class Table:
 
 
 _BATCHES = 4  # Plus learns from a quarter of the images a step, in four times the steps
-PROPOSED, PLUS, VANILLA, MULTI_VIEW, VPL, PRGAN = (
-    Variant(name, METHODS[name], smaller_batches=_BATCHES if name == "plus" else 1)
-    for name in ("proposed", "plus", "vanilla", "multi-view", "vpl", "prgan")
+
+
+def _plus(name: str, data: str, changes: Mapping[str, Any] | None = None, **options: Any) -> Variant:
+    """Plus on the images that the paper's preset for these data sees."""
+    return Variant(name, f"plus-{data}", changes or {}, smaller_batches=_BATCHES, whole=f"peng2020-{data}", **options)
+
+
+PROPOSED, VANILLA, MULTI_VIEW, VPL, PRGAN = (
+    Variant(name, METHODS[name]) for name in ("proposed", "vanilla", "multi-view", "vpl", "prgan")
 )
+PLUS = _plus("plus", "kato")
 
 _NO_PRIOR = Variant("without-prior", "peng2020-kato", {"lambda_prior": 0.0})
 #: Without the confusion loss the discriminator has no effect on the encoder, so its own loss is off, too.
@@ -78,11 +86,11 @@ def _bins(widths: str) -> Variant:
 
 _KAR_VANILLA = Variant("kar-vanilla", "peng2020-kar-vanilla", checkpoint="best")
 _KAR_VPL = Variant("kar-vpl", "kato2019-kar", checkpoint="best")
-_KAR_PLUS = Variant("kar-plus", "plus-kar", checkpoint="best", smaller_batches=_BATCHES)
+_KAR_PLUS = _plus("kar-plus", "kar", checkpoint="best")
 _PASCAL_PROPOSED = Variant("pascal-proposed", "peng2020-pascal", checkpoint="best")
 _PASCAL_BASELINE = Variant("pascal-baseline", "peng2020-pascal-vanilla", checkpoint="best")
 _PASCAL_VPL = Variant("pascal-vpl", "kato2019-pascal")
-_PASCAL_PLUS = Variant("pascal-plus", "plus-pascal", checkpoint="best", smaller_batches=_BATCHES)
+_PASCAL_PLUS = _plus("pascal-plus", "pascal", checkpoint="best")
 
 #: What Plus has and any method can have: its step sizes, its average of the weights, its symmetry.
 _OF_PLUS = PlusSettings()
@@ -95,12 +103,12 @@ _SHARED = _SCHEDULE | _SYMMETRY
 _SHARED |= {name: getattr(_OF_PLUS, name) for name in ("encoder", "lambda_smooth", "lambda_smooth_end")}
 _PROPOSED_SHARED = Variant("proposed-shared", "peng2020-kato", _SHARED, smaller_batches=_BATCHES)
 _VANILLA_SHARED = Variant("vanilla-shared", "peng2020-kato-vanilla", _SHARED, smaller_batches=_BATCHES)
-_PLUS_FREE = Variant("plus-without-symmetry", "plus-kato", {"symmetry": None}, smaller_batches=_BATCHES)
-_PLUS_SEEN = Variant("plus-without-unseen", "plus-kato", {"lambda_unseen": 0.0}, smaller_batches=_BATCHES)
+_PLUS_FREE = _plus("plus-without-symmetry", "kato", {"symmetry": None})
+_PLUS_SEEN = _plus("plus-without-unseen", "kato", {"lambda_unseen": 0.0})
 _ONE_VIEW = {"views_per_object": 1}
 _SINGLE_VANILLA = Variant("single-vanilla", "peng2020-kato-vanilla", _ONE_VIEW)
 _SINGLE_PROPOSED = Variant("single-proposed", "peng2020-kato", _ONE_VIEW)
-_SINGLE_PLUS = Variant("single-plus", "plus-kato", _ONE_VIEW, smaller_batches=_BATCHES)
+_SINGLE_PLUS = _plus("single-plus", "kato", _ONE_VIEW)
 
 _THREE = ("airplane", "car", "chair")
 

@@ -109,10 +109,13 @@ class Method(abc.ABC):
         `learn3d.networks.resnet.load_pretrained`.
         """
 
+    def check_batch(self, batch: Batch) -> None:  # noqa: B027
+        """Raise ValueError where the method cannot learn from batches like this one. Called before a run begins."""
+
     def train_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Take optimisation step `step` (from 1) and return every loss that was computed, unweighted, and "total".
 
-        Raises FloatingPointError, before stepping, when a loss is not finite.
+        Raises FloatingPointError when a loss is not finite, before it reaches a weight.
         """
         factor = self.plan.factor(step)
         for name, optimizer in self.optimizers.items():

@@ -55,6 +55,9 @@ class MultiView(MeshMethod):
             optimizers["centroid"] = SparseGradientAdam(slow, lr=CENTROID_LEARNING_RATE * rate)
         return optimizers
 
+    def check_batch(self, batch: Batch) -> None:
+        check_pairs(batch)
+
     @property
     def weights(self) -> dict[str, float]:
         return {"projection": 1.0, "smoothness": self.settings.lambda_smooth}

@@ -143,7 +143,7 @@ class Plus(PoseInvariant):
             return {}
         silhouettes = self.render(vertices, views.poses[torch.full((len(vertices),), seen_by)])
         drawn = self.ranks.join_rows(_reduced(silhouettes), views.rows, len(views))
-        real = self.memory.of_view(int(views.view_ids[seen_by]))
+        real = self.memory.of_view(int(views.view_ids[seen_by])).to(drawn.device)
         return {"unseen": silhouette_energy_distance(drawn, real)}
 
 

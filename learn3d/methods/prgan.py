@@ -208,7 +208,8 @@ def statistics_loss(of_real: Tensor, of_fake: Tensor, ranks: Ranks = ALONE) -> T
 
 
 def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
-    """Raise a ValueError unless every camera is that of its view class, to half a degree and half a percent.
+    """Raise a ValueError unless every camera is that of its view class: angles to half a degree, the distance to
+    half a percent, half the field of view to a tenth of a degree.
 
     PrGAN needs a table of views to draw from. Data with continuous viewpoints have none; the means of their classes
     would be one, but then no image would be seen from where its class says.

@@ -17,7 +17,7 @@ CODE_STEPS = 40
 CODE_STEP_SIZE = 0.1  # of Adam, in units of the root mean square of the codes' entries
 VERTEX_STEPS = 40
 VERTEX_STEP_SIZE = 0.002  # of Adam, in units of the object frame
-SMOOTHNESS = 0.001  # weight of the smoothness loss, that of the methods
+SMOOTHNESS = 0.001  # weight of the smoothness loss, that of the proposed method
 
 
 def refine(
@@ -31,7 +31,7 @@ def refine(
 ) -> Meshes:
     """Meshes of stored images uint8 [B,4,S,S], fitted to masks float32 [B,64,64] that the B cameras of `poses` see.
 
-    Both parts minimise soft IoU loss + 0.001 smoothness, as training does: over the codes, so that shapes stay among
+    Both parts minimise soft IoU loss + 0.001 smoothness: over the codes, so that shapes stay among
     those that the generator knows, then over the vertices. Symmetric shapes stay symmetric.
     """
 

@@ -38,8 +38,8 @@ class Grids:
 def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> tuple[Tensor, Tensor]:
     """Marching cubes: the surface of a grid [s, s, s] with axes (x, y, z) over the cube [-box/2, box/2].
 
-    Returns vertices float32 [V, 3] in the object frame and faces int64 [F, 3]; both empty where no cell, or every cell,
-    is above `level`. Cells at the border are closed. The faces are wound as `nmr.icosphere`'s (normals outwards by the
+    Returns vertices float32 [V, 3] in the object frame and faces int64 [F, 3]; both empty where no cell is above
+    `level`. Cells at the border are closed. The faces are wound as `nmr.icosphere`'s (normals outwards by the
     right-hand rule in these axes).
     """
     size = grid.shape[-1]

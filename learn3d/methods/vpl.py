@@ -115,6 +115,10 @@ class VPL(MeshMethod):
 
     settings: VPLSettings
 
+    def check_batch(self, batch: Batch) -> None:
+        if self.settings.lambda_discriminator > 0 and len(batch.step_views) < 2:
+            raise ValueError("view prior learning needs another view for each image: batches of at least 2, got 1")
+
     def create_networks(self) -> dict[str, nn.Module]:
         settings, shape = self.settings, self.shape
         if settings.class_conditional and shape.num_classes < 2:
@@ -231,11 +235,8 @@ def other_views(batch: Batch | StepViews, choice: Literal["random", "reversed", 
     "random" asks torch's global generator, and takes any sample where all have one view class. Over a data set in which
     all views are equally frequent it draws uniformly from the other views, as the code of Peng et al. 2020 does.
     "reversed" leaves the middle one of an odd batch its own view, "next" a sample alone in its category (as published).
-    Raises ValueError for a batch of one sample.
     """
     count = len(batch)
-    if count < 2:
-        raise ValueError(f"view prior learning needs another view for each image: batches of at least 2, got {count}")
     if choice == "reversed":
         return torch.arange(count).flip(0)
     if choice == "next":

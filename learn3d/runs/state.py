@@ -90,6 +90,7 @@ class Run:
         same = {
             "options": config_to_dict(options),
             "precision": self.conditions.precision,
+            "what the networks depend on": self.shape,
             "training data": (self.conditions, train_set.digest()),
             "validation data": (len(val_set), val_set.digest()),
             "steps taken": progress.step,
@@ -109,6 +110,8 @@ class Run:
             precision = metadata.config.precision
         check_resume(self.config, dataclasses.replace(metadata.config, precision=precision))
         _check_conditions(self.conditions, metadata.conditions, self.config.data)
+        if self.shape != metadata.shape:
+            raise ValueError(f"{saved.path} was trained on data of {metadata.shape}, these are {self.shape}")
         checkpoint.restore_networks(self.method, tensors, saved.path)
         if self.method.average is not None:
             with self.method.averaged():

@@ -146,12 +146,15 @@ def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
         ({"layout": "shapenet"}, "layout must be 'kato'"),
         ({"sampling": "all"}, "sampling must be 'views'"),
         ({"augment": ("zoom",)}, "augment must be 'flip'"),
-        ({"augment": ("channels", "flip")}, "the discriminator of 'peng2020-kato' is told the class of the original"),
+        ({"augment": ("channels", "flip")}, "but 'peng2020-kato' learns with the class of the original"),
         ({"layout": "r2n2"}, "the layout 'r2n2' has no split val; validate on test"),
         ({"encoder": "resnet18"}, "images of the layout 'kato' have 64x64 pixels, but 224 are wanted"),
         ({"layout": "pascal3d", "view_bins": "15x20"}, "view_bins '15x20': .* of the layout 'pascal3d' are rotations"),
         ({"preset": "gadelha2017-kato"}, "encoder_from_step=53051 lies beyond the 4 iterations: .* such as 3"),
-        ({"preset": "gadelha2017-kato", "augment": ("flip",), "encoder_from_step": 2}, "'gadelha2017-kato' is told"),
+        (
+            {"preset": "gadelha2017-kato", "augment": ("flip",), "encoder_from_step": 2},
+            "'gadelha2017-kato' learns with",
+        ),
         ({"preset": "plus-kato", "remembered": 3}, r"\(--remembered\): batch_size must lie in 2 .. 3, got 4; --lambda"),
         ({"preset": "plus-kato", "batch_size": 1}, "batch_size must lie in 2 .. 2048, got 1"),
         ({"view_bins": "15"}, "view bins are written as AZIMUTHxELEVATION"),
@@ -367,6 +370,14 @@ def test_resume_refuses_other_poses(tiny_config, tiny_set, finished_run, monkeyp
         train(tiny_config(finished_run), resume=True)
 
 
+def test_resume_refuses_another_mirror_plane(tiny_config, finished_run, monkeypatch) -> None:
+    change_metadata(
+        monkeypatch, lambda m: dataclasses.replace(m, shape=dataclasses.replace(m.shape, mirror_plane_deg=7.5))
+    )
+    with pytest.raises(ValueError, match=r"was trained on data of .*mirror_plane_deg=7\.5"):
+        train(tiny_config(finished_run), resume=True)
+
+
 def test_the_best_of_other_validation_images_is_forgotten(tiny_config, finished_run, tmp_path) -> None:
     run = shutil.copytree(finished_run, tmp_path / "run")
     assert train(tiny_config(run), resume=True).best_step > 0
@@ -409,6 +420,24 @@ def test_used_folder_is_refused_and_overwrite_keeps_foreign_files(
     train(tiny_config(run_folder, iterations=1, preset=VANILLA), overwrite=True)
     assert (run_folder / "notes.txt").read_text() == "mine"
     assert read_metrics(run_folder)[0]["step"] == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"augment": ("crop",)}, "crop needs the original images"),
+        ({"preset": "kato2018-kato", "sampling": "views"}, "choose sampling 'pairs'"),
+        ({"preset": "peng2020-kato-vpl", "batch_size": 1}, "batches of at least 2, got 1"),
+    ],
+)
+def test_what_no_step_can_be_taken_with_leaves_the_older_run(
+    options, message: str, tiny_config, finished_run, tmp_path
+) -> None:
+    run = shutil.copytree(finished_run, tmp_path / "run")
+    before = {path.name for path in run.iterdir()}
+    with pytest.raises(ValueError, match=message):
+        train(tiny_config(run, **options), overwrite=True)
+    assert {path.name for path in run.iterdir()} == before
 
 
 def test_output_that_is_a_file(tiny_config, tmp_path) -> None:

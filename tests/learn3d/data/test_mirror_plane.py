@@ -71,6 +71,19 @@ def test_four_photographs_of_each_of_forty_objects_are_enough(plane: float | Non
     assert find_mirror_plane(some_views(triangles_seen(plane, objects=40), 4)) == plane
 
 
+@pytest.mark.parametrize("cameras", [6, 8, 12])
+def test_finds_the_plane_with_few_azimuths(cameras: int) -> None:
+    for plane in (0.0, 90.0, None):
+        whole = triangles_seen(plane, objects=40)
+        kept = np.flatnonzero(np.arange(len(whole)) % (24 // cameras) == 0)
+        assert find_mirror_plane(whole.select(kept)) == plane
+
+
+def test_too_few_azimuths_show_nothing() -> None:
+    whole = triangles_seen(0.0, objects=40)
+    assert find_mirror_plane(whole.select(np.flatnonzero(np.arange(len(whole)) % 6 == 0))) is None
+
+
 def test_needs_azimuths() -> None:
     dataset = triangles_seen(0.0, objects=1)
     poses = RotationPoses(torch.eye(3).expand(24, 3, 3))

@@ -71,6 +71,15 @@ def test_every_layout_keeps_its_batches(layout, meshes, tmp_path, command, small
         assert find_mirror_plane(after) == find_mirror_plane(before)
 
 
+def test_pascal3d_by_either_name_and_split(meshes, tmp_path, command, small_shards) -> None:
+    given = {"category": "airplane", "source": meshes, "layout": "pascal3d"} | SPLITS["pascal3d"]
+    make_dataset(DatasetConfig(output=tmp_path / "data", **given), progress=False)
+    words = ("--data", tmp_path / "data", "--layout", "pascal3d", "--category", "airplane")
+    assert command("convert-dataset", *words, "--output", tmp_path / "shards")[0] == 0
+    val, test = (load_dataset("pascal3d", tmp_path / "shards", "aeroplane", split) for split in ("val", "test"))
+    assert val.digest() == test.digest()
+
+
 def same_networks(folder, other) -> None:
     """Weights, optimizers and random state of two runs agree to the bit."""
     (ours, _), (theirs, _) = (checkpoint.load(f / "last.safetensors") for f in (folder, other))
@@ -115,6 +124,18 @@ def test_pairs_and_classes_are_drawn_from_shards(stored, tiny_folder) -> None:
         sets = [load_dataset("kato", folder, "airplane", "train") for folder in (tiny_folder, stored)]
         one, other = (sample_indices(each, sampling, 8, 3, 5) for each in sets)
         assert torch.equal(one, other)
+
+
+def test_no_rows_are_an_empty_array(stored) -> None:
+    images = load_dataset("kato", stored, "airplane", "train").images
+    assert images[np.empty(0, np.int64)].shape == (0, 4, 64, 64)
+
+
+def test_only_shards_are_removed(stored, command, tiny_folder) -> None:
+    folder = stored / "02691156" / "train"
+    (folder / "2024-notes.json").write_text("mine")
+    assert command("convert-dataset", "--data", tiny_folder, "--output", stored, "--overwrite")[0] == 0
+    assert (folder / "2024-notes.json").read_text() == "mine"
 
 
 def test_several_categories(stored, tiny_folder, tmp_path) -> None:

@@ -59,6 +59,22 @@ def test_smaller_batches_show_as_many_images(tmp_path) -> None:
         sizes(batch_size=6)
 
 
+@pytest.mark.parametrize("name", ["kar", "pascal", "plus-single"])
+def test_plus_sees_as_many_images_as_the_proposed_method(name: str, tmp_path) -> None:
+    runs = plan_runs(TABLES[name], Options(tmp_path, tmp_path, ("airplane",), seeds=1))
+    images = {run.variant.name: run.config.iterations * run.config.batch_size for run in runs}
+    ours, theirs = {"kar": ("kar-plus", "bins-15x20")}.get(name, ("pascal-plus", "pascal-proposed"))
+    if name == "plus-single":
+        ours, theirs = "single-plus", "single-proposed"
+    assert images[ours] == images[theirs]
+
+
+def test_short_runs_warm_up_for_a_tenth(tmp_path) -> None:
+    options = Options(tmp_path, tmp_path, ("chair",), ("proposed-schedule", "proposed-shared", "plus"), 100, seeds=1)
+    found = {run.variant.name: run.config.warmup_steps for run in plan_runs(TABLES["plus"], options)}
+    assert found == {"proposed-schedule": 10, "proposed-shared": 40, "plus": 40}
+
+
 def test_changes_reach_the_methods_that_they_name(options) -> None:
     changes = ("precision=fp32", "Vanilla-AE:learning-rate=3e-4", "lambda_smooth=0.5", "augment=flip-image,channels")
     vanilla, proposed = plan_runs(TABLES["kato"], options(changes=changes))

@@ -50,6 +50,17 @@ def test_report_files_tell_the_same(report, tmp_path) -> None:
     assert not {"http://", "https://", "src="} & set(page.split("=")), "nothing is loaded from elsewhere"
 
 
+def test_seeds_that_were_measured_on_different_objects_have_no_mean(report, tmp_path, make) -> None:
+    path = tmp_path / "out/runs/chair/proposed-seed1/test.json"
+    result = json.loads(path.read_text())
+    result["objects"]["names"][0] = "another"
+    path.write_text(json.dumps(result))
+    asked = {"categories": ("airplane", "chair"), "methods": ("vanilla", "proposed"), "iterations": 6, "batch_size": 4}
+    options = Options(tmp_path / "data", tmp_path / "out", seeds=3, **asked)
+    with pytest.raises(ValueError, match="measured on different test objects"):
+        make(Call("kato", options, report_only=True))
+
+
 def test_mmd_is_compared_by_ratio(tmp_path, make, options) -> None:
     make(Call("mmd", options()))
     proposed = json.loads((tmp_path / "out" / "mmd.json").read_text())["rows"][1]

@@ -326,5 +326,6 @@ def test_settings_that_contradict_the_data_are_refused() -> None:
 def test_one_image_has_no_other_view() -> None:
     settings = replace(SHAPENET, image_size=64)
     with pytest.raises(ValueError, match="batches of at least 2, got 1"):
-        create(settings).train_step(make_batch(64, 1), 1)
+        create(settings).check_batch(make_batch(64, 1))
+    create(replace(settings, lambda_discriminator=0.0)).check_batch(make_batch(64, 1))
     assert "projection" in create(replace(settings, lambda_discriminator=0.0)).train_step(make_batch(64, 1), 1)
