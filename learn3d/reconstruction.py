@@ -187,7 +187,9 @@ def export_mesh(path: Path, surface: Surface) -> None:
     points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
     mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)
     if surface.colors is not None and kind != "obj":
-        mesh.visual.vertex_colors = (surface.colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        colors = surface.colors.detach().cpu().clamp(0, 1)
+        colors = colors**2.2 if kind == "glb" else colors  # those of a GLB are linear
+        mesh.visual.vertex_colors = (colors * 255).round().to(torch.uint8).numpy()
     if kind == "glb":
         content = trimesh.Scene({path.stem: mesh}).export(file_type=kind, tree_postprocessor=_seen_from_both_sides)
     else:
@@ -198,7 +200,7 @@ def export_mesh(path: Path, surface: Surface) -> None:
 def _seen_from_both_sides(tree: dict) -> None:
     """Give all meshes of a glTF tree a dull material whose faces are seen from both sides."""
     tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}]
-    for mesh in tree["meshes"]:
+    for mesh in tree.get("meshes", ()):  # none in an empty shape
         for primitive in mesh["primitives"]:
             primitive["material"] = 0
 
@@ -232,7 +234,7 @@ def save_reconstruction(
     check_pictures(frames, image_size)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png")]
+    paths = [folder / f"{name}.{suffix}" for suffix in _suffixes(mesh_format)]
     export_mesh(paths[0], surface)
     figures.save_gif(paths[1], figures.turntable(surface, frames=frames, image_size=image_size))
     start = input_azimuth_deg(surface, mask) if azimuth_deg is None else azimuth_deg
@@ -241,6 +243,11 @@ def save_reconstruction(
     shown = [_pixels(picture), _pixels(np.repeat(mask[..., None], 3, axis=2))]
     figures.save_png(paths[2], figures.tile([[*shown, *views]], titles, tile_size=STRIP_SIZE))
     return paths
+
+
+def _suffixes(mesh_format: str) -> tuple[str, str, str]:
+    """Endings of the files of one image: mesh, turntable, views."""
+    return mesh_format, "gif", "png"
 
 
 def _pixels(picture: np.ndarray) -> np.ndarray:
@@ -273,18 +280,33 @@ def reconstruct_files(
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
     if poses is not None and len(poses) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(poses)} poses; give one azimuth per image")
+    names = [Path(image).stem for image in images]
+    if len(set(names)) < len(names):
+        names = [f"{number:03}_{name}" for number, name in enumerate(names)]
+    _check_inputs_stay([*images, *masks], folder, names, options)
     model, prepared = load_model(run, which), []
+    if poses is not None and LAYOUTS[model.config.layout].stretched:
+        raise ValueError(
+            f"this run learnt from photographs stretched to a square (layout {model.config.layout!r}): no camera shows "
+            "image files so, and shapes cannot be fitted to their masks; leave out --refine"
+        )
     for image, mask in zip(images, masks or [None] * len(images), strict=True):
         photo = _read(image, mask, plain_background)  # one at a time: they may be large
         strip = model.prepare(*photo, crop=crop, size=STRIP_SIZE, nearest=True)
         prepared.append((model.prepare(*photo, crop=crop), strip))
     stored, fine = map(np.stack, zip(*prepared, strict=True))
-    names = [Path(image).stem for image in images]
-    if len(set(names)) < len(names):
-        names = [f"{number:03}_{name}" for number, name in enumerate(names)]
     small = nn.functional.interpolate(torch.from_numpy(stored[:, 3:]).float() / 255, MASK_SIZE, mode="area")[:, 0]
     surfaces = reconstruct(model.method, stored, small, poses)
     return _save_all(surfaces, folder, names, model.shown(fine), fine[:, 3], poses, options)
+
+
+def _check_inputs_stay(inputs: Sequence[Path], folder: Path, names: Sequence[str], options: dict[str, Any]) -> None:
+    """Raise ValueError where a result would replace one of the inputs."""
+    there = {Path(path).resolve() for path in inputs}
+    for name in names:
+        for suffix in _suffixes(options.get("mesh_format", "glb")):
+            if (path := Path(folder, f"{name}.{suffix}")).resolve() in there:
+                raise ValueError(f"the result {path} would replace an image that was given; give another --output")
 
 
 def reconstruct_dataset(

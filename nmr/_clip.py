@@ -71,7 +71,7 @@ def clip_near(world: Tensor, mesh: MeshBatch, camera: Camera | None, near: float
     vertices = torch.cat([x for pair in zip(own, new.split(num_new), strict=True) for x in pair])
     vertex_counts = tuple(v + n for v, n in zip(own_counts, num_new, strict=True))
     drawn = MeshBatch(vertices, faces, packed_starts(vertex_counts, num_drawn), vertex_counts, num_drawn)
-    eye = torch.eye(3).to(vertices)
+    eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
     places = (1 - share) * eye[ends[:, 2]] + share * eye[ends[:, 3]]
     places = torch.cat([x for part in places.split(num_new) for x in (eye, part)])
     place_starts = packed_starts([3 + n for n in num_new], num_drawn)

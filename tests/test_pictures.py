@@ -1,4 +1,4 @@
-"""The pictures of README and docs are those that today's code draws."""
+"""No picture of README and docs is older than the files that `make_pictures` names as its sources."""
 
 import importlib.util
 import re

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Checks the kernels (csrc/) without Python, in separate builds under build/native. Usage: bash tools/check_native.sh CHECK...
+# Checks the kernels (csrc/) without Python, in separate builds under build/native. Usage: bash tools/check_native.sh CHECK [ARGUMENTS]
 #   tests         the C++ tests, and the fuzz target on its stored inputs
 #   asan          the same under AddressSanitizer and UndefinedBehaviorSanitizer (CXX: g++ or clang++)
 #   tsan          the same under ThreadSanitizer, with a small OpenMP replacement that it understands (g++)
@@ -194,6 +194,10 @@ check_coverage() {
 mkdir -p build/native
 check=$1
 shift
+case $check in
+tests | asan | tsan | tsan-clang | variants | coverage | keep)
+    [ $# -eq 0 ] || { echo "$check takes no arguments, got: $*"; exit 2; } ;;
+esac
 case $check in
 tests | asan | tsan | count | variants | coverage | mutate | fuzz | keep) "check_$check" "$@" ;;
 tsan-clang) check_tsan_clang ;;

@@ -1,4 +1,4 @@
-# Sourced by quickstart.sh and test.sh: checks the machine, makes a virtual environment in .venv and installs the package.
+# Sourced by quickstart.sh, test.sh and site.sh: checks the machine, makes a virtual environment in .venv and installs the package.
 # Usage: . tools/setup.sh; setup EXTRA
 # Sets $python to the environment's interpreter. The current folder must be the repository.
 
@@ -33,7 +33,7 @@ check_room() { # folder, free disk space needed in GB, further advice
     [ "$free" -ge "$2" ] || fail "only $free GB free on the disk of $1, $2 GB are needed; free some space$3"
 }
 
-setup() { # extra of the package to install: train or test
+setup() { # extra of the package to install: report, site or test
     check_machine 4
     python=$PWD/.venv/bin/python
     if ! "$python" -c '' 2>/dev/null; then

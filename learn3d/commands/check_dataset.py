@@ -10,7 +10,6 @@ The exit status is 1 where training or evaluation would fail (an error), 0 where
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from learn3d.commands.parsing import names, parse
 from learn3d.data.checking import check_folder
 from learn3d.data.layouts import Layout
 from learn3d.files.writing import check_target, write_json
-from learn3d.terminal import say
+from learn3d.terminal import is_watched, say
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ def run(arguments: Sequence[str]) -> int:
     if command.json is not None:
         check_target(command.json, "--json")
     what = (names(command.category), command.split)
-    report = check_folder(command.layout, command.folder, *what, progress=sys.stderr.isatty())
+    report = check_folder(command.layout, command.folder, *what, progress=is_watched())
     lines = [f"{p.severity}: {p.path}: {p.message}" for split in report.splits for p in split.problems]
     for line in lines[: command.most]:
         say(line)

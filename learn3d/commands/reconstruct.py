@@ -79,6 +79,8 @@ def run(arguments: Sequence[str]) -> int:
         raise ValueError(f"{given} given; leave out what belongs to {wanted}: {', '.join(ignored)}")
     if command.images and command.refine != bool(command.azimuths):
         raise ValueError("--refine takes the azimuth of the camera of each image file: give --refine --azimuths A ...")
+    if command.images and not command.refine and command.elevation != Command.elevation:
+        raise ValueError("--elevation is where the camera stood that --refine fits to: give --refine --azimuths A ...")
     import torch
 
     from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG

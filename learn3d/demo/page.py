@@ -97,6 +97,8 @@ def _told() -> Iterator[None]:
 
 def _shown(surface: Surface, name: str, azimuth_deg: float, root: Path) -> tuple:
     """What a `_viewer` is to show: a mesh from this azimuth, and its files, in a new folder of `root`."""
+    if not len(surface.faces):
+        raise ValueError("the model makes an empty shape of this picture; try another picture, or another model")
     glb, obj = map(str, picture_tab.write_mesh(surface, Path(tempfile.mkdtemp(dir=root)), name))
     radius = 3.3 * float(surface.vertices.norm(dim=1).max())  # all of it is seen in a narrow window, too
     mesh = gr.Model3D(glb, camera_position=(-azimuth_deg, 70, radius))
@@ -253,7 +255,8 @@ def page(models: dict[str, Model], root: Path) -> gr.Blocks:
 
 def labels(runs: Sequence[Path]) -> list[str]:
     """A name for each run: that of its folder or file; numbered where they would be the same."""
-    names = [Path(run).resolve().stem for run in runs]
+    paths = [Path(run).resolve() for run in runs]
+    names = [path.stem if path.is_file() else path.name for path in paths]
     return [f"{name} {i + 1}" if names.count(name) > 1 else name for i, name in enumerate(names)]
 
 

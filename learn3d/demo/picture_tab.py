@@ -90,8 +90,7 @@ def write_mesh(surface: Surface, folder: Path, name: str) -> tuple[Path, Path]:
     """Write <name>.glb (in clay where the shape has no colours) and <name>.obj; returns both paths."""
     folder.mkdir(parents=True, exist_ok=True)
     if surface.colors is None:
-        clay = torch.tensor(CLAY) ** 2.2  # colours of a GLB are linear
-        surface = surface._replace(colors=clay.expand_as(surface.vertices))
+        surface = surface._replace(colors=torch.tensor(CLAY).expand_as(surface.vertices))
     paths = folder / f"{name}.glb", folder / f"{name}.obj"
     for path in paths:
         export_mesh(path, surface)

@@ -75,6 +75,8 @@ def azimuths_deg(poses: Poses) -> Tensor:
 
     Of a rotation it is that of the direction against which the camera looks.
     """
+    if poses is None:
+        raise ValueError("these data do not say where the cameras stood, which this figure needs")
     eye = poses.features() if isinstance(poses, LookAtPoses) else -poses.rotation[:, 2]
     return torch.rad2deg(torch.atan2(eye[:, 0].double(), -eye[:, 2].double()))
 

@@ -95,8 +95,8 @@ def _draw(
     """(Pictures uint8 [len(azimuths), n, S, S, 3] of n shapes, magnified as far as shapes and masks allow; by what)."""
     if not azimuths:
         raise ValueError("an interpolation is seen from at least one azimuth, none was given")
-    pose = poses[torch.tensor([0])]
-    turns = [azimuth - float(azimuths_deg(pose)[0]) for azimuth in azimuths]
+    start = float(azimuths_deg(poses)[0])
+    pose, turns = poses[torch.tensor([0])], [azimuth - start for azimuth in azimuths]
     cameras = orbit(pose, turns)
     zoom = common_zoom([(surface, cameras) for surface in shapes], masks)
     cameras = orbit(pose, turns, zoom=zoom)

@@ -60,7 +60,7 @@ def save_tsne(runs: Sequence[Run], output: Path) -> list[Path]:
     for run in runs:
         dataset = run.dataset
         samples = spread_samples(dataset.object_ids, dataset.view_ids, min(MOST_CODES, len(dataset)))
-        shape_codes, azimuths = encode(run.method, dataset, samples).numpy(), azimuths_deg(dataset.poses[samples])
+        shape_codes, azimuths = encode(run.method, dataset, samples).numpy(), azimuths_deg(dataset.poses)[samples]
         rows = samples.numpy()
         ids = (dataset.view_ids[rows], dataset.object_ids[rows])
         maps.append(codes.map_codes(title_of(run, runs), shape_codes, azimuths.numpy(), *ids))

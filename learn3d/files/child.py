@@ -54,10 +54,10 @@ def allow(memory: int = 0, seconds: float = 0.0) -> None:
         return
     if memory and sys.platform == "linux":
         soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        resource.setrlimit(resource.RLIMIT_DATA, (soft + memory, hard))
+        resource.setrlimit(resource.RLIMIT_DATA, (_below(soft + memory, hard), hard))
     if seconds:
         soft, hard = resource.getrlimit(resource.RLIMIT_CPU)
-        resource.setrlimit(resource.RLIMIT_CPU, (soft + math.ceil(seconds), hard))
+        resource.setrlimit(resource.RLIMIT_CPU, (_below(soft + math.ceil(seconds), hard), hard))
 
 
 def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
@@ -131,10 +131,17 @@ def _limit(memory: int | None, seconds: float | None) -> None:
         return
     if sys.platform == "linux":  # elsewhere the limit does not count what malloc takes in large pieces
         hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-        resource.setrlimit(resource.RLIMIT_DATA, (hard if memory is None else _memory() + memory, hard))
+        resource.setrlimit(resource.RLIMIT_DATA, (hard if memory is None else _below(_memory() + memory, hard), hard))
     hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
     used = time.process_time()
-    resource.setrlimit(resource.RLIMIT_CPU, (hard if seconds is None else math.ceil(used + seconds), hard))
+    resource.setrlimit(
+        resource.RLIMIT_CPU, (hard if seconds is None else _below(math.ceil(used + seconds), hard), hard)
+    )
+
+
+def _below(wanted: int, hard: int) -> int:
+    """A limit that the system's own, where it has one, allows."""
+    return wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
 
 
 def _memory() -> int:

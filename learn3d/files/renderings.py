@@ -129,6 +129,8 @@ def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
     table = np.empty((rows, columns))
     for k, line in enumerate(lines[:rows]):
         try:
+            if len(line) < columns:
+                raise ValueError
             table[k] = [float(word) for word in line[:columns]]
         except ValueError:
             raise DamagedFile(path, f"row {k} is {' '.join(line)!r}; expected {wanted}") from None

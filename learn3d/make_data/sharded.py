@@ -33,7 +33,7 @@ from learn3d.parallel.engine import Task, carry_out_all
 from learn3d.terminal import INTERRUPTED, note, say, stop_on_signal
 
 OBJECTS_PER_SHARD = 512  # 201 MB of images
-SETTINGS, LOG = "card.json", "log.txt"
+SETTINGS = "card.json"
 _MOST_SAID = 20  # meshes that are named in the terminal as skipped
 
 
@@ -63,15 +63,15 @@ def make_shards(config: DatasetConfig) -> int:
     threads = max(1, torch.get_num_threads() // config.jobs)
     tasks, shards = [], {}
     for split, numbers in split_objects(len(sources), config.test, config.val, config.seed).items():
-        step = OBJECTS_PER_SHARD // (_copies(config, split))  # meshes of a shard
+        step = max(1, OBJECTS_PER_SHARD // _copies(config, split))  # meshes of a shard
         parts = np.split(numbers, range(step, len(numbers), step)) if len(numbers) else []
         shards[split] = len(parts)
         for number, part in enumerate(parts):
             if made(folder / split, number) is None:
                 items = [Item(i, names[i], sources[i]) for i in part.tolist()]
                 given = (config, folder / split, split, number, items, threads)
-                tasks.append(Task(f"{split} {number}", make_shard, given, folder / LOG))
-    note(f"{config.category}: {sum(shards.values())} shards, {len(tasks)} to be made; log: {folder / LOG}")
+                tasks.append(Task(f"{split} {number}", make_shard, given, folder / f"{split}-{number:05d}.log"))
+    note(f"{config.category}: {sum(shards.values())} shards, {len(tasks)} to be made; logs: {folder / '*.log'}")
     failed = carry_out_all(tasks, folder, jobs=config.jobs, cluster=config.cluster)
     for name, tail in failed.items():
         note(f"\nFAILED {name}; the end of the log:\n{tail}")
@@ -133,11 +133,11 @@ def _crc(names: Sequence[str]) -> int:
 
 def _prepare(config: DatasetConfig, folder: Path, settings: dict) -> None:
     """The category's folder, with the settings of its shards."""
+    check_room(folder, 2**24, "a data set")
     if config.overwrite:
         for split in SPLITS:
             remove(folder / split)
         (folder / SETTINGS).unlink(missing_ok=True)
-    check_room(folder, 2**24, "a data set")
     path = folder / SETTINGS
     if path.is_file():
         before = parse_json(read_bytes(path, 2**20, "the settings of shards"))

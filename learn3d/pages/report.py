@@ -21,7 +21,7 @@ from learn3d.experiments.evaluation_report import MEANINGS
 from learn3d.experiments.plan import command_line
 from learn3d.experiments.statistics import Interval, percentile_interval, resampled_means
 from learn3d.figures import azimuths_deg
-from learn3d.figures.curves import TITLES, panels, read_metrics
+from learn3d.figures.curves import TITLES, Curve, Key, panels, read_metrics
 from learn3d.figures.plots import COLORS
 from learn3d.figures.polar import profile
 from learn3d.figures.runs import Run, open_runs
@@ -42,9 +42,9 @@ class Measured:
 
     run: Run
     about: Metadata
-    path: Path
     result: Evaluation
     ious: np.ndarray  # float64 [M]: IoU of each image; NaN where it is not defined
+    log: dict[Key, Curve]
 
     def by_object(self) -> tuple[np.ndarray, np.ndarray]:
         """(sum of the IoUs, number of IoUs) of each object, float64 [N]."""
@@ -89,13 +89,14 @@ def write_report(
     if not 1 <= (count := len(indices) or objects) <= MOST_SHOWN:
         raise ValueError(f"shapes can be shown of 1 to {MOST_SHOWN} images, and {count} are asked for")
     runs[0].dataset.batch(torch.tensor(indices, dtype=torch.int64))  # says which indices there are
+    logs = [_log(path) for path in paths]  # before anything is measured
     measured = []
-    for run, about, path in zip(runs, abouts, paths, strict=True):
+    for run, about, log in zip(runs, abouts, logs, strict=True):
         report_progress(f"measuring {run.label} on {len(run.dataset)} images")
         result = evaluate(run.method, run.dataset)
         values = next(iter(result.ious.values()), result.silhouette_iou)
         ious = np.full(len(run.dataset), np.nan) if values is None else values.double().numpy()
-        measured.append(Measured(run, about, Path(path), result, ious))
+        measured.append(Measured(run, about, result, ious, log))
     ranked = _ranked(measured)
     page = _page(measured, ranked, _chosen(measured, ranked, objects, indices)) | {"split": split, "which": which}
     page["data"] = plain(Path(data or abouts[0].config.data).name)
@@ -174,7 +175,7 @@ def _page(measured: Sequence[Measured], ranked: np.ndarray, samples: Sequence[in
         "faces": [{axis: {"dtype": k[0], "bdata": k[1 + n]} for n, axis in enumerate("ijk")} for k in faces],
         "kind": kind,
         "views": [{"azimuths": p.azimuths_deg.tolist(), "ious": [_number(x, 4) for x in p.iou]} for p in profiles],
-        "curves": _curves([m.path for m in measured]),
+        "curves": _curves([m.log for m in measured]),
     }
     return {
         "runs": [_row(m, first) | run for m, run in zip(measured, runs, strict=True)],
@@ -216,9 +217,13 @@ def _row(m: Measured, baseline: Measured) -> dict[str, Any]:
     }
 
 
-def _curves(paths: Sequence[Path]) -> list[dict[str, Any]]:
-    """The logged numbers as panels, validation first, with a line of each run; a checkpoint file has no log."""
-    logs = [read_metrics(path) if path.is_dir() else {} for path in paths]
+def _log(path: Path) -> dict[Key, Curve]:
+    """What a run has logged; nothing where there is no log, as beside a checkpoint file."""
+    return read_metrics(path) if (Path(path) / "metrics.jsonl").is_file() else {}
+
+
+def _curves(logs: Sequence[dict[Key, Curve]]) -> list[dict[str, Any]]:
+    """The logged numbers as panels, validation first, with a line of each run."""
     found = []
     for split, name in panels({"": logs}) if any(logs) else ():
         lines = [log.get((split, name)) for log in logs]

@@ -1,8 +1,11 @@
 // A main for the fuzz target without libFuzzer.
-//   fuzz [-v] FILE...                          runs every input of the files, one per line in hexadecimal digits; -v
-//   names each before it does fuzz -mutate SECONDS SEED CURRENT FILE...  runs mutations of them for that long. CURRENT
-//   holds the input that is running, in the
-//                                              same digits: the culprit after a crash
+// clang-format off
+//   fuzz [-v] FILE...
+//     runs every input of the files, one per line in hexadecimal digits; -v names each before it does
+//   fuzz -mutate SECONDS SEED CURRENT FILE...
+//     runs mutations of them for that long. CURRENT holds the input that is running, in the same digits: the culprit
+//     after a crash
+// clang-format on
 #include <fcntl.h>
 #include <sys/mman.h>
 #include <unistd.h>

@@ -126,6 +126,7 @@ class Own:
 
 DRAWN = {
     "silhouette": lambda: nmr.render_silhouette(SPHERE, FACES, CAMERA, **SIZE),
+    "cut": lambda: nmr.render_silhouette(SPHERE, FACES, nmr.LookAt([0.0, 0.0, -0.5]), **SIZE),
     "list": lambda: nmr.render_silhouette([SPHERE, SPHERE[:12]], [FACES, FACES[:0]], CAMERA, **SIZE),
     "local": lambda: nmr.render_silhouette(SPHERE, FACES, CAMERA, gradient="local", **SIZE),
     "wide": lambda: CAMERA.for_image(8, 16).transform(SPHERE),

@@ -124,8 +124,8 @@ def fetch_debian_models(config: FetchConfig, progress: bool = True) -> Report:
     if output.exists():
         if not config.overwrite:
             raise ValueError(f"{config.output} is there already; remove it, or replace it with --overwrite")
-        if not (output / "index.csv").is_file():
-            raise ValueError(f"{config.output} was not written by this tool (no index.csv); choose another folder")
+        if not _is_ours(output / "index.csv"):
+            raise ValueError(f"{config.output} was not written by this tool (no such index.csv); choose another folder")
     output.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as scratch:
         written, downloads = Path(scratch, "models"), Path(scratch, "packages")
@@ -218,6 +218,14 @@ def _prepare(package: Path, read: Callable[[], tuple[np.ndarray, np.ndarray]]) -
         raise DamagedFile(package, str(error)) from error
     whole, cube = (surface_grid(mesh.vertices, mesh.faces, GRID, per_axis=cubes) for cubes in (False, True))
     return mesh, (whole, cube)
+
+
+def _is_ours(index: Path) -> bool:
+    """Whether a table begins as index.csv does."""
+    if not index.is_file():
+        return False
+    with index.open(encoding="utf-8", errors="replace") as file:
+        return file.readline(1000).strip() == ",".join(field.name for field in fields(Model))
 
 
 def _write_table(path: Path, kind: type, rows: list) -> None:

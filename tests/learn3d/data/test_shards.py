@@ -131,6 +131,14 @@ def test_no_rows_are_an_empty_array(stored) -> None:
     assert images[np.empty(0, np.int64)].shape == (0, 4, 64, 64)
 
 
+def test_overwriting_with_what_is_not_there_keeps_the_shards(stored, command, tmp_path, tiny_folder) -> None:
+    before = sorted(stored.rglob("*"))
+    (tmp_path / "nothing").mkdir()
+    words = ("--output", stored, "--category", "airplane", "--overwrite")
+    assert command("convert-dataset", "--data", tmp_path / "nothing", *words)[0] == 1
+    assert sorted(stored.rglob("*")) == before
+
+
 def test_only_shards_are_removed(stored, command, tiny_folder) -> None:
     folder = stored / "02691156" / "train"
     (folder / "2024-notes.json").write_text("mine")

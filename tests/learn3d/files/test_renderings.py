@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from learn3d.files.findings import DamagedFile
 from learn3d.files.images import RENDERINGS, open_image
-from learn3d.files.renderings import shrink, split_alpha
+from learn3d.files.renderings import read_table, shrink, split_alpha
 
 
 def test_shrinking_takes_the_mean_over_each_pixels_area():
@@ -15,6 +16,15 @@ def test_shrinking_takes_the_mean_over_each_pixels_area():
     blocks = np.dstack([color, mask]).reshape(64, 2, 64, 2, 4).mean((1, 3)).transpose(2, 0, 1)
     assert image.dtype == np.uint8 and np.abs(image - blocks).max() <= 0.51
     np.testing.assert_array_equal(small, image[3])
+
+
+def test_rows_that_are_cut_short_are_damage(tmp_path):
+    path = tmp_path / "view.txt"
+    path.write_text("10 20 0 1.5\n33.2 20 0 1.5 9")
+    np.testing.assert_array_equal(read_table(path, 2, 4, "a table"), [[10, 20, 0, 1.5], [33.2, 20, 0, 1.5]])
+    path.write_text("10 20 0 1.5\n33.2")
+    with pytest.raises(DamagedFile, match=r"row 1 is '33\.2'; expected a table"):
+        read_table(path, 2, 4, "a table")
 
 
 def test_shrinking_by_three_and_a_half_keeps_the_covered_area():

@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -242,3 +243,8 @@ def test_runs_that_read_different_images_are_told(runs, tmp_path, monkeypatch, t
     monkeypatch.setattr(report, "open_runs", lambda *_, **__: mixed)
     with pytest.raises(ValueError, match="read different images"):
         write_report(runs, tmp_path / "page.html")
+
+
+def test_a_run_without_a_log_has_no_curves(runs, tmp_path) -> None:
+    run = shutil.copytree(runs[0], tmp_path / "run", ignore=shutil.ignore_patterns("metrics.jsonl"))
+    assert write_report([run], tmp_path / "report.html", split="train", objects=2) > 0

@@ -75,6 +75,7 @@ def test_output_is_replaced_only_when_asked_and_ours(debs: Path, tmp_path: Path)
     fetch(out, debs, category="table", overwrite=True)
     assert sorted(path.name for path in out.iterdir()) == ["dropped.csv", "index.csv", "licences", "table"]
     (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "index.csv").write_text("id,name\n")
     with pytest.raises(ValueError, match="not written by this tool"):
         fetch(tmp_path / "precious", debs, overwrite=True)
 
