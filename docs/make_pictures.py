@@ -35,8 +35,9 @@ class Picture:
 
 _QUICKSTART = ("tools/quickstart.sh", "learn3d/figures/grids.py")
 _QUICKSTART += ("learn3d/methods/plus.py", "learn3d/networks/encoders.py")
-_RUNS = "$OUTPUT/runs/airplane/proposed-seed0 $OUTPUT/runs/airplane/plus-seed0"
-_THREE = " ".join(f"$OUTPUT/runs/airplane/{method}-seed0" for method in ("vanilla", "proposed", "plus"))
+_RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
+_RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
+_THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
 _NOTEBOOKS = {"quick_tour": 5, "shape_from_silhouettes": 4, "texture_and_light": 4, "photographs_to_glb": 1}
 PICTURES = {
     "views.png": Picture(
