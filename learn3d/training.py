@@ -67,7 +67,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
         method = create_method(config.settings, shape, **how)
         sample = functools.partial(sample_indices, train_set, config.sampling, config.batch_size, config.seed)
         first = train_set.batch(sample(1), ranks.rows, voxels=False)
-        method.check_batch(augment(first, config.augment, config.seed, 1))  # before an older run is cleared away
+        changed = functools.partial(augment, names=config.augment, seed=config.seed, inverted=train_set.inverted)
+        method.check_batch(changed(first, step=1))  # before an older run is cleared away
         run = Run(config, method, shape, conditions_of(train_set, precision), ranks)
         progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:  # also after a kill between the last save and the end
@@ -85,7 +86,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
                 batch = train_set.batch(indices, ranks.rows, voxels=False)
                 indices = sample(step + 1)
                 train_set.prepare(indices, ranks.rows)
-                losses = method.train_step(augment(batch, config.augment, config.seed, step), step)
+                losses = method.train_step(changed(batch, step=step), step)
                 # With the losses of the step before: some methods train one network in odd steps, another in even ones.
                 recent = progress.losses | losses
                 seconds = before + time.monotonic() - started

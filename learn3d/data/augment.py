@@ -17,14 +17,15 @@ COLOR_GAIN = 0.3  # "colors" multiplies each colour by 1 - this .. 1 + this
 WITHOUT_COLOR = 0.3  # share of the images that it leaves without colours
 
 
-def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -> Batch:
+def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *, inverted: bool = True) -> Batch:
     """The batch with the named changes, each drawn for every sample on its own, in the order of the names.
 
     "flip": image, mask and, where it is known, pose mirrored left-right with probability 1/2 (Kato and Harada 2019).
     "flip-image": the colours of the input image alone, while every mask stays with its pose (published code of both
     papers on Pascal3D+; it works because the mesh is symmetric). "channels": a random permutation of the three colours.
     "colors": a random permutation, each colour times a random factor of 0.7 .. 1.3, and 30 % of the images without
-    colours (0), so that an object is not known by its tint.
+    colours (0), so that an object is not known by its tint. It is 255 - colour that is changed, so that a white
+    background stays white; `inverted` says that images are stored so. It is not for encoders that ignore the mask.
     "crop": the colours cut anew from the original image, each side of the padded box moved by up to 15 % of the box,
     uniformly (Pascal3D+, both papers); it comes first, and masks stay as they are. Where processes share a step, each
     view is changed as in one process.
@@ -56,7 +57,9 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int) -
                 gain = rng.uniform(1 - COLOR_GAIN, 1 + COLOR_GAIN, (count, 3))
                 gain[rng.random(count) < WITHOUT_COLOR] = 0
                 gain = torch.from_numpy(gain.astype(np.float32))[rows][:, :, None, None]
-                colors = (colors * gain).round_().clamp_(max=255).to(torch.uint8)
+                darkness = colors if inverted else 255 - colors
+                darkness = (darkness * gain).round_().clamp_(max=255).to(torch.uint8)
+                colors = darkness if inverted else 255 - darkness
         else:
             mirrored = torch.from_numpy(rng.random(count) < 0.5)
             chosen = mirrored[rows][:, None, None, None]

@@ -46,17 +46,22 @@ class LightConvEncoder(ConvEncoder):
     weights, not 19, and a quarter of the multiplications; no paper's.
 
     Its convolutions start from He's initial weights: with torch's, images hardly change the codes of the first hundred
-    steps, and all shapes may become one and stay so.
+    steps, and all shapes may become one and stay so. A white background has the same effect, so colours that are not
+    `inverted` (stored as 1 - colour over black) are inverted first.
     """
 
     hidden_sizes: tuple[int, ...] = (1024, 1024)
 
-    def __init__(self) -> None:
+    def __init__(self, inverted: bool = True) -> None:
         nn.Module.__init__(self)
+        self.inverted = inverted
         narrow = 32
         self.convolutions = _convolutions(32, 64, 128).extend([nn.Conv2d(128, narrow, 1), nn.ReLU()])
         self.layers = linear_layers(narrow * (self.image_size // 8) ** 2, *self.hidden_sizes, CODE_SIZE)
         initialize_he(self.convolutions)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return super().forward(images if self.inverted else torch.cat([1 - images[:, :3], images[:, 3:]], dim=1))
 
 
 class SmallConvEncoder(ConvEncoder):
@@ -128,10 +133,12 @@ ENCODERS: dict[str, type[nn.Module]] = {
 def create_encoder(name: EncoderName, *, inverted: bool) -> nn.Module:
     """The encoder `name` for images whose colours are stored as 255 - colour, or as they are.
 
-    It matters to resnet18 alone, whose normalisation and pretrained weights are for natural colours. The others learn
-    from scratch, as published, on the colours as they are stored.
+    resnet18 turns them into natural colours, for which its normalisation and pretrained weights are; conv-light and
+    conv-centred into inverted ones, which are 0 where a render has a white background. The others learn from scratch,
+    as published, on the colours as they are stored.
     """
-    return ResNet18Encoder(inverted) if name == "resnet18" else ENCODERS[name]()
+    encoder = ENCODERS[name]
+    return encoder(inverted) if issubclass(encoder, (ResNet18Encoder, LightConvEncoder)) else encoder()
 
 
 def network_input(images: Tensor, device: torch.device | str, size: int = 64) -> Tensor:

@@ -286,3 +286,12 @@ def test_colours_are_permuted_scaled_or_left_out(tiny_set) -> None:
     assert ratio.min() > 0.6
     assert ratio.max() < 1.4
     assert ratio.std() > 0.05
+
+
+def test_a_white_background_stays_white(tiny_set) -> None:
+    """Natural colours are changed as the same colours in Kato's form are."""
+    batch = tiny_set.batch(torch.arange(72))
+    colors, mask = batch.images[:, :3], batch.images[:, 3:]
+    natural = dataclasses.replace(batch, images=torch.cat([255 - colors, mask], dim=1))
+    changed = augment(natural, ("colors",), 0, 1, inverted=False).images
+    assert torch.equal(255 - changed[:, :3], augment(batch, ("colors",), 0, 1).images[:, :3])

@@ -140,6 +140,7 @@ def test_presets() -> None:
         preset = PRESETS[name]
         assert (preset.schedule, preset.warmup_steps, preset.average) == ("cosine", 100, 0.99)
         assert preset.settings.symmetry == symmetry
+        assert (preset.settings.lambda_unseen > 0) == (name != "plus-kar"), "cameras of a class differ in Kar's data"
         assert "flip-image" not in preset.augment, "the method flips images itself, and tells the discriminator"
 
 

@@ -136,3 +136,15 @@ def test_encoders_with_he_weights_tell_images_apart_from_the_start(name: Encoder
         torch.manual_seed(seed)
         codes = create_encoder(name, inverted=True)(images)
         assert codes.std(0).norm() > 0.2 * codes.mean(0).norm()
+
+
+@pytest.mark.parametrize("name", ["conv-light", "conv-centred"])
+def test_a_white_background_is_as_good_as_a_black_one(name: EncoderName) -> None:
+    """Natural colours have the codes of the same colours in Kato's form."""
+    images = torch.rand(4, 4, 64, 64)
+    natural = torch.cat([1 - images[:, :3], images[:, 3:]], dim=1)
+    codes = []
+    for stored, inverted in ((images, True), (natural, False)):
+        torch.manual_seed(0)
+        codes.append(create_encoder(name, inverted=inverted)(stored))
+    torch.testing.assert_close(*codes)
