@@ -14,7 +14,7 @@ import torch
 from learn3d.config import TrainConfig
 from learn3d.data.augment import augment
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.layouts import load_dataset
+from learn3d.data.layouts import LAYOUTS, load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import sample_indices
 from learn3d.device import crowding, keep_freed_memory, resolve_precision
@@ -66,8 +66,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
         how = {"device": config.device, "precision": precision, "seed": config.seed, "plan": config.plan}
         method = create_method(config.settings, shape, **how)
         sample = functools.partial(sample_indices, train_set, config.sampling, config.batch_size, config.seed)
-        first = train_set.batch(sample(1), ranks.rows, voxels=False)
         changed = functools.partial(augment, names=config.augment, seed=config.seed, inverted=train_set.inverted)
+        first = train_set.batch(sample(1), ranks.rows, voxels=False)
         method.check_batch(changed(first, step=1))  # before an older run is cleared away
         run = Run(config, method, shape, conditions_of(train_set, precision), ranks)
         progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
@@ -127,7 +127,9 @@ def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDat
 def _shape_of(train_set: ViewDataset, config: TrainConfig) -> DataShape:
     wanted = getattr(config.settings, "symmetry", None) == "auto"
     plane = find_mirror_plane(train_set) if wanted else None
-    return DataShape(train_set.num_views, train_set.num_classes, train_set.pose_features, train_set.inverted, plane)
+    box = train_set.convention.box if LAYOUTS[config.layout].voxels else None
+    known = (train_set.num_views, train_set.num_classes, train_set.pose_features, train_set.inverted)
+    return DataShape(*known, mirror_plane_deg=plane, box=box)
 
 
 def _about_plane(plane_deg: float | None) -> str:

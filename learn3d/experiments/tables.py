@@ -100,7 +100,7 @@ _VANILLA_BOTH = Variant("vanilla-schedule-symmetry", "peng2020-kato-vanilla", _S
 _PROPOSED_SCHEDULE = Variant("proposed-schedule", "peng2020-kato", _SCHEDULE)
 _PROPOSED_BOTH = Variant("proposed-schedule-symmetry", "peng2020-kato", _SCHEDULE | _SYMMETRY)
 _SHARED = _SCHEDULE | _SYMMETRY
-_SHARED |= {name: getattr(_OF_PLUS, name) for name in ("encoder", "lambda_smooth", "lambda_smooth_end")}
+_SHARED |= {name: getattr(_OF_PLUS, name) for name in ("encoder", "inside_box", "lambda_smooth", "lambda_smooth_end")}
 _PROPOSED_SHARED = Variant("proposed-shared", "peng2020-kato", _SHARED, smaller_batches=_BATCHES)
 _VANILLA_SHARED = Variant("vanilla-shared", "peng2020-kato-vanilla", _SHARED, smaller_batches=_BATCHES)
 _PLUS_FREE = _plus("plus-without-symmetry", "kato", {"symmetry": None})

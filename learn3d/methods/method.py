@@ -33,6 +33,7 @@ class DataShape:
     pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # of a camera: eye position 3, rotation 9, unknown 0
     inverted: bool = False  # colours are stored as 255 - colour
     mirror_plane_deg: float | None = None  # what `data.mirror_plane` found; None: nothing, or it was not asked for
+    box: float | None = None  # side of the cube, centred at the origin, in which all objects lie; None: not known
 
 
 def plane_of(symmetry: SymmetryOption, shape: DataShape) -> Symmetry | None:

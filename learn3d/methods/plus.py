@@ -33,6 +33,9 @@ class PlusSettings(PoseInvariantSettings):
     """Mirror shapes at a vertical plane: auto: the one at which the training masks mirror each other, or none where
     they do not; x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along it. None: shapes are
     free."""
+    inside_box: bool = True
+    """Whether what reaches out of the cube in which all objects of a data set lie, where it has one, is moved onto its
+    sides, in evaluation and reconstruction. The voxelizers count a shape that reaches out of their grid as hollow."""
     learning_rate: Positive = 4e-4
     """Adam's step size, the same for the three networks. The preset warms it up and lets it fall to 0."""
     lambda_smooth: Weight = 5e-4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal
 
 from torch import Tensor, nn
@@ -12,9 +13,12 @@ from learn3d.device import Download, upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod
 from learn3d.methods.optimization import frozen
+from learn3d.methods.surfaces import Meshes
 from learn3d.networks import ENCODERS, EncoderName, GeneratorName, PoseDiscriminator, SymmetryOption
 from learn3d.networks.resnet import check_pretrained, load_pretrained
 from learn3d.settings import FilePath, Positive, Weight, checked
+
+INSIDE = 0.499  # of a box's side: a face exactly on the border of the grid is outside to the voxelizer kato18
 
 
 @checked
@@ -33,6 +37,9 @@ class PoseInvariantSettings:
     """Mirror shapes at a vertical plane: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
     it (0 is x = 0). auto: the plane at which the training masks mirror each other, or none where they do not. None:
     shapes are free."""
+    inside_box: bool = False
+    """Whether what reaches out of the cube in which all objects of a data set lie, where it has one, is moved onto its
+    sides, in evaluation and reconstruction. The voxelizers count a shape that reaches out of their grid as hollow."""
     pretrained: FilePath | None = None
     """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's. None: random.
     The encoder gets natural colours, R, G, B, normalised as ImageNet's, however the data set stores them."""
@@ -103,6 +110,13 @@ class PoseInvariant(MeshMethod):
             return self.weights
         done = min(1.0, (step - 1) / max(1, self.plan.iterations - 1))
         return self.weights | {"smoothness": first ** (1 - done) * last**done}
+
+    def decode(self, codes: Tensor) -> Meshes:
+        shapes = super().decode(codes)
+        if not self.settings.inside_box or self.shape.box is None:
+            return shapes
+        limit = INSIDE * self.shape.box
+        return dataclasses.replace(shapes, vertices=shapes.vertices.clamp(-limit, limit))
 
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:

@@ -110,7 +110,7 @@ class Run:
             precision = metadata.config.precision
         check_resume(self.config, dataclasses.replace(metadata.config, precision=precision))
         _check_conditions(self.conditions, metadata.conditions, self.config.data)
-        if self.shape != metadata.shape:
+        if self.shape != dataclasses.replace(metadata.shape, box=self.shape.box):  # older checkpoints have no box
             raise ValueError(f"{saved.path} was trained on data of {metadata.shape}, these are {self.shape}")
         checkpoint.restore_networks(self.method, tensors, saved.path)
         if self.method.average is not None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from learn3d.config import differences
+from learn3d.data.conventions import KATO
 from learn3d.methods import DataShape, create_method
 from learn3d.methods.optimization import Plan
 from learn3d.methods.plus import MaskMemory, Plus, PlusSettings
@@ -39,6 +40,22 @@ def test_the_memory_keeps_the_newest() -> None:
     assert memory.full
     assert memory.view_ids.tolist() == [0, 1, 1, 2, 0]
     assert torch.equal(memory.of_view(1), masks[[3, 4]])
+
+
+@pytest.mark.parametrize("preset", ["plus-kato", "peng2020-kato"])
+def test_shapes_end_at_the_box_where_it_is_known(preset: str) -> None:
+    settings = dataclasses.replace(PRESETS[preset].settings, encoder="conv-small", generator="sphere-small")
+    inside = preset == "plus-kato"
+    codes = 100 * torch.randn(8, 512, generator=torch.Generator().manual_seed(0))
+    shapes = {}
+    for box in (None, 1.0):
+        method = create_method(settings, DataShape(24, box=box), device="cpu", precision="fp32", seed=0)
+        with torch.no_grad():
+            shapes[box] = method.decode(codes).vertices
+    free = shapes[None]
+    assert (free.abs().amax((1, 2)) > 0.5).all()
+    assert torch.equal(shapes[1.0], free.clamp(-0.499, 0.499) if inside else free)
+    assert KATO.leaves_grid(shapes[1.0], "kato19").any() != inside
 
 
 def test_losses(batch) -> None:
