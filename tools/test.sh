@@ -10,7 +10,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 which=(-m "not slow") room=2
 if [ "${1:-}" = --all ]; then
     shift
-    which=(--cov --cov-report=term:skip-covered) room=5
+    which=(--cov --cov-report=term:skip-covered --durations=40) room=5
 fi
 setup test
 step "Style"
