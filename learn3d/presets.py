@@ -181,7 +181,7 @@ PRESETS: dict[str, Preset] = {
     "plus-kato": _PLUS,
     "peng2020-kar": _KAR,
     "peng2020-kar-vanilla": _vanilla(_KAR, f"{_PAPER}: the baseline on the same images"),
-    # The cameras of a view class differ here, so that its masks say little about one of them: docs/methods/plus.md.
+    # Cameras differ within a view class, so the class's masks say little about a single camera: docs/methods/plus.md.
     "plus-kar": replace(_PLUS, layout="kar", settings=PlusSettings(lambda_unseen=0.0)),
     "plus-pascal": replace(  # it flips images itself; resnet18 ignores the mask, so no image loses its colours
         _PLUS, settings=PlusSettings(**_ON_PASCAL), layout="pascal3d", iterations=160_000, augment=("crop", "channels")

@@ -289,7 +289,7 @@ def test_colours_are_permuted_scaled_or_left_out(tiny_set) -> None:
 
 
 def test_a_white_background_stays_white(tiny_set) -> None:
-    """Natural colours are changed as the same colours in Kato's form are."""
+    """The same images stored as they are and inverted, as Kato's are, get the same change."""
     batch = tiny_set.batch(torch.arange(72))
     colors, mask = batch.images[:, :3], batch.images[:, 3:]
     natural = dataclasses.replace(batch, images=torch.cat([255 - colors, mask], dim=1))

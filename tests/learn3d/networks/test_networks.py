@@ -140,7 +140,7 @@ def test_encoders_with_he_weights_tell_images_apart_from_the_start(name: Encoder
 
 @pytest.mark.parametrize("name", ["conv-light", "conv-centred"])
 def test_a_white_background_is_as_good_as_a_black_one(name: EncoderName) -> None:
-    """Natural colours have the codes of the same colours in Kato's form."""
+    """The same images stored as they are and inverted, as Kato's are, have the same codes."""
     images = torch.rand(4, 4, 64, 64)
     natural = torch.cat([1 - images[:, :3], images[:, 3:]], dim=1)
     codes = []

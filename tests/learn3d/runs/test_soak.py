@@ -46,7 +46,7 @@ def soak(tiny_run, tiny_folder: Path, folder: Path) -> list[dict[str, float]]:
 
 
 def thirds(of: Callable[[list[float]], float], values: list[float]) -> tuple[float, float]:
-    """The median or the least of the first and of the last third, after a tenth for warming up."""
+    """`of` (median or min) of the first third and of the last third, without the first tenth, which warms up."""
     values = values[len(values) // 10 :]
     third = len(values) // 3
     return of(values[:third]), of(values[-third:])
