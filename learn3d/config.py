@@ -15,14 +15,14 @@ from learn3d.data.sampling import Sampling
 from learn3d.files import limits
 from learn3d.files.findings import DamagedFile
 from learn3d.files.reading import parse_json, read_bytes
-from learn3d.methods import Plan, Schedule, Settings
+from learn3d.methods import LRSchedule, Plan, Settings
 from learn3d.presets import PRESETS
 from learn3d.settings import Count, FilePath, Items, Step, checked
 
 DEFAULT_PRESET = "plus-kato"
 
-_FROM_PRESET = ("settings", "layout", "sampling", "augment", "iterations", "batch_size", "schedule")
-_FROM_PRESET += ("warmup_steps", "average")  # options that the preset decides where they are None
+_FROM_PRESET = ("settings", "layout", "sampling", "augment", "iterations", "batch_size", "lr_schedule")
+_FROM_PRESET += ("warmup_steps", "ema_decay")  # options that the preset decides where they are None
 
 
 def _known_preset(name: str) -> str:
@@ -63,13 +63,13 @@ class TrainConfig:
     """Number of training steps. None: the preset's."""
     batch_size: Annotated[int, Field(ge=1, le=65_536)] | None = None
     """Images per step. None: the preset's."""
-    schedule: Schedule | None = None
+    lr_schedule: LRSchedule | None = None
     """How the step size changes over the run. linear, cosine: it falls to 0. step: to a tenth in the last 5 % of all
     iterations. None: the preset's, constant for most."""
     warmup_steps: Annotated[int, Field(ge=0, le=10**9)] | None = None
     """Steps at the beginning in which the step size grows from 0 to its full size. None: the preset's, 0 for most, and
     never more than a tenth of the iterations."""
-    average: Annotated[float, Field(ge=0, lt=1)] | None = None
+    ema_decay: Annotated[float, Field(ge=0, lt=1)] | None = None
     """Also keep an exponential moving average of all weights, with this decay a step, such as 0.999. Validation, the
     best checkpoint, evaluation and reconstruction use it. 0: no average. None: the preset's, 0 for most."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
@@ -119,11 +119,11 @@ class TrainConfig:
             raise ValueError(
                 f"sampling 'pairs' takes two views of each object: batch_size must be even, got {self.batch_size}"
             )
-        if getattr(self.settings, "lambda_unseen", 0) > 0 and not 2 <= self.batch_size <= self.settings.remembered:
+        if getattr(self.settings, "lambda_novel_view", 0) > 0 and not 2 <= self.batch_size <= self.settings.bank_size:
             raise ValueError(
-                f"the loss at unseen views compares a batch with the {self.settings.remembered} masks that are "
-                f"remembered (--remembered): batch_size must lie in 2 .. {self.settings.remembered}, got "
-                f"{self.batch_size}; --lambda-unseen 0 leaves it out"
+                f"the loss at novel views compares a batch with the {self.settings.bank_size} masks of the "
+                f"mask bank (--bank-size): batch_size must lie in 2 .. {self.settings.bank_size}, got "
+                f"{self.batch_size}; --lambda-novel-view 0 leaves it out"
             )
         self.plan  # noqa: B018 (it checks itself)
         if getattr(self.settings, "encoder_from_step", 0) > self.iterations:
@@ -135,7 +135,7 @@ class TrainConfig:
     @property
     def plan(self) -> Plan:
         """What the method must know about the run."""
-        return Plan(self.iterations, self.schedule, self.warmup_steps, self.average)
+        return Plan(self.iterations, self.lr_schedule, self.warmup_steps, self.ema_decay)
 
 
 #: Options that a resumed run may change: they say where and how long to compute and what to report, not what to learn.
@@ -193,8 +193,8 @@ def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
 
 def _what_depends_on_iterations(config: TrainConfig) -> str | None:
     """What makes every step depend on the number of steps of the whole run."""
-    if config.schedule != "constant":
-        return f"the schedule {config.schedule}"
+    if config.lr_schedule != "constant":
+        return f"the schedule {config.lr_schedule}"
     settings = config.settings
     falls = getattr(settings, "lambda_smooth_end", None) is not None and settings.lambda_smooth > 0
     return "lambda_smooth_end" if falls else None

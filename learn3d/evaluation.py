@@ -16,10 +16,10 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import Definition
 from learn3d.data.dataset import ViewDataset
+from learn3d.distributed.ranks import ALONE, Ranks
 from learn3d.losses import mmd_from_distances
 from learn3d.methods import Grids, Meshes, Method
 from learn3d.methods.surfaces import grid_surface
-from learn3d.parallel.ranks import ALONE, Ranks
 
 #: What brings the predicted shapes of a batch to the true ones before they are compared; see `evaluate`.
 Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]
@@ -166,7 +166,7 @@ def evaluate(
                     precision, recall = nmr.metrics.voxel_precision_recall(filled, batch.voxels)
                     hollow = torch.zeros(len(filled), dtype=torch.bool)
                     if isinstance(shapes, Meshes):
-                        hollow = dataset.convention.leaves_grid(shapes.vertices, name)
+                        hollow = dataset.convention.exceeds_grid(shapes.vertices, name)
                     overlaps.append(torch.stack([precision, recall, hollow.to(precision)], dim=1))
             if truth is not None:
                 points = _surface_points(shapes, generator)

@@ -11,7 +11,7 @@ from typing import Any
 from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import Layout
 from learn3d.data.sampling import Sampling
-from learn3d.methods import Schedule, Settings
+from learn3d.methods import LRSchedule, Settings
 from learn3d.methods.multi_view import MultiViewSettings
 from learn3d.methods.plus import PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
@@ -31,9 +31,9 @@ class Preset:
     source: str  # where the figures come from
     sampling: Sampling = "views"
     augment: tuple[Augmentation, ...] = ()  # what is done to every training batch
-    schedule: Schedule = "constant"  # of the step size
+    lr_schedule: LRSchedule = "constant"  # of the step size
     warmup_steps: int = 0  # in which it grows to its full size
-    average: float = 0.0  # decay of the average of the weights, 0: there is none
+    ema_decay: float = 0.0  # of the exponential moving average of the weights a step; 0: no average
 
 
 #: Short names of the methods, accepted wherever a preset is: those on Kato's data.
@@ -160,9 +160,9 @@ _PLUS = replace(
     batch_size=32,
     source="docs/methods/plus.md",
     augment=("colors",),
-    schedule="cosine",
+    lr_schedule="cosine",
     warmup_steps=100,
-    average=0.99,
+    ema_decay=0.99,
 )
 
 #: "peng2020-kato" is what the published code computes (and what the paper's tables were
@@ -182,7 +182,7 @@ PRESETS: dict[str, Preset] = {
     "peng2020-kar": _KAR,
     "peng2020-kar-vanilla": _vanilla(_KAR, f"{_PAPER}: the baseline on the same images"),
     # Cameras differ within a view class, so the class's masks say little about a single camera: docs/methods/plus.md.
-    "plus-kar": replace(_PLUS, layout="kar", settings=PlusSettings(lambda_unseen=0.0)),
+    "plus-kar": replace(_PLUS, layout="kar", settings=PlusSettings(lambda_novel_view=0.0)),
     "plus-pascal": replace(  # it flips images itself; resnet18 ignores the mask, so no image loses its colours
         _PLUS, settings=PlusSettings(**_ON_PASCAL), layout="pascal3d", iterations=160_000, augment=("crop", "channels")
     ),
@@ -195,7 +195,7 @@ PRESETS: dict[str, Preset] = {
         128,
         "published code of Kato et al. 2018, one category: 64 pairs of views, iterations of airplane",
         sampling="pairs",
-        schedule="step",
+        lr_schedule="step",
     ),
     # 50 epochs for the GAN and as many for the encoder, of the 2,831 x 24 training images of airplanes.
     "gadelha2017-kato": Preset(

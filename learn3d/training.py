@@ -17,16 +17,16 @@ from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import LAYOUTS, load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import sample_indices
-from learn3d.device import crowding, keep_freed_memory, resolve_precision
+from learn3d.device import keep_freed_memory, oversubscription, resolve_precision
+from learn3d.distributed.ranks import ALONE, Ranks
 from learn3d.files.worker import together
-from learn3d.methods import DataShape, create_method
-from learn3d.parallel.ranks import ALONE, Ranks
+from learn3d.methods import DatasetInfo, create_method
 from learn3d.presets import PRESETS
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.faults import advice_on_errors
 from learn3d.runs.log import RunLog, SilentLog
-from learn3d.runs.state import Run, conditions_of
+from learn3d.runs.state import Run, fingerprint_of
 from learn3d.terminal import is_watched, stop_on_signal
 from learn3d.validation import draw, validate
 
@@ -38,7 +38,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
     and return. With `resume` the run continues from its last checkpoint (bit for bit on a CPU: same machine, numbers of
     threads and processes), or from the start if it was stopped before its first one. A finished run stays as it is.
 
-    Several processes, each with its `ranks`, train one model together (`parallel.ranks`); the first one writes.
+    Several processes, each with its `ranks`, train one model together (`distributed.ranks`); the first one writes.
 
     Raises ValueError for a folder in use, options or training data that conflict with the resumed run or data that do
     not fit, FloatingPointError when a loss is no longer finite (the last checkpoint is from before that), OSError when
@@ -49,7 +49,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
     if config.threads is not None:
         torch.set_num_threads(config.threads)
 
-    with run_folder.sole_use(folder) if ranks.main else contextlib.nullcontext():
+    with run_folder.lock_folder(folder) if ranks.main else contextlib.nullcontext():
         if ranks.main and not resume:
             run_folder.check_free(folder, overwrite)  # it is cleared when all else is well
         ranks = ranks.divide(config.batch_size, config.sampling)
@@ -59,7 +59,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
             *train_set.notes,
             *val_set.notes,
             train_set.check_masks(),
-            crowding(torch.get_num_threads(), ranks.local_world),
+            oversubscription(torch.get_num_threads(), ranks.local_world),
         )
         shape = _shape_of(train_set, config)
         precision = resolve_precision(config.precision, config.device)
@@ -69,7 +69,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
         changed = functools.partial(augment, names=config.augment, seed=config.seed, inverted=train_set.inverted)
         first = train_set.batch(sample(1), ranks.rows, voxels=False)
         method.check_batch(changed(first, step=1))  # before an older run is cleared away
-        run = Run(config, method, shape, conditions_of(train_set, precision), ranks)
+        run = Run(config, method, shape, fingerprint_of(train_set, precision), ranks)
         progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:  # also after a kill between the last save and the end
             return dataclasses.replace(_summary(config, progress, started), was_finished=True)
@@ -86,7 +86,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
                 batch = train_set.batch(indices, ranks.rows, voxels=False)
                 indices = sample(step + 1)
                 train_set.prepare(indices, ranks.rows)
-                losses = method.train_step(changed(batch, step=step), step)
+                losses = method.take_step(changed(batch, step=step), step)
                 # With the losses of the step before: some methods train one network in odd steps, another in even ones.
                 recent = progress.losses | losses
                 seconds = before + time.monotonic() - started
@@ -124,12 +124,12 @@ def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDat
     return train_set, val_set
 
 
-def _shape_of(train_set: ViewDataset, config: TrainConfig) -> DataShape:
+def _shape_of(train_set: ViewDataset, config: TrainConfig) -> DatasetInfo:
     wanted = getattr(config.settings, "symmetry", None) == "auto"
     plane = find_mirror_plane(train_set) if wanted else None
     box = train_set.convention.box if LAYOUTS[config.layout].voxels else None
     known = (train_set.num_views, train_set.num_classes, train_set.pose_features, train_set.inverted)
-    return DataShape(*known, mirror_plane_deg=plane, box=box)
+    return DatasetInfo(*known, mirror_plane_deg=plane, cube_side=box)
 
 
 def _about_plane(plane_deg: float | None) -> str:

@@ -28,7 +28,7 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog | S
     Returns the progress with the best IoU and its step.
     """
     config, step = run.config, progress.step
-    with run.method.averaged():
+    with run.method.ema_weights():
         result = evaluate(run.method, val_set, max_images=config.max_val_images)
     log.metrics(step, config.val_split, {k: v for k, v in result.summary().items() if v is not None})
     mmd = "" if result.mmd is None else f", MMD {result.mmd:.3f}"
@@ -50,7 +50,7 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog | S
 
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
     """Write pictures/<step>.png: the same few validation images every time, of different objects and views."""
-    with method.averaged():
+    with method.ema_weights():
         grid = figures.picture_grid(method, val_set, picture_samples(val_set, PICTURE_ROWS))
     folder = config.output / PICTURES
     try:

@@ -159,5 +159,5 @@ def test_networks_whose_shapes_are_not_rendered_have_the_same_to_do():
     method = bench_step.build(config, dataset, "fp32")
     bench_step.stop_rendering(method)
     before = {name: value.clone() for name, value in method.generator.named_parameters()}
-    method.train_step(dataset.batch(torch.tensor([0, 30]), voxels=False), 1)
+    method.take_step(dataset.batch(torch.tensor([0, 30]), voxels=False), 1)
     assert all(not torch.equal(value, before[name]) for name, value in method.generator.named_parameters())

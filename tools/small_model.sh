@@ -13,7 +13,7 @@ for category in ${categories//,/ }; do
         --procedural "${OBJECTS:-250}" --overwrite
 done
 "$python" tools/train.py --data "$out/data" --layout kar --views-per-object 12 --category "$categories" --preset plus \
-    --encoder conv-centred --generator sphere-small --remembered 6144 --iterations "${STEPS:-24000}" --validate-every 6000 \
+    --encoder conv-centred --generator sphere-small --bank-size 6144 --iterations "${STEPS:-24000}" --validate-every 6000 \
     --output "$out/run" --overwrite
 "$python" tools/evaluate.py "$out/run" --data "$out/data" --json "$out/evaluation.json"
 mkdir -p learn3d/models

@@ -19,8 +19,8 @@ import tyro
 
 from learn3d.commands.parsing import parse
 from learn3d.config import DEFAULT_PRESET, TrainConfig, load_config
-from learn3d.parallel.launch import label, start
-from learn3d.parallel.ranks import LostPeerError
+from learn3d.distributed.launch import label, start
+from learn3d.distributed.ranks import LostPeerError
 from learn3d.presets import METHODS, PRESETS, full_name
 from learn3d.terminal import INTERRUPTED, say, without_traceback
 from learn3d.training import train

@@ -62,7 +62,7 @@ class VoxelConvention:
         grid = nmr.voxelize(self._to_unit(vertices, definition), faces, size=VOXEL_SIZE, definition=definition)
         return self.to_axes(grid)
 
-    def leaves_grid(self, vertices: Tensor, definition: Definition = "kato18") -> Tensor:
+    def exceeds_grid(self, vertices: Tensor, definition: Definition = "kato18") -> Tensor:
         """Which meshes, vertices float [B, V, 3], reach beyond the grid and so count as hollow: bool [B]."""
         return (self._to_unit(vertices, definition) - 0.5).abs().amax(dim=(1, 2)) > 0.5
 

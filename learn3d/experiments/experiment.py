@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import torch
 
 from learn3d.device import cores
+from learn3d.distributed.tasks import Task, run_tasks
 from learn3d.experiments import results
 from learn3d.experiments.formats import to_text, write_report
 from learn3d.experiments.plan import Options, Run, plan_runs
 from learn3d.experiments.report import make_report
 from learn3d.experiments.results import conflicts_with, read_results
 from learn3d.experiments.tables import TABLES
-from learn3d.parallel.engine import Task, carry_out_all
 from learn3d.runs import folder as run_folder
 from learn3d.terminal import INTERRUPTED, note, say
 from learn3d.training import train
@@ -106,7 +106,7 @@ def _complete(runs: Sequence[Run], call: Call, threads: int, work: Work) -> dict
         for run in runs
         if run.folder not in done
     ]
-    return carry_out_all(tasks, call.options.output, jobs=call.jobs, cluster=call.cluster)
+    return run_tasks(tasks, call.options.output, jobs=call.jobs, cluster=call.cluster)
 
 
 def describe_tables() -> str:

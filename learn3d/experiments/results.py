@@ -57,7 +57,7 @@ def measure(run: Run) -> dict[str, Any]:
         "step": metadata.progress.step,
         "seed": config.seed,
         "seconds": last.progress.seconds,
-        "conditions": dataclasses.asdict(last.conditions),
+        "fingerprint": dataclasses.asdict(last.fingerprint),
         "trained_by": last.versions,
         "tested_by": versions(),
     }
@@ -104,7 +104,7 @@ class _Result(BaseModel, strict=True):
     mmd_paper: Number = None
     chamfer_l1: Number = None
     f_score: Number = None
-    conditions: dict[str, Any] | None = None
+    fingerprint: dict[str, Any] | None = None
     trained_by: _Versions | None = None
     tested_by: _Versions | None = None
 

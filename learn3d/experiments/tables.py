@@ -94,17 +94,19 @@ _PASCAL_PLUS = _plus("pascal-plus", "pascal", checkpoint="best")
 
 #: What Plus has and any method can have: its step sizes, its average of the weights, its symmetry.
 _OF_PLUS = PlusSettings()
-_SCHEDULE = {"schedule": "cosine", "warmup_steps": 100, "average": 0.99, "learning_rate": _OF_PLUS.learning_rate}
+_SCHEDULE = {"lr_schedule": "cosine", "warmup_steps": 100, "ema_decay": 0.99, "learning_rate": _OF_PLUS.learning_rate}
 _SYMMETRY = {"symmetry": "auto"}
 _VANILLA_BOTH = Variant("vanilla-schedule-symmetry", "peng2020-kato-vanilla", _SCHEDULE | _SYMMETRY)
 _PROPOSED_SCHEDULE = Variant("proposed-schedule", "peng2020-kato", _SCHEDULE)
 _PROPOSED_BOTH = Variant("proposed-schedule-symmetry", "peng2020-kato", _SCHEDULE | _SYMMETRY)
 _SHARED = _SCHEDULE | _SYMMETRY
-_SHARED |= {name: getattr(_OF_PLUS, name) for name in ("encoder", "inside_box", "lambda_smooth", "lambda_smooth_end")}
+_SHARED |= {
+    name: getattr(_OF_PLUS, name) for name in ("encoder", "clamp_to_cube", "lambda_smooth", "lambda_smooth_end")
+}
 _PROPOSED_SHARED = Variant("proposed-shared", "peng2020-kato", _SHARED, smaller_batches=_BATCHES)
 _VANILLA_SHARED = Variant("vanilla-shared", "peng2020-kato-vanilla", _SHARED, smaller_batches=_BATCHES)
 _PLUS_FREE = _plus("plus-without-symmetry", "kato", {"symmetry": None})
-_PLUS_SEEN = _plus("plus-without-unseen", "kato", {"lambda_unseen": 0.0})
+_PLUS_SEEN = _plus("plus-without-novel-views", "kato", {"lambda_novel_view": 0.0})
 _ONE_VIEW = {"views_per_object": 1}
 _SINGLE_VANILLA = Variant("single-vanilla", "peng2020-kato-vanilla", _ONE_VIEW)
 _SINGLE_PROPOSED = Variant("single-proposed", "peng2020-kato", _ONE_VIEW)
@@ -221,7 +223,7 @@ _ALL = (
             Row("Proposed, schedule and symmetry", _PROPOSED_BOTH),
             Row("Vanilla-AE, all that is shared", _VANILLA_SHARED),
             Row("Proposed, all that is shared", _PROPOSED_SHARED),
-            Row("Plus, w/o unseen views", _PLUS_SEEN),
+            Row("Plus, w/o novel views", _PLUS_SEEN),
             Row("Plus, w/o symmetry", _PLUS_FREE),
             Row("Plus", PLUS),
         ),

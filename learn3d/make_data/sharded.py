@@ -20,6 +20,7 @@ from learn3d.data.dataset import SPLITS
 from learn3d.data.layouts import load_dataset
 from learn3d.data.readers import kato
 from learn3d.data.shards import finish_set, made, remove, split_folder, write_shard
+from learn3d.distributed.tasks import Task, run_tasks
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.files.writing import write_json
 from learn3d.make_data import meshes
@@ -29,7 +30,6 @@ from learn3d.make_data.folders import check_room
 from learn3d.make_data.render import list_sources, render, settings_of, split_objects
 from learn3d.make_data.writers import writer_of
 from learn3d.make_data.writers.pictures import write_png
-from learn3d.parallel.engine import Task, carry_out_all
 from learn3d.terminal import INTERRUPTED, note, say, stop_on_signal
 
 OBJECTS_PER_SHARD = 512  # 201 MB of images
@@ -72,7 +72,7 @@ def make_shards(config: DatasetConfig) -> int:
                 given = (config, folder / split, split, number, items, threads)
                 tasks.append(Task(f"{split} {number}", make_shard, given, folder / f"{split}-{number:05d}.log"))
     note(f"{config.category}: {sum(shards.values())} shards, {len(tasks)} to be made; logs: {folder / '*.log'}")
-    failed = carry_out_all(tasks, folder, jobs=config.jobs, cluster=config.cluster)
+    failed = run_tasks(tasks, folder, jobs=config.jobs, cluster=config.cluster)
     for name, tail in failed.items():
         note(f"\nFAILED {name}; the end of the log:\n{tail}")
     missing = [f"{s} {k}" for s, count in shards.items() for k in range(count) if made(folder / s, k) is None]

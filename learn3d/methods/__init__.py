@@ -7,9 +7,9 @@ from typing import Literal
 import torch
 
 from learn3d.device import check_device
-from learn3d.methods.method import DataShape, MeshMethod, Method
+from learn3d.methods.method import DatasetInfo, MeshMethod, Method
 from learn3d.methods.multi_view import MultiView, MultiViewSettings
-from learn3d.methods.optimization import CONSTANT, Plan, Schedule
+from learn3d.methods.optimization import CONSTANT, LRSchedule, Plan
 from learn3d.methods.plus import Plus, PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.prgan import PrGAN, PrGANSettings
@@ -17,13 +17,13 @@ from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.methods.vpl import VPL, VPLSettings
 
 __all__ = [
-    "DataShape",
+    "DatasetInfo",
     "Grids",
+    "LRSchedule",
     "MeshMethod",
     "Meshes",
     "Method",
     "Plan",
-    "Schedule",
     "Settings",
     "create_method",
 ]
@@ -41,7 +41,7 @@ _METHODS: dict[type, type[Method]] = {
 
 def create_method(
     settings: Settings,
-    shape: DataShape,
+    info: DatasetInfo,
     *,
     device: str,
     precision: Literal["bf16", "fp32"],
@@ -56,7 +56,7 @@ def create_method(
     if type(settings) not in _METHODS:
         raise ValueError(f"no method learns with {type(settings).__name__}; add the pair to learn3d.methods._METHODS")
     kind = _METHODS[type(settings)]
-    if kind.needs_poses and shape.pose_features == 0:
+    if kind.needs_poses and info.pose_features == 0:
         raise ValueError(
             f"{kind.__name__} learns from images whose camera poses are known, but this data set has no poses; take "
             "a data set with poses, or a method that estimates them"
@@ -64,4 +64,4 @@ def create_method(
     if device == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # torch's default for convolutions; fp32 is to mean fp32
     torch.manual_seed(seed)
-    return kind(settings, shape, device, precision, plan)
+    return kind(settings, info, device, precision, plan)

@@ -16,16 +16,16 @@ from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
 from learn3d.device import autocast
-from learn3d.methods.optimization import CONSTANT, Average, Plan, adam, backpropagate
+from learn3d.distributed.ranks import ALONE, Ranks, sum_gradients
+from learn3d.distributed.sync_batch_norm import use_whole_batch
+from learn3d.methods.optimization import CONSTANT, EMA, Plan, adam, backpropagate
 from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.networks import GENERATORS, MeshGenerator, Symmetry, SymmetryOption, create_encoder, network_input
-from learn3d.parallel.ranks import ALONE, Ranks, sum_gradients
-from learn3d.parallel.whole_batch_norm import use_whole_batch
 from learn3d.settings import checked
 
 
 @checked
-class DataShape:
+class DatasetInfo:
     """What a method must know about its data before it builds its networks. Saved in every checkpoint."""
 
     num_views: Annotated[int, Field(ge=0, le=100_000)]  # K pose classes
@@ -33,37 +33,37 @@ class DataShape:
     pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # of a camera: eye position 3, rotation 9, unknown 0
     inverted: bool = False  # colours are stored as 255 - colour
     mirror_plane_deg: float | None = None  # what `data.mirror_plane` found; None: nothing, or it was not asked for
-    box: float | None = None  # side of the cube, centred at the origin, in which all objects lie; None: not known
+    cube_side: float | None = None  # side of the cube, centred at the origin, in which all objects lie; None: not known
 
 
-def plane_of(symmetry: SymmetryOption, shape: DataShape) -> Symmetry | None:
+def plane_of(symmetry: SymmetryOption, info: DatasetInfo) -> Symmetry | None:
     """The mirror plane of the shapes: the one that the settings name, or with "auto" the one that the data have."""
-    return shape.mirror_plane_deg if symmetry == "auto" else symmetry
+    return info.mirror_plane_deg if symmetry == "auto" else symmetry
 
 
 class Method(abc.ABC):
     """One method in training or in use. A subclass creates networks and optimizers and has its own training step.
 
     Everything that decides the next steps lies in the parameters and buffers of `networks`, in `optimizers`, in
-    `average` and in torch's global random state, so that a checkpoint of these resumes bit for bit.
+    `ema` and in torch's global random state, so that a checkpoint of these resumes bit for bit.
     """
 
     needs_poses: ClassVar[bool] = True  # whether it can be trained only where the pose of every image is known
     networks: dict[str, nn.Module]  # each is also an attribute: networks["encoder"] is self.encoder
     optimizers: dict[str, torch.optim.Optimizer]
-    average: Average | None = None  # of the weights, where the run asks for it
+    ema: EMA | None = None  # of the weights, where the run asks for it
     ranks: Ranks = ALONE  # the processes that train it together; set by `join`
     image_size: int  # side of the images that `encode` takes; also a property of the method's settings
 
     def __init__(
         self,
         settings: Any,
-        shape: DataShape,
+        info: DatasetInfo,
         device: str,
         precision: Literal["bf16", "fp32"],
         plan: Plan = CONSTANT,
     ) -> None:
-        self.settings, self.shape, self.plan = settings, shape, plan
+        self.settings, self.info, self.plan = settings, info, plan
         self.image_size = settings.image_size
         self.device, self.precision = torch.device(device), precision
         self.networks = self.create_networks()
@@ -71,20 +71,20 @@ class Method(abc.ABC):
             setattr(self, name, network.to(device))
         self.optimizers = self.create_optimizers()
         self._step_sizes = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimizers.items()}
-        if plan.average > 0:
-            self.average = Average(self.networks, plan.average)
+        if plan.ema_decay > 0:
+            self.ema = EMA(self.networks, plan.ema_decay)
 
     @abc.abstractmethod
     def create_networks(self) -> dict[str, nn.Module]:
-        """The networks by name, of `settings` and `shape`. Raises ValueError where these contradict each other."""
+        """The networks by name, of `settings` and `info`. Raises ValueError where these contradict each other."""
 
     @abc.abstractmethod
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Optimizers by name, with their full step sizes."""
 
     @abc.abstractmethod
-    def learn(self, batch: Batch, step: int) -> dict[str, float]:
-        """The method's own part of `train_step`: losses, and `descend` for the optimizers that are to step."""
+    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
+        """The method's own part of `take_step`: losses, and `backward_and_step` for the optimizers that are to step."""
 
     @abc.abstractmethod
     def encode(self, images: Tensor) -> Tensor:
@@ -96,7 +96,7 @@ class Method(abc.ABC):
 
     @property
     def weights(self) -> Mapping[str, float]:
-        """The weight of every loss that `descend` is given, by the name of the loss."""
+        """The weight of every loss that `backward_and_step` is given, by the name of the loss."""
         return {}
 
     def weights_at(self, step: int) -> Mapping[str, float]:
@@ -113,7 +113,7 @@ class Method(abc.ABC):
     def check_batch(self, batch: Batch) -> None:  # noqa: B027
         """Raise ValueError where the method cannot learn from batches like this one. Called before a run begins."""
 
-    def train_step(self, batch: Batch, step: int) -> dict[str, float]:
+    def take_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Take optimisation step `step` (from 1) and return every loss that was computed, unweighted, and "total".
 
         Raises FloatingPointError when a loss is not finite, before it reaches a weight.
@@ -123,12 +123,12 @@ class Method(abc.ABC):
             for group, step_size in zip(optimizer.param_groups, self._step_sizes[name], strict=True):
                 group["lr"] = factor * step_size
         self._clear_gradients()  # here, too, so that the forward pass has their memory
-        values = self.learn(batch, step)
-        if self.average is not None:
-            self.average.update(step)
+        values = self.training_step(batch, step)
+        if self.ema is not None:
+            self.ema.update(step)
         return values
 
-    def descend(self, losses: Mapping[str, Tensor], step: int, *names: str) -> dict[str, float]:
+    def backward_and_step(self, losses: Mapping[str, Tensor], step: int, *names: str) -> dict[str, float]:
         """Backpropagate the weighted sum of the losses and let the optimizers `names` step; see `backpropagate`."""
         self._clear_gradients()
         values = backpropagate(losses, self.weights_at(step), step, self.ranks)
@@ -150,9 +150,9 @@ class Method(abc.ABC):
         for optimizer in self.optimizers.values():
             optimizer.register_step_pre_hook(sum_gradients)
 
-    def averaged(self) -> contextlib.AbstractContextManager[None]:
+    def ema_weights(self) -> contextlib.AbstractContextManager[None]:
         """Within it the networks have their averaged weights, where there are any: for evaluation and pictures."""
-        return contextlib.nullcontext() if self.average is None else self.average.in_place()
+        return contextlib.nullcontext() if self.ema is None else self.ema.in_place()
 
     def autocast(self) -> torch.autocast:
         """Context in which the networks run at the method's precision."""
@@ -184,8 +184,8 @@ class MeshMethod(Method):
         self.faces, self.edges = self.generator.faces.cpu(), self.generator.edges.cpu()  # for the renderer
 
     def create_networks(self) -> dict[str, nn.Module]:
-        encoder = create_encoder(self.settings.encoder, inverted=self.shape.inverted)
-        generator = GENERATORS[self.settings.generator](symmetry=plane_of(self.settings.symmetry, self.shape))
+        encoder = create_encoder(self.settings.encoder, inverted=self.info.inverted)
+        generator = GENERATORS[self.settings.generator](symmetry=plane_of(self.settings.symmetry, self.info))
         return {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:

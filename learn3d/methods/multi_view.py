@@ -62,7 +62,7 @@ class MultiView(MeshMethod):
     def weights(self) -> dict[str, float]:
         return {"projection": 1.0, "smoothness": self.settings.lambda_smooth}
 
-    def learn(self, batch: Batch, step: int) -> dict[str, float]:
+    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shapes of both views, {a, b}, in both views: the mean of four IoU losses, and lambda_s times the
         mean smoothness of the shapes. Raises ValueError where the batch is not made of pairs.
         """
@@ -74,7 +74,7 @@ class MultiView(MeshMethod):
         silhouettes = self.render(torch.cat([vertices, vertices]), batch.poses[seen])
         losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks[seen])}
         losses |= self.surface_losses(vertices)
-        return self.descend(losses, step, *self.optimizers)
+        return self.backward_and_step(losses, step, *self.optimizers)
 
 
 def check_pairs(batch: Batch) -> int:

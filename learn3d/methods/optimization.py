@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from learn3d.device import Download
-from learn3d.parallel.ranks import ALONE, Ranks
+from learn3d.distributed.ranks import ALONE, Ranks
 
-Schedule = Literal["constant", "cosine", "linear", "step"]
+LRSchedule = Literal["constant", "cosine", "linear", "step"]
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Plan:
     """What a method must know about the run that it is trained in."""
 
     iterations: int = 1  # steps of the whole run
-    schedule: Schedule = "constant"  # how the step size changes after the warm-up
+    lr_schedule: LRSchedule = "constant"  # how the step size changes after the warm-up
     warmup_steps: int = 0  # steps in which it grows from nothing to its full size
-    average: float = 0.0  # decay of the average of the weights, 0: there is none
+    ema_decay: float = 0.0  # of the exponential moving average of the weights a step; 0: no average
 
     def __post_init__(self) -> None:
         if 0 < self.iterations <= self.warmup_steps:
@@ -42,17 +42,17 @@ class Plan:
         if step <= self.warmup_steps:
             return step / self.warmup_steps
         done = (step - 1 - self.warmup_steps) / max(1, self.iterations - self.warmup_steps)  # 0 .. below 1
-        if self.schedule == "linear":
+        if self.lr_schedule == "linear":
             return 1 - done
-        if self.schedule == "cosine":
+        if self.lr_schedule == "cosine":
             return (1 + math.cos(math.pi * done)) / 2
-        return 0.1 if self.schedule == "step" and 20 * step > 19 * self.iterations else 1.0
+        return 0.1 if self.lr_schedule == "step" and 20 * step > 19 * self.iterations else 1.0
 
 
 CONSTANT = Plan()  # full step sizes, no average
 
 
-class Average:
+class EMA:
     """An exponential moving average of all weights of some networks (EMA), and of their batch norms' statistics.
 
     After step t: average = d * average + (1 - d) * weights, where d is the `decay`, but at most (1 + t) / (10 + t), so

@@ -1,4 +1,4 @@
-"""Plus: the pose-invariant method, with mirror symmetry and with what masks of other objects say about unseen views.
+"""Plus: the pose-invariant method, with mirror symmetry and with what masks of other objects say about novel views.
 
 The supervision is that of Peng et al. 2020: images taken singly, each with its mask and its pose.
 """
@@ -19,7 +19,7 @@ from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.networks import EncoderName, PoseDiscriminator, SymmetryOption
 from learn3d.settings import Count, Positive, Weight, checked
 
-REDUCED = MASK_SIZE // 2  # side of the masks that are remembered and compared
+REDUCED = MASK_SIZE // 2  # side of the masks in the mask bank
 
 
 @checked
@@ -33,7 +33,7 @@ class PlusSettings(PoseInvariantSettings):
     """Mirror shapes at a vertical plane: auto: the one at which the training masks mirror each other, or none where
     they do not; x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along it. None: shapes are
     free."""
-    inside_box: bool = True
+    clamp_to_cube: bool = True
     """Whether what reaches out of the cube in which all objects of a data set lie, where it has one, is moved onto its
     sides, in evaluation and reconstruction. The voxelizers count a shape that reaches out of their grid as hollow."""
     learning_rate: Positive = 4e-4
@@ -42,17 +42,17 @@ class PlusSettings(PoseInvariantSettings):
     """Weight of the smoothness loss (lambda_1) at the start of the run."""
     lambda_smooth_end: Positive | None = 1e-4
     """This weight at the end of the run, approached by a constant factor a step. None: lambda_smooth throughout."""
-    lambda_unseen: Weight = 0.5
-    """Weight of the loss at unseen views."""
-    remembered: Count = 2048
-    """Number of masks that are remembered for it."""
+    lambda_novel_view: Weight = 0.5
+    """Weight of the loss at novel views."""
+    bank_size: Count = 2048
+    """Number of training masks in the mask bank, from which that loss draws."""
 
     @property
     def reads_view_ids(self) -> bool:
-        return self.uses_discriminator or self.lambda_unseen > 0
+        return self.uses_discriminator or self.lambda_novel_view > 0
 
 
-class MaskMemory(nn.Module):
+class MaskBank(nn.Module):
     """The last masks of the training, at half their resolution, with their view classes. It has no weights.
 
     It is a network so that it is saved in checkpoints with them.
@@ -83,35 +83,35 @@ class MaskMemory(nn.Module):
 
 
 class Plus(PoseInvariant):
-    """Encoder, mesh generator, pose discriminator and a memory of masks."""
+    """Encoder, mesh generator, pose discriminator and a mask bank."""
 
     settings: PlusSettings
-    memory: MaskMemory
+    mask_bank: MaskBank
 
     def create_networks(self) -> dict[str, nn.Module]:
         networks = super().create_networks()
         if self.settings.uses_discriminator and networks["generator"].mirror is not None:
-            networks["discriminator"] = PoseDiscriminator(2 * self.shape.num_views)  # flipped views are other views
-        if self.settings.lambda_unseen > 0:
-            networks["memory"] = MaskMemory(self.settings.remembered)
+            networks["discriminator"] = PoseDiscriminator(2 * self.info.num_views)  # flipped views are other views
+        if self.settings.lambda_novel_view > 0:
+            networks["mask_bank"] = MaskBank(self.settings.bank_size)
         return networks
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        trained = {name: network for name, network in self.networks.items() if name != "memory"}
+        trained = {name: network for name, network in self.networks.items() if name != "mask_bank"}
         return {name: adam(network, self.settings.learning_rate) for name, network in trained.items()}
 
     @property
     def weights(self) -> dict[str, float]:
-        return super().weights | {"unseen": self.settings.lambda_unseen}
+        return super().weights | {"novel_view": self.settings.lambda_novel_view}
 
     def encode(self, images: Tensor) -> Tensor:
         """Shape codes; where shapes are symmetric, the mean of the codes of an image and of its mirror image."""
         codes = super().encode(images)
         return codes if self.generator.mirror is None else (codes + super().encode(images.flip(3))) / 2
 
-    def learn(self, batch: Batch, step: int) -> dict[str, float]:
+    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """A step of `PoseInvariant`, in which every second image is flipped where shapes are symmetric, and with
-        lambda_unseen times the loss at an unseen view, once the memory is full.
+        lambda_novel_view times the loss at a novel view, once the mask bank is full.
 
         The flipped image of a symmetric object has the same shape, so its mask and its pose stay as they are. To the
         discriminator it is of another view, K + k for view k.
@@ -120,36 +120,36 @@ class Plus(PoseInvariant):
         images = torch.where(flipped[:, None, None, None], batch.images.flip(3), batch.images)
         codes, vertices = self.predict(images)
         download = Download(vertices)  # a GPU computes the losses on codes while the CPU waits and renders
-        on_codes = self._losses_on_codes(codes, batch.view_ids + self.shape.num_views * flipped, step)
+        on_codes = self._losses_on_codes(codes, batch.view_ids + self.info.num_views * flipped, step)
         vertices = download.wait()
         silhouettes = self.render(vertices, batch.poses)
         losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks)}
-        if self.settings.lambda_unseen > 0:
-            losses |= self._unseen(vertices, batch)
+        if self.settings.lambda_novel_view > 0:
+            losses |= self._novel_view_loss(vertices, batch)
         losses |= self.surface_losses(vertices) | on_codes
         trained = ["encoder", "generator"] + ["discriminator"] * ("classification" in losses)
-        return self.descend(losses, step, *trained)
+        return self.backward_and_step(losses, step, *trained)
 
     def _flipped(self, batch: Batch) -> Tensor:
         """Which images are flipped, bool [B]: none where shapes are free. (Batches are in random order already.)"""
         return (batch.step_views.rows % 2 == 1) & (self.generator.mirror is not None)
 
-    def _unseen(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
+    def _novel_view_loss(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
         """All shapes of the batch are seen from one of its cameras. Their silhouettes are to be distributed as the
-        masks that are remembered of this view, mostly of other objects: the energy distance of the two sets.
+        masks of this view in the mask bank, mostly of other objects: the energy distance of the two sets.
         """
         views = batch.step_views
         masks = self.ranks.join_rows(_reduced(batch.masks), views.rows, len(views))
-        self.memory.add(masks, views.view_ids)
+        self.mask_bank.add(masks, views.view_ids)
         seen_by = int(torch.randint(len(views), ()))
-        if not self.memory.full:
+        if not self.mask_bank.full:
             return {}
         silhouettes = self.render(vertices, views.poses[torch.full((len(vertices),), seen_by)])
         drawn = self.ranks.join_rows(_reduced(silhouettes), views.rows, len(views))
-        real = self.memory.of_view(int(views.view_ids[seen_by])).to(drawn.device)
-        return {"unseen": silhouette_energy_distance(drawn, real)}
+        real = self.mask_bank.of_view(int(views.view_ids[seen_by])).to(drawn.device)
+        return {"novel_view": silhouette_energy_distance(drawn, real)}
 
 
 def _reduced(silhouettes: Tensor) -> Tensor:
-    """Silhouettes [B, MASK_SIZE, MASK_SIZE] at the resolution of the memory, [B, REDUCED^2]."""
+    """Silhouettes [B, MASK_SIZE, MASK_SIZE] at the resolution of the mask bank, [B, REDUCED^2]."""
     return F.avg_pool2d(silhouettes[:, None], MASK_SIZE // REDUCED).flatten(1)

@@ -37,7 +37,7 @@ class PoseInvariantSettings:
     """Mirror shapes at a vertical plane: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
     it (0 is x = 0). auto: the plane at which the training masks mirror each other, or none where they do not. None:
     shapes are free."""
-    inside_box: bool = False
+    clamp_to_cube: bool = False
     """Whether what reaches out of the cube in which all objects of a data set lie, where it has one, is moved onto its
     sides, in evaluation and reconstruction. The voxelizers count a shape that reaches out of their grid as hollow."""
     pretrained: FilePath | None = None
@@ -89,7 +89,7 @@ class PoseInvariant(MeshMethod):
     def create_networks(self) -> dict[str, nn.Module]:
         networks = super().create_networks()
         if self.settings.uses_discriminator:
-            networks["discriminator"] = PoseDiscriminator(self.shape.num_views)
+            networks["discriminator"] = PoseDiscriminator(self.info.num_views)
         return networks
 
     @property
@@ -113,16 +113,16 @@ class PoseInvariant(MeshMethod):
 
     def decode(self, codes: Tensor) -> Meshes:
         shapes = super().decode(codes)
-        if not self.settings.inside_box or self.shape.box is None:
+        if not self.settings.clamp_to_cube or self.info.cube_side is None:
             return shapes
-        limit = INSIDE * self.shape.box
+        limit = INSIDE * self.info.cube_side
         return dataclasses.replace(shapes, vertices=shapes.vertices.clamp(-limit, limit))
 
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:
             load_pretrained(self.encoder, self.settings.pretrained)
 
-    def learn(self, batch: Batch, step: int) -> dict[str, float]:
+    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """In every step encoder and generator descend projection + lambda_1 smoothness + lambda_4 prior. Odd steps add
         lambda_2 classification on detached codes, which trains the discriminator and nothing else. Even steps add
         lambda_3 confusion, which reaches the encoder through the discriminator, while the discriminator itself gets
@@ -136,7 +136,7 @@ class PoseInvariant(MeshMethod):
         losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks)}
         losses |= self.surface_losses(vertices) | on_codes
         trained = ["encoder", "generator"] + ["discriminator"] * ("classification" in losses)
-        return self.descend(losses, step, *trained)
+        return self.backward_and_step(losses, step, *trained)
 
     def _losses_on_codes(self, codes: Tensor, view_ids: Tensor, step: int) -> dict[str, Tensor]:
         settings, losses = self.settings, {}

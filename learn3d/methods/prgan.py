@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from learn3d.data.batch import Batch, StepViews
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
 from learn3d.device import autocast, upload
+from learn3d.distributed.ranks import ALONE, Ranks
 from learn3d.methods.method import Method
 from learn3d.methods.optimization import adam, frozen
 from learn3d.methods.surfaces import Grids
@@ -28,7 +29,6 @@ from learn3d.networks.voxel_gan import (
     SilhouetteDiscriminator,
     VoxelGenerator,
 )
-from learn3d.parallel.ranks import ALONE, Ranks
 from learn3d.settings import Items, LayerChannels, Positive, Share, Step, checked
 
 BETAS = (0.5, 0.999)  # of Adam, for the two networks of the GAN
@@ -37,7 +37,7 @@ FourLayers = Annotated[tuple[LayerChannels, LayerChannels, LayerChannels, LayerC
 
 @checked
 class PrGANSettings:
-    """Schedule, step sizes and widths; the defaults are the published code's, the schedule is that for airplanes."""
+    """Learning rates, widths and when each network is trained; defaults: the published code, for airplanes."""
 
     encoder_from_step: Step = 53_051
     """First step that trains the encoder instead of the GAN (published: after 50 epochs)."""
@@ -109,7 +109,7 @@ class PrGAN(Method):
     def views(self) -> ViewCircle:
         """The K views that silhouettes are projected to."""
         own = self.settings
-        return ViewCircle(self.shape.num_views, own.elevation_deg, own.distance, own.half_fov_deg, own.perspective)
+        return ViewCircle(self.info.num_views, own.elevation_deg, own.distance, own.half_fov_deg, own.perspective)
 
     def encode(self, images: Tensor) -> Tensor:
         """Shape codes [B, 200], of the mask channel alone."""
@@ -135,7 +135,7 @@ class PrGAN(Method):
         with autocast(self.device, "fp32"):
             return project(self.generator(codes), self.view_ids(z), self.views, TAU)
 
-    def learn(self, batch: Batch, step: int) -> dict[str, float]:
+    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """A step of the GAN before `encoder_from_step`, of the encoder from there on.
 
         Raises ValueError where the batch's cameras are not those of the K views.
@@ -154,23 +154,23 @@ class PrGAN(Method):
         values = {"accuracy": self.accuracy(real, z)}
         self.set_training(True)
 
-        def descend(name: str, loss: Tensor) -> None:
-            values[name] = self.descend({name: loss}, step, name)[name]
+        def backward_and_step(name: str, loss: Tensor) -> None:
+            values[name] = self.backward_and_step({name: loss}, step, name)[name]
 
         fake = self.generate(z)
         if values["accuracy"] <= self.settings.accuracy_margin:
             with self.autocast():
                 of_real, of_fake = self.discriminator(real).float(), self.discriminator(fake.detach()).float()
-            descend("discriminator", _bce(of_real, 1.0) + _bce(of_fake, 0.0))
+            backward_and_step("discriminator", _bce(of_real, 1.0) + _bce(of_fake, 0.0))
 
         with self.autocast():
             logits = frozen(self.discriminator, fake).float()
-        descend("generator", _bce(logits, 1.0))
+        backward_and_step("generator", _bce(logits, 1.0))
 
         with self.autocast():
             first = self.discriminator.first
             of_real, of_fake = (frozen(first, images[:, None]).float() for images in (real, self.generate(z)))
-        descend("generator_statistics", statistics_loss(of_real, of_fake, self.ranks))
+        backward_and_step("generator_statistics", statistics_loss(of_real, of_fake, self.ranks))
         values["total"] = sum(values.get(name, 0.0) for name in self.optimizers)
         return values
 
@@ -184,7 +184,7 @@ class PrGAN(Method):
             estimate = self.encoder(images)
         difference = estimate.float() - upload(z, self.device)
         # A sum over the batch, not a mean: this process has only its share of it.
-        return self.descend({"encoder": difference.square().sum() / self.ranks.share}, step, "encoder")
+        return self.backward_and_step({"encoder": difference.square().sum() / self.ranks.share}, step, "encoder")
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> float:

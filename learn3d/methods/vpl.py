@@ -21,7 +21,7 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
 from learn3d.device import Download, upload
 from learn3d.losses import silhouette_pyramid_loss
-from learn3d.methods.method import DataShape, MeshMethod, plane_of
+from learn3d.methods.method import DatasetInfo, MeshMethod, plane_of
 from learn3d.methods.optimization import adam, frozen
 from learn3d.networks import ENCODERS, GENERATORS, GeneratorName, MeshGenerator, SymmetryOption
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
@@ -120,13 +120,13 @@ class VPL(MeshMethod):
             raise ValueError("view prior learning needs another view for each image: batches of at least 2, got 1")
 
     def create_networks(self) -> dict[str, nn.Module]:
-        settings, shape = self.settings, self.shape
-        if settings.class_conditional and shape.num_classes < 2:
+        settings, info = self.settings, self.info
+        if settings.class_conditional and info.num_classes < 2:
             raise ValueError("class_conditional needs data of several categories, got one")
-        encoder = _create_encoder(settings, shape).to(memory_format=torch.channels_last)
-        networks = {"encoder": encoder, "generator": _create_generator(settings, self.shape)}
+        encoder = _create_encoder(settings, info).to(memory_format=torch.channels_last)
+        networks = {"encoder": encoder, "generator": _create_generator(settings, self.info)}
         if settings.lambda_discriminator > 0:
-            networks["discriminator"] = _create_discriminator(settings, shape)
+            networks["discriminator"] = _create_discriminator(settings, info)
         return networks
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
@@ -148,7 +148,7 @@ class VPL(MeshMethod):
         if self.settings.pretrained is not None:
             load_pretrained(self.encoder.resnet, self.settings.pretrained)
 
-    def learn(self, batch: Batch, step: int) -> dict[str, float]:
+    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """In every step encoder and generator descend projection + smoothness + inflation.
 
         With a discriminator D each shape is also rendered at another view. Alternating: in odd steps D descends
@@ -164,7 +164,7 @@ class VPL(MeshMethod):
             vertices = self._vertices(batch)
             silhouettes = self.render(vertices, batch.poses)
             losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
-            return self.descend(losses, step, "encoder", "generator")
+            return self.backward_and_step(losses, step, "encoder", "generator")
 
         views = batch.step_views
         others = other_views(views, settings.other_views)[views.rows]
@@ -183,7 +183,7 @@ class VPL(MeshMethod):
             logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, views)
             losses["adversarial"] = F.softplus(-logits).mean()
         trained = ["encoder", "generator"] + ["discriminator"] * ("discrimination" in losses)
-        return self.descend(losses, step, *trained)
+        return self.backward_and_step(losses, step, *trained)
 
     def _vertices(self, batch: Batch) -> Tensor:
         return Download(self.predict(batch.images)[1]).wait()
@@ -250,31 +250,31 @@ def other_views(batch: Batch | StepViews, choice: Literal["random", "reversed", 
     return torch.multinomial(weights, 1).squeeze(1)
 
 
-def _create_encoder(settings: VPLSettings, shape: DataShape) -> nn.Module:
+def _create_encoder(settings: VPLSettings, info: DatasetInfo) -> nn.Module:
     if settings.encoder == "preact-resnet18":
         return PreactResNet18(settings.image_size)
     if settings.encoder == "resnet18":
-        return FlatResNet18(settings.image_size, settings.pretrained is not None, shape.inverted)
+        return FlatResNet18(settings.image_size, settings.pretrained is not None, info.inverted)
     return ENCODERS[settings.encoder]()
 
 
-def _create_generator(settings: VPLSettings, shape: DataShape) -> MeshGenerator:
+def _create_generator(settings: VPLSettings, info: DatasetInfo) -> MeshGenerator:
     scales = {}
     if settings.generator.startswith("cube"):
         scales = {"scale": settings.vertex_scale, "object_scale": settings.object_scale}
-    return GENERATORS[settings.generator](symmetry=plane_of(settings.symmetry, shape), **scales)
+    return GENERATORS[settings.generator](symmetry=plane_of(settings.symmetry, info), **scales)
 
 
-def _create_discriminator(settings: VPLSettings, shape: DataShape) -> nn.Module:
+def _create_discriminator(settings: VPLSettings, info: DatasetInfo) -> nn.Module:
     channels = settings.discriminator_channels
     if settings.discriminator == "dcgan":
-        if shape.num_views < 2:
+        if info.num_views < 2:
             raise ValueError(
-                f"discriminator 'dcgan' tells views by their class and needs at least 2, got {shape.num_views}"
+                f"discriminator 'dcgan' tells views by their class and needs at least 2, got {info.num_views}"
             )
-        return OneHotViewDiscriminator(shape.num_views, channels, settings.silhouette_size)
+        return OneHotViewDiscriminator(info.num_views, channels, settings.silhouette_size)
     if settings.discriminator == "patch":
-        return PatchDiscriminator(shape.pose_features, channels)
+        return PatchDiscriminator(info.pose_features, channels)
     return SpectralPatchDiscriminator(
-        shape.pose_features, channels, shape.num_classes if settings.class_conditional else None
+        info.pose_features, channels, info.num_classes if settings.class_conditional else None
     )

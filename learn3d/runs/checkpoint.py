@@ -26,7 +26,7 @@ from learn3d.data.layouts import load_dataset
 from learn3d.device import resolve_precision
 from learn3d.files import limits, writing
 from learn3d.files.reading import check_file, parse_json
-from learn3d.methods import DataShape, Method, create_method
+from learn3d.methods import DatasetInfo, Method, create_method
 from learn3d.settings import Count, Share, Weight, checked
 
 FORMAT = 3
@@ -50,7 +50,7 @@ class Progress:
 
 
 @checked
-class Conditions:
+class DataFingerprint:
     """What decides the next steps besides the options and the saved state; a resumed run must find it as it was."""
 
     samples: Count  # training images: their number decides the order
@@ -71,9 +71,9 @@ class Metadata:
     """All that a checkpoint holds besides its tensors."""
 
     config: Annotated[TrainConfig, _from_json(config_from_dict)]
-    shape: Annotated[DataShape, _by_name(DataShape)]
+    info: Annotated[DatasetInfo, _by_name(DatasetInfo)]
     progress: Annotated[Progress, _by_name(Progress)]
-    conditions: Annotated[Conditions, _by_name(Conditions)]
+    fingerprint: Annotated[DataFingerprint, _by_name(DataFingerprint)]
     versions: dict[str, str | None]  # of the code that wrote it
     optimizers: dict[str, dict[str, dict[str, Any]]]  # what they keep beside tensors, by parameter
 
@@ -177,7 +177,7 @@ def _parse(path: Path, text: str) -> Metadata:
 def network_tensors(method: Method) -> dict[str, Tensor]:
     """Parameters and buffers of all networks, named network.<encoder|generator|...>.<parameter>.
 
-    Their averages have the same names with "average" in place of "network".
+    Their averages have the same names with "ema" in place of "network".
     """
     return {
         f"network.{name}.{key}": tensor
@@ -187,7 +187,7 @@ def network_tensors(method: Method) -> dict[str, Tensor]:
 
 
 def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path, kind: str = "network") -> None:
-    """Copy the weights of a checkpoint, or with the kind "average" their averages, into the networks of a method.
+    """Copy the weights of a checkpoint, or with the kind "ema" their averages, into the networks of a method.
 
     Weights at half precision (`runs.export`) become float32. Raises ValueError where they do not fit.
     """
@@ -300,8 +300,8 @@ def load_method(path: Path, *, device: str = "cpu", precision: str = "fp32") -> 
     tensors, metadata = load(path)
     arithmetic = resolve_precision(precision, device)
     with torch.random.fork_rng(devices=[]):
-        method = create_method(metadata.config.settings, metadata.shape, device=device, precision=arithmetic, seed=0)
-    restore_networks(method, tensors, path, "average" if starting_with("average.", tensors) else "network")
+        method = create_method(metadata.config.settings, metadata.info, device=device, precision=arithmetic, seed=0)
+    restore_networks(method, tensors, path, "ema" if starting_with("ema.", tensors) else "network")
     method.set_training(False)
     for network in method.networks.values():
         network.requires_grad_(False)

@@ -12,7 +12,11 @@ from learn3d.runs import checkpoint
 
 SMALL_MODEL = Path(__file__).parents[1] / "models" / "small.safetensors"
 NO_SMALL_MODEL = "this installation has no small model of its own; name a trained one with --run"
-_TRAINING_ONLY = ("lambda_classification", "lambda_adversarial", "lambda_unseen")  # weights of what needs more networks
+_TRAINING_ONLY = (
+    "lambda_classification",
+    "lambda_adversarial",
+    "lambda_novel_view",
+)  # weights of what needs more networks
 
 
 def export(source: Path, target: Path, *, which: str = "last") -> int:

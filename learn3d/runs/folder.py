@@ -39,7 +39,7 @@ WRITTEN = (
 
 
 @contextlib.contextmanager
-def sole_use(folder: Path, lock: str = LOCK) -> Iterator[None]:
+def lock_folder(folder: Path, lock: str = LOCK) -> Iterator[None]:
     """Make the folder and keep other processes from working in it while the block runs.
 
     The lock is the operating system's: it ends with its process, however that ends. Raises ValueError where `folder` is

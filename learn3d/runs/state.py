@@ -11,20 +11,20 @@ from torch import Tensor
 
 from learn3d.config import TrainConfig, check_resume, config_to_dict, load_config
 from learn3d.data.dataset import ViewDataset
+from learn3d.distributed.ranks import Ranks, weights_digest
 from learn3d.files import writing
-from learn3d.methods import DataShape, Method
-from learn3d.parallel.ranks import Ranks, weights_digest
+from learn3d.methods import DatasetInfo, Method
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
-from learn3d.runs.checkpoint import Conditions, Metadata, Progress
+from learn3d.runs.checkpoint import DataFingerprint, Metadata, Progress
 from learn3d.runs.folder import BEST, CONFIG, LAST
 from learn3d.runs.log import RunLog, SilentLog
 from learn3d.runs.versions import versions
 
 
-def conditions_of(train_set: ViewDataset, precision: str) -> Conditions:
-    """The conditions of a run on these training images."""
-    return Conditions(len(train_set), f"{train_set.digest(voxels=False):08x}", precision)
+def fingerprint_of(train_set: ViewDataset, precision: str) -> DataFingerprint:
+    """The fingerprint of a run on these training images."""
+    return DataFingerprint(len(train_set), f"{train_set.digest(voxels=False):08x}", precision)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +43,8 @@ class Run:
 
     config: TrainConfig
     method: Method
-    shape: DataShape
-    conditions: Conditions
+    info: DatasetInfo
+    fingerprint: DataFingerprint
     ranks: Ranks
     versions: dict[str, str | None] = field(default_factory=versions)  # of the code that runs
 
@@ -89,9 +89,9 @@ class Run:
         options = dataclasses.replace(self.config, data=Path("-"), output=Path("-"), threads=None)
         same = {
             "options": config_to_dict(options),
-            "precision": self.conditions.precision,
-            "what the networks depend on": self.shape,
-            "training data": (self.conditions, train_set.digest()),
+            "precision": self.fingerprint.precision,
+            "what the networks depend on": self.info,
+            "training data": (self.fingerprint, train_set.digest()),
             "validation data": (len(val_set), val_set.digest()),
             "steps taken": progress.step,
             "weights": weights_digest(self.method.networks),
@@ -103,19 +103,19 @@ class Run:
 
         An option or a condition that differs is a ValueError that names it.
         """
-        tensors, metadata, precision = saved.tensors, saved.metadata, saved.metadata.conditions.precision
-        if precision == self.conditions.precision:  # asked for by name or by "auto", it is the same
+        tensors, metadata, precision = saved.tensors, saved.metadata, saved.metadata.fingerprint.precision
+        if precision == self.fingerprint.precision:  # asked for by name or by "auto", it is the same
             precision = self.config.precision
         elif self.config.precision == "auto":
             precision = metadata.config.precision
         check_resume(self.config, dataclasses.replace(metadata.config, precision=precision))
-        _check_conditions(self.conditions, metadata.conditions, self.config.data)
-        if self.shape != dataclasses.replace(metadata.shape, box=self.shape.box):  # older checkpoints have no box
-            raise ValueError(f"{saved.path} was trained on data of {metadata.shape}, these are {self.shape}")
+        _check_fingerprint(self.fingerprint, metadata.fingerprint, self.config.data)
+        if self.info != metadata.info:
+            raise ValueError(f"{saved.path} was trained on data of {metadata.info}, these are {self.info}")
         checkpoint.restore_networks(self.method, tensors, saved.path)
-        if self.method.average is not None:
-            with self.method.averaged():
-                checkpoint.restore_networks(self.method, tensors, saved.path, "average")
+        if self.method.ema is not None:
+            with self.method.ema_weights():
+                checkpoint.restore_networks(self.method, tensors, saved.path, "ema")
         for name, optimizer in self.method.optimizers.items():
             others = metadata.optimizers.get(name, {})
             checkpoint.restore_optimizer(name, optimizer, tensors, others, saved.path)
@@ -149,8 +149,8 @@ class Run:
         folder, keep, others = self.config.output, self.config.keep_checkpoints, {}
         self._check_networks()
         tensors = checkpoint.network_tensors(self.method)
-        if self.method.average is not None:
-            tensors |= {f"average.{name}": tensor for name, tensor in self.method.average.tensors.items()}
+        if self.method.ema is not None:
+            tensors |= {f"ema.{name}": tensor for name, tensor in self.method.ema.tensors.items()}
         tensors["random.cpu"] = torch.get_rng_state()
         if self.config.device == "cuda":
             tensors["random.cuda"] = torch.cuda.get_rng_state()
@@ -165,7 +165,7 @@ class Run:
 
     def save_best(self, progress: Progress) -> None:
         """Write best.safetensors by the first process: the networks, or their averages, for use."""
-        with self.method.averaged():
+        with self.method.ema_weights():
             self._check_networks()
             if self.ranks.main:
                 networks = checkpoint.network_tensors(self.method)
@@ -177,7 +177,7 @@ class Run:
             checkpoint.check_finite(name, network.state_dict())
 
     def _metadata(self, progress: Progress, optimizers: dict) -> Metadata:
-        return Metadata(self.config, self.shape, progress, self.conditions, self.versions, optimizers)
+        return Metadata(self.config, self.info, progress, self.fingerprint, self.versions, optimizers)
 
 
 def load_last(config: TrainConfig, *, repair: bool = True) -> Saved | None:
@@ -230,8 +230,8 @@ def _reached_by(path: Path) -> int:
         return 0
 
 
-def _check_conditions(now: Conditions, then: Conditions, data: Path) -> None:
-    """Raise a ValueError naming what differs from the conditions that a checkpoint recorded."""
+def _check_fingerprint(now: DataFingerprint, then: DataFingerprint, data: Path) -> None:
+    """Raise a ValueError naming what differs from the fingerprint that a checkpoint recorded."""
     if then.precision != now.precision:
         raise ValueError(
             f"cannot resume: the run computes in {then.precision}, but precision 'auto' means {now.precision} here; "

@@ -174,7 +174,7 @@ RESULT: dict[str, Any] = {
     "step": 10,
     "seconds": 1.5,
     "images": 24,
-    "conditions": {"precision": "fp32"},
+    "fingerprint": {"precision": "fp32"},
     "voxel_iou_kato18": 0.5,
     "voxel_iou_kato19": 0.4,
     "mmd": None,

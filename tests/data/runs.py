@@ -9,10 +9,10 @@ from typing import Any
 import torch
 
 from learn3d.config import TrainConfig
-from learn3d.methods import DataShape
+from learn3d.methods import DatasetInfo
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
-from learn3d.runs.checkpoint import Conditions, Metadata, Progress
+from learn3d.runs.checkpoint import DataFingerprint, Metadata, Progress
 
 
 def check_same(folder: Path, other: Path) -> None:
@@ -38,7 +38,9 @@ def check_same(folder: Path, other: Path) -> None:
 def metadata(step: int = 3, **changes: Any) -> Metadata:
     """What a checkpoint says about a run."""
     config = TrainConfig(data="data", category="chair", output="run")
-    about = Metadata(config, DataShape(24), Progress(step=step), Conditions(72, "0a", "fp32"), {"torch": "2"}, {})
+    about = Metadata(
+        config, DatasetInfo(24), Progress(step=step), DataFingerprint(72, "0a", "fp32"), {"torch": "2"}, {}
+    )
     return dataclasses.replace(about, **changes)
 
 

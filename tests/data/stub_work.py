@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from learn3d.config import config_to_dict
+from learn3d.distributed.tasks import Task
 from learn3d.experiments.plan import Run
 from learn3d.files.writing import write_json
-from learn3d.parallel.engine import Task
 from learn3d.runs.folder import CONFIG
 from learn3d.terminal import stop_on_signal
 
@@ -41,7 +41,7 @@ def work(run: Run, fresh: bool) -> bool:
     iou = sum(means) / 5
     result = {"config": config_to_dict(config), "command": "learn3d train ...", "data": str(config.data.resolve())}
     result |= {"checkpoint": run.variant.checkpoint, "seed": run.seed}
-    result |= {"iterations": config.iterations, "step": config.iterations, "seconds": 60.0, "conditions": {}}
+    result |= {"iterations": config.iterations, "step": config.iterations, "seconds": 60.0, "fingerprint": {}}
     result |= {"trained_by": {"commit": "0123456789ab"}, "tested_by": {"commit": "ba9876543210"}}
     result |= {"voxel_iou_kato18": iou, "voxel_iou_kato19": iou - 0.05, "mmd": 1 - base, "mmd_paper": 0.5}
     result |= {"images": 120, "chamfer_l1": 0.1, "f_score": 0.6, "undefined": 0, "objects": table, "views": table}

@@ -20,10 +20,10 @@ import torch
 import nmr
 from learn3d import validation
 from learn3d.config import config_from_dict
+from learn3d.distributed.launch import start
+from learn3d.distributed.ranks import ALONE, Ranks
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.methods import method, prgan, vpl
-from learn3d.parallel.launch import start
-from learn3d.parallel.ranks import ALONE, Ranks
 from learn3d.runs import checkpoint
 from learn3d.training import load_splits, train
 

@@ -37,7 +37,7 @@ class Constant(Method):
     def create_optimizers(self):
         raise NotImplementedError
 
-    def learn(self, batch, step):
+    def training_step(self, batch, step):
         raise NotImplementedError
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:

@@ -23,7 +23,7 @@ FLOORS = (
     {"presets"},
     {"methods"},
     {"networks", "losses"},
-    {"parallel"},
+    {"distributed"},
     {"data"},
     {"device", "settings", "terminal"},
     {"files"},

@@ -17,15 +17,15 @@ from learn3d.config import TrainConfig, check_resume, config_from_dict, config_t
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
 from learn3d.data.sampling import shuffled_epochs
-from learn3d.device import crowding
-from learn3d.methods import DataShape, create_method
+from learn3d.device import oversubscription
+from learn3d.distributed.ranks import ALONE
+from learn3d.methods import DatasetInfo, create_method
 from learn3d.methods.multi_view import MultiViewSettings
 from learn3d.methods.plus import PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariant
-from learn3d.parallel.ranks import ALONE
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint, state
-from learn3d.runs.checkpoint import Conditions, Progress
+from learn3d.runs.checkpoint import DataFingerprint, Progress
 from learn3d.training import train
 
 VANILLA = "peng2020-kato-vanilla"
@@ -41,9 +41,9 @@ def changed(network: torch.nn.Module, before: list[torch.Tensor]) -> bool:
 
 def make_step(config: TrainConfig, data: ViewDataset):
     """Networks by name, and a function that takes one step with them."""
-    method = create_method(config.settings, DataShape(24), device="cpu", precision="fp32", seed=0)
+    method = create_method(config.settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
     batch = data.batch(torch.tensor([0, 25, 50, 7]))
-    return method.networks, lambda iteration: method.train_step(batch, iteration)
+    return method.networks, lambda iteration: method.take_step(batch, iteration)
 
 
 def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
@@ -155,7 +155,7 @@ def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
             {"preset": "gadelha2017-kato", "augment": ("flip",), "encoder_from_step": 2},
             "'gadelha2017-kato' learns with",
         ),
-        ({"preset": "plus-kato", "remembered": 3}, r"\(--remembered\): batch_size must lie in 2 .. 3, got 4; --lambda"),
+        ({"preset": "plus-kato", "bank_size": 3}, r"\(--bank-size\): batch_size must lie in 2 .. 3, got 4; --lambda"),
         ({"preset": "plus-kato", "batch_size": 1}, "batch_size must lie in 2 .. 2048, got 1"),
         ({"view_bins": "15"}, "view bins are written as AZIMUTHxELEVATION"),
         ({"prior_form": "cube"}, "prior_form must be 'squared' or 'norm'"),
@@ -246,7 +246,7 @@ def test_a_finished_run_leaves_everything(finished_run, read_metrics) -> None:
     assert list((finished_run / "tensorboard").iterdir())
 
 
-TRAIN_STEP = PoseInvariant.train_step
+TRAIN_STEP = PoseInvariant.take_step
 
 
 def signal_after(number: int, step: int):
@@ -263,7 +263,7 @@ def signal_after(number: int, step: int):
 
 def test_sigterm_saves_and_says_how_to_resume(tiny_config, run_folder, monkeypatch, capsys) -> None:
     handler = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(PoseInvariant, "train_step", signal_after(signal.SIGTERM, 1))
+    monkeypatch.setattr(PoseInvariant, "take_step", signal_after(signal.SIGTERM, 1))
     summary = train(tiny_config(run_folder, preset=VANILLA))
     assert (summary.step, summary.finished) == (1, False)
     assert signal.getsignal(signal.SIGTERM) is handler
@@ -276,7 +276,7 @@ def test_a_second_interrupt_does_not_wait(tiny_config, run_folder, monkeypatch) 
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(PoseInvariant, "train_step", twice)
+    monkeypatch.setattr(PoseInvariant, "take_step", twice)
     with pytest.raises(KeyboardInterrupt):
         train(tiny_config(run_folder, preset=VANILLA))
 
@@ -284,13 +284,13 @@ def test_a_second_interrupt_does_not_wait(tiny_config, run_folder, monkeypatch) 
 def test_interrupted_run_resumes_bit_for_bit(
     tiny_config, finished_run, run_folder, monkeypatch, capsys, read_metrics
 ) -> None:
-    monkeypatch.setattr(PoseInvariant, "train_step", signal_after(signal.SIGINT, 2))
+    monkeypatch.setattr(PoseInvariant, "take_step", signal_after(signal.SIGINT, 2))
     summary = train(tiny_config(run_folder))
     assert (summary.step, summary.finished) == (2, False)
     assert f"--output {run_folder} --resume" in capsys.readouterr().err
 
     torch.manual_seed(99)  # whatever the new process does before
-    monkeypatch.setattr(PoseInvariant, "train_step", TRAIN_STEP)
+    monkeypatch.setattr(PoseInvariant, "take_step", TRAIN_STEP)
     with open(run_folder / "metrics.jsonl", "a") as file:
         file.write('{"step": 3, "split": "train"}\n{"step": 4, "spl')  # as a crash after the checkpoint would leave it
     summary = train(tiny_config(run_folder), resume=True)
@@ -301,7 +301,7 @@ def test_interrupted_run_resumes_bit_for_bit(
         theirs, about_theirs = checkpoint.load(finished_run / f"{name}.safetensors")
         assert ours.keys() == theirs.keys()
         assert all(torch.equal(ours[key], theirs[key]) for key in ours)
-        assert (about.conditions, about.shape) == (about_theirs.conditions, about_theirs.shape)
+        assert (about.fingerprint, about.info) == (about_theirs.fingerprint, about_theirs.info)
         assert dataclasses.replace(about.progress, seconds=0.0) == dataclasses.replace(
             about_theirs.progress, seconds=0.0
         )
@@ -372,7 +372,7 @@ def test_resume_refuses_other_poses(tiny_config, tiny_set, finished_run, monkeyp
 
 def test_resume_refuses_another_mirror_plane(tiny_config, finished_run, monkeypatch) -> None:
     change_metadata(
-        monkeypatch, lambda m: dataclasses.replace(m, shape=dataclasses.replace(m.shape, mirror_plane_deg=7.5))
+        monkeypatch, lambda m: dataclasses.replace(m, shape=dataclasses.replace(m.info, mirror_plane_deg=7.5))
     )
     with pytest.raises(ValueError, match=r"was trained on data of .*mirror_plane_deg=7\.5"):
         train(tiny_config(finished_run), resume=True)
@@ -464,12 +464,12 @@ def test_nan_loss_stops_before_the_step_and_names_the_last_checkpoint(tiny_confi
 
 def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> None:
     config = tiny_config(run_folder)
-    method = create_method(config.settings, DataShape(24), device="cpu", precision="fp32", seed=0)
+    method = create_method(config.settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
     with torch.no_grad():
         method.generator.layers[0].bias[3] = float("inf")
     run_folder.mkdir()
     with pytest.raises(FloatingPointError, match="generator has values that are not finite"):
-        state.Run(config, method, DataShape(24), Conditions(72, "0a", "fp32"), ALONE).save_last(Progress())
+        state.Run(config, method, DatasetInfo(24), DataFingerprint(72, "0a", "fp32"), ALONE).save_last(Progress())
     assert not list(run_folder.iterdir())
 
 
@@ -489,7 +489,7 @@ def test_the_journal_says_how_the_run_ended(tiny_run, run_folder, monkeypatch) -
     def fail(*_):
         raise RuntimeError("the cat is on the keyboard")
 
-    monkeypatch.setattr(PoseInvariant, "train_step", fail)
+    monkeypatch.setattr(PoseInvariant, "take_step", fail)
     with pytest.raises(RuntimeError):
         train(tiny_run(run_folder, iterations=4), resume=True)
     assert journal.read_text().splitlines()[-1].endswith(" ended by RuntimeError: the cat is on the keyboard")
@@ -547,14 +547,14 @@ def test_another_precision_is_compared_with_what_auto_was(tiny_run, run_folder) 
 
 @pytest.mark.parametrize(("threads", "processes", "named"), [(10**4, 1, True), (1, 1, False), (10**4, 2, True)])
 def test_more_threads_than_cores_are_named(threads: int, processes: int, named: bool) -> None:
-    assert ("--threads" in crowding(threads, processes)) == named
+    assert ("--threads" in oversubscription(threads, processes)) == named
 
 
 @pytest.mark.parametrize("preset", ["peng2020-kato", "peng2020-kato-vpl", "kato2018-kato"])
 @pytest.mark.parametrize(("plane", "fixed"), [(37.5, True), (None, False)])
 def test_symmetry_auto_is_the_plane_that_the_data_have(preset: str, plane: float | None, fixed: bool) -> None:
     settings = dataclasses.replace(PRESETS[preset].settings, symmetry="auto", generator="sphere-small")
-    shape = DataShape(24, mirror_plane_deg=plane)
+    shape = DatasetInfo(24, mirror_plane_deg=plane)
     generator = create_method(settings, shape, device="cpu", precision="fp32", seed=0).networks["generator"]
     assert (generator.mirror is not None) == fixed
 
@@ -563,5 +563,5 @@ def test_the_plane_is_found_before_the_first_step_and_kept(tiny_config, run_fold
     monkeypatch.setattr(training, "find_mirror_plane", lambda dataset: 37.5)
     train(tiny_config(run_folder, symmetry="auto"))
     method, config, metadata = checkpoint.load_method(run_folder / "best.safetensors")
-    assert (config.settings.symmetry, metadata.shape.mirror_plane_deg) == ("auto", 37.5)
+    assert (config.settings.symmetry, metadata.info.mirror_plane_deg) == ("auto", 37.5)
     assert method.generator.mirror is not None

@@ -26,9 +26,9 @@ from bench_work import num_cores
 from learn3d.data import conventions
 from learn3d.data.sampling import shuffled_epochs
 from learn3d.device import keep_freed_memory, resolve_precision
-from learn3d.methods import DataShape, create_method
-from learn3d.parallel.launch import start
-from learn3d.parallel.ranks import Ranks
+from learn3d.distributed.launch import start
+from learn3d.distributed.ranks import Ranks
+from learn3d.methods import DatasetInfo, create_method
 from learn3d.presets import PRESETS
 from learn3d.terminal import Stop, without_traceback
 
@@ -56,7 +56,7 @@ def measure_steps(options: Options, ranks: Ranks) -> tuple[float, float, float]:
     ranks = ranks.divide(options.batch, "views")
     method = create_method(
         PRESETS["peng2020-kato"].settings,
-        DataShape(conventions.NUM_VIEWS),
+        DatasetInfo(conventions.NUM_VIEWS),
         device=options.device,
         precision=precision,
         seed=0,
@@ -65,7 +65,7 @@ def measure_steps(options: Options, ranks: Ranks) -> tuple[float, float, float]:
     steps, busy = [], []
     for step in range(1, options.repeats + 3):
         began, before = time.perf_counter(), time.process_time()
-        method.train_step(dataset.batch(shuffled_epochs(len(dataset), options.batch, 0, step), ranks.rows), step)
+        method.take_step(dataset.batch(shuffled_epochs(len(dataset), options.batch, 0, step), ranks.rows), step)
         ranks.stopped_by(Stop())
         if step > 2:
             steps.append(1e3 * (time.perf_counter() - began))

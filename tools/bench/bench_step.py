@@ -19,7 +19,7 @@ from learn3d.data.readers import kato
 from learn3d.data.sampling import sample_indices
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.evaluation import evaluate
-from learn3d.methods import DataShape, Method, create_method
+from learn3d.methods import DatasetInfo, Method, create_method
 
 VALIDATED_IMAGES = 700 * 24  # a tenth of ShapeNet's larger categories in Kato's layout
 
@@ -41,16 +41,16 @@ def proposed(batch: int | None) -> tuple[TrainConfig, ViewDataset]:
 
 
 def build(config: TrainConfig, dataset: ViewDataset, precision: str) -> Method:
-    return create_method(config.settings, DataShape(dataset.num_views), device="cpu", precision=precision, seed=0)
+    return create_method(config.settings, DatasetInfo(dataset.num_views), device="cpu", precision=precision, seed=0)
 
 
 def run_step(config: TrainConfig, dataset: ViewDataset, method: Method, step: int) -> tuple[float, float]:
-    """Seconds of one step as in learn3d/training.py, and of its train_step alone."""
+    """Seconds of one step as in learn3d/training.py, and of its take_step alone."""
     start = time.perf_counter()
     indices = sample_indices(dataset, config.sampling, config.batch_size, config.seed, step)
     batch = augment(dataset.batch(indices, voxels=False), config.augment, config.seed, step)
     prepared = time.perf_counter()
-    method.train_step(batch, step)
+    method.take_step(batch, step)
     end = time.perf_counter()
     return end - start, end - prepared
 

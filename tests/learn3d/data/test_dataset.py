@@ -15,7 +15,7 @@ from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.poses import LookAtPoses, RotationPoses, wrap_deg
 from learn3d.data.sampling import sample_indices
 from learn3d.data.view_bins import AngleBins
-from learn3d.methods import DataShape, create_method
+from learn3d.methods import DatasetInfo, create_method
 from learn3d.presets import PRESETS
 
 
@@ -250,7 +250,7 @@ def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
 @pytest.mark.parametrize("preset", ["peng2020-kato", "kato2018-kato", "peng2020-kato-vpl", "gadelha2017-kato"])
 def test_methods_that_need_poses_say_so(preset: str) -> None:
     with pytest.raises(ValueError, match="has no poses"):
-        create_method(PRESETS[preset].settings, DataShape(1, pose_features=0), device="cpu", precision="fp32", seed=0)
+        create_method(PRESETS[preset].settings, DatasetInfo(1, pose_features=0), device="cpu", precision="fp32", seed=0)
 
 
 def test_few_views_of_every_object(tiny_set) -> None:

@@ -101,7 +101,7 @@ def test_colours_have_katos_form() -> None:
     assert (image[:, 5, 5] == 0).all()
 
 
-def test_small_photos_are_enlarged_and_large_ones_averaged() -> None:
+def test_small_photos_are_enlarged_and_large_ones_ema_weights() -> None:
     mask = np.zeros((20, 20), np.uint8)
     mask[5:15, 5:15] = 255
     for factor in (1, 64):

@@ -20,7 +20,7 @@ from learn3d.data.augment import augment
 from learn3d.data.dataset import concatenate
 from learn3d.data.layouts import load_dataset
 from learn3d.data.readers import pascal3d
-from learn3d.methods.method import DataShape
+from learn3d.methods.method import DatasetInfo
 from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.networks.resnet import ResNet18Encoder
 from learn3d.presets import PRESETS
@@ -338,13 +338,13 @@ def test_the_presets_train_and_are_measured(folder: Path, name: str) -> None:
     preset = PRESETS[name]
     train = load_dataset(preset.layout, folder, "aeroplane", "train", image_size=224)
     torch.manual_seed(0)
-    shape = DataShape(train.num_views, pose_features=train.poses.features().shape[1])
+    shape = DatasetInfo(train.num_views, pose_features=train.poses.features().shape[1])
     method = PoseInvariant(preset.settings, shape, "cpu", "fp32")
     assert method.image_size == train.image_size
     losses = {}
     for step in (1, 2):
         batch = augment(train.batch(torch.arange(3)), preset.augment, 0, step)
-        losses |= method.train_step(batch, step)
+        losses |= method.take_step(batch, step)
     assert all(np.isfinite(value) for value in losses.values())
     assert ("confusion" in losses and "prior" in losses) == (name == "peng2020-pascal")
     method.set_training(False)

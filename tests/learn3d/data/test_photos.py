@@ -21,7 +21,7 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import photos
 from learn3d.data.readers.photo_table import split_objects
 from learn3d.evaluation import evaluate
-from learn3d.methods.method import DataShape
+from learn3d.methods.method import DatasetInfo
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.runs import checkpoint
 from learn3d.training import train
@@ -103,9 +103,9 @@ def test_the_examples_folder_is_read(made: Path) -> None:
 def test_a_method_trains_on_it(made: Path) -> None:
     train = photos.load(made, "chair", "train")
     torch.manual_seed(0)
-    method = PoseInvariant(PoseInvariantSettings(), DataShape(train.num_views), "cpu", "fp32")
+    method = PoseInvariant(PoseInvariantSettings(), DatasetInfo(train.num_views), "cpu", "fp32")
     for step in (1, 2):
-        losses = method.train_step(train.batch(torch.arange(4)), step)
+        losses = method.take_step(train.batch(torch.arange(4)), step)
     assert np.isfinite(losses["total"]) and 0 < losses["projection"] < 1
     shapes = method.decode(method.encode(torch.from_numpy(train.images[:1])))
     assert shapes.vertices.shape == (1, 642, 3)

@@ -29,7 +29,7 @@ def options(tmp_path: Path) -> Callable[..., Options]:
 @pytest.fixture
 def make(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
     """Makes a table of results that nobody has trained, in this process."""
-    monkeypatch.setattr(experiment, "carry_out_all", stub_work.carry_out_here)
+    monkeypatch.setattr(experiment, "run_tasks", stub_work.carry_out_here)
     return functools.partial(run_experiment, work=stub_work.work)
 
 

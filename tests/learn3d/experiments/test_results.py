@@ -28,7 +28,7 @@ CHANGES = {
     "mmd": "low",
     "data": 5,
     "config": [],
-    "conditions": 7,
+    "fingerprint": 7,
     "trained_by": {"commit": 5},
     "objects": {},
 }

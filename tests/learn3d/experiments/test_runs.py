@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 import stub_work
 
+from learn3d.distributed import tasks
 from learn3d.experiments import experiment, results
 from learn3d.experiments.experiment import Call, carry_out, run_experiment
 from learn3d.experiments.plan import Options, plan_runs
 from learn3d.experiments.tables import TABLES
-from learn3d.parallel import engine
 from learn3d.training import Summary
 
 
@@ -72,7 +72,7 @@ def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, optio
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals")
 @pytest.mark.parametrize(("nohup", "status"), [(True, 0), (False, 130)])
 def test_a_closed_terminal_stops_the_runs_except_under_nohup(monkeypatch, nohup, status, options) -> None:
-    executor = engine._executor
+    executor = tasks._executor
 
     @contextlib.contextmanager
     def hang_up(*given: object) -> Iterator[Executor]:
@@ -81,7 +81,7 @@ def test_a_closed_terminal_stops_the_runs_except_under_nohup(monkeypatch, nohup,
             yield threads
 
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN if nohup else signal.SIG_DFL)
-    monkeypatch.setattr(engine, "_executor", hang_up)
+    monkeypatch.setattr(tasks, "_executor", hang_up)
     try:
         assert run_experiment(Call("kato", options(methods=("vanilla",))), work=stub_work.work) == status
     finally:

@@ -25,10 +25,10 @@ import trimesh
 
 from learn3d import commands
 from learn3d.data.layouts import Layout
+from learn3d.distributed.tasks import Task
 from learn3d.experiments import experiment
 from learn3d.experiments.tables import TABLES
 from learn3d.make_data.render import DatasetConfig, make_dataset
-from learn3d.parallel.engine import Task
 from learn3d.runs import checkpoint
 
 pytestmark = pytest.mark.slow
@@ -55,7 +55,9 @@ SMALLER = {
     "without-adversarial": _SMALL,
     "without-smoothness": _SMALL,
     "multi-view": _SMALL,
-    **dict.fromkeys(("plus", "plus-without-symmetry", "plus-without-unseen", "kar-plus"), (*_SMALL, "remembered=4")),
+    **dict.fromkeys(
+        ("plus", "plus-without-symmetry", "plus-without-novel-views", "kar-plus"), (*_SMALL, "bank_size=4")
+    ),
     **{f"{name}-schedule-symmetry": (*_SMALL, "warmup_steps=1") for name in ("vanilla", "proposed")},
     **dict.fromkeys(("proposed-schedule", "vanilla-shared", "proposed-shared"), (*_SMALL, "warmup_steps=1")),
     **{f"single-{name}": _SMALL for name in ("vanilla", "proposed", "plus")},
@@ -66,7 +68,7 @@ SMALLER = {
     "pascal-vpl": (*_VPL, "generator=cube-conv"),
     "pascal-baseline": _SMALL[:1],
     "pascal-proposed": _SMALL[:1],
-    "pascal-plus": (_SMALL[0], "remembered=4"),
+    "pascal-plus": (_SMALL[0], "bank_size=4"),
     "proposed-fp32": _SMALL,
     "proposed-bf16": _SMALL,
     "prgan": ("discriminator_channels=4,8,16,32", "generator_channels=16,8,4,1"),
@@ -117,7 +119,7 @@ def call_tool(name: str, *words: object) -> tuple[int, str, str]:
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         patch.setattr(sys, "argv", ["learn3d", name, *map(str, words)])
-        patch.setattr(experiment, "carry_out_all", carry_out_here)
+        patch.setattr(experiment, "run_tasks", carry_out_here)
         status = commands.main()
     return status, out.getvalue(), err.getvalue()
 
@@ -225,7 +227,7 @@ def test_bins_decide_the_number_of_view_classes(laboratory: Laboratory, outcomes
     counts = {}
     for row in TABLES["bins"].rows:
         metadata = checkpoint.load_metadata(laboratory.runs / f"{row.variant.name}-seed0" / "best.safetensors")
-        counts[row.label.removesuffix(" degrees")] = metadata.shape.num_views
+        counts[row.label.removesuffix(" degrees")] = metadata.info.num_views
     assert counts == VIEW_CLASSES
     assert sorted(counts.values()) == list(counts.values()), "finer and finer"
     assert outcomes["bins"].report["missing"] == []
@@ -248,7 +250,7 @@ def test_losses_that_an_ablation_turns_off_are_not_computed(
 def test_the_precision_is_the_rows(laboratory: Laboratory, outcomes: dict[str, Outcome]) -> None:
     for row in TABLES["precision"].rows:
         metadata = checkpoint.load_metadata(laboratory.runs / f"{row.variant.name}-seed0" / "last.safetensors")
-        assert row.label.endswith(metadata.conditions.precision)
+        assert row.label.endswith(metadata.fingerprint.precision)
     fp32, bf16 = (outcomes["precision"].cell(row.label)["values"]["kato18"] for row in TABLES["precision"].rows)
     assert fp32 != bf16
 

@@ -14,13 +14,13 @@ from PIL import Image
 import nmr
 from learn3d import figures
 from learn3d.data.poses import LookAtPoses, RotationPoses
-from learn3d.methods import DataShape, Grids, Meshes, Method, create_method
+from learn3d.methods import DatasetInfo, Grids, Meshes, Method, create_method
 from learn3d.presets import PRESETS
 
 
 def create_vanilla() -> Method:
     settings = PRESETS["peng2020-kato-vanilla"].settings
-    return create_method(settings, DataShape(24), device="cpu", precision="fp32", seed=0)
+    return create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,7 @@ class Ellipsoids(Method):
     def create_optimizers(self):
         raise NotImplementedError
 
-    def learn(self, batch, step):
+    def training_step(self, batch, step):
         raise NotImplementedError
 
     def encode(self, images: Tensor) -> Tensor:

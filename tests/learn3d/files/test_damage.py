@@ -109,14 +109,14 @@ def test_what_could_not_be_resumed_is_not_saved(tiny_run, stopped, run_folder, m
     """Adam's second moment overflows long before a weight does: its square is 1e42 for a gradient of 1e21."""
     shutil.copytree(stopped, run_folder)
     before = (run_folder / "last.safetensors").read_bytes()
-    real = PoseInvariant.train_step
+    real = PoseInvariant.take_step
 
     def explode(method, batch, step):
         losses = real(method, batch, step)
         method.optimizers["encoder"].state[next(method.encoder.parameters())]["exp_avg_sq"].fill_(math.inf)
         return losses
 
-    monkeypatch.setattr(PoseInvariant, "train_step", explode)
+    monkeypatch.setattr(PoseInvariant, "take_step", explode)
     with pytest.raises(
         FloatingPointError, match="the optimizer of the encoder has values that are not finite"
     ) as error:

@@ -25,7 +25,7 @@ from learn3d.data.readers import kato
 from learn3d.data.sampling import sample_indices
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.make_data.render import DatasetConfig, make_dataset
-from learn3d.methods import DataShape, create_method
+from learn3d.methods import DatasetInfo, create_method
 from learn3d.presets import PRESETS
 
 VIEWS = (0, 6, 12, 18)  # from the four sides
@@ -54,9 +54,9 @@ def splits(tmp_path_factory: pytest.TempPathFactory) -> tuple[ViewDataset, ViewD
 def train_small(preset: str, train_set: ViewDataset, test_set: ViewDataset, **changes: float) -> Evaluation:
     small = {"encoder": "conv-small", "generator": "sphere-small", "learning_rate": 1e-3}
     settings = dataclasses.replace(PRESETS[preset].settings, **small, **changes)
-    method = create_method(settings, DataShape(len(VIEWS)), device="cpu", precision="fp32", seed=SEED)
+    method = create_method(settings, DatasetInfo(len(VIEWS)), device="cpu", precision="fp32", seed=SEED)
     for step in range(1, STEPS + 1):
-        method.train_step(train_set.batch(sample_indices(train_set, "views", 32, SEED, step)), step)
+        method.take_step(train_set.batch(sample_indices(train_set, "views", 32, SEED, step)), step)
     return evaluate(method, test_set)
 
 

@@ -13,7 +13,7 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.poses import LookAtPoses
 from learn3d.methods.adam import SparseGradientAdam
-from learn3d.methods.method import DataShape
+from learn3d.methods.method import DatasetInfo
 from learn3d.methods.multi_view import MultiView, MultiViewSettings, check_pairs
 from learn3d.methods.optimization import Plan
 from learn3d.networks import ENCODERS, GENERATORS
@@ -36,7 +36,7 @@ def make_batch(objects: list[int]) -> Batch:
 @pytest.fixture(scope="module")
 def method() -> MultiView:
     torch.manual_seed(0)
-    return MultiView(MultiViewSettings(encoder="conv-small"), DataShape(24), "cpu", "fp32", Plan(200, "step"))
+    return MultiView(MultiViewSettings(encoder="conv-small"), DatasetInfo(24), "cpu", "fp32", Plan(200, "step"))
 
 
 def test_bounded_rule() -> None:
@@ -111,7 +111,7 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> N
         smoothness = float(nmr.losses.smoothness_loss(vertices, method.generator.edges))
     assert len({round(loss, 4) for loss in losses}) == 4
     before = {name: [p.detach().clone() for p in n.parameters()] for name, n in method.networks.items()}
-    values = method.train_step(batch, 1)
+    values = method.take_step(batch, 1)
     assert values["projection"] == pytest.approx(sum(losses) / 4, abs=1e-6)
     assert values["smoothness"] == pytest.approx(smoothness, rel=1e-5)
     assert values["total"] == pytest.approx(values["projection"] + 0.001 * values["smoothness"])
@@ -122,7 +122,7 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> N
 def test_step_size_decays_once_and_is_smaller_for_the_centroid(method: MultiView) -> None:
     rates = {}
     for step in (190, 191):
-        method.train_step(make_batch([0, 0]), step)
+        method.take_step(make_batch([0, 0]), step)
         rates[step] = {name: optimizer.param_groups[0]["lr"] for name, optimizer in method.optimizers.items()}
     assert rates[190] == pytest.approx({"encoder": 1e-4, "generator": 1e-4, "centroid": 1e-5})
     assert rates[191] == pytest.approx({"encoder": 1e-5, "generator": 1e-5, "centroid": 1e-6})
@@ -182,5 +182,5 @@ def test_preset_is_the_published_schedule() -> None:
     preset = PRESETS["kato2018-kato"]
     assert isinstance(preset.settings, MultiViewSettings)
     assert preset.sampling == "pairs"
-    assert preset.schedule == "step"
+    assert preset.lr_schedule == "step"
     assert PRESETS["gadelha2017-kato"].settings.encoder_from_step == PRESETS["gadelha2017-kato"].iterations // 2 + 1

@@ -12,8 +12,8 @@ import tiny_networks
 import torch
 from torch import nn
 
-from learn3d.methods import DataShape, Method, Plan, create_method
-from learn3d.methods.optimization import Average, adam
+from learn3d.methods import DatasetInfo, Method, Plan, create_method
+from learn3d.methods.optimization import EMA, adam
 from learn3d.networks import ENCODERS
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
@@ -63,10 +63,10 @@ def test_schedules() -> None:
         return [Plan(4, **plan).factor(step) for step in (1, 2, 3, 4)]
 
     assert factors() == [1, 1, 1, 1]
-    assert factors(schedule="linear") == [1, 0.75, 0.5, 0.25]
-    assert factors(schedule="cosine") == pytest.approx([(1 + math.cos(math.pi * k / 4)) / 2 for k in range(4)])
+    assert factors(lr_schedule="linear") == [1, 0.75, 0.5, 0.25]
+    assert factors(lr_schedule="cosine") == pytest.approx([(1 + math.cos(math.pi * k / 4)) / 2 for k in range(4)])
     assert factors(warmup_steps=2) == [0.5, 1, 1, 1]
-    assert factors(warmup_steps=2, schedule="linear") == [0.5, 1, 1, 0.5]
+    assert factors(warmup_steps=2, lr_schedule="linear") == [0.5, 1, 1, 0.5]
     published = Plan(200_000, "step")
     assert [published.factor(step) for step in (1, 190_000, 190_001, 200_000)] == [1, 1, 0.1, 0.1]
 
@@ -78,9 +78,9 @@ def test_a_warmup_as_long_as_the_run_is_refused() -> None:
 
 def test_step_sizes_follow_the_schedule(tiny_names, tiny_set) -> None:
     settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **TINY, learning_rate=1e-3)
-    method = create_method(settings, DataShape(24), device="cpu", precision="fp32", seed=0, plan=Plan(4, "linear"))
+    method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, plan=Plan(4, "linear"))
     for step in (1, 2, 3):
-        method.train_step(tiny_set.batch(torch.arange(4)), step)
+        method.take_step(tiny_set.batch(torch.arange(4)), step)
         assert [o.param_groups[0]["lr"] for o in method.optimizers.values()] == [1e-3 * (1 - (step - 1) / 4)] * 3
 
 
@@ -90,7 +90,7 @@ def test_step_sizes_follow_the_schedule(tiny_names, tiny_set) -> None:
 def test_the_average_is_the_one_of_a_slow_reference() -> None:
     torch.manual_seed(0)
     network = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4))
-    average = Average({"net": network}, decay=0.5)
+    average = EMA({"net": network}, decay=0.5)
     wanted = {f"net.{name}": value.double().clone() for name, value in network.state_dict().items()}
     for step in range(1, 12):
         with torch.no_grad():
@@ -118,11 +118,11 @@ def test_an_average_does_not_change_what_is_learnt(tiny_names, tiny_set) -> None
     settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **TINY)
     ends = []
     for average in (0.0, 0.9):
-        plan = Plan(3, average=average)
-        method = create_method(settings, DataShape(24), device="cpu", precision="fp32", seed=0, plan=plan)
+        plan = Plan(3, ema_decay=average)
+        method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, plan=plan)
         for step in (1, 2, 3):
-            method.train_step(tiny_set.batch(torch.arange(4)), step)
-            with method.averaged():
+            method.take_step(tiny_set.batch(torch.arange(4)), step)
+            with method.ema_weights():
                 method.encode(tiny_set.batch(torch.arange(2)).images)
         ends.append({name: network.state_dict() for name, network in method.networks.items()})
     assert all(torch.equal(ends[0][n][key], value) for n in ends[0] for key, value in ends[1][n].items())
@@ -133,15 +133,15 @@ def test_an_average_does_not_change_what_is_learnt(tiny_names, tiny_set) -> None
 
 def stop_after(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     """Let a signal end the run after this step."""
-    train_step = Method.train_step
+    take_step = Method.take_step
 
     def step_and_signal(self: Method, batch, now: int) -> dict[str, float]:
-        losses = train_step(self, batch, now)
+        losses = take_step(self, batch, now)
         if now == step:
             signal.raise_signal(signal.SIGTERM)
         return losses
 
-    monkeypatch.setattr(Method, "train_step", step_and_signal)
+    monkeypatch.setattr(Method, "take_step", step_and_signal)
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -149,7 +149,7 @@ def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
     name: str, tiny_names, tiny_config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(ENCODERS, "conv", tiny_networks.TinyEncoder)
-    options = METHODS[name] | {"schedule": "cosine", "warmup_steps": 1, "average": 0.8, "validate_every": 2}
+    options = METHODS[name] | {"lr_schedule": "cosine", "warmup_steps": 1, "ema_decay": 0.8, "validate_every": 2}
     train(tiny_config(tmp_path / "straight", **options))
     with monkeypatch.context() as patch:
         stop_after(patch, 2)
@@ -164,20 +164,20 @@ def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
 
 
 def test_what_a_run_is_evaluated_with_is_the_average(tiny_names, tiny_config, tmp_path: Path) -> None:
-    train(tiny_config(tmp_path, **TINY, average=0.8, validate_every=4))
+    train(tiny_config(tmp_path, **TINY, ema_decay=0.8, validate_every=4))
     last, best = (checkpoint.load(tmp_path / f"{file}.safetensors")[0] for file in ("last", "best"))
-    averages = {name.removeprefix("average."): value for name, value in last.items() if name.startswith("average.")}
+    averages = {name.removeprefix("ema."): value for name, value in last.items() if name.startswith("ema.")}
     assert averages
     loaded = checkpoint.load_method(tmp_path / "last.safetensors")[0]
     for name, network in loaded.networks.items():
         for key, value in network.state_dict().items():
             assert torch.equal(value, averages[f"{name}.{key}"])
             assert torch.equal(value, best[f"network.{name}.{key}"])
-    assert not any(name.startswith("average.") for name in best)
+    assert not any(name.startswith("ema.") for name in best)
     assert any(not torch.equal(last[f"network.{name}"], value) for name, value in averages.items())
 
 
 def test_a_schedule_keeps_the_number_of_iterations(tiny_names, tiny_config, tmp_path: Path) -> None:
-    train(tiny_config(tmp_path, **TINY, schedule="linear"))
+    train(tiny_config(tmp_path, **TINY, lr_schedule="linear"))
     with pytest.raises(ValueError, match="iterations"):
-        train(tiny_config(tmp_path, **TINY, schedule="linear", iterations=6), resume=True)
+        train(tiny_config(tmp_path, **TINY, lr_schedule="linear", iterations=6), resume=True)

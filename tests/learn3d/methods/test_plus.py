@@ -1,4 +1,4 @@
-"""Plus: its memory, what its terms reach, and that runs of it resume."""
+"""Plus: its bank, what its terms reach, and that runs of it resume."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import torch
 
 from learn3d.config import differences
 from learn3d.data.conventions import KATO
-from learn3d.methods import DataShape, create_method
+from learn3d.methods import DatasetInfo, create_method
 from learn3d.methods.optimization import Plan
-from learn3d.methods.plus import MaskMemory, Plus, PlusSettings
+from learn3d.methods.plus import MaskBank, Plus, PlusSettings
 from learn3d.presets import PRESETS
 from learn3d.runs.checkpoint import load
 from learn3d.training import train
 
-SMALL = PlusSettings(encoder="conv-small", generator="sphere-small", remembered=4)
+SMALL = PlusSettings(encoder="conv-small", generator="sphere-small", bank_size=4)
 
 
 def make(plane: float | None = None, **settings: object) -> Plus:
-    shape = DataShape(24, mirror_plane_deg=plane)
+    shape = DatasetInfo(24, mirror_plane_deg=plane)
     return create_method(dataclasses.replace(SMALL, **settings), shape, device="cpu", precision="fp32", seed=0)
 
 
@@ -30,16 +30,16 @@ def batch(tiny_set):
 
 
 def test_the_memory_keeps_the_newest() -> None:
-    memory = MaskMemory(5)
-    assert not memory.full
+    bank = MaskBank(5)
+    assert not bank.full
     masks = torch.eye(7, 1024)
-    memory.add(masks[:3], torch.tensor([0, 1, 0]))
-    assert not memory.full
-    assert torch.equal(memory.of_view(0), masks[[0, 2]])
-    memory.add(masks[3:], torch.tensor([1, 1, 2, 0]))
-    assert memory.full
-    assert memory.view_ids.tolist() == [0, 1, 1, 2, 0]
-    assert torch.equal(memory.of_view(1), masks[[3, 4]])
+    bank.add(masks[:3], torch.tensor([0, 1, 0]))
+    assert not bank.full
+    assert torch.equal(bank.of_view(0), masks[[0, 2]])
+    bank.add(masks[3:], torch.tensor([1, 1, 2, 0]))
+    assert bank.full
+    assert bank.view_ids.tolist() == [0, 1, 1, 2, 0]
+    assert torch.equal(bank.of_view(1), masks[[3, 4]])
 
 
 @pytest.mark.parametrize("preset", ["plus-kato", "peng2020-kato"])
@@ -49,20 +49,20 @@ def test_shapes_end_at_the_box_where_it_is_known(preset: str) -> None:
     codes = 100 * torch.randn(8, 512, generator=torch.Generator().manual_seed(0))
     shapes = {}
     for box in (None, 1.0):
-        method = create_method(settings, DataShape(24, box=box), device="cpu", precision="fp32", seed=0)
+        method = create_method(settings, DatasetInfo(24, cube_side=box), device="cpu", precision="fp32", seed=0)
         with torch.no_grad():
             shapes[box] = method.decode(codes).vertices
     free = shapes[None]
     assert (free.abs().amax((1, 2)) > 0.5).all()
     assert torch.equal(shapes[1.0], free.clamp(-0.499, 0.499) if inside else free)
-    assert KATO.leaves_grid(shapes[1.0], "kato19").any() != inside
+    assert KATO.exceeds_grid(shapes[1.0], "kato19").any() != inside
 
 
 def test_losses(batch) -> None:
     method = make()
-    first, second = method.train_step(batch, 1), method.train_step(batch, 2)
-    assert {"projection", "smoothness", "prior", "classification", "unseen"} <= set(first)
-    assert {"confusion", "unseen"} <= set(second)
+    first, second = method.take_step(batch, 1), method.take_step(batch, 2)
+    assert {"projection", "smoothness", "prior", "classification", "novel_view"} <= set(first)
+    assert {"confusion", "novel_view"} <= set(second)
     for step, losses in enumerate((first, second), 1):
         total = sum(method.weights_at(step)[name] * value for name, value in losses.items() if name != "total")
         assert losses["total"] == pytest.approx(total, rel=1e-5)
@@ -70,38 +70,38 @@ def test_losses(batch) -> None:
 
 def test_the_weight_of_the_smoothness_falls_over_the_run(tiny_set, batch) -> None:
     settings = dataclasses.replace(SMALL, lambda_smooth=1e-2, lambda_smooth_end=1e-4)
-    method = create_method(settings, DataShape(24), device="cpu", precision="fp32", seed=0, plan=Plan(iterations=5))
+    method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, plan=Plan(iterations=5))
     weights = [method.weights_at(step)["smoothness"] for step in (1, 3, 5, 6)]
     assert weights == pytest.approx([1e-2, 1e-3, 1e-4, 1e-4])
-    losses = method.train_step(batch, 3)
+    losses = method.take_step(batch, 3)
     total = sum(method.weights_at(3)[name] * value for name, value in losses.items() if name != "total")
     assert losses["total"] == pytest.approx(total, rel=1e-5)
     assert make(lambda_smooth_end=None).weights_at(5) == make().weights
 
 
 def test_a_weight_on_the_volume(batch) -> None:
-    assert "volume" not in make().train_step(batch, 1)
+    assert "volume" not in make().take_step(batch, 1)
     method = make(lambda_volume=0.1)
-    assert method.train_step(batch, 1)["volume"] > 0
+    assert method.take_step(batch, 1)["volume"] > 0
 
 
-def test_the_loss_at_unseen_views_waits_for_a_full_memory(batch) -> None:
-    method = make(remembered=6)
-    assert "unseen" not in method.train_step(batch, 1)
-    assert "unseen" in method.train_step(batch, 2)
+def test_the_loss_at_novel_views_waits_for_a_full_mask_bank(batch) -> None:
+    method = make(bank_size=6)
+    assert "novel_view" not in method.take_step(batch, 1)
+    assert "novel_view" in method.take_step(batch, 2)
 
 
-def test_without_its_weight_nothing_is_remembered(batch) -> None:
-    method = make(lambda_unseen=0.0)
-    assert "memory" not in method.networks
-    assert "unseen" not in method.train_step(batch, 1)
+def test_without_its_weight_there_is_no_mask_bank(batch) -> None:
+    method = make(lambda_novel_view=0.0)
+    assert "mask_bank" not in method.networks
+    assert "novel_view" not in method.take_step(batch, 1)
 
 
-def test_the_loss_at_unseen_views_moves_vertices_where_the_projection_does_not(batch) -> None:
+def test_the_loss_at_novel_views_moves_vertices_where_the_projection_does_not(batch) -> None:
     method = make()
-    method._unseen(0.5 * method.generator.sphere.expand(4, -1, -1), batch)
+    method._novel_view_loss(0.5 * method.generator.sphere.expand(4, -1, -1), batch)
     vertices = (0.5 * method.generator.sphere).repeat(4, 1, 1).requires_grad_()
-    (gradient,) = torch.autograd.grad(method._unseen(vertices, batch)["unseen"], vertices)
+    (gradient,) = torch.autograd.grad(method._novel_view_loss(vertices, batch)["novel_view"], vertices)
     assert torch.isfinite(gradient).all()
     assert gradient.abs().sum() > 0
 
@@ -119,9 +119,9 @@ def test_flipped_images_are_views_of_their_own(batch, monkeypatch) -> None:
         return original(self, codes, views, step)
 
     monkeypatch.setattr(Plus, "_losses_on_codes", losses_on_codes)
-    make(90.0).train_step(batch, 1)
+    make(90.0).take_step(batch, 1)
     assert seen[0].tolist() == [0, 25, 0, 24]
-    make(None).train_step(batch, 1)
+    make(None).take_step(batch, 1)
     assert seen[1].tolist() == [0, 1, 0, 0]
 
 
@@ -133,7 +133,7 @@ def test_an_image_and_its_mirror_image_have_one_code(batch) -> None:
 
 
 def test_an_interrupted_run_resumes_bit_for_bit(tiny_config, run_folder, tmp_path) -> None:
-    options = {"preset": "plus-kato", "remembered": 8, "warmup_steps": 1, "iterations": 6, "schedule": "constant"}
+    options = {"preset": "plus-kato", "bank_size": 8, "warmup_steps": 1, "iterations": 6, "lr_schedule": "constant"}
     options["lambda_smooth_end"] = None
     whole = tiny_config(tmp_path / "whole", **options)
     train(whole)
@@ -141,12 +141,12 @@ def test_an_interrupted_run_resumes_bit_for_bit(tiny_config, run_folder, tmp_pat
     train(dataclasses.replace(whole, output=run_folder), resume=True)
     tensors = [load(folder / "last.safetensors")[0] for folder in (tmp_path / "whole", run_folder)]
     assert tensors[0].keys() == tensors[1].keys()
-    assert "network.memory.masks" in tensors[0]
+    assert "network.mask_bank.masks" in tensors[0]
     assert all(torch.equal(a, tensors[1][name]) for name, a in tensors[0].items())
 
 
 def test_the_length_of_a_run_whose_smoothness_falls_is_kept(tiny_config, tmp_path) -> None:
-    config = tiny_config(tmp_path, preset="plus-kato", schedule="constant", iterations=6)
+    config = tiny_config(tmp_path, preset="plus-kato", lr_schedule="constant", iterations=6)
     assert differences(dataclasses.replace(config, iterations=7), config) == [
         "iterations: 6 in the run, 7 asked for (lambda_smooth_end depends on it)"
     ]
@@ -155,9 +155,11 @@ def test_the_length_of_a_run_whose_smoothness_falls_is_kept(tiny_config, tmp_pat
 def test_presets() -> None:
     for name, symmetry in {"plus-kato": "auto", "plus-kar": "auto", "plus-pascal": "z"}.items():
         preset = PRESETS[name]
-        assert (preset.schedule, preset.warmup_steps, preset.average) == ("cosine", 100, 0.99)
+        assert (preset.lr_schedule, preset.warmup_steps, preset.ema_decay) == ("cosine", 100, 0.99)
         assert preset.settings.symmetry == symmetry
-        assert (preset.settings.lambda_unseen > 0) == (name != "plus-kar"), "cameras of a class differ in Kar's data"
+        assert (preset.settings.lambda_novel_view > 0) == (name != "plus-kar"), (
+            "cameras of a class differ in Kar's data"
+        )
         assert "flip-image" not in preset.augment, "the method flips images itself, and tells the discriminator"
 
 

@@ -13,7 +13,7 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import KATO
 from learn3d.data.poses import LookAtPoses, RotationPoses
-from learn3d.methods.method import DataShape
+from learn3d.methods.method import DatasetInfo
 from learn3d.methods.prgan import PrGAN, PrGANSettings, statistics_loss
 from learn3d.networks.voxel_gan import (
     SHAPE_CODE,
@@ -30,7 +30,7 @@ SMALL = {"generator_channels": (4, 4, 2, 1), "discriminator_channels": (4, 4, 4,
 
 def small_prgan(**settings: object) -> PrGAN:
     torch.manual_seed(0)
-    return PrGAN(PrGANSettings(**SMALL | settings), DataShape(VIEWS), "cpu", "fp32")
+    return PrGAN(PrGANSettings(**SMALL | settings), DatasetInfo(VIEWS), "cpu", "fp32")
 
 
 def make_batch(count: int = 3, poses: LookAtPoses | RotationPoses | None = None) -> Batch:
@@ -135,7 +135,7 @@ def test_each_step_changes_its_network_only(
         if other != name:
             monkeypatch.setattr(optimizer, "step", lambda: None)
     before = weights(method)
-    losses = method.train_step(make_batch(), step)
+    losses = method.take_step(make_batch(), step)
     assert name in losses
     assert changed(method, before) == {network}
 
@@ -145,7 +145,7 @@ def test_discriminator_rests_while_it_is_too_good(monkeypatch: pytest.MonkeyPatc
     for accuracy, rests in ((0.81, True), (0.8, False)):
         monkeypatch.setattr(method, "accuracy", lambda real, z, value=accuracy: value)
         before = weights(method)
-        losses = method.train_step(make_batch(), 1)
+        losses = method.take_step(make_batch(), 1)
         assert ("discriminator" in losses) is not rests
         assert changed(method, before) == ({"generator"} if rests else {"generator", "discriminator"})
 
@@ -171,7 +171,7 @@ def test_encoder_learns_to_invert_a_fixed_generator(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(method, "generate", bars)
     batch = make_batch(32)
     for step in range(1, 41):
-        losses = method.train_step(batch, step)
+        losses = method.take_step(batch, step)
     assert set(losses) == {"encoder", "total"}
     z = method.sample_z(64)
     with torch.no_grad():
@@ -182,9 +182,9 @@ def test_encoder_learns_to_invert_a_fixed_generator(monkeypatch: pytest.MonkeyPa
 
 def test_encoder_phase_leaves_generator_and_its_averages_alone() -> None:
     method = small_prgan(encoder_from_step=2)
-    method.train_step(make_batch(), 1)
+    method.take_step(make_batch(), 1)
     before = copy.deepcopy(method.generator.state_dict())
-    method.train_step(make_batch(), 2)
+    method.take_step(make_batch(), 2)
     assert all(torch.equal(before[key], value) for key, value in method.generator.state_dict().items())
 
 
@@ -220,17 +220,17 @@ def test_voxels_lie_where_the_data_sets_voxels_do() -> None:
 def test_training_goes_on_from_weights_averages_optimizers_and_random_state() -> None:
     straight = small_prgan(encoder_from_step=4)
     for step in (1, 2):
-        straight.train_step(make_batch(), step)
+        straight.take_step(make_batch(), step)
     state = copy.deepcopy([part.state_dict() for part in (*straight.networks.values(), *straight.optimizers.values())])
     random = torch.get_rng_state()
-    wanted = [straight.train_step(make_batch(), step) for step in (3, 4, 5)]
+    wanted = [straight.take_step(make_batch(), step) for step in (3, 4, 5)]
 
     resumed = small_prgan(encoder_from_step=4)
     for part, saved in zip((*resumed.networks.values(), *resumed.optimizers.values()), state, strict=True):
         part.load_state_dict(saved)
     resumed.set_training(True)
     torch.set_rng_state(random)
-    assert [resumed.train_step(make_batch(), step) for step in (3, 4, 5)] == wanted
+    assert [resumed.take_step(make_batch(), step) for step in (3, 4, 5)] == wanted
     assert all(
         torch.equal(a, b)
         for name in straight.networks
@@ -250,7 +250,7 @@ def test_training_goes_on_from_weights_averages_optimizers_and_random_state() ->
 )
 def test_other_cameras_are_refused(poses: LookAtPoses | RotationPoses, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        small_prgan().train_step(make_batch(poses=poses), 1)
+        small_prgan().take_step(make_batch(poses=poses), 1)
 
 
 @pytest.mark.parametrize(
@@ -282,4 +282,4 @@ def test_a_loss_that_is_not_finite_stops_the_training() -> None:
     with torch.no_grad():
         method.discriminator.last.bias.fill_(float("nan"))
     with pytest.raises(FloatingPointError, match="at iteration 7"):
-        method.train_step(make_batch(), 7)
+        method.take_step(make_batch(), 7)

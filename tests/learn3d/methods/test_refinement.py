@@ -11,7 +11,7 @@ from PIL import Image
 
 import nmr
 from learn3d.data.poses import LookAtPoses
-from learn3d.methods import DataShape, create_method
+from learn3d.methods import DatasetInfo, create_method
 from learn3d.methods.refinement import refine
 from learn3d.presets import PRESETS
 from learn3d.reconstruction import reconstruct, reconstruct_dataset, reconstruct_files
@@ -19,9 +19,9 @@ from learn3d.reconstruction import reconstruct, reconstruct_dataset, reconstruct
 
 def make(plane: float | None):
     settings = dataclasses.replace(
-        PRESETS["plus-kato"].settings, encoder="conv-small", generator="sphere-small", lambda_unseen=0.0
+        PRESETS["plus-kato"].settings, encoder="conv-small", generator="sphere-small", lambda_novel_view=0.0
     )
-    return create_method(settings, DataShape(24, mirror_plane_deg=plane), device="cpu", precision="fp32", seed=0)
+    return create_method(settings, DatasetInfo(24, mirror_plane_deg=plane), device="cpu", precision="fp32", seed=0)
 
 
 @pytest.mark.parametrize("steps", [(30, 0), (0, 30), (15, 15)])
@@ -38,7 +38,7 @@ def test_the_silhouette_comes_closer(tiny_set, steps: tuple[int, int]) -> None:
 
 
 def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set) -> None:
-    method = create_method(PRESETS["kato2019-kar"].settings, DataShape(24), device="cpu", precision="fp32", seed=0)
+    method = create_method(PRESETS["kato2019-kar"].settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
     batch = tiny_set.batch(torch.tensor([0]))
     images = torch.zeros(1, 4, method.image_size, method.image_size, dtype=torch.uint8)
     shapes = refine(method, images, batch.masks, batch.poses, code_steps=1, vertex_steps=1)
@@ -81,7 +81,7 @@ def test_voxels_cannot_be_fitted(tiny_set) -> None:
     settings = dataclasses.replace(
         PRESETS["gadelha2017-kato"].settings, generator_channels=(4, 4, 2, 1), discriminator_channels=(4, 8, 8, 8)
     )
-    method = create_method(settings, DataShape(24), device="cpu", precision="fp32", seed=0)
+    method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
     batch = tiny_set.batch(torch.tensor([0]))
     with pytest.raises(ValueError, match="leave out --refine"):
         reconstruct(method, batch.images.numpy(), batch.masks, batch.poses)

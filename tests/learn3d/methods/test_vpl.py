@@ -20,7 +20,7 @@ from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods import create_method
 from learn3d.methods import vpl as vpl_module
-from learn3d.methods.method import DataShape
+from learn3d.methods.method import DatasetInfo
 from learn3d.methods.vpl import VPL, VPLSettings, other_views
 from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
@@ -39,7 +39,7 @@ SHAPENET = replace(PRESETS["kato2019-kar"].settings, **SMALL)
 SHAPENET_CLASS = replace(PRESETS["kato2019-kar-class"].settings, **SMALL)
 PASCAL = replace(PRESETS["kato2019-pascal"].settings, **SMALL, encoder="preact-resnet18", object_scale=0.6)
 FORMS = {"reimplemented": REIMPLEMENTED, "shapenet": SHAPENET, "class": SHAPENET_CLASS, "pascal": PASCAL}
-SHAPE = DataShape(num_views=3, num_classes=2)
+SHAPE = DatasetInfo(num_views=3, num_classes=2)
 
 
 class NarrowEncoder(nn.Module):
@@ -113,7 +113,7 @@ def test_a_few_steps_lower_the_projection_loss(form: str) -> None:
     method = create(settings, pose_features=9 if rotations else 3)
     batch = make_batch(settings.image_size, rotations=rotations)
     steps = 20 if form == "reimplemented" else 14
-    losses = [method.train_step(batch, step)["projection"] for step in range(1, steps + 1)]
+    losses = [method.take_step(batch, step)["projection"] for step in range(1, steps + 1)]
     assert losses[-1] < 0.8 * losses[0], losses
     method.set_training(False)
     codes = method.encode(batch.images)
@@ -131,7 +131,7 @@ def test_bf16_and_wider_batches_take_steps() -> None:
     for settings in (REIMPLEMENTED, SHAPENET_CLASS):
         method = create_method(settings, SHAPE, device="cpu", precision="bf16", seed=0)
         for step in (1, 2):
-            losses = method.train_step(make_batch(settings.image_size, 3), step)
+            losses = method.take_step(make_batch(settings.image_size, 3), step)
             assert all(np.isfinite(list(losses.values())))
 
 
@@ -140,7 +140,7 @@ def test_training_repeats_itself(form: str) -> None:
     runs = []
     for _ in range(2):
         method = create(FORMS[form])
-        runs.append([method.train_step(make_batch(FORMS[form].image_size, 4), step) for step in (1, 2)])
+        runs.append([method.take_step(make_batch(FORMS[form].image_size, 4), step) for step in (1, 2)])
     assert runs[0] == runs[1]
 
 
@@ -148,14 +148,14 @@ def test_training_repeats_itself(form: str) -> None:
 def test_training_goes_on_from_its_saved_state(form: str) -> None:
     batch = make_batch(FORMS[form].image_size, 4)
     method, other = create(FORMS[form]), create(FORMS[form])
-    method.train_step(batch, 1)
+    method.take_step(batch, 1)
     for name, network in method.networks.items():
         other.networks[name].load_state_dict(network.state_dict())
         other.optimizers[name].load_state_dict(deepcopy(method.optimizers[name].state_dict()))
     runs = []
     for continued in (method, other):
         torch.manual_seed(1)
-        runs.append([continued.train_step(batch, step) for step in (2, 3)])
+        runs.append([continued.take_step(batch, step) for step in (2, 3)])
     assert runs[0] == runs[1]
 
 
@@ -163,14 +163,14 @@ def test_alternating_steps_train_one_side() -> None:
     method = create(REIMPLEMENTED)
     batch = make_batch(64)
     before, encoder = state_of(method.discriminator), state_of(method.encoder)
-    losses = method.train_step(batch, 1)
+    losses = method.take_step(batch, 1)
     assert losses.keys() == {"projection", "smoothness", "discrimination", "total"}
     after = state_of(method.discriminator)
     assert not any(torch.equal(before[name], after[name]) for name in before if "bias" not in name)
     assert not same(encoder, state_of(method.encoder))
 
     encoder = state_of(method.encoder)
-    losses = method.train_step(batch, 2)
+    losses = method.take_step(batch, 2)
     assert losses.keys() == {"projection", "smoothness", "adversarial", "total"}
     assert same(after, state_of(method.discriminator))  # running averages too
     assert all(parameter.grad is None for parameter in method.discriminator.parameters())
@@ -181,7 +181,7 @@ def test_odd_steps_move_shapes_as_without_a_discriminator() -> None:
     method, baseline = create(REIMPLEMENTED), create(replace(REIMPLEMENTED, lambda_discriminator=0.0))
     assert "discriminator" not in baseline.networks
     batch = make_batch(64)
-    losses, plain = method.train_step(batch, 1), baseline.train_step(batch, 1)
+    losses, plain = method.take_step(batch, 1), baseline.take_step(batch, 1)
     assert plain.keys() == {"projection", "smoothness", "total"}
     assert losses["projection"] == plain["projection"]
     for own, other in zip(method.generator.parameters(), baseline.generator.parameters(), strict=True):
@@ -192,8 +192,8 @@ def test_even_steps_pull_the_other_view_towards_real() -> None:
     """The gradient of an even step is that of projection + smoothness + lambda_D BCE(D(other view), 1)."""
     batch = make_batch(64)
     baseline, method = create(replace(REIMPLEMENTED, lambda_discriminator=0.0)), create(REIMPLEMENTED)
-    baseline.train_step(batch, 2)
-    losses = method.train_step(batch, 2)
+    baseline.take_step(batch, 2)
+    losses = method.take_step(batch, 2)
     adversary = create(REIMPLEMENTED)
     vertices = adversary.generator(adversary.encoder(batch.images.float() / 255))
     others = torch.tensor([1, 0])  # the only other view of each
@@ -231,7 +231,7 @@ def test_reversal_gives_shapes_minus_lambda_times_and_the_discriminator_all() ->
 
     for factor in (0.1, 0.7):
         method = create(replace(SHAPENET, lambda_discriminator=factor))
-        losses = method.train_step(batch, 1)
+        losses = method.take_step(batch, 1)
         assert losses.keys() == {"projection", "inflation", "discrimination", "total"}
         assert losses["discrimination"] == pytest.approx(loss.item(), rel=1e-4)
         own = [parameter.grad for parameter in method.discriminator.parameters() if parameter.requires_grad]
@@ -270,12 +270,12 @@ def test_input_mask_is_the_target_at_its_size() -> None:
     settings = replace(SHAPENET, image_size=96, silhouette_size=96, lambda_discriminator=0.0)
     batch = make_batch(96)
     wrong = replace(batch, masks=torch.zeros(2, 64, 64))
-    losses = [create(settings).train_step(b, 1)["projection"] for b in (batch, wrong)]
+    losses = [create(settings).take_step(b, 1)["projection"] for b in (batch, wrong)]
     assert losses[0] == losses[1]
     faint = replace(batch, images=torch.where(batch.images == 0, 25, batch.images))  # 25 / 255 is below 0.1
     method = create(settings)
     method.predict = lambda images: VPL.predict(method, batch.images)
-    assert method.train_step(faint, 1)["projection"] == losses[0]
+    assert method.take_step(faint, 1)["projection"] == losses[0]
 
 
 def test_presets_of_vpl() -> None:
@@ -328,4 +328,4 @@ def test_one_image_has_no_other_view() -> None:
     with pytest.raises(ValueError, match="batches of at least 2, got 1"):
         create(settings).check_batch(make_batch(64, 1))
     create(replace(settings, lambda_discriminator=0.0)).check_batch(make_batch(64, 1))
-    assert "projection" in create(replace(settings, lambda_discriminator=0.0)).train_step(make_batch(64, 1), 1)
+    assert "projection" in create(replace(settings, lambda_discriminator=0.0)).take_step(make_batch(64, 1), 1)

@@ -10,7 +10,7 @@ from vectors import load_vector
 
 from learn3d import device as precision_module
 from learn3d.device import autocast, resolve_precision
-from learn3d.methods import DataShape, Method, create_method
+from learn3d.methods import DatasetInfo, Method, create_method
 from learn3d.networks import PoseDiscriminator, network_input
 from learn3d.networks.encoders import ConvEncoder, EncoderName, create_encoder
 from learn3d.networks.generators import SphereGenerator, deform_sphere
@@ -18,7 +18,7 @@ from learn3d.presets import PRESETS
 
 
 def create(preset: str, seed: int = 0, device: str = "cpu") -> Method:
-    return create_method(PRESETS[preset].settings, DataShape(24), device=device, precision="fp32", seed=seed)
+    return create_method(PRESETS[preset].settings, DatasetInfo(24), device=device, precision="fp32", seed=seed)
 
 
 def layer_sizes(network: nn.Module) -> list[tuple[int, int]]:

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from learn3d.files import limits
-from learn3d.methods.method import DataShape
+from learn3d.methods.method import DatasetInfo
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.vpl import VPL, VPLSettings
 from learn3d.networks import ENCODERS, network_input
@@ -118,7 +118,7 @@ def test_it_sees_natural_colours_of_every_layout(kind: str, inverted: bool) -> N
     stored = torch.zeros(1, 4, 224, 224, dtype=torch.uint8)
     stored[:, 0], stored[:, 3] = 255, 255
     stored[:, :3] = 255 - stored[:, :3] if inverted else stored[:, :3]
-    shape = DataShape(3, inverted=inverted)
+    shape = DatasetInfo(3, inverted=inverted)
     if kind == "flat":
         method = VPL(VPLSettings(encoder="resnet18", image_size=224), shape, "cpu", "fp32")
         convolution = method.encoder.resnet.conv1
@@ -138,7 +138,7 @@ def test_a_method_starts_from_pretrained_weights(tmp_path: Path) -> None:
     torch.save(weights, tmp_path / "weights.pth")
     settings = PoseInvariantSettings(encoder="resnet18", symmetry="z", pretrained=str(tmp_path / "weights.pth"))
     assert settings.pretrained == tmp_path / "weights.pth"
-    method = PoseInvariant(settings, DataShape(3, pose_features=9), "cpu", "fp32")
+    method = PoseInvariant(settings, DatasetInfo(3, pose_features=9), "cpu", "fp32")
     method.start_from_pretrained()
     assert torch.equal(method.encoder.conv1.weight, weights["conv1.weight"])
     message = (

@@ -7,7 +7,7 @@ import torch
 from runs import metadata
 from safetensors.torch import save_file
 
-from learn3d.methods import DataShape, create_method
+from learn3d.methods import DatasetInfo, create_method
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 
@@ -68,7 +68,7 @@ def test_missing_foreign_and_future_files(tmp_path, monkeypatch) -> None:
 
 def test_networks_of_another_shape_are_refused(tmp_path) -> None:
     of_24_views, of_72_views = (
-        create_method(PRESETS["peng2020-kato"].settings, DataShape(k), device="cpu", precision="fp32", seed=0)
+        create_method(PRESETS["peng2020-kato"].settings, DatasetInfo(k), device="cpu", precision="fp32", seed=0)
         for k in (24, 72)
     )
     with pytest.raises(ValueError, match="does not fit the discriminator"):

@@ -12,7 +12,7 @@ from learn3d.training import train
 
 @pytest.mark.parametrize("preset", ["peng2020-kato", "peng2020-kato-vanilla", "plus-kato"])
 def test_an_exported_model_gives_the_shapes_of_the_run(tiny_config, tiny_set, run_folder, tmp_path, preset) -> None:
-    train(tiny_config(run_folder, preset=preset, average=0.5))
+    train(tiny_config(run_folder, preset=preset, ema_decay=0.5))
     size = export(run_folder, tmp_path / "small.safetensors")
     assert size == (tmp_path / "small.safetensors").stat().st_size
     assert size < 0.6 * (run_folder / "best.safetensors").stat().st_size

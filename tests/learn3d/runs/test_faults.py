@@ -28,19 +28,19 @@ from learn3d.runs import checkpoint, log
 from learn3d.runs import folder as run_folder
 from learn3d.training import train
 
-TRAIN_STEP = PoseInvariant.train_step
+TRAIN_STEP = PoseInvariant.take_step
 
 
 def before_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], object]) -> None:
     """Let something happen before a training step, once."""
     left = [action]
 
-    def train_step(self, batch, now: int):
+    def take_step(self, batch, now: int):
         if now == step and left:
             left.pop()()
         return TRAIN_STEP(self, batch, now)
 
-    monkeypatch.setattr(PoseInvariant, "train_step", train_step)
+    monkeypatch.setattr(PoseInvariant, "take_step", take_step)
 
 
 def full(*_: object, **__: object) -> None:
@@ -152,11 +152,11 @@ def test_metrics_and_pictures_wait_for_room_and_never_stop_a_run(
     monkeypatch.setattr(RecordWriter, "write", lambda *a: full() if disk.full else write(*a))
     monkeypatch.setattr("threading.excepthook", lambda arguments: None)  # TensorBoard's thread tells as well
 
-    def train_step(self, batch, now: int):
+    def take_step(self, batch, now: int):
         disk.full = now in (3, 4)
         return TRAIN_STEP(self, batch, now)
 
-    monkeypatch.setattr(PoseInvariant, "train_step", train_step)
+    monkeypatch.setattr(PoseInvariant, "take_step", take_step)
     assert train(tiny_run(run_folder)).finished
     said = capsys.readouterr().err
     for what in ("metrics.jsonl cannot be written", "pictures cannot be written", "tensorboard does not work"):
@@ -214,7 +214,7 @@ def test_missing_permission(tmp_path) -> None:
 
 
 def run_folder_of(name: str) -> contextlib.AbstractContextManager[None]:
-    return run_folder.sole_use(Path(name))
+    return run_folder.lock_folder(Path(name))
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # TensorBoard's

@@ -21,8 +21,8 @@ from learn3d.runs import folder as run_folder
 HOLDER = """
 import sys, time
 from pathlib import Path
-from learn3d.runs.folder import sole_use
-with sole_use(Path(sys.argv[1])):
+from learn3d.runs.folder import lock_folder
+with lock_folder(Path(sys.argv[1])):
     print("mine", flush=True)
     time.sleep(60)
 """
@@ -48,18 +48,18 @@ def test_a_folder_in_use_is_refused_and_a_killed_process_does_not_hold_it(tmp_pa
     with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, cwd=tmp_path) as holder:
         assert holder.stdout.readline() == b"mine\n"
         with pytest.raises(OSError, match=r"another process works in .*run; wait for it, or stop it"):
-            with run_folder.sole_use(folder):
+            with run_folder.lock_folder(folder):
                 pass
         holder.send_signal(signal.SIGKILL)
         holder.wait(timeout=30)
     assert (folder / ".lock").exists()
-    with run_folder.sole_use(folder):
+    with run_folder.lock_folder(folder):
         run_folder.claim(folder, overwrite=False)
     assert not (folder / ".lock").exists()
 
 
 def test_a_folder_that_was_made_for_nothing_is_removed(tmp_path) -> None:
-    with pytest.raises(ValueError, match="no data"), run_folder.sole_use(tmp_path / "run"):
+    with pytest.raises(ValueError, match="no data"), run_folder.lock_folder(tmp_path / "run"):
         raise ValueError("no data")
     assert not (tmp_path / "run").exists()
 
@@ -183,8 +183,8 @@ def test_half_written_files_do_not_make_a_folder_used_and_are_removed(tmp_path) 
 
 
 def test_two_processes_never_share_a_run(tmp_path) -> None:
-    with run_folder.sole_use(tmp_path), pytest.raises(OSError, match="another process works in"):
-        with run_folder.sole_use(tmp_path):
+    with run_folder.lock_folder(tmp_path), pytest.raises(OSError, match="another process works in"):
+        with run_folder.lock_folder(tmp_path):
             pass
-    with run_folder.sole_use(tmp_path):
+    with run_folder.lock_folder(tmp_path):
         pass

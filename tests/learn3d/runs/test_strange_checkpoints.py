@@ -95,7 +95,7 @@ METADATA = {
     "losses as a list": ({"progress": {"losses": [1.0]}}, "losses must be"),
     "unknown": ({"progress": {"surprise": 1}}, "there is no option 'surprise'"),
     "config": ({"config": [1]}, "config .* must hold options by name"),
-    "conditions": ({"conditions": {"samples": []}}, "samples must be"),
+    "fingerprint": ({"fingerprint": {"samples": []}}, "samples must be"),
     "versions": ({"versions": None}, "versions must be"),
     "classes": ({"shape": {"num_views": 10**9}}, "num_views must be at most"),
     "missing": ({"shape": {}}, "num_views is missing"),

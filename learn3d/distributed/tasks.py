@@ -33,8 +33,8 @@ SECONDS_KEPT = 3600.0  # of a file that stops tasks which a cluster has lost
 LOST = "the cluster lost it: its scheduler or its workers have ended; the same command tries it again"
 MOST_LINES = 8  # about tasks that are under way
 
-_CHILD = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from learn3d.parallel import engine; "
-_CHILD += "engine._child()"
+_CHILD = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from learn3d.distributed import tasks; "
+_CHILD += "tasks._child()"
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Task:
     log: Path  # what it prints is appended here
 
 
-def carry_out_all(
+def run_tasks(
     tasks: Sequence[Task],
     folder: Path,
     *,

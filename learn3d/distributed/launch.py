@@ -19,7 +19,7 @@ from torch.distributed.elastic.multiprocessing.errors import get_error_handler
 from torch.distributed.rendezvous import rendezvous
 
 from learn3d.device import check_device
-from learn3d.parallel.ranks import ALONE, LostPeerError, Ranks, first_sentence
+from learn3d.distributed.ranks import ALONE, LostPeerError, Ranks, first_sentence
 
 TIMEOUT = timedelta(minutes=10)  # how long a process waits for the others before it gives up
 GRACE_SECONDS = 2.0  # how long a failing process waits before it ends, so that the one with the first error ends first

@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor, nn
 
-from learn3d.parallel.ranks import Ranks
+from learn3d.distributed.ranks import Ranks
 
 BatchNorm = nn.BatchNorm1d | nn.BatchNorm2d | nn.BatchNorm3d
 

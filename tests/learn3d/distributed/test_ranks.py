@@ -26,10 +26,10 @@ from train_in_ranks import evaluate_last, linear_optimizer
 
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.data import augment as augmentation
-from learn3d.parallel import launch
-from learn3d.parallel.launch import all_agree, label, start
-from learn3d.parallel.ranks import ALONE, LostPeerError, Ranks
-from learn3d.parallel.whole_batch_norm import use_whole_batch
+from learn3d.distributed import launch
+from learn3d.distributed.launch import all_agree, label, start
+from learn3d.distributed.ranks import ALONE, LostPeerError, Ranks
+from learn3d.distributed.sync_batch_norm import use_whole_batch
 from learn3d.training import train
 
 TASKS = Path(__file__).parents[2] / "data" / "train_in_ranks.py"
@@ -43,14 +43,14 @@ PRGAN = {"generator_channels": (4, 4, 2, 1), "discriminator_channels": (4, 8, 8,
 #: Runs of 4 steps by name: options, and the tolerances of weights and of losses.
 RUNS: dict[str, tuple[dict[str, object], float, float]] = {
     # 5 images for 2 processes: one has 3 of them.
-    "proposed": (SMALL | {"augment": ("channels",), "batch_size": 5, "average": 0.9}, 1e-6, 1e-6),
-    "vanilla": (SMALL | {"preset": "peng2020-kato-vanilla", "augment": ("flip",), "schedule": "cosine"}, 1e-6, 1e-6),
+    "proposed": (SMALL | {"augment": ("channels",), "batch_size": 5, "ema_decay": 0.9}, 1e-6, 1e-6),
+    "vanilla": (SMALL | {"preset": "peng2020-kato-vanilla", "augment": ("flip",), "lr_schedule": "cosine"}, 1e-6, 1e-6),
     "pairs": ({"preset": "kato2018-kato", "encoder": "conv-small", "batch_size": 6}, 1e-5, 1e-5),
     # Batch norms, and for each image a random view of another one, which may be with the other process.
     "vpl": (VPL | {"preset": "peng2020-kato-vpl", "batch_size": 5}, 1e-4, 1e-4),
     "reversal": (PATCH | {"preset": "kato2019-kar", "batch_size": 5, "augment": ()}, 1e-4, 1e-4),
     # Shapes of both processes are compared with each other.
-    "plus": (SMALL | {"preset": "plus-kato", "batch_size": 5, "remembered": 8, "symmetry": "x"}, 1e-5, 1e-5),
+    "plus": (SMALL | {"preset": "plus-kato", "batch_size": 5, "bank_size": 8, "symmetry": "x"}, 1e-5, 1e-5),
     "prgan": (PRGAN | {"preset": "gadelha2017-kato", "batch_size": 5}, 1e-5, 1e-3),
 }
 
@@ -263,7 +263,7 @@ def distance(a: Path, b: Path) -> float:
     ours, theirs = (load_file(folder / "last.safetensors") for folder in (a, b))
     assert ours.keys() == theirs.keys()
     assert torch.equal(ours["random.cpu"], theirs["random.cpu"])
-    names = [name for name in ours if name.startswith(("network", "average"))]
+    names = [name for name in ours if name.startswith(("network", "ema"))]
     difference = sum(float((ours[name].double() - theirs[name].double()).square().sum()) for name in names)
     return (difference / sum(float(ours[name].double().square().sum()) for name in names)) ** 0.5
 
@@ -396,7 +396,7 @@ def test_torchrun_reports_what_went_wrong_once(tmp_path) -> None:
 
 RESTARTED = """
 import os, time
-from learn3d.parallel.launch import start
+from learn3d.distributed.launch import start
 first, rank = os.environ["TORCHELASTIC_RESTART_COUNT"] == "0", os.environ["RANK"]
 if not first and rank == "1":
     time.sleep(2)  # the other one would find the address that this one had

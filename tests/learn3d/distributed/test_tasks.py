@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import stub_tasks
 
-from learn3d.parallel.engine import Task, carry_out_all
+from learn3d.distributed.tasks import Task, run_tasks
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 
@@ -44,7 +44,7 @@ def begun(folder: Path, *names: str) -> bool:
 
 def test_tasks_of_all_kinds(tmp_path) -> None:
     said = []
-    failed = carry_out_all(tasks(tmp_path, "a", "fails", "dies", "b"), tmp_path, jobs=2, say=said.append)
+    failed = run_tasks(tasks(tmp_path, "a", "fails", "dies", "b"), tmp_path, jobs=2, say=said.append)
     assert set(failed) == {"fails", "dies"}
     assert "error: no such thing" in failed["fails"]
     assert "(ended by SIGKILL)" in failed["dies"]
@@ -56,7 +56,7 @@ def test_tasks_of_all_kinds(tmp_path) -> None:
 
 def test_a_task_whose_log_cannot_be_written_has_failed(tmp_path) -> None:
     (tmp_path / "a.log").mkdir()
-    failed = carry_out_all(tasks(tmp_path, "a", "b"), tmp_path)
+    failed = run_tasks(tasks(tmp_path, "a", "b"), tmp_path)
     assert set(failed) == {"a"} and "Is a directory" in failed["a"]
     assert finished(tmp_path, "b")
 
@@ -72,9 +72,9 @@ def test_a_second_interruption_ends_tasks_at_once(tmp_path) -> None:
 
     threading.Thread(target=interrupt).start()
     started = time.monotonic()
-    assert carry_out_all(tasks(tmp_path, "a", seconds=30.0), tmp_path) == {}
+    assert run_tasks(tasks(tmp_path, "a", seconds=30.0), tmp_path) == {}
     assert time.monotonic() - started < 25
-    assert carry_out_all(tasks(tmp_path, "a"), tmp_path) == {}, "it goes on"
+    assert run_tasks(tasks(tmp_path, "a"), tmp_path) == {}, "it goes on"
     assert finished(tmp_path, "a")
 
 
@@ -139,7 +139,7 @@ def test_a_cluster_that_loses_a_node_and_wins_one(tmp_path, cluster) -> None:
     thread.start()
     said = []
     given = [*tasks(tmp_path, *names, seconds=0.3), *tasks(tmp_path, "fails")]
-    failed = carry_out_all(given, tmp_path, cluster=cluster.address, say=said.append)
+    failed = run_tasks(given, tmp_path, cluster=cluster.address, say=said.append)
     assert set(failed) == {"fails"}, said
     thread.join()
     assert finished(tmp_path, *names)
@@ -157,17 +157,17 @@ def test_a_cluster_that_loses_its_head(tmp_path, cluster) -> None:
         cluster.head.kill()
 
     threading.Thread(target=behead).start()
-    failed = carry_out_all(tasks(tmp_path, "a", "b", seconds=0.3), tmp_path, cluster=cluster.address)
+    failed = run_tasks(tasks(tmp_path, "a", "b", seconds=0.3), tmp_path, cluster=cluster.address)
     assert set(failed) == {"a", "b"}
     assert "the cluster lost it" in failed["a"]
     wait_for(lambda: "saved" in (tmp_path / "a.log").read_text(), "the orphan")
     cluster.start_head()
     cluster.start_node()
-    assert carry_out_all(tasks(tmp_path, "a", "b"), tmp_path, cluster=cluster.address) == {}
+    assert run_tasks(tasks(tmp_path, "a", "b"), tmp_path, cluster=cluster.address) == {}
     assert finished(tmp_path, "a", "b")
 
 
 def test_no_cluster_there(tmp_path) -> None:
     pytest.importorskip("distributed")
     with pytest.raises(OSError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        carry_out_all(tasks(tmp_path, "a"), tmp_path, cluster="tcp://127.0.0.1:9")
+        run_tasks(tasks(tmp_path, "a"), tmp_path, cluster="tcp://127.0.0.1:9")
