@@ -15,7 +15,7 @@ from learn3d.data.sampling import Sampling
 from learn3d.files import limits
 from learn3d.files.findings import DamagedFile
 from learn3d.files.reading import parse_json, read_bytes
-from learn3d.methods import LRSchedule, Plan, Settings
+from learn3d.methods import LRSchedule, MethodSettings, Plan
 from learn3d.presets import PRESETS
 from learn3d.settings import Count, FilePath, Items, Step, checked
 
@@ -44,7 +44,7 @@ class TrainConfig:
     """Folder of this run: checkpoints, metrics, pictures. It must be new or empty unless you resume or overwrite."""
     preset: Annotated[str, AfterValidator(_known_preset)] = DEFAULT_PRESET
     """Published experiment whose settings apply where nothing else is said."""
-    settings: Annotated[Settings | None, SkipValidation] = None
+    settings: Annotated[MethodSettings | None, SkipValidation] = None
     """Settings of the method. None: the preset's."""
     layout: Layout | None = None
     """Layout of the data set. None: the preset's."""
@@ -110,7 +110,7 @@ class TrainConfig:
         check_options(self.layout, image_size=self.settings.image_size, view_bins=self.view_bins)
         if self.val_split == "val" and not LAYOUTS[self.layout].validation:
             raise ValueError(f"the layout {self.layout!r} has no split val; validate on test (val_split test)")
-        if "flip" in self.augment and getattr(self.settings, "reads_view_ids", False):
+        if "flip" in self.augment and self.settings.reads_view_ids:
             raise ValueError(
                 "augment 'flip' moves the camera into another view class, but "
                 f"{self.preset!r} learns with the class of the original; leave 'flip' out"
@@ -119,18 +119,8 @@ class TrainConfig:
             raise ValueError(
                 f"sampling 'pairs' takes two views of each object: batch_size must be even, got {self.batch_size}"
             )
-        if getattr(self.settings, "lambda_novel_view", 0) > 0 and not 2 <= self.batch_size <= self.settings.bank_size:
-            raise ValueError(
-                f"the loss at novel views compares a batch with the {self.settings.bank_size} masks of the "
-                f"mask bank (--bank-size): batch_size must lie in 2 .. {self.settings.bank_size}, got "
-                f"{self.batch_size}; --lambda-novel-view 0 leaves it out"
-            )
+        self.settings.check_run(iterations=self.iterations, batch_size=self.batch_size)
         self.plan  # noqa: B018 (it checks itself)
-        if getattr(self.settings, "encoder_from_step", 0) > self.iterations:
-            raise ValueError(
-                f"encoder_from_step={self.settings.encoder_from_step} lies beyond the {self.iterations} iterations: "
-                f"the encoder would never be trained; give a step such as {self.iterations // 2 + 1}"
-            )
 
     @property
     def plan(self) -> Plan:
@@ -195,9 +185,7 @@ def _what_depends_on_iterations(config: TrainConfig) -> str | None:
     """What makes every step depend on the number of steps of the whole run."""
     if config.lr_schedule != "constant":
         return f"the schedule {config.lr_schedule}"
-    settings = config.settings
-    falls = getattr(settings, "lambda_smooth_end", None) is not None and settings.lambda_smooth > 0
-    return "lambda_smooth_end" if falls else None
+    return config.settings.varies_over_run
 
 
 def check_resume(config: TrainConfig, saved: TrainConfig) -> None:

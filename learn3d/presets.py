@@ -11,7 +11,7 @@ from typing import Any
 from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import Layout
 from learn3d.data.sampling import Sampling
-from learn3d.methods import LRSchedule, Settings
+from learn3d.methods import LRSchedule, MethodSettings
 from learn3d.methods.multi_view import MultiViewSettings
 from learn3d.methods.plus import PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
@@ -24,7 +24,7 @@ class Preset:
     """One published experiment."""
 
     label: str  # what tables call it
-    settings: Settings  # of the method, which is decided by their type
+    settings: MethodSettings  # of the method, which is decided by their type
     layout: Layout  # layout of the data set that it was made for
     iterations: int
     batch_size: int

@@ -79,7 +79,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
             for warning in filter(None, (*notes, *found)):
                 log.say(f"warning: {warning}")
             log.say(_describe(config, precision, train_set, val_set, progress, ranks))
-            if getattr(config.settings, "symmetry", None) == "auto":
+            if config.settings.wants_mirror_plane:
                 log.say(_about_plane(shape.mirror_plane_deg))
             indices = sample(progress.step + 1)
             for step in range(progress.step + 1, config.iterations + 1):
@@ -125,8 +125,7 @@ def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDat
 
 
 def _shape_of(train_set: ViewDataset, config: TrainConfig) -> DatasetInfo:
-    wanted = getattr(config.settings, "symmetry", None) == "auto"
-    plane = find_mirror_plane(train_set) if wanted else None
+    plane = find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None
     box = train_set.convention.box if LAYOUTS[config.layout].voxels else None
     known = (train_set.num_views, train_set.num_classes, train_set.pose_features, train_set.inverted)
     return DatasetInfo(*known, mirror_plane_deg=plane, cube_side=box)

@@ -133,15 +133,13 @@ def _configure(
         raise ValueError(f"{variant.name} divides batches by {parts}: batch_size must be a multiple, got {batch_size}")
     if "warmup_steps" in changes:  # no more than a preset's own
         changes["warmup_steps"] = min(changes["warmup_steps"], iterations // 10)
-    # PrGAN's encoder is trained in the second half, however long it is.
-    settings = {"encoder_from_step": iterations // 2 + 1} if "encoder_from_step" in setting_names else {}
-    settings |= {name: value for name, value in changes.items() if name in setting_names}
+    settings = {name: value for name, value in changes.items() if name in setting_names}
     return TrainConfig(
         data=options.data,
         category=category,
         output=options.output / "runs" / category / f"{variant.name}-seed{seed}",
         preset=variant.preset,
-        settings=dataclasses.replace(preset.settings, **settings),
+        settings=dataclasses.replace(preset.settings.for_iterations(iterations), **settings),
         layout=options.layout or table.layout,
         iterations=iterations,
         batch_size=batch_size // parts,

@@ -13,6 +13,7 @@ from learn3d.methods.optimization import CONSTANT, LRSchedule, Plan
 from learn3d.methods.plus import Plus, PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.prgan import PrGAN, PrGANSettings
+from learn3d.methods.settings import MethodSettings
 from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.methods.vpl import VPL, VPLSettings
 
@@ -23,14 +24,12 @@ __all__ = [
     "MeshMethod",
     "Meshes",
     "Method",
+    "MethodSettings",
     "Plan",
-    "Settings",
     "create_method",
 ]
 
-Settings = PoseInvariantSettings | PlusSettings | MultiViewSettings | VPLSettings | PrGANSettings
-
-_METHODS: dict[type, type[Method]] = {
+_METHODS: dict[type[MethodSettings], type[Method]] = {
     PoseInvariantSettings: PoseInvariant,
     PlusSettings: Plus,
     MultiViewSettings: MultiView,
@@ -40,7 +39,7 @@ _METHODS: dict[type, type[Method]] = {
 
 
 def create_method(
-    settings: Settings,
+    settings: MethodSettings,
     info: DatasetInfo,
     *,
     device: str,

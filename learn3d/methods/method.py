@@ -19,6 +19,7 @@ from learn3d.device import autocast
 from learn3d.distributed.ranks import ALONE, Ranks, sum_gradients
 from learn3d.distributed.sync_batch_norm import use_whole_batch
 from learn3d.methods.optimization import CONSTANT, EMA, Plan, adam, backpropagate
+from learn3d.methods.settings import MeshSettings, MethodSettings
 from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.networks import GENERATORS, MeshGenerator, Symmetry, SymmetryOption, create_encoder, network_input
 from learn3d.settings import checked
@@ -57,7 +58,7 @@ class Method(abc.ABC):
 
     def __init__(
         self,
-        settings: Any,
+        settings: MethodSettings,
         info: DatasetInfo,
         device: str,
         precision: Literal["bf16", "fp32"],
@@ -176,6 +177,7 @@ class MeshMethod(Method):
     subclass has no others.
     """
 
+    settings: MeshSettings
     encoder: nn.Module
     generator: MeshGenerator
 

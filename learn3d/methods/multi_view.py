@@ -9,33 +9,21 @@ from learn3d.data.batch import Batch
 from learn3d.device import Download
 from learn3d.methods.adam import SparseGradientAdam
 from learn3d.methods.method import MeshMethod
-from learn3d.networks import ENCODERS, EncoderName, GeneratorName, SymmetryOption
-from learn3d.settings import Positive, Weight, checked
+from learn3d.methods.settings import MeshSettings
+from learn3d.networks import EncoderName, GeneratorName
+from learn3d.settings import Weight, checked
 
 CENTROID_LEARNING_RATE = 0.1  # of the centroid's layer, relative to all others
 
 
 @checked
-class MultiViewSettings:
+class MultiViewSettings(MeshSettings):
     """Networks and weight of Kato et al. 2018; the defaults are the published code's for one category."""
 
     encoder: EncoderName = "conv-relu"
-    """conv-relu: three convolutions, on 64-pixel RGB and mask, with a ReLU on the code, as in Kato et al. conv: without
-    the ReLU. conv-small: conv with a fifteenth of the weights. resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "bounded"
-    """bounded: that of Kato et al. sphere: 642 free vertices. The others: see PoseInvariantSettings."""
-    symmetry: SymmetryOption = None
-    """Mirror shapes at a vertical plane: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
-    it (0 is x = 0). auto: the plane that the training masks show, or none. None: shapes are free."""
-    learning_rate: Positive = 1e-4
-    """Adam's full step size. The preset's schedule "step" takes a tenth of it in the last 5 % of all iterations."""
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (published: 0.001 for one category, 0 for all together)."""
-
-    @property
-    def image_size(self) -> int:
-        """Side of the images that the encoder takes, in pixels."""
-        return ENCODERS[self.encoder].image_size
 
 
 class MultiView(MeshMethod):

@@ -27,21 +27,11 @@ class PlusSettings(PoseInvariantSettings):
     """Networks, weights and forms of the terms of the loss; a weight of 0 means that the term is not computed."""
 
     encoder: EncoderName = "conv-light"
-    """conv-light: four convolutions, the last one (1x1) to 32 channels. conv, conv-small, conv-centred, conv-relu,
-    resnet18: see the proposed method (--preset proposed --help-all)."""
     symmetry: SymmetryOption = "auto"
-    """Mirror shapes at a vertical plane: auto: the one at which the training masks mirror each other, or none where
-    they do not; x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along it. None: shapes are
-    free."""
     clamp_to_cube: bool = True
-    """Whether what reaches out of the cube in which all objects of a data set lie, where it has one, is moved onto its
-    sides, in evaluation and reconstruction. The voxelizers count a shape that reaches out of their grid as hollow."""
     learning_rate: Positive = 4e-4
-    """Adam's step size, the same for the three networks. The preset warms it up and lets it fall to 0."""
     lambda_smooth: Weight = 5e-4
-    """Weight of the smoothness loss (lambda_1) at the start of the run."""
     lambda_smooth_end: Positive | None = 1e-4
-    """This weight at the end of the run, approached by a constant factor a step. None: lambda_smooth throughout."""
     lambda_novel_view: Weight = 0.5
     """Weight of the loss at novel views."""
     bank_size: Count = 2048
@@ -50,6 +40,14 @@ class PlusSettings(PoseInvariantSettings):
     @property
     def reads_view_ids(self) -> bool:
         return self.uses_discriminator or self.lambda_novel_view > 0
+
+    def check_run(self, *, iterations: int, batch_size: int) -> None:
+        if self.lambda_novel_view > 0 and not 2 <= batch_size <= self.bank_size:
+            raise ValueError(
+                f"the loss at novel views compares a batch with the {self.bank_size} masks of the mask bank "
+                f"(--bank-size): batch_size must lie in 2 .. {self.bank_size}, got {batch_size}; "
+                "--lambda-novel-view 0 leaves it out"
+            )
 
 
 class MaskBank(nn.Module):

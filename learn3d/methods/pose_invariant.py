@@ -13,8 +13,9 @@ from learn3d.device import Download, upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod
 from learn3d.methods.optimization import frozen
+from learn3d.methods.settings import MeshSettings
 from learn3d.methods.surfaces import Meshes
-from learn3d.networks import ENCODERS, EncoderName, GeneratorName, PoseDiscriminator, SymmetryOption
+from learn3d.networks import PoseDiscriminator
 from learn3d.networks.resnet import check_pretrained, load_pretrained
 from learn3d.settings import FilePath, Positive, Weight, checked
 
@@ -22,33 +23,20 @@ INSIDE = 0.499  # of a box's side: a face exactly on the border of the grid is o
 
 
 @checked
-class PoseInvariantSettings:
+class PoseInvariantSettings(MeshSettings):
     """Networks, weights and forms of the terms of L_tot; a weight of 0 means that the term is not computed."""
 
-    encoder: EncoderName = "conv"
-    """conv: three convolutions, on 64-pixel RGB and mask. conv-light: with half the channels, and a fourth (1x1) to
-    32 channels. conv-small: with a fifteenth of the weights. conv-centred: about as small, on images in which every
-    object is scaled to one size, for pictures from cameras at unknown distances. conv-relu: conv with a ReLU on the
-    code, as in Kato et al. 2018. resnet18: on 224-pixel RGB."""
-    generator: GeneratorName = "sphere"
-    """sphere: 642 free vertices. sphere-small: from fewer weights. bounded: that of Kato et al. 2018. cube-conv,
-    cube-fc: those of Kato and Harada 2019."""
-    symmetry: SymmetryOption = None
-    """Mirror shapes at a vertical plane: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
-    it (0 is x = 0). auto: the plane at which the training masks mirror each other, or none where they do not. None:
-    shapes are free."""
     clamp_to_cube: bool = False
-    """Whether what reaches out of the cube in which all objects of a data set lie, where it has one, is moved onto its
-    sides, in evaluation and reconstruction. The voxelizers count a shape that reaches out of their grid as hollow."""
+    """Clamp vertices to the cube in which all objects of the data set lie, if it has one, in evaluation and
+    reconstruction. The voxelizers take a shape that exceeds their grid for hollow."""
     pretrained: FilePath | None = None
-    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's. None: random.
-    The encoder gets natural colours, R, G, B, normalised as ImageNet's, however the data set stores them."""
-    learning_rate: Positive = 1e-4
-    """Adam's step size, the same for the three networks."""
+    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's (default: random
+    weights). The encoder gets natural colours, R, G, B, normalised as ImageNet's, however the data set stores them."""
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1)."""
     lambda_smooth_end: Positive | None = None
-    """This weight at the end of the run, approached by a constant factor a step. None: lambda_smooth throughout."""
+    """Weight of the smoothness loss at the end of the run, approached by a constant factor a step. None: lambda_smooth
+    throughout."""
     lambda_volume: Weight = 0.0
     """Weight of the volume that shapes enclose."""
     lambda_classification: Weight = 1.0
@@ -66,14 +54,12 @@ class PoseInvariantSettings:
         check_pretrained(self.pretrained, self.encoder)
 
     @property
-    def image_size(self) -> int:
-        """Side of the images that the encoder takes, in pixels."""
-        return ENCODERS[self.encoder].image_size
+    def reads_view_ids(self) -> bool:
+        return self.uses_discriminator
 
     @property
-    def reads_view_ids(self) -> bool:
-        """Whether training depends on the view classes."""
-        return self.uses_discriminator
+    def varies_over_run(self) -> str | None:
+        return "lambda_smooth_end" if self.lambda_smooth_end is not None and self.lambda_smooth > 0 else None
 
     @property
     def uses_discriminator(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Annotated
 
@@ -16,6 +17,7 @@ from learn3d.device import autocast, upload
 from learn3d.distributed.ranks import ALONE, Ranks
 from learn3d.methods.method import Method
 from learn3d.methods.optimization import adam, frozen
+from learn3d.methods.settings import MethodSettings
 from learn3d.methods.surfaces import Grids
 from learn3d.networks import network_input
 from learn3d.networks.projection import ViewCircle, project
@@ -36,7 +38,7 @@ FourLayers = Annotated[tuple[LayerChannels, LayerChannels, LayerChannels, LayerC
 
 
 @checked
-class PrGANSettings:
+class PrGANSettings(MethodSettings):
     """Learning rates, widths and when each network is trained; defaults: the published code, for airplanes."""
 
     encoder_from_step: Step = 53_051
@@ -71,8 +73,17 @@ class PrGANSettings:
 
     @property
     def image_size(self) -> int:
-        """Side of the images that the encoder takes, in pixels."""
         return IMAGE_SIZE
+
+    def check_run(self, *, iterations: int, batch_size: int) -> None:
+        if self.encoder_from_step > iterations:
+            raise ValueError(
+                f"encoder_from_step={self.encoder_from_step} lies beyond the {iterations} iterations: "
+                f"the encoder would never be trained; give a step such as {iterations // 2 + 1}"
+            )
+
+    def for_iterations(self, iterations: int) -> PrGANSettings:
+        return dataclasses.replace(self, encoder_from_step=iterations // 2 + 1)
 
 
 class PrGAN(Method):

@@ -23,7 +23,8 @@ from learn3d.device import Download, upload
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.method import DatasetInfo, MeshMethod, plane_of
 from learn3d.methods.optimization import adam, frozen
-from learn3d.networks import ENCODERS, GENERATORS, GeneratorName, MeshGenerator, SymmetryOption
+from learn3d.methods.settings import MeshSettings
+from learn3d.networks import ENCODERS, GENERATORS, MeshGenerator
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
 from learn3d.networks.flat_resnet import FlatResNet18
 from learn3d.networks.layers import reverse_gradient
@@ -35,7 +36,7 @@ MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object where alph
 
 
 @checked
-class VPLSettings:
+class VPLSettings(MeshSettings):
     """Networks, losses and their weights; a weight of 0 means that the term is not computed.
 
     The defaults are the re-implementation that Peng et al. 2020 compared with on Kato's data.
@@ -43,18 +44,12 @@ class VPLSettings:
 
     encoder: Literal["conv", "preact-resnet18", "resnet18"] = "conv"
     """conv: three convolutions, 64-pixel RGB and mask. preact-resnet18: RGB on grey. resnet18: RGB, may be pretrained.
-    The last two take any multiple of 32 pixels."""
+    The last two take any multiple of 32 pixels (--image-size)."""
     pretrained: FilePath | None = None
-    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's; its batch norms
-    stay frozen then. None: random weights. The encoder gets natural colours, however the data set stores them."""
+    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's (default: random
+    weights); its batch norms stay frozen then. The encoder gets natural colours, however the data set stores them."""
     image_size: Pixels = 64
     """Side of the input images in pixels."""
-    generator: GeneratorName = "sphere"
-    """sphere: 642 free vertices. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or not. The
-    others: see PoseInvariantSettings."""
-    symmetry: SymmetryOption = None
-    """Mirror shapes at a vertical plane: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
-    it (0 is x = 0). auto: the plane that the training masks show, or none. None: shapes are free."""
     vertex_scale: Positive = 0.01
     """Cube generators only: s, the factor of the last layer's output."""
     object_scale: Positive = 0.5
@@ -80,8 +75,6 @@ class VPLSettings:
     """Gradient of the renderer: Kato et al. 2018's, or the local one of Kato and Harada 2019."""
     silhouette_loss: Literal["iou", "pyramid"] = "iou"
     """iou: 1 - soft IoU. pyramid: squared distance of normalised images at five resolutions."""
-    learning_rate: Positive = 1e-4
-    """Adam's step size, the same for the three networks."""
     adam_beta1: Annotated[float, Field(ge=0, lt=1)] = 0.9
     """Adam's decay of the mean gradient (of its square: 0.999)."""
     lambda_smooth: Weight = 0.001
@@ -93,7 +86,6 @@ class VPLSettings:
 
     @property
     def reads_view_ids(self) -> bool:
-        """Whether training depends on the view classes."""
         return self.lambda_discriminator > 0 and (self.discriminator == "dcgan" or self.other_views == "random")
 
     def __post_init__(self) -> None:
