@@ -1,4 +1,4 @@
-// Work on an owner map in blocks of raster rows, with sums that do not depend on the number of threads: the blocks
+// Work on a face index map in blocks of raster rows, with sums that do not depend on the number of threads: the blocks
 // depend only on the sizes, each block has its own sum, and the sums are added in the order of the blocks.
 #pragma once
 
@@ -35,8 +35,8 @@ struct RowBlocks {
 
 // The faces that own a pixel, numbered from 1 in ascending order; the background is number 0.
 struct VisibleFaces {
-  std::vector<int32_t> slots;  // [2 F + 1] number of owner entry id at [id + 1]; defined only for visible faces
-  std::vector<int32_t> ids;    // [count] owner entries; ids[0] = -1
+  std::vector<int32_t> slots;  // [2 F + 1] number of face index id at [id + 1]; defined only for visible faces
+  std::vector<int32_t> ids;    // [count] face indices; ids[0] = -1
   int64_t count;
 
   void reserve_for(int64_t num_faces, int64_t most_visible) {
@@ -44,18 +44,18 @@ struct VisibleFaces {
     reserve(ids, most_visible + 2);  // the search may write one entry after the last one
   }
 
-  NMR_INLINE void find(const int32_t* owner, int64_t pixels, int64_t num_faces) {
+  NMR_INLINE void find(const int32_t* face_index, int64_t pixels, int64_t num_faces) {
     int32_t *slot = slots.data(), *id = ids.data();
     std::fill_n(slot, 2 * num_faces + 1, 0);
     int64_t n = 0;
     for (; n + 8 <= pixels; n += 8) {
       uint64_t pairs[4];
-      std::memcpy(pairs, owner + n, sizeof pairs);
+      std::memcpy(pairs, face_index + n, sizeof pairs);
       const uint64_t signs = pairs[0] & pairs[1] & pairs[2] & pairs[3];
       if ((~signs & UINT64_C(0x8000000080000000)) == 0) continue;  // background
-      for (int64_t k = 0; k < 8; ++k) slot[owner[n + k] + 1] = 1;
+      for (int64_t k = 0; k < 8; ++k) slot[face_index[n + k] + 1] = 1;
     }
-    for (; n < pixels; ++n) slot[owner[n] + 1] = 1;
+    for (; n < pixels; ++n) slot[face_index[n] + 1] = 1;
     int32_t found = 1;
     for (int64_t f = 0; f < 2 * num_faces; ++f) {
       const int32_t visible = slot[f + 1];
@@ -110,7 +110,7 @@ void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& b
 // Gradients per visible face of a block, in the vertex order in which the face is drawn.
 template <class T>
 struct FaceGradients {
-  std::vector<int32_t> ids;  // [count] owner entries
+  std::vector<int32_t> ids;  // [count] face indices
   std::vector<T> values;     // [count, 3, 3] of the three corners' x, y, z
   int64_t count;
 

@@ -23,8 +23,8 @@ NMR_INLINE void expand_color_row(const ColorImage<T>& image, int64_t j, T* row) 
 
 // Writes pixel m as number `at` of line n. grad: its gradients, `grad_stride` apart.
 template <int64_t kChannels, class T>
-NMR_INLINE void put_color(ColorLines<T>& lines, int64_t n, int64_t at, int64_t m, int32_t owner, const T* color,
-                          const T* grad, int64_t grad_stride) {
+NMR_INLINE void put_color(ScanlineColors<T>& lines, int64_t n, int64_t at, int64_t m, int32_t face_index,
+                          const T* color, const T* grad, int64_t grad_stride) {
   const int64_t C = kChannels ? kChannels : lines.channels;
   T* out = lines.values.data() + (n * lines.stride + at / kLanes * kLanes) * (1 + 2 * C) + at % kLanes;
   out[0] = static_cast<T>(m);
@@ -32,18 +32,18 @@ NMR_INLINE void put_color(ColorLines<T>& lines, int64_t n, int64_t at, int64_t m
     out[(1 + c) * kLanes] = color[c];
     out[(1 + C + c) * kLanes] = grad[c * grad_stride];
   }
-  lines.owners(n)[at] = owner;
+  lines.face_indices(n)[at] = face_index;
 }
 
 // Bounds, padding and numbers of lines [first, last), when all their pixels have been seen.
 template <class T>
-NMR_INLINE void finish_color_lines(ColorLines<T>& lines, int64_t first, int64_t last, int64_t length) {
+NMR_INLINE void finish_color_lines(ScanlineColors<T>& lines, int64_t first, int64_t last, int64_t length) {
   const T infinity = std::numeric_limits<T>::infinity();
   for (int64_t n = first; n < last; ++n) {
     const int64_t count = lines.count[n], rest = count % kLanes;
-    lines.pull_end[0][n] = count ? lines.position(n, count - 1) : -infinity;
-    lines.pull_end[1][n] = count ? -lines.position(n, 0) : -infinity;
-    lines.gain_start[1][n] = std::max(static_cast<T>(1 - length), -lines.gain_start[1][n]);
+    lines.outer_end[0][n] = count ? lines.position(n, count - 1) : -infinity;
+    lines.outer_end[1][n] = count ? -lines.position(n, 0) : -infinity;
+    lines.inner_start[1][n] = std::max(static_cast<T>(1 - length), -lines.inner_start[1][n]);
     T* block = lines.at(n, count / kLanes);
     for (int64_t k = 0; rest && k < 1 + 2 * lines.channels; ++k)
       std::fill(block + k * kLanes + rest, block + (k + 1) * kLanes, T(0));
@@ -53,7 +53,7 @@ NMR_INLINE void finish_color_lines(ColorLines<T>& lines, int64_t first, int64_t 
 // Writes how many of the pixels of line n before pixel m, ..., m + 7 are listed. bits: which of these eight are;
 // count: those before them.
 template <class T>
-NMR_INLINE void count_before(ColorLines<T>& lines, int64_t n, int64_t m, int64_t count, uint32_t bits) {
+NMR_INLINE void count_before(ScanlineColors<T>& lines, int64_t n, int64_t m, int64_t count, uint32_t bits) {
   // Byte k of `each` is bit k, and byte k of `below` the sum of the bytes before it.
   const uint64_t apart = bits * UINT64_C(0x0101010101010101) & UINT64_C(0x8040201008040201);
   const uint64_t each = (apart + UINT64_C(0x7f7f7f7f7f7f7f7f)) >> 7 & UINT64_C(0x0101010101010101);
@@ -68,7 +68,7 @@ NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& r
   const int64_t H = image.raster.height, W = image.raster.width, C = kChannels ? kChannels : image.channels,
                 plane = W + kPad;
   const bool in_rows = range.row_first < range.row_last, in_columns = range.column_first < range.column_last;
-  ColorLines<T>&columns = image.lines[0], &rows = image.lines[1];
+  ScanlineColors<T>&columns = image.lines[0], &rows = image.lines[1];
   start_lines(columns, range.column_first, range.column_last);
   start_lines(rows, range.row_first, range.row_last);
   const Lanes<T> zero = splat(T(0));
@@ -92,20 +92,20 @@ NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& r
       if (!bits) continue;
       Lanes32 id = splat(int32_t(-1));
       if (start + kLanes <= W)
-        id = load_lanes<Lanes32>(image.owner + row + start);
+        id = load_lanes<Lanes32>(image.face_index + row + start);
       else
-        std::memcpy(&id, image.owner + row + start, (W - start) * sizeof(int32_t));
+        std::memcpy(&id, image.face_index + row + start, (W - start) * sizeof(int32_t));
       const Lanes32 on_face = id > splat(int32_t(-1));
       for (uint32_t rest = bits; rest; rest &= rest - 1) {
         const int64_t i = start + lowest_bit(rest);
         const T* color = image.color(row + i);
-        const int32_t owner = image.owner[row + i];
-        if (in_rows) put_color<kChannels>(rows, j, in_row++, i, owner, color, grad_row + i, plane);
-        if (in_columns) put_color<kChannels>(columns, i, columns.count[i], j, owner, color, grad_row + i, plane);
+        const int32_t face_index = image.face_index[row + i];
+        if (in_rows) put_color<kChannels>(rows, j, in_row++, i, face_index, color, grad_row + i, plane);
+        if (in_columns) put_color<kChannels>(columns, i, columns.count[i], j, face_index, color, grad_row + i, plane);
       }
       if (in_rows) {
         const uint32_t gains = bits & lane_bits(on_face);
-        T &first = rows.gain_start[0][j], &last = rows.gain_start[1][j];
+        T &first = rows.inner_start[0][j], &last = rows.inner_start[1][j];
         if (gains) {
           first = std::min(first, static_cast<T>(start));  // at least that
           last = static_cast<T>(start + kLanes - 1);       // at most that
@@ -113,7 +113,7 @@ NMR_INLINE void collect_colors_of(const ColorImage<T>& image, const LineRange& r
       }
       if (in_columns) {
         const LaneMask<T> gains = listed & widen_mask<T>(on_face);
-        T *first = columns.gain_start[0].data() + start, *last = columns.gain_start[1].data() + start;
+        T *first = columns.inner_start[0].data() + start, *last = columns.inner_start[1].data() + start;
         const Lanes<T> line_first = load_lanes<Lanes<T>>(first), at = splat(static_cast<T>(j));
         store_lanes(first, select(gains & (line_first > at), at, line_first));
         store_lanes(last, select(gains, at, load_lanes<Lanes<T>>(last)));
@@ -148,39 +148,41 @@ NMR_INLINE Lanes<T> color_gains(const T* block, int64_t channels, const T* refer
 // Adds the pulls of eight pixels at these offsets from the crossing where the mask is set. The quotients w / h_p
 // and w / h_q share one division: w / (h_p h_q) times h_q and h_p.
 template <class T>
-NMR_INLINE void pull_lanes(LaneMask<T> mask, Lanes<T> weight, Lanes<T> offset, const Lever<T>& lever, Lanes<T>& pulls_p,
-                           Lanes<T>& pulls_q) {
-  const Lanes<T> eps = splat(lever.eps), zero = splat(T(0));
-  const Lanes<T> p = offset * splat(lever.factor_p), q = offset * splat(lever.factor_q);
+NMR_INLINE void pull_lanes(LaneMask<T> mask, Lanes<T> weight, Lanes<T> offset, const EdgeDerivative<T>& derivative,
+                           Lanes<T>& pulls_p, Lanes<T>& pulls_q) {
+  const Lanes<T> eps = splat(derivative.eps), zero = splat(T(0));
+  const Lanes<T> p = offset * splat(derivative.factor_p), q = offset * splat(derivative.factor_q);
   const Lanes<T> h_p = p + select(p > zero, eps, zero - eps), h_q = q + select(q > zero, eps, zero - eps);
   const Lanes<T> share = keep(mask, weight / (h_p * h_q));
   pulls_p = pulls_p + keep(mask, share * h_q);
   pulls_q = pulls_q + keep(mask, share * h_p);
 }
 
-// The pulls of the listed pixels [first, last) of a line, if kOwn those of one face alone, for levers of extreme size.
+// The pulls of the listed pixels [first, last) of a line, if kOwn those of one face alone, for factors of extreme size.
 template <bool kOwn, class T>
-void pull_one_by_one(const ColorLines<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id, const T* reference,
-                     const Lever<T>& lever, T* pulls) {
+void pull_one_by_one(const ScanlineColors<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id,
+                     const T* reference, const EdgeDerivative<T>& derivative, T* pulls) {
   const int64_t C = lines.channels;
-  const int32_t* owner = lines.owners(n);
+  const int32_t* face_index = lines.face_indices(n);
   for (int64_t k = first; k < last; ++k) {
     const T* pixel = lines.at(n, k / kLanes) + k % kLanes;
     T gain = 0;
     for (int64_t c = 0; c < C; ++c) gain += (pixel[(1 + c) * kLanes] - reference[c]) * pixel[(1 + C + c) * kLanes];
-    if (gain > 0 && (!kOwn || owner[k] == id)) pull(gain, pixel[0] - lever.crossing, lever, pulls);
+    if (gain > 0 && (!kOwn || face_index[k] == id)) pull(gain, pixel[0] - derivative.crossing, derivative, pulls);
   }
 }
 
 // Outside: every listed pixel beyond the crossing, from the outer one to the border, takes the colour of the inner
 // one if the edge moves out to it.
 template <bool kUp, int64_t kChannels, class T>
-NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, int64_t blocks, const T* reference,
-                             const Lever<T>& lever, T* pulls) {
+NMR_INLINE void pull_outside(const ScanlineColors<T>& lines, int64_t n, int64_t blocks, const T* reference,
+                             const EdgeDerivative<T>& derivative, T* pulls) {
   // All offsets have the same sign, so the signs of both distances are constant.
-  const T eps = kUp ? lever.eps : -lever.eps;
-  const Lanes<T> crossing = splat(lever.crossing), factor_p = splat(lever.factor_p), factor_q = splat(lever.factor_q);
-  const Lanes<T> eps_p = splat(lever.factor_p > 0 ? eps : -eps), eps_q = splat(lever.factor_q > 0 ? eps : -eps);
+  const T eps = kUp ? derivative.eps : -derivative.eps;
+  const Lanes<T> crossing = splat(derivative.crossing), factor_p = splat(derivative.factor_p),
+                 factor_q = splat(derivative.factor_q);
+  const Lanes<T> eps_p = splat(derivative.factor_p > 0 ? eps : -eps),
+                 eps_q = splat(derivative.factor_q > 0 ? eps : -eps);
   Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
   const int64_t C = kChannels ? kChannels : lines.channels, entry = kLanes * (1 + 2 * C);  // numbers of a block
   T near_color[kChannels ? kChannels : 1];  // a local copy: kept in registers
@@ -203,9 +205,9 @@ NMR_INLINE void pull_outside(const ColorLines<T>& lines, int64_t n, int64_t bloc
 // Inside: the listed pixels [first, last) that face `id` owns take the colour of the outer one if the edge moves in
 // past them.
 template <int64_t kChannels, class T>
-NMR_INLINE void pull_own(const ColorLines<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id,
-                         const T* reference, const Lever<T>& lever, T* pulls) {
-  const int32_t* owner = lines.owners(n);
+NMR_INLINE void pull_own(const ScanlineColors<T>& lines, int64_t n, int64_t first, int64_t last, int32_t id,
+                         const T* reference, const EdgeDerivative<T>& derivative, T* pulls) {
+  const int32_t* face_index = lines.face_indices(n);
   const int64_t C = kChannels ? kChannels : lines.channels;
   T far_color[kChannels ? kChannels : 1];  // a local copy: kept in registers
   if (kChannels) std::copy_n(reference, C, far_color), reference = far_color;
@@ -214,11 +216,11 @@ NMR_INLINE void pull_own(const ColorLines<T>& lines, int64_t n, int64_t first, i
                 own = splat(id);
   for (int64_t k = first / kLanes * kLanes; k < last; k += kLanes) {
     const Lanes32 number = lane_numbers() + splat(static_cast<int32_t>(k));
-    const Lanes32 here = (number > begin) & (number < end) & (load_lanes<Lanes32>(owner + k) == own);
+    const Lanes32 here = (number > begin) & (number < end) & (load_lanes<Lanes32>(face_index + k) == own);
     const T* block = lines.at(n, k / kLanes);
     const Lanes<T> gain = color_gains<kChannels>(block, C, reference);
     const LaneMask<T> acts = widen_mask<T>(here) & (gain > splat(T(0)));
-    pull_lanes<T>(acts, gain, load_lanes<Lanes<T>>(block) - splat(lever.crossing), lever, pulls_p, pulls_q);
+    pull_lanes<T>(acts, gain, load_lanes<Lanes<T>>(block) - splat(derivative.crossing), derivative, pulls_p, pulls_q);
   }
   add_lane_sums<T>(pulls_p, pulls_q, pulls);
 }
@@ -228,19 +230,19 @@ NMR_INLINE void pull_own(const ColorLines<T>& lines, int64_t n, int64_t first, i
 // Crossings of one axis and direction, before their pixels are pulled.
 template <class T>
 struct PlacedCrossings {
-  // The pixel inside, the listed pixels of the face, its owner entry, the first listed pixel outside, all of the line.
+  // The pixel inside, the listed pixels of the face, its face index, the first listed pixel outside, all of the line.
   int32_t pixel_at[kCrossings + kPad], first_at[kCrossings + kPad], last_at[kCrossings + kPad],
       id_at[kCrossings + kPad], outer_at[kCrossings + kPad], count_at[kCrossings + kPad];
-  int32_t extreme[2][kCrossings + kPad];  // as pulled and gained, where a lever has extreme size
+  int32_t extreme[2][kCrossings + kPad];  // as Crossings::outer and ::inner, if a factor has extreme size
   T factor_p[kCrossings + kPad], factor_q[kCrossings + kPad];
-  int64_t num_pulled, num_gained, num_extreme[2];
+  int64_t num_outer, num_inner, num_extreme[2];
 };
 
 // Places all crossings, and empties them; this does not depend on the channels.
 template <bool kUp, class T>
 void place_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& block, PlacedCrossings<T>& placed) {
   const int64_t H = image.raster.height, W = image.raster.width, length = axis == 0 ? H : W;
-  const ColorLines<T>& lines = image.lines[axis];
+  const ScanlineColors<T>& lines = image.lines[axis];
   Crossings<T>& crossings = block.crossings[axis][kUp ? 0 : 1];
   const int32_t d = kUp ? 1 : -1;
   const T top = static_cast<T>(length - 1);  // the last pixel of a line
@@ -255,23 +257,23 @@ void place_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
   const Lanes32 last_pixel = splat(static_cast<int32_t>(length - 1)), none = splat(int32_t(0)), one = splat(int32_t(1));
   const Lanes32 before_n = splat(static_cast<int32_t>(lines.step_n)),
                 before_m = splat(static_cast<int32_t>(lines.step_m));
-  const Lanes<T> largest = splat(image.largest_lever);
+  const Lanes<T> largest = splat(image.largest_factor);
   const int32_t* before = lines.before.data();
-  int64_t num_pulled = 0, num_gained = 0, num_extreme[2] = {0, 0};
+  int64_t num_outer = 0, num_inner = 0, num_extreme[2] = {0, 0};
   for (int64_t i = 0; i < crossings.count; i += kLanes) {
     const Lanes<T> at = load_lanes<Lanes<T>>(crossings.at + i);
     const Lanes32 number = lane_numbers() + splat(static_cast<int32_t>(i)), used = number < all;
     const LaneMask<T> on_line = (at >= start) & (at < end);
-    const Lanes32 may_pull = used & narrow_mask(on_line & (at < load_lanes<Lanes<T>>(crossings.pull_end + i)));
-    const Lanes32 may_gain = used & narrow_mask(on_line & (at >= load_lanes<Lanes<T>>(crossings.gain_start + i)));
-    const Lanes32 wanted = may_pull | may_gain;
+    const Lanes32 maybe_outer = used & narrow_mask(on_line & (at < load_lanes<Lanes<T>>(crossings.outer_end + i)));
+    const Lanes32 maybe_inner = used & narrow_mask(on_line & (at >= load_lanes<Lanes<T>>(crossings.inner_start + i)));
+    const Lanes32 wanted = maybe_outer | maybe_inner;
     if (!lane_bits(wanted)) continue;
     const Lanes32 line = keep(wanted, load_lanes<Lanes32>(crossings.line + i));
     const Lanes32 inner = truncate(floor_lanes<T>(keep(widen_mask<T>(wanted), at)));
     const Lanes32 pixel = keep(wanted, origin + line * step_n + inner * step_m);
     const Lanes32 edge = keep(used, load_lanes<Lanes32>(crossings.edge + i));
     const Lanes32 id = gather_lanes(block.id, edge & face_of);
-    const Lanes32 inner_owner = gather_lanes(image.owner, pixel);
+    const Lanes32 inner_face_index = gather_lanes(image.face_index, pixel);
     // The pixels inside: from the inner one to the far side, at most one pixel beyond the line, as sweep_limit rounds.
     const Lanes<T> far_side = load_lanes<Lanes<T>>(crossings.far_side + i);
     Lanes<T> far = keep(far_side == far_side, far_side);
@@ -301,15 +303,16 @@ void place_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
     store_lanes(placed.factor_p + i, by_p);
     store_lanes(placed.factor_q + i, by_q);
     const uint32_t regular = lane_bits(moderate);
-    const uint32_t pulls = lane_bits(may_pull & (inner_owner == id)), gains = lane_bits(may_gain & (first < last));
-    num_pulled += compress_lanes(number, pulls & regular, crossings.pulled + num_pulled);
-    num_gained += compress_lanes(number, gains & regular, crossings.gained + num_gained);
+    const uint32_t pulls = lane_bits(maybe_outer & (inner_face_index == id)),
+                   gains = lane_bits(maybe_inner & (first < last));
+    num_outer += compress_lanes(number, pulls & regular, crossings.outer + num_outer);
+    num_inner += compress_lanes(number, gains & regular, crossings.inner + num_inner);
     if (!((pulls | gains) & ~regular)) continue;
     num_extreme[0] += compress_lanes(number, pulls & ~regular, placed.extreme[0] + num_extreme[0]);
     num_extreme[1] += compress_lanes(number, gains & ~regular, placed.extreme[1] + num_extreme[1]);
   }
   crossings.count = 0;
-  placed.num_pulled = num_pulled, placed.num_gained = num_gained;
+  placed.num_outer = num_outer, placed.num_inner = num_inner;
   placed.num_extreme[0] = num_extreme[0], placed.num_extreme[1] = num_extreme[1];
 }
 
@@ -318,38 +321,39 @@ template <bool kUp, int64_t kChannels, class T>
 void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& block) {
   PlacedCrossings<T> placed;
   place_crossings<kUp>(image, axis, block, placed);
-  const ColorLines<T>& lines = image.lines[axis];
+  const ScanlineColors<T>& lines = image.lines[axis];
   const Crossings<T>& crossings = block.crossings[axis][kUp ? 0 : 1];
   const int32_t* before = lines.before.data();
   const int32_t d = kUp ? 1 : -1, step = axis == 0 ? static_cast<int32_t>(-image.raster.width) * d : d;
-  const auto lever_of = [&](int32_t i) {
-    return Lever<T>{kUp ? crossings.at[i] : -crossings.at[i], placed.factor_p[i], placed.factor_q[i], image.eps};
+  const auto derivative_of = [&](int32_t i) {
+    return EdgeDerivative<T>{kUp ? crossings.at[i] : -crossings.at[i], placed.factor_p[i], placed.factor_q[i],
+                             image.eps};
   };
   const auto pulls_of = [&](int32_t i) { return block.pulls[axis][crossings.edge[i]]; };
-  for (int64_t k = 0; k < placed.num_pulled; ++k) {
-    const int32_t i = crossings.pulled[k];
+  for (int64_t k = 0; k < placed.num_outer; ++k) {
+    const int32_t i = crossings.outer[k];
     const T* reference = image.pixels + placed.pixel_at[i] * image.channels;  // of the face
     const int64_t blocks = kUp ? (placed.count_at[i] + 7) / 8 - placed.outer_at[i] / 8 : (placed.outer_at[i] + 7) / 8;
-    pull_outside<kUp, kChannels>(lines, crossings.line[i], blocks, reference, lever_of(i), pulls_of(i));
+    pull_outside<kUp, kChannels>(lines, crossings.line[i], blocks, reference, derivative_of(i), pulls_of(i));
   }
   for (int64_t k = 0; k < placed.num_extreme[0]; ++k) {
     const int32_t i = placed.extreme[0][k], n = crossings.line[i];
     const int64_t outer = d * static_cast<int64_t>(std::floor(crossings.at[i])) + d;
     const int64_t first = kUp ? before[n * lines.step_n + outer * lines.step_m] : 0;
     const int64_t last = kUp ? lines.count[n] : before[n * lines.step_n + (outer + 1) * lines.step_m];
-    pull_one_by_one<false>(lines, n, first, last, 0, image.color(placed.pixel_at[i]), lever_of(i), pulls_of(i));
+    pull_one_by_one<false>(lines, n, first, last, 0, image.color(placed.pixel_at[i]), derivative_of(i), pulls_of(i));
   }
-  for (int64_t k = 0; k < placed.num_gained; ++k) {
-    const int32_t i = crossings.gained[k];
+  for (int64_t k = 0; k < placed.num_inner; ++k) {
+    const int32_t i = crossings.inner[k];
     const T* reference = image.color(placed.pixel_at[i] + step);
     pull_own<kChannels>(lines, crossings.line[i], placed.first_at[i], placed.last_at[i], placed.id_at[i], reference,
-                        lever_of(i), pulls_of(i));
+                        derivative_of(i), pulls_of(i));
   }
   for (int64_t k = 0; k < placed.num_extreme[1]; ++k) {
     const int32_t i = placed.extreme[1][k];
     const T* reference = image.color(placed.pixel_at[i] + step);
     pull_one_by_one<true>(lines, crossings.line[i], placed.first_at[i], placed.last_at[i], placed.id_at[i], reference,
-                          lever_of(i), pulls_of(i));
+                          derivative_of(i), pulls_of(i));
   }
 }
 

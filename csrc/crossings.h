@@ -1,5 +1,5 @@
 // What the sweeps of silhouettes (sweep.h) and of colours (color_sweep.h) share: visible faces, the crossings of their
-// edges with the lines of an image, and the levers of edges. Part of a level file (levels.h).
+// edges with the lines of an image, and the derivatives of edges. Part of a level file (levels.h).
 
 #include "visible.h"
 
@@ -14,21 +14,21 @@ bool all_finite(const T* values, int64_t count) {
   return zero == T(0) && lane_bits(zeros == splat(T(0))) == 0xff;
 }
 
-// Empties lines [first, last) (PullLines or ColorLines). Until they are finished, gain_start holds the first and the
-// last pixel that gains.
+// Empties lines [first, last) (ScanlineGrads or ScanlineColors). Until they are finished, inner_start holds the first
+// and the last pixel that gains.
 template <template <class> class Lines, class T>
 NMR_INLINE void start_lines(Lines<T>& lines, int64_t first, int64_t last) {
   const T infinity = std::numeric_limits<T>::infinity();
   std::fill(lines.count.begin() + first, lines.count.begin() + last, 0);
-  std::fill(lines.gain_start[0].begin() + first, lines.gain_start[0].begin() + last, infinity);
-  std::fill(lines.gain_start[1].begin() + first, lines.gain_start[1].begin() + last, -infinity);
+  std::fill(lines.inner_start[0].begin() + first, lines.inner_start[0].begin() + last, infinity);
+  std::fill(lines.inner_start[1].begin() + first, lines.inner_start[1].begin() + last, -infinity);
 }
 
 // --- how an edge follows a pull
 
 // How the crossing c of an edge P-Q and a line n of M pixels moves with each end of the edge.
 template <class T>
-struct Lever {
+struct EdgeDerivative {
   T crossing;  // c
   T factor_p;  // 2 / M (Qs - Ps) / (Qs - n): travel of P, in [-1, 1] coordinates, that moves the crossing by one pixel
   T factor_q;  // 2 / M (Qs - Ps) / (n - Ps): the same of Q
@@ -42,12 +42,12 @@ NMR_INLINE T travel(T factor, T offset, T eps) {
   return h > 0 ? h + eps : h - eps;
 }
 
-// The pull of one pixel, for pixels inside the face and for levers of extreme size. An end without a finite lever does
-// not move.
+// The pull of one pixel, for pixels inside the face and for factors of extreme size. An end without a finite factor
+// does not move.
 template <class T>
-NMR_INLINE void pull(T weight, T offset, const Lever<T>& lever, T* pulls) {
-  if (std::isfinite(lever.factor_p)) pulls[0] += weight / travel(lever.factor_p, offset, lever.eps);
-  if (std::isfinite(lever.factor_q)) pulls[1] += weight / travel(lever.factor_q, offset, lever.eps);
+NMR_INLINE void pull(T weight, T offset, const EdgeDerivative<T>& derivative, T* pulls) {
+  if (std::isfinite(derivative.factor_p)) pulls[0] += weight / travel(derivative.factor_p, offset, derivative.eps);
+  if (std::isfinite(derivative.factor_q)) pulls[1] += weight / travel(derivative.factor_q, offset, derivative.eps);
 }
 
 // --- the crossings of edges and lines
@@ -94,7 +94,7 @@ NMR_INLINE void cross_edges(const Image& image, int axis, int k, int64_t first, 
 
   for (int direction = 0; direction < 2; ++direction) {
     Crossings<T>& crossings = block.crossings[axis][direction];
-    const T *pull_end = lines.pull_end[direction].data(), *gain_start = lines.gain_start[direction].data();
+    const T *outer_end = lines.outer_end[direction].data(), *inner_start = lines.inner_start[direction].data();
     const LaneArray<T, Lanes<T>> slope_at(direction ? zero - slope : slope), height_at(direction ? zero - pt : pt);
     int64_t count = crossings.count;
     for (uint32_t bits = found & (direction ? ~up : up); bits; bits &= bits - 1) {
@@ -110,8 +110,8 @@ NMR_INLINE void cross_edges(const Image& image, int axis, int k, int64_t first, 
         }
         const Lanes32 line = lane_numbers() + splat(start);
         store_lanes(crossings.at + count, (to_values<T>(line) - scan) * slopes + height);
-        store_lanes(crossings.pull_end + count, load_lanes<Lanes<T>>(pull_end + start));
-        store_lanes(crossings.gain_start + count, load_lanes<Lanes<T>>(gain_start + start));
+        store_lanes(crossings.outer_end + count, load_lanes<Lanes<T>>(outer_end + start));
+        store_lanes(crossings.inner_start + count, load_lanes<Lanes<T>>(inner_start + start));
         store_lanes(crossings.line + count, line);
         if constexpr (Image::kFarSides) {
           const Lanes<T> n = to_values<T>(line);

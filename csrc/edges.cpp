@@ -13,11 +13,11 @@
 #include <limits>
 #include <vector>
 
-#include "color_lines.h"
+#include "scanline_colors.h"
 #include "corner_values.h"
 #include "geometry.h"
 #include "parallel.h"
-#include "pull_lines.h"
+#include "scanline_grads.h"
 #include "stages.h"
 #include "swept_image.h"
 
@@ -31,17 +31,17 @@ namespace {
 // A row of the image, w pixels wide, from the raster rows `pixels` [2 or 1, W, C]. behind: the background and the
 // mean of four background pixels [2, C], or nullptr. kChannels: C, or 0 if it is known only at run time.
 template <int64_t kChannels, class T>
-NMR_INLINE void resolve_row(const int32_t* owner, const T* pixels, const T* behind, int64_t w, bool anti_aliasing,
+NMR_INLINE void resolve_row(const int32_t* face_index, const T* pixels, const T* behind, int64_t w, bool anti_aliasing,
                             int64_t channels, T* out) {
   const int64_t C = kChannels ? kChannels : channels, W = 2 * w;
   if (!anti_aliasing) {
     for (int64_t x = 0; x < w; ++x)
-      for (int64_t c = 0; c < C; ++c) out[x * C + c] = behind && owner[x] < 0 ? behind[c] : pixels[x * C + c];
+      for (int64_t c = 0; c < C; ++c) out[x * C + c] = behind && face_index[x] < 0 ? behind[c] : pixels[x * C + c];
     return;
   }
   for (int64_t x = 0; x < w; ++x, out += C) {
     const T *upper = pixels + 2 * x * C, *lower = upper + W * C;
-    const int32_t* corner = owner + 2 * x;
+    const int32_t* corner = face_index + 2 * x;
     if (!behind || (corner[0] | corner[1] | corner[W] | corner[W + 1]) >= 0) {
       for (int64_t c = 0; c < C; ++c) out[c] = (upper[c] + upper[C + c] + lower[c] + lower[C + c]) / 4;
     } else if ((corner[0] & corner[1] & corner[W] & corner[W + 1]) < 0) {
@@ -54,15 +54,16 @@ NMR_INLINE void resolve_row(const int32_t* owner, const T* pixels, const T* behi
   }
 }
 
-// Its gradient for one raster row [W, C]: `grad` is that of the image row, owner nullptr if no background is mixed in.
+// Its gradient for one raster row [W, C]: `grad` is that of the image row, face_index nullptr if no background is mixed
+// in.
 template <int64_t kChannels, class T>
-NMR_INLINE void resolve_row_backward(const int32_t* owner, const T* grad, int64_t w, bool anti_aliasing,
+NMR_INLINE void resolve_row_backward(const int32_t* face_index, const T* grad, int64_t w, bool anti_aliasing,
                                      int64_t channels, T* out) {
   const int64_t C = kChannels ? kChannels : channels, scale = anti_aliasing ? 2 : 1;
   const T share = T(1) / static_cast<T>(scale * scale);  // a power of two: exact
   for (int64_t x = 0; x < w; ++x, grad += C)
     for (int64_t k = 0; k < scale; ++k, out += C) {
-      const bool drawn = !owner || owner[scale * x + k] >= 0;
+      const bool drawn = !face_index || face_index[scale * x + k] >= 0;
       for (int64_t c = 0; c < C; ++c) out[c] = drawn ? grad[c] * share : T(0);
     }
 }
@@ -85,8 +86,8 @@ void resolve_forward(const Resolve<T>& args) {
     parallel_for(args.batch * h, args.num_threads, [&](int64_t n) {  // n: image b, row y
       const T* background =
           args.background ? behind.data() + (args.background_batch == 1 ? 0 : n / h * 2 * C) : nullptr;
-      const int32_t* owner = args.background ? args.owner + n * scale * W : nullptr;
-      resolve_row<kChannels>(owner, args.pixels + n * scale * W * C, background, w, args.anti_aliasing, C,
+      const int32_t* face_index = args.background ? args.face_index + n * scale * W : nullptr;
+      resolve_row<kChannels>(face_index, args.pixels + n * scale * W * C, background, w, args.anti_aliasing, C,
                              args.resolved + n * w * C);
     });
   });
@@ -102,7 +103,7 @@ void resolve_backward(const Resolve<T>& args) {
     with_channels<T>(C, [&](auto known) {
       constexpr int64_t kChannels = known();
       parallel_for(args.batch * H, args.num_threads, [&](int64_t n) {  // n: image b, raster row
-        resolve_row_backward<kChannels>(args.background ? args.owner + n * W : nullptr,
+        resolve_row_backward<kChannels>(args.background ? args.face_index + n * W : nullptr,
                                         args.grad_resolved + n / scale * w * C, w, args.anti_aliasing, C,
                                         args.grad_pixels + n * W * C);
       });
@@ -111,11 +112,11 @@ void resolve_backward(const Resolve<T>& args) {
     parallel_for(args.batch, args.num_threads, [&](int64_t b) {
       T* sum = args.grad_background + b * C;
       std::fill_n(sum, C, T(0));
-      const int32_t* owner = args.owner + b * H * W;
+      const int32_t* face_index = args.face_index + b * H * W;
       const T* grad = args.grad_resolved + b * h * w * C;
       for (int64_t y = 0; y < H; ++y)
         for (int64_t x = 0; x < W; ++x)
-          for (int64_t c = 0; c < C && owner[y * W + x] < 0; ++c)
+          for (int64_t c = 0; c < C && face_index[y * W + x] < 0; ++c)
             sum[c] += grad[(y / scale * w + x / scale) * C + c] * share;
     });
 }
@@ -124,14 +125,14 @@ namespace {
 
 template <class T>
 struct EdgeLines {
-  ColorLines<T> lines[2];  // [0] columns: lines of constant x, swept along y; [1] rows
+  ScanlineColors<T> lines[2];  // [0] columns: lines of constant x, swept along y; [1] rows
 };
 
 template <class T>
 void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threads) {
   const Size raster = raster_of(args.image, args.anti_aliasing);
   const int64_t H = raster.height, W = raster.width, C = args.channels;
-  ColorLines<T>* lines = thread_scratch<EdgeLines<T>>().lines;
+  ScanlineColors<T>* lines = thread_scratch<EdgeLines<T>>().lines;
   const ColorImage<T> image{args.mesh.image_vertices(b),
                             args.mesh.image_faces(b),
                             args.mesh.face_count(b),
@@ -139,7 +140,7 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
                             args.image,
                             args.anti_aliasing,
                             args.eps,
-                            args.owner + b * raster.pixels(),
+                            args.face_index + b * raster.pixels(),
                             args.pixels + b * raster.pixels() * C,
                             args.background ? args.background + (args.background_batch == 1 ? 0 : b * C) : nullptr,
                             args.grad_resolved + b * args.image.pixels() * C,
@@ -153,7 +154,7 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
   sweep_image(
       image, C, num_threads,
       [&](uint8_t* seen, int32_t* ids) {
-        return NMR_AT_BEST_LEVEL(find_visible, image.owner, raster.pixels(), image.num_faces, seen, ids);
+        return NMR_AT_BEST_LEVEL(find_visible, image.face_index, raster.pixels(), image.num_faces, seen, ids);
       },
       [&] { return NMR_AT_BEST_LEVEL(all_finite, image.grad_resolved, args.image.pixels() * C); },
       [&](const LineRange& range, T* grad_row) { NMR_AT_BEST_LEVEL(collect_colors, image, range, grad_row); },

@@ -233,22 +233,22 @@ NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T r
 
 constexpr int32_t kBits[kLanes] = {1, 2, 4, 8, 16, 32, 64, 128};
 
-// For eight pixels (i .. i + 7, j) of a row: which of the contested ones face `id` wins from their owners by exact
-// depth. Of equally near faces the first one wins, in whichever order they are filled.
+// For eight pixels (i .. i + 7, j) of a row: which of the contested ones face `id` wins from the nearest faces so far
+// by exact depth. Of equally near faces the first one wins, in whichever order they are filled.
 template <class T>
 LaneMask<T> contest(const Image<T>& image, int32_t id, uint32_t contested_bits, int64_t i, int64_t j,
-                    const int32_t* owner_at) {
+                    const int32_t* face_index_at) {
   const Lanes<T> column = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i)));
   const T row = static_cast<T>(j);
   const Lanes<T> z = exact_depths(face_plane(image, id), column, row);
   const Lanes32 bit = load_lanes<Lanes32>(kBits), among = splat(static_cast<int32_t>(contested_bits)) & bit;
   const LaneMask<T> contested = widen_mask<T>(among > splat(int32_t(0))) & (z > splat(image.settings.near)) &
                                 (z < splat(image.settings.far));  // not NaN either
-  const Lanes32 owner = load_lanes<Lanes32>(owner_at);
-  LaneMask<T> wins = contested & widen_mask<T>(owner < splat(int32_t(0))), open = without(contested, wins);
+  const Lanes32 face_index = load_lanes<Lanes32>(face_index_at);
+  LaneMask<T> wins = contested & widen_mask<T>(face_index < splat(int32_t(0))), open = without(contested, wins);
   for (uint32_t bits = lane_bits(open); bits; bits = lane_bits(open)) {
-    const int32_t rival = owner_at[lowest_bit(bits)];
-    const LaneMask<T> here = open & widen_mask<T>(owner == splat(rival));
+    const int32_t rival = face_index_at[lowest_bit(bits)];
+    const LaneMask<T> here = open & widen_mask<T>(face_index == splat(rival));
     const Lanes<T> theirs = exact_depths(face_plane(image, rival), column, row);
     wins = wins | (here & (id < rival ? z <= theirs : z < theirs));
     open = without(open, here);
@@ -294,10 +294,10 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
       const Lanes<T> q_column = to_values<T>(number) * slope_x + level;
       const int64_t start = (top - band.row_first) * stride + i;
       T *most = band.most + start, *least = band.least + start;
-      int32_t* owner = band.owner + start;
+      int32_t* face_index = band.face_index + start;
       uint8_t contested[kLanes];
       uint32_t any_contested = 0;
-      for (int64_t r = 0; r < rows; ++r, most += stride, least += stride, owner += stride) {
+      for (int64_t r = 0; r < rows; ++r, most += stride, least += stride, face_index += stride) {
         const LaneMask<T> outside =
             (splat(row_terms[0][r]) < c0) | (splat(row_terms[1][r]) < c1) | (splat(row_terms[2][r]) < c2);
         const Lanes<T> q = q_column + splat(row_terms[3][r]), q_most = q + margin, q_least = q - margin;
@@ -309,17 +309,17 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
         any_contested |= bits;
         store_lanes(most, choose(wins, q_most, pixel_most));
         store_lanes(least, choose(wins, q_least, pixel_least));
-        store_lanes(owner, choose(narrow_mask(wins), ids, load_lanes<Lanes32>(owner)));
+        store_lanes(face_index, choose(narrow_mask(wins), ids, load_lanes<Lanes32>(face_index)));
       }
       if (!any_contested) continue;
       for (int64_t r = 0; r < rows; ++r) {
         if (!contested[r]) continue;
         const int64_t at = start + r * stride;
-        const LaneMask<T> wins = contest<T>(image, id, contested[r], i, top + r, band.owner + at);
+        const LaneMask<T> wins = contest<T>(image, id, contested[r], i, top + r, band.face_index + at);
         const Lanes<T> q = q_column + splat(row_terms[3][r]);
         store_lanes(band.most + at, choose(wins, q + margin, load_lanes<Lanes<T>>(band.most + at)));
         store_lanes(band.least + at, choose(wins, q - margin, load_lanes<Lanes<T>>(band.least + at)));
-        store_lanes(band.owner + at, choose(narrow_mask(wins), ids, load_lanes<Lanes32>(band.owner + at)));
+        store_lanes(band.face_index + at, choose(narrow_mask(wins), ids, load_lanes<Lanes32>(band.face_index + at)));
       }
     }
   }
@@ -365,7 +365,7 @@ NMR_INLINE void bound_blocks(const Band<T>& band, const Window& window, int64_t 
     }
 }
 
-// True if every pixel of the face's box already has a nearer owner.
+// True if every pixel of the face's box already has a nearer face.
 template <class T>
 NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& band, int64_t blocks,
                           const T* block_least) {
@@ -393,9 +393,9 @@ NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& b
   return true;
 }
 
-// Fills all faces into one band of rows, and copies what they can reach to the image's owner map.
+// Fills all faces into one band of rows, and copies what they can reach to the image's face index map.
 template <class T>
-void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* block_least, int32_t* owner) {
+void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* block_least, int32_t* face_index) {
   const Band<T> band = args;  // a copy that no store of pixels can change
   const FaceTable<T>& table = *image.table;
   const int64_t rows = band.row_last - band.row_first + 1, H = band.raster.height, W = band.raster.width;
@@ -408,7 +408,7 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
     for (int64_t i = window.column_first; i <= window.column_last; i += kLanes) {
       store_lanes(band.most + j * band.stride + i, nothing);
       store_lanes(band.least + j * band.stride + i, nothing);
-      store_lanes(band.owner + j * band.stride + i, background);
+      store_lanes(band.face_index + j * band.stride + i, background);
     }
   // Draw the nearer of the two lists first, so that most faces of the other one are hidden.
   T front_sum = 0, back_sum = 0;
@@ -433,13 +433,13 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
   }
   const int64_t first = window.column_first, last = std::min(window.column_last, W);
   for (int64_t j = 0; j < rows; ++j) {
-    int32_t* row = owner + (H - 1 - band.row_first - j) * W;
+    int32_t* row = face_index + (H - 1 - band.row_first - j) * W;
     if (j < window.row_first || j >= window.row_last) {
       std::fill_n(row, W, -1);
       continue;
     }
     std::fill_n(row, first, -1);
-    std::memcpy(row + first, band.owner + j * band.stride + first, (last - first) * sizeof(int32_t));
+    std::memcpy(row + first, band.face_index + j * band.stride + first, (last - first) * sizeof(int32_t));
     std::fill_n(row + last, W - last, -1);
   }
 }

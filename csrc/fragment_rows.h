@@ -11,7 +11,7 @@ NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& 
   const int64_t W = block.raster.width, F = block.num_faces;
   int32_t *ids = scratch.ids.data(), *slots = scratch.slots.data() + 1;
   scratch.count =
-      find_visible(block.owner + block.first * W, (block.last - block.first) * W, F, scratch.seen.data(), ids);
+      find_visible(block.face_index + block.first * W, (block.last - block.first) * W, F, scratch.seen.data(), ids);
   slots[-1] = 0;
   T* table = scratch.table.data();
   for (int64_t n = 0; n < kEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);
@@ -62,19 +62,19 @@ struct FragmentPixels {
   int64_t slot[kLanes];
 };
 
-// The owners of the pixels [i, i + 8) of a row of the raster; background beyond its end.
-NMR_INLINE Lanes32 load_owners(const int32_t* row, int64_t i, int64_t width) {
+// Face indices of the pixels [i, i + 8) of a row of the raster; background beyond its end.
+NMR_INLINE Lanes32 load_face_indices(const int32_t* row, int64_t i, int64_t width) {
   if (i + kLanes <= width) return load_lanes<Lanes32>(row + i);
   int32_t rest[kLanes];
   for (int64_t n = 0; n < kLanes; ++n) rest[n] = i + n < width ? row[i + n] : -1;
   return load_lanes<Lanes32>(rest);
 }
 
-// Weights and depths of the pixels [i, i + 8) with these owners, in the row of pixel coordinate y.
+// Weights and depths of the pixels [i, i + 8) with these face indices, in the row of pixel coordinate y.
 template <class T>
-NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32 owners, int64_t i, Lanes<T> y) {
+NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32 ids, int64_t i, Lanes<T> y) {
   FragmentPixels<T> p;
-  const LaneArray<int32_t, Lanes32> slots(gather_lanes(scratch.slots.data() + 1, owners));
+  const LaneArray<int32_t, Lanes32> slots(gather_lanes(scratch.slots.data() + 1, ids));
   const T* entry[kLanes];
   for (int64_t n = 0; n < kLanes; ++n) {
     p.slot[n] = slots.lane[n];
@@ -99,7 +99,7 @@ NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32
   return p;
 }
 
-// Calls visit(i, owners, y) for every eight pixels [i, i + 8) of row j (from the top) with a covered one among them,
+// Calls visit(i, ids, y) for every eight pixels [i, i + 8) of row j (from the top) with a covered one among them,
 // and background(i) for the others.
 template <class T, class Visit, class Background>
 NMR_INLINE void for_covered(const FragmentBlock<T>& block, int64_t j, const Visit& visit,
@@ -107,9 +107,9 @@ NMR_INLINE void for_covered(const FragmentBlock<T>& block, int64_t j, const Visi
   const int64_t W = block.raster.width;
   const Lanes<T> y = splat(static_cast<T>(block.raster.height - 1 - j));
   for (int64_t i = 0; i < W; i += kLanes) {
-    const Lanes32 owners = load_owners(block.owner + j * W, i, W);
-    if (lane_bits(owners >= splat(int32_t(0))))
-      visit(i, owners, y);
+    const Lanes32 ids = load_face_indices(block.face_index + j * W, i, W);
+    if (lane_bits(ids >= splat(int32_t(0))))
+      visit(i, ids, y);
     else
       background(i);
   }
@@ -121,9 +121,9 @@ NMR_INLINE void depth_row(const FragmentBlock<T>& block, int64_t j, Lanes<T> far
                           T* out) {
   for_covered(
       block, j,
-      [&](int64_t i, Lanes32 owners, Lanes<T> y) {
-        const FragmentPixels<T> p = evaluate<T>(scratch, owners, i, y);
-        store_lanes(out + i, choose(widen_mask<T>(owners >= splat(int32_t(0))), p.z, far));
+      [&](int64_t i, Lanes32 ids, Lanes<T> y) {
+        const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
+        store_lanes(out + i, choose(widen_mask<T>(ids >= splat(int32_t(0))), p.z, far));
       },
       [&](int64_t i) { store_lanes(out + i, far); });
 }
@@ -167,10 +167,10 @@ void fragments_forward_block(const Fragments<T>& args, const FragmentBlock<T>& b
     T* weights = args.weights + 3 * (b * block.raster.pixels() + j * W);
     for_covered(
         block, j,
-        [&](int64_t i, Lanes32 owners, Lanes<T> y) {
-          const FragmentPixels<T> p = evaluate<T>(scratch, owners, i, y);
-          const LaneMask<T> drawn = widen_mask<T>(owners >= splat(int32_t(0)));
-          const LaneMask<T> reversed = widen_mask<T>(owners >= splat(static_cast<int32_t>(block.num_faces)));
+        [&](int64_t i, Lanes32 ids, Lanes<T> y) {
+          const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
+          const LaneMask<T> drawn = widen_mask<T>(ids >= splat(int32_t(0)));
+          const LaneMask<T> reversed = widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
           Lanes<T> at[3];
           for (int k = 0; k < 3; ++k) at[k] = choose(drawn, p.w[k] * p.z / p.corner_z[k], zero);
           T value[3][kLanes], z[kLanes];
@@ -259,8 +259,8 @@ void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& blo
     }
     for_covered(
         block, j,
-        [&](int64_t i, Lanes32 owners, Lanes<T> y) {
-          const FragmentPixels<T> p = evaluate<T>(scratch, owners, i, y);
+        [&](int64_t i, Lanes32 ids, Lanes<T> y) {
+          const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
           const Lanes<T> z = depth_or_zero<T>(p.z), c = load_lanes<Lanes<T>>(grad + i) * z * z;
           add_quads<T>({c * p.w[0], c * p.w[1], c * p.w[2], zero}, p.slot, 4, sums);
         },
@@ -301,8 +301,8 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
     const int64_t row = b * block.raster.pixels() + j * W;
     for_covered(
         block, j,
-        [&](int64_t i, Lanes32 owners, Lanes<T> y) {
-          const FragmentPixels<T> p = evaluate<T>(scratch, owners, i, y);
+        [&](int64_t i, Lanes32 ids, Lanes<T> y) {
+          const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
           const int64_t count = std::min(kLanes, W - i);
           Lanes<T> h[3] = {zero, zero, zero};
           if (args.grad_depth) {
@@ -315,7 +315,7 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
             T grad[3][kLanes] = {};
             for (int64_t n = 0; n < count; ++n)
               for (int m = 0; m < 3; ++m) grad[m][n] = args.grad_weights[3 * (row + i + n) + m];
-            const LaneMask<T> reversed = widen_mask<T>(owners >= splat(static_cast<int32_t>(block.num_faces)));
+            const LaneMask<T> reversed = widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
             const Lanes<T> first = load_lanes<Lanes<T>>(grad[0]), last = load_lanes<Lanes<T>>(grad[2]);
             const Lanes<T> u[3] = {choose(reversed, last, first), load_lanes<Lanes<T>>(grad[1]),
                                    choose(reversed, first, last)};

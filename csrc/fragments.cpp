@@ -1,5 +1,5 @@
-// Barycentric weights and depth of the owner at each pixel. They are computed from the owner map, by the same
-// expressions as in the rasterizer.
+// Barycentric weights and depth of the nearest face at each pixel. They are computed from the face index map, by the
+// same expressions as in the rasterizer.
 //
 // With w_k the normalised screen weights and q = sum_k w_k / z_k: depth z = 1 / q, perspective-correct weights b_k = z
 // w_k / z_k. Moving corner k by (dX, dY) pixels changes the weights at a fixed pixel by dw_m = -w_k (M_m0 dX + M_m1
@@ -28,9 +28,9 @@ constexpr int64_t kEntry = 16;
 template <class T>
 struct FragmentScratch {
   std::vector<uint8_t> seen;   // [2 F + 1 + 8] of find_visible
-  // [2 F + 1] number of owner entry id at [id + 1]; defined for visible faces and background.
+  // [2 F + 1] number of face index id at [id + 1]; defined for visible faces and background.
   std::vector<int32_t> slots;
-  std::vector<int32_t> ids;    // [visible + 8] owner entry of face n at [n - 1]
+  std::vector<int32_t> ids;    // [visible + 8] face index of face n at [n - 1]
   int64_t count;               // visible faces
   std::vector<T> table;        // [visible + 1 + 8, kEntry]
   std::vector<T> rows;         // [2, W + 8] a row of depths or gradients each
@@ -53,15 +53,20 @@ struct FragmentBlock {
   const int64_t* faces;
   int64_t num_faces;
   Size raster;
-  const int32_t* owner;  // [H, W], row 0 = top
+  const int32_t* face_index;  // [H, W], row 0 = top
   int64_t first, last;   // rows
 };
 
 template <class T>
-FragmentBlock<T> make_block(const MeshBatch<T>& mesh, const int32_t* owner, const RowBlocks& blocks, int64_t b,
+FragmentBlock<T> make_block(const MeshBatch<T>& mesh, const int32_t* face_index, const RowBlocks& blocks, int64_t b,
                             int64_t block) {
-  return {mesh.image_vertices(b), mesh.image_faces(b), mesh.face_count(b), blocks.raster,
-          owner + b * blocks.raster.pixels(), blocks.first(block), blocks.last(block)};
+  return {mesh.image_vertices(b),
+          mesh.image_faces(b),
+          mesh.face_count(b),
+          blocks.raster,
+          face_index + b * blocks.raster.pixels(),
+          blocks.first(block),
+          blocks.last(block)};
 }
 
 }  // namespace
@@ -87,7 +92,7 @@ void forward(const Args& args, Size raster, const Body& body) {
     if (block >= blocks.count) return;
     FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
     scratch.reserve_for(F, blocks);
-    body(make_block(mesh, args.owner, blocks, b, block), b, scratch);
+    body(make_block(mesh, args.face_index, blocks, b, block), b, scratch);
   });
 }
 
@@ -107,7 +112,7 @@ void backward(const Args& args, Size raster, int64_t sums, const Body& body) {
         reserve(scratch.sums, (most + 1 + kTogether) * sums);
         reserve(result.ids, most);
         reserve(result.values, 9 * most);
-        body(make_block(mesh, args.owner, blocks, b, block), b, scratch, result);
+        body(make_block(mesh, args.face_index, blocks, b, block), b, scratch, result);
       },
       [&](int64_t b, const FaceGradients<T>& result) {
         scatter_face_gradients(result, mesh.image_faces(b), mesh.face_count(b),

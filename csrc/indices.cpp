@@ -10,7 +10,7 @@ bool are_indices(const int64_t* index, int64_t count, int64_t limit) {
   return !(wrong >> 63);
 }
 
-bool are_owners(const int32_t* entry, int64_t count, int64_t num_faces) {
+bool are_face_indices(const int32_t* entry, int64_t count, int64_t num_faces) {
   const uint32_t limit = static_cast<uint32_t>(2 * num_faces);
   uint32_t wrong = 0;
   for (int64_t n = 0; n < count; ++n) wrong |= static_cast<uint32_t>(entry[n]) + 1 > limit;

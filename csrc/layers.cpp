@@ -1,5 +1,5 @@
 // The K nearest faces at each pixel, by the same tests and the same depth as in the rasterizer: the first layer is its
-// owner map.
+// face index map.
 //
 // Faces are visited in ascending order, all originals, then all reversed copies, and inserted into the sorted list of
 // each pixel that they cover, behind those that are equally near. Bands of rows are independent.
@@ -28,7 +28,7 @@ struct LayerBand {
   int64_t layers, first, last;
   const T* centres;  // of the columns, padded to whole groups
   T* depth;          // [rows, W, K], sorted; `far` where there is no face
-  int32_t* owner;    // [H, W, K] of the image, row 0 = top
+  int32_t* face_index;  // [H, W, K] of the image, row 0 = top
 };
 
 // A range of pixels that contains all centres in [lo, hi], and few others.
@@ -83,14 +83,14 @@ NMR_INLINE void insert_face(const LayerBand<T>& band, int64_t f, bool reversed) 
       for (int64_t n = 0; n < lanes; ++n) {
         T* depths = band.depth + ((j - band.first) * raster.width + i + n) * K;
         if (!covered[n] || !(depth[n] < depths[K - 1])) continue;
-        int32_t* owners = band.owner + ((raster.height - 1 - j) * raster.width + i + n) * K;
+        int32_t* face_indices = band.face_index + ((raster.height - 1 - j) * raster.width + i + n) * K;
         int64_t k = K - 1;
         for (; k > 0 && depth[n] < depths[k - 1]; --k) {
           depths[k] = depths[k - 1];
-          owners[k] = owners[k - 1];
+          face_indices[k] = face_indices[k - 1];
         }
         depths[k] = depth[n];
-        owners[k] = id;
+        face_indices[k] = id;
       }
     }
   }
@@ -117,10 +117,10 @@ void rasterize_layers(const RasterizeLayers<T>& args) {
     const int64_t b = task / bands, first = task % bands * kBandRows,
                   last = std::min(first + kBandRows, raster.height) - 1;
     std::vector<T> depth((last - first + 1) * raster.width * K, args.settings.far);
-    int32_t* owner = args.owner + b * raster.pixels() * K;
-    std::fill_n(owner + (raster.height - 1 - last) * raster.width * K, (last - first + 1) * raster.width * K, -1);
+    int32_t* face_index = args.face_index + b * raster.pixels() * K;
+    std::fill_n(face_index + (raster.height - 1 - last) * raster.width * K, (last - first + 1) * raster.width * K, -1);
     fill_layers(LayerBand<T>{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b),
-                             args.settings, K, first, last, centres.data(), depth.data(), owner});
+                             args.settings, K, first, last, centres.data(), depth.data(), face_index});
   });
 }
 

@@ -362,18 +362,18 @@ template <class T>
 void find_visible(const Lit<T>& args, const View<T>& view, const RowBlocks& blocks, int64_t begin, int64_t end,
                   LitSums<T>& sums) {
   sums.visible.reserve_for(view.image.num_faces, blocks.most_visible(view.image.num_faces));
-  sums.visible.find(args.at.owner + begin, end - begin, view.image.num_faces);
+  sums.visible.find(args.at.face_index + begin, end - begin, view.image.num_faces);
 }
 
 // Pixels [begin, end) where the light depends only on the face. kColors: channels of colours, 0: none, white.
 template <int64_t kColors, class T>
 void lit_faces_forward(const Lit<T>& args, int64_t begin, int64_t end, const LitSums<T>& sums) {
-  const int32_t *owner = args.at.owner, *slots = sums.visible.slots.data() + 1;
+  const int32_t *face_index = args.at.face_index, *slots = sums.visible.slots.data() + 1;
   const T *faces = sums.faces.data(), *colors = args.colors;
   T* lit = args.lit + 3 * begin;
   for (int64_t n = begin; n < end; ++n, lit += 3) {
-    const bool drawn = owner[n] >= 0;
-    const T* face = faces + 3 * (drawn ? slots[owner[n]] : 0);  // 0: any values
+    const bool drawn = face_index[n] >= 0;
+    const T* face = faces + 3 * (drawn ? slots[face_index[n]] : 0);  // 0: any values
     T light[3];
     for (int k = 0; k < 3; ++k) light[k] = kColors ? colors[kColors * n + (kColors == 3 ? k : 0)] * face[k] : face[k];
     for (int k = 0; k < 3; ++k) lit[k] = drawn ? light[k] : T(0);
@@ -383,14 +383,14 @@ void lit_faces_forward(const Lit<T>& args, int64_t begin, int64_t end, const Lit
 // Their gradients: those of colours, and in sums.values from number 9 on those of the light of each face.
 template <int64_t kColors, class T>
 void lit_faces_backward(const Lit<T>& args, int64_t begin, int64_t end, LitSums<T>& sums) {
-  const int32_t *owner = args.at.owner, *slots = sums.visible.slots.data() + 1;
+  const int32_t *face_index = args.at.face_index, *slots = sums.visible.slots.data() + 1;
   const T *faces = sums.faces.data(), *grads = args.grad_lit, *colors = args.colors;
   T *grad_colors = kColors ? args.grad_colors : nullptr, *values = sums.values.data() + 9;
   if (args.at.grad_weights) std::fill_n(args.at.grad_weights + 3 * begin, 3 * (end - begin), T(0));
   if (grad_colors) std::fill_n(grad_colors + kColors * begin, kColors * (end - begin), T(0));
   for (int64_t n = begin; n < end; ++n) {
-    if (owner[n] < 0) continue;
-    const int64_t slot = slots[owner[n]];
+    if (face_index[n] < 0) continue;
+    const int64_t slot = slots[face_index[n]];
     const T *grad = grads + 3 * n, *face = faces + 3 * slot;
     T* sum = values + kSums * slot;
     for (int k = 0; k < 3; ++k) {
@@ -415,7 +415,7 @@ void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, i
     return lit_faces_forward<kColors>(args, begin, end, sums);
   }
   for (int64_t n = begin; n < end; ++n) {
-    const int64_t id = args.at.owner[n];
+    const int64_t id = args.at.face_index[n];
     T* lit = args.lit + 3 * n;
     if (id < 0) {
       for (int k = 0; k < 3; ++k) lit[k] = 0;
@@ -447,7 +447,7 @@ void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, 
     lit_faces_backward<kColors>(args, begin, end, sums);
   }
   for (int64_t n = begin; !per_face && n < end; ++n) {
-    const int64_t id = args.at.owner[n];
+    const int64_t id = args.at.face_index[n];
     T* grad_color = kColors && args.grad_colors ? args.grad_colors + kColors * n : nullptr;
     T* grad_weights = args.at.grad_weights ? args.at.grad_weights + 3 * n : nullptr;
     if (grad_weights) std::fill_n(grad_weights, 3, T(0));

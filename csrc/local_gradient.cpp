@@ -27,10 +27,10 @@ struct LocalImage {
   Size raster, size;  // H x W, and that of the image
   bool anti_aliasing;
   T eps;
-  const int32_t* owner;
+  const int32_t* face_index;
   const T* grad_alpha;
 
-  bool covered(int64_t row, int64_t column) const { return owner[row * raster.width + column] >= 0; }
+  bool covered(int64_t row, int64_t column) const { return face_index[row * raster.width + column] >= 0; }
 
   // With a 2x2 mean each raster pixel gets a quarter of the image's gradient.
   T grad(int64_t row, int64_t column) const {
@@ -65,7 +65,7 @@ struct Rates {
 };
 
 // Screen weights of a face's corners at the centre of a pixel, in the order in which it is drawn, computed as in the
-// rasterizer. False if they are not defined; the rasterizer never makes such a face an owner.
+// rasterizer. False if they are not defined; the rasterizer never draws such a face.
 template <class T>
 bool screen_weights(const Triangle<T>& t, int64_t row, int64_t column, Size raster, T (&w)[3]) {
   const T width = static_cast<T>(raster.width), height = static_cast<T>(raster.height);
@@ -98,7 +98,7 @@ void pull_pixel(const LocalImage<T>& image, int64_t row, int64_t column, T* grad
   const T grad_x = x.gradient(static_cast<T>(raster.width) / 2, image.eps);
   const T grad_y = y.gradient(static_cast<T>(raster.height) / 2, image.eps);
   if (grad_x == 0 && grad_y == 0) return;
-  const int32_t id = image.owner[row * raster.width + column];
+  const int32_t id = image.face_index[row * raster.width + column];
   const bool reversed = id >= image.num_faces;
   const int64_t* face = image.faces + 3 * (reversed ? id - image.num_faces : id);
   T w[3];
@@ -117,8 +117,14 @@ template <class T>
 void local_gradient(const SilhouetteBackward<T>& args) {
   const Size raster = raster_of(args.image, args.anti_aliasing);
   parallel_for(args.mesh.batch, args.num_threads, [&](int64_t b) {
-    const LocalImage<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b), raster,
-                              args.image, args.anti_aliasing, args.eps, args.owner + b * raster.pixels(),
+    const LocalImage<T> image{args.mesh.image_vertices(b),
+                              args.mesh.image_faces(b),
+                              args.mesh.face_count(b),
+                              raster,
+                              args.image,
+                              args.anti_aliasing,
+                              args.eps,
+                              args.face_index + b * raster.pixels(),
                               args.grad_alpha + b * args.image.pixels()};
     T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
     std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));

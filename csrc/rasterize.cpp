@@ -1,9 +1,9 @@
 // Which face is nearest at each pixel of each image.
 //
 // Three steps per image. Set-up: for each face, the vertex orders that face the camera, its box of pixels, bounds of
-// its depth. Fill: for each face (all originals, then all reversed copies), mark the pixels inside. Copy: to the owner
-// map. The published depth needs sixteen divisions per pixel, and its rounding decides which face is nearer; it is
-// computed only where the bounds do not decide. Several threads can share one image: set-up by chunks of faces, fill
+// its depth. Fill: for each face (all originals, then all reversed copies), mark the pixels inside. Copy: to the face
+// index map. The published depth needs sixteen divisions per pixel, and its rounding decides which face is nearer; it
+// is computed only where the bounds do not decide. Several threads can share one image: set-up by chunks of faces, fill
 // by bands of rows.
 //
 // The bounds are those of q = 1 / depth, which is linear on the screen: at a pixel (i, j) inside a face, q differs from
@@ -64,9 +64,9 @@ template <class T>
 struct BandScratch {
   std::vector<T> columns, rows;  // [W + 8] and [H + 8] pixel centres in [-1, 1]
   Size raster{0, 0};             // for which they are computed
-  // [rows, W + 8] bounds of the owner's q = 1 / depth; -infinity on background; 8 more at the end.
+  // [rows, W + 8] bounds of the nearest face's q = 1 / depth; -infinity on background; 8 more at the end.
   std::vector<T> most, least;
-  std::vector<int32_t> owner;    // the same of the owner
+  std::vector<int32_t> face_index;  // the nearest face
   // [rows / 8, W / 8] the smallest of `least` in a block: the second pass skips what lies behind.
   std::vector<T> block_least;
 };
@@ -88,7 +88,7 @@ struct Band {
   int64_t stride;
   const T *columns, *rows;      // pixel centres
   T *most, *least;
-  int32_t* owner;
+  int32_t* face_index;
 };
 
 // The numbers from which the depth of a face is computed at any pixel.
@@ -152,9 +152,9 @@ void rasterize(const Rasterize<T>& args) {
       const int64_t rows = band.row_last - band.row_first + 1, blocks = (W + kTogether - 1) / kTogether;
       band.most = reserve(scratch.most, rows * band.stride + kTogether);
       band.least = reserve(scratch.least, rows * band.stride + kTogether);
-      band.owner = reserve(scratch.owner, rows * band.stride + kTogether);
+      band.face_index = reserve(scratch.face_index, rows * band.stride + kTogether);
       T* block_least = reserve(scratch.block_least, (rows / kTogether + 1) * blocks);
-      NMR_AT_BEST_LEVEL(fill_band, image, band, blocks, block_least, args.owner + b * H * W);
+      NMR_AT_BEST_LEVEL(fill_band, image, band, blocks, block_least, args.face_index + b * H * W);
     });
   });
 }

@@ -65,9 +65,9 @@ class ThreadScratch {
   template <class Scratch>
   struct Kept : AnyKept {
     Scratch value;
-    Kept** owner;
-    explicit Kept(Kept** owner) : owner(owner) {}
-    ~Kept() override { *owner = nullptr; }
+    Kept** face_index;
+    explicit Kept(Kept** face_index) : face_index(face_index) {}
+    ~Kept() override { *face_index = nullptr; }
   };
   struct Registry {
     std::mutex mutex;

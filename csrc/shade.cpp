@@ -1,5 +1,6 @@
-// Colours from texture cubes, and interpolation of values given at the corners of faces. Both read the owner map and
-// the perspective-correct weights, in the vertex order of the original face, so that reversed copies are not special.
+// Colours from texture cubes, and interpolation of values given at the corners of faces. Both read the face index map
+// and the perspective-correct weights, in the vertex order of the original face, so that reversed copies are not
+// special.
 #include <algorithm>
 #include <vector>
 
@@ -79,7 +80,7 @@ void texture_cubes_forward(const TextureCubes<T>& args) {
       const T* textures = args.textures + first_cube(args, b) * cube;
       T* color = args.colors + start * C;
       for (int64_t n = start; n < start + W; ++n, color += C) {
-        const int64_t id = args.owner[n];
+        const int64_t id = args.face_index[n];
         if (id >= 0)
           blend<kChannels>(texels_of(args.weights + 3 * n, ts, args.eps), textures + (id < F ? id : id - F) * cube, C,
                            color);
@@ -99,7 +100,7 @@ void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first
   const int64_t F = face_count(args, b), pixels = args.raster.pixels();
   T* grad_textures = args.grad_textures + first_cube(args, b) * cube;
   for (int64_t n = b * pixels; n < (b + 1) * pixels; ++n) {
-    const int64_t id = args.owner[n], f = id < F ? id : id - F;
+    const int64_t id = args.face_index[n], f = id < F ? id : id - F;
     if (f < first_face || f >= last_face) continue;  // also background
     const Texels<T> texels = texels_of(args.weights + 3 * n, ts, args.eps);
     const T* grad = args.grad_colors + n * C;
@@ -142,11 +143,11 @@ void interpolate_block_backward(const Interpolate<T>& args, const ImageAttribute
   const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
   if (args.grad_attributes) {
     sums.visible.reserve_for(F, blocks.most_visible(F));
-    sums.visible.find(args.owner + begin, end - begin, F);
+    sums.visible.find(args.face_index + begin, end - begin, F);
     std::fill_n(reserve(sums.values, sums.visible.count * 3 * C), sums.visible.count * 3 * C, T(0));
   }
   for (int64_t n = begin; n < end; ++n) {
-    const int64_t id = args.owner[n];
+    const int64_t id = args.face_index[n];
     const T *grad = args.grad_values + n * C, *weights = args.weights + 3 * n;
     if (args.grad_weights && id < 0) std::fill_n(args.grad_weights + 3 * n, 3, T(0));
     if (id < 0) continue;
@@ -178,7 +179,7 @@ void interpolate_forward(const Interpolate<T>& args) {
       const int64_t start = (b * args.raster.height + row) * W;
       T* value = args.values + start * C;
       for (int64_t n = start; n < start + W; ++n, value += C) {
-        const int64_t id = args.owner[n];
+        const int64_t id = args.face_index[n];
         if (id < 0) {
           for (int64_t c = 0; c < C; ++c) value[c] = 0;
           continue;

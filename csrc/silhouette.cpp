@@ -9,7 +9,7 @@
 
 #include "geometry.h"
 #include "parallel.h"
-#include "pull_lines.h"
+#include "scanline_grads.h"
 #include "stages.h"
 #include "swept_image.h"
 
@@ -21,7 +21,7 @@ namespace {
 
 template <class T>
 struct Lines {
-  PullLines<T> lines[2];  // [0] columns: lines of constant x, swept along y; [1] rows
+  ScanlineGrads<T> lines[2];  // [0] columns: lines of constant x, swept along y; [1] rows
 };
 
 }  // namespace
@@ -31,13 +31,13 @@ template <class T>
 void silhouette_forward(const SilhouetteForward<T>& args) {
   const Size image = args.image, raster = raster_of(image, args.anti_aliasing);
   parallel_for(args.batch, args.num_threads, [&](int64_t b) {
-    const int32_t* owner = args.owner + b * raster.pixels();
+    const int32_t* face_index = args.face_index + b * raster.pixels();
     T* alpha = args.alpha + b * image.pixels();
     if (!args.anti_aliasing) {
-      for (int64_t n = 0; n < image.pixels(); ++n) alpha[n] = owner[n] >= 0 ? T(1) : T(0);
+      for (int64_t n = 0; n < image.pixels(); ++n) alpha[n] = face_index[n] >= 0 ? T(1) : T(0);
       return;
     }
-    NMR_AT_BEST_LEVEL(average_coverage, owner, image, alpha);
+    NMR_AT_BEST_LEVEL(average_coverage, face_index, image, alpha);
   });
 }
 
@@ -48,10 +48,18 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
   // Many images: one thread per image. Few images: all threads share one image at a time.
   const bool share = args.mesh.batch < args.num_threads;
   parallel_for(args.mesh.batch, share ? 1 : args.num_threads, [&](int64_t b) {
-    PullLines<T>* lines = thread_scratch<Lines<T>>().lines;
-    const SweepImage<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b), raster,
-                              args.image, args.anti_aliasing, args.eps, args.owner + b * raster.pixels(),
-                              args.grad_alpha + b * args.image.pixels(), lines, args.eps > T(1e-15) ? T(1e15) : T(0)};
+    ScanlineGrads<T>* lines = thread_scratch<Lines<T>>().lines;
+    const SweepImage<T> image{args.mesh.image_vertices(b),
+                              args.mesh.image_faces(b),
+                              args.mesh.face_count(b),
+                              raster,
+                              args.image,
+                              args.anti_aliasing,
+                              args.eps,
+                              args.face_index + b * raster.pixels(),
+                              args.grad_alpha + b * args.image.pixels(),
+                              lines,
+                              args.eps > T(1e-15) ? T(1e15) : T(0)};
     T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
     std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));
     lines[0].reserve_lines(raster.width, raster.height);
@@ -59,7 +67,7 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
     sweep_image(
         image, 1, share ? args.num_threads : 1,
         [&](uint8_t* seen, int32_t* ids) {
-          return NMR_AT_BEST_LEVEL(find_visible, image.owner, raster.pixels(), image.num_faces, seen, ids);
+          return NMR_AT_BEST_LEVEL(find_visible, image.face_index, raster.pixels(), image.num_faces, seen, ids);
         },
         [&] { return NMR_AT_BEST_LEVEL(all_finite, image.grad_alpha, args.image.pixels()); },
         [&](const LineRange& range, T* grad_row) { NMR_AT_BEST_LEVEL(collect_lines, image, range, grad_row); },

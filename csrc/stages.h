@@ -1,5 +1,5 @@
 // The argument struct of each stage: inputs, outputs, sizes, settings. Raw arrays only, row-major. Every image has row
-// 0 at the top. Stages in the order of a render: camera, clip, rasterize, then those that use the owner map:
+// 0 at the top. Stages in the order of a render: camera, clip, rasterize, then those that use the face index map:
 // silhouette, fragments, depth, shading, resolve.
 #pragma once
 
@@ -124,7 +124,7 @@ template <class T>
 struct Rasterize {
   MeshBatch<T> mesh;
   RasterSettings<T> settings;
-  int32_t* owner;  // out [B, H, W]; -1 background, f front, F + f reversed copy of f
+  int32_t* face_index;  // out [B, H, W]; -1 background, f front, F + f reversed copy of f
   int num_threads;
 };
 
@@ -134,14 +134,15 @@ struct RasterizeLayers {
   MeshBatch<T> mesh;
   RasterSettings<T> settings;
   int64_t layers;  // K
-  int32_t* owner;  // out [B, H, W, K]; as in Rasterize, -1 after the last face
+  int32_t* face_index;  // out [B, H, W, K]; as in Rasterize, -1 after the last face
   int num_threads;
 };
 
-// Coverage of an owner map, with NMR's gradient (silhouette.cpp) or that of Kato and Harada 2019 (local_gradient.cpp).
+// Coverage of a face index map, with NMR's gradient (silhouette.cpp) or that of Kato and Harada 2019
+// (local_gradient.cpp).
 template <class T>
 struct SilhouetteForward {
-  const int32_t* owner;  // [B, H, W], of raster_of(image, anti_aliasing)
+  const int32_t* face_index;  // [B, H, W], of raster_of(image, anti_aliasing)
   int64_t batch;
   Size image;            // h x w
   bool anti_aliasing;    // 2x2 mean
@@ -156,7 +157,7 @@ struct SilhouetteBackward {
   bool anti_aliasing;
   T eps;                // NMR's: keeps the distance to an edge away from zero; local: if rates differ by less, the
                         // gradient is 0
-  const int32_t* owner; // [B, H, W]
+  const int32_t* face_index;  // [B, H, W]
   const T* grad_alpha;  // [B, h, w]
   T* grad_vertices;     // out, like mesh.vertices; z gets 0
   int num_threads;
@@ -188,13 +189,13 @@ struct SoftBackward {
   int num_threads;
 };
 
-// Barycentric weights and depth of the owner at each pixel, and their derivatives (fragments.cpp).
+// Barycentric weights and depth of the nearest face at each pixel, and their derivatives (fragments.cpp).
 template <class T>
 struct Fragments {
   MeshBatch<T> mesh;
   Size raster;           // H x W
   T far;                 // depth of the background
-  const int32_t* owner;  // [B, H, W]
+  const int32_t* face_index;  // [B, H, W]
   T* weights;            // forward out [B, H, W, 3]: of the face's own vertices 0, 1, 2, perspective-correct; 0 on
                          // background
   T* depth;              // forward out [B, H, W]
@@ -211,7 +212,7 @@ struct DepthImage {
   Size image;           // h x w
   bool anti_aliasing;
   T far;
-  const int32_t* owner;
+  const int32_t* face_index;
   T* depth;             // forward out [B, h, w]
   const T* grad_depth;  // backward in [B, h, w]
   T* grad_vertices;     // backward out, like mesh.vertices
@@ -221,7 +222,7 @@ struct DepthImage {
 // Colours from texture cubes (shade.cpp): axis k of a cube is the weight of the face's vertex k.
 template <class T>
 struct TextureCubes {
-  const int32_t* owner;    // [B, H, W]
+  const int32_t* face_index;  // [B, H, W]
   const T* weights;        // [B, H, W, 3] of Fragments
   int64_t batch;
   Size raster;             // H x W
@@ -241,7 +242,7 @@ struct TextureCubes {
 // Values given at the corners of faces, interpolated over the pixels (shade.cpp).
 template <class T>
 struct Interpolate {
-  const int32_t* owner;      // [B, H, W]
+  const int32_t* face_index;  // [B, H, W]
   const T* weights;          // [B, H, W, 3] of Fragments
   int64_t batch;
   Size raster;               // H x W
@@ -363,7 +364,7 @@ struct Resolve {
   Size image;               // h x w
   bool anti_aliasing;
   int64_t channels;         // C
-  const int32_t* owner;     // [B, H, W]
+  const int32_t* face_index;  // [B, H, W]
   const T* pixels;          // [B, H, W, C] of the raster
   const T* background;      // [B or 1, C] colour of pixels without a face, or nullptr: that in `pixels`
   int64_t background_batch; // 1 or B
@@ -382,7 +383,7 @@ struct EdgesBackward {
   Size image;               // h x w
   bool anti_aliasing;
   T eps;
-  const int32_t* owner;     // [B, H, W]
+  const int32_t* face_index;  // [B, H, W]
   const T* pixels;          // [B, H, W, C]
   int64_t channels;         // C
   const T* background;      // [B or 1, C] colour of pixels without a face, or nullptr: that in `pixels`

@@ -2,7 +2,7 @@
 //
 // For axis 0 the lines are columns: s is the scan coordinate x and t the sweep coordinate y. For axis 1 they are rows:
 // s is y, t is x. A sweep goes outward, up or down its line. In the coordinate of its direction (t or -t, see
-// PullLines) it always goes up.
+// ScanlineGrads) it always goes up.
 //
 // An edge of a small face crosses three or four lines only. So edges are first written out as crossings, of all edges
 // with one axis and direction, and then crossings are worked on in full vectors.
@@ -11,11 +11,11 @@
 
 // --- coverage
 
-// alpha [h, w]: the covered share of each pixel of an image whose owner map has twice its size.
+// alpha [h, w]: the covered share of each pixel of an image whose face index map has twice its size.
 template <class T>
-void average_coverage(const int32_t* owner, Size image, T* alpha) {
+void average_coverage(const int32_t* face_index, Size image, T* alpha) {
   for (int64_t y = 0; y < image.height; ++y, alpha += image.width) {
-    const int32_t *upper = owner + 4 * y * image.width, *lower = upper + 2 * image.width;
+    const int32_t *upper = face_index + 4 * y * image.width, *lower = upper + 2 * image.width;
     for (int64_t x = 0; x < image.width; ++x) {
       const int upper_covered = (upper[2 * x] >= 0) + (upper[2 * x + 1] >= 0);
       const int lower_covered = (lower[2 * x] >= 0) + (lower[2 * x + 1] >= 0);
@@ -41,7 +41,7 @@ NMR_INLINE void expand_row(const SweepImage<T>& image, int64_t j, T* row) {
 
 // Adds pixel m to the list of line n.
 template <class T>
-NMR_INLINE void append_pull(PullLines<T>& lines, int64_t n, int64_t m, T weight) {
+NMR_INLINE void append_pull(ScanlineGrads<T>& lines, int64_t n, int64_t m, T weight) {
   const int64_t at = n * lines.stride + kPad + lines.count[n]++;
   lines.position[at] = static_cast<T>(m);
   lines.weight[at] = weight;
@@ -49,14 +49,14 @@ NMR_INLINE void append_pull(PullLines<T>& lines, int64_t n, int64_t m, T weight)
 
 // Bounds and padding of lines [first, last), when all their pixels have been seen.
 template <class T>
-NMR_INLINE void finish_lines(PullLines<T>& lines, int64_t first, int64_t last) {
+NMR_INLINE void finish_lines(ScanlineGrads<T>& lines, int64_t first, int64_t last) {
   const T infinity = std::numeric_limits<T>::infinity(), length = static_cast<T>(lines.stride - 2 * kPad);
   for (int64_t n = first; n < last; ++n) {
     const int32_t count = lines.count[n];
     T* position = lines.position.data() + n * lines.stride + kPad;
-    lines.pull_end[0][n] = count ? position[count - 1] : -infinity;
-    lines.pull_end[1][n] = count ? -position[0] : -infinity;
-    lines.gain_start[1][n] = std::max(T(1) - length, -lines.gain_start[1][n]);
+    lines.outer_end[0][n] = count ? position[count - 1] : -infinity;
+    lines.outer_end[1][n] = count ? -position[0] : -infinity;
+    lines.inner_start[1][n] = std::max(T(1) - length, -lines.inner_start[1][n]);
     store_lanes(position - kPad, splat(T(-1)));
     store_lanes(position + count, splat(length));
   }
@@ -67,22 +67,22 @@ template <class T>
 void collect_lines(const SweepImage<T>& image, const LineRange& range, T* grad_row) {
   const int64_t H = image.raster.height, W = image.raster.width;
   const bool any_column = range.column_first < range.column_last;
-  PullLines<T>&columns = image.lines[0], &rows = image.lines[1];
+  ScanlineGrads<T>&columns = image.lines[0], &rows = image.lines[1];
   start_lines(columns, range.column_first, range.column_last);
   start_lines(rows, range.row_first, range.row_last);
   const int64_t j_first = any_column ? 0 : range.row_first, j_last = any_column ? H : range.row_last;
   for (int64_t j = j_first; j < j_last; ++j) {
     const bool in_rows = j >= range.row_first && j < range.row_last;
-    const int32_t* owner = image.owner + (H - 1 - j) * W;
+    const int32_t* face_index = image.face_index + (H - 1 - j) * W;
     if (j == j_first || !image.anti_aliasing || j % 2 == 0) expand_row(image, j, grad_row);
     const int64_t i_last = in_rows ? W : range.column_last;
     for (int64_t start = in_rows ? 0 : range.column_first; start < i_last; start += kLanes) {
       const Lanes<T> g = load_lanes<Lanes<T>>(grad_row + start);
       Lanes32 id = splat(int32_t(-1));
       if (start + kLanes <= W)
-        id = load_lanes<Lanes32>(owner + start);
+        id = load_lanes<Lanes32>(face_index + start);
       else
-        std::memcpy(&id, owner + start, (W - start) * sizeof(int32_t));
+        std::memcpy(&id, face_index + start, (W - start) * sizeof(int32_t));
       const Lanes32 background = id < splat(int32_t(0));
       uint32_t bits = lane_bits(narrow_mask(g < splat(T(0))) & background);
       const uint32_t gain_bits = lane_bits(g > splat(T(0))) & ~lane_bits(background);
@@ -93,12 +93,12 @@ void collect_lines(const SweepImage<T>& image, const LineRange& range, T* grad_r
       }
       if (!gain_bits) continue;
       if (in_rows) {
-        rows.gain_start[0][j] = std::min(rows.gain_start[0][j], static_cast<T>(start));  // at least that
-        rows.gain_start[1][j] = static_cast<T>(start + kLanes - 1);                      // at most that
+        rows.inner_start[0][j] = std::min(rows.inner_start[0][j], static_cast<T>(start));  // at least that
+        rows.inner_start[1][j] = static_cast<T>(start + kLanes - 1);                       // at most that
       }
       if (any_column) {
         const LaneMask<T> here = (g > splat(T(0))) & widen_mask<T>(id >= splat(int32_t(0)));
-        T *gain_first = columns.gain_start[0].data() + start, *gain_last = columns.gain_start[1].data() + start;
+        T *gain_first = columns.inner_start[0].data() + start, *gain_last = columns.inner_start[1].data() + start;
         const Lanes<T> line_first = load_lanes<Lanes<T>>(gain_first), at = splat(static_cast<T>(j));
         store_lanes(gain_first, select(here & (line_first > at), at, line_first));
         store_lanes(gain_last, select(here, at, load_lanes<Lanes<T>>(gain_last)));
@@ -114,11 +114,14 @@ void collect_lines(const SweepImage<T>& image, const LineRange& range, T* grad_r
 // Adds the pulls of the listed pixels beyond the crossing: above it if kUp, else below. A pixel of weight w pulls P
 // with w / h_p and Q with w / h_q, h the travel. The quotients share one division: w / (h_p h_q) times h_q and h_p.
 template <bool kUp, class T>
-NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, const Lever<T>& lever, T* pulls) {
+NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, const EdgeDerivative<T>& derivative,
+                            T* pulls) {
   // All offsets have the same sign, so the signs of both distances are constant.
-  const T eps = kUp ? lever.eps : -lever.eps;
-  const Lanes<T> crossing = splat(lever.crossing), factor_p = splat(lever.factor_p), factor_q = splat(lever.factor_q);
-  const Lanes<T> eps_p = splat(lever.factor_p > 0 ? eps : -eps), eps_q = splat(lever.factor_q > 0 ? eps : -eps);
+  const T eps = kUp ? derivative.eps : -derivative.eps;
+  const Lanes<T> crossing = splat(derivative.crossing), factor_p = splat(derivative.factor_p),
+                 factor_q = splat(derivative.factor_q);
+  const Lanes<T> eps_p = splat(derivative.factor_p > 0 ? eps : -eps),
+                 eps_q = splat(derivative.factor_q > 0 ? eps : -eps);
   Lanes<T> pulls_p = splat(T(0)), pulls_q = splat(T(0));
   int64_t n = kUp ? count - kLanes : 0;  // from the border of the image inwards
   bool more;
@@ -129,7 +132,7 @@ NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, c
     const Lanes<T> share = keep(beyond, load_lanes<Lanes<T>>(weight + n) / (h_p * h_q));
     pulls_p = pulls_p + share * h_q;
     pulls_q = pulls_q + share * h_p;
-    more = kUp ? position[n] > lever.crossing : position[n + kLanes - 1] < lever.crossing;
+    more = kUp ? position[n] > derivative.crossing : position[n + kLanes - 1] < derivative.crossing;
     n += kUp ? -kLanes : kLanes;
   } while (more);
   add_lane_sums<T>(pulls_p, pulls_q, pulls);
@@ -138,11 +141,11 @@ NMR_INLINE void pull_listed(const T* position, const T* weight, int32_t count, c
 // Pulls of the pixels inside the face that should be background: the loss falls if the edge moves in past them.
 template <class T>
 void pull_inside(const SweepImage<T>& image, const SweepScratch<T>& block, int axis, int32_t edge, int64_t n,
-                 int64_t inner, int64_t d, const Lever<T>& lever, T* pulls) {
+                 int64_t inner, int64_t d, const EdgeDerivative<T>& derivative, T* pulls) {
   const int64_t H = image.raster.height, W = image.raster.width, face = edge % kSweptFaces, p = edge / kSweptFaces;
   const int64_t q = p < 2 ? p + 1 : 0, o = p > 0 ? p - 1 : 2;
-  // pixel m of line n: owner[m * step]
-  const int32_t* owner = axis == 0 ? image.owner + (H - 1) * W + n : image.owner + (H - 1 - n) * W;
+  // pixel m of line n: face_index[m * step]
+  const int32_t* face_index = axis == 0 ? image.face_index + (H - 1) * W + n : image.face_index + (H - 1 - n) * W;
   const int64_t step = axis == 0 ? -W : 1, length = axis == 0 ? H : W;
   const auto s = [&](int64_t k) { return block.corner[axis][k][face]; };
   const auto t = [&](int64_t k) { return block.corner[1 - axis][k][face]; };
@@ -153,9 +156,9 @@ void pull_inside(const SweepImage<T>& image, const SweepScratch<T>& block, int a
   const int64_t m_first = std::max<int64_t>(std::min(inner, limit), 0);
   const int64_t m_last = std::min(std::max(inner, limit), length - 1);
   for (int64_t m = m_first; m <= m_last; ++m) {
-    if (owner[m * step] != block.id[face]) continue;
+    if (face_index[m * step] != block.id[face]) continue;
     const T g = axis == 0 ? image.grad(n, m) : image.grad(m, n);
-    if (g > 0) pull(g, static_cast<T>(m) - lever.crossing, lever, pulls);
+    if (g > 0) pull(g, static_cast<T>(m) - derivative.crossing, derivative, pulls);
   }
 }
 
@@ -165,64 +168,67 @@ void pull_inside(const SweepImage<T>& image, const SweepScratch<T>& block, int a
 template <bool kUp, class T>
 void run_crossings(const SweepImage<T>& image, int axis, SweepScratch<T>& block) {
   const int64_t H = image.raster.height, W = image.raster.width;
-  const PullLines<T>& lines = image.lines[axis];
+  const ScanlineGrads<T>& lines = image.lines[axis];
   Crossings<T>& crossings = block.crossings[axis][kUp ? 0 : 1];
   const int32_t d = kUp ? 1 : -1;
   const T top = static_cast<T>((axis == 0 ? H : W) - 1);  // the last pixel of a line
   // The inner pixel is floor(c) in the coordinate of the direction. It and the next one lie on the line if start <= c
   // < end.
   const Lanes<T> start = splat(kUp ? T(0) : -top), end = splat(kUp ? top : T(0));
-  // pixel m of line n: owner[origin + n * step_n + m * step_m]
+  // pixel m of line n: face_index[origin + n * step_n + m * step_m]
   const int32_t across = static_cast<int32_t>(-W), step = axis == 0 ? across * d : d;
   const Lanes32 origin = splat(static_cast<int32_t>((H - 1) * W));
   const Lanes32 step_n = splat(axis == 0 ? int32_t(1) : across), step_m = splat(step);
   const Lanes32 all = splat(static_cast<int32_t>(crossings.count));
   const Lanes32 face_of = splat(static_cast<int32_t>(kSweptFaces - 1));
-  int64_t num_pulled = 0, num_gained = 0;
+  int64_t num_outer = 0, num_inner = 0;
   for (int64_t i = 0; i < crossings.count; i += kLanes) {
     const Lanes<T> at = load_lanes<Lanes<T>>(crossings.at + i);
     const Lanes32 number = lane_numbers() + splat(static_cast<int32_t>(i)), used = number < all;
-    const Lanes32 may_pull = used & narrow_mask((at >= start) & (at < load_lanes<Lanes<T>>(crossings.pull_end + i)));
-    const Lanes32 may_gain = used & narrow_mask((at >= load_lanes<Lanes<T>>(crossings.gain_start + i)) & (at < end));
-    const Lanes32 wanted = may_pull | may_gain;
+    const Lanes32 maybe_outer =
+        used & narrow_mask((at >= start) & (at < load_lanes<Lanes<T>>(crossings.outer_end + i)));
+    const Lanes32 maybe_inner =
+        used & narrow_mask((at >= load_lanes<Lanes<T>>(crossings.inner_start + i)) & (at < end));
+    const Lanes32 wanted = maybe_outer | maybe_inner;
     const Lanes32 inner = truncate(floor_lanes<T>(keep(widen_mask<T>(wanted), at)));
     const Lanes32 pixel = origin + load_lanes<Lanes32>(crossings.line + i) * step_n + inner * step_m;
     const Lanes32 face = load_lanes<Lanes32>(crossings.edge + i) & face_of;
     const Lanes32 id = gather_lanes(block.id, keep(used, face));
-    const Lanes32 inner_owner = gather_lanes(image.owner, keep(wanted, pixel));
-    const Lanes32 outer_owner = gather_lanes(image.owner, keep(wanted, pixel + step_m));
-    num_pulled += compress_lanes(number, lane_bits(may_pull & (inner_owner == id)), crossings.pulled + num_pulled);
-    const uint32_t gain_bits = lane_bits(may_gain & (outer_owner < splat(int32_t(0))));
-    if (gain_bits) num_gained += compress_lanes(number, gain_bits, crossings.gained + num_gained);
+    const Lanes32 inner_face_index = gather_lanes(image.face_index, keep(wanted, pixel));
+    const Lanes32 outer_face_index = gather_lanes(image.face_index, keep(wanted, pixel + step_m));
+    num_outer += compress_lanes(number, lane_bits(maybe_outer & (inner_face_index == id)), crossings.outer + num_outer);
+    const uint32_t gain_bits = lane_bits(maybe_inner & (outer_face_index < splat(int32_t(0))));
+    if (gain_bits) num_inner += compress_lanes(number, gain_bits, crossings.inner + num_inner);
   }
   crossings.count = 0;
 
-  const auto lever_of = [&](int32_t i) {
+  const auto derivative_of = [&](int32_t i) {
     const T line = static_cast<T>(crossings.line[i]), reach = block.reach[axis][crossings.edge[i]];
-    return Lever<T>{kUp ? crossings.at[i] : -crossings.at[i], reach / (block.qs[axis][crossings.edge[i]] - line),
-                    reach / (line - block.ps[axis][crossings.edge[i]]), image.eps};
+    return EdgeDerivative<T>{kUp ? crossings.at[i] : -crossings.at[i],
+                             reach / (block.qs[axis][crossings.edge[i]] - line),
+                             reach / (line - block.ps[axis][crossings.edge[i]]), image.eps};
   };
   // Outside: pixels from the outer one to the border that should be covered. The loss falls if the edge moves out to
   // them.
-  for (int64_t k = 0; k < num_pulled; ++k) {
-    const int32_t i = crossings.pulled[k], n = crossings.line[i];
-    const Lever<T> lever = lever_of(i);
+  for (int64_t k = 0; k < num_outer; ++k) {
+    const int32_t i = crossings.outer[k], n = crossings.line[i];
+    const EdgeDerivative<T> derivative = derivative_of(i);
     T* pulls = block.pulls[axis][crossings.edge[i]];
     const T *position = lines.positions(n), *weight = lines.weights(n);
-    const T largest = image.largest_lever;
-    if (std::abs(lever.factor_p) < largest && std::abs(lever.factor_q) < largest) {
-      pull_listed<kUp>(position, weight, lines.count[n], lever, pulls);
+    const T largest = image.largest_factor;
+    if (std::abs(derivative.factor_p) < largest && std::abs(derivative.factor_q) < largest) {
+      pull_listed<kUp>(position, weight, lines.count[n], derivative, pulls);
     } else {
       for (int32_t m = 0; m < lines.count[n]; ++m)
-        if (kUp ? position[m] > lever.crossing : position[m] < lever.crossing)
-          pull(weight[m], position[m] - lever.crossing, lever, pulls);
+        if (kUp ? position[m] > derivative.crossing : position[m] < derivative.crossing)
+          pull(weight[m], position[m] - derivative.crossing, derivative, pulls);
     }
   }
-  for (int64_t k = 0; k < num_gained; ++k) {
-    const int32_t i = crossings.gained[k];
+  for (int64_t k = 0; k < num_inner; ++k) {
+    const int32_t i = crossings.inner[k];
     const int64_t inner = d * static_cast<int64_t>(std::floor(crossings.at[i]));
     const int32_t edge = crossings.edge[i];
-    pull_inside(image, block, axis, edge, crossings.line[i], inner, d, lever_of(i), block.pulls[axis][edge]);
+    pull_inside(image, block, axis, edge, crossings.line[i], inner, d, derivative_of(i), block.pulls[axis][edge]);
   }
 }
 

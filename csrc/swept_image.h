@@ -8,7 +8,7 @@
 #include <vector>
 
 #include "parallel.h"
-#include "pull_lines.h"
+#include "scanline_grads.h"
 #include "stages.h"
 
 namespace nmr {
@@ -17,7 +17,7 @@ namespace nmr {
 template <class T>
 struct SweptFaces {
   std::vector<uint8_t> seen;  // [2 F + 1 + pad]
-  std::vector<int32_t> ids;   // [visible faces + pad] their owner entries
+  std::vector<int32_t> ids;   // [visible faces + pad] their face indices
   std::vector<T> grad;        // [visible faces, 3, 2] of x and y of their corners, in the order in which they are drawn
 };
 
@@ -31,7 +31,7 @@ struct SweepTask {
 // Adds the gradients of an image (SweepImage or ColorImage) of C channels to its vertices. If a gradient of the image
 // is not finite, x and y of every vertex of a visible face get NaN.
 //
-//   find(seen, ids)                   writes the owner entries of the visible faces, and returns their number
+//   find(seen, ids)                   writes the face indices of the visible faces, and returns their number
 //   finite()                          whether all gradients of the image are finite
 //   collect(range, grad_row)          lists the pixels of some lines that can pull
 //   sweep(ids, first, last, block, grad)   writes the gradients of some of these faces

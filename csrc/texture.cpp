@@ -187,7 +187,7 @@ void uv_levels(const UVLevels<T>& args) {
     const T* uv = args.uv.attributes + 2 * image.first_row;
     LevelScratch<T>& scratch = thread_scratch<LevelScratch<T>>();
     scratch.visible.reserve_for(F, std::min(2 * F, raster.pixels()));
-    scratch.visible.find(args.uv.owner + begin, raster.pixels(), F);
+    scratch.visible.find(args.uv.face_index + begin, raster.pixels(), F);
     Slopes<T>* slopes = reserve(scratch.slopes, scratch.visible.count);
     for (int64_t n = 1; n < scratch.visible.count; ++n) {
       const int64_t id = scratch.visible.ids[n], face = id < F ? id : id - F;
@@ -196,7 +196,7 @@ void uv_levels(const UVLevels<T>& args) {
     }
     const Grid grid = grid_of(args.grids, args.images, args.levels, b, 0);
     for (int64_t n = begin; n < begin + raster.pixels(); ++n) {
-      const int64_t id = args.uv.owner[n];
+      const int64_t id = args.uv.face_index[n];
       args.level[n] = 0;
       if (id < 0) continue;
       const T* weights = args.uv.weights + 3 * n;
@@ -322,11 +322,11 @@ void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>&
   const T* uv = at.attributes + 2 * image.first_row;
   if (at.grad_attributes) {
     sums.visible.reserve_for(F, blocks.most_visible(F));
-    sums.visible.find(at.owner + begin, end - begin, F);
+    sums.visible.find(at.face_index + begin, end - begin, F);
     std::fill_n(reserve(sums.values, sums.visible.count * 6), sums.visible.count * 6, T(0));
   }
   for (int64_t n = begin; n < end; ++n) {
-    const int64_t id = at.owner[n];
+    const int64_t id = at.face_index[n];
     if (rows) std::fill_n(rows + n * per_pixel, per_pixel, static_cast<int32_t>(kNoRow));
     if (id < 0) {
       if (at.grad_weights) std::fill_n(at.grad_weights + 3 * n, 3, T(0));
@@ -375,7 +375,7 @@ void scatter_texels(const SampleUV<T>& args, const int32_t* rows, int64_t first,
       for (int64_t k = 0; k < per_pixel; ++k)
         inside |= rows[n * per_pixel + k] >= first && rows[n * per_pixel + k] < last;
       if (!inside) continue;
-      const int64_t id = at.owner[n];
+      const int64_t id = at.face_index[n];
       const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);
       const Place<T> place = place_of(at.attributes + 2 * image.first_row, corners, at.weights + 3 * n);
       const Blend<T> blend = blend_of(args, b, n);
@@ -400,7 +400,7 @@ void sample_uv_forward(const SampleUV<T>& args) {
       const int64_t start = (b * at.raster.height + row) * W, F = image.num_faces;
       T* color = args.colors + start * C;
       for (int64_t n = start; n < start + W; ++n, color += C) {
-        const int64_t id = at.owner[n];
+        const int64_t id = at.face_index[n];
         if (id < 0) {
           for (int64_t c = 0; c < C; ++c) color[c] = 0;
           continue;

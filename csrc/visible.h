@@ -1,16 +1,16 @@
 // The faces that own a pixel; all others have gradient 0. Part of a level file (levels.h).
 
-// Writes their owner entries to ids, ascending, and returns their number; ids has room for kLanes more. seen: [2 F + 1
+// Writes their face indices to ids, ascending, and returns their number; ids has room for kLanes more. seen: [2 F + 1
 // + kLanes] of scratch.
-int64_t find_visible(const int32_t* owner, int64_t pixels, int64_t num_faces, uint8_t* seen, int32_t* ids) {
+int64_t find_visible(const int32_t* face_index, int64_t pixels, int64_t num_faces, uint8_t* seen, int32_t* ids) {
   const int64_t entries = 2 * num_faces + 1;  // entry 0 is the background
   std::memset(seen, 0, entries + kLanes);
   int64_t n = 0;
   for (; n + kLanes <= pixels; n += kLanes) {
-    if (!lane_bits(load_lanes<Lanes32>(owner + n) >= splat(int32_t(0)))) continue;
-    for (int64_t k = 0; k < kLanes; ++k) seen[owner[n + k] + 1] = 1;
+    if (!lane_bits(load_lanes<Lanes32>(face_index + n) >= splat(int32_t(0)))) continue;
+    for (int64_t k = 0; k < kLanes; ++k) seen[face_index[n + k] + 1] = 1;
   }
-  for (; n < pixels; ++n) seen[owner[n] + 1] = 1;
+  for (; n < pixels; ++n) seen[face_index[n] + 1] = 1;
   seen[0] = 0;
   int64_t count = 0;
   for (int64_t e = 0; e < entries; e += 8) {

@@ -1,6 +1,6 @@
 """Near-plane clipping: the meshes that are drawn in place of those that cross the plane, and the way back to these.
 
-The kernels then see a packed mesh in which faces are cut. What users see (owner, weights) is that of their own faces.
+The kernels then see a packed mesh in which faces are cut. Users see face indices and weights of their own faces.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ class Clipped(NamedTuple):
     places: Tensor  # packed [3 B + P, 3]: barycentric coordinates on the source
     place_starts: Tensor  # [B + 1, 2]: first of the places and first face of each mesh
 
-    def owner(self, owner: Tensor) -> Tensor:
-        """An owner map of the drawn meshes as one of the user's: ``[B, H, W]`` or ``[B, H, W, K]``."""
-        one = (-1, *(1,) * (owner.ndim - 1))
+    def face_index(self, face_index: Tensor) -> Tensor:
+        """A face index map of the drawn meshes as one of the user's: ``[B, H, W]`` or ``[B, H, W, K]``."""
+        one = (-1, *(1,) * (face_index.ndim - 1))
         drawn, num_faces = self.mesh.num_faces.view(one), self.num_faces
         num_faces = num_faces.view(one) if isinstance(num_faces, Tensor) else num_faces
-        back = owner >= drawn
-        face = torch.where(back, owner - drawn, owner).long() + self.mesh.first_faces(0).view(one)
-        source = self.source[torch.where(owner < 0, len(self.source) - 1, face)]
+        back = face_index >= drawn
+        face = torch.where(back, face_index - drawn, face_index).long() + self.mesh.first_faces(0).view(one)
+        source = self.source[torch.where(face_index < 0, len(self.source) - 1, face)]
         return torch.where(back, source + num_faces, source)
 
-    def weights(self, owner: Tensor, weights: Tensor) -> Tensor:
-        """Weights on the drawn faces ``[B, H, W, 3]`` (of their owner map) as weights on the user's faces.
+    def weights(self, face_index: Tensor, weights: Tensor) -> Tensor:
+        """Weights on the drawn faces ``[B, H, W, 3]`` (of their face index map) as weights on the user's faces.
 
         Both are linear in space: a point with weights b_k on a face whose corners lie at B_k has the weights
         sum_k b_k B_k.
         """
-        return ops.interpolate(self.places, self.corners, owner, weights, self.place_starts)
+        return ops.interpolate(self.places, self.corners, face_index, weights, self.place_starts)
 
 
 def clip_near(world: Tensor, mesh: MeshBatch, camera: Camera | None, near: float, far: float) -> Clipped | None:

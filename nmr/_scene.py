@@ -38,7 +38,7 @@ Meshes = Tensor | Sequence[Tensor]
 class Scene(NamedTuple):
     """Checked arguments: meshes before and after the camera, and height and width of the raster.
 
-    If faces cross the near plane, ``clipped`` has the meshes that are drawn. Owner maps are then of these.
+    If faces cross the near plane, ``clipped`` has the meshes that are drawn. Face index maps are then of these.
     """
 
     world: Tensor
@@ -81,29 +81,32 @@ class Scene(NamedTuple):
         clear = ops.soft_silhouette(*self.drawn[:3], *self.raster, *settings)
         return 1 - average(clear.unsqueeze(-1), anti_aliasing).squeeze(-1)
 
-    def depth(self, owner: Tensor, anti_aliasing: bool, far: float) -> Tensor:
-        return ops.depth_image(*self.drawn[:3], owner, bool(anti_aliasing), float(far))
+    def depth(self, face_index: Tensor, anti_aliasing: bool, far: float) -> Tensor:
+        return ops.depth_image(*self.drawn[:3], face_index, bool(anti_aliasing), float(far))
 
-    def fragments(self, owner: Tensor, anti_aliasing: bool, far: float, eps: float) -> Fragments:
-        """Those of an owner map ``[B, H, W]``, or of layers ``[B, H, W, K]``."""
-        if owner.ndim == 4:
-            layers = [self._weights_and_depth(layer, far) for layer in owner.unbind(-1)]
+    def fragments(self, face_index: Tensor, anti_aliasing: bool, far: float, eps: float) -> Fragments:
+        """Those of a face index map ``[B, H, W]``, or of layers ``[B, H, W, K]``."""
+        if face_index.ndim == 4:
+            layers = [self._weights_and_depth(layer, far) for layer in face_index.unbind(-1)]
             weights, depth = (torch.stack(x, dim=3) for x in zip(*layers, strict=True))
         else:
-            weights, depth = self._weights_and_depth(owner, far)
-        drawn, drawn_owner = self.drawn, owner
+            weights, depth = self._weights_and_depth(face_index, far)
+        drawn, drawn_face_index = self.drawn, face_index
         if self.clipped is not None:
-            owner = self.clipped.owner(owner)
+            face_index = self.clipped.face_index(face_index)
         settings = bool(anti_aliasing), float(eps)
-        return Fragments(owner, weights, depth, self.mesh, self.world, self.camera, *settings, drawn, drawn_owner)
+        return Fragments(
+            face_index, weights, depth, self.mesh, self.world, self.camera, *settings, drawn, drawn_face_index
+        )
 
-    def _weights_and_depth(self, owner: Tensor, far: float) -> tuple[Tensor, Tensor]:
-        weights, depth = ops.fragments(*self.drawn[:3], owner, float(far))
-        return weights if self.clipped is None else self.clipped.weights(owner, weights), depth
+    def _weights_and_depth(self, face_index: Tensor, far: float) -> tuple[Tensor, Tensor]:
+        weights, depth = ops.fragments(*self.drawn[:3], face_index, float(far))
+        return weights if self.clipped is None else self.clipped.weights(face_index, weights), depth
 
-    def face_index(self, owner: Tensor) -> Tensor:
-        owner = owner if self.clipped is None else self.clipped.owner(owner)
-        return torch.where(owner >= self.mesh.num_faces, owner - self.mesh.num_faces, owner)
+    def face_index(self, face_index: Tensor) -> Tensor:
+        if self.clipped is not None:
+            face_index = self.clipped.face_index(face_index)
+        return torch.where(face_index >= self.mesh.num_faces, face_index - self.mesh.num_faces, face_index)
 
 
 def make_scene(
@@ -151,7 +154,7 @@ def shade(
     """The shaded raster ``[B, H, W, C]``, undefined where there is no face, and the background ``[B | 1, C]``."""
     if not interpolation_gradient:
         fragments = replace(fragments, weights=fragments.weights.detach())
-    shape = fragments.owner.shape
+    shape = fragments.sided_face_index.shape
     if lights is not None and not isinstance(lights, Lights):
         raise TypeError(f"lights must be nmr.Lights, got {describe(lights)}")
     image = None  # white, for the lights

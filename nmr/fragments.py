@@ -31,23 +31,24 @@ class Fragments:
 
     Attributes
     ----------
-    owner : int32 Tensor [B, H, W]
-        ``owner[b, y, x] = f``: face f is nearest and seen from its front; ``F + f``: from its back; -1: background.
+    sided_face_index : int32 Tensor [B, H, W]
+        Face index as :mod:`nmr.ops` takes it. ``sided_face_index[b, y, x] = f``: face f is nearest and seen from its
+        front; ``F + f``: from its back; -1: background. ``face_index`` and ``is_back`` say the same as two tensors.
     weights : Tensor [B, H, W, 3]
         Perspective-correct barycentric weights of the face's vertices in their own order; their sum is 1. 0 on
-        background. Differentiable in the vertices (at fixed owner). Use ``weights.detach()`` for NMR's definition, in
-        which colours move vertices only through edges.
+        background. Differentiable in the vertices (at fixed face indices). Use ``weights.detach()`` for NMR's
+        definition, in which colours move vertices only through edges.
     depth : Tensor [B, H, W]
-        z of the nearest point, ``far`` on background. Differentiable in the vertices (at fixed owner).
+        z of the nearest point, ``far`` on background. Differentiable in the vertices (at fixed face indices).
     vertices, faces
         The meshes in renderer space, ``[B, V, 3]``; for a list of meshes ``[N, 3]``, one mesh after the other.
 
-    With ``faces_per_pixel`` K > 1 these have one more axis: owner and depth ``[B, H, W, K]``, weights
+    With ``faces_per_pixel`` K > 1 these have one more axis: sided_face_index and depth ``[B, H, W, K]``, weights
     ``[B, H, W, K, 3]``, nearest first. So do the results of :meth:`interpolate`, :meth:`per_face`, :meth:`normals` and
     of the properties. For colours, lights and :meth:`resolve` take one :meth:`layer` at a time.
     """
 
-    owner: Tensor
+    sided_face_index: Tensor
     weights: Tensor
     depth: Tensor
     mesh: MeshBatch  # in renderer space
@@ -56,7 +57,7 @@ class Fragments:
     anti_aliasing: bool
     eps: float
     _drawn: MeshBatch  # the meshes as drawn: faces that cross the near plane are cut
-    _drawn_owner: Tensor | None  # None: surfaces behind others, which have no edge gradient
+    _drawn_face_index: Tensor | None  # None: surfaces behind others, which have no edge gradient
 
     @property
     def vertices(self) -> Tensor:
@@ -69,7 +70,7 @@ class Fragments:
     @property
     def layers(self) -> int | None:
         """K, or None without that axis."""
-        return self.owner.shape[3] if self.owner.ndim == 4 else None
+        return self.sided_face_index.shape[3] if self.sided_face_index.ndim == 4 else None
 
     def layer(self, k: int) -> Fragments:
         """The k-th nearest surfaces, without the axis for K: 0 is what is seen.
@@ -82,16 +83,16 @@ class Fragments:
             raise IndexError(f"layer {k} was requested of fragments with {have}; see faces_per_pixel")
         return replace(
             self,
-            owner=self.owner[..., k],
+            sided_face_index=self.sided_face_index[..., k],
             weights=self.weights[..., k, :],
             depth=self.depth[..., k],
-            _drawn_owner=self._drawn_owner[..., k] if k in (0, -self.layers) else None,
+            _drawn_face_index=self._drawn_face_index[..., k] if k in (0, -self.layers) else None,
         )
 
     def _wide(self) -> Fragments:
         """All layers side by side, as one raster ``[B, H, W K]``."""
-        owner, weights, depth = self.owner.flatten(2), self.weights.flatten(2, 3), self.depth.flatten(2)
-        return replace(self, owner=owner, weights=weights, depth=depth)
+        index, weights, depth = self.sided_face_index.flatten(2), self.weights.flatten(2, 3), self.depth.flatten(2)
+        return replace(self, sided_face_index=index, weights=weights, depth=depth)
 
     def _require_one_layer(self, what: str) -> None:
         if self.layers:
@@ -99,22 +100,22 @@ class Fragments:
 
     def _each_layer(self, raster: Tensor) -> Tensor:
         """Values ``[B, H, W K, C]`` of :meth:`_wide` as ``[B, H, W, K, C]``."""
-        return raster.unflatten(2, self.owner.shape[2:])
+        return raster.unflatten(2, self.sided_face_index.shape[2:])
 
     @property
     def covered(self) -> Tensor:
         """bool ``[B, H, W]``: some face is there."""
-        return self.owner >= 0
+        return self.sided_face_index >= 0
 
     @property
     def is_back(self) -> Tensor:
         """bool ``[B, H, W]``: the face there is seen from its back (its vertices run clockwise on the screen)."""
-        return self.owner >= self._num_faces
+        return self.sided_face_index >= self._num_faces
 
     @property
     def face_index(self) -> Tensor:
         """int32 ``[B, H, W]``: f where face f is nearest, seen from either side; -1 is background."""
-        return torch.where(self.is_back, self.owner - self._num_faces, self.owner)
+        return torch.where(self.is_back, self.sided_face_index - self._num_faces, self.sided_face_index)
 
     @property
     def _num_faces(self) -> int | Tensor:
@@ -138,7 +139,7 @@ class Fragments:
         if self.layers:
             return self._each_layer(self._wide()._interpolate(attributes, corners, name, corners_name))
         attributes, faces, starts = self._corner_values(attributes, corners, name, corners_name)
-        return ops.interpolate(attributes, faces, self.owner, self.weights, starts)
+        return ops.interpolate(attributes, faces, self.sided_face_index, self.weights, starts)
 
     def _corner_values(
         self, attributes: object, corners: object, name: str, corners_name: str
@@ -191,7 +192,7 @@ class Fragments:
         """
         world = self.world.expand(len(self.faces), -1, -1) if self.faces.ndim == 3 else self.world
         normals = ops.normals(world, self.faces, self.mesh.starts, smooth)
-        viewer, at = self._viewer(highlights), (self.faces, self.owner, self.weights, self.mesh.starts)
+        viewer, at = self._viewer(highlights), (self.faces, self.sided_face_index, self.weights, self.mesh.starts)
         points = usable(world) if positions else world.detach()
         return ops.lit(colors, normals, parameters, layout, viewer, points, *at, smooth)
 
@@ -223,15 +224,15 @@ class Fragments:
         several lengths; the longest counts that lies in front of the eye as a whole.
         """
         with torch.no_grad():
-            batch, pixels = self.owner.shape[0], self.owner.shape[1:].numel()
+            batch, pixels = self.sided_face_index.shape[0], self.sided_face_index.shape[1:].numel()
             depth = torch.where(self.covered, self.depth, -1.0).reshape(batch, pixels)
             farthest = depth.argmax(1)
-            images = torch.arange(batch, device=self.owner.device)
+            images = torch.arange(batch, device=self.sided_face_index.device)
             weights = self.weights.reshape(batch, pixels, 3)[images, farthest]
-            owner = self.owner.reshape(batch, pixels)[images, farthest]
+            face_index = self.sided_face_index.reshape(batch, pixels)[images, farthest]
             world = usable(self.world)
             at = weights.view(batch, 1, 1, 3), self.mesh.starts
-            point = ops.interpolate(world, self.faces, owner.view(batch, 1, 1).contiguous(), *at).view(batch, 1, 3)
+            point = ops.interpolate(world, self.faces, face_index.view(batch, 1, 1).contiguous(), *at).view(batch, 1, 3)
             if self.mesh.starts is None:
                 extent = (world.amax(1) - world.amin(1)).amax(-1) if world.shape[1] else world.new_ones(len(world))
             else:
@@ -267,7 +268,7 @@ class Fragments:
             If image is not a float tensor [B, H, W, C] of the dtype of the vertices.
         """
         image = cast_under_autocast(image)
-        if self.layers or self._drawn_owner is None:
+        if self.layers or self._drawn_face_index is None:
             raise ValueError(
                 "only the nearest surfaces can be resolved, because NMR's gradient is that of the edges that are seen: "
                 "combine the layers into one image [B, H, W, C] and call fragments.layer(0).resolve(image)"
@@ -276,13 +277,13 @@ class Fragments:
             raise TypeError(
                 f"image must be a tensor of {self.vertices.dtype}, as the vertices are, got {describe(image)}"
             )
-        if image.ndim != 4 or image.shape[:3] != self.owner.shape:
-            raise ValueError(f"image must have shape {[*self.owner.shape, 'C']}, got {describe(image)}")
+        if image.ndim != 4 or image.shape[:3] != self.sided_face_index.shape:
+            raise ValueError(f"image must have shape {[*self.sided_face_index.shape, 'C']}, got {describe(image)}")
         return self._resolve(image, None)
 
     def _resolve(self, image: Tensor, background: Tensor | None) -> Tensor:
         """The same; pixels without a face have the colour ``background [B | 1, C]``, if it is given."""
-        return ops.resolve(image, background, *self._drawn[:3], self._drawn_owner, self.anti_aliasing, self.eps)
+        return ops.resolve(image, background, *self._drawn[:3], self._drawn_face_index, self.anti_aliasing, self.eps)
 
 
 def usable(points: Tensor) -> Tensor:

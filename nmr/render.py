@@ -99,19 +99,19 @@ def render(
             "other rgb images with gradient 'nmr'"
         )
     if white or ("alpha" in images and "rgb" not in images):
-        alpha, owner = scene.silhouette(anti_aliasing, fill_back, near, far, eps, gradient == "local")
+        alpha, face_index = scene.silhouette(anti_aliasing, fill_back, near, far, eps, gradient == "local")
         if "alpha" in images:
             images["alpha"] = alpha
         if white:
             covered = alpha.unsqueeze(-1)
             images["rgb"] = covered + (1 - covered) * behind[:, None, None]
     else:
-        owner = scene.rasterize(fill_back, near, far)
+        face_index = scene.rasterize(fill_back, near, far)
     if "depth" in images:
-        images["depth"] = scene.depth(owner, anti_aliasing, far)
+        images["depth"] = scene.depth(face_index, anti_aliasing, far)
     shaded = "rgb" in images and not white
     if shaded or "normals" in images or "fragments" in images:
-        fragments = scene.fragments(owner, anti_aliasing, far, eps)
+        fragments = scene.fragments(face_index, anti_aliasing, far, eps)
         if shaded:
             image, behind = shade(fragments, colors, lights, background, interpolation_gradient)
             if "alpha" in images:
@@ -452,8 +452,8 @@ def render_fragments(
     -------
     Fragments
         h x w pixels; with ``anti_aliasing`` 2h x 2w pixels, which :meth:`Fragments.resolve` averages. With K > 1,
-        ``owner[b, y, x, k]`` is the face of the k-th nearest surface, -1 behind the last one (there weights are 0 and
-        depth is ``far``). Of equally near faces the first one comes first.
+        ``sided_face_index[b, y, x, k]`` is the face of the k-th nearest surface, -1 behind the last one (there
+        weights are 0 and depth is ``far``). Of equally near faces the first one comes first.
 
     Notes
     -----
@@ -478,10 +478,10 @@ def render_fragments(
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
     layers = check_size(faces_per_pixel, "faces_per_pixel", 1024)
     if layers == 1:
-        owner = scene.rasterize(fill_back, near, far)
+        face_index = scene.rasterize(fill_back, near, far)
     else:
-        owner = scene.rasterize_layers(layers, fill_back, near, far)
-    return scene.fragments(owner, anti_aliasing, far, eps)
+        face_index = scene.rasterize_layers(layers, fill_back, near, far)
+    return scene.fragments(face_index, anti_aliasing, far, eps)
 
 
 @torch.no_grad()
@@ -516,5 +516,5 @@ def render_face_index(
     >>> seen = torch.unique(face_index[face_index >= 0])
     """
     scene = make_scene(vertices, faces, camera, image_size, False, near, far, clip)
-    owner = scene.rasterize(fill_back, near, far)
-    return scene.face_index(owner)
+    face_index = scene.rasterize(fill_back, near, far)
+    return scene.face_index(face_index)

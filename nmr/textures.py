@@ -137,7 +137,7 @@ class TextureCubes:
         textures = check_values(self.textures, "textures", "F, ts, ts, ts, C")
         textures = fragments.mesh.values(textures, "textures", "face")
         return ops.sample_texture_cubes(
-            textures, fragments.owner, fragments.weights, fragments.mesh.starts, fragments.eps
+            textures, fragments.sided_face_index, fragments.weights, fragments.mesh.starts, fragments.eps
         )
 
 
@@ -208,7 +208,7 @@ class UVTexture:
         """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
         fragments._require_one_layer("texture images")
         attributes, corners, starts = fragments._corner_values(self.uv, self.uv_faces, "uv", "uv_faces")
-        at = attributes, corners, fragments.owner, fragments.weights, starts
+        at = attributes, corners, fragments.sided_face_index, fragments.weights, starts
         texels, grids, count = self._texels(fragments)
         level = None
         if self.filter == "mipmap":

@@ -128,29 +128,31 @@ MeshBatch<T> mesh_batch(const Array<T>& vertices, const Indices& faces, const st
   return mesh;
 }
 
-// The raster of an owner map [B, H, W]; each of its entries must name a face of its image, or a reversed copy of one.
+// The raster of a face index map [B, H, W]; each of its entries must name a face of its image, or a reversed copy of
+// one.
 template <class FaceCount>
-Size require_owner(const Array<int32_t>& owner, int64_t batch, const FaceCount& face_count, int num_threads) {
-  require(owner.ndim() == 3 && owner.shape(0) == batch,
-          "owner must have shape [" + std::to_string(batch) + ", H, W], got " + shape_of(owner));
-  const int64_t pixels = owner.shape(1) * owner.shape(2);
-  const int32_t* entries = owner.data();
+Size require_face_index(const Array<int32_t>& face_index, int64_t batch, const FaceCount& face_count, int num_threads) {
+  require(face_index.ndim() == 3 && face_index.shape(0) == batch,
+          "face_index must have shape [" + std::to_string(batch) + ", H, W], got " + shape_of(face_index));
+  const int64_t pixels = face_index.shape(1) * face_index.shape(2);
+  const int32_t* entries = face_index.data();
   const py::gil_scoped_release release;
   parallel_for(batch, num_threads, [&](int64_t b) {
-    require(are_owners(entries + b * pixels, pixels, face_count(b)), "the owner map does not belong to these faces");
+    require(are_face_indices(entries + b * pixels, pixels, face_count(b)),
+            "the face index map does not belong to these faces");
   });
-  return {owner.shape(1), owner.shape(2)};
+  return {face_index.shape(1), face_index.shape(2)};
 }
 
 template <class T>
-Size require_owner(const Array<int32_t>& owner, const MeshBatch<T>& mesh, int num_threads) {
-  return require_owner(owner, mesh.batch, [&](int64_t b) { return mesh.face_count(b); }, num_threads);
+Size require_face_index(const Array<int32_t>& face_index, const MeshBatch<T>& mesh, int num_threads) {
+  return require_face_index(face_index, mesh.batch, [&](int64_t b) { return mesh.face_count(b); }, num_threads);
 }
 
 // The image of a raster: half its size with anti-aliasing.
-inline Size require_image(const Array<int32_t>& owner, Size raster, bool anti_aliasing) {
+inline Size require_image(const Array<int32_t>& face_index, Size raster, bool anti_aliasing) {
   require(!anti_aliasing || (raster.height % 2 == 0 && raster.width % 2 == 0),
-          "an anti-aliased owner map has an even size, got " + shape_of(owner));
+          "an anti-aliased face index map has an even size, got " + shape_of(face_index));
   return anti_aliasing ? Size{raster.height / 2, raster.width / 2} : raster;
 }
 

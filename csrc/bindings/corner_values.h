@@ -5,20 +5,20 @@
 
 namespace nmr {
 
-// Checks weights [B, H, W, 3] and an owner map of the given number of faces (packed: those of starts).
+// Checks weights [B, H, W, 3] and a face index map of the given number of faces (packed: those of starts).
 template <class T>
-void require_fragments(const Array<int32_t>& owner, const Array<T>& weights, const std::optional<Indices>& starts,
+void require_fragments(const Array<int32_t>& face_index, const Array<T>& weights, const std::optional<Indices>& starts,
                        int64_t num_faces, int num_threads) {
-  const int64_t batch = starts ? starts->shape(0) - 1 : owner.ndim() == 3 ? owner.shape(0) : 0;
+  const int64_t batch = starts ? starts->shape(0) - 1 : face_index.ndim() == 3 ? face_index.shape(0) : 0;
   const int64_t* s = starts ? starts->data() : nullptr;
-  const Size raster =
-      require_owner(owner, batch, [&](int64_t b) { return s ? s[2 * b + 3] - s[2 * b + 1] : num_faces; }, num_threads);
+  const Size raster = require_face_index(
+      face_index, batch, [&](int64_t b) { return s ? s[2 * b + 3] - s[2 * b + 1] : num_faces; }, num_threads);
   require_shape(weights, "weights", {batch, raster.height, raster.width, 3});
 }
 
 // Checks values at the corners of faces, and every index among them.
 template <class T>
-Interpolate<T> interpolate_args(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& owner,
+Interpolate<T> interpolate_args(const Array<T>& attributes, const Indices& corners, const Array<int32_t>& face_index,
                                 const Array<T>& weights, const std::optional<Indices>& starts, int num_threads) {
   const bool packed = starts.has_value(), per_image = corners.ndim() == 3;
   require(attributes.ndim() == (packed ? 2 : 3) && attributes.shape(attributes.ndim() - 1) >= 1,
@@ -29,8 +29,8 @@ Interpolate<T> interpolate_args(const Array<T>& attributes, const Indices& corne
               shape_of(corners));
   const int64_t num_attributes = attributes.shape(packed ? 0 : 1), num_faces = corners.shape(per_image ? 1 : 0);
   if (packed) require_starts(*starts, num_attributes, num_faces);
-  require_fragments(owner, weights, starts, num_faces, num_threads);
-  const int64_t batch = owner.shape(0), attribute_batch = packed ? 1 : attributes.shape(0);
+  require_fragments(face_index, weights, starts, num_faces, num_threads);
+  const int64_t batch = face_index.shape(0), attribute_batch = packed ? 1 : attributes.shape(0);
   require(packed || attribute_batch == 1 || attribute_batch == batch,
           "attributes must have the batch size " + std::to_string(batch) + " or 1, got " + shape_of(attributes));
   require(!per_image || corners.shape(0) == batch,
@@ -42,10 +42,10 @@ Interpolate<T> interpolate_args(const Array<T>& attributes, const Indices& corne
   }
   if (!packed) require_indices(corners.data(), corners.size(), num_attributes, "corners", "attribute", "attributes");
   Interpolate<T> args{};
-  args.owner = owner.data();
+  args.face_index = face_index.data();
   args.weights = weights.data();
   args.batch = batch;
-  args.raster = {owner.shape(1), owner.shape(2)};
+  args.raster = {face_index.shape(1), face_index.shape(2)};
   args.attributes = attributes.data();
   args.attribute_batch = attribute_batch;
   args.num_attributes = num_attributes;

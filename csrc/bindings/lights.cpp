@@ -77,10 +77,10 @@ inline void require_layout(const Indices& layout, int64_t num_parameters, int64_
 template <class T>
 Lit<T> lit_args(const std::optional<Array<T>>& colors, const Array<T>& normals,
                 const std::optional<Array<T>>& parameters, const Indices& layout, const Array<T>& viewer,
-                const Array<T>& vertices, const Indices& faces, const Array<int32_t>& owner, const Array<T>& weights,
-                const std::optional<Indices>& starts, bool smooth, int num_threads) {
+                const Array<T>& vertices, const Indices& faces, const Array<int32_t>& face_index,
+                const Array<T>& weights, const std::optional<Indices>& starts, bool smooth, int num_threads) {
   Lit<T> args{};
-  args.at = interpolate_args(vertices, faces, owner, weights, starts, num_threads);
+  args.at = interpolate_args(vertices, faces, face_index, weights, starts, num_threads);
   require(args.at.channels == 3, "vertices must have 3 coordinates, got " + shape_of(vertices));
   const int64_t rows = smooth ? args.at.num_attributes : args.at.num_faces, batch = args.at.batch;
   if (starts) {
@@ -115,11 +115,11 @@ Lit<T> lit_args(const std::optional<Array<T>>& colors, const Array<T>& normals,
 template <class T>
 void lit_forward_py(const std::optional<Array<T>>& colors, const Array<T>& normals,
                     const std::optional<Array<T>>& parameters, const Indices& layout, const Array<T>& viewer,
-                    const Array<T>& vertices, const Indices& faces, const Array<int32_t>& owner,
+                    const Array<T>& vertices, const Indices& faces, const Array<int32_t>& face_index,
                     const Array<T>& weights, const std::optional<Indices>& starts, bool smooth, Array<T>& lit,
                     int num_threads) {
-  Lit<T> args = lit_args(colors, normals, parameters, layout, viewer, vertices, faces, owner, weights, starts, smooth,
-                         num_threads);
+  Lit<T> args = lit_args(colors, normals, parameters, layout, viewer, vertices, faces, face_index, weights, starts,
+                         smooth, num_threads);
   require_shape(lit, "lit", {args.at.batch, args.at.raster.height, args.at.raster.width, 3});
   args.lit = lit.mutable_data();
   py::gil_scoped_release release;
@@ -129,13 +129,13 @@ void lit_forward_py(const std::optional<Array<T>>& colors, const Array<T>& norma
 template <class T>
 void lit_backward_py(const std::optional<Array<T>>& colors, const Array<T>& normals,
                      const std::optional<Array<T>>& parameters, const Indices& layout, const Array<T>& viewer,
-                     const Array<T>& vertices, const Indices& faces, const Array<int32_t>& owner,
+                     const Array<T>& vertices, const Indices& faces, const Array<int32_t>& face_index,
                      const Array<T>& weights, const std::optional<Indices>& starts, bool smooth,
                      const Array<T>& grad_lit, std::optional<Array<T>> grad_colors,
                      std::optional<Array<T>> grad_normals, std::optional<Array<T>> grad_parameters,
                      std::optional<Array<T>> grad_vertices, std::optional<Array<T>> grad_weights, int num_threads) {
-  Lit<T> args = lit_args(colors, normals, parameters, layout, viewer, vertices, faces, owner, weights, starts, smooth,
-                         num_threads);
+  Lit<T> args = lit_args(colors, normals, parameters, layout, viewer, vertices, faces, face_index, weights, starts,
+                         smooth, num_threads);
   require_shape(grad_lit, "grad_lit", {args.at.batch, args.at.raster.height, args.at.raster.width, 3});
   args.grad_lit = grad_lit.data();
   if (colors) args.grad_colors = optional_like(grad_colors, "grad_colors", *colors);
@@ -154,10 +154,10 @@ void define_lights(py::module_& m) {
   m.def("normals_backward", &normals_backward_py<T>, array("vertices"), array("faces"), array("starts"),
         py::arg("smooth"), array("grad_normals"), array("grad_vertices"), py::arg("num_threads"));
   m.def("lit_forward", &lit_forward_py<T>, array("colors"), array("normals"), array("parameters"), array("layout"),
-        array("viewer"), array("vertices"), array("faces"), array("owner"), array("weights"), array("starts"),
+        array("viewer"), array("vertices"), array("faces"), array("face_index"), array("weights"), array("starts"),
         py::arg("smooth"), array("lit"), py::arg("num_threads"));
   m.def("lit_backward", &lit_backward_py<T>, array("colors"), array("normals"), array("parameters"), array("layout"),
-        array("viewer"), array("vertices"), array("faces"), array("owner"), array("weights"), array("starts"),
+        array("viewer"), array("vertices"), array("faces"), array("face_index"), array("weights"), array("starts"),
         py::arg("smooth"), array("grad_lit"), array("grad_colors"), array("grad_normals"), array("grad_parameters"),
         array("grad_vertices"), array("grad_weights"), py::arg("num_threads"));
 }

@@ -75,9 +75,9 @@ void mipmaps_backward_py(const Array<T>& grad_pyramid, const Indices& grids, Arr
 // --- levels
 
 template <class T>
-Interpolate<T> uv_args(const Array<T>& uv, const Indices& corners, const Array<int32_t>& owner, const Array<T>& weights,
-                       const std::optional<Indices>& starts, int num_threads) {
-  const Interpolate<T> args = interpolate_args(uv, corners, owner, weights, starts, num_threads);
+Interpolate<T> uv_args(const Array<T>& uv, const Indices& corners, const Array<int32_t>& face_index,
+                       const Array<T>& weights, const std::optional<Indices>& starts, int num_threads) {
+  const Interpolate<T> args = interpolate_args(uv, corners, face_index, weights, starts, num_threads);
   require(args.channels == 2, "uv must have 2 channels, got " + shape_of(uv));
   return args;
 }
@@ -89,18 +89,18 @@ inline void require_images(int64_t images, int64_t batch) {
 
 template <class T>
 void uv_levels_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& mesh_starts,
-                  const Array<T>& uv, const Indices& corners, const Array<int32_t>& owner, const Array<T>& weights,
+                  const Array<T>& uv, const Indices& corners, const Array<int32_t>& face_index, const Array<T>& weights,
                   const std::optional<Indices>& starts, const Indices& grids, Array<T>& level, int num_threads) {
   UVLevels<T> args{};
   args.mesh = mesh_batch(vertices, faces, mesh_starts);
-  args.uv = uv_args(uv, corners, owner, weights, starts, num_threads);
-  require_owner(owner, args.mesh, num_threads);
+  args.uv = uv_args(uv, corners, face_index, weights, starts, num_threads);
+  require_face_index(face_index, args.mesh, num_threads);
   require(grids.ndim() == 3, "grids must have shape [I, L, 3], got " + shape_of(grids));
   args.images = require_grids(grids, (int64_t(1) << 31) - 1);
   require_images(args.images, args.uv.batch);
   args.grids = grids.data();
   args.levels = grids.shape(1);
-  require_like(level, "level", owner);
+  require_like(level, "level", face_index);
   args.level = level.mutable_data();
   py::gil_scoped_release release;
   uv_levels(args);
@@ -110,10 +110,10 @@ void uv_levels_py(const Array<T>& vertices, const Indices& faces, const std::opt
 
 template <class T>
 SampleUV<T> sample_args(const Array<T>& texels, const Indices& grids, const std::optional<Array<T>>& level,
-                        const Array<T>& uv, const Indices& corners, const Array<int32_t>& owner,
+                        const Array<T>& uv, const Indices& corners, const Array<int32_t>& face_index,
                         const Array<T>& weights, const std::optional<Indices>& starts, int wrap, int num_threads) {
   SampleUV<T> args{};
-  args.uv = uv_args(uv, corners, owner, weights, starts, num_threads);
+  args.uv = uv_args(uv, corners, face_index, weights, starts, num_threads);
   args.texels = texels.data();
   args.num_texels = require_texels(texels, "texels");
   args.channels = texels.shape(1);
@@ -122,7 +122,7 @@ SampleUV<T> sample_args(const Array<T>& texels, const Indices& grids, const std:
   args.grids = grids.data();
   args.levels = grids.shape(1);
   if (level) {
-    require_like(*level, "level", owner);
+    require_like(*level, "level", face_index);
     args.level = level->data();
   }
   require(wrap >= 0 && wrap <= 2, "wrap must be 0, 1 or 2, got " + std::to_string(wrap));
@@ -132,10 +132,10 @@ SampleUV<T> sample_args(const Array<T>& texels, const Indices& grids, const std:
 
 template <class T>
 void sample_uv_forward_py(const Array<T>& texels, const Indices& grids, const std::optional<Array<T>>& level,
-                          const Array<T>& uv, const Indices& corners, const Array<int32_t>& owner,
+                          const Array<T>& uv, const Indices& corners, const Array<int32_t>& face_index,
                           const Array<T>& weights, const std::optional<Indices>& starts, int wrap, Array<T>& colors,
                           int num_threads) {
-  SampleUV<T> args = sample_args(texels, grids, level, uv, corners, owner, weights, starts, wrap, num_threads);
+  SampleUV<T> args = sample_args(texels, grids, level, uv, corners, face_index, weights, starts, wrap, num_threads);
   require_shape(colors, "colors", {args.uv.batch, args.uv.raster.height, args.uv.raster.width, args.channels});
   args.colors = colors.mutable_data();
   py::gil_scoped_release release;
@@ -144,11 +144,11 @@ void sample_uv_forward_py(const Array<T>& texels, const Indices& grids, const st
 
 template <class T>
 void sample_uv_backward_py(const Array<T>& texels, const Indices& grids, const std::optional<Array<T>>& level,
-                           const Array<T>& uv, const Indices& corners, const Array<int32_t>& owner,
+                           const Array<T>& uv, const Indices& corners, const Array<int32_t>& face_index,
                            const Array<T>& weights, const std::optional<Indices>& starts, int wrap,
                            const Array<T>& grad_colors, std::optional<Array<T>> grad_texels,
                            std::optional<Array<T>> grad_uv, std::optional<Array<T>> grad_weights, int num_threads) {
-  SampleUV<T> args = sample_args(texels, grids, level, uv, corners, owner, weights, starts, wrap, num_threads);
+  SampleUV<T> args = sample_args(texels, grids, level, uv, corners, face_index, weights, starts, wrap, num_threads);
   require_shape(grad_colors, "grad_colors",
                 {args.uv.batch, args.uv.raster.height, args.uv.raster.width, args.channels});
   args.grad_colors = grad_colors.data();
@@ -166,13 +166,13 @@ void define_texture(py::module_& m) {
   m.def("mipmaps_backward", &mipmaps_backward_py<T>, array("grad_pyramid"), array("grids"), array("grad_texels"),
         py::arg("num_threads"));
   m.def("uv_levels", &uv_levels_py<T>, array("vertices"), array("faces"), array("mesh_starts"), array("uv"),
-        array("corners"), array("owner"), array("weights"), array("starts"), array("grids"), array("level"),
+        array("corners"), array("face_index"), array("weights"), array("starts"), array("grids"), array("level"),
         py::arg("num_threads"));
   m.def("sample_uv_forward", &sample_uv_forward_py<T>, array("texels"), array("grids"), array("level"), array("uv"),
-        array("corners"), array("owner"), array("weights"), array("starts"), py::arg("wrap"), array("colors"),
+        array("corners"), array("face_index"), array("weights"), array("starts"), py::arg("wrap"), array("colors"),
         py::arg("num_threads"));
   m.def("sample_uv_backward", &sample_uv_backward_py<T>, array("texels"), array("grids"), array("level"), array("uv"),
-        array("corners"), array("owner"), array("weights"), array("starts"), py::arg("wrap"), array("grad_colors"),
+        array("corners"), array("face_index"), array("weights"), array("starts"), py::arg("wrap"), array("grad_colors"),
         array("grad_texels"), array("grad_uv"), array("grad_weights"), py::arg("num_threads"));
 }
 

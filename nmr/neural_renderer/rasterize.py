@@ -31,9 +31,9 @@ class _Cubes:
     def sample(self, fragments: Fragments) -> Tensor:
         if self.textures is None:
             raise ValueError("RGB images need textures [B, F, ts, ts, ts, 3], got None")
-        owner, weights, batch = fragments.owner, fragments.weights, fragments.mesh.batch
+        face_index, weights, batch = fragments.sided_face_index, fragments.weights, fragments.mesh.batch
         textures = check_textures(self.textures, batch, fragments.faces.shape[-2]).to(weights)
-        colors = ops.sample_texture_cubes(textures, owner, weights, None, fragments.eps)
+        colors = ops.sample_texture_cubes(textures, face_index, weights, None, fragments.eps)
         if self.light is None:
             return colors
         if self.light.shape[0] not in (1, batch):
@@ -42,8 +42,8 @@ class _Cubes:
             raise ValueError(f"light has three colours: textures must have 1 or 3 channels, got {colors.shape[-1]}")
         # Faces seen from behind have numbers and lights of their own. For this operator they are further faces; the
         # three corners of a face have the same value.
-        corners = torch.arange(self.light.shape[1], device=owner.device)[:, None].expand(-1, 3)
-        return colors * ops.interpolate(self.light, corners, owner, weights, None)
+        corners = torch.arange(self.light.shape[1], device=face_index.device)[:, None].expand(-1, 3)
+        return colors * ops.interpolate(self.light, corners, face_index, weights, None)
 
 
 def draw(

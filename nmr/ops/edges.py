@@ -22,7 +22,7 @@ def resolve(
     vertices: Tensor,
     faces: Tensor,
     starts: Tensor | None,
-    owner: Tensor,
+    face_index: Tensor,
     anti_aliasing: bool,
     eps: float,
 ) -> Tensor:
@@ -32,13 +32,13 @@ def resolve(
     ``image`` and ``background`` are those of the mean. That in x and y of ``vertices`` is NMR's, summed over channels.
     """
     resolved = host_empty(_image_shape(image, anti_aliasing), dtype=image.dtype)
-    arrays = map(host_array, (image, background, owner))
+    arrays = map(host_array, (image, background, face_index))
     _C.resolve_forward(*arrays, resolved.numpy(), anti_aliasing, num_threads())
     return resolved.to(image.device)
 
 
 @torch.library.register_fake(resolve)
-def _(image, background, vertices, faces, starts, owner, anti_aliasing, eps):
+def _(image, background, vertices, faces, starts, face_index, anti_aliasing, eps):
     return image.new_empty(_image_shape(image, anti_aliasing))
 
 
@@ -48,16 +48,16 @@ def _resolve_setup(ctx, inputs, output):
 
 
 def _resolve_backward(ctx, grad_resolved):
-    image, background, vertices, faces, starts, owner = ctx.saved_tensors
+    image, background, vertices, faces, starts, face_index = ctx.saved_tensors
     of_image, of_background, of_vertices = ctx.needs_input_grad[:3]
     grad_image = grad_background = grad_vertices = None
     if of_image or of_background:
         wanted = ctx.anti_aliasing, of_image, of_background
-        grad_image, grad_background = resolve_backward(grad_resolved, background, owner, *wanted)
+        grad_image, grad_background = resolve_backward(grad_resolved, background, face_index, *wanted)
     if of_background and background.shape[0] == 1:
         grad_background = grad_background.sum(0, keepdim=True)
     if of_vertices:
-        mesh = vertices, faces, starts, owner
+        mesh = vertices, faces, starts, face_index
         grad_vertices = edges_backward(*mesh, image, background, grad_resolved, ctx.anti_aliasing, ctx.eps)
     grads = grad_image if of_image else None, grad_background if of_background else None, grad_vertices
     return *grads, None, None, None, None, None
@@ -66,25 +66,25 @@ def _resolve_backward(ctx, grad_resolved):
 register_autograd(resolve, _resolve_backward, _resolve_setup)
 
 
-def _resolve_grad_shapes(grad_resolved, owner, of_image, of_background):
+def _resolve_grad_shapes(grad_resolved, face_index, of_image, of_background):
     batch, channels = grad_resolved.shape[0], grad_resolved.shape[3]
-    return (*owner.shape, channels) if of_image else (0,), (batch, channels) if of_background else (0,)
+    return (*face_index.shape, channels) if of_image else (0,), (batch, channels) if of_background else (0,)
 
 
 @operator
 def resolve_backward(
     grad_resolved: Tensor,
     background: Tensor | None,
-    owner: Tensor,
+    face_index: Tensor,
     anti_aliasing: bool,
     of_image: bool,
     of_background: bool,
 ) -> tuple[Tensor, Tensor]:
     """Gradients ``[B, H, W, C]`` and ``[B, C]`` of the mean in :func:`resolve`; one that is not requested is empty."""
-    shapes = _resolve_grad_shapes(grad_resolved, owner, of_image, of_background)
+    shapes = _resolve_grad_shapes(grad_resolved, face_index, of_image, of_background)
     grads = [host_empty(shape, dtype=grad_resolved.dtype) for shape in shapes]
     _C.resolve_backward(
-        *map(host_array, (grad_resolved, background, owner)),
+        *map(host_array, (grad_resolved, background, face_index)),
         grads[0].numpy() if of_image else None,
         grads[1].numpy() if of_background else None,
         anti_aliasing,
@@ -94,8 +94,8 @@ def resolve_backward(
 
 
 @torch.library.register_fake(resolve_backward)
-def _(grad_resolved, background, owner, anti_aliasing, of_image, of_background):
-    shapes = _resolve_grad_shapes(grad_resolved, owner, of_image, of_background)
+def _(grad_resolved, background, face_index, anti_aliasing, of_image, of_background):
+    shapes = _resolve_grad_shapes(grad_resolved, face_index, of_image, of_background)
     return grad_resolved.new_empty(shapes[0]), grad_resolved.new_empty(shapes[1])
 
 
@@ -107,7 +107,7 @@ def edges_backward(
     vertices: Tensor,
     faces: Tensor,
     starts: Tensor | None,
-    owner: Tensor,
+    face_index: Tensor,
     image: Tensor,
     background: Tensor | None,
     grad_resolved: Tensor,
@@ -119,13 +119,13 @@ def edges_backward(
     If an upstream gradient of an image is not finite, those of all its visible faces are NaN.
     """
     grad_vertices = host_empty(vertices.shape, dtype=vertices.dtype)
-    arrays = map(host_array, (vertices, faces, starts, owner, image, background, grad_resolved))
+    arrays = map(host_array, (vertices, faces, starts, face_index, image, background, grad_resolved))
     _C.edges_backward(*arrays, grad_vertices.numpy(), anti_aliasing, eps, num_threads())
     return grad_vertices.to(vertices.device)
 
 
 @torch.library.register_fake(edges_backward)
-def _(vertices, faces, starts, owner, image, background, grad_resolved, anti_aliasing, eps):
+def _(vertices, faces, starts, face_index, image, background, grad_resolved, anti_aliasing, eps):
     return vertices.new_empty(vertices.shape)
 
 

@@ -1,4 +1,4 @@
-"""Operators: barycentric weights and depth of the owner at each pixel, and depth images."""
+"""Operators: barycentric weights and depth of the nearest face at each pixel, and depth images."""
 
 import torch
 from torch import Tensor
@@ -14,24 +14,24 @@ def fragments(
     vertices: Tensor,
     faces: Tensor,
     starts: Tensor | None,
-    owner: Tensor,
+    face_index: Tensor,
     far: float,
 ) -> tuple[Tensor, Tensor]:
-    """Perspective-correct weights ``[B, H, W, 3]`` of the owner's own vertices 0, 1, 2, and depth ``[B, H, W]``.
+    """Perspective-correct weights ``[B, H, W, 3]`` of the nearest face's own vertices 0, 1, 2, and depth ``[B, H, W]``.
 
-    On the background the weights are 0 and the depth is ``far``. Both are differentiable in the vertices at a fixed
-    owner.
+    On the background the weights are 0 and the depth is ``far``. Both are differentiable in the vertices at fixed
+    face indices.
     """
-    weights = host_empty((*owner.shape, 3), dtype=vertices.dtype)
-    depth = host_empty(owner.shape, dtype=vertices.dtype)
-    arrays = host_array(vertices), host_array(faces), host_array(starts), host_array(owner)
+    weights = host_empty((*face_index.shape, 3), dtype=vertices.dtype)
+    depth = host_empty(face_index.shape, dtype=vertices.dtype)
+    arrays = host_array(vertices), host_array(faces), host_array(starts), host_array(face_index)
     _C.fragments_forward(*arrays, weights.numpy(), depth.numpy(), far, num_threads())
     return weights.to(vertices.device), depth.to(vertices.device)
 
 
 @torch.library.register_fake(fragments)
-def _(vertices, faces, starts, owner, far):
-    return vertices.new_empty((*owner.shape, 3)), vertices.new_empty(owner.shape)
+def _(vertices, faces, starts, face_index, far):
+    return vertices.new_empty((*face_index.shape, 3)), vertices.new_empty(face_index.shape)
 
 
 def _fragments_setup(ctx, inputs, output):
@@ -54,19 +54,19 @@ def fragments_backward(
     vertices: Tensor,
     faces: Tensor,
     starts: Tensor | None,
-    owner: Tensor,
+    face_index: Tensor,
     grad_weights: Tensor | None,
     grad_depth: Tensor | None,
 ) -> Tensor:
     """Gradient of :func:`fragments`, of the shape of ``vertices``; a gradient that is None counts as zero."""
     grad_vertices = host_empty(vertices.shape, dtype=vertices.dtype)
-    arrays = vertices, faces, starts, owner, grad_weights, grad_depth
+    arrays = vertices, faces, starts, face_index, grad_weights, grad_depth
     _C.fragments_backward(*map(host_array, arrays), grad_vertices.numpy(), num_threads())
     return grad_vertices.to(vertices.device)
 
 
 @torch.library.register_fake(fragments_backward)
-def _(vertices, faces, starts, owner, grad_weights, grad_depth):
+def _(vertices, faces, starts, face_index, grad_weights, grad_depth):
     return vertices.new_empty(vertices.shape)
 
 
@@ -76,9 +76,9 @@ register_autograd(fragments_backward, no_second_derivative("render_fragments"))
 # --- depth image
 
 
-def _image_shape(owner, anti_aliasing) -> tuple[int, int, int]:
+def _image_shape(face_index, anti_aliasing) -> tuple[int, int, int]:
     scale = 2 if anti_aliasing else 1
-    return owner.shape[0], owner.shape[1] // scale, owner.shape[2] // scale
+    return face_index.shape[0], face_index.shape[1] // scale, face_index.shape[2] // scale
 
 
 @operator
@@ -86,23 +86,23 @@ def depth_image(
     vertices: Tensor,
     faces: Tensor,
     starts: Tensor | None,
-    owner: Tensor,
+    face_index: Tensor,
     anti_aliasing: bool,
     far: float,
 ) -> Tensor:
-    """Depth ``[B, h, w]`` of an owner map; with anti-aliasing the mean of 2x2 pixels, ``far`` mixed in.
+    """Depth ``[B, h, w]`` of a face index map; with anti-aliasing the mean of 2x2 pixels, ``far`` mixed in.
 
-    The same numbers as the depth of :func:`fragments`, with a true derivative at a fixed owner, but faster.
+    The same numbers as the depth of :func:`fragments`, with a true derivative at fixed face indices, but faster.
     """
-    depth = host_empty(_image_shape(owner, anti_aliasing), dtype=vertices.dtype)
-    arrays = host_array(vertices), host_array(faces), host_array(starts), host_array(owner)
+    depth = host_empty(_image_shape(face_index, anti_aliasing), dtype=vertices.dtype)
+    arrays = host_array(vertices), host_array(faces), host_array(starts), host_array(face_index)
     _C.depth_forward(*arrays, depth.numpy(), anti_aliasing, far, num_threads())
     return depth.to(vertices.device)
 
 
 @torch.library.register_fake(depth_image)
-def _(vertices, faces, starts, owner, anti_aliasing, far):
-    return vertices.new_empty(_image_shape(owner, anti_aliasing))
+def _(vertices, faces, starts, face_index, anti_aliasing, far):
+    return vertices.new_empty(_image_shape(face_index, anti_aliasing))
 
 
 def _depth_setup(ctx, inputs, output):
@@ -122,19 +122,19 @@ def depth_backward(
     vertices: Tensor,
     faces: Tensor,
     starts: Tensor | None,
-    owner: Tensor,
+    face_index: Tensor,
     grad_depth: Tensor,
     anti_aliasing: bool,
 ) -> Tensor:
     """Gradient of :func:`depth_image`, of the shape of ``vertices``."""
     grad_vertices = host_empty(vertices.shape, dtype=vertices.dtype)
-    arrays = vertices, faces, starts, owner, grad_depth
+    arrays = vertices, faces, starts, face_index, grad_depth
     _C.depth_backward(*map(host_array, arrays), grad_vertices.numpy(), anti_aliasing, num_threads())
     return grad_vertices.to(vertices.device)
 
 
 @torch.library.register_fake(depth_backward)
-def _(vertices, faces, starts, owner, grad_depth, anti_aliasing):
+def _(vertices, faces, starts, face_index, grad_depth, anti_aliasing):
     return vertices.new_empty(vertices.shape)
 
 

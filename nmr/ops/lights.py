@@ -73,7 +73,7 @@ def lit(
     viewer: Tensor,
     vertices: Tensor,
     faces: Tensor,
-    owner: Tensor,
+    face_index: Tensor,
     weights: Tensor,
     starts: Tensor | None,
     smooth: bool,
@@ -84,15 +84,15 @@ def lit(
     lights, and layout int64 ``[11, 3]`` where each lies: first value, rows (1 or B), lights; viewer ``[B, 5]``: see
     :func:`viewer_of`; vertices and faces the meshes in world space.
     """
-    result = host_empty((*owner.shape, 3), dtype=weights.dtype)
-    arrays = colors, normals, parameters, layout, viewer, vertices, faces, owner, weights, starts
+    result = host_empty((*face_index.shape, 3), dtype=weights.dtype)
+    arrays = colors, normals, parameters, layout, viewer, vertices, faces, face_index, weights, starts
     _C.lit_forward(*map(host_array, arrays), smooth, result.numpy(), num_threads())
     return result.to(weights.device)
 
 
 @torch.library.register_fake(lit)
-def _(colors, normals, parameters, layout, viewer, vertices, faces, owner, weights, starts, smooth):
-    return weights.new_empty((*owner.shape, 3))
+def _(colors, normals, parameters, layout, viewer, vertices, faces, face_index, weights, starts, smooth):
+    return weights.new_empty((*face_index.shape, 3))
 
 
 def _lit_setup(ctx, inputs, output):
@@ -124,7 +124,7 @@ def lit_backward(
     viewer: Tensor,
     vertices: Tensor,
     faces: Tensor,
-    owner: Tensor,
+    face_index: Tensor,
     weights: Tensor,
     starts: Tensor | None,
     smooth: bool,
@@ -134,14 +134,16 @@ def lit_backward(
     """Gradients of :func:`lit` in colors, normals, parameters, vertices, weights; those not needed are empty."""
     like = colors, normals, parameters, vertices, weights
     grads = [host_empty(x.shape if need else 0, dtype=weights.dtype) for x, need in zip(like, needed, strict=True)]
-    arrays = colors, normals, parameters, layout, viewer, vertices, faces, owner, weights, starts
+    arrays = colors, normals, parameters, layout, viewer, vertices, faces, face_index, weights, starts
     outputs = (grad.numpy() if need else None for grad, need in zip(grads, needed, strict=True))
     _C.lit_backward(*map(host_array, arrays), smooth, host_array(grad_lit), *outputs, num_threads())
     return tuple(grad.to(weights.device) for grad in grads)
 
 
 @torch.library.register_fake(lit_backward)
-def _(colors, normals, parameters, layout, viewer, vertices, faces, owner, weights, starts, smooth, grad_lit, needed):
+def _(
+    colors, normals, parameters, layout, viewer, vertices, faces, face_index, weights, starts, smooth, grad_lit, needed
+):
     like = colors, normals, parameters, vertices, weights
     return tuple(weights.new_empty(x.shape if need else 0) for x, need in zip(like, needed, strict=True))
 

@@ -7,11 +7,11 @@ from ._host import _C, batch_size, host_array, host_empty, no_second_derivative,
 from ._register import operator, register_autograd
 
 
-def _owner_map(vertices, faces, starts, height, width, fill_back, near, far) -> Tensor:
-    owner = host_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
+def _face_index_map(vertices, faces, starts, height, width, fill_back, near, far) -> Tensor:
+    face_index = host_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
     arrays = host_array(vertices), host_array(faces), host_array(starts)
-    _C.rasterize(*arrays, owner.numpy(), fill_back, near, far, num_threads())
-    return owner
+    _C.rasterize(*arrays, face_index.numpy(), fill_back, near, far, num_threads())
+    return face_index
 
 
 # --- rasterize
@@ -28,8 +28,8 @@ def rasterize(
     near: float,
     far: float,
 ) -> Tensor:
-    """Owner map ``[B, height, width]`` of meshes in renderer space; not differentiable."""
-    return _owner_map(vertices, faces, starts, height, width, fill_back, near, far).to(vertices.device)
+    """Face index map ``[B, height, width]`` of meshes in renderer space; not differentiable."""
+    return _face_index_map(vertices, faces, starts, height, width, fill_back, near, far).to(vertices.device)
 
 
 @torch.library.register_fake(rasterize)
@@ -52,11 +52,11 @@ def rasterize_layers(
     near: float,
     far: float,
 ) -> Tensor:
-    """The owners of the nearest surfaces at each pixel, ``[B, height, width, layers]``, nearest first, then -1."""
-    owner = host_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
+    """Face indices of the nearest surfaces at each pixel, ``[B, height, width, layers]``, nearest first, then -1."""
+    face_index = host_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
     arrays = host_array(vertices), host_array(faces), host_array(starts)
-    _C.rasterize_layers(*arrays, owner.numpy(), fill_back, near, far, num_threads())
-    return owner.to(vertices.device)
+    _C.rasterize_layers(*arrays, face_index.numpy(), fill_back, near, far, num_threads())
+    return face_index.to(vertices.device)
 
 
 @torch.library.register_fake(rasterize_layers)
@@ -81,15 +81,15 @@ def silhouette(
     eps: float,
     local: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Silhouettes ``alpha [B, height, width]`` and the owner map ``[B, H, W]`` of meshes in renderer space.
+    """Silhouettes ``alpha [B, height, width]`` and the face index map ``[B, H, W]`` of meshes in renderer space.
 
     Its gradient is :func:`silhouette_backward` or, if ``local``, :func:`local_gradient`.
     """
     scale = 2 if anti_aliasing else 1
-    owner = _owner_map(vertices, faces, starts, scale * height, scale * width, fill_back, near, far)
-    alpha = host_empty((owner.shape[0], height, width), dtype=vertices.dtype)
-    _C.silhouette_forward(owner.numpy(), alpha.numpy(), anti_aliasing, num_threads())
-    return alpha.to(vertices.device), owner.to(vertices.device)
+    face_index = _face_index_map(vertices, faces, starts, scale * height, scale * width, fill_back, near, far)
+    alpha = host_empty((face_index.shape[0], height, width), dtype=vertices.dtype)
+    _C.silhouette_forward(face_index.numpy(), alpha.numpy(), anti_aliasing, num_threads())
+    return alpha.to(vertices.device), face_index.to(vertices.device)
 
 
 @torch.library.register_fake(silhouette)
@@ -101,15 +101,15 @@ def _(vertices, faces, starts, height, width, anti_aliasing, fill_back, near, fa
 
 def _silhouette_setup(ctx, inputs, output):
     vertices, faces, starts, _, _, anti_aliasing, _, _, _, eps, local = inputs
-    owner = output[1]
-    ctx.mark_non_differentiable(owner)
-    ctx.set_materialize_grads(False)  # no zeros in the shape of the owner map
-    ctx.save_for_backward(vertices, faces, starts, owner)
+    face_index = output[1]
+    ctx.mark_non_differentiable(face_index)
+    ctx.set_materialize_grads(False)  # no zeros in the shape of the face index map
+    ctx.save_for_backward(vertices, faces, starts, face_index)
     ctx.settings = anti_aliasing, eps
     ctx.local = local
 
 
-def _silhouette_backward(ctx, grad_alpha, _grad_owner):
+def _silhouette_backward(ctx, grad_alpha, _grad_face_index):
     if grad_alpha is None:
         return (None,) * 11
     gradient = local_gradient if ctx.local else silhouette_backward
@@ -124,24 +124,24 @@ def silhouette_backward(
     vertices: Tensor,
     faces: Tensor,
     starts: Tensor | None,
-    owner: Tensor,
+    face_index: Tensor,
     grad_alpha: Tensor,
     anti_aliasing: bool,
     eps: float,
 ) -> Tensor:
     """NMR's silhouette gradient, per vertex, of the shape of ``vertices``; zero in z."""
-    return _gradient(_C.silhouette_backward, vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps)
+    return _gradient(_C.silhouette_backward, vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps)
 
 
-def _gradient(kernel, vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps) -> Tensor:
+def _gradient(kernel, vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps) -> Tensor:
     grad_vertices = host_empty(vertices.shape, dtype=vertices.dtype)
-    arrays = map(host_array, (vertices, faces, starts, owner, grad_alpha))
+    arrays = map(host_array, (vertices, faces, starts, face_index, grad_alpha))
     kernel(*arrays, grad_vertices.numpy(), anti_aliasing, eps, num_threads())
     return grad_vertices.to(vertices.device)
 
 
 @torch.library.register_fake(silhouette_backward)
-def _(vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps):
+def _(vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps):
     return vertices.new_empty(vertices.shape)
 
 
@@ -153,17 +153,17 @@ def local_gradient(
     vertices: Tensor,
     faces: Tensor,
     starts: Tensor | None,
-    owner: Tensor,
+    face_index: Tensor,
     grad_alpha: Tensor,
     anti_aliasing: bool,
     eps: float,
 ) -> Tensor:
     """Kato and Harada's silhouette gradient, which reaches one pixel; of the shape of ``vertices``, zero in z."""
-    return _gradient(_C.local_gradient, vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps)
+    return _gradient(_C.local_gradient, vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps)
 
 
 @torch.library.register_fake(local_gradient)
-def _(vertices, faces, starts, owner, grad_alpha, anti_aliasing, eps):
+def _(vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps):
     return vertices.new_empty(vertices.shape)
 
 

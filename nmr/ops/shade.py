@@ -12,7 +12,7 @@ from ._register import operator, register_autograd
 @operator
 def sample_texture_cubes(
     textures: Tensor,
-    owner: Tensor,
+    face_index: Tensor,
     weights: Tensor,
     starts: Tensor | None,
     eps: float,
@@ -23,20 +23,20 @@ def sample_texture_cubes(
     Axis k of a cube is the weight of the face's vertex k: sampled trilinearly at ``weights * (ts - 1)``, clamped to
     ``[0, ts - 1 - eps]``. Differentiable in ``textures`` only, as published.
     """
-    colors = host_empty((*owner.shape, textures.shape[-1]), dtype=textures.dtype)
-    arrays = host_array(textures), host_array(owner), host_array(weights), host_array(starts)
+    colors = host_empty((*face_index.shape, textures.shape[-1]), dtype=textures.dtype)
+    arrays = host_array(textures), host_array(face_index), host_array(weights), host_array(starts)
     _C.texture_cubes_forward(*arrays, colors.numpy(), eps, num_threads())
     return colors.to(textures.device)
 
 
 @torch.library.register_fake(sample_texture_cubes)
-def _(textures, owner, weights, starts, eps):
-    return textures.new_empty((*owner.shape, textures.shape[-1]))
+def _(textures, face_index, weights, starts, eps):
+    return textures.new_empty((*face_index.shape, textures.shape[-1]))
 
 
 def _texture_cubes_setup(ctx, inputs, output):
-    textures, owner, weights, starts, eps = inputs
-    ctx.save_for_backward(owner, weights, starts)
+    textures, face_index, weights, starts, eps = inputs
+    ctx.save_for_backward(face_index, weights, starts)
     ctx.shape, ctx.eps = textures.shape, eps
 
 
@@ -52,7 +52,7 @@ register_autograd(sample_texture_cubes, _texture_cubes_backward, _texture_cubes_
 
 @operator
 def texture_cubes_backward(
-    owner: Tensor,
+    face_index: Tensor,
     weights: Tensor,
     starts: Tensor | None,
     grad_colors: Tensor,
@@ -61,13 +61,13 @@ def texture_cubes_backward(
 ) -> Tensor:
     """Gradient of :func:`sample_texture_cubes` in its textures, of the given shape; shared ones sum over images."""
     grad_textures = host_empty(shape, dtype=grad_colors.dtype)
-    arrays = owner, weights, starts, grad_colors
+    arrays = face_index, weights, starts, grad_colors
     _C.texture_cubes_backward(*map(host_array, arrays), grad_textures.numpy(), eps, num_threads())
     return grad_textures.to(grad_colors.device)
 
 
 @torch.library.register_fake(texture_cubes_backward)
-def _(owner, weights, starts, grad_colors, shape, eps):
+def _(face_index, weights, starts, grad_colors, shape, eps):
     return grad_colors.new_empty(shape)
 
 
@@ -81,7 +81,7 @@ register_autograd(texture_cubes_backward, no_second_derivative("render_rgb"))
 def interpolate(
     attributes: Tensor,
     corners: Tensor,
-    owner: Tensor,
+    face_index: Tensor,
     weights: Tensor,
     starts: Tensor | None,
 ) -> Tensor:
@@ -90,15 +90,15 @@ def interpolate(
     attributes are ``[B or 1, N, C]``, packed ``[N, C]``; corners ``[F, 3]``, ``[B, F, 3]`` or packed ``[M, 3]`` are
     rows of them, counted from the first of the mesh; ``starts`` (packed) are first row and first face of each mesh.
     """
-    values = host_empty((*owner.shape, attributes.shape[-1]), dtype=attributes.dtype)
-    arrays = attributes, corners, owner, weights, starts
+    values = host_empty((*face_index.shape, attributes.shape[-1]), dtype=attributes.dtype)
+    arrays = attributes, corners, face_index, weights, starts
     _C.interpolate_forward(*map(host_array, arrays), values.numpy(), num_threads())
     return values.to(attributes.device)
 
 
 @torch.library.register_fake(interpolate)
-def _(attributes, corners, owner, weights, starts):
-    return attributes.new_empty((*owner.shape, attributes.shape[-1]))
+def _(attributes, corners, face_index, weights, starts):
+    return attributes.new_empty((*face_index.shape, attributes.shape[-1]))
 
 
 def _interpolate_setup(ctx, inputs, output):
@@ -118,7 +118,7 @@ register_autograd(interpolate, _interpolate_backward, _interpolate_setup)
 def interpolate_backward(
     attributes: Tensor,
     corners: Tensor,
-    owner: Tensor,
+    face_index: Tensor,
     weights: Tensor,
     starts: Tensor | None,
     grad_values: Tensor,
@@ -128,7 +128,7 @@ def interpolate_backward(
     """Gradients of :func:`interpolate` in attributes and weights; a gradient that is not requested is empty."""
     grad_attributes = host_empty(attributes.shape if of_attributes else 0, dtype=attributes.dtype)
     grad_weights = host_empty(weights.shape if of_weights else 0, dtype=attributes.dtype)
-    arrays = attributes, corners, owner, weights, starts, grad_values
+    arrays = attributes, corners, face_index, weights, starts, grad_values
     _C.interpolate_backward(
         *map(host_array, arrays),
         grad_attributes.numpy() if of_attributes else None,
@@ -139,7 +139,7 @@ def interpolate_backward(
 
 
 @torch.library.register_fake(interpolate_backward)
-def _(attributes, corners, owner, weights, starts, grad_values, of_attributes, of_weights):
+def _(attributes, corners, face_index, weights, starts, grad_values, of_attributes, of_weights):
     return (
         attributes.new_empty(attributes.shape if of_attributes else 0),
         attributes.new_empty(weights.shape if of_weights else 0),

@@ -67,21 +67,21 @@ def uv_levels(
     mesh_starts: Tensor | None,
     uv: Tensor,
     corners: Tensor,
-    owner: Tensor,
+    face_index: Tensor,
     weights: Tensor,
     starts: Tensor | None,
     grids: Tensor,
 ) -> Tensor:
     """The mipmap level of each pixel ``[B, H, W]``, OpenGL's; 0 on background. It has no gradient."""
-    level = host_empty(owner.shape, dtype=weights.dtype)
-    arrays = vertices, faces, mesh_starts, uv, corners, owner, weights, starts, grids
+    level = host_empty(face_index.shape, dtype=weights.dtype)
+    arrays = vertices, faces, mesh_starts, uv, corners, face_index, weights, starts, grids
     _C.uv_levels(*map(host_array, arrays), level.numpy(), num_threads())
     return level.to(weights.device)
 
 
 @torch.library.register_fake(uv_levels)
-def _(vertices, faces, mesh_starts, uv, corners, owner, weights, starts, grids):
-    return weights.new_empty(owner.shape)
+def _(vertices, faces, mesh_starts, uv, corners, face_index, weights, starts, grids):
+    return weights.new_empty(face_index.shape)
 
 
 def _no_gradient(ctx, grad_level):
@@ -101,26 +101,26 @@ def sample_uv(
     level: Tensor | None,
     uv: Tensor,
     corners: Tensor,
-    owner: Tensor,
+    face_index: Tensor,
     weights: Tensor,
     starts: Tensor | None,
     wrap: int,
 ) -> Tensor:
     """Colours ``[B, H, W, C]`` of texture images at the uv of each pixel; 0 on background.
 
-    uv, corners, owner, weights and starts are those of :func:`nmr.ops.interpolate`. Bilinear on level 0, or linear
+    uv, corners, face_index, weights and starts are those of :func:`nmr.ops.interpolate`. Bilinear on level 0, or linear
     between the two levels around ``level [B, H, W]``, a constant. wrap is an index of ``WRAPS``. Differentiable in
     texels, uv and weights.
     """
-    colors = host_empty((*owner.shape, texels.shape[-1]), dtype=texels.dtype)
-    arrays = texels, grids, level, uv, corners, owner, weights, starts
+    colors = host_empty((*face_index.shape, texels.shape[-1]), dtype=texels.dtype)
+    arrays = texels, grids, level, uv, corners, face_index, weights, starts
     _C.sample_uv_forward(*map(host_array, arrays), wrap, colors.numpy(), num_threads())
     return colors.to(texels.device)
 
 
 @torch.library.register_fake(sample_uv)
-def _(texels, grids, level, uv, corners, owner, weights, starts, wrap):
-    return texels.new_empty((*owner.shape, texels.shape[-1]))
+def _(texels, grids, level, uv, corners, face_index, weights, starts, wrap):
+    return texels.new_empty((*face_index.shape, texels.shape[-1]))
 
 
 def _sample_uv_setup(ctx, inputs, output):
@@ -145,7 +145,7 @@ def sample_uv_backward(
     level: Tensor | None,
     uv: Tensor,
     corners: Tensor,
-    owner: Tensor,
+    face_index: Tensor,
     weights: Tensor,
     starts: Tensor | None,
     wrap: int,
@@ -155,14 +155,14 @@ def sample_uv_backward(
     """Gradients of :func:`sample_uv` in texels, uv and weights; those that are not needed are empty."""
     like = texels, uv, weights
     grads = [host_empty(x.shape if need else 0, dtype=x.dtype) for x, need in zip(like, needed, strict=True)]
-    arrays = texels, grids, level, uv, corners, owner, weights, starts
+    arrays = texels, grids, level, uv, corners, face_index, weights, starts
     outputs = (grad.numpy() if need else None for grad, need in zip(grads, needed, strict=True))
     _C.sample_uv_backward(*map(host_array, arrays), wrap, host_array(grad_colors), *outputs, num_threads())
     return tuple(grad.to(texels.device) for grad in grads)
 
 
 @torch.library.register_fake(sample_uv_backward)
-def _(texels, grids, level, uv, corners, owner, weights, starts, wrap, grad_colors, needed):
+def _(texels, grids, level, uv, corners, face_index, weights, starts, wrap, grad_colors, needed):
     like = texels, uv, weights
     return tuple(x.new_empty(x.shape if need else 0) for x, need in zip(like, needed, strict=True))
 

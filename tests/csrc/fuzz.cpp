@@ -72,7 +72,7 @@ void decode(Bytes bytes, Scene<T>& s) {
   s.per_image_values = flags & 16;
   s.perspective = flags & 32;
   s.distorted = flags & 64;
-  s.foreign_owner = more % 8 == 7;
+  s.foreign_face_index = more % 8 == 7;
   constexpr int64_t batches[] = {1, 1, 1, 1, 2, 2, 3, 9}, cubes[] = {1, 2, 2, 2, 3, 2, 2, 4};
   s.batch = batches[more / 8 % 8];
   if (more == 255) s.batch = 0;

@@ -26,7 +26,7 @@ enum Stream : uint64_t {
   kDistortion,
   kGradPoints,
   kGradLoss,
-  kOwner,
+  kFaceIndex,
   kGradResolved,
   kOrigin,
   kExtent,
@@ -72,14 +72,14 @@ std::vector<T>& input(const Scene<T>& scene, Stream stream, int64_t size) {
   return values;
 }
 
-// Owner maps that no rasterizer made: any entry that names a face of its image.
+// Face index maps that no rasterizer made: any entry that names a face of its image.
 template <class T>
-void make_up_owner(const Scene<T>& scene, std::vector<int32_t>& owner) {
+void make_up_face_index(const Scene<T>& scene, std::vector<int32_t>& face_index) {
   const int64_t per_image = scene.raster().pixels();
   for (int64_t n = 0; n < scene.pixels(); ++n) {
     const int64_t choices = 2 * scene.mesh().face_count(n / per_image) + 1;
-    const double u = (noise(64 * scene.seed + kOwner, n) + 1) / 2;
-    owner[n] = static_cast<int32_t>(u * static_cast<double>(choices)) - 1;
+    const double u = (noise(64 * scene.seed + kFaceIndex, n) + 1) / 2;
+    face_index[n] = static_cast<int32_t>(u * static_cast<double>(choices)) - 1;
   }
 }
 
@@ -87,13 +87,12 @@ template <class T>
 void run_silhouette(const Scene<T>& s, Results<T>& r, int num_threads) {
   const int64_t size = s.batch * s.image.pixels();
   unwritten(r.alpha, size);
-  silhouette_forward(
-      SilhouetteForward<T>{r.owner.data(), s.batch, s.image, s.anti_aliasing, r.alpha.data(), num_threads});
+  silhouette_forward(SilhouetteForward<T>{r.face_index.data(), s.batch, s.image, s.anti_aliasing, r.alpha.data(), num_threads});
   const std::vector<T>& grad_alpha = input(s, kGradAlpha, size);
   unwritten(r.grad_silhouette, 3 * s.rows());
   unwritten(r.grad_local, 3 * s.rows());
-  SilhouetteBackward<T> args{s.mesh(), s.image, s.anti_aliasing, s.eps, r.owner.data(), grad_alpha.data(),
-                             r.grad_silhouette.data(), num_threads};
+  SilhouetteBackward<T> args{
+      s.mesh(), s.image, s.anti_aliasing, s.eps, r.face_index.data(), grad_alpha.data(), r.grad_silhouette.data(), num_threads};
   silhouette_backward(args);
   args.grad_vertices = r.grad_local.data();
   local_gradient(args);
@@ -109,7 +108,7 @@ void run_fragments(const Scene<T>& s, Results<T>& r, int num_threads) {
   Fragments<T> args{s.mesh(),
                     s.raster(),
                     s.far,
-                    r.owner.data(),
+                    r.face_index.data(),
                     r.weights.data(),
                     r.depth.data(),
                     s.no_grad_weights ? nullptr : grad_weights.data(),
@@ -123,10 +122,14 @@ void run_fragments(const Scene<T>& s, Results<T>& r, int num_threads) {
   unwritten(r.depth_image, size);
   unwritten(r.grad_depth, 3 * s.rows());
   const std::vector<T>& grad_image = input(s, kGradDepthImage, size);
-  DepthImage<T> image{s.mesh(),          s.image,
-                      s.anti_aliasing,   s.far,
-                      r.owner.data(),    r.depth_image.data(),
-                      grad_image.data(), r.grad_depth.data(),
+  DepthImage<T> image{s.mesh(),
+                      s.image,
+                      s.anti_aliasing,
+                      s.far,
+                      r.face_index.data(),
+                      r.depth_image.data(),
+                      grad_image.data(),
+                      r.grad_depth.data(),
                       num_threads};
   depth_forward(image);
   depth_backward(image);
@@ -140,7 +143,7 @@ void run_shading(const Scene<T>& s, Results<T>& r, int num_threads) {
   const std::vector<T>& grad_colors = input(s, kGradColors, s.pixels() * C);
   unwritten(r.colors, s.pixels() * C);
   unwritten(r.grad_textures, textures.size());
-  TextureCubes<T> cubes{r.owner.data(),
+  TextureCubes<T> cubes{r.face_index.data(),
                         r.weights.data(),
                         s.batch,
                         s.raster(),
@@ -163,7 +166,7 @@ void run_shading(const Scene<T>& s, Results<T>& r, int num_threads) {
   unwritten(r.values, s.pixels() * C);
   unwritten(r.grad_attributes, attributes.size());
   unwritten(r.grad_weights, 3 * s.pixels());
-  Interpolate<T> values{r.owner.data(),
+  Interpolate<T> values{r.face_index.data(),
                         r.weights.data(),
                         s.batch,
                         s.raster(),
@@ -218,12 +221,23 @@ void run_texture_images(const Scene<T>& s, Results<T>& r, int num_threads) {
   for (T& x : uv) x *= T(1.5);
   unwritten(r.grad_uv, static_cast<int64_t>(uv.size()));
   unwritten(r.grad_uv_weights, 3 * s.pixels());
-  const Interpolate<T> at{
-      r.owner.data(), r.weights.data(), s.batch,           s.raster(),
-      uv.data(),      groups,           s.num_vertices,    2,
-      s.faces.data(), s.num_faces,      s.faces_per_image, s.packed() ? s.starts.data() : nullptr,
-      nullptr,        nullptr,          r.grad_uv.data(),  s.no_grad_weights ? nullptr : r.grad_uv_weights.data(),
-      num_threads};
+  const Interpolate<T> at{r.face_index.data(),
+                          r.weights.data(),
+                          s.batch,
+                          s.raster(),
+                          uv.data(),
+                          groups,
+                          s.num_vertices,
+                          2,
+                          s.faces.data(),
+                          s.num_faces,
+                          s.faces_per_image,
+                          s.packed() ? s.starts.data() : nullptr,
+                          nullptr,
+                          nullptr,
+                          r.grad_uv.data(),
+                          s.no_grad_weights ? nullptr : r.grad_uv_weights.data(),
+                          num_threads};
   unwritten(r.level, s.pixels());
   uv_levels(UVLevels<T>{at, s.mesh(), grids.data(), images, levels, r.level.data()});
   const std::vector<T>& grad_sampled = input(s, kGradSampled, s.pixels() * C);
@@ -290,7 +304,7 @@ void run_lights(const Scene<T>& s, Results<T>& r, int num_threads) {
   unwritten(r.grad_lit_vertices, 3 * s.rows());
   unwritten(r.grad_lit_weights, 3 * s.pixels());
   Lit<T> args{};
-  args.at = Interpolate<T>{r.owner.data(),
+  args.at = Interpolate<T>{r.face_index.data(),
                            r.weights.data(),
                            s.batch,
                            s.raster(),
@@ -382,10 +396,12 @@ void run_edges(const Scene<T>& s, Results<T>& r, int num_threads) {
   const int64_t background_batch = s.per_image_values ? s.batch : 1;
   const std::vector<T>& colors = input(s, kBackground, background_batch * s.channels);
   const T* background = s.fill_back ? colors.data() : nullptr;
-  Resolve<T> resolve{s.batch, s.image, s.anti_aliasing, s.channels, r.owner.data(), image.data(), background, background_batch,
-                     r.resolved.data(), grad_resolved.data(), r.grad_image.data(), r.grad_background.data(), num_threads};
-  edges_backward(EdgesBackward<T>{s.mesh(), s.image, s.anti_aliasing, s.eps, r.owner.data(), image.data(), s.channels, background,
-                                  background_batch, grad_resolved.data(), r.grad_edges.data(), num_threads});
+  Resolve<T> resolve{
+      s.batch,    s.image,          s.anti_aliasing,   s.channels,           r.face_index.data(), image.data(),
+      background, background_batch, r.resolved.data(), grad_resolved.data(), r.grad_image.data(), r.grad_background.data(),
+      num_threads};
+  edges_backward(EdgesBackward<T>{s.mesh(), s.image, s.anti_aliasing, s.eps, r.face_index.data(), image.data(), s.channels,
+                                  background, background_batch, grad_resolved.data(), r.grad_edges.data(), num_threads});
   resolve_forward(resolve);
   resolve_backward(resolve);
 }
@@ -569,12 +585,12 @@ const char* compare(const Results<T>& a, const Results<T>& b, const Share& share
 
 template <class T>
 void run_stages(const Scene<T>& scene, int num_threads, Results<T>& r) {
-  resize(r.owner, scene.pixels());
-  std::fill(r.owner.begin(), r.owner.end(), std::numeric_limits<int32_t>::min());
-  rasterize(Rasterize<T>{
-      scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, r.owner.data(), num_threads});
+  resize(r.face_index, scene.pixels());
+  std::fill(r.face_index.begin(), r.face_index.end(), std::numeric_limits<int32_t>::min());
+  rasterize(
+      Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, r.face_index.data(), num_threads});
   run_surfaces(scene, r, num_threads);
-  if (scene.foreign_owner) make_up_owner(scene, r.owner);
+  if (scene.foreign_face_index) make_up_face_index(scene, r.face_index);
   run_clip(scene, r, num_threads);
   run_silhouette(scene, r, num_threads);
   run_fragments(scene, r, num_threads);
@@ -653,12 +669,12 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   const Size raster = scene.raster(), image = scene.image;
   const int64_t H = raster.height, W = raster.width, C = scene.channels;
   for (int64_t b = 0; b < scene.batch; ++b) {
-    const int64_t F = mesh.face_count(b), limit = scene.fill_back || scene.foreign_owner ? 2 * F : F;
-    const int32_t* owner = r.owner.data() + b * raster.pixels();
+    const int64_t F = mesh.face_count(b), limit = scene.fill_back || scene.foreign_face_index ? 2 * F : F;
+    const int32_t* face_index = r.face_index.data() + b * raster.pixels();
     for (int64_t n = 0; n < raster.pixels(); ++n) {
-      const int32_t id = owner[n];
-      if (id < -1 || id >= limit) return "owner names a face of its image, or -1";
-      if (id < 0 || scene.foreign_owner) continue;
+      const int32_t id = face_index[n];
+      if (id < -1 || id >= limit) return "face_index names a face of its image, or -1";
+      if (id < 0 || scene.foreign_face_index) continue;
       const int64_t* face = mesh.image_faces(b) + 3 * (id % F);
       const T x = static_cast<T>(2 * (n % W) + 1 - W) / static_cast<T>(W),
               y = static_cast<T>(H - 1 - 2 * (n / W)) / static_cast<T>(H);
@@ -676,7 +692,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     }
     for (int64_t n = 0; n < image.pixels(); ++n) {
       const int32_t* pixel =
-          scene.anti_aliasing ? owner + 2 * (n / image.width) * W + 2 * (n % image.width) : owner + n;
+          scene.anti_aliasing ? face_index + 2 * (n / image.width) * W + 2 * (n % image.width) : face_index + n;
       const int covered = scene.anti_aliasing
                               ? (pixel[0] >= 0) + (pixel[1] >= 0) + (pixel[W] >= 0) + (pixel[W + 1] >= 0)
                               : 4 * (pixel[0] >= 0);
@@ -684,14 +700,15 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     }
   }
   if (const char* broken = broken_clip(scene, r)) return broken;
-  const size_t layers = r.owner.empty() ? 0 : r.layers.size() / r.owner.size();
+  const size_t layers = r.face_index.empty() ? 0 : r.layers.size() / r.face_index.size();
   for (size_t n = 0; n < r.layers.size(); ++n) {
     const int32_t id = r.layers[n],
                   F = static_cast<int32_t>(mesh.face_count(static_cast<int64_t>(n / layers) / raster.pixels()));
     if (id < -1 || id >= (scene.fill_back ? 2 * F : F)) return "a layer names a face of its image, or -1";
     if (n % layers > 0 && id >= 0 && (r.layers[n - 1] < 0 || r.layers[n - 1] == id))
       return "layers are different faces, then -1";
-    if (n % layers == 0 && !scene.foreign_owner && id != r.owner[n / layers]) return "the first layer is the owner map";
+    if (n % layers == 0 && !scene.foreign_face_index && id != r.face_index[n / layers])
+      return "the first layer is the face index map";
   }
   for (T clear : r.clear)
     if (!(clear >= 0 && clear <= 1)) return "a soft silhouette lies in [0, 1]";
@@ -707,7 +724,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     if (std::isfinite(r.pose[n]) != std::isfinite(r.pose[n - n % 12]) || std::isinf(r.pose[n]))
       return "a pose is finite or all NaN";
   for (size_t n = 0; n < r.depth.size(); ++n) {
-    if (r.owner[n] >= 0) continue;
+    if (r.face_index[n] >= 0) continue;
     if (r.depth[n] != scene.far) return "the background's depth is far";
     for (int k = 0; k < 3; ++k)
       if (r.weights[3 * n + k] != 0) return "the background's weights are 0";
@@ -723,18 +740,18 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
       if ((*grad)[n] != 0) return "the gradients of silhouettes and edges have no z";
   if (!scene.hostile_upstream) {
     if (!all_finite(r.grad_local)) return "the silhouette's local gradient is finite";
-    if (!scene.foreign_owner && !all_finite(r.grad_silhouette)) return "the silhouette's gradient is finite";
-    if (!scene.foreign_owner && !all_finite(r.grad_edges)) return "the edges' gradient is finite";
+    if (!scene.foreign_face_index && !all_finite(r.grad_silhouette)) return "the silhouette's gradient is finite";
+    if (!scene.foreign_face_index && !all_finite(r.grad_edges)) return "the edges' gradient is finite";
     for (const auto* grad :
          {&r.grad_world, &r.grad_matrix, &r.grad_intrinsics, &r.grad_distortion, &r.grad_origin, &r.grad_extent})
       if (!all_finite(*grad)) return "the gradient of the projection is finite";
     if (!all_finite(r.grad_soft)) return "the soft silhouette's gradient is finite";
     if (!all_finite(r.grad_forward) || !all_finite(r.grad_up)) return "the gradient of a pose is finite";
   }
-  if (scene.foreign_owner || !is_tame(scene)) return nullptr;
+  if (scene.foreign_face_index || !is_tame(scene)) return nullptr;
 
   for (size_t n = 0; n < r.depth.size(); ++n) {
-    if (r.owner[n] < 0) continue;
+    if (r.face_index[n] < 0) continue;
     const T* w = r.weights.data() + 3 * n;
     if (!(std::abs(w[0] + w[1] + w[2] - 1) <= T(1e-4))) return "the weights of a covered pixel sum to 1";
     if (!(r.depth[n] > scene.near * T(0.99) && r.depth[n] < scene.far * T(1.01)))

@@ -65,7 +65,7 @@ struct Scene {
   int64_t channels = 3, texture_size = 2, grid_size = 4;
   bool per_image_values = false;  // textures and attributes of each image, not shared
   bool perspective = true, distorted = true;  // the camera; undistorted ones have an origin and an extent
-  bool foreign_owner = false;  // backward stages get a made-up owner map: any in range is allowed
+  bool foreign_face_index = false;            // backward stages get a made-up face index map: any in range is allowed
   bool hostile_upstream = false;  // NaN, infinities and huge numbers among the upstream gradients
   bool no_grad_weights = false, no_grad_depth = false;  // optional upstream gradients and results of a backward stage
   uint64_t seed = 1;           // of textures, attributes, cameras and upstream gradients
@@ -92,7 +92,7 @@ struct Scene {
 
 template <class T>
 struct Results {
-  std::vector<int32_t> owner;
+  std::vector<int32_t> face_index;
   std::vector<int64_t> clip_counts, clip_starts, clip_faces, clip_corners, clip_ends;
   std::vector<int32_t> clip_source;
   std::vector<T> alpha, grad_silhouette, grad_local;
@@ -114,7 +114,7 @@ struct Results {
 
   template <class Visit>
   void for_each(const Visit& visit) const {
-    visit("owner", owner);
+    visit("face_index", face_index);
     visit("clip_counts", clip_counts);
     visit("clip_starts", clip_starts);
     visit("clip_faces", clip_faces);

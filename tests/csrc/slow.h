@@ -66,12 +66,12 @@ struct SlowFace {
   }
 };
 
-// Owner and depth of every pixel of image b.
+// Face index and depth of every pixel of image b.
 template <class T>
-void slow_rasterize(const Scene<T>& scene, int64_t b, std::vector<int32_t>& owner, std::vector<T>& depth) {
+void slow_rasterize(const Scene<T>& scene, int64_t b, std::vector<int32_t>& face_index, std::vector<T>& depth) {
   const Size raster = scene.raster();
   const int64_t H = raster.height, W = raster.width, F = scene.mesh().face_count(b);
-  owner.assign(H * W, -1);
+  face_index.assign(H * W, -1);
   depth.assign(H * W, scene.far);
   for (int64_t id = 0; id < (scene.fill_back ? 2 * F : F); ++id) {
     const SlowFace<T> face(scene, b, id);
@@ -79,7 +79,7 @@ void slow_rasterize(const Scene<T>& scene, int64_t b, std::vector<int32_t>& owne
       const SlowHit<T> hit = face.at(n % W, H - 1 - n / W, raster);
       if (!hit.inside || !(hit.depth > scene.near) || !(hit.depth < depth[n])) continue;
       depth[n] = hit.depth;
-      owner[n] = static_cast<int32_t>(id);
+      face_index[n] = static_cast<int32_t>(id);
     }
   }
 }
@@ -92,11 +92,11 @@ int64_t slow_index(T t, int64_t length) {
 
 // NMR's gradient of an image [H, W, C] with respect to vertices; added to grad [V, 3].
 template <class T>
-void slow_edge_gradient(const Scene<T>& scene, int64_t b, const int32_t* owner, const T* image, const T* grad_image, int64_t channels,
-                        T* grad) {
+void slow_edge_gradient(const Scene<T>& scene, int64_t b, const int32_t* face_index, const T* image, const T* grad_image,
+                        int64_t channels, T* grad) {
   const int64_t H = scene.raster().height, W = scene.raster().width, F = scene.mesh().face_count(b);
   for (int64_t id = 0; id < 2 * F; ++id) {
-    if (std::find(owner, owner + H * W, static_cast<int32_t>(id)) == owner + H * W) continue;
+    if (std::find(face_index, face_index + H * W, static_cast<int32_t>(id)) == face_index + H * W) continue;
     const SlowFace<T> face(scene, b, id);
     const int64_t* corner = scene.mesh().image_faces(b) + 3 * (id % F);
     for (int axis = 0; axis < 2; ++axis)
@@ -134,10 +134,10 @@ void slow_edge_gradient(const Scene<T>& scene, int64_t b, const int32_t* owner, 
             if (qs != line) end(p) -= strength / (move_p + (move_p > 0 ? scene.eps : -scene.eps));
             if (ps != line) end(q) -= strength / (move_q + (move_q > 0 ? scene.eps : -scene.eps));
           };
-          if (owner[pixel(n, in)] == id)
+          if (face_index[pixel(n, in)] == id)
             for (int64_t m = out; m >= 0 && m < M; m += d) deposit(m, gain(pixel(n, m), pixel(n, in)));
           for (int64_t m = std::max<int64_t>(0, std::min(in, limit)); m <= std::min(M - 1, std::max(in, limit)); ++m)
-            if (owner[pixel(n, m)] == id) deposit(m, gain(pixel(n, m), pixel(n, out)));
+            if (face_index[pixel(n, m)] == id) deposit(m, gain(pixel(n, m), pixel(n, out)));
         }
       }
   }

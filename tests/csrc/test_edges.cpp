@@ -6,18 +6,19 @@ namespace nmr::test {
 namespace {
 
 template <class T>
-std::vector<int32_t> owner_of(const Scene<T>& scene) {
-  std::vector<int32_t> owner(scene.pixels());
-  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, owner.data(), 1});
-  return owner;
+std::vector<int32_t> face_index_of(const Scene<T>& scene) {
+  std::vector<int32_t> face_index(scene.pixels());
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, face_index.data(), 1});
+  return face_index;
 }
 
 template <class T>
-std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& owner, const std::vector<T>& image, const std::vector<T>& grad) {
+std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& face_index, const std::vector<T>& image,
+                        const std::vector<T>& grad) {
   std::vector<T> result = unwritten<T>(3 * scene.rows());
   const int64_t channels = static_cast<int64_t>(image.size()) / std::max<int64_t>(1, scene.pixels());
-  edges_backward(EdgesBackward<T>{scene.mesh(), scene.image, scene.anti_aliasing, scene.eps, owner.data(), image.data(), channels,
-                                  nullptr, 0, grad.data(), result.data(), 2});
+  edges_backward(EdgesBackward<T>{scene.mesh(), scene.image, scene.anti_aliasing, scene.eps, face_index.data(), image.data(),
+                                  channels, nullptr, 0, grad.data(), result.data(), 2});
   return result;
 }
 
@@ -54,15 +55,15 @@ TEST_REAL(edge_gradients_are_the_definition) {
       Scene<T> scene = seed == 0 ? pack<T>({sphere(1, 1), Mesh{}, soup(6, 5)}) : stack<T>({soup(8, seed), soup(8, seed + 50)}, seed % 2);
       scene.image = square(13);
       const int64_t R = scene.raster_size();
-      const std::vector<int32_t> owner = owner_of(scene);
+      const std::vector<int32_t> face_index = face_index_of(scene);
       const std::vector<T> image = noise_array<T>(1, scene.pixels() * channels);
       const std::vector<T> grad = noise_array<T>(2, scene.batch * scene.image.pixels() * channels);
       const std::vector<T> pixels = at_raster(scene, grad, channels);
       std::vector<T> expected(3 * scene.rows(), T(0));
       for (int64_t b = 0; b < scene.batch; ++b)
-        slow_edge_gradient(scene, b, owner.data() + b * R * R, image.data() + b * R * R * channels, pixels.data() + b * R * R * channels,
-                           channels, expected.data() + 3 * scene.mesh().vertex_start(b));
-      check_close(gradient(scene, owner, image, grad), expected, sizeof(T) == 4 ? 1e-4 : 1e-11);
+        slow_edge_gradient(scene, b, face_index.data() + b * R * R, image.data() + b * R * R * channels,
+                           pixels.data() + b * R * R * channels, channels, expected.data() + 3 * scene.mesh().vertex_start(b));
+      check_close(gradient(scene, face_index, image, grad), expected, sizeof(T) == 4 ? 1e-4 : 1e-11);
     }
 }
 
@@ -71,20 +72,21 @@ TEST_REAL(edge_gradients_of_coverage_are_the_silhouettes) {
   Scene<T> scene = stack<T>({sphere(2, 1), sphere(2, 2)}, true);
   scene.image = square(16);
   const int64_t S = 16;
-  const std::vector<int32_t> owner = owner_of(scene);
+  const std::vector<int32_t> face_index = face_index_of(scene);
   const std::vector<T> grad_alpha = noise_array<T>(3, 2 * S * S);
   std::vector<T> image(scene.pixels()), expected(3 * scene.rows());
-  for (int64_t n = 0; n < scene.pixels(); ++n) image[n] = T(owner[n] >= 0);
-  silhouette_backward(SilhouetteBackward<T>{scene.mesh(), square(S), true, scene.eps, owner.data(), grad_alpha.data(), expected.data(), 1});
-  check_close(gradient(scene, owner, image, grad_alpha), expected, sizeof(T) == 4 ? 1e-5 : 1e-12);
+  for (int64_t n = 0; n < scene.pixels(); ++n) image[n] = T(face_index[n] >= 0);
+  silhouette_backward(
+      SilhouetteBackward<T>{scene.mesh(), square(S), true, scene.eps, face_index.data(), grad_alpha.data(), expected.data(), 1});
+  check_close(gradient(scene, face_index, image, grad_alpha), expected, sizeof(T) == 4 ? 1e-5 : 1e-12);
 }
 
 TEST_REAL(edge_gradients_of_an_image_of_one_colour_are_zero) {
   Scene<T> scene = single<T>(sphere(1, 1));
   scene.image = square(12);
-  const std::vector<int32_t> owner = owner_of(scene);
+  const std::vector<int32_t> face_index = face_index_of(scene);
   const std::vector<T> image(2 * scene.pixels(), T(0.3)), grad = noise_array<T>(1, 2 * scene.image.pixels());
-  for (T g : gradient(scene, owner, image, grad)) CHECK_EQUAL(g, T(0));
+  for (T g : gradient(scene, face_index, image, grad)) CHECK_EQUAL(g, T(0));
 }
 
 TEST_REAL(resolve_is_a_mean_and_its_gradient_the_adjoint) {

@@ -76,15 +76,15 @@ TEST_REAL(strange_settings) {
     const Results<T> one = run_stages(scene, 1);
     const char* difference = first_difference(one, run_stages(scene, 3));
     CHECK_EQUAL(std::string(difference ? difference : ""), "");
-    for (int32_t id : one.owner) CHECK(id >= -1 && id < 2 * scene.num_faces);
+    for (int32_t id : one.face_index) CHECK(id >= -1 && id < 2 * scene.num_faces);
   }
 }
 
-TEST_REAL(owner_maps_that_no_rasterizer_made) {
+TEST_REAL(face_indices_that_no_rasterizer_made) {
   for (uint64_t seed = 0; seed < 4; ++seed) {
     Scene<T> scene = seed % 2 ? stack<T>({soup(5, seed), soup(5, seed + 1)}, true) : pack<T>({soup(5, seed), Mesh{}, sphere(1, seed)});
     scene.seed = seed;
-    scene.foreign_owner = true;
+    scene.foreign_face_index = true;
     if (seed % 3 == 0) scene.vertices[seed % 9] = T(seed % 2 ? kNaN : -kInf);
     check_survives(scene);
   }

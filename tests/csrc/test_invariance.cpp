@@ -63,7 +63,7 @@ TEST_REAL(an_image_does_not_depend_on_its_company) {
     scene = stack<T>({all[b]}, true);
     scene.image = {6, 11};
     const Results<T> alone = run_stages(scene, 1);
-    CHECK(alone.owner == share(together.owner, b, kMeshes));
+    CHECK(alone.face_index == share(together.face_index, b, kMeshes));
     CHECK(alone.alpha == share(together.alpha, b, kMeshes));
     CHECK(alone.weights == share(together.weights, b, kMeshes));
     CHECK(alone.depth == share(together.depth, b, kMeshes));

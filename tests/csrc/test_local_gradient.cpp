@@ -7,15 +7,15 @@ namespace {
 
 template <class T>
 std::vector<int32_t> draw(const Scene<T>& scene) {
-  std::vector<int32_t> owner(scene.pixels());
-  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, owner.data(), 1});
-  return owner;
+  std::vector<int32_t> face_index(scene.pixels());
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, face_index.data(), 1});
+  return face_index;
 }
 
 template <class T>
-std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& owner, const std::vector<T>& grad_alpha) {
+std::vector<T> gradient(const Scene<T>& scene, const std::vector<int32_t>& face_index, const std::vector<T>& grad_alpha) {
   std::vector<T> grad = unwritten<T>(3 * scene.rows());
-  local_gradient(SilhouetteBackward<T>{scene.mesh(), scene.image, scene.anti_aliasing, scene.eps, owner.data(),
+  local_gradient(SilhouetteBackward<T>{scene.mesh(), scene.image, scene.anti_aliasing, scene.eps, face_index.data(),
                                        grad_alpha.data(), grad.data(), 2});
   return grad;
 }
@@ -37,16 +37,16 @@ template <class T>
 void check_gradient(const Scene<T>& scene) {
   const int64_t H = scene.raster().height, W = scene.raster().width, w = scene.image.width;
   const std::vector<T> grad_alpha = noise_array<T>(scene.seed, scene.batch * scene.image.pixels());
-  std::vector<int32_t> owners, owner;
+  std::vector<int32_t> face_indices, face_index;
   std::vector<T> depth;
   std::vector<T> expected(3 * scene.rows(), T(0));
   for (int64_t b = 0; b < scene.batch; ++b) {
     const int64_t F = scene.mesh().face_count(b);
     const T* upstream = grad_alpha.data() + b * scene.image.pixels();
-    slow_rasterize(scene, b, owner, depth);
-    owners.insert(owners.end(), owner.begin(), owner.end());
+    slow_rasterize(scene, b, face_index, depth);
+    face_indices.insert(face_indices.end(), face_index.begin(), face_index.end());
     for (int64_t n = 0; n < H * W; ++n) {
-      const int32_t id = owner[n];
+      const int32_t id = face_index[n];
       if (id < 0) continue;
       T move[2];
       for (int axis = 0; axis < 2; ++axis) {
@@ -56,7 +56,7 @@ void check_gradient(const Scene<T>& scene) {
           const int64_t column = n % W + (axis == 0 ? k - 1 : 0), row = n / W - (axis == 1 ? k - 1 : 0);
           exists[k] = column >= 0 && column < W && row >= 0 && row < H;
           if (!exists[k]) continue;
-          coverage[k] = owner[row * W + column] >= 0;
+          coverage[k] = face_index[row * W + column] >= 0;
           grad[k] = scene.anti_aliasing ? upstream[row / 2 * w + column / 2] / 4 : upstream[row * W + column];
         }
         move[axis] = slow_move(coverage, grad, exists, T(axis == 0 ? W : H) / 2, scene.eps);
@@ -68,7 +68,7 @@ void check_gradient(const Scene<T>& scene) {
           expected[3 * (scene.mesh().vertex_start(b) + corner[id < F ? k : 2 - k]) + axis] += hit.weights[k] * move[axis];
     }
   }
-  const std::vector<T> grad = gradient(scene, owners, grad_alpha);
+  const std::vector<T> grad = gradient(scene, face_indices, grad_alpha);
   for (size_t n = 0; n < grad.size(); ++n) CHECK_NEAR(grad[n], expected[n], sizeof(T) == 4 ? 1e-4 : 1e-12);
 }
 

@@ -7,9 +7,9 @@ namespace {
 
 template <class T>
 std::vector<int32_t> rasterized(const Scene<T>& scene, int num_threads = 1) {
-  std::vector<int32_t> owner(scene.pixels(), -7);
-  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, owner.data(), num_threads});
-  return owner;
+  std::vector<int32_t> face_index(scene.pixels(), -7);
+  rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, face_index.data(), num_threads});
+  return face_index;
 }
 
 template <class T>
@@ -26,21 +26,21 @@ Scene<T> raster_of(const Mesh& mesh, int64_t raster_size, bool fill_back = true)
   return raster_of<T>(mesh, square(raster_size), fill_back);
 }
 
-int64_t covered(const std::vector<int32_t>& owner) {
-  return std::count_if(owner.begin(), owner.end(), [](int32_t id) { return id >= 0; });
+int64_t covered(const std::vector<int32_t>& face_index) {
+  return std::count_if(face_index.begin(), face_index.end(), [](int32_t id) { return id >= 0; });
 }
 
-// Coverage exactly; the owner, too, unless two faces are equally deep to rounding.
+// Coverage exactly; the face index, too, unless two faces are equally deep to rounding.
 template <class T>
 void check_against_definition(const Scene<T>& scene) {
   const int64_t H = scene.raster().height, W = scene.raster().width;
-  const std::vector<int32_t> owner = rasterized(scene);
+  const std::vector<int32_t> face_index = rasterized(scene);
   for (int64_t b = 0; b < scene.batch; ++b) {
     std::vector<int32_t> expected;
     std::vector<T> depth;
     slow_rasterize(scene, b, expected, depth);
     for (int64_t n = 0; n < H * W; ++n) {
-      const int32_t id = owner[b * H * W + n];
+      const int32_t id = face_index[b * H * W + n];
       CHECK_EQUAL(id >= 0, expected[n] >= 0);
       if (id == expected[n]) continue;
       const SlowHit<T> hit = SlowFace<T>(scene, b, id).at(n % W, H - 1 - n / W, scene.raster());
@@ -126,9 +126,9 @@ TEST_REAL(rasterize_almost_coplanar_faces_by_exact_depth) {
 }
 
 TEST_REAL(rasterize_row_0_is_the_top) {
-  const std::vector<int32_t> owner = rasterized(raster_of<T>(triangle({-1, 0.1, 1, 1, 0.1, 1, -1, 1, 1}), 8));
-  for (int n = 32; n < 64; ++n) CHECK_EQUAL(owner[n], -1);
-  CHECK_EQUAL(owner[8 * 3], 0);  // just above the middle, at the left
+  const std::vector<int32_t> face_index = rasterized(raster_of<T>(triangle({-1, 0.1, 1, 1, 0.1, 1, -1, 1, 1}), 8));
+  for (int n = 32; n < 64; ++n) CHECK_EQUAL(face_index[n], -1);
+  CHECK_EQUAL(face_index[8 * 3], 0);  // just above the middle, at the left
 }
 
 // z is linear in 1/z on the screen: a slanted face meets near and far where the closed form says.
@@ -136,10 +136,10 @@ TEST_REAL(rasterize_near_and_far_cut_each_pixel) {
   Scene<T> scene = raster_of<T>(Mesh{{-2, -1, 1, 2, -1, 5, 2, 1, 5, -2, 1, 1}, {0, 1, 2, 0, 2, 3}}, 64);
   scene.near = T(2);
   scene.far = T(3);
-  const std::vector<int32_t> owner = rasterized(scene);
+  const std::vector<int32_t> face_index = rasterized(scene);
   for (int64_t n = 0; n < 64 * 64; ++n) {
     const double x = static_cast<double>(2 * (n % 64) + 1 - 64) / 64, z = 1 / (1 + (0.2 - 1) * (x + 2) / 4);
-    if (std::abs(z - 2) > 1e-4 && std::abs(z - 3) > 1e-4) CHECK_EQUAL(owner[n] >= 0, z > 2 && z < 3);
+    if (std::abs(z - 2) > 1e-4 && std::abs(z - 3) > 1e-4) CHECK_EQUAL(face_index[n] >= 0, z > 2 && z < 3);
   }
   scene.near = scene.far = T(2.5);
   CHECK_EQUAL(covered(rasterized(scene)), 0);

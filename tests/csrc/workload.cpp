@@ -50,25 +50,25 @@ Scene<T> spheres(int64_t batch) {
 template <class T>
 struct W1 {
   Scene<T> scene;
-  std::vector<int32_t> owner;
+  std::vector<int32_t> face_index;
   std::vector<T> alpha, target, grad_alpha, grad_vertices;
 
   explicit W1(int64_t batch)
       : scene(spheres<T>(batch)),
-        owner(scene.pixels()),
+        face_index(scene.pixels()),
         alpha(batch * kSize * kSize),
         target(alpha.size()),
         grad_alpha(alpha.size()),
         grad_vertices(scene.vertices.size()) {}
 
   void forward() {
-    rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), true, scene.near, scene.far}, owner.data(), 1});
-    silhouette_forward(SilhouetteForward<T>{owner.data(), scene.batch, scene.image, true, alpha.data(), 1});
+    rasterize(Rasterize<T>{scene.mesh(), {scene.raster(), true, scene.near, scene.far}, face_index.data(), 1});
+    silhouette_forward(SilhouetteForward<T>{face_index.data(), scene.batch, scene.image, true, alpha.data(), 1});
   }
 
   void backward() {
-    silhouette_backward(SilhouetteBackward<T>{scene.mesh(), scene.image, true, scene.eps, owner.data(),
-                                              grad_alpha.data(), grad_vertices.data(), 1});
+    silhouette_backward(SilhouetteBackward<T>{scene.mesh(), scene.image, true, scene.eps, face_index.data(), grad_alpha.data(),
+                                              grad_vertices.data(), 1});
   }
 
   // d(1 - IoU) / d alpha, IoU = sum(a t) / sum(a + t - a t) of each image with its neighbour.
@@ -88,14 +88,14 @@ struct W1 {
   }
 };
 
-// Colours on the spheres of W1: from the owner map to the image, and back. 32x32 texels with mipmaps; one directional
+// Colours on the spheres of W1: from the face index map to the image, and back. 32x32 texels with mipmaps; one directional
 // light, flat.
 template <class T>
 struct Colors {
   static constexpr int64_t kTexels = 32, kLevels = 6, kLayers = 4;
   Scene<T> scene;
   int64_t pixels, rows, faces;
-  std::vector<int32_t> owner, layers;
+  std::vector<int32_t> face_index, layers;
   std::vector<T> weights, depth, at_vertices, uv, texels, colors, resolved, pyramid, level, normals, lit, clear;
   std::vector<T> upstream, grad_image, grad_weights, grad_depth, grad_vertices, grad_values, grad_texels, grad_pyramid,
       grad_normals, grad_lights;
@@ -108,7 +108,7 @@ struct Colors {
     pixels = scene.pixels();
     rows = scene.rows();
     faces = batch * scene.num_faces;
-    owner.resize(pixels), layers.resize(kLayers * pixels);
+    face_index.resize(pixels), layers.resize(kLayers * pixels);
     weights.resize(3 * pixels), depth.resize(pixels), colors.resize(3 * pixels), resolved.resize(3 * pixels),
         level.resize(pixels);
     lit.resize(3 * pixels), clear.resize(pixels), normals.resize(3 * faces);
@@ -132,11 +132,11 @@ struct Colors {
   }
 
   Fragments<T> fragments() {
-    return {scene.mesh(), scene.raster(),      scene.far,         owner.data(),         weights.data(),
+    return {scene.mesh(), scene.raster(),      scene.far,         face_index.data(),    weights.data(),
             depth.data(), grad_weights.data(), grad_depth.data(), grad_vertices.data(), 1};
   }
   Interpolate<T> interpolate(std::vector<T>& attributes, int64_t channels) {
-    return {owner.data(),
+    return {face_index.data(),
             weights.data(),
             scene.batch,
             scene.raster(),
@@ -155,8 +155,9 @@ struct Colors {
             1};
   }
   Resolve<T> resolve() {
-    return {scene.batch, scene.image, true, 3, owner.data(), colors.data(), background.data(), 1, resolved.data(),
-            upstream.data(), grad_image.data(), nullptr, 1};
+    return {
+        scene.batch,     scene.image,       true,    3, face_index.data(), colors.data(), background.data(), 1, resolved.data(),
+        upstream.data(), grad_image.data(), nullptr, 1};
   }
   Mipmaps<T> mipmaps() {
     return {1, kLevels, grids.data(), 3, texels.data(), pyramid.data(), grad_pyramid.data(), grad_texels.data(), 1};
@@ -201,7 +202,7 @@ struct Colors {
   SoftSettings<T> soft() const { return {settings(), T(1e-4), T(9.2e-4)}; }
 
   void rasterize_first() {
-    rasterize(Rasterize<T>{scene.mesh(), settings(), owner.data(), 1});
+    rasterize(Rasterize<T>{scene.mesh(), settings(), face_index.data(), 1});
     fragments_forward(fragments());
     resolve_backward(resolve());
   }
@@ -229,9 +230,8 @@ constexpr Row kRows[] = {
      }},
     {"edges_backward",
      [](C& c) {
-       edges_backward(EdgesBackward<float>{c.scene.mesh(), c.scene.image, true, c.scene.eps, c.owner.data(),
-                                           c.colors.data(), 3, c.background.data(), 1, c.upstream.data(),
-                                           c.grad_vertices.data(), 1});
+       edges_backward(EdgesBackward<float>{c.scene.mesh(), c.scene.image, true, c.scene.eps, c.face_index.data(), c.colors.data(),
+                                           3, c.background.data(), 1, c.upstream.data(), c.grad_vertices.data(), 1});
      }},
     {"uv_forward",
      [](C& c) {
@@ -244,13 +244,8 @@ constexpr Row kRows[] = {
     {"lights_forward", [](C& c) { normals_forward(c.face_normals()), lit_forward(c.light()); }},
     {"lights_backward", [](C& c) { lit_backward(c.light()), normals_backward(c.face_normals()); }},
     {"layers",
-     [](C& c) {
-       rasterize_layers(RasterizeLayers<float>{c.scene.mesh(), c.settings(), C::kLayers, c.layers.data(), 1});
-     }},
-    {"soft_forward",
-     [](C& c) {
-       soft_forward(SoftForward<float>{c.scene.mesh(), c.soft(), c.clear.data(), 1});
-     }},
+     [](C& c) { rasterize_layers(RasterizeLayers<float>{c.scene.mesh(), c.settings(), C::kLayers, c.layers.data(), 1}); }},
+    {"soft_forward", [](C& c) { soft_forward(SoftForward<float>{c.scene.mesh(), c.soft(), c.clear.data(), 1}); }},
     {"soft_backward",
      [](C& c) {
        soft_backward(
@@ -299,8 +294,8 @@ template <class T>
 void print_hashes(const char* type, const W1<T>& w1) {
   double area = 0;
   for (T a : w1.alpha) area += double(a);
-  std::printf("%-7s w1 owner %016" PRIx64 "  alpha %016" PRIx64 "  gradient %016" PRIx64 "  (mean alpha %.4f)\n", type,
-              hash(w1.owner), hash(w1.alpha), hash(w1.grad_vertices), area / double(w1.alpha.size()));
+  std::printf("%-7s w1 face_index %016" PRIx64 "  alpha %016" PRIx64 "  gradient %016" PRIx64 "  (mean alpha %.4f)\n", type,
+              hash(w1.face_index), hash(w1.alpha), hash(w1.grad_vertices), area / double(w1.alpha.size()));
   // Every stage on other meshes; the camera and the smoothness loss included.
   Scene<T> scene = pack<T>({sphere(2, 1), soup(40, 2), Mesh{}, sphere(1, 3)});
   scene.image = {31, 22};

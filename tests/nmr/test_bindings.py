@@ -16,13 +16,13 @@ import torch
 from nmr import _C, ops
 
 CALLS = {
-    "rasterize": lambda a: _C.rasterize(a["vertices"], a["faces"], a["starts"], a["owner"], True, 0.1, 100.0, 1),
-    "silhouette": lambda a: _C.silhouette_forward(a["owner"], a["alpha"], True, 1),
+    "rasterize": lambda a: _C.rasterize(a["vertices"], a["faces"], a["starts"], a["face_index"], True, 0.1, 100.0, 1),
+    "silhouette": lambda a: _C.silhouette_forward(a["face_index"], a["alpha"], True, 1),
     "silhouette_backward": lambda a: _C.silhouette_backward(
-        a["vertices"], a["faces"], a["starts"], a["owner"], a["alpha"], a["grad"], True, 1e-4, 1
+        a["vertices"], a["faces"], a["starts"], a["face_index"], a["alpha"], a["grad"], True, 1e-4, 1
     ),
     "local_gradient": lambda a: _C.local_gradient(
-        a["vertices"], a["faces"], a["starts"], a["owner"], a["alpha"], a["grad"], True, 1e-4, 1
+        a["vertices"], a["faces"], a["starts"], a["face_index"], a["alpha"], a["grad"], True, 1e-4, 1
     ),
     "smoothness": lambda a: _C.smoothness_forward(a["vertices"], a["edges"], a["loss"], 1),
     "smoothness_backward": lambda a: _C.smoothness_backward(a["vertices"], a["edges"], a["loss"], a["grad"], 1),
@@ -45,17 +45,21 @@ STARTS = np.array([[0, 0], [6, 2], [12, 4]])
         (RASTER, dict(faces=np.zeros((4, 2), int)), r"faces must have shape \[F, 3\], or .* got \[4, 2\]"),
         (RASTER, dict(faces=np.zeros((3, 4, 3), int)), r"with the B of vertices \[2, 12, 3\], got \[3, 4, 3\]"),
         (RASTER, dict(faces=np.full((4, 3), -1)), "faces refer to vertex -1, but a mesh has 12 vertices"),
-        (("rasterize",), dict(owner=np.zeros((2, 0, 0), np.int32)), r"H and W in 1\.\.16384, got \[2, 0, 0\]"),
+        (("rasterize",), dict(face_index=np.zeros((2, 0, 0), np.int32)), r"H and W in 1\.\.16384, got \[2, 0, 0\]"),
         (
             ("rasterize",),
-            dict(owner=np.zeros((3, 8, 8), np.int32)),
-            r"owner must have shape \[2, H, W\] .*, got \[3, 8, 8\]",
+            dict(face_index=np.zeros((3, 8, 8), np.int32)),
+            r"face_index must have shape \[2, H, W\] .*, got \[3, 8, 8\]",
         ),
         (("silhouette",), dict(alpha=np.zeros((2, 4))), r"alpha must have shape \[B, h, w\], got \[2, 4\]"),
-        (("silhouette",), dict(alpha=np.zeros((2, 4, 5))), r"owner must have shape \[2, 8, 10\], got \[2, 8, 8\]"),
-        (("silhouette",), dict(owner=np.zeros((2, 4, 4), np.int32)), r"owner must have shape \[2, 8, 8\]"),
-        (RASTER[1:], dict(owner=np.zeros((2, 9, 9), np.int32)), r"has an even size, got \[2, 9, 9\]"),
-        (RASTER[1:], dict(owner=np.full((2, 8, 8), 9, np.int32)), "the owner map does not belong to these faces"),
+        (("silhouette",), dict(alpha=np.zeros((2, 4, 5))), r"face_index must have shape \[2, 8, 10\], got \[2, 8, 8\]"),
+        (("silhouette",), dict(face_index=np.zeros((2, 4, 4), np.int32)), r"face_index must have shape \[2, 8, 8\]"),
+        (RASTER[1:], dict(face_index=np.zeros((2, 9, 9), np.int32)), r"has an even size, got \[2, 9, 9\]"),
+        (
+            RASTER[1:],
+            dict(face_index=np.full((2, 8, 8), 9, np.int32)),
+            "the face index map does not belong to these faces",
+        ),
         (RASTER[1:], dict(alpha=np.zeros((2, 8, 8))), r"grad_alpha must have shape \[2, 4, 4\], got \[2, 8, 8\]"),
         (RASTER[1:], dict(grad=np.zeros((1, 12, 3))), r"grad_vertices must have shape \[2, 12, 3\], got \[1, 12, 3\]"),
         (SMOOTHNESS, dict(vertices=np.zeros((2, 12))), r"vertices must have shape \[B, V, 3\], got \[2, 12\]"),
@@ -80,7 +84,7 @@ def test_no_call_reads_or_writes_outside_an_array(calls, change, words):
         vertices=np.random.default_rng(0).random((2, 12, 3)) + 0.5,
         faces=np.arange(12).reshape(4, 3),
         starts=None,
-        owner=np.zeros((2, 8, 8), np.int32),
+        face_index=np.zeros((2, 8, 8), np.int32),
         alpha=np.zeros((2, 4, 4)),
         grad=np.zeros((2, 12, 3)),
         edges=np.array([[0, 1, 2, 3]]),
@@ -102,25 +106,32 @@ def test_no_call_reads_or_writes_outside_an_array(calls, change, words):
 @pytest.mark.parametrize(
     "call, words",
     [
-        (lambda v, wrong, owner: _C.smoothness_forward(v, wrong.reshape(-1, 4), np.zeros(1), 1), "edges refer to"),
-        (lambda v, wrong, owner: _C.rasterize(v, wrong, None, owner, True, 0.1, 100.0, 1), "faces refer to vertex"),
+        (lambda v, wrong, face_index: _C.smoothness_forward(v, wrong.reshape(-1, 4), np.zeros(1), 1), "edges refer to"),
         (
-            lambda v, wrong, owner: _C.interpolate_forward(
-                v, wrong[None], owner[:, :2], np.zeros((1, 2, 4096, 3)), None, np.zeros((1, 2, 4096, 3)), 1
+            lambda v, wrong, face_index: _C.rasterize(v, wrong, None, face_index, True, 0.1, 100.0, 1),
+            "faces refer to vertex",
+        ),
+        (
+            lambda v, wrong, face_index: _C.interpolate_forward(
+                v, wrong[None], face_index[:, :2], np.zeros((1, 2, 4096, 3)), None, np.zeros((1, 2, 4096, 3)), 1
             ),
             "corners refer to",
         ),
         (
-            lambda v, wrong, owner: _C.silhouette_backward(
-                v, wrong[:1], None, owner, np.zeros((1, 4096, 4096)), np.zeros((1, 3, 3)), False, 1e-4, 1
+            lambda v, wrong, face_index: _C.silhouette_backward(
+                v, wrong[:1], None, face_index, np.zeros((1, 4096, 4096)), np.zeros((1, 3, 3)), False, 1e-4, 1
             ),
-            "the owner map does not belong",
+            "the face index map does not belong",
         ),
     ],
 )
 def test_other_python_threads_run_while_arrays_are_checked(call, words):
-    vertices, wrong, owner = np.zeros((1, 3, 3)), np.zeros((4_000_000, 3), int), np.zeros((1, 4096, 4096), np.int32)
-    wrong[-1], owner[0, -1, -1] = 3, 2
+    vertices, wrong, face_index = (
+        np.zeros((1, 3, 3)),
+        np.zeros((4_000_000, 3), int),
+        np.zeros((1, 4096, 4096), np.int32),
+    )
+    wrong[-1], face_index[0, -1, -1] = 3, 2
     turns, stop, interval = [0], [False], sys.getswitchinterval()
 
     def take_turns():
@@ -136,7 +147,7 @@ def test_other_python_threads_run_while_arrays_are_checked(call, words):
         before = turns[0]
         for _ in range(100):  # on a busy machine the thread may miss its turn
             with pytest.raises(ValueError, match=words):
-                call(vertices, wrong, owner)
+                call(vertices, wrong, face_index)
             if turns[0] > before:
                 break
         assert turns[0] > before
@@ -169,10 +180,10 @@ def promised(gigabytes, dtype):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory that is promised and never touched")
-def test_more_faces_than_an_owner_map_can_name():
-    faces, owner = promised(24, np.int64).reshape(-1, 3), np.zeros((1, 8, 8), np.int32)
+def test_more_faces_than_an_face_index_map_can_name():
+    faces, face_index = promised(24, np.int64).reshape(-1, 3), np.zeros((1, 8, 8), np.int32)
     with pytest.raises(ValueError, match=r"at most 2\^30 faces per mesh"):
-        _C.rasterize(np.zeros((1, 3, 3)), faces, None, owner, True, 0.1, 100.0, 1)
+        _C.rasterize(np.zeros((1, 3, 3)), faces, None, face_index, True, 0.1, 100.0, 1)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory that is promised and never touched")
@@ -180,9 +191,9 @@ def test_more_faces_than_an_owner_map_can_name():
 def test_more_vertices_than_the_set_up_of_faces_can_name(packed):
     vertices, faces = promised(6, np.float32).reshape(-1, 3), np.array([[0, 1, 2]])
     starts = np.array([[0, 0], [len(vertices), 1]]) if packed else None
-    owner = np.zeros((1, 8, 8), np.int32)
+    face_index = np.zeros((1, 8, 8), np.int32)
     with pytest.raises(ValueError, match=r"at most 2\^29 vertices per mesh"):
-        _C.rasterize(vertices if packed else vertices[None], faces, starts, owner, True, 0.1, 100.0, 1)
+        _C.rasterize(vertices if packed else vertices[None], faces, starts, face_index, True, 0.1, 100.0, 1)
 
 
 def test_gradients_of_gradients_are_refused():

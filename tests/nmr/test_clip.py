@@ -54,7 +54,7 @@ def test_a_floor_under_the_eye_is_that_of_a_fine_mesh(camera, image_size):
     torch.testing.assert_close(normals, wanted[4])
     assert (rgb - wanted[0]).abs().mean() < 2e-3
     fragments = nmr.render_fragments(*coarse, camera, **options)
-    assert fragments.owner.unique().tolist() in ([-1, 1], [-1, 0, 1], [-1, 2, 3], [-1, 3])
+    assert fragments.sided_face_index.unique().tolist() in ([-1, 1], [-1, 0, 1], [-1, 2, 3], [-1, 3])
     torch.testing.assert_close(fragments.weights.sum(-1), alpha, rtol=0, atol=1e-5)
 
 
@@ -82,7 +82,7 @@ def test_a_room_from_inside():
         walls = points.abs().amax(-1)[fragments.covered]
         torch.testing.assert_close(walls, torch.ones_like(walls), rtol=0, atol=1e-4)
         plain = nmr.render_fragments(corners, faces, camera, image_size=SIZE, near=0.05, clip=False)
-        assert (plain.owner != fragments.owner).float().mean() > 0.05
+        assert (plain.sided_face_index != fragments.sided_face_index).float().mean() > 0.05
 
 
 def test_one_face_is_drawn_as_its_part_in_front():
@@ -121,20 +121,22 @@ def test_gradients_are_the_derivative(packed):
         return seen.weights, seen.depth.clamp_max(50), depth, seen.interpolate(attributes), seen.normals()
 
     covered = nmr.render_fragments(vertices, faces, camera, image_size=7)
-    assert {0, 1, 2} <= {owner % 3 for owner in covered.owner[covered.covered].tolist()}
+    assert {0, 1, 2} <= {face_index % 3 for face_index in covered.sided_face_index[covered.covered].tolist()}
     vertices.requires_grad_(), camera.eye.requires_grad_()
     assert torch.autograd.gradcheck(draw, (vertices, camera.eye), eps=1e-7, atol=1e-4, rtol=1e-4)
 
 
 def test_faces_keep_their_numbers_and_sides():
     vertices, faces = tilted(torch.float32)
-    owner = nmr.render_fragments(vertices, faces, CAMERA, image_size=SIZE).owner
+    face_index = nmr.render_fragments(vertices, faces, CAMERA, image_size=SIZE).sided_face_index
     seen = nmr.render_face_index(vertices, faces, CAMERA, image_size=SIZE)
-    assert seen.unique().tolist() == [-1, 0, 1, 2] and torch.equal(seen, torch.where(owner >= 3, owner - 3, owner))
+    assert seen.unique().tolist() == [-1, 0, 1, 2] and torch.equal(
+        seen, torch.where(face_index >= 3, face_index - 3, face_index)
+    )
     flipped = nmr.render_fragments(vertices, faces.flip(1), CAMERA, image_size=SIZE)
-    assert torch.equal(flipped.is_back, (owner >= 0) & (owner < 3)) and torch.equal(flipped.face_index, seen)
-    front = nmr.render_fragments(vertices, faces, CAMERA, image_size=SIZE, fill_back=False).owner
-    assert 0 < (front >= 0).sum() < (owner >= 0).sum() and front.max() < 3
+    assert torch.equal(flipped.is_back, (face_index >= 0) & (face_index < 3)) and torch.equal(flipped.face_index, seen)
+    front = nmr.render_fragments(vertices, faces, CAMERA, image_size=SIZE, fill_back=False).sided_face_index
+    assert 0 < (front >= 0).sum() < (face_index >= 0).sum() and front.max() < 3
 
 
 def test_scenes_in_front_of_the_plane_keep_their_bits():

@@ -13,14 +13,14 @@ def slow_layers(vertices, faces, size, layers, fill_back):
     """Draws the faces of one mesh one by one; sorts those at each pixel by depth, then by number. Row 0 = top."""
     ids = range(2 * len(faces) if fill_back else len(faces))
     triangles = reference.with_back_faces(faces, fill_back)
-    owners, depths = [], []
+    face_indices, depths = [], []
     for face in ids:
         index = reference.face_index(vertices, triangles[face : face + 1], size, False, NEAR, FAR)
         _, depth = reference.fragments(vertices, triangles[face : face + 1], index, FAR)
-        owners.append(torch.where(index < 0, -1, face)), depths.append(depth)
+        face_indices.append(torch.where(index < 0, -1, face)), depths.append(depth)
     depth, order = torch.stack(depths, -1).sort(dim=-1, stable=True)
-    owner = torch.stack(owners, -1).gather(-1, order)
-    return owner[..., :layers].flip(0), depth[..., :layers].flip(0)
+    face_index = torch.stack(face_indices, -1).gather(-1, order)
+    return face_index[..., :layers].flip(0), depth[..., :layers].flip(0)
 
 
 def soup(seed, dtype=torch.float64, num_faces=12):
@@ -37,8 +37,8 @@ def soup(seed, dtype=torch.float64, num_faces=12):
 def test_equals_the_slow_definition(seed, fill_back):
     vertices, faces = soup(seed)
     fragments = nmr.render_fragments(vertices, faces, image_size=20, fill_back=fill_back, faces_per_pixel=5, clip=False)
-    owner, depth = slow_layers(vertices[0], faces, 20, 5, fill_back)
-    assert torch.equal(fragments.owner[0].long(), owner) and (owner[..., 1] >= 0).any()
+    face_index, depth = slow_layers(vertices[0], faces, 20, 5, fill_back)
+    assert torch.equal(fragments.sided_face_index[0].long(), face_index) and (face_index[..., 1] >= 0).any()
     torch.testing.assert_close(fragments.depth[0], depth, rtol=1e-9, atol=0)
 
 
@@ -50,21 +50,21 @@ def test_the_first_layer_is_what_is_seen(dtype, image_size):
         plain = nmr.render_fragments(vertices, faces, image_size=image_size)
         layers = nmr.render_fragments(vertices, faces, image_size=image_size, faces_per_pixel=3)
         first = layers.layer(0)
-        for name in ("owner", "weights", "depth", "covered", "is_back", "face_index"):
+        for name in ("sided_face_index", "weights", "depth", "covered", "is_back", "face_index"):
             assert torch.equal(getattr(first, name), getattr(plain, name))
         assert torch.equal(first.normals(), plain.normals())
         image = first.interpolate(vertices)
         assert torch.equal(first.resolve(image), plain.resolve(plain.interpolate(vertices)))
         one = nmr.render_fragments(vertices, faces, image_size=image_size, faces_per_pixel=1)
-        assert one.layers is None and torch.equal(one.owner, plain.owner)
+        assert one.layers is None and torch.equal(one.sided_face_index, plain.sided_face_index)
 
 
 def test_of_equally_near_faces_the_first_comes_first():
     vertices = torch.tensor([[-0.9, -0.9, 2.0], [0.9, -0.9, 2.0], [0.0, 0.9, 2.0]])
     faces = torch.tensor([[0, 1, 2], [1, 2, 0], [2, 1, 0], [0, 1, 2]])
-    owner = nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=6).owner
+    face_index = nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=6).sided_face_index
     # Faces 0, 1, 3 from their fronts, then 2 (4 + 2) from its back, where the depths have the same bits.
-    middle = owner[0, 5, 4].tolist()
+    middle = face_index[0, 5, 4].tolist()
     assert middle == [0, 1, 3, 6, -1, -1]
 
 
@@ -109,7 +109,7 @@ def test_lists_batches_and_clipped_faces():
     for b in range(2):
         alone = nmr.render_fragments(vertices[b], faces[b], camera, image_size=24, faces_per_pixel=4)
         nearest = nmr.render_fragments(vertices[b], faces[b], camera, image_size=24)
-        for name in ("owner", "weights", "depth", "face_index"):
+        for name in ("sided_face_index", "weights", "depth", "face_index"):
             assert torch.equal(getattr(together, name)[b], getattr(alone, name)[0])
             assert torch.equal(getattr(together.layer(0), name)[b], getattr(nearest, name)[0])
         assert torch.equal(together.normals()[b], alone.normals()[0])
@@ -120,9 +120,11 @@ def test_results_do_not_depend_on_threads():
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        one = nmr.render_fragments(vertices, faces, image_size=100, faces_per_pixel=3).owner
+        one = nmr.render_fragments(vertices, faces, image_size=100, faces_per_pixel=3).sided_face_index
         torch.set_num_threads(3)
-        assert torch.equal(one, nmr.render_fragments(vertices, faces, image_size=100, faces_per_pixel=3).owner)
+        assert torch.equal(
+            one, nmr.render_fragments(vertices, faces, image_size=100, faces_per_pixel=3).sided_face_index
+        )
     finally:
         torch.set_num_threads(threads)
 

@@ -235,7 +235,7 @@ def test_opcheck(smooth):
     torch.library.opcheck(nmr.ops.normals_backward, (vertices[None], faces, None, smooth, normals))
     layout = torch.tensor([[0, 1, 1], [1, 1, 1], [4, 2, 1], [6, 1, 1], [9, 1, 1], *[[0, 1, 0]] * 6])
     viewer = torch.tensor([[0.0, 0, -3, 1, 1]]).double().expand(2, 5).contiguous()
-    at = layout, viewer, vertices[None], faces, fragments.owner, fragments.weights.detach(), None, smooth
+    at = layout, viewer, vertices[None], faces, fragments.sided_face_index, fragments.weights.detach(), None, smooth
     leaves = [x.requires_grad_() for x in (torch.rand(2, 6, 6, 3).double(), normals.clone(), torch.rand(12).double())]
     torch.library.opcheck(nmr.ops.lit, (*leaves, *at))
     leaves = [x.detach() for x in leaves]

@@ -51,8 +51,8 @@ def test_rectangles_equal_the_slow_definition(size, anti_aliasing):
     upstream = noise(2, *size)
     raster = tuple(n * (1 + anti_aliasing) for n in size)
     index = torch.stack([reference.face_index(v, faces, raster) for v in vertices])
-    owner = index.flip(1).to(torch.int32).contiguous()
-    grad = nmr.ops.local_gradient(vertices, faces, None, owner, upstream, anti_aliasing, 1e-4)
+    face_index = index.flip(1).to(torch.int32).contiguous()
+    grad = nmr.ops.local_gradient(vertices, faces, None, face_index, upstream, anti_aliasing, 1e-4)
     for b in range(2):
         expected = reference.local_gradient(vertices[b], faces, index[b], upstream[b], anti_aliasing)
         torch.testing.assert_close(grad[b], expected, rtol=1e-9, atol=1e-9)
@@ -225,14 +225,14 @@ def test_opcheck(dtype):
     vertices, faces = random_soup(0, dtype=dtype)
     settings = 12, 12, True, True, 0.1, 100.0, 1e-4
     torch.library.opcheck(nmr.ops.silhouette, (vertices.clone().requires_grad_(), faces, None, *settings, True))
-    _, owner = nmr.ops.silhouette(vertices, faces, None, *settings, True)
+    _, face_index = nmr.ops.silhouette(vertices, faces, None, *settings, True)
     upstream = noise(2, 12, 12, dtype=dtype)
-    torch.library.opcheck(nmr.ops.local_gradient, (vertices, faces, None, owner, upstream, True, 1e-4))
+    torch.library.opcheck(nmr.ops.local_gradient, (vertices, faces, None, face_index, upstream, True, 1e-4))
     packed = pack(different_soups(dtype))
-    _, owner = nmr.ops.silhouette(*packed, *settings, True)
+    _, face_index = nmr.ops.silhouette(*packed, *settings, True)
     torch.library.opcheck(nmr.ops.silhouette, (packed[0].requires_grad_(), *packed[1:], *settings, True))
     upstream = noise(4, 12, 12, dtype=dtype)
-    torch.library.opcheck(nmr.ops.local_gradient, (packed[0].detach(), *packed[1:], owner, upstream, True, 1e-4))
+    torch.library.opcheck(nmr.ops.local_gradient, (packed[0].detach(), *packed[1:], face_index, upstream, True, 1e-4))
 
 
 def test_compile_fullgraph():

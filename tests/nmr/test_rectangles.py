@@ -99,9 +99,13 @@ def test_the_middle_is_the_square_image(camera, size, anti_aliasing):
         close(middle_of(image, size), expected)
     assert (outside_of(wide.depth, size) == 100).all() and not outside_of(wide.alpha, size).any()
     scale = 2 if anti_aliasing else 1
-    assert wide.fragments.owner.shape[1:] == wide.fragments.weights.shape[1:3] == (scale * size[0], scale * size[1])
-    cut = wide.fragments.owner.unflatten(2, (-1, scale)).unflatten(1, (-1, scale)).transpose(2, 3)
-    uncut = square.fragments.owner.unflatten(2, (-1, scale)).unflatten(1, (-1, scale)).transpose(2, 3)
+    assert (
+        wide.fragments.sided_face_index.shape[1:]
+        == wide.fragments.weights.shape[1:3]
+        == (scale * size[0], scale * size[1])
+    )
+    cut = wide.fragments.sided_face_index.unflatten(2, (-1, scale)).unflatten(1, (-1, scale)).transpose(2, 3)
+    uncut = square.fragments.sided_face_index.unflatten(2, (-1, scale)).unflatten(1, (-1, scale)).transpose(2, 3)
     assert torch.equal(middle_of(cut, size), uncut)
 
 
@@ -369,10 +373,10 @@ def test_every_function_takes_height_and_width(size):
     assert nmr.render_normals(vertices, faces, camera, image_size=size).shape == (*shape, 3)
     assert nmr.render_face_index(vertices, faces, camera, image_size=size).shape == shape
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=size)
-    assert fragments.owner.shape == fragments.depth.shape == shape and fragments.weights.shape == (*shape, 3)
+    assert fragments.sided_face_index.shape == fragments.depth.shape == shape and fragments.weights.shape == (*shape, 3)
     assert torch.equal(fragments.face_index, nmr.render_face_index(vertices, faces, camera, image_size=size))
     twice = nmr.render_fragments(vertices, faces, camera, image_size=size, anti_aliasing=True)
-    assert twice.owner.shape == (2, 48, 80)
+    assert twice.sided_face_index.shape == (2, 48, 80)
     assert twice.resolve(twice.interpolate(vertices)).shape == (*shape, 3)
     assert fragments.per_face(torch.ones(len(faces), 5)).shape == (*shape, 5)
 

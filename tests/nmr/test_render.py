@@ -76,7 +76,7 @@ def test_fragments_know_front_from_back():
     assert front.covered.any() and torch.equal(front.covered, back.covered)
     assert not front.is_back.any() and torch.equal(back.is_back, back.covered)
     assert torch.equal(front.face_index, nmr.render_face_index(vertices, faces, image_size=8))
-    assert torch.equal(front.face_index, back.face_index) and back.owner.max() == 3
+    assert torch.equal(front.face_index, back.face_index) and back.sided_face_index.max() == 3
     # Weights are in the face's own order, whichever way round it is drawn.
     torch.testing.assert_close(front.weights, back.weights.flip(-1), rtol=1e-12, atol=1e-12)
 
@@ -189,7 +189,9 @@ def test_each_output_has_a_function_of_its_own():
     assert torch.equal(images.depth, nmr.render_depth(vertices, faces, CAMERA, **size))
     assert torch.equal(images.normals, nmr.render_normals(vertices, faces, CAMERA, **size))
     fragments = nmr.render_fragments(vertices, faces, CAMERA, anti_aliasing=True, **size)
-    assert torch.equal(images.fragments.owner, fragments.owner) and fragments.owner.shape == (2, 32, 32)
+    assert torch.equal(
+        images.fragments.sided_face_index, fragments.sided_face_index
+    ) and fragments.sided_face_index.shape == (2, 32, 32)
     assert torch.equal(images.fragments.weights, fragments.weights)
 
 

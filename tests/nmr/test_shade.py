@@ -12,8 +12,8 @@ EPS = 1e-3
 
 
 def fragments_of(vertices, faces, raster_size, starts=None):
-    owner = nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, True, 0.1, 50.0)
-    return owner, nmr.ops.fragments(vertices, faces, starts, owner, 50.0)[0]
+    face_index = nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, True, 0.1, 50.0)
+    return face_index, nmr.ops.fragments(vertices, faces, starts, face_index, 50.0)[0]
 
 
 def random_like(shape, dtype=torch.float64, seed=0):
@@ -36,15 +36,15 @@ def with_gradients(op, *leaves, seed=1):
 @pytest.mark.parametrize("texture_batch", [1, 2])
 def test_texture_cubes_equal_the_slow_definition(size, channels, texture_batch):
     vertices, faces = random_soup(0)
-    owner, weights = fragments_of(vertices, faces, 10)
-    assert (owner >= len(faces)).any() and (owner < 0).any()
+    face_index, weights = fragments_of(vertices, faces, 10)
+    assert (face_index >= len(faces)).any() and (face_index < 0).any()
     textures = random_like((texture_batch, len(faces), size, size, size, channels))
-    colors, grad = with_gradients(lambda t: nmr.ops.sample_texture_cubes(t, owner, weights, None, EPS), textures)
+    colors, grad = with_gradients(lambda t: nmr.ops.sample_texture_cubes(t, face_index, weights, None, EPS), textures)
 
     def slow(textures):
-        out = torch.zeros(*owner.shape, channels, dtype=torch.float64)
-        for b, y, x in (owner >= 0).nonzero().tolist():
-            cube = textures[b % texture_batch, owner[b, y, x] % len(faces)]
+        out = torch.zeros(*face_index.shape, channels, dtype=torch.float64)
+        for b, y, x in (face_index >= 0).nonzero().tolist():
+            cube = textures[b % texture_batch, face_index[b, y, x] % len(faces)]
             out[b, y, x] = reference.texture_color(cube, weights[b, y, x], EPS)
         return out
 
@@ -56,10 +56,10 @@ def test_texture_cubes_equal_the_slow_definition(size, channels, texture_batch):
 def test_axis_k_of_a_cube_is_the_weight_of_vertex_k():
     """A cube that holds its own coordinates gives the weights back, for originals and reversed copies alike."""
     vertices, faces = random_soup(1)
-    owner, weights = fragments_of(vertices, faces, 16)
+    face_index, weights = fragments_of(vertices, faces, 16)
     axis = torch.linspace(0, 1, 3, dtype=torch.float64)
     cube = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).expand(1, len(faces), -1, -1, -1, -1)
-    colors = nmr.ops.sample_texture_cubes(cube.contiguous(), owner, weights, None, 1e-12)
+    colors = nmr.ops.sample_texture_cubes(cube.contiguous(), face_index, weights, None, 1e-12)
     torch.testing.assert_close(colors, weights)
 
 
@@ -67,25 +67,27 @@ def test_axis_k_of_a_cube_is_the_weight_of_vertex_k():
 def test_texture_cubes_at_their_far_end(eps):
     """At a corner of a face, where t = ts - 1 unless eps keeps it below: the last texel, never the one beyond."""
     textures = random_like((1, 1, 4, 4, 4, 1), torch.float32)
-    owner = torch.zeros((1, 1, 1), dtype=torch.int32)
+    face_index = torch.zeros((1, 1, 1), dtype=torch.int32)
     for k in range(3):
         weights = torch.zeros((1, 1, 1, 3))
         weights[..., k] = 1
         index = [0, 0, 0]
         index[k] = 3
-        color = nmr.ops.sample_texture_cubes(textures, owner, weights, None, eps).item()
+        color = nmr.ops.sample_texture_cubes(textures, face_index, weights, None, eps).item()
         last = textures[0, 0][tuple(index)].item()
         index[k] = 2
         expected = (1 - eps) * last + eps * textures[0, 0][tuple(index)].item()
         assert color == pytest.approx(expected, rel=1e-6)
-    assert nmr.ops.sample_texture_cubes(textures, owner, weights * float("nan"), None, eps) == textures[0, 0, 0, 0, 0]
+    assert (
+        nmr.ops.sample_texture_cubes(textures, face_index, weights * float("nan"), None, eps) == textures[0, 0, 0, 0, 0]
+    )
 
 
 def test_texture_cubes_gradcheck():
     vertices, faces = random_soup(2, num_faces=3)
-    owner, weights = fragments_of(vertices, faces, 5)
+    face_index, weights = fragments_of(vertices, faces, 5)
     textures = random_like((1, 3, 2, 2, 2, 2)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda t: nmr.ops.sample_texture_cubes(t, owner, weights, None, EPS), textures)
+    assert torch.autograd.gradcheck(lambda t: nmr.ops.sample_texture_cubes(t, face_index, weights, None, EPS), textures)
 
 
 # --- interpolate
@@ -96,20 +98,20 @@ def test_texture_cubes_gradcheck():
 @pytest.mark.parametrize("channels", [1, 3, 6])
 def test_interpolate_equals_the_formula(attribute_batch, corners_per_image, channels):
     vertices, faces = random_soup(0)
-    owner, weights = fragments_of(vertices, faces, 14)
+    face_index, weights = fragments_of(vertices, faces, 14)
     attributes = random_like((attribute_batch, 9, channels))
     g = torch.Generator().manual_seed(0)
     corners = torch.randint(0, 9, (2, len(faces), 3) if corners_per_image else (len(faces), 3), generator=g)
 
     def formula(attributes, weights):
-        face = owner.clamp_min(0).long() % len(faces)
+        face = face_index.clamp_min(0).long() % len(faces)
         picked = torch.stack(
             [attributes[b % attribute_batch][(corners[b] if corners_per_image else corners)[face[b]]] for b in range(2)]
         )
         values = (weights[..., None] * picked).sum(-2)
-        return torch.where((owner >= 0)[..., None], values, torch.zeros_like(values))
+        return torch.where((face_index >= 0)[..., None], values, torch.zeros_like(values))
 
-    ours = with_gradients(lambda a, w: nmr.ops.interpolate(a, corners, owner, w, None), attributes, weights)
+    ours = with_gradients(lambda a, w: nmr.ops.interpolate(a, corners, face_index, w, None), attributes, weights)
     slow = with_gradients(formula, attributes, weights)
     for a, b in zip(ours, slow, strict=True):
         torch.testing.assert_close(a, b)
@@ -117,21 +119,23 @@ def test_interpolate_equals_the_formula(attribute_batch, corners_per_image, chan
 
 def test_interpolate_gradcheck():
     vertices, faces = random_soup(2, num_faces=3)
-    owner, weights = fragments_of(vertices, faces, 5)
+    face_index, weights = fragments_of(vertices, faces, 5)
     attributes = random_like((1, 9, 2)).requires_grad_()
     weights.requires_grad_()
-    assert torch.autograd.gradcheck(lambda a, w: nmr.ops.interpolate(a, faces, owner, w, None), (attributes, weights))
+    assert torch.autograd.gradcheck(
+        lambda a, w: nmr.ops.interpolate(a, faces, face_index, w, None), (attributes, weights)
+    )
 
 
 def test_interpolate_through_fragments_gradcheck():
     """Colours depend on the vertices through the weights: perspective-correct interpolation is differentiable."""
     vertices, faces = random_soup(3, num_faces=3)
-    owner, _ = fragments_of(vertices, faces, 6)
+    face_index, _ = fragments_of(vertices, faces, 6)
     attributes = random_like((2, 9, 2))
 
     def colors(vertices):
-        weights, _ = nmr.ops.fragments(vertices, faces, None, owner, 50.0)
-        return nmr.ops.interpolate(attributes, faces, owner, weights, None)
+        weights, _ = nmr.ops.fragments(vertices, faces, None, face_index, 50.0)
+        return nmr.ops.interpolate(attributes, faces, face_index, weights, None)
 
     assert torch.autograd.gradcheck(colors, vertices.requires_grad_())
 
@@ -139,12 +143,12 @@ def test_interpolate_through_fragments_gradcheck():
 @pytest.mark.parametrize("of_attributes, of_weights", [(True, False), (False, True)])
 def test_interpolate_computes_only_the_gradients_asked_for(of_attributes, of_weights):
     vertices, faces = random_soup(2)
-    owner, weights = fragments_of(vertices, faces, 12)
+    face_index, weights = fragments_of(vertices, faces, 12)
     attributes = random_like((1, 36, 3))
-    both = with_gradients(lambda a, w: nmr.ops.interpolate(a, faces, owner, w, None), attributes, weights)[1:]
+    both = with_gradients(lambda a, w: nmr.ops.interpolate(a, faces, face_index, w, None), attributes, weights)[1:]
     attributes.requires_grad_(of_attributes)
     weights.requires_grad_(of_weights)
-    output = nmr.ops.interpolate(attributes, faces, owner, weights, None)
+    output = nmr.ops.interpolate(attributes, faces, face_index, weights, None)
     upstream = torch.randn(output.shape[1:], dtype=output.dtype, generator=torch.Generator().manual_seed(1))
     output.backward(upstream.expand_as(output))
     for leaf, asked, expected in zip((attributes, weights), (of_attributes, of_weights), both, strict=True):
@@ -158,14 +162,14 @@ def test_interpolate_computes_only_the_gradients_asked_for(of_attributes, of_wei
 @pytest.mark.parametrize("shared", [False, True])
 def test_same_bits_for_any_number_of_threads(batch, raster_size, shared):
     vertices, faces = random_soup(4, batch, 60, torch.float32)
-    owner, weights = fragments_of(vertices, faces, raster_size)
+    face_index, weights = fragments_of(vertices, faces, raster_size)
     textures = random_like((1 if shared else batch, len(faces), 3, 3, 3, 3), torch.float32)
     attributes = random_like((1 if shared else batch, vertices.shape[1], 3), torch.float32)
 
     def run():
         return [
-            *with_gradients(lambda t: nmr.ops.sample_texture_cubes(t, owner, weights, None, EPS), textures),
-            *with_gradients(lambda a, w: nmr.ops.interpolate(a, faces, owner, w, None), attributes, weights),
+            *with_gradients(lambda t: nmr.ops.sample_texture_cubes(t, face_index, weights, None, EPS), textures),
+            *with_gradients(lambda a, w: nmr.ops.interpolate(a, faces, face_index, w, None), attributes, weights),
         ]
 
     results = for_threads((1, 2, 5), run)
@@ -176,15 +180,15 @@ def test_same_bits_for_any_number_of_threads(batch, raster_size, shared):
 def test_packed_equals_one_by_one():
     meshes = different_soups()
     vertices, faces, starts = pack(meshes)
-    owner, weights = fragments_of(vertices, faces, 150, starts)
+    face_index, weights = fragments_of(vertices, faces, 150, starts)
     textures = random_like((len(faces), 2, 2, 2, 3), torch.float32)
     attributes = random_like((len(vertices), 4), torch.float32)
-    cubes = with_gradients(lambda t: nmr.ops.sample_texture_cubes(t, owner, weights, starts, EPS), textures)
-    values = with_gradients(lambda a, w: nmr.ops.interpolate(a, faces, owner, w, starts), attributes, weights)
+    cubes = with_gradients(lambda t: nmr.ops.sample_texture_cubes(t, face_index, weights, starts, EPS), textures)
+    values = with_gradients(lambda a, w: nmr.ops.interpolate(a, faces, face_index, w, starts), attributes, weights)
     for b, (_, f) in enumerate(meshes):
         image = slice(b, b + 1)
         rows, own = (slice(starts[b, k], starts[b + 1, k]) for k in range(2))
-        o, w = owner[image], weights[image]
+        o, w = face_index[image], weights[image]
         single = with_gradients(
             lambda t, o=o, w=w: nmr.ops.sample_texture_cubes(t, o, w, None, EPS), textures[None, own]
         )
@@ -198,12 +202,12 @@ def test_packed_equals_one_by_one():
 @pytest.mark.parametrize("shared", [False, True])
 def test_empty_batches_and_meshes(batch, num_faces, shared):
     vertices, faces = torch.zeros(batch, 15, 3), torch.zeros(num_faces, 3, dtype=torch.long)
-    owner, weights = fragments_of(vertices, faces, 8)
+    face_index, weights = fragments_of(vertices, faces, 8)
     lead = 1 if shared else batch
     textures, attributes = torch.ones(lead, num_faces, 2, 2, 2, 3), torch.ones(lead, 15, 3)
     for output, *grads in (
-        with_gradients(lambda t: nmr.ops.sample_texture_cubes(t, owner, weights, None, EPS), textures),
-        with_gradients(lambda a, w: nmr.ops.interpolate(a, faces, owner, w, None), attributes, weights),
+        with_gradients(lambda t: nmr.ops.sample_texture_cubes(t, face_index, weights, None, EPS), textures),
+        with_gradients(lambda a, w: nmr.ops.interpolate(a, faces, face_index, w, None), attributes, weights),
     ):
         assert output.shape == (batch, 8, 8, 3) and not output.any() and not any(g.any() for g in grads)
 
@@ -215,28 +219,28 @@ def test_opcheck(dtype, packed):
     if packed:
         vertices, faces, starts = pack([(v, faces) for v in vertices])
         lead = ()
-    owner, weights = fragments_of(vertices, faces, 10, starts)
+    face_index, weights = fragments_of(vertices, faces, 10, starts)
     textures = random_like((*lead, 12 * (1 + packed), 2, 2, 2, 3), dtype)
     attributes = random_like((*lead, 36 * (1 + packed), 2), dtype)
     leaf = textures.clone().requires_grad_()
-    torch.library.opcheck(nmr.ops.sample_texture_cubes, (leaf, owner, weights, starts, EPS))
+    torch.library.opcheck(nmr.ops.sample_texture_cubes, (leaf, face_index, weights, starts, EPS))
     colors = random_like((2, 10, 10, 3), dtype)
     shape = list(textures.shape)
-    torch.library.opcheck(nmr.ops.texture_cubes_backward, (owner, weights, starts, colors, shape, EPS))
+    torch.library.opcheck(nmr.ops.texture_cubes_backward, (face_index, weights, starts, colors, shape, EPS))
     leaves = attributes.clone().requires_grad_(), weights.clone().requires_grad_()
-    torch.library.opcheck(nmr.ops.interpolate, (leaves[0], faces, owner, leaves[1], starts))
-    arguments = attributes, faces, owner, weights, starts, colors[..., :2]
+    torch.library.opcheck(nmr.ops.interpolate, (leaves[0], faces, face_index, leaves[1], starts))
+    arguments = attributes, faces, face_index, weights, starts, colors[..., :2]
     torch.library.opcheck(nmr.ops.interpolate_backward, (*arguments, True, False))
 
 
 def test_second_derivatives_are_refused():
     vertices, faces = random_soup(0)
-    owner, weights = fragments_of(vertices, faces, 10)
+    face_index, weights = fragments_of(vertices, faces, 10)
     textures = random_like((1, 12, 2, 2, 2, 3)).requires_grad_()
     attributes = random_like((1, 36, 3)).requires_grad_()
     for leaf, output in (
-        (textures, nmr.ops.sample_texture_cubes(textures, owner, weights, None, EPS)),
-        (attributes, nmr.ops.interpolate(attributes, faces, owner, weights, None)),
+        (textures, nmr.ops.sample_texture_cubes(textures, face_index, weights, None, EPS)),
+        (attributes, nmr.ops.interpolate(attributes, faces, face_index, weights, None)),
     ):
         (grad,) = torch.autograd.grad(output.square().sum(), leaf, create_graph=True)
         with pytest.raises(RuntimeError, match="render_rgb has no second derivative"):
@@ -245,16 +249,24 @@ def test_second_derivatives_are_refused():
 
 CALLS = {
     "cubes": lambda a: _C.texture_cubes_forward(
-        a["textures"], a["owner"], a["weights"], a["starts"], a["colors"], EPS, 1
+        a["textures"], a["face_index"], a["weights"], a["starts"], a["colors"], EPS, 1
     ),
     "cubes_backward": lambda a: _C.texture_cubes_backward(
-        a["owner"], a["weights"], a["starts"], a["colors"], a["textures"], EPS, 1
+        a["face_index"], a["weights"], a["starts"], a["colors"], a["textures"], EPS, 1
     ),
     "interpolate": lambda a: _C.interpolate_forward(
-        a["attributes"], a["corners"], a["owner"], a["weights"], a["starts"], a["colors"], 1
+        a["attributes"], a["corners"], a["face_index"], a["weights"], a["starts"], a["colors"], 1
     ),
     "interpolate_backward": lambda a: _C.interpolate_backward(
-        a["attributes"], a["corners"], a["owner"], a["weights"], a["starts"], a["colors"], a["grad"], a["grad_w"], 1
+        a["attributes"],
+        a["corners"],
+        a["face_index"],
+        a["weights"],
+        a["starts"],
+        a["colors"],
+        a["grad"],
+        a["grad_w"],
+        1,
     ),
 }
 ALL = tuple(CALLS)
@@ -271,10 +283,25 @@ PACKED = dict(
 @pytest.mark.parametrize(
     "calls, packed, change, words",
     [
-        (ALL, False, dict(owner=np.full((2, 8, 9), -1, np.int32)), r"weights must have shape \[2, 8, 9, 3\]"),
-        (ALL, False, dict(owner=np.zeros((8, 8), np.int32)), r"owner must have shape \[0, H, W\], got \[8, 8\]"),
-        (ALL, False, dict(owner=np.full((2, 8, 8), 8, np.int32)), "the owner map does not belong to these faces"),
-        (ALL, True, dict(owner=np.full((2, 8, 8), 2, np.int32)), "the owner map does not belong to these faces"),
+        (ALL, False, dict(face_index=np.full((2, 8, 9), -1, np.int32)), r"weights must have shape \[2, 8, 9, 3\]"),
+        (
+            ALL,
+            False,
+            dict(face_index=np.zeros((8, 8), np.int32)),
+            r"face_index must have shape \[0, H, W\], got \[8, 8\]",
+        ),
+        (
+            ALL,
+            False,
+            dict(face_index=np.full((2, 8, 8), 8, np.int32)),
+            "the face index map does not belong to these faces",
+        ),
+        (
+            ALL,
+            True,
+            dict(face_index=np.full((2, 8, 8), 2, np.int32)),
+            "the face index map does not belong to these faces",
+        ),
         (ALL, False, dict(weights=np.zeros((2, 8, 8, 2))), r"weights must have shape \[2, 8, 8, 3\]"),
         (ALL[:1], False, dict(colors=np.zeros((2, 8, 8, 2))), r"^colors must have shape \[2, 8, 8, 3\]"),
         (ALL[1:2], False, dict(colors=np.zeros((2, 8, 8, 2))), r"grad_colors must have shape \[2, 8, 8, 3\]"),
@@ -328,7 +355,7 @@ def test_no_call_reads_or_writes_outside_an_array(calls, packed, change, words):
         attributes=np.zeros((2, 9, 3)),
         corners=np.zeros((4, 3), np.int64),
         starts=None,
-        owner=np.zeros((2, 8, 8), np.int32),
+        face_index=np.zeros((2, 8, 8), np.int32),
         weights=np.zeros((2, 8, 8, 3)),
         colors=np.zeros((2, 8, 8, 3)),
         grad=np.zeros((2, 9, 3)),

@@ -161,11 +161,11 @@ def op_arguments(dtype=torch.float32, requires_grad=True):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_opcheck(dtype):
     torch.library.opcheck(nmr.ops.silhouette, op_arguments(dtype))
-    _, owner = nmr.ops.silhouette(*op_arguments(dtype, False))
+    _, face_index = nmr.ops.silhouette(*op_arguments(dtype, False))
     torch.library.opcheck(nmr.ops.rasterize, (*op_arguments(dtype, False)[:3], 24, 24, True, 0.1, 100.0))
     vertices, faces = op_arguments(dtype, False)[:2]
     upstream = torch.randn(2, 12, 12, dtype=dtype)
-    torch.library.opcheck(nmr.ops.silhouette_backward, (vertices, faces, None, owner, upstream, True, 1e-4))
+    torch.library.opcheck(nmr.ops.silhouette_backward, (vertices, faces, None, face_index, upstream, True, 1e-4))
 
 
 def test_compile_fullgraph():

@@ -185,7 +185,7 @@ def test_values_and_gradients_equal_torch_operations(wrap, per_image, filter):
 
 def slow_level(fragments, uv, size, most):
     """OpenGL's level from differences: the same face, seen a hundred-thousandth of a pixel further on."""
-    height, width = fragments.owner.shape[1:]
+    height, width = fragments.sided_face_index.shape[1:]
     step, images = 1e-5, []
     for b in range(len(uv)):
         corners = fragments.faces[fragments.face_index[b].clamp_min(0).long()]
@@ -211,7 +211,7 @@ def slow_level(fragments, uv, size, most):
 def test_the_level_is_that_of_opengl():
     fragments, _, uv = textured_fragments()
     grids = torch.tensor([[[0, 7, 12], [84, 3, 6], [102, 1, 3], [105, 1, 1]]])
-    at = uv.unsqueeze(0), fragments.faces, fragments.owner, fragments.weights, None
+    at = uv.unsqueeze(0), fragments.faces, fragments.sided_face_index, fragments.weights, None
     level = nmr.ops.uv_levels(*fragments.mesh[:3], *at, grids)
     torch.testing.assert_close(level, slow_level(fragments, uv.expand(2, -1, -1), (7, 12), 3), rtol=1e-4, atol=1e-4)
     covered = level[fragments.covered]
@@ -276,13 +276,13 @@ def test_opcheck(per_image):
     if not per_image:
         image, uv = image[None], uv[None]
     grids = torch.tensor([[[84 * b, 7, 12]] for b in range(len(image))])
-    at = uv, fragments.faces, fragments.owner, fragments.weights, None
+    at = uv, fragments.faces, fragments.sided_face_index, fragments.weights, None
     texels = image.detach().reshape(-1, 3).requires_grad_()
     torch.library.opcheck(nmr.ops.sample_uv, (texels, grids, None, *at, 0))
     grids = torch.tensor([[[84, 1, 12], [96, 1, 6]], [[0, 7, 12], [102, 3, 6]]])[: len(image)]
-    level = uniform(*fragments.owner.shape)
+    level = uniform(*fragments.sided_face_index.shape)
     at = tuple(x.detach() if isinstance(x, torch.Tensor) else x for x in at)
-    grad = uniform(*fragments.owner.shape, 3)
+    grad = uniform(*fragments.sided_face_index.shape, 3)
     texels = uniform(120, 3)
     torch.library.opcheck(nmr.ops.sample_uv_backward, (texels, grids, level, *at, 1, grad, [True, False, True]))
     torch.library.opcheck(nmr.ops.uv_levels, (*fragments.mesh[:3], *at, grids))
@@ -299,7 +299,7 @@ def test_no_call_reads_or_writes_outside_an_array():
         level=None,
         uv=uv[None],
         corners=fragments.faces,
-        owner=fragments.owner,
+        face_index=fragments.sided_face_index,
         weights=fragments.weights,
         starts=None,
         wrap=0,

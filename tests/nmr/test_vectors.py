@@ -55,7 +55,7 @@ def test_index_map(name):
     v = load_vector(name)
     num_faces, raster_size = len(v["faces"]), v["face_index_map"].shape[1]
     expected = v["face_index_map"][:, ::-1]
-    owner = nmr.ops.rasterize(
+    face_index = nmr.ops.rasterize(
         torch.from_numpy(v["vertices"]),
         torch.from_numpy(v["faces"]).long(),
         None,
@@ -65,7 +65,7 @@ def test_index_map(name):
         float(v["near"]),
         float(v["far"]),
     )
-    assert np.array_equal(owner.numpy(), expected)
+    assert np.array_equal(face_index.numpy(), expected)
     public = nmr.render_face_index(
         torch.from_numpy(v["vertices"]),
         torch.from_numpy(v["faces"]),

@@ -18,21 +18,21 @@ def render(v):
     mode, anti_aliasing = str(v["mode"]), bool(v["anti_aliasing"])
     size = int(v["image_size"]) * (2 if anti_aliasing else 1)
     settings = size, size, bool(v["fill_back"]), float(v["near"]), far
-    owner = nmr.ops.rasterize(vertices.detach(), faces, None, *settings)
+    face_index = nmr.ops.rasterize(vertices.detach(), faces, None, *settings)
     if "face_index_map" in v:
-        assert np.array_equal(owner.numpy(), v["face_index_map"][:, ::-1])
+        assert np.array_equal(face_index.numpy(), v["face_index_map"][:, ::-1])
     images, textures = {}, None
     if mode in ("depth", "rgbad"):
-        images["depth"] = nmr.ops.depth_image(vertices, faces, None, owner, anti_aliasing, far)
+        images["depth"] = nmr.ops.depth_image(vertices, faces, None, face_index, anti_aliasing, far)
     if mode in ("rgb", "rgbad"):
         textures = torch.from_numpy(v["textures"]).requires_grad_()
-        weights, _ = nmr.ops.fragments(vertices.detach(), faces, None, owner, far)
-        colors = nmr.ops.sample_texture_cubes(textures, owner, weights, None, eps)
-        covered = (owner >= 0)[..., None]
+        weights, _ = nmr.ops.fragments(vertices.detach(), faces, None, face_index, far)
+        colors = nmr.ops.sample_texture_cubes(textures, face_index, weights, None, eps)
+        covered = (face_index >= 0)[..., None]
         image = torch.where(covered, colors, torch.from_numpy(v["background"]))
         if mode == "rgbad":
             image = torch.cat([image, covered.float()], dim=-1)
-        image = nmr.ops.resolve(image, None, vertices, faces, None, owner, anti_aliasing, eps)
+        image = nmr.ops.resolve(image, None, vertices, faces, None, face_index, anti_aliasing, eps)
         images["rgb"] = image[..., :3].permute(0, 3, 1, 2)
         if mode == "rgbad":
             images["alpha"] = image[..., 3]

@@ -15,20 +15,20 @@ constexpr int64_t kPad = 8;  // entries that lanes may touch before and after th
 // Sweeps go up the line (direction 0) or down (direction 1). What belongs to a direction is in its own coordinate:
 // positions are negative for sweeps down, so that every sweep goes towards larger coordinates.
 template <class T>
-struct PullLines {
+struct ScanlineGrads {
   // [N, pad + M + pad] background pixels with gradient < 0, ascending, and -gradient. Their neighbours in the padding
   // have positions before and after every pixel.
   std::vector<T> position, weight;
-  std::vector<int32_t> count;      // [N] their number
-  // [N + pad] by direction: a crossing before pull_end has a pulling pixel beyond it; one before gain_start has no
+  std::vector<int32_t> count;  // [N] their number
+  // [N + pad] by direction: a crossing before outer_end has a pulling pixel beyond it; one before inner_start has no
   // pixel with gradient > 0 inside.
-  std::vector<T> pull_end[2], gain_start[2];
-  int64_t stride;                  // pad + M + pad
+  std::vector<T> outer_end[2], inner_start[2];
+  int64_t stride;  // pad + M + pad
 
   void reserve_lines(int64_t N, int64_t M) {
     stride = M + 2 * kPad;
     for (std::vector<T>* v : {&position, &weight}) reserve(*v, N * stride);
-    for (std::vector<T>* v : {&pull_end[0], &pull_end[1], &gain_start[0], &gain_start[1]}) reserve(*v, N + kPad);
+    for (std::vector<T>* v : {&outer_end[0], &outer_end[1], &inner_start[0], &inner_start[1]}) reserve(*v, N + kPad);
     reserve(count, N);
   }
   const T* positions(int64_t n) const { return position.data() + n * stride + kPad; }
@@ -41,13 +41,13 @@ struct SweepImage {
   const T* vertices;
   const int64_t* faces;
   int64_t num_faces;
-  Size raster, size;     // H x W, and that of the image
+  Size raster, size;  // H x W, and that of the image
   bool anti_aliasing;
   T eps;
-  const int32_t* owner;  // row 0 = top; pixel (column i, row j from the bottom) is owner[(H - 1 - j) W + i]
+  const int32_t* face_index;  // row 0 = top; pixel (column i, row j from the bottom) is face_index[(H - 1 - j) W + i]
   const T* grad_alpha;
-  PullLines<T>* lines;   // [0] columns: lines of constant x, swept along y; [1] rows
-  T largest_lever;       // above this, or with a tiny eps, the product of two distances could overflow or underflow
+  ScanlineGrads<T>* lines;  // [0] columns: lines of constant x, swept along y; [1] rows
+  T largest_factor;         // above this, or with a tiny eps, the product of two distances could overflow or underflow
   static constexpr bool kFarSides = false;  // whether sweeps need Crossings::far_side
 
   // Gradient of raster pixel (column i, row j from the bottom). With a 2x2 mean each pixel gets a quarter of the
@@ -70,24 +70,24 @@ constexpr int64_t kCrossings = 256;   // crossings of one kind that are worked o
 template <class T>
 struct Crossings {
   int64_t count;
-  // Crossing, and the entries of its line in PullLines, in the coordinate of the direction.
-  T at[kCrossings + kPad], pull_end[kCrossings + kPad], gain_start[kCrossings + kPad];
+  // Crossing, and the entries of its line in ScanlineGrads, in the coordinate of the direction.
+  T at[kCrossings + kPad], outer_end[kCrossings + kPad], inner_start[kCrossings + kPad];
   int32_t line[kCrossings + kPad];
   // Colours only: coordinate on the line where it leaves the face on the other side, as an infinite line.
   T far_side[kCrossings + kPad];
   int32_t edge[kCrossings + kPad];  // k * kSweptFaces + face: edge k, k + 1 of a face of the block
   // Numbers of the crossings that have something to sweep: outside the face, and inside.
-  int32_t pulled[kCrossings + kPad], gained[kCrossings + kPad];
+  int32_t outer[kCrossings + kPad], inner[kCrossings + kPad];
 };
 
 // Memory for a block of faces.
 template <class T>
 struct SweepScratch {
-  int32_t id[kSweptFaces];  // in the owner map
+  int32_t id[kSweptFaces];  // in the face index map
   // x (0) and y (1) of the corners in pixels, in the order in which the face is drawn.
   T corner[2][3][kSweptFaces];
-  // Of edge P-Q = corners k, k + 1 and the lines of an axis: scan coordinates, and 2 / M (Qs - Ps), the reach of a
-  // lever.
+  // Of edge P-Q = corners k, k + 1 and the lines of an axis: scan coordinates, and 2 / M (Qs - Ps), the numerator of
+  // EdgeDerivative's factors.
   T ps[2][3 * kSweptFaces], qs[2][3 * kSweptFaces], reach[2][3 * kSweptFaces];
   T pulls[2][3 * kSweptFaces][2];  // sum of the pulls on P and on Q
   Crossings<T> crossings[2][2];    // by axis and direction

@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "parallel.h"
-#include "pull_lines.h"
+#include "scanline_grads.h"
 #include "stages.h"
 
 namespace nmr {
@@ -13,16 +13,17 @@ namespace nmr {
 // The pixels with a gradient, for the lines of one axis: N lines of M pixels, C channels. Others cannot pull.
 // Sweeps go up the line (direction 0) or down (direction 1).
 template <class T>
-struct ColorLines {
+struct ScanlineColors {
   // [N, blocks, 1 + 2 C, 8] position on the line in pixels, ascending; colour; gradient. What belongs to eight
   // pixels lies together. The last block is filled with zeros, which have no effect.
   std::vector<T> values;
-  std::vector<int32_t> owner;     // [N, blocks, 8]
-  std::vector<int32_t> count;     // [N + pad] number of listed pixels
+  std::vector<int32_t> face_index;  // [N, blocks, 8]
+  std::vector<int32_t> count;       // [N + pad] number of listed pixels
   // Number of listed pixels of line n before pixel m, for m up to M: before[n * step_n + m * step_m].
   std::vector<int32_t> before;
-  std::vector<T> pull_end[2];  // [N + pad] by direction: a crossing before this has a listed pixel beyond its outer one
-  std::vector<T> gain_start[2];   // [N + pad] by direction: a crossing before this has no listed pixel of a face inside
+  std::vector<T>
+      outer_end[2];  // [N + pad] by direction: a crossing before this has a listed pixel beyond its outer one
+  std::vector<T> inner_start[2];  // [N + pad] by direction: a crossing before this has no listed pixel of a face inside
   int64_t stride, channels;       // stride: 8 blocks
   int64_t step_n, step_m;         // of before
 
@@ -33,10 +34,10 @@ struct ColorLines {
     step_n = axis == 0 ? 1 : stride;
     step_m = axis == 0 ? N : 1;
     reserve(values, N * (1 + 2 * C) * stride);
-    reserve(owner, N * stride);
+    reserve(face_index, N * stride);
     reserve(count, N + kPad);
     reserve(before, axis == 0 ? N * (M + 1) : N * stride);
-    for (std::vector<T>* v : {&pull_end[0], &pull_end[1], &gain_start[0], &gain_start[1]}) reserve(*v, N + kPad);
+    for (std::vector<T>* v : {&outer_end[0], &outer_end[1], &inner_start[0], &inner_start[1]}) reserve(*v, N + kPad);
   }
   // Block `block` of line n: eight positions, then as many of each colour and of each gradient.
   T* at(int64_t n, int64_t block) { return values.data() + (n * stride + block * kPad) * (1 + 2 * channels); }
@@ -44,8 +45,8 @@ struct ColorLines {
     return values.data() + (n * stride + block * kPad) * (1 + 2 * channels);
   }
   T position(int64_t n, int64_t k) const { return at(n, k / kPad)[k % kPad]; }
-  int32_t* owners(int64_t n) { return owner.data() + n * stride; }
-  const int32_t* owners(int64_t n) const { return owner.data() + n * stride; }
+  int32_t* face_indices(int64_t n) { return face_index.data() + n * stride; }
+  const int32_t* face_indices(int64_t n) const { return face_index.data() + n * stride; }
 };
 
 // Input of the sweeps for one image.
@@ -54,20 +55,20 @@ struct ColorImage {
   const T* vertices;
   const int64_t* faces;
   int64_t num_faces;
-  Size raster, size;       // H x W, and that of the image
+  Size raster, size;  // H x W, and that of the image
   bool anti_aliasing;
   T eps;
-  const int32_t* owner;    // row 0 = top; pixel (column i, row j from the bottom) is owner[(H - 1 - j) W + i]
-  const T* pixels;         // [H, W, C]
-  const T* background;     // [C] the colour of pixels without a face, or nullptr: that in `pixels`
-  const T* grad_resolved;  // [h, w, C]
-  int64_t channels;        // C
-  ColorLines<T>* lines;    // [0] columns: lines of constant x, swept along y; [1] rows
-  T largest_lever;         // above this, or with a tiny eps, the product of two distances could overflow or underflow
+  const int32_t* face_index;  // row 0 = top; pixel (column i, row j from the bottom) is face_index[(H - 1 - j) W + i]
+  const T* pixels;            // [H, W, C]
+  const T* background;        // [C] the colour of pixels without a face, or nullptr: that in `pixels`
+  const T* grad_resolved;     // [h, w, C]
+  int64_t channels;           // C
+  ScanlineColors<T>* lines;   // [0] columns: lines of constant x, swept along y; [1] rows
+  T largest_factor;  // above this, or with a tiny eps, the product of two distances could overflow or underflow
   static constexpr bool kFarSides = true;  // whether sweeps need Crossings::far_side
 
   const T* color(int64_t pixel) const {
-    return background && owner[pixel] < 0 ? background : pixels + pixel * channels;
+    return background && face_index[pixel] < 0 ? background : pixels + pixel * channels;
   }
 };
 
