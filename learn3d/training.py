@@ -19,7 +19,6 @@ from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import sample_indices
 from learn3d.device import keep_freed_memory, oversubscription, resolve_precision
 from learn3d.distributed.ranks import ALONE, Ranks
-from learn3d.files.worker import together
 from learn3d.methods import DatasetInfo, create_method
 from learn3d.presets import PRESETS
 from learn3d.runs import folder as run_folder
@@ -112,16 +111,15 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
 
 
 def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDataset, ViewDataset]:
-    """The training and the validation split of a run, read at the same time. Both have the same view classes.
+    """The training and the validation split of a run. Both have the same view classes.
 
     progress: on a terminal, show a bar where many files are read.
     """
     options = {"image_size": config.settings.image_size, "view_bins": config.view_bins}
     load = functools.partial(load_dataset, config.layout, config.data, config.category, **options)
     progress = progress and is_watched()
-    train = functools.partial(load, "train", views_per_object=config.views_per_object, progress=progress)
-    train_set, val_set = together([train, functools.partial(load, config.val_split)])
-    return train_set, val_set
+    train_set = load("train", views_per_object=config.views_per_object, progress=progress)
+    return train_set, load(config.val_split)
 
 
 def _shape_of(train_set: ViewDataset, config: TrainConfig) -> DatasetInfo:

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from PIL import Image, ImageOps
 
-from learn3d.files import child, limits, worker
+from learn3d.files import limits, sandbox
 from learn3d.files.findings import DamagedFile
 from learn3d.files.images import PHOTOGRAPHS, open_image
 
@@ -35,7 +35,7 @@ def read_photo(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, n
     Both are turned upright (EXIF). A mask file is its transparency where it has some, else grey: white is the object.
     Raises FileNotFoundError, and ValueError for what cannot be read, no mask at all, and sizes that differ.
     """
-    return worker.read(_read, Path(path), mask_path, wanted="a photograph")
+    return sandbox.read(_read, Path(path), mask_path, wanted="a photograph")
 
 
 def read_picture(path: Path, most_side: int) -> tuple[np.ndarray, np.ndarray | None]:
@@ -44,7 +44,7 @@ def read_picture(path: Path, most_side: int) -> tuple[np.ndarray, np.ndarray | N
     Made smaller where a side has more than `most_side` pixels. Raises FileNotFoundError, and ValueError for what cannot
     be read.
     """
-    return worker.read(_read_picture, Path(path), most_side, wanted="a photograph")
+    return sandbox.read(_read_picture, Path(path), most_side, wanted="a photograph")
 
 
 class Framed(NamedTuple):
@@ -247,7 +247,7 @@ def _outline(inside: np.ndarray) -> np.ndarray:
 def _open(path: Path) -> Image.Image:
     """The image, upright: cameras write the pixels as they lie on the sensor, and the turn into the EXIF data."""
     image = open_image(path, PHOTOGRAPHS, limits.IMAGE_SIDE)
-    child.allow(_MEMORY_PER_PIXEL * image.width * image.height, image.width * image.height / _PIXELS_PER_SECOND)
+    sandbox.allow(_MEMORY_PER_PIXEL * image.width * image.height, image.width * image.height / _PIXELS_PER_SECOND)
     try:
         return ImageOps.exif_transpose(image)
     except Exception:  # its EXIF data are damaged: whatever Pillow's parser raises, the picture itself is sound

@@ -14,7 +14,6 @@ from learn3d.data.readers import READERS
 from learn3d.data.readers.properties import LayoutProperties
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.findings import DamagedFile, MissingFile
-from learn3d.files.worker import together
 
 Layout = Literal[tuple(READERS)]
 LAYOUTS: dict[str, LayoutProperties] = {name: reader.PROPERTIES for name, reader in READERS.items()}
@@ -88,9 +87,7 @@ def load_dataset(
         in_shards = functools.partial(in_shards, image_size=image_size)
     stored = {name: shards.holds(folder, name, split) for name in names}
     try:
-        dataset = concatenate(
-            together([functools.partial(in_shards if stored[name] else load, name) for name in names])
-        )
+        dataset = concatenate([(in_shards if stored[name] else load)(name) for name in names])
     except (DamagedFile, FileNotFoundError) as error:
         if others := layouts_in(Path(folder), layout):
             hint = f"this is a data set of the layout {others[0]!r}, not {layout!r}; give another folder, or train "

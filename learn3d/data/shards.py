@@ -31,7 +31,7 @@ from learn3d.data.stored import StoredArray
 from learn3d.files import npz
 from learn3d.files.findings import DamagedFile, MissingFile, Problem
 from learn3d.files.reading import parse_json, read_bytes
-from learn3d.files.worker import Call, read_all
+from learn3d.files.sandbox import Call, read_all
 from learn3d.files.writing import replacing, write_json
 
 SET_FILE = "set.json"

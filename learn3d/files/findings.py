@@ -62,7 +62,7 @@ class Findings:
             return self.take(error)
 
     def take(self, result: Any) -> Any:
-        """A result of `worker.read_all`; None with a note where it says what is wrong with its file."""
+        """A result of `sandbox.read_all`; None with a note where it says what is wrong with its file."""
         if not isinstance(result, (DamagedFile, MissingFile)):
             return result
         if self.strict:

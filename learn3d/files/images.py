@@ -9,7 +9,7 @@ from typing import Any
 
 from PIL import Image, UnidentifiedImageError
 
-from learn3d.files import child, limits
+from learn3d.files import limits, sandbox
 from learn3d.files.findings import FETCH_AGAIN, DamagedFile
 from learn3d.files.reading import check_file
 
@@ -41,13 +41,13 @@ def open_image(path: Path, formats: Sequence[str], most_side: int) -> Image.Imag
                 f"is {image.width}x{image.height} pixels; at most {most_side} a side and {limits.IMAGE_PIXELS} in all "
                 "are read: make it smaller",
             )
-        child.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
+        sandbox.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
         try:
             image.load()
         except MemoryError:
             raise
         except Exception as error:  # Pillow's decoders raise whatever a damaged file leads them to
-            raise DamagedFile(path, f"cannot be decoded as an image ({child.one_line(error)}). {FETCH_AGAIN}") from None
+            raise DamagedFile(path, f"cannot be decoded as an image ({sandbox.reason(error)}). {FETCH_AGAIN}") from None
         return image
 
 

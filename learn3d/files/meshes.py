@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from learn3d.files import child, limits, worker
+from learn3d.files import limits, sandbox
 from learn3d.files.findings import DamagedFile, MissingFile
 from learn3d.files.images import opening_only
 from learn3d.files.reading import read_bytes
@@ -38,7 +38,7 @@ def read_mesh(path: Path, root: Path | None = None) -> RawMesh:
     Raises ValueError with the reason where it cannot be read, holds no triangle, or has over 256 MiB.
     """
     try:
-        return worker.read(_read, path, path.parent if root is None else root, wanted="a mesh file")
+        return sandbox.read(_read, path, path.parent if root is None else root, wanted="a mesh file")
     except (DamagedFile, MissingFile) as error:
         raise ValueError(error.message) from error
 
@@ -49,7 +49,7 @@ def _read(path: Path, root: Path) -> RawMesh:
 
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
     content = _as_utf8(read_bytes(path, limits.MESH_FILE_BYTES, "a mesh file"), path.suffix)
-    child.allow(_MEMORY_PER_BYTE * len(content), len(content) / _BYTES_PER_SECOND)
+    sandbox.allow(_MEMORY_PER_BYTE * len(content), len(content) / _BYTES_PER_SECOND)
     kind, beside = path.suffix.lower().lstrip("."), _files_below(path.parent, root.resolve())
     with opening_only(TEXTURES):
         scene = trimesh.load(io.BytesIO(content), file_type=kind, resolver=beside, force="scene", process=False)
@@ -91,7 +91,7 @@ def _files_below(folder: Path, root: Path) -> Any:
             if not path.is_relative_to(root):
                 raise ValueError(f"it refers to {name!r}, which lies outside of {root}")
             content = read_bytes(path, limits.MESH_FILE_BYTES, "a file that a mesh refers to")
-            child.allow(_MEMORY_PER_BYTE * len(content))
+            sandbox.allow(_MEMORY_PER_BYTE * len(content))
             return _as_utf8(content, path.suffix)
 
         def namespaced(self, namespace: str) -> Resolver:

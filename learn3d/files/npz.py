@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from learn3d.files import child, limits
+from learn3d.files import limits, sandbox
 
 try:
     from isal import isal_zlib as zlib  # twice as fast
@@ -66,8 +66,8 @@ def read(path: Path, key: str, most: int | None = None) -> np.ndarray:
         raise ValueError(f"the values of {key!r} must be numbers, got {kind}")
     if size != info.file_size - start:
         raise ValueError(f"{key!r} is {head}, which takes {size} bytes, but {info.file_size - start} are there")
-    child.allow(seconds=size / _BYTES_PER_SECOND)
-    array = child.empty((math.prod(head.shape),), head.dtype)
+    sandbox.allow(seconds=size / _BYTES_PER_SECOND)
+    array = sandbox.empty((math.prod(head.shape),), head.dtype)
     content = array.view(np.uint8)
     at, checksum = -start, 0
     for piece in _pieces(path, info):
@@ -94,7 +94,7 @@ def read_ragged(path: Path, key: str) -> np.ndarray | tuple[np.ndarray, list[tup
     with _archive(path).open(info) as file:
         if not _header(file)[0].dtype.hasobject:
             return read(path, key)
-        child.allow(3 * info.file_size, 2 * info.file_size / _BYTES_PER_SECOND)
+        sandbox.allow(3 * info.file_size, 2 * info.file_size / _BYTES_PER_SECOND)
         items = _Arrays(file, encoding="bytes").load()
     if type(items) is not np.ndarray or items.dtype != object or items.ndim != 1:
         raise ValueError(f"{key!r} is no list of arrays")
@@ -103,7 +103,7 @@ def read_ragged(path: Path, key: str) -> np.ndarray | tuple[np.ndarray, list[tup
             raise ValueError(f"{key}[{k}] must be an array of uint8, got {getattr(item, 'dtype', type(item).__name__)}")
     if sum(item.nbytes for item in items) > info.file_size:
         raise ValueError(f"the arrays of {key!r} take more bytes than the file has")  # one of them listed many times
-    flat, at = child.empty((sum(item.nbytes for item in items),), np.uint8), 0
+    flat, at = sandbox.empty((sum(item.nbytes for item in items),), np.uint8), 0
     for item in items:
         flat[at : at + item.nbytes] = item.reshape(-1)
         at += item.nbytes

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.files import child, limits
+from learn3d.files import limits, sandbox
 from learn3d.files.findings import DamagedFile
 from learn3d.files.reading import check_file
 
@@ -19,7 +19,7 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
 
     Nothing in the file is executed (weights_only). Raises DamagedFile for what is no state dict of plain numbers.
     """
-    child.allow(4 * check_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18"))
+    sandbox.allow(4 * check_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18"))
     import torch
 
     if path.suffix == ".safetensors":

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from learn3d.files import npz, worker
+from learn3d.files import npz, sandbox
 from learn3d.files.meshes import EXTENSIONS, RawMesh, read_mesh
 
 SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
@@ -55,8 +55,8 @@ def pack_sources(path: Path) -> list[MeshSource]:
     """
     wanted = "an npz file with n (how many), v0, f0, v1, f1, ... and no pickled objects"
     try:
-        there = set(worker.read(npz.keys, path, wanted=wanted))
-        number = worker.read(npz.read, path, "n", 8, wanted=wanted) if "n" in there else np.array(None)
+        there = set(sandbox.read(npz.keys, path, wanted=wanted))
+        number = sandbox.read(npz.read, path, "n", 8, wanted=wanted) if "n" in there else np.array(None)
     except ValueError as error:
         raise ValueError(f"cannot read the mesh pack {error}") from error
     count = int(number.reshape(())) if number.size == 1 and number.dtype.kind in "iu" else -1
@@ -68,7 +68,7 @@ def pack_sources(path: Path) -> list[MeshSource]:
 
 
 def _packed(path: Path, number: int, wanted: str) -> RawMesh:
-    vertices, faces = (worker.read(npz.read, path, f"{kind}{number}", wanted=wanted) for kind in "vf")
+    vertices, faces = (sandbox.read(npz.read, path, f"{kind}{number}", wanted=wanted) for kind in "vf")
     return RawMesh(vertices, faces)
 
 

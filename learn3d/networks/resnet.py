@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learn3d.files import weights, worker
+from learn3d.files import sandbox, weights
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -95,7 +95,7 @@ def load_pretrained(encoder: nn.Module, path: Path | str) -> None:
     if not isinstance(encoder, ResNet18Encoder):
         raise ValueError(f"pretrained weights are for the encoder resnet18, not for {type(encoder).__name__}")
     limits = {"memory": weights.MEMORY, "seconds": weights.SECONDS}
-    read = worker.read(weights.read_state_dict, path, wanted="weights of torchvision's resnet18", **limits)
+    read = sandbox.read(weights.read_state_dict, path, wanted="weights of torchvision's resnet18", **limits)
     given = {name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")}
     own = encoder.state_dict()
     counters = {name for name in own if name.endswith("num_batches_tracked")}  # not in files of older versions

@@ -24,7 +24,7 @@ from learn3d.data.readers import READERS
 from learn3d.data.readers.photo_table import read_table, split_objects
 from learn3d.experiments.results import object_sums, read_result
 from learn3d.figures.curves import read_metrics
-from learn3d.files import weights, worker
+from learn3d.files import sandbox, weights
 from learn3d.files.reading import parse_json
 from learn3d.make_data.render import DatasetConfig, make_dataset
 from learn3d.runs import checkpoint, log
@@ -149,7 +149,7 @@ def weights_target(tmp: Path) -> Target:
 
     def read(folder: Path) -> None:
         for name in ("a.pth", "b.pth"):
-            worker.read(weights.read_state_dict, folder / name, memory=weights.MEMORY)
+            sandbox.read(weights.read_state_dict, folder / name, memory=weights.MEMORY)
 
     return Target(tmp, {"a.pth": m.damage_zip(), "b.pth": m.damage}, read)
 

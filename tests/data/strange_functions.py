@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.files import child
+from learn3d.files import sandbox
 
 
 def size(path: Path) -> int:
@@ -40,7 +40,7 @@ def eat(path: Path) -> int:
 
 
 def keep(path: Path, megabytes: int, held: list = []) -> int:  # noqa: B006
-    child.allow(memory=megabytes * 2**20)
+    sandbox.allow(memory=megabytes * 2**20)
     held.append(bytearray(megabytes * 2**20))
     return os.getpid()
 
@@ -56,7 +56,7 @@ def chatter(path: Path) -> str:
 
 
 def shared(path: Path, count: int) -> np.ndarray:
-    array = child.empty((count,), np.float64)
+    array = sandbox.empty((count,), np.float64)
     array[:] = np.arange(count)
     return array
 

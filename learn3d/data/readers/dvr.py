@@ -43,7 +43,7 @@ from learn3d.data.readers.renderings import (
 from learn3d.files import limits, npz, renderings
 from learn3d.files.findings import FETCH_AGAIN, DamagedFile, Findings, MissingFile, Problem
 from learn3d.files.reading import read_text
-from learn3d.files.worker import Call
+from learn3d.files.sandbox import Call
 
 PROPERTIES = LayoutProperties(voxels=False, inverted=True, options=("progress",))
 POINTS = 10_000  # kept of each object's point cloud, which holds 100,000

@@ -48,7 +48,7 @@ from learn3d.data.readers.renderings import (
 from learn3d.files import limits, renderings, volumes
 from learn3d.files.findings import FETCH_AGAIN, DamagedFile, Findings, MissingFile, Problem
 from learn3d.files.reading import parse_json, read_bytes, read_text
-from learn3d.files.worker import Call
+from learn3d.files.sandbox import Call
 
 PROPERTIES = LayoutProperties(voxels=True, inverted=False, options=("image_size", "views_per_object", "progress"))
 #: The .mat volumes, as the paper's code reads them: axes (-z, y, x) of the object frame.

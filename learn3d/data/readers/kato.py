@@ -27,7 +27,7 @@ from learn3d.data.readers.properties import LayoutProperties
 from learn3d.data.readers.renderings import check_split
 from learn3d.files import npz
 from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
-from learn3d.files.worker import Call, read_all
+from learn3d.files.sandbox import Call, read_all
 
 PROPERTIES = LayoutProperties(voxels=True, inverted=True)
 VIEW_NAMES = tuple(f"azimuth {AZIMUTH_STEP_DEG * view:g}°" for view in range(NUM_VIEWS))

@@ -37,7 +37,7 @@ from learn3d.data.readers.properties import LayoutProperties
 from learn3d.data.readers.renderings import check_split
 from learn3d.files import npz
 from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
-from learn3d.files.worker import Call, read_all
+from learn3d.files.sandbox import Call, read_all
 
 PROPERTIES = LayoutProperties(voxels=True, inverted=False, angles=False, stretched=True, options=("image_size",))
 #: The grid spans [-1, 1]; axes (-x, -z, -y) of the object frame.

@@ -31,7 +31,7 @@ from learn3d.data.readers.properties import LayoutProperties
 from learn3d.data.readers.renderings import check_split
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
-from learn3d.files.worker import Call, read_all
+from learn3d.files.sandbox import Call, read_all
 
 PROPERTIES = LayoutProperties(voxels=False, inverted=True, options=("image_size", "progress"))
 AZIMUTH_WIDTHS_DEG = (15, 20, 30, 45, 60, 90)

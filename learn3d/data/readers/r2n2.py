@@ -50,7 +50,7 @@ from learn3d.data.readers.renderings import (
 )
 from learn3d.files import renderings, volumes
 from learn3d.files.findings import DamagedFile, Findings, Problem
-from learn3d.files.worker import Call
+from learn3d.files.sandbox import Call
 
 PROPERTIES = LayoutProperties(
     voxels=True, inverted=False, validation=False, options=("image_size", "views_per_object", "progress")

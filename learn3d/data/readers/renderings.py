@@ -18,7 +18,7 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import AngleBins
 from learn3d.files import limits
 from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
-from learn3d.files.worker import Call, read_all
+from learn3d.files.sandbox import Call, read_all
 
 
 class ReadObject(NamedTuple):

@@ -23,7 +23,7 @@ import trimesh
 from pydantic import Field
 from tqdm import tqdm
 
-from learn3d.files import limits, worker
+from learn3d.files import limits, sandbox
 from learn3d.files.findings import DamagedFile, MissingFile
 from learn3d.files.writing import write_bytes
 from learn3d.make_data.debian import packages
@@ -187,7 +187,7 @@ class _Kept:
         """Write the candidate's mesh; ValueError, with the reason, where it is left out."""
         package, known = candidate.package, self._grids[candidate.category]
         try:
-            mesh, grids = worker.read(_prepare, package.path, candidate.read, memory=2 * limits.GIB, seconds=60.0)
+            mesh, grids = sandbox.read(_prepare, package.path, candidate.read, memory=2 * limits.GIB, seconds=60.0)
         except (DamagedFile, MissingFile) as error:
             raise ValueError(f"unreadable ({error.message})") from error
         for name, others in known.items():

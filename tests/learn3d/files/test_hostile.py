@@ -24,7 +24,7 @@ from python2_pickles import npy
 import nmr.neural_renderer as nr
 from learn3d.data.conventions import VOXEL_SIZE
 from learn3d.data.framing import read_photo
-from learn3d.files import meshes, npz, renderings, volumes, worker
+from learn3d.files import meshes, npz, renderings, sandbox, volumes
 
 SECONDS, BYTES = 10.0, 700e6
 if sys.gettrace() is not None:  # the coverage of lines is measured, which slows Python down
@@ -45,7 +45,7 @@ def bounded() -> Iterator[None]:
 
     def watch() -> None:
         while not done.wait(0.01):
-            workers = sum(_resident(each.process.pid) for each in list(worker._workers))
+            workers = sum(_resident(each.process.pid) for each in list(sandbox._workers))
             most[0] = max(most[0], _resident("self") - before + workers)
 
     thread = threading.Thread(target=watch)
@@ -72,11 +72,11 @@ def refused(read, path: Path, *arguments: object, said: str | None = None) -> No
 
 
 def read_mat(path: Path) -> np.ndarray:
-    return worker.read(volumes.read_matlab, path, "Volume", VOXEL_SIZE)
+    return sandbox.read(volumes.read_matlab, path, "Volume", VOXEL_SIZE)
 
 
 def read_image(path: Path) -> object:
-    return worker.read(renderings.read_with_alpha, path, 64)
+    return sandbox.read(renderings.read_with_alpha, path, 64)
 
 
 def mat(tmp_path: Path) -> Path:
@@ -163,7 +163,7 @@ def jpeg_of_scans(path: Path, scans: int) -> Path:
 @linux
 def test_progressive_jpeg_of_thousands_of_scans(tmp_path):
     path = jpeg_of_scans(tmp_path / "a.jpg", 3000)
-    refused(lambda p: worker.read(renderings.read_with_alpha, p, 64, seconds=1), path, said="processor time")
+    refused(lambda p: sandbox.read(renderings.read_with_alpha, p, 64, seconds=1), path, said="processor time")
 
 
 def bomb(path: Path, name: str, size: int, header: bytes) -> Path:
@@ -178,7 +178,7 @@ def test_npz_bomb(tmp_path):
     size = 2**28
     header = b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }" % size
     path = bomb(tmp_path / "a.npz", "a.npy", size, header)
-    refused(lambda p: worker.read(npz.read, p, "a"), path, said="times its size")
+    refused(lambda p: sandbox.read(npz.read, p, "a"), path, said="times its size")
 
 
 @linux
@@ -187,7 +187,7 @@ def test_object_array_bomb(tmp_path):
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("images.npy", npy(b"\x80\x02" + b"]" * 30_000_000 + b"."))
-    refused(lambda p: worker.read(npz.read_ragged, p, "images"), path)
+    refused(lambda p: sandbox.read(npz.read_ragged, p, "images"), path)
 
 
 class Runs:
@@ -201,10 +201,10 @@ def test_no_code_of_pickles_runs(tmp_path, monkeypatch):
     array[0] = Runs()
     path = tmp_path / "a.npz"
     np.savez(path, images=array, a=array)
-    refused(lambda p: worker.read(npz.read_ragged, p, "images"), path, said="asks for")
-    refused(lambda p: worker.read(npz.read, p, "a"), path, said="pickled objects")
+    refused(lambda p: sandbox.read(npz.read_ragged, p, "images"), path, said="asks for")
+    refused(lambda p: sandbox.read(npz.read, p, "a"), path, said="pickled objects")
     path.write_bytes(pickle.dumps(Runs()))
-    refused(lambda p: worker.read(npz.read, p, "a"), path)
+    refused(lambda p: sandbox.read(npz.read, p, "a"), path)
     assert not (tmp_path / "ran").exists()
 
 
@@ -217,7 +217,7 @@ def test_zips_within_zips(tmp_path):
                 archive.writestr(f"{k}.zip", content)
         content = out.getvalue()
     (tmp_path / "a.npz").write_bytes(content)
-    refused(lambda p: worker.read(npz.read, p, "a"), tmp_path / "a.npz", said="no array")
+    refused(lambda p: sandbox.read(npz.read, p, "a"), tmp_path / "a.npz", said="no array")
 
 
 @linux

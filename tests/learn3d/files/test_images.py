@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from learn3d.data.framing import read_photo
-from learn3d.files import limits, renderings, worker
+from learn3d.files import limits, renderings, sandbox
 from learn3d.files.images import PHOTOGRAPHS, RENDERINGS, open_image
 
 
@@ -29,7 +29,7 @@ def png(width: int, height: int) -> bytes:
 
 
 def read_image(path: Path) -> object:
-    return worker.read(renderings.read_with_alpha, path, 64)
+    return sandbox.read(renderings.read_with_alpha, path, 64)
 
 
 def written(path: Path, content: bytes) -> Path:

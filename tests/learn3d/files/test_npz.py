@@ -15,7 +15,7 @@ import pytest
 from python2_pickles import HEADER, python2_pickle
 from python2_pickles import npy as npy_bytes
 
-from learn3d.files import limits, npz, worker
+from learn3d.files import limits, npz, sandbox
 
 RNG = np.random.default_rng(0)
 IMAGES = [RNG.integers(0, 256, shape, np.uint8) for shape in ((3, 2, 3), (20, 7, 3))]
@@ -29,11 +29,11 @@ def write(path: Path, member: bytes, name: str = "a.npy", method: int = zipfile.
 
 
 def read(path: Path, most: int | None = None) -> np.ndarray:
-    return worker.read(npz.read, path, "a", most)
+    return sandbox.read(npz.read, path, "a", most)
 
 
 def ragged(path: Path, member: bytes) -> list[np.ndarray]:
-    flat, shapes = worker.read(npz.read_ragged, write(path, member), "a")
+    flat, shapes = sandbox.read(npz.read_ragged, write(path, member), "a")
     ends = np.cumsum([np.prod(shape, dtype=int) for shape in shapes])[:-1] if shapes else []
     return [part.reshape(shape) for part, shape in zip(np.split(flat, ends), shapes, strict=True)] if shapes else []
 
@@ -59,9 +59,9 @@ def test_what_numpy_writes_is_read_and_can_be_changed(tmp_path, dtype, order):
 
 def test_names_and_headers(tmp_path):
     np.savez(tmp_path / "a.npz", a=np.arange(6), b=np.zeros(2))
-    assert worker.read(npz.keys, tmp_path / "a.npz") == ["a", "b"]
-    assert str(worker.read(npz.header, tmp_path / "a.npz", "a")) == "int64 [6]"
-    found = worker.read(npz.read_those_there, tmp_path / "a.npz", ["b", "c"], 100)
+    assert sandbox.read(npz.keys, tmp_path / "a.npz") == ["a", "b"]
+    assert str(sandbox.read(npz.header, tmp_path / "a.npz", "a")) == "int64 [6]"
+    found = sandbox.read(npz.read_those_there, tmp_path / "a.npz", ["b", "c"], 100)
     assert list(found) == ["b"]
 
 
@@ -167,11 +167,11 @@ def test_python_3s_object_arrays_are_read(tmp_path, protocol, module):
 
 def test_plain_arrays_and_those_beside_them(tmp_path):
     np.savez(tmp_path / "a.npz", images=object_array(*IMAGES), plain=np.zeros((2, 5)), boxes=np.ones((2, 4)))
-    found = worker.read(npz.read_with_items, tmp_path / "a.npz", "images", {"boxes": 32})
+    found = sandbox.read(npz.read_with_items, tmp_path / "a.npz", "images", {"boxes": 32})
     assert found[0][1] == [(3, 2, 3), (20, 7, 3)] and found[1].shape == (2, 4)
-    assert worker.read(npz.read_ragged, tmp_path / "a.npz", "plain").shape == (2, 5)
+    assert sandbox.read(npz.read_ragged, tmp_path / "a.npz", "plain").shape == (2, 5)
     with pytest.raises(ValueError, match="boxes"):  # larger than two items can be
-        worker.read(npz.read_with_items, tmp_path / "a.npz", "images", {"boxes": -500})
+        sandbox.read(npz.read_with_items, tmp_path / "a.npz", "images", {"boxes": -500})
 
 
 class Runs:

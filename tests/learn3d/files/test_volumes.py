@@ -10,7 +10,7 @@ import scipy.io
 from shapenet_files import binvox_bytes
 from trimesh.exchange.binvox import load_binvox
 
-from learn3d.files import limits, volumes, worker
+from learn3d.files import limits, sandbox, volumes
 
 VOLUME = np.random.default_rng(0).random((4, 4, 4)) < 0.3
 
@@ -23,7 +23,7 @@ def saved(compressed: bool = False, **arrays: object) -> bytes:
 
 def matlab(folder, content: bytes, name: str = "Volume", size: int = 4):
     (folder / "a.mat").write_bytes(content)
-    return worker.read(volumes.read_matlab, folder / "a.mat", name, size)
+    return sandbox.read(volumes.read_matlab, folder / "a.mat", name, size)
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -44,12 +44,12 @@ def test_matlab_files_that_are_none(tmp_path):
         with pytest.raises(ValueError, match=r"a\.mat: "):
             matlab(tmp_path, content)
     with pytest.raises(FileNotFoundError, match="is missing"):
-        worker.read(volumes.read_matlab, tmp_path / "none.mat", "Volume", 4)
+        sandbox.read(volumes.read_matlab, tmp_path / "none.mat", "Volume", 4)
 
 
 def binvox(path, content: bytes, size: int = 8):
     path.write_bytes(content)
-    return worker.read(volumes.read_binvox, path, size)
+    return sandbox.read(volumes.read_binvox, path, size)
 
 
 @pytest.fixture

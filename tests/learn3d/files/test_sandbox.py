@@ -15,7 +15,7 @@ import pytest
 import strange_functions as strange
 
 from learn3d.files.findings import DamagedFile, MissingFile
-from learn3d.files.worker import Call, cores, read, read_all
+from learn3d.files.sandbox import Call, cores, read, read_all
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_missing_file(path: Path) -> None:
 
 
 def test_worker_that_does_not_answer_is_ended(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learn3d.files.worker._PATIENCE", 0.1)
+    monkeypatch.setattr("learn3d.files.sandbox._PATIENCE", 0.1)
     with pytest.raises(DamagedFile, match="stopped"):
         read(strange.sleep, path, 60.0, seconds=0.1)
 
@@ -147,7 +147,7 @@ def test_cores_are_shared_with_the_processes_beside(monkeypatch: pytest.MonkeyPa
 
 def _script(path: Path, code: str) -> subprocess.Popen:
     """A program that prints the number of its worker, and then does `code`."""
-    start = f"import os, sys, strange_functions as s; from learn3d.files.worker import read; p = {str(path)!r}\n"
+    start = f"import os, sys, strange_functions as s; from learn3d.files.sandbox import read; p = {str(path)!r}\n"
     start += "if __name__ == '__main__':\n print(read(s.sleep, p, 0.0), flush=True)\n "
     paths = os.pathsep.join([str(Path(strange.__file__).parent), *sys.path])
     environment = {**os.environ, "PYTHONPATH": paths}
