@@ -15,7 +15,7 @@ from learn3d.data.sampling import Sampling
 from learn3d.files import limits
 from learn3d.files.findings import DamagedFile
 from learn3d.files.reading import parse_json, read_bytes
-from learn3d.methods import LRSchedule, MethodSettings, Plan
+from learn3d.methods import LRSchedule, MethodSettings, TrainingSchedule
 from learn3d.presets import PRESETS
 from learn3d.settings import Count, FilePath, Items, Step, checked
 
@@ -64,10 +64,10 @@ class TrainConfig:
     batch_size: Annotated[int, Field(ge=1, le=65_536)] | None = None
     """Images per step. None: the preset's."""
     lr_schedule: LRSchedule | None = None
-    """How the step size changes over the run. linear, cosine: it falls to 0. step: to a tenth in the last 5 % of all
-    iterations. None: the preset's, constant for most."""
+    """How the learning rate changes over the run. linear, cosine: it falls to 0. step: to a tenth in the last 5 % of
+    all iterations. None: the preset's, constant for most."""
     warmup_steps: Annotated[int, Field(ge=0, le=10**9)] | None = None
-    """Steps at the beginning in which the step size grows from 0 to its full size. None: the preset's, 0 for most, and
+    """Steps over which the learning rate grows from 0 at the beginning. None: the preset's, 0 for most, and
     never more than a tenth of the iterations."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)] | None = None
     """Also keep an exponential moving average of all weights, with this decay a step, such as 0.999. Validation, the
@@ -120,12 +120,12 @@ class TrainConfig:
                 f"sampling 'pairs' takes two views of each object: batch_size must be even, got {self.batch_size}"
             )
         self.settings.check_run(iterations=self.iterations, batch_size=self.batch_size)
-        self.plan  # noqa: B018 (it checks itself)
+        self.schedule  # noqa: B018 (it checks itself)
 
     @property
-    def plan(self) -> Plan:
+    def schedule(self) -> TrainingSchedule:
         """What the method must know about the run."""
-        return Plan(self.iterations, self.lr_schedule, self.warmup_steps, self.ema_decay)
+        return TrainingSchedule(self.iterations, self.lr_schedule, self.warmup_steps, self.ema_decay)
 
 
 #: Options that a resumed run may change: they say where and how long to compute and what to report, not what to learn.

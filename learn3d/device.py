@@ -52,7 +52,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def oversubscription(threads: int, processes: int) -> str:
+def oversubscription_warning(threads: int, processes: int) -> str:
     """What to warn of where the threads of all processes on this machine are more than its cores; "" otherwise.
 
     Threads meet hundreds of times a step, and all wait for one that has no core.

@@ -16,7 +16,7 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import Definition
 from learn3d.data.dataset import ViewDataset
-from learn3d.distributed.ranks import ALONE, Ranks
+from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.losses import mmd_from_distances
 from learn3d.methods import Grids, Meshes, Method
 from learn3d.methods.surfaces import grid_surface
@@ -136,8 +136,8 @@ def evaluate(
     Where several processes train the method, all of them call this; they share the work, and all return the result that
     one process gives with these networks. Raises ValueError for `surfaces` there: they are measured in one process.
     """
-    ranks = method.ranks
-    if surfaces and not ranks.alone:
+    group = method.group
+    if surfaces and group.world_size > 1:
         raise ValueError("surfaces are measured in one process; evaluate the run when it has ended")
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
     generator = torch.Generator().manual_seed(0)
@@ -149,11 +149,11 @@ def evaluate(
     view_ids = torch.from_numpy(dataset.view_ids[samples.numpy()]).to(torch.int64)
     compared = _first_of_each_view(view_ids)
     chunks = samples.split(batch_size)
-    rows = torch.arange(count).split(batch_size)[ranks.rank :: ranks.world]
+    rows = torch.arange(count).split(batch_size)[group.rank :: group.world_size]
     was_training = method.training
     method.set_training(False)
     try:
-        for numbers, chosen in zip(rows, chunks[ranks.rank :: ranks.world], strict=True):
+        for numbers, chosen in zip(rows, chunks[group.rank :: group.world_size], strict=True):
             batch = dataset.batch(chosen)
             code = method.encode(batch.images)
             shapes = method.decode(code)
@@ -179,21 +179,21 @@ def evaluate(
     forms = ("released", "paper") if paper_mmd else ("released",)
     own = torch.cat(rows) if rows else torch.empty(0, dtype=torch.int64)
     place = (compared.cumsum(0) - 1)[own[compared[own]]]  # of this process's codes among all that are compared
-    all_codes = ranks.gather(codes, place, int(compared.sum()))
-    means = mean_mmd(all_codes, view_ids[compared], forms=forms, ranks=ranks)
+    all_codes = group.all_gather(codes, place, int(compared.sum()))
+    means = mean_mmd(all_codes, view_ids[compared], forms=forms, group=group)
     chamfer, f_score = torch.tensor(distances).T if distances else (None, None)
-    seen = ranks.any(bool(silhouettes))
-    precision, recall, hollow = ranks.gather(overlaps, own, count).T if ious else (None, None, torch.zeros(0))
+    seen = group.any(bool(silhouettes))
+    precision, recall, hollow = group.all_gather(overlaps, own, count).T if ious else (None, None, torch.zeros(0))
     return Evaluation(
         object_ids=torch.from_numpy(dataset.object_ids[samples.numpy()]).to(torch.int64),
         view_ids=view_ids,
-        ious={name: ranks.gather(values, own, count) for name, values in ious.items()},
+        ious={name: group.all_gather(values, own, count) for name, values in ious.items()},
         precision=precision,
         recall=recall,
         hollow=int(hollow.sum()),
         chamfer_l1=chamfer,
         f_score=f_score,
-        silhouette_iou=ranks.gather(silhouettes, own, count) if seen else None,
+        silhouette_iou=group.all_gather(silhouettes, own, count) if seen else None,
         mmd=means.get("released"),
         mmd_paper=means.get("paper"),
     )
@@ -271,7 +271,7 @@ def mean_mmd(
     *,
     per_view: int = CODES_PER_VIEW,
     forms: tuple[Literal["released", "paper"], ...] = ("released",),
-    ranks: Ranks = ALONE,
+    group: ProcessGroup = SINGLE_PROCESS,
 ) -> dict[str, float]:
     """Mean MMD over all pairs of views (276 for 24) between the codes [N,C] of their images; {} for a single view.
 
@@ -292,13 +292,13 @@ def mean_mmd(
 
     within = [distances(i, i) for i in range(len(groups))]
     pairs = list(itertools.combinations(range(len(groups)), 2))
-    own = torch.arange(len(pairs))[ranks.rank :: ranks.world]
+    own = torch.arange(len(pairs))[group.rank :: group.world_size]
     values: dict[str, list[Tensor]] = {form: [] for form in forms}
-    for i, j in pairs[ranks.rank :: ranks.world]:
+    for i, j in pairs[group.rank :: group.world_size]:
         between = distances(i, j)
         for form in forms:
             values[form].append(mmd_from_distances(within[i], within[j], between, form)[None])
-    of_pairs = {form: ranks.gather(parts, own, len(pairs)) for form, parts in values.items()}
+    of_pairs = {form: group.all_gather(parts, own, len(pairs)) for form, parts in values.items()}
     return {form: sum(of_pairs[form].tolist()) / len(pairs) for form in forms}
 
 

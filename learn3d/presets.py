@@ -31,7 +31,7 @@ class Preset:
     source: str  # where the figures come from
     sampling: Sampling = "views"
     augment: tuple[Augmentation, ...] = ()  # what is done to every training batch
-    lr_schedule: LRSchedule = "constant"  # of the step size
+    lr_schedule: LRSchedule = "constant"  # of the learning rate
     warmup_steps: int = 0  # in which it grows to its full size
     ema_decay: float = 0.0  # of the exponential moving average of the weights a step; 0: no average
 

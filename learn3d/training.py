@@ -17,8 +17,8 @@ from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import LAYOUTS, load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import sample_indices
-from learn3d.device import keep_freed_memory, oversubscription, resolve_precision
-from learn3d.distributed.ranks import ALONE, Ranks
+from learn3d.device import keep_freed_memory, oversubscription_warning, resolve_precision
+from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.methods import DatasetInfo, create_method
 from learn3d.presets import PRESETS
 from learn3d.runs import folder as run_folder
@@ -30,14 +30,16 @@ from learn3d.terminal import is_watched, stop_on_signal
 from learn3d.validation import draw, validate
 
 
-def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False, ranks: Ranks = ALONE) -> Summary:
+def train(
+    config: TrainConfig, *, resume: bool = False, overwrite: bool = False, group: ProcessGroup = SINGLE_PROCESS
+) -> Summary:
     """Train one model and leave everything in `config.output`.
 
     What the folder holds afterwards is listed in `runs.folder`. SIGINT, SIGTERM and SIGHUP end the current step, save
     and return. With `resume` the run continues from its last checkpoint (bit for bit on a CPU: same machine, numbers of
     threads and processes), or from the start if it was stopped before its first one. A finished run stays as it is.
 
-    Several processes, each with its `ranks`, train one model together (`distributed.ranks`); the first one writes.
+    Several processes, each with its own `group`, train one model together; rank 0 writes.
 
     Raises ValueError for a folder in use, options or training data that conflict with the resumed run or data that do
     not fit, FloatingPointError when a loss is no longer finite (the last checkpoint is from before that), OSError when
@@ -48,43 +50,43 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
     if config.threads is not None:
         torch.set_num_threads(config.threads)
 
-    with run_folder.lock_folder(folder) if ranks.main else contextlib.nullcontext():
-        if ranks.main and not resume:
-            run_folder.check_free(folder, overwrite)  # it is cleared when all else is well
-        ranks = ranks.divide(config.batch_size, config.sampling)
+    with run_folder.lock_folder(folder) if group.is_main else contextlib.nullcontext():
+        if group.is_main and not resume:
+            run_folder.check_can_start(folder, overwrite)  # it is cleared when all else is well
+        group = group.split_batch(config.batch_size, config.sampling)
 
-        train_set, val_set = load_splits(config, progress=ranks.main)
+        train_set, val_set = load_splits(config, progress=group.is_main)
         found = (
             *train_set.notes,
             *val_set.notes,
             train_set.check_masks(),
-            oversubscription(torch.get_num_threads(), ranks.local_world),
+            oversubscription_warning(torch.get_num_threads(), group.local_world_size),
         )
         shape = _shape_of(train_set, config)
         precision = resolve_precision(config.precision, config.device)
-        how = {"device": config.device, "precision": precision, "seed": config.seed, "plan": config.plan}
+        how = {"device": config.device, "precision": precision, "seed": config.seed, "schedule": config.schedule}
         method = create_method(config.settings, shape, **how)
         sample = functools.partial(sample_indices, train_set, config.sampling, config.batch_size, config.seed)
         changed = functools.partial(augment, names=config.augment, seed=config.seed, inverted=train_set.inverted)
-        first = train_set.batch(sample(1), ranks.rows, voxels=False)
+        first = train_set.batch(sample(1), group.rows, voxels=False)
         method.check_batch(changed(first, step=1))  # before an older run is cleared away
-        run = Run(config, method, shape, fingerprint_of(train_set, precision), ranks)
+        run = Run(config, method, shape, fingerprint_of(train_set, precision), group)
         progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:  # also after a kill between the last save and the end
             return dataclasses.replace(_summary(config, progress, started), was_finished=True)
         before = progress.seconds
 
-        with advice_on_errors(folder), stop_on_signal() as stop, _open_log(config, progress, ranks) as log:
+        with advice_on_errors(folder), stop_on_signal() as stop, _open_log(config, progress, group) as log:
             for warning in filter(None, (*notes, *found)):
                 log.say(f"warning: {warning}")
-            log.say(_describe(config, precision, train_set, val_set, progress, ranks))
+            log.say(_describe(config, precision, train_set, val_set, progress, group))
             if config.settings.wants_mirror_plane:
                 log.say(_about_plane(shape.mirror_plane_deg))
             indices = sample(progress.step + 1)
             for step in range(progress.step + 1, config.iterations + 1):
-                batch = train_set.batch(indices, ranks.rows, voxels=False)
+                batch = train_set.batch(indices, group.rows, voxels=False)
                 indices = sample(step + 1)
-                train_set.prepare(indices, ranks.rows)
+                train_set.prepare(indices, group.rows)
                 losses = method.take_step(changed(batch, step=step), step)
                 # With the losses of the step before: some methods train one network in odd steps, another in even ones.
                 recent = progress.losses | losses
@@ -92,12 +94,12 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False,
                 progress = dataclasses.replace(progress, step=step, losses=losses, seconds=seconds)
                 log.step(step, losses)
 
-                last, stopped_by = step == config.iterations, ranks.stopped_by(stop)
+                last, stopped_by = step == config.iterations, group.stopped_by(stop)
                 if last or step % config.log_every == 0:
                     log.metrics(step, "train", recent)
                 if last or step % config.validate_every == 0:
                     progress = validate(run, val_set, progress, log)
-                if ranks.main and (last or step % config.pictures_every == 0):
+                if group.is_main and (last or step % config.pictures_every == 0):
                     draw(config, method, val_set, step, log)
                 if last or stopped_by or step % config.checkpoint_every == 0:
                     run.save(progress, log)
@@ -169,16 +171,16 @@ def _summary(config: TrainConfig, at: Progress, started: float) -> Summary:
     return Summary(config.output, at.step, finished, at.best_iou, at.best_step, seconds, at.seconds)
 
 
-def _open_log(config: TrainConfig, progress: Progress, ranks: Ranks) -> RunLog | SilentLog:
-    return RunLog(config.output, start=progress.step, total=config.iterations) if ranks.main else SilentLog()
+def _open_log(config: TrainConfig, progress: Progress, group: ProcessGroup) -> RunLog | SilentLog:
+    return RunLog(config.output, start=progress.step, total=config.iterations) if group.is_main else SilentLog()
 
 
 def _describe(
-    config: TrainConfig, precision: str, train_set: ViewDataset, val_set: ViewDataset, at: Progress, ranks: Ranks
+    config: TrainConfig, precision: str, train_set: ViewDataset, val_set: ViewDataset, at: Progress, group: ProcessGroup
 ) -> str:
     where = f"{config.device}, {precision}, {torch.get_num_threads()} threads"
-    if not ranks.alone:
-        where += f" in each of {ranks.world} processes ({ranks.backend})"
+    if group.world_size > 1:
+        where += f" in each of {group.world_size} processes ({group.backend})"
     data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
     verb = f"resuming at step {at.step}" if at.step else "training"
     name = f"{PRESETS[config.preset].label} ({config.preset})"

@@ -19,8 +19,8 @@ import tyro
 
 from learn3d.commands.parsing import parse
 from learn3d.config import DEFAULT_PRESET, TrainConfig, load_config
-from learn3d.distributed.launch import label, start
-from learn3d.distributed.ranks import LostPeerError
+from learn3d.distributed.launch import init_process_group, rank_label
+from learn3d.distributed.process_group import LostPeerError
 from learn3d.presets import METHODS, PRESETS, full_name
 from learn3d.terminal import INTERRUPTED, say, without_traceback
 from learn3d.training import train
@@ -82,14 +82,14 @@ def _presets() -> str:
     return "\n".join(["Presets (--preset NAME --help-all shows the settings of one):", *lines])
 
 
-@without_traceback(FloatingPointError, MemoryError, LostPeerError, label=label)
+@without_traceback(FloatingPointError, MemoryError, LostPeerError, label=rank_label)
 def run(arguments: Sequence[str]) -> int:
     """Train, and say how it ended; the exit status is 130 where a signal stopped the only process."""
     command = read(arguments)
     if command.resume and command.overwrite:
         raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
-    with start(command.config.device) as ranks:  # the first Ctrl-C in it saves
-        summary = train(command.config, resume=command.resume, overwrite=command.overwrite, ranks=ranks)
-    if ranks.main:
+    with init_process_group(command.config.device) as group:  # the first Ctrl-C in it saves
+        summary = train(command.config, resume=command.resume, overwrite=command.overwrite, group=group)
+    if group.is_main:
         say(str(summary))
-    return 0 if summary.finished or not ranks.alone else INTERRUPTED  # torchrun would take it for a failure
+    return 0 if summary.finished or group.world_size > 1 else INTERRUPTED  # torchrun would take it for a failure

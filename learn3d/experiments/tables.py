@@ -92,7 +92,7 @@ _PASCAL_BASELINE = Variant("pascal-baseline", "peng2020-pascal-vanilla", checkpo
 _PASCAL_VPL = Variant("pascal-vpl", "kato2019-pascal")
 _PASCAL_PLUS = _plus("pascal-plus", "pascal", checkpoint="best")
 
-#: What Plus has and any method can have: its step sizes, its average of the weights, its symmetry.
+#: What Plus has and any method can have: its learning-rate schedule, its average of the weights, its symmetry.
 _OF_PLUS = PlusSettings()
 _SCHEDULE = {"lr_schedule": "cosine", "warmup_steps": 100, "ema_decay": 0.99, "learning_rate": _OF_PLUS.learning_rate}
 _SYMMETRY = {"symmetry": "auto"}
@@ -230,7 +230,7 @@ _ALL = (
         baseline="Proposed",
         categories=("airplane", "chair", "table"),
         seeds=3,
-        note="Schedule: the step sizes and the average of the weights that Plus has. Shared: also its symmetry, its "
+        note="Schedule: the learning-rate schedule and the EMA of Plus. Shared: also its symmetry, its "
         "encoder, its smoothness, and its batches, a quarter of the others' in four times the steps (as many images).",
     ),
     Table(

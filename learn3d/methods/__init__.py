@@ -9,7 +9,7 @@ import torch
 from learn3d.device import check_device
 from learn3d.methods.method import DatasetInfo, MeshMethod, Method
 from learn3d.methods.multi_view import MultiView, MultiViewSettings
-from learn3d.methods.optimization import CONSTANT, LRSchedule, Plan
+from learn3d.methods.optimization import CONSTANT_LR, LRSchedule, TrainingSchedule
 from learn3d.methods.plus import Plus, PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.prgan import PrGAN, PrGANSettings
@@ -25,7 +25,7 @@ __all__ = [
     "Meshes",
     "Method",
     "MethodSettings",
-    "Plan",
+    "TrainingSchedule",
     "create_method",
 ]
 
@@ -45,7 +45,7 @@ def create_method(
     device: str,
     precision: Literal["bf16", "fp32"],
     seed: int,
-    plan: Plan = CONSTANT,
+    schedule: TrainingSchedule = CONSTANT_LR,
 ) -> Method:
     """The method of `settings`, with PyTorch's default initialisation of its networks from `seed`.
 
@@ -63,4 +63,4 @@ def create_method(
     if device == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # torch's default for convolutions; fp32 is to mean fp32
     torch.manual_seed(seed)
-    return kind(settings, info, device, precision, plan)
+    return kind(settings, info, device, precision, schedule)

@@ -16,9 +16,9 @@ from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
 from learn3d.device import autocast
-from learn3d.distributed.ranks import ALONE, Ranks, sum_gradients
-from learn3d.distributed.sync_batch_norm import use_whole_batch
-from learn3d.methods.optimization import CONSTANT, EMA, Plan, adam, backpropagate
+from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup, all_reduce_gradients
+from learn3d.distributed.sync_batch_norm import convert_sync_batchnorm
+from learn3d.methods.optimization import CONSTANT_LR, EMA, TrainingSchedule, adam, backpropagate
 from learn3d.methods.settings import MeshSettings, MethodSettings
 from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.networks import GENERATORS, MeshGenerator, Symmetry, SymmetryOption, create_encoder, network_input
@@ -53,7 +53,7 @@ class Method(abc.ABC):
     networks: dict[str, nn.Module]  # each is also an attribute: networks["encoder"] is self.encoder
     optimizers: dict[str, torch.optim.Optimizer]
     ema: EMA | None = None  # of the weights, where the run asks for it
-    ranks: Ranks = ALONE  # the processes that train it together; set by `join`
+    group: ProcessGroup = SINGLE_PROCESS  # the processes that train it together; set by `distribute`
     image_size: int  # side of the images that `encode` takes; also a property of the method's settings
 
     def __init__(
@@ -62,18 +62,18 @@ class Method(abc.ABC):
         info: DatasetInfo,
         device: str,
         precision: Literal["bf16", "fp32"],
-        plan: Plan = CONSTANT,
+        schedule: TrainingSchedule = CONSTANT_LR,
     ) -> None:
-        self.settings, self.info, self.plan = settings, info, plan
+        self.settings, self.info, self.schedule = settings, info, schedule
         self.image_size = settings.image_size
         self.device, self.precision = torch.device(device), precision
         self.networks = self.create_networks()
         for name, network in self.networks.items():
             setattr(self, name, network.to(device))
         self.optimizers = self.create_optimizers()
-        self._step_sizes = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimizers.items()}
-        if plan.ema_decay > 0:
-            self.ema = EMA(self.networks, plan.ema_decay)
+        self._learning_rates = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimizers.items()}
+        if schedule.ema_decay > 0:
+            self.ema = EMA(self.networks, schedule.ema_decay)
 
     @abc.abstractmethod
     def create_networks(self) -> dict[str, nn.Module]:
@@ -81,7 +81,7 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Optimizers by name, with their full step sizes."""
+        """Optimizers by name, with their full learning rates."""
 
     @abc.abstractmethod
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
@@ -119,10 +119,10 @@ class Method(abc.ABC):
 
         Raises FloatingPointError when a loss is not finite, before it reaches a weight.
         """
-        factor = self.plan.factor(step)
+        factor = self.schedule.lr_factor(step)
         for name, optimizer in self.optimizers.items():
-            for group, step_size in zip(optimizer.param_groups, self._step_sizes[name], strict=True):
-                group["lr"] = factor * step_size
+            for group, learning_rate in zip(optimizer.param_groups, self._learning_rates[name], strict=True):
+                group["lr"] = factor * learning_rate
         self._clear_gradients()  # here, too, so that the forward pass has their memory
         values = self.training_step(batch, step)
         if self.ema is not None:
@@ -132,7 +132,7 @@ class Method(abc.ABC):
     def backward_and_step(self, losses: Mapping[str, Tensor], step: int, *names: str) -> dict[str, float]:
         """Backpropagate the weighted sum of the losses and let the optimizers `names` step; see `backpropagate`."""
         self._clear_gradients()
-        values = backpropagate(losses, self.weights_at(step), step, self.ranks)
+        values = backpropagate(losses, self.weights_at(step), step, self.group)
         for name in names:
             self.optimizers[name].step()
         return values
@@ -141,15 +141,15 @@ class Method(abc.ABC):
         for optimizer in self.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
 
-    def join(self, ranks: Ranks) -> None:
-        """Learn from batches that are divided among processes: gradients are summed, batch norms see all rows."""
-        self.ranks = ranks
-        if ranks.alone:
+    def distribute(self, group: ProcessGroup) -> None:
+        """Train in several processes: gradients are summed over them, batch norms see the rows of all."""
+        self.group = group
+        if group.world_size == 1:
             return
         for network in self.networks.values():
-            use_whole_batch(network, ranks)
+            convert_sync_batchnorm(network, group)
         for optimizer in self.optimizers.values():
-            optimizer.register_step_pre_hook(sum_gradients)
+            optimizer.register_step_pre_hook(all_reduce_gradients)
 
     def ema_weights(self) -> contextlib.AbstractContextManager[None]:
         """Within it the networks have their averaged weights, where there are any: for evaluation and pictures."""

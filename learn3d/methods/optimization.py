@@ -1,4 +1,4 @@
-"""How weights follow from losses: gradients, optimizers, step sizes over a run, averages of the weights.
+"""How weights follow from losses: gradients, optimizers, learning rates over a run, averages of the weights.
 
 A method creates its optimizers; all the rest is the same for every method and stands here.
 """
@@ -15,17 +15,17 @@ import torch
 from torch import Tensor, nn
 
 from learn3d.device import Download
-from learn3d.distributed.ranks import ALONE, Ranks
+from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 
 LRSchedule = Literal["constant", "cosine", "linear", "step"]
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingSchedule:
     """What a method must know about the run that it is trained in."""
 
     iterations: int = 1  # steps of the whole run
-    lr_schedule: LRSchedule = "constant"  # how the step size changes after the warm-up
+    lr_schedule: LRSchedule = "constant"  # how the learning rate changes after the warm-up
     warmup_steps: int = 0  # steps in which it grows from nothing to its full size
     ema_decay: float = 0.0  # of the exponential moving average of the weights a step; 0: no average
 
@@ -33,8 +33,8 @@ class Plan:
         if 0 < self.iterations <= self.warmup_steps:
             raise ValueError(f"warmup_steps must be below the {self.iterations} iterations, got {self.warmup_steps}")
 
-    def factor(self, step: int) -> float:
-        """The step size of step `step` (from 1), as a share of the full one.
+    def lr_factor(self, step: int) -> float:
+        """The learning rate of step `step` (from 1), as a share of the full one.
 
         A warm-up of w steps: 1/w, 2/w .. 1. Then constant: 1. linear: from 1 down towards 0. cosine: the same along
         half a cosine. step: 1, and 0.1 in the last 5 % of all iterations (Kato et al. 2018).
@@ -49,7 +49,7 @@ class Plan:
         return 0.1 if self.lr_schedule == "step" and 20 * step > 19 * self.iterations else 1.0
 
 
-CONSTANT = Plan()  # full step sizes, no average
+CONSTANT_LR = TrainingSchedule()  # full learning rates, no average
 
 
 class EMA:
@@ -120,7 +120,7 @@ def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
 
 
 def backpropagate(
-    losses: Mapping[str, Tensor], weights: Mapping[str, float], step: int, ranks: Ranks = ALONE
+    losses: Mapping[str, Tensor], weights: Mapping[str, float], step: int, group: ProcessGroup = SINGLE_PROCESS
 ) -> dict[str, float]:
     """Backpropagate the sum of the losses, each times its weight; return them, and "total".
 
@@ -136,12 +136,14 @@ def backpropagate(
         weight = weights[name]
         term = loss if weight == 1.0 else weight * loss
         totals[loss.device] = totals[loss.device] + term if loss.device in totals else term
-    values = ranks.means(read_back(losses))
+    values = group.all_reduce_mean(read_back(losses))
     values["total"] = sum(weights[name] * value for name, value in values.items())
     if not all(math.isfinite(value) for value in values.values()):
         listed = ", ".join(f"{name} {value:g}" for name, value in values.items())
         raise FloatingPointError(f"the loss is not finite at iteration {step} ({listed})")
-    torch.autograd.backward([total if ranks.alone else ranks.share * total for total in totals.values()])
+    torch.autograd.backward(
+        [total if group.world_size == 1 else group.batch_share * total for total in totals.values()]
+    )
     return values
 
 

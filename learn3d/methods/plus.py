@@ -137,13 +137,13 @@ class Plus(PoseInvariant):
         masks of this view in the mask bank, mostly of other objects: the energy distance of the two sets.
         """
         views = batch.step_views
-        masks = self.ranks.join_rows(_reduced(batch.masks), views.rows, len(views))
+        masks = self.group.all_gather_rows(_reduced(batch.masks), views.rows, len(views))
         self.mask_bank.add(masks, views.view_ids)
         seen_by = int(torch.randint(len(views), ()))
         if not self.mask_bank.full:
             return {}
         silhouettes = self.render(vertices, views.poses[torch.full((len(vertices),), seen_by)])
-        drawn = self.ranks.join_rows(_reduced(silhouettes), views.rows, len(views))
+        drawn = self.group.all_gather_rows(_reduced(silhouettes), views.rows, len(views))
         real = self.mask_bank.of_view(int(views.view_ids[seen_by])).to(drawn.device)
         return {"novel_view": silhouette_energy_distance(drawn, real)}
 

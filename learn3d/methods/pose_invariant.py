@@ -94,7 +94,7 @@ class PoseInvariant(MeshMethod):
         first, last = self.settings.lambda_smooth, self.settings.lambda_smooth_end
         if last is None or first == 0:
             return self.weights
-        done = min(1.0, (step - 1) / max(1, self.plan.iterations - 1))
+        done = min(1.0, (step - 1) / max(1, self.schedule.iterations - 1))
         return self.weights | {"smoothness": first ** (1 - done) * last**done}
 
     def decode(self, codes: Tensor) -> Meshes:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from learn3d.data.batch import Batch, StepViews
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
 from learn3d.device import autocast, upload
-from learn3d.distributed.ranks import ALONE, Ranks
+from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.methods.method import Method
 from learn3d.methods.optimization import adam, frozen
 from learn3d.methods.settings import MethodSettings
@@ -44,11 +44,11 @@ class PrGANSettings(MethodSettings):
     encoder_from_step: Step = 53_051
     """First step that trains the encoder instead of the GAN (published: after 50 epochs)."""
     generator_learning_rate: Positive = 2.5e-3
-    """Adam's step size for the generator, in both of its steps."""
+    """Adam's learning rate for the generator, in both of its steps."""
     discriminator_learning_rate: Positive = 1e-4
-    """Adam's step size for the discriminator."""
+    """Adam's learning rate for the discriminator."""
     encoder_learning_rate: Positive = 1e-5
-    """Adam's step size for the inverse encoder."""
+    """Adam's learning rate for the inverse encoder."""
     accuracy_margin: Share = 0.8
     """The discriminator rests in steps that begin with a higher accuracy."""
     generator_channels: FourLayers = GENERATOR_CHANNELS
@@ -181,7 +181,7 @@ class PrGAN(Method):
         with self.autocast():
             first = self.discriminator.first
             of_real, of_fake = (frozen(first, images[:, None]).float() for images in (real, self.generate(z)))
-        backward_and_step("generator_statistics", statistics_loss(of_real, of_fake, self.ranks))
+        backward_and_step("generator_statistics", statistics_loss(of_real, of_fake, self.group))
         values["total"] = sum(values.get(name, 0.0) for name in self.optimizers)
         return values
 
@@ -195,7 +195,7 @@ class PrGAN(Method):
             estimate = self.encoder(images)
         difference = estimate.float() - upload(z, self.device)
         # A sum over the batch, not a mean: this process has only its share of it.
-        return self.backward_and_step({"encoder": difference.square().sum() / self.ranks.share}, step, "encoder")
+        return self.backward_and_step({"encoder": difference.square().sum() / self.group.batch_share}, step, "encoder")
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> float:
@@ -204,15 +204,15 @@ class PrGAN(Method):
         with self.autocast():
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
         accuracy = float((of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2)
-        return self.ranks.means({"accuracy": accuracy})["accuracy"]
+        return self.group.all_reduce_mean({"accuracy": accuracy})["accuracy"]
 
 
-def statistics_loss(of_real: Tensor, of_fake: Tensor, ranks: Ranks = ALONE) -> Tensor:
+def statistics_loss(of_real: Tensor, of_fake: Tensor, group: ProcessGroup = SINGLE_PROCESS) -> Tensor:
     """Squared distance of the batch means of features [B, ...] and of their variances, summed over all features."""
     means, variances = [], []  # not by torch's var, which takes ten times as long over the first axis
     for features in (of_real, of_fake):
         mean = features.mean(0)
-        mean, variance = ranks.pool(mean, (features - mean).square().mean(0))
+        mean, variance = group.all_reduce_moments(mean, (features - mean).square().mean(0))
         means.append(mean)
         variances.append(variance)
     return torch.sub(*means).square().sum() + torch.sub(*variances).square().sum()

@@ -14,9 +14,9 @@ from learn3d.methods.method import MeshMethod
 from learn3d.methods.surfaces import Meshes
 
 CODE_STEPS = 40
-CODE_STEP_SIZE = 0.1  # of Adam, in units of the root mean square of the codes' entries
+CODE_LEARNING_RATE = 0.1  # of Adam, in units of the root mean square of the codes' entries
 VERTEX_STEPS = 40
-VERTEX_STEP_SIZE = 0.002  # of Adam, in units of the object frame
+VERTEX_LEARNING_RATE = 0.002  # of Adam, in units of the object frame
 SMOOTHNESS = 0.001  # weight of the smoothness loss, that of the proposed method
 
 
@@ -47,19 +47,19 @@ def refine(
 
     with torch.no_grad():
         codes = method.encode(images).float().cpu()
-    step_size = CODE_STEP_SIZE * float(codes.square().mean().sqrt())
-    codes = _descend(lambda codes: loss(decode(codes)), codes, step_size, code_steps)
+    learning_rate = CODE_LEARNING_RATE * float(codes.square().mean().sqrt())
+    codes = _descend(lambda codes: loss(decode(codes)), codes, learning_rate, code_steps)
     with torch.no_grad():
         vertices = decode(codes).float().cpu()
     symmetrized = method.generator.symmetrized
-    vertices = _descend(lambda vertices: loss(symmetrized(vertices)), vertices, VERTEX_STEP_SIZE, vertex_steps)
+    vertices = _descend(lambda vertices: loss(symmetrized(vertices)), vertices, VERTEX_LEARNING_RATE, vertex_steps)
     return Meshes(symmetrized(vertices), method.faces)
 
 
 @torch.enable_grad()
-def _descend(loss: Callable[[Tensor], Tensor], start: Tensor, step_size: float, steps: int) -> Tensor:
+def _descend(loss: Callable[[Tensor], Tensor], start: Tensor, learning_rate: float, steps: int) -> Tensor:
     values = start.clone().requires_grad_()
-    optimizer = torch.optim.Adam([values], lr=step_size)
+    optimizer = torch.optim.Adam([values], lr=learning_rate)
     for _ in range(steps):
         (values.grad,) = torch.autograd.grad(loss(values), values)
         optimizer.step()

@@ -212,7 +212,7 @@ def starting_with(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def optimizer_state(name: str, optimizer: torch.optim.Optimizer) -> tuple[dict[str, Tensor], dict[str, dict[str, Any]]]:
     """What any optimizer of torch keeps of each parameter: tensors, named optimizer.<name>.<index>.<key>, and the other
-    values by index and key. Its step sizes and the like are not among them: they come from the options.
+    values by index and key. Its learning rate and the like are not among them: they come from the options.
     """
     tensors, others = {}, {}
     for index, state in optimizer.state_dict()["state"].items():

@@ -70,7 +70,7 @@ def lock_folder(folder: Path, lock: str = LOCK) -> Iterator[None]:
                 folder.rmdir()
 
 
-def check_free(folder: Path, overwrite: bool) -> None:
+def check_can_start(folder: Path, overwrite: bool) -> None:
     """Raise a ValueError where a new run may not begin in a folder: it is not empty, or not a run that can be replaced.
 
     What a run that was killed before it had anything leaves behind (a lock, a half-written file) does not count. With
@@ -91,9 +91,9 @@ def check_free(folder: Path, overwrite: bool) -> None:
         )
 
 
-def claim(folder: Path, overwrite: bool) -> None:
-    """Take a folder for a new run, where `check_free` allows it: what an earlier run has written is removed."""
-    check_free(folder, overwrite)
+def remove_old_run(folder: Path, overwrite: bool) -> None:
+    """Take a folder for a new run, where `check_can_start` allows it: what an earlier run has written is removed."""
+    check_can_start(folder, overwrite)
     for pattern in WRITTEN:
         for path in folder.glob(pattern):
             path.unlink()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from learn3d.config import TrainConfig, check_resume, config_to_dict, load_config
 from learn3d.data.dataset import ViewDataset
-from learn3d.distributed.ranks import Ranks, weights_digest
+from learn3d.distributed.process_group import ProcessGroup, weights_checksum
 from learn3d.files import writing
 from learn3d.methods import DatasetInfo, Method
 from learn3d.runs import checkpoint
@@ -45,7 +45,7 @@ class Run:
     method: Method
     info: DatasetInfo
     fingerprint: DataFingerprint
-    ranks: Ranks
+    group: ProcessGroup
     versions: dict[str, str | None] = field(default_factory=versions)  # of the code that runs
 
     def begin(
@@ -60,31 +60,31 @@ class Run:
         progress, notes = Progress(object_share=train_set.object_share()), ()
         saved = None
         if resume:
-            with self.ranks.main_first():  # it may have to put an earlier checkpoint in place
-                saved = load_last(config, repair=self.ranks.main)
+            with self.group.main_process_first():  # it may have to put an earlier checkpoint in place
+                saved = load_last(config, repair=self.group.is_main)
         if saved is not None:
             progress, notes = self._restore(saved), saved.notes
         else:
             self.method.start_from_pretrained()
         if progress.step > config.iterations:
             raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
-        if self.ranks.main and resume:
+        if self.group.is_main and resume:
             run_folder.remove_partials(folder)
         if progress.step == config.iterations:
-            if self.ranks.main:
+            if self.group.is_main:
                 run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
             return progress, notes
-        self.method.join(self.ranks)
+        self.method.distribute(self.group)
         self._compare_processes(progress, train_set, val_set)
-        if self.ranks.main:
+        if self.group.is_main:
             if not resume:
-                run_folder.claim(folder, overwrite)
+                run_folder.remove_old_run(folder, overwrite)
             writing.write_json(folder / CONFIG, config_to_dict(config), sync=True)
         return progress, notes
 
     def _compare_processes(self, progress: Progress, train_set: ViewDataset, val_set: ViewDataset) -> None:
         """Raise a ValueError naming what is not the same in all processes of the run."""
-        if self.ranks.alone:
+        if self.group.world_size == 1:
             return
         options = dataclasses.replace(self.config, data=Path("-"), output=Path("-"), threads=None)
         same = {
@@ -94,9 +94,9 @@ class Run:
             "training data": (self.fingerprint, train_set.digest()),
             "validation data": (len(val_set), val_set.digest()),
             "steps taken": progress.step,
-            "weights": weights_digest(self.method.networks),
+            "weights": weights_checksum(self.method.networks),
         }
-        self.ranks.check_same(**same)
+        self.group.check_equal(**same)
 
     def _restore(self, saved: Saved) -> Progress:
         """Bring everything back to the state that `save_last` wrote.
@@ -135,8 +135,8 @@ class Run:
 
     def save(self, progress: Progress, log: RunLog | SilentLog) -> None:
         """Write last.safetensors by the first process, where all have the same weights, and what was logged before."""
-        self.ranks.check_same(weights=0 if self.ranks.alone else weights_digest(self.method.networks))
-        if self.ranks.main:
+        self.group.check_equal(weights=0 if self.group.world_size == 1 else weights_checksum(self.method.networks))
+        if self.group.is_main:
             log.sync()
             self.save_last(progress)
 
@@ -167,7 +167,7 @@ class Run:
         """Write best.safetensors by the first process: the networks, or their averages, for use."""
         with self.method.ema_weights():
             self._check_networks()
-            if self.ranks.main:
+            if self.group.is_main:
                 networks = checkpoint.network_tensors(self.method)
                 checkpoint.save(self.config.output / BEST, networks, self._metadata(progress, {}))
 

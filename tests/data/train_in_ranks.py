@@ -20,8 +20,8 @@ import torch
 import nmr
 from learn3d import validation
 from learn3d.config import config_from_dict
-from learn3d.distributed.launch import start
-from learn3d.distributed.ranks import ALONE, Ranks
+from learn3d.distributed.launch import init_process_group
+from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.methods import method, prgan, vpl
 from learn3d.runs import checkpoint
@@ -57,16 +57,16 @@ def inject(fault: str, stack: contextlib.ExitStack) -> None:
     stack.enter_context(mock.patch.object(nmr.losses, "soft_iou_loss", fail))
 
 
-def evaluate_last(folder: Path, ranks: Ranks = ALONE) -> Evaluation:
+def evaluate_last(folder: Path, group: ProcessGroup = SINGLE_PROCESS) -> Evaluation:
     method, config, _ = checkpoint.load_method(folder / "last.safetensors")
-    method.join(ranks)
+    method.distribute(group)
     return evaluate(method, load_splits(config)[1], batch_size=5, paper_mmd=True)
 
 
-def run(task: dict, ranks: Ranks) -> None:
+def run(task: dict, group: ProcessGroup) -> None:
     if "evaluate" in task:
-        result = evaluate_last(Path(task["evaluate"]), ranks)
-        if ranks.main:
+        result = evaluate_last(Path(task["evaluate"]), group)
+        if group.is_main:
             summary = result.summary() | {"ious": result.ious["kato18"].tolist()}
             Path(task["evaluate"], "evaluation.json").write_text(json.dumps(summary))
         return
@@ -74,21 +74,21 @@ def run(task: dict, ranks: Ranks) -> None:
     with contextlib.ExitStack() as stack:
         if task.get("linear"):
             stack.enter_context(linear_optimizer())
-        if ranks.rank == 1 and "fault" in task:
+        if group.rank == 1 and "fault" in task:
             inject(task["fault"], stack)
-        if ranks.rank == 1 and "seed_of_rank_1" in task:
+        if group.rank == 1 and "seed_of_rank_1" in task:
             config = dataclasses.replace(config, seed=task["seed_of_rank_1"])
-        train(config, resume=task.get("resume", False), ranks=ranks)
+        train(config, resume=task.get("resume", False), group=group)
 
 
 def main() -> None:
     tiny_networks.put_in_place()
     validation.PICTURE_ROWS = 1
     tasks = json.loads(Path(sys.argv[1]).read_text())
-    with start(tasks[0]["config"]["device"]) as ranks:
+    with init_process_group(tasks[0]["config"]["device"]) as group:
         for task in tasks:
             try:
-                run(task, ranks)
+                run(task, group)
             except (ValueError, FloatingPointError) as error:  # those that all processes raise together
                 if "raises" not in task or task["raises"] not in str(error):
                     raise

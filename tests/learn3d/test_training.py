@@ -17,8 +17,8 @@ from learn3d.config import TrainConfig, check_resume, config_from_dict, config_t
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
 from learn3d.data.sampling import shuffled_epochs
-from learn3d.device import oversubscription
-from learn3d.distributed.ranks import ALONE
+from learn3d.device import oversubscription_warning
+from learn3d.distributed.process_group import SINGLE_PROCESS
 from learn3d.methods import DatasetInfo, create_method
 from learn3d.methods.multi_view import MultiViewSettings
 from learn3d.methods.plus import PlusSettings
@@ -469,7 +469,9 @@ def test_networks_that_are_not_finite_are_not_saved(tiny_config, run_folder) -> 
         method.generator.layers[0].bias[3] = float("inf")
     run_folder.mkdir()
     with pytest.raises(FloatingPointError, match="generator has values that are not finite"):
-        state.Run(config, method, DatasetInfo(24), DataFingerprint(72, "0a", "fp32"), ALONE).save_last(Progress())
+        state.Run(config, method, DatasetInfo(24), DataFingerprint(72, "0a", "fp32"), SINGLE_PROCESS).save_last(
+            Progress()
+        )
     assert not list(run_folder.iterdir())
 
 
@@ -547,7 +549,7 @@ def test_another_precision_is_compared_with_what_auto_was(tiny_run, run_folder) 
 
 @pytest.mark.parametrize(("threads", "processes", "named"), [(10**4, 1, True), (1, 1, False), (10**4, 2, True)])
 def test_more_threads_than_cores_are_named(threads: int, processes: int, named: bool) -> None:
-    assert ("--threads" in oversubscription(threads, processes)) == named
+    assert ("--threads" in oversubscription_warning(threads, processes)) == named
 
 
 @pytest.mark.parametrize("preset", ["peng2020-kato", "peng2020-kato-vpl", "kato2018-kato"])

@@ -26,8 +26,8 @@ from bench_work import num_cores
 from learn3d.data import conventions
 from learn3d.data.sampling import shuffled_epochs
 from learn3d.device import keep_freed_memory, resolve_precision
-from learn3d.distributed.launch import start
-from learn3d.distributed.ranks import Ranks
+from learn3d.distributed.launch import init_process_group
+from learn3d.distributed.process_group import ProcessGroup
 from learn3d.methods import DatasetInfo, create_method
 from learn3d.presets import PRESETS
 from learn3d.terminal import Stop, without_traceback
@@ -47,13 +47,13 @@ class Options:
     """Arithmetic of the networks."""
 
 
-def measure_steps(options: Options, ranks: Ranks) -> tuple[float, float, float]:
+def measure_steps(options: Options, group: ProcessGroup) -> tuple[float, float, float]:
     """Milliseconds: median step, fastest step, and the CPU time of a step in this process, which hardly depends
     on what else the machine does."""
     keep_freed_memory()
     torch.set_num_threads(options.threads)
     dataset, precision = sphere_dataset(), resolve_precision(options.precision, options.device)
-    ranks = ranks.divide(options.batch, "views")
+    group = group.split_batch(options.batch, "views")
     method = create_method(
         PRESETS["peng2020-kato"].settings,
         DatasetInfo(conventions.NUM_VIEWS),
@@ -61,12 +61,12 @@ def measure_steps(options: Options, ranks: Ranks) -> tuple[float, float, float]:
         precision=precision,
         seed=0,
     )
-    method.join(ranks)
+    method.distribute(group)
     steps, busy = [], []
     for step in range(1, options.repeats + 3):
         began, before = time.perf_counter(), time.process_time()
-        method.take_step(dataset.batch(shuffled_epochs(len(dataset), options.batch, 0, step), ranks.rows), step)
-        ranks.stopped_by(Stop())
+        method.take_step(dataset.batch(shuffled_epochs(len(dataset), options.batch, 0, step), group.rows), step)
+        group.stopped_by(Stop())
         if step > 2:
             steps.append(1e3 * (time.perf_counter() - began))
             busy.append(1e3 * (time.process_time() - before))
@@ -101,11 +101,11 @@ def bench_processes(repeats: int) -> None:
 @without_traceback()
 def main() -> int:
     options = tyro.cli(Options, description=__doc__)
-    with start(options.device) as ranks:
-        step, fastest, busy = measure_steps(options, ranks)
-    if ranks.main:
+    with init_process_group(options.device) as group:
+        step, fastest, busy = measure_steps(options, group)
+    if group.is_main:
         print(
-            f"{ranks.world} x {options.threads} threads, batch {options.batch}: {step:.1f} ms a step, fastest "
+            f"{group.world_size} x {options.threads} threads, batch {options.batch}: {step:.1f} ms a step, fastest "
             f"{fastest:.1f} ms, CPU {busy:.1f} ms"
         )
     return 0

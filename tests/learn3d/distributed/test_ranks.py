@@ -27,9 +27,9 @@ from train_in_ranks import evaluate_last, linear_optimizer
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.data import augment as augmentation
 from learn3d.distributed import launch
-from learn3d.distributed.launch import all_agree, label, start
-from learn3d.distributed.ranks import ALONE, LostPeerError, Ranks
-from learn3d.distributed.sync_batch_norm import use_whole_batch
+from learn3d.distributed.launch import all_true, init_process_group, rank_label
+from learn3d.distributed.process_group import SINGLE_PROCESS, LostPeerError, ProcessGroup
+from learn3d.distributed.sync_batch_norm import convert_sync_batchnorm
 from learn3d.training import train
 
 TASKS = Path(__file__).parents[2] / "data" / "train_in_ranks.py"
@@ -67,9 +67,9 @@ RUNS: dict[str, tuple[dict[str, object], float, float]] = {
     ],
 )
 def test_each_row_belongs_to_one_process(world: int, batch_size: int, sampling: str, parts: list[list[int]]) -> None:
-    ranks = [Ranks(rank, world).divide(batch_size, sampling) for rank in range(world)]
+    ranks = [ProcessGroup(rank, world).split_batch(batch_size, sampling) for rank in range(world)]
     assert [r.rows.tolist() for r in ranks] == parts
-    assert sum(r.share for r in ranks) == pytest.approx(1)
+    assert sum(r.batch_share for r in ranks) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
@@ -81,12 +81,12 @@ def test_each_row_belongs_to_one_process(world: int, batch_size: int, sampling: 
 )
 def test_too_many_processes_are_refused(batch_size: int, sampling: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Ranks(0, 3).divide(batch_size, sampling)
+        ProcessGroup(0, 3).split_batch(batch_size, sampling)
 
 
 def test_too_many_processes_are_refused_before_data_are_read(tiny_config, tmp_path) -> None:
     with pytest.raises(ValueError, match="a batch of 4 is too small for 5 processes"):
-        train(tiny_config(tmp_path / "run", data=tmp_path / "nowhere"), ranks=Ranks(1, 5))
+        train(tiny_config(tmp_path / "run", data=tmp_path / "nowhere"), group=ProcessGroup(1, 5))
 
 
 @pytest.mark.parametrize("names", [("flip",), ("flip-image", "channels"), ("channels", "flip"), ("colors",)])
@@ -104,12 +104,12 @@ def test_parts_of_a_batch_are_changed_as_the_whole_is(tiny_set, names: tuple[str
 
 def test_without_torchrun_there_is_one_process(monkeypatch) -> None:
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    with start("cpu") as ranks:
-        assert (ranks, label()) == (ALONE, "")
+    with init_process_group("cpu") as group:
+        assert (group, rank_label()) == (SINGLE_PROCESS, "")
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.delenv("RANK", raising=False)
     with pytest.raises(ValueError, match=r"WORLD_SIZE is 2, but RANK.* not set; start the processes by torchrun"):
-        with start("cpu"):
+        with init_process_group("cpu"):
             pass
 
 
@@ -125,7 +125,7 @@ def test_processes_that_do_not_meet_say_where_and_what_to_look_for(monkeypatch) 
         monkeypatch.setenv(name, str(value))
     monkeypatch.setattr(launch, "TIMEOUT", timedelta(seconds=1))
     said = rf"the 2 processes of the run did not find each other by 127.0.0.1:{port} \(.*\); one of them has ended"
-    with pytest.raises(LostPeerError, match=said), start("cpu"):
+    with pytest.raises(LostPeerError, match=said), init_process_group("cpu"):
         pass
 
 
@@ -137,7 +137,7 @@ def test_a_lost_machine_that_kept_the_store_is_a_lost_process(monkeypatch) -> No
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     monkeypatch.setattr(launch, "GRACE_SECONDS", 0)
     with pytest.raises(LostPeerError) as lost:
-        Ranks(1, 2).any(True)
+        ProcessGroup(1, 2).any(True)
     launch._announce(mock.Mock(check=fail), lost.value)
     said = "another process of the run failed, was killed or does not answer ([pair.cc:537] Connection reset by peer)"
     assert str(lost.value) == said
@@ -163,7 +163,7 @@ def test_batch_norm_of_one_process_is_the_usual_one() -> None:
         torch.nn.BatchNorm2d(3, momentum=0.3),
         torch.nn.BatchNorm2d(3, momentum=0.3),
     )
-    use_whole_batch(ours, ALONE)
+    convert_sync_batchnorm(ours, SINGLE_PROCESS)
     inputs = [x.clone().requires_grad_() for _ in range(2)]
     outputs = [norm(value) for norm, value in zip((usual, ours), inputs, strict=True)]
     torch.testing.assert_close(*outputs)
@@ -179,7 +179,7 @@ def test_batch_norm_of_one_process_is_the_usual_one() -> None:
 def test_nccl_is_taken_where_all_can(values: tuple[bool, ...], agreed: bool) -> None:
     store = torch.distributed.HashStore()
     with ThreadPoolExecutor(len(values)) as threads:
-        found = threads.map(lambda own: all_agree(store, own[0], len(values), own[1]), enumerate(values))
+        found = threads.map(lambda own: all_true(store, own[0], len(values), own[1]), enumerate(values))
         assert list(found) == [agreed] * len(values)
 
 
@@ -396,14 +396,14 @@ def test_torchrun_reports_what_went_wrong_once(tmp_path) -> None:
 
 RESTARTED = """
 import os, time
-from learn3d.distributed.launch import start
+from learn3d.distributed.launch import init_process_group
 first, rank = os.environ["TORCHELASTIC_RESTART_COUNT"] == "0", os.environ["RANK"]
 if not first and rank == "1":
     time.sleep(2)  # the other one would find the address that this one had
-with start("cpu") as ranks:
+with init_process_group("cpu") as group:
     if first:
         raise RuntimeError("once more")
-    assert ranks.any(rank == "1")
+    assert group.any(rank == "1")
 """
 
 

@@ -15,7 +15,7 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.methods.adam import SparseGradientAdam
 from learn3d.methods.method import DatasetInfo
 from learn3d.methods.multi_view import MultiView, MultiViewSettings, check_pairs
-from learn3d.methods.optimization import Plan
+from learn3d.methods.optimization import TrainingSchedule
 from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.networks.generators import deform_bounded_sphere
 from learn3d.presets import PRESETS
@@ -36,7 +36,9 @@ def make_batch(objects: list[int]) -> Batch:
 @pytest.fixture(scope="module")
 def method() -> MultiView:
     torch.manual_seed(0)
-    return MultiView(MultiViewSettings(encoder="conv-small"), DatasetInfo(24), "cpu", "fp32", Plan(200, "step"))
+    return MultiView(
+        MultiViewSettings(encoder="conv-small"), DatasetInfo(24), "cpu", "fp32", TrainingSchedule(200, "step")
+    )
 
 
 def test_bounded_rule() -> None:
@@ -119,7 +121,7 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> N
         assert all((p != q).any() for p, q in zip(network.parameters(), before[name], strict=True)), name
 
 
-def test_step_size_decays_once_and_is_smaller_for_the_centroid(method: MultiView) -> None:
+def test_learning_rate_decays_once_and_is_smaller_for_the_centroid(method: MultiView) -> None:
     rates = {}
     for step in (190, 191):
         method.take_step(make_batch([0, 0]), step)

@@ -12,7 +12,7 @@ import tiny_networks
 import torch
 from torch import nn
 
-from learn3d.methods import DatasetInfo, Method, Plan, create_method
+from learn3d.methods import DatasetInfo, Method, TrainingSchedule, create_method
 from learn3d.methods.optimization import EMA, adam
 from learn3d.networks import ENCODERS
 from learn3d.presets import PRESETS
@@ -55,30 +55,32 @@ def test_moments_of_dead_units_vanish_and_change_no_weight() -> None:
     assert ours.state[layer.weight]["exp_avg"].count_nonzero() == 0
 
 
-# --- step sizes
+# --- learning rates
 
 
 def test_schedules() -> None:
-    def factors(**plan: object) -> list[float]:
-        return [Plan(4, **plan).factor(step) for step in (1, 2, 3, 4)]
+    def factors(**schedule: object) -> list[float]:
+        return [TrainingSchedule(4, **schedule).lr_factor(step) for step in (1, 2, 3, 4)]
 
     assert factors() == [1, 1, 1, 1]
     assert factors(lr_schedule="linear") == [1, 0.75, 0.5, 0.25]
     assert factors(lr_schedule="cosine") == pytest.approx([(1 + math.cos(math.pi * k / 4)) / 2 for k in range(4)])
     assert factors(warmup_steps=2) == [0.5, 1, 1, 1]
     assert factors(warmup_steps=2, lr_schedule="linear") == [0.5, 1, 1, 0.5]
-    published = Plan(200_000, "step")
-    assert [published.factor(step) for step in (1, 190_000, 190_001, 200_000)] == [1, 1, 0.1, 0.1]
+    published = TrainingSchedule(200_000, "step")
+    assert [published.lr_factor(step) for step in (1, 190_000, 190_001, 200_000)] == [1, 1, 0.1, 0.1]
 
 
 def test_a_warmup_as_long_as_the_run_is_refused() -> None:
     with pytest.raises(ValueError, match="warmup_steps"):
-        Plan(10, warmup_steps=10)
+        TrainingSchedule(10, warmup_steps=10)
 
 
-def test_step_sizes_follow_the_schedule(tiny_names, tiny_set) -> None:
+def test_learning_rates_follow_the_schedule(tiny_names, tiny_set) -> None:
     settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **TINY, learning_rate=1e-3)
-    method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, plan=Plan(4, "linear"))
+    method = create_method(
+        settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, schedule=TrainingSchedule(4, "linear")
+    )
     for step in (1, 2, 3):
         method.take_step(tiny_set.batch(torch.arange(4)), step)
         assert [o.param_groups[0]["lr"] for o in method.optimizers.values()] == [1e-3 * (1 - (step - 1) / 4)] * 3
@@ -118,8 +120,8 @@ def test_an_average_does_not_change_what_is_learnt(tiny_names, tiny_set) -> None
     settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **TINY)
     ends = []
     for average in (0.0, 0.9):
-        plan = Plan(3, ema_decay=average)
-        method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, plan=plan)
+        schedule = TrainingSchedule(3, ema_decay=average)
+        method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, schedule=schedule)
         for step in (1, 2, 3):
             method.take_step(tiny_set.batch(torch.arange(4)), step)
             with method.ema_weights():

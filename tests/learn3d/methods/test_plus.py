@@ -10,7 +10,7 @@ import torch
 from learn3d.config import differences
 from learn3d.data.conventions import KATO
 from learn3d.methods import DatasetInfo, create_method
-from learn3d.methods.optimization import Plan
+from learn3d.methods.optimization import TrainingSchedule
 from learn3d.methods.plus import MaskBank, Plus, PlusSettings
 from learn3d.presets import PRESETS
 from learn3d.runs.checkpoint import load
@@ -70,7 +70,9 @@ def test_losses(batch) -> None:
 
 def test_the_weight_of_the_smoothness_falls_over_the_run(tiny_set, batch) -> None:
     settings = dataclasses.replace(SMALL, lambda_smooth=1e-2, lambda_smooth_end=1e-4)
-    method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, plan=Plan(iterations=5))
+    method = create_method(
+        settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, schedule=TrainingSchedule(iterations=5)
+    )
     weights = [method.weights_at(step)["smoothness"] for step in (1, 3, 5, 6)]
     assert weights == pytest.approx([1e-2, 1e-3, 1e-4, 1e-4])
     losses = method.take_step(batch, 3)

@@ -265,7 +265,7 @@ def test_settings_are_checked(settings: dict[str, object], message: str) -> None
         PrGANSettings(**settings)
 
 
-def test_step_sizes_are_checked() -> None:
+def test_learning_rates_are_checked() -> None:
     with pytest.raises(ValueError, match="generator_learning_rate must be greater than 0"):
         PrGANSettings(generator_learning_rate=0.0)
 

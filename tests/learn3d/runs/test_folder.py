@@ -54,7 +54,7 @@ def test_a_folder_in_use_is_refused_and_a_killed_process_does_not_hold_it(tmp_pa
         holder.wait(timeout=30)
     assert (folder / ".lock").exists()
     with run_folder.lock_folder(folder):
-        run_folder.claim(folder, overwrite=False)
+        run_folder.remove_old_run(folder, overwrite=False)
     assert not (folder / ".lock").exists()
 
 
@@ -106,7 +106,7 @@ def test_overwriting_leaves_what_is_not_of_a_run(tmp_path) -> None:
     mine = [tmp_path / "notes.txt", tmp_path / "checkpoints" / "copy-of-step-10.safetensors"]
     for path in mine:
         path.write_text("mine")
-    run_folder.claim(tmp_path, overwrite=True)
+    run_folder.remove_old_run(tmp_path, overwrite=True)
     assert sorted(path for path in tmp_path.rglob("*") if path.is_file()) == sorted(mine)
 
 
@@ -125,10 +125,10 @@ def test_a_kill_while_a_run_is_replaced_leaves_nothing_to_continue(tmp_path, mon
 
     monkeypatch.setattr(Path, "unlink", killed)
     with pytest.raises(KeyboardInterrupt):
-        run_folder.claim(tmp_path, overwrite=True)
+        run_folder.remove_old_run(tmp_path, overwrite=True)
     assert removed == ["config.json"], "without it --resume finds no run"
     monkeypatch.undo()
-    run_folder.claim(tmp_path, overwrite=True)
+    run_folder.remove_old_run(tmp_path, overwrite=True)
     assert not list(tmp_path.iterdir()), "what is left is still known as a run's, and can be replaced"
 
 
@@ -139,7 +139,7 @@ def test_what_is_not_a_run_is_not_replaced(tmp_path) -> None:
         (tmp_path / name).write_text("mine")
     for overwrite in (False, True):
         with pytest.raises(ValueError, match=r"has config.json, but no run that it could belong to; choose another"):
-            run_folder.claim(tmp_path, overwrite)
+            run_folder.remove_old_run(tmp_path, overwrite)
     assert all((tmp_path / name).read_text() == "mine" for name in mine)
 
 
@@ -148,8 +148,8 @@ def test_a_run_beside_other_files(tmp_path) -> None:
     for name in ("log.txt", "pictures/holiday.jpg"):
         (tmp_path / name).write_text("mine")
     with pytest.raises(ValueError, match="is not empty; choose another folder, or put the run beside"):
-        run_folder.claim(tmp_path, overwrite=False)
-    run_folder.claim(tmp_path, overwrite=True)
+        run_folder.remove_old_run(tmp_path, overwrite=False)
+    run_folder.remove_old_run(tmp_path, overwrite=True)
     assert all((tmp_path / name).read_text() == "mine" for name in ("log.txt", "pictures/holiday.jpg"))
 
 
@@ -158,7 +158,7 @@ def test_of_a_run_only_its_own_files_are_removed(tmp_path) -> None:
     for name in ("pictures/000200.png", "pictures/holiday.jpg", "tensorboard/events.out.tfevents.1", "notes.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("x")
-    run_folder.claim(tmp_path, overwrite=True)
+    run_folder.remove_old_run(tmp_path, overwrite=True)
     left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*"))
     assert left == ["notes.txt", "pictures", "pictures/holiday.jpg"]
 
@@ -175,11 +175,11 @@ def test_the_command_to_continue_is_the_one_that_ran(tmp_path, monkeypatch, star
 
 def test_half_written_files_do_not_make_a_folder_used_and_are_removed(tmp_path) -> None:
     (tmp_path / ".config.json.partial").write_text("{")
-    run_folder.claim(tmp_path, overwrite=False)
+    run_folder.remove_old_run(tmp_path, overwrite=False)
     assert not list(tmp_path.iterdir())
     writing.write_bytes(tmp_path / "x", b"")
     with pytest.raises(ValueError, match="is not empty"):
-        run_folder.claim(tmp_path, overwrite=False)
+        run_folder.remove_old_run(tmp_path, overwrite=False)
 
 
 def test_two_processes_never_share_a_run(tmp_path) -> None:
