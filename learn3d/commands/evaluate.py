@@ -41,24 +41,25 @@ class Command:
 
 def run(arguments: Sequence[str]) -> int:
     """Measure, and print a table."""
-    from learn3d.experiments.evaluation_report import describe_columns, evaluate_runs, format_table
+    from learn3d.experiments.measurement import describe_measures, evaluate_runs, format_table, to_json
     from learn3d.files.writing import check_target, write_json
 
     columns = "Columns of the table (means over the images, then over the classes; - where there is no value):"
-    command = parse(Command, arguments, name="evaluate", about=f"{__doc__}\n{columns}\n{describe_columns()}")
+    command = parse(Command, arguments, name="evaluate", about=f"{__doc__}\n{columns}\n{describe_measures()}")
     if command.json is not None:
         check_target(command.json, "--json")
-    report = evaluate_runs(
+    results = evaluate_runs(
         command.runs,
         data=command.data,
         category=command.category,
-        split=command.split,
         which=command.checkpoint,
+        split=command.split,
         precision=command.precision,
         device=command.device,
         report_progress=note,
     )
-    say(format_table(report))
+    say(format_table(results))
     if command.json is not None:
-        write_json(command.json, report)
+        protocol = {"split": command.split, "checkpoint": command.checkpoint, "precision": command.precision}
+        write_json(command.json, to_json(results, **protocol))
     return 0

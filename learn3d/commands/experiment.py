@@ -21,8 +21,8 @@ import tyro
 
 from learn3d.commands.parsing import names, parse
 from learn3d.data.layouts import Layout
-from learn3d.experiments.experiment import Call, describe_tables, run_experiment
-from learn3d.experiments.plan import Options
+from learn3d.experiments.experiment import describe_tables, run_experiment
+from learn3d.experiments.plan import Request
 from learn3d.terminal import say
 
 COMMON = ("table", "data", "output", "category", "methods", "iterations", "batch_size", "seeds", "jobs", "list", "set")
@@ -75,9 +75,7 @@ def run(arguments: Sequence[str]) -> int:
         say(describe_tables())
         return 0
     command = parse(Command, arguments, name="experiment", about=__doc__, common=COMMON)
-    shared = ("data", "output", "methods", "iterations", "batch_size", "seeds", "layout", "device", "threads")
-    options = Options(
-        categories=names(command.category), changes=command.set, **{name: getattr(command, name) for name in shared}
-    )
-    how = {name: getattr(command, name) for name in ("jobs", "cluster", "overwrite", "report_only")}
-    return run_experiment(Call(command.table, options, **how))
+    shared = ("table", "data", "output", "methods", "iterations", "batch_size", "seeds", "layout", "device", "threads")
+    shared += ("jobs", "cluster", "overwrite", "report_only")
+    values = {name: getattr(command, name) for name in shared}
+    return run_experiment(Request(categories=names(command.category), changes=command.set, **values))

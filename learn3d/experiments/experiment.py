@@ -1,81 +1,72 @@
-"""One table from beginning to end: plan, train and measure what is missing, report."""
+"""One table from beginning to end: plan its runs, train and test the missing ones, write the report."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from pathlib import Path
 
 import torch
+from pydantic import ValidationError
 
+from learn3d.config import config_from_dict, differences, load_config
 from learn3d.device import cores
 from learn3d.distributed.tasks import Task, run_tasks
-from learn3d.experiments import results
 from learn3d.experiments.formats import to_text, write_report
-from learn3d.experiments.plan import Options, Run, plan_runs
+from learn3d.experiments.measurement import Result, measure
+from learn3d.experiments.plan import PlannedRun, Request, plan_runs
 from learn3d.experiments.report import make_report
-from learn3d.experiments.results import conflicts_with, read_results
-from learn3d.experiments.tables import TABLES
+from learn3d.experiments.tables import TABLES, VARIANTS
+from learn3d.files import limits, writing
+from learn3d.files.reading import parse_json, read_bytes
+from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.terminal import INTERRUPTED, note, say
 from learn3d.training import train
 
-LOG_FILE = "log.txt"  # in a run's folder
+LOG_FILE, RESULT_FILE = "log.txt", "test.json"  # in a run's folder
 
-#: Carries out a run, anew if the second argument says so; False where it was stopped.
-Work = Callable[[Run, bool], bool]
-
-
-@dataclass(frozen=True)
-class Call:
-    """What is asked for."""
-
-    table: str
-    options: Options
-    jobs: int = 1
-    cluster: str | None = None
-    overwrite: bool = False
-    report_only: bool = False
+#: Trains and tests a run, anew if the second argument is true; returns False if it was stopped.
+Work = Callable[[PlannedRun, bool], bool]
 
 
-def carry_out(run: Run, fresh: bool) -> bool:
-    """Train and measure; False when a signal stopped the training. Raises what `train` and `measure` raise.
+def train_and_test(run: PlannedRun, fresh: bool) -> bool:
+    """Train, measure and write test.json; False if a signal stopped the training. Raises as `train` and `measure` do.
 
-    A run that is there goes on, unless `fresh` replaces it. If it only needs measuring, `train` finds that it is
-    complete and still of the same options and data.
+    An existing run goes on, unless `fresh` replaces it. If it only needs measuring, `train` checks that it is complete
+    and of the same options and data.
     """
     resume = not fresh and run_folder.is_run(run.folder)
     if not resume:
-        (run.folder / results.RESULT_FILE).unlink(missing_ok=True)
+        (run.folder / RESULT_FILE).unlink(missing_ok=True)
     if not train(run.config, resume=resume, overwrite=not resume).finished:
         return False
-    record = results.measure(run)
-    print(f"tested: voxel IoU {record['voxel_iou_kato18']:.4f} (kato18)", flush=True)
+    file = checkpoint.find(run.folder, run.checkpoint)
+    result = measure(file, data=run.config.data, device=run.config.device)
+    writing.write_json(run.folder / RESULT_FILE, result.model_dump())
+    print(f"tested: voxel IoU {result.voxel_iou_kato18:.4f} (kato18)", flush=True)
     return True
 
 
-def run_experiment(call: Call, *, work: Work = carry_out) -> int:
-    """Carry out a table's missing runs and write its report; the exit status: 0, 1 where a run failed, 130 if stopped.
+def run_experiment(request: Request, *, work: Work = train_and_test) -> int:
+    """Carry out a table's missing runs and write its report; the exit status: 0, 1 if a run failed, 130 if stopped.
 
-    The report is written in any case, with what there is. Raises ValueError for a table, method or option that does not
+    The report is written in any case, from the results so far. Raises ValueError for a method or option that does not
     exist, for runs with other options in the output folder (unless `overwrite`), and for damaged files.
     """
-    if call.table not in TABLES:
-        raise ValueError(f"there is no table {call.table!r}; choose one of {', '.join(TABLES)} (see --list)")
-    if call.jobs < 1:
-        raise ValueError(f"jobs must be a number of processes, at least 1, got {call.jobs}")
-    if call.report_only and call.overwrite:
-        raise ValueError("--report-only trains nothing and --overwrite trains anew; give one of them")
-    table, failed = TABLES[call.table], {}
-    threads = call.options.threads or max(1, min(cores(), torch.get_num_threads()) // call.jobs)
-    runs = plan_runs(table, dataclasses.replace(call.options, threads=threads))
-    if not call.report_only:
-        failed = _complete(runs, call, threads, work)
-    unlike = {run.name: text for run in runs if (text := conflicts_with(run))}
-    for text in unlike.values():
+    threads = request.threads or max(1, min(cores(), torch.get_num_threads()) // request.jobs)
+    runs, failed = plan_runs(dataclasses.replace(request, threads=threads)), {}
+    conflicts = {run.name: text for run in runs if (text := find_conflict(run))}
+    if not request.report_only:
+        if conflicts and not request.overwrite:
+            advice = "ask for the same options, choose another --output, or give --overwrite"
+            raise ValueError("\n  ".join([*conflicts.values(), advice]))
+        failed = _complete(runs, conflicts, request, threads, work)
+        conflicts = {run.name: text for run in runs if (text := find_conflict(run))}
+    for text in conflicts.values():
         note(f"left out: {text}")
-    report = make_report(table, call.options, runs, read_results([run for run in runs if run.name not in unlike]))
-    paths = write_report(call.options.output, report)
+    report = make_report(request, runs, read_results([run for run in runs if run.name not in conflicts]))
+    paths = write_report(request.output, report)
     say(to_text(report))
     note("report: " + ", ".join(map(str, paths)))
     for name, tail in failed.items():
@@ -83,40 +74,81 @@ def run_experiment(call: Call, *, work: Work = carry_out) -> int:
     if failed:
         note(f"\n{len(failed)} of {len(runs)} runs failed; the same command tries them again")
         return 1
-    if report["missing"] and not call.report_only:
+    if report["missing"] and not request.report_only:
         note("stopped; the same command goes on")
         return INTERRUPTED
     return 0
 
 
-def _complete(runs: Sequence[Run], call: Call, threads: int, work: Work) -> dict[str, str]:
-    """Train and measure what is not done yet; runs with other options are an error, or replaced."""
-    conflicts = {run.name: text for run in runs if (text := conflicts_with(run))}
-    if conflicts and not call.overwrite:
-        advice = "ask for the same options, choose another --output, or give --overwrite"
-        raise ValueError("\n  ".join([*conflicts.values(), advice]))
+def _complete(
+    runs: Sequence[PlannedRun], conflicts: dict[str, str], request: Request, threads: int, work: Work
+) -> dict[str, str]:
+    """Train and test the missing runs, and replace those in conflict; returns the end of each failed run's log."""
     done = read_results([run for run in runs if run.name not in conflicts])
-    where = f"on the cluster {call.cluster}" if call.cluster else f"{call.jobs} at a time"
-    logs = call.options.output / "runs/*/*" / LOG_FILE
-    note(
-        f"{call.table}: {len(runs)} runs, of which {len(done)} are done; {where}, {threads} threads each; logs: {logs}"
-    )
+    where = f"on the cluster {request.cluster}" if request.cluster else f"{request.jobs} at a time"
+    logs = request.output / "runs/*/*" / LOG_FILE
+    note(f"{request.table}: {len(runs)} runs, {len(done)} of them done; {where}, {threads} threads each; logs: {logs}")
     tasks = [
         Task(run.name, work, (run, run.name in conflicts), run.folder / LOG_FILE)
         for run in runs
         if run.folder not in done
     ]
-    return run_tasks(tasks, call.options.output, jobs=call.jobs, cluster=call.cluster)
+    return run_tasks(tasks, request.output, jobs=request.jobs, cluster=request.cluster)
+
+
+def read_result(path: Path) -> Result:
+    """Read a test.json; ValueError naming it if it is damaged or holds something else."""
+    content = read_bytes(path, limits.JSON_BYTES, "the measurement of a run as JSON")
+    try:
+        return Result.model_validate(parse_json(content))
+    except ValueError as error:
+        reason = error
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            reason = f"{'.'.join(map(str, first['loc'])) or 'it'}: {first['msg']}"
+        raise ValueError(f"{path} is no measurement of a run ({reason}); remove it, and it is made again") from None
+
+
+def read_results(runs: Sequence[PlannedRun]) -> dict[Path, Result]:
+    """The stored results of these runs by folder, if they are of this checkpoint, length of training and data."""
+    results = {}
+    for run in runs:
+        if (path := run.folder / RESULT_FILE).is_file():
+            result, data = read_result(path), str(run.config.data.resolve())
+            stored = (result.iterations, Path(result.checkpoint).stem, result.data)
+            if stored == (run.config.iterations, run.checkpoint, data):
+                results[run.folder] = result
+    return results
+
+
+def find_conflict(run: PlannedRun) -> str:
+    """The options in which the run in the folder differs from the planned one, as a sentence; "" if it can go on."""
+    if run_folder.is_run(run.folder):
+        saved = load_config(run.folder / run_folder.CONFIG)
+    elif (path := run.folder / RESULT_FILE).is_file():
+        saved = config_from_dict(read_result(path).config, str(path))
+    else:
+        return ""
+    changed = differences(run.config, saved)
+    if run.checkpoint == "best" and run.config.val_split != saved.val_split:
+        changed.append(
+            f"val_split: {saved.val_split!r} chose the run's best networks, {run.config.val_split!r} asked for"
+        )
+    return f"{run.folder} has a run with other options: " + "; ".join(changed) if changed else ""
 
 
 def describe_tables() -> str:
-    """What --list prints: every table with its methods."""
+    """Every table with its methods, for --list."""
     lines = []
-    for table in TABLES.values():
-        lines.append(f"{table.name}: {table.title}")
-        lines.append(f"  layout {table.layout}, {len(table.categories)} categories, seeds {table.seeds}")
-        for row in table.rows:
-            changes = "".join(f", {name}={value}" for name, value in row.variant.changes.items()) if row.variant else ""
-            what = f"{row.variant.name}, preset {row.variant.preset}{changes}" if row.variant else "quoted"
-            lines.append(f"  {row.label}: {what}")
+    for name, table in TABLES.items():
+        lines += [
+            f"{name}: {table.title}",
+            f"  layout {table.layout}, {len(table.categories)} categories, seeds {table.seeds}",
+        ]
+        for label, variant in table.rows.items():
+            about = "quoted"
+            if variant:
+                changes = "".join(f", {option}={value}" for option, value in VARIANTS[variant].changes.items())
+                about = f"{variant}, preset {VARIANTS[variant].preset}{changes}"
+            lines.append(f"  {label}: {about}")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Which runs a table needs, and what each of them is."""
+"""The training runs that a table needs: their names, folders and options."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from typing import Any, Literal
 
 from learn3d.config import TrainConfig
 from learn3d.data.layouts import LAYOUTS, Layout
-from learn3d.experiments.tables import Row, Table, Variant
+from learn3d.experiments.tables import TABLES, VARIANTS, Table, Variant
 from learn3d.presets import PRESETS
 
-_SHOWN = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")  # in every command line
-_OWN_OPTIONS = (*_SHOWN, "settings", "layout")
+_FIRST = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")  # in every command line
+_NOT_CHANGEABLE = (*_FIRST, "settings", "layout")  # by --set: the request or the table decides them
 
 
 @dataclass(frozen=True)
-class Options:
-    """What the user decides about the runs of a table."""
+class Request:
+    """The table that is asked for, and the choices of the user."""
 
+    table: str
     data: Path  # folder of the data set
     output: Path  # folder of all runs and reports
     categories: tuple[str, ...] = ()  # (): the table's
@@ -32,15 +33,31 @@ class Options:
     seeds: int | None = None  # seeds 0 .. seeds - 1; None: the table's
     layout: Layout | None = None  # None: the table's
     device: Literal["cpu", "cuda"] = "cpu"
-    threads: int | None = None  # of each run
-    changes: tuple[str, ...] = ()  # "name=value" or "method:name=value": settings and options of the training
+    threads: int | None = None  # of each run; None: the cores divided by `jobs`
+    changes: tuple[str, ...] = ()  # "name=value" or "method:name=value": settings and training options
+    jobs: int = 1  # runs at a time
+    cluster: str | None = None  # address or scheduler file of a Dask cluster
+    overwrite: bool = False  # replace runs that were started with other options
+    report_only: bool = False  # train nothing
+
+    def __post_init__(self) -> None:
+        if self.table not in TABLES:
+            raise ValueError(f"there is no table {self.table!r}; choose one of {', '.join(TABLES)} (see --list)")
+        if self.jobs < 1:
+            raise ValueError(f"jobs must be a number of processes, at least 1, got {self.jobs}")
+        if self.seeds is not None and self.seeds < 1:
+            raise ValueError(f"seeds must be a number of seeds, at least 1, got {self.seeds}")
+        if len(set(self.categories)) != len(self.categories):
+            raise ValueError(f"categories must be different ones, got {', '.join(self.categories)}")
+        if self.report_only and self.overwrite:
+            raise ValueError("--report-only trains nothing and --overwrite trains anew; give one of them")
 
 
 @dataclass(frozen=True)
-class Run:
-    """One training run and its measurement. Its folder is its identity: any table that needs it finds it there."""
+class PlannedRun:
+    """A training run and its test. The folder identifies it: every table that needs the run finds it there."""
 
-    variant: Variant
+    variant: str
     category: str
     seed: int
     config: TrainConfig
@@ -54,58 +71,123 @@ class Run:
         """<category>/<variant>-seed<k>."""
         return f"{self.category}/{self.folder.name}"
 
+    @property
+    def checkpoint(self) -> Literal["last", "best"]:
+        """The checkpoint that is tested."""
+        return VARIANTS[self.variant].checkpoint
 
-def selected_rows(table: Table, methods: Sequence[str]) -> tuple[Row, ...]:
-    """The rows whose label or variant is among `methods` (all for none), and the quoted ones.
+
+def selected_rows(table: Table, name: str, methods: Sequence[str]) -> dict[str, str | None]:
+    """The rows of a table, label -> variant, whose label or variant is among `methods` (all for none), and quoted ones.
 
     Raises ValueError naming a method that the table does not have.
     """
-    known = {name: row for row in table.rows if row.variant for name in (row.label.lower(), row.variant.name.lower())}
-    if unknown := [name for name in methods if name.lower() not in known]:
-        raise ValueError(
-            f"the table {table.name} has no method {', '.join(map(repr, unknown))}; it has "
-            + ", ".join(variant.name for variant in table.variants)
-        )
-    chosen = [known[name.lower()] for name in methods] or list(table.rows)
-    return tuple(row for row in table.rows if row.variant is None or row in chosen)
+    variants = [variant for variant in table.rows.values() if variant]
+    labels = {label.lower(): variant for label, variant in table.rows.items()} | {v: v for v in variants}
+    if unknown := [method for method in methods if not labels.get(method.lower())]:
+        unknown_names = ", ".join(map(repr, unknown))
+        raise ValueError(f"the table {name} has no method {unknown_names}; it has {', '.join(variants)}")
+    chosen = [labels[method.lower()] for method in methods] or variants
+    return {label: variant for label, variant in table.rows.items() if variant is None or variant in chosen}
 
 
-def plan_runs(table: Table, options: Options) -> list[Run]:
-    """The runs that the rows of a table need, by category, then row, then seed.
+def plan_runs(request: Request) -> list[PlannedRun]:
+    """The runs of a request, by category, then row, then seed.
 
     Raises ValueError for an unknown method, for a layout without true voxels, and for options that do not fit (see
     `TrainConfig`).
     """
-    layout = options.layout or table.layout
+    table = TABLES[request.table]
+    layout = request.layout or table.layout
     if layout in LAYOUTS and not LAYOUTS[layout].voxels:
         raise ValueError(f"the layout {layout!r} has no true voxels, so that no run of the table could be measured")
-    variants = [row.variant for row in selected_rows(table, options.methods) if row.variant]
-    changes = _changes_by_variant(variants, table, options.changes)
-    seeds = table.seeds if options.seeds is None else options.seeds
-    if seeds < 1:
-        raise ValueError(f"seeds must be a number of seeds, at least 1, got {seeds}")
-    categories = options.categories or table.categories
-    if len(set(categories)) != len(categories):
-        raise ValueError(f"categories must be different ones, got {', '.join(categories)}")
+    variants = [variant for variant in selected_rows(table, request.table, request.methods).values() if variant]
+    changes = _parse_changes(variants, table, request.changes)
     return [
-        Run(variant, category, seed, _configure(table, options, variant, changes[variant.name], category, seed))
-        for category in categories
-        for variant in variants
-        for seed in range(seeds)
+        PlannedRun(name, category, seed, _configure(request, layout, name, changes[name], category, seed))
+        for category in request.categories or table.categories
+        for name in variants
+        for seed in range(request.seeds or table.seeds)
     ]
 
 
+def _configure(
+    request: Request, layout: Layout, name: str, given: dict[str, Any], category: str, seed: int
+) -> TrainConfig:
+    variant: Variant = VARIANTS[name]
+    preset, length_of = PRESETS[variant.preset], PRESETS[variant.length_of or variant.preset]
+    changes = dict(variant.changes) | given
+    divisor = variant.batch_divisor
+    iterations = (request.iterations or length_of.iterations) * divisor
+    batch_size = request.batch_size or length_of.batch_size
+    if batch_size % divisor:
+        raise ValueError(f"{name} divides batches by {divisor}: batch_size must be a multiple, got {batch_size}")
+    if "warmup_steps" in changes:  # as for presets
+        changes["warmup_steps"] = min(changes["warmup_steps"], iterations // 10)
+    setting_names = {field.name for field in dataclasses.fields(preset.settings)}
+    settings = {key: value for key, value in changes.items() if key in setting_names}
+    return TrainConfig(
+        data=request.data,
+        category=category,
+        output=request.output / "runs" / category / f"{name}-seed{seed}",
+        preset=variant.preset,
+        settings=dataclasses.replace(preset.settings.for_iterations(iterations), **settings),
+        layout=layout,
+        iterations=iterations,
+        batch_size=batch_size // divisor,
+        seed=seed,
+        device=request.device,
+        threads=request.threads,
+        **{key: value for key, value in changes.items() if key not in setting_names},
+    )
+
+
+def _parse_changes(variants: Sequence[str], table: Table, texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The changes "name=value" and "method:name=value" by variant; without a method, of all variants with that name."""
+    labels = {label.lower(): variant for label, variant in table.rows.items()}
+    options = {field.name: field.default for field in dataclasses.fields(TrainConfig)} | {"augment": ()}
+    known = {v: dataclasses.asdict(PRESETS[VARIANTS[v].preset].settings) | options for v in variants}
+    changes: dict[str, dict[str, Any]] = {variant: {} for variant in known}
+    for text in texts:
+        target, separator, value = text.partition("=")
+        method, _, name = target.rpartition(":")
+        name, method = name.strip().replace("-", "_"), labels.get(method.strip().lower(), method.strip())
+        if not separator or not name:
+            raise ValueError(f"a change is written as name=value or method:name=value, got {text!r}")
+        if name in _NOT_CHANGEABLE:
+            raise ValueError(f"{name} has an option of its own, or belongs to the table; {text!r} cannot change it")
+        if method and method not in known:
+            raise ValueError(f"{text!r} names the method {method!r}; there are {', '.join(known)}")
+        meant = [method] if method else list(known)
+        with_name = [variant for variant in meant if name in known[variant]]
+        if not with_name:
+            raise ValueError(f"{text!r}: there is no setting {name!r}; there are {', '.join(known[meant[0]])}")
+        for variant in with_name:
+            changes[variant][name] = _parse_value(value, is_tuple=isinstance(known[variant][name], tuple))
+    return changes
+
+
+def _parse_value(text: str, is_tuple: bool = False) -> Any:
+    """A value as in JSON (0.5, true, null, [1, 2]), else the text itself; for a tuple also "a,b"."""
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        value = text
+    if is_tuple and isinstance(value, str):
+        return tuple(_parse_value(part) for part in value.split(",") if part)
+    return tuple(value) if isinstance(value, list) else value
+
+
 def command_line(config: TrainConfig, **placeholders: str) -> str:
-    """The command that repeats a run, quoted for a POSIX shell; `placeholders` stand for options of these names."""
-    where = {name: getattr(config, name) for name in ("data", "category", "output", "preset")}
-    usual, values = (_flat(c) for c in (TrainConfig(**where), config))
-    names = [n for n in values if n not in (*_SHOWN, "device", "threads") and values[n] != usual[n]]
+    """The command that repeats a run, quoted for a POSIX shell; `placeholders` replace the values of these options."""
+    values, usual = _flatten(config), _flatten(TrainConfig(config.data, config.category, config.output, config.preset))
+    names = [n for n in values if n not in (*_FIRST, "device", "threads") and values[n] != usual[n]]
     words = ["learn3d", "train"]
-    for name in (*_SHOWN, *names):
+    for name in (*_FIRST, *names):
         option, value = name.replace("_", "-"), values[name]
         if name in placeholders:
             words += [f"--{option}", placeholders[name]]
-        elif isinstance(value, bool):  # a flag: no word follows it
+        elif isinstance(value, bool):
             words.append(f"--{option}" if value else f"--no-{option}")
         else:
             items = value if isinstance(value, tuple) else (value,)
@@ -113,74 +195,7 @@ def command_line(config: TrainConfig, **placeholders: str) -> str:
     return " ".join(words)
 
 
-def _flat(config: TrainConfig) -> dict[str, Any]:
+def _flatten(config: TrainConfig) -> dict[str, Any]:
     """Options by name, the method's settings among them."""
     values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
     return values | dataclasses.asdict(values.pop("settings"))
-
-
-def _configure(
-    table: Table, options: Options, variant: Variant, given: dict[str, Any], category: str, seed: int
-) -> TrainConfig:
-    preset = PRESETS[variant.preset]
-    changes = dict(variant.changes) | given
-    setting_names = {field.name for field in dataclasses.fields(preset.settings)}
-    parts = variant.smaller_batches
-    whole = PRESETS[variant.whole or variant.preset]
-    iterations = (options.iterations or whole.iterations) * parts
-    batch_size = options.batch_size or whole.batch_size
-    if batch_size % parts:
-        raise ValueError(f"{variant.name} divides batches by {parts}: batch_size must be a multiple, got {batch_size}")
-    if "warmup_steps" in changes:  # no more than a preset's own
-        changes["warmup_steps"] = min(changes["warmup_steps"], iterations // 10)
-    settings = {name: value for name, value in changes.items() if name in setting_names}
-    return TrainConfig(
-        data=options.data,
-        category=category,
-        output=options.output / "runs" / category / f"{variant.name}-seed{seed}",
-        preset=variant.preset,
-        settings=dataclasses.replace(preset.settings.for_iterations(iterations), **settings),
-        layout=options.layout or table.layout,
-        iterations=iterations,
-        batch_size=batch_size // parts,
-        seed=seed,
-        device=options.device,
-        threads=options.threads,
-        **{name: value for name, value in changes.items() if name not in setting_names},
-    )
-
-
-def _changes_by_variant(variants: Sequence[Variant], table: Table, texts: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """What "name=value" and "method:name=value" change in each variant; without a method, wherever the name exists."""
-    labels = {row.label.lower(): row.variant.name for row in table.rows if row.variant}
-    options = {field.name: field.default for field in dataclasses.fields(TrainConfig)} | {"augment": ()}
-    known = {v.name: dataclasses.asdict(PRESETS[v.preset].settings) | options for v in variants}
-    changes: dict[str, dict[str, Any]] = {name: {} for name in known}
-    for text in texts:
-        target, separator, value = text.partition("=")
-        method, _, name = target.rpartition(":")
-        name, method = name.strip().replace("-", "_"), labels.get(method.strip().lower(), method.strip())
-        if not separator or not name:
-            raise ValueError(f"a change is written as name=value or method:name=value, got {text!r}")
-        if name in _OWN_OPTIONS:
-            raise ValueError(f"{name} has an option of its own, or belongs to the table; {text!r} cannot change it")
-        if method and method not in known:
-            raise ValueError(f"{text!r} names the method {method!r}; there are {', '.join(known)}")
-        meant = [method] if method else list(known)
-        able = [variant for variant in meant if name in known[variant]]
-        if not able:
-            raise ValueError(f"{text!r}: there is no setting {name!r}; there are {', '.join(known[meant[0]])}")
-        for variant in able:
-            changes[variant][name] = _parse(value, several=isinstance(known[variant][name], tuple))
-    return changes
-
-
-def _parse(text: str, several: bool = False) -> Any:
-    """A value as JSON has it (0.5, true, null, [1, 2]), else the text itself; "a,b" where several values are wanted."""
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        value = text
-    if several and isinstance(value, str):
-        return tuple(_parse(part) for part in value.split(",") if part)
-    return tuple(value) if isinstance(value, list) else value

@@ -17,7 +17,7 @@ from plotly.offline import get_plotlyjs
 
 from learn3d.config import TrainConfig
 from learn3d.evaluation import Evaluation, evaluate
-from learn3d.experiments.evaluation_report import MEANINGS
+from learn3d.experiments.measurement import MEASURES
 from learn3d.experiments.plan import command_line
 from learn3d.experiments.statistics import Interval, percentile_interval, resampled_means
 from learn3d.figures import azimuths_deg
@@ -183,8 +183,8 @@ def _page(measured: Sequence[Measured], ranked: np.ndarray, samples: Sequence[in
         "images": len(dataset),
         "objects": objects,
         "kind": kind,
-        "meaning": MEANINGS["silhouette_iou" if dataset.voxels is None else "voxel_iou_kato18"],
-        "mmd": MEANINGS["mmd"],
+        "meaning": MEASURES["silhouette_iou" if dataset.voxels is None else "voxel_iou_kato18"][1],
+        "mmd": MEASURES["mmd"][1],
         "truth": dataset.voxels is not None,
         "browser": browser,
     }

@@ -12,6 +12,7 @@ from typing import Any
 import fuzz_meshes
 import mutations as m
 import numpy as np
+import stub_work
 import torch
 from lopsided_meshes import write_meshes
 from mutations import Target
@@ -22,7 +23,7 @@ from learn3d.config import TrainConfig, config_from_dict, config_to_dict, load_c
 from learn3d.data.framing import read_photo
 from learn3d.data.readers import READERS
 from learn3d.data.readers.photo_table import read_table, split_objects
-from learn3d.experiments.results import object_sums, read_result
+from learn3d.experiments.experiment import read_result
 from learn3d.figures.curves import read_metrics
 from learn3d.files import sandbox, weights
 from learn3d.files.reading import parse_json
@@ -165,27 +166,7 @@ def config_target(tmp: Path) -> Target:
     return Target(tmp, {"config.json": m.damage_json}, read)
 
 
-RESULT: dict[str, Any] = {
-    "config": {"data": "d", "category": "chair", "output": "o"},
-    "command": "learn3d train",
-    "data": "/d",
-    "checkpoint": "last",
-    "iterations": 10,
-    "step": 10,
-    "seconds": 1.5,
-    "images": 24,
-    "fingerprint": {"precision": "fp32"},
-    "voxel_iou_kato18": 0.5,
-    "voxel_iou_kato19": 0.4,
-    "mmd": None,
-    "objects": {
-        "names": ["a", "b"],
-        "images": [12, 12],
-        "defined": [12, 0],
-        "kato18": [0.5, None],
-        "kato19": [0, None],
-    },
-}
+RESULT: dict[str, Any] = stub_work.result().model_dump()
 
 
 def results_target(tmp: Path) -> Target:
@@ -203,7 +184,7 @@ def results_target(tmp: Path) -> Target:
         finally:
             (folder / "metrics.jsonl").write_bytes(kept)
         result = read_result(folder / "test.json")
-        sums, defined = object_sums(result, "kato18")
+        sums, defined = result.objects.sums("kato18")
         assert sums.shape == defined.shape and np.isfinite(sums).all()
 
     return Target(tmp, {"test.json": m.damage_json, "metrics.jsonl": m.damage_text}, read)

@@ -1,26 +1,41 @@
-"""Stands in for the training of a table's runs; a module, so that their processes can import it."""
+"""Replaces the training of a table's runs; a module, so that their processes can import it."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from learn3d.config import config_to_dict
 from learn3d.distributed.tasks import Task
-from learn3d.experiments.plan import Run
+from learn3d.experiments.measurement import GroupMeans, Result
+from learn3d.experiments.plan import PlannedRun
 from learn3d.files.writing import write_json
 from learn3d.runs.folder import CONFIG
 from learn3d.terminal import stop_on_signal
 
+OBJECTS = GroupMeans(names=list("abcde"), images=[24] * 5, defined=[24] * 5, kato18=[0.5] * 5, kato19=[0.4] * 5)
 
-def work(run: Run, fresh: bool) -> bool:
-    """A category called "fails" fails, "waits" goes on until it is asked to stop, others leave a result whose IoUs
+
+def result(**changes: Any) -> Result:
+    """The measurement of a run."""
+    versions: dict[str, Any] = {"trained_by": {"commit": "0123456789ab"}, "tested_by": {"commit": "ba9876543210"}}
+    numbers = {"precision": 0.5, "recall": 0.5, "chamfer_l1": 0.1, "f_score": 0.6, "mmd": 0.7, "mmd_paper": 0.5}
+    numbers |= {"voxel_iou_kato18": 0.5, "voxel_iou_kato19": 0.4, "silhouette_iou": None, "seconds": 60.0}
+    counts = {"images": 120, "iterations": 6, "step": 6, "seed": 0, "undefined": 0, "hollow": 0, "without_distance": 0}
+    texts = {"checkpoint": "run/last.safetensors", "method": "Proposed", "preset": "peng2020-kato", "split": "test"}
+    texts |= {"category": "airplane", "data": "/data", "command": "learn3d train ..."}
+    tables = {"config": {}, "fingerprint": {}, "objects": OBJECTS, "views": OBJECTS}
+    return Result(**(versions | numbers | counts | texts | tables | changes))
+
+
+def work(run: PlannedRun, fresh: bool) -> bool:
+    """A category called "fails" fails, "waits" goes on until it is asked to stop; others leave a result whose IoUs
     depend on the variant, the seed and the object."""
-    config, name = run.config, run.variant.name
+    config = run.config
     print("threads", config.threads, "fresh", fresh, flush=True)
     if run.category == "fails":
         print("first line")
@@ -35,30 +50,36 @@ def work(run: Run, fresh: bool) -> bool:
                 time.sleep(0.02)
             print("saved", flush=True)
         return False
-    base = {"vanilla": 0.3, "proposed": 0.4}[name] + 0.01 * run.seed
+    base = {"vanilla": 0.3, "proposed": 0.4}[run.variant] + 0.01 * run.seed
     means = [round(base + 0.02 * k, 5) for k in range(5)]
-    table = {"names": list("abcde"), "images": [24] * 5, "defined": [24] * 5, "kato18": means, "kato19": means}
-    iou = sum(means) / 5
-    result = {"config": config_to_dict(config), "command": "learn3d train ...", "data": str(config.data.resolve())}
-    result |= {"checkpoint": run.variant.checkpoint, "seed": run.seed}
-    result |= {"iterations": config.iterations, "step": config.iterations, "seconds": 60.0, "fingerprint": {}}
-    result |= {"trained_by": {"commit": "0123456789ab"}, "tested_by": {"commit": "ba9876543210"}}
-    result |= {"voxel_iou_kato18": iou, "voxel_iou_kato19": iou - 0.05, "mmd": 1 - base, "mmd_paper": 0.5}
-    result |= {"images": 120, "chamfer_l1": 0.1, "f_score": 0.6, "undefined": 0, "objects": table, "views": table}
-    (run.folder / "test.json").write_text(json.dumps(result))
+    iou, objects = sum(means) / 5, OBJECTS.model_copy(update={"kato18": means, "kato19": means})
+    measured = result(
+        checkpoint=f"{run.folder}/{run.checkpoint}.safetensors",
+        config=config_to_dict(config),
+        data=str(config.data.resolve()),
+        iterations=config.iterations,
+        step=config.iterations,
+        seed=run.seed,
+        voxel_iou_kato18=iou,
+        voxel_iou_kato19=iou - 0.05,
+        mmd=1 - base,
+        objects=objects,
+        views=objects,
+    )
+    write_json(run.folder / "test.json", measured.model_dump())
     write_json(run.folder / CONFIG, config_to_dict(config))
     return True
 
 
-def never(run: Run, fresh: bool) -> bool:
-    """For where nothing may be trained."""
+def fail_if_started(run: PlannedRun, fresh: bool) -> bool:
+    """Replaces `work` if nothing may be trained."""
     raise ValueError("started")
 
 
-def carry_out_here(tasks: Sequence[Task], folder: Path, **how: object) -> dict[str, str]:
-    """What the engine does, in this process: starting Python and torch takes seconds."""
+def run_tasks_here(tasks: Sequence[Task], folder: Path, **options: object) -> dict[str, str]:
+    """Run tasks in this process: starting Python and torch takes seconds."""
     for task in tasks:
         task.log.parent.mkdir(parents=True, exist_ok=True)
-        with open(task.log, "a") as log, contextlib.redirect_stdout(log):
+        with open(task.log, "a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
             assert task.function(*task.arguments)
     return {}

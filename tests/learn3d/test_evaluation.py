@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+import stub_work
 import torch
 
 import nmr
@@ -16,7 +17,7 @@ from learn3d.data.batch import Batch
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers.pascal3d import PASCAL3D
 from learn3d.evaluation import codes_per_view, evaluate, mean_mmd, spread_samples
-from learn3d.experiments.evaluation_report import COLUMNS, _class_means, _warnings, evaluate_runs, format_table
+from learn3d.experiments.measurement import _warnings, class_means, evaluate_runs, format_table, to_json
 from learn3d.losses import mmd
 from learn3d.methods import Grids, Meshes, Method
 from learn3d.runs.versions import versions
@@ -253,20 +254,16 @@ def test_views_with_a_single_code_do_not_count() -> None:
 
 def test_evaluate_runs_reports_and_tabulates(finished_run) -> None:
     said: list[str] = []
-    report = evaluate_runs([finished_run], split="test", report_progress=said.append)
-    (result,) = report["results"]
-    assert (result["category"], result["method"], result["iterations"], result["images"]) == (
-        "airplane",
-        "Proposed",
-        4,
-        24,
-    )
-    assert report["means"][0]["voxel_iou_kato18"] == result["voxel_iou"]
+    results = evaluate_runs([finished_run], split="test", report_progress=said.append)
+    (result,) = results
+    assert (result.category, result.method, result.step, result.images) == ("airplane", "Proposed", 4, 24)
+    assert result.objects.images == [24] and len(result.views.names) == 24
     assert "last.safetensors" in said[0]
+    report = to_json(results, split="test")
     assert json.loads(json.dumps(report)) == report
-    lines = format_table(report).splitlines()
-    assert len(lines) == 3
-    assert f"{result['voxel_iou']:.4f}" in lines[1]
+    assert report["means"][0]["voxel_iou_kato18"] == result.voxel_iou_kato18
+    lines = format_table(results).splitlines()
+    assert len(lines) == 3 and f"{result.voxel_iou_kato18:.4f}" in lines[1]
     with pytest.raises(ValueError, match="at least one run"):
         evaluate_runs([])
 
@@ -276,18 +273,15 @@ def test_a_run_on_several_categories_is_measured_on_each(finished_run, monkeypat
         "learn3d.runs.checkpoint.load_dataset",
         lambda *where, **options: dataclasses.replace(tiny_set, category=where[2]),
     )
-    report = evaluate_runs([finished_run], category="airplane, chair")
-    assert [result["category"] for result in report["results"]] == ["airplane", "chair"]
-    assert report["means"][0]["classes"] == 2
+    results = evaluate_runs([finished_run], category="airplane, chair")
+    assert [result.category for result in results] == ["airplane", "chair"]
+    assert class_means(results)[0]["classes"] == 2
 
 
 def test_mean_is_over_classes_not_over_runs() -> None:
-    rows = [
-        dict.fromkeys(COLUMNS)
-        | {"category": c, "method": "Proposed", "preset": "peng2020-kato", "voxel_iou_kato18": v, "mmd": v}
-        for c, v in (("airplane", 0.6), ("airplane", 0.4), ("chair", 0.1))
-    ]
-    (mean,) = _class_means(rows)
+    figures = (("airplane", 0.6), ("airplane", 0.4), ("chair", 0.1))
+    results = [stub_work.result(category=c, voxel_iou_kato18=v, mmd=v, mmd_paper=None) for c, v in figures]
+    (mean,) = class_means(results)
     assert mean["classes"] == 2
     assert mean["voxel_iou_kato18"] == pytest.approx(0.3)
     assert mean["mmd_paper"] is None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from learn3d.experiments.evaluation_report import evaluate_runs
+from learn3d.experiments.measurement import evaluate_runs
 from learn3d.runs import checkpoint
 from learn3d.training import train
 
@@ -23,8 +23,7 @@ def test_train_resume_and_evaluate(precision: str, tiny_config, run_folder, read
     tensors, _ = checkpoint.load(run_folder / "last.safetensors")
     assert "random.cuda" in tensors
     on_gpu, on_cpu = (
-        evaluate_runs([run_folder], split="test", device=device)["results"][0]["voxel_iou"]
-        for device in ("cuda", "cpu")
+        evaluate_runs([run_folder], split="test", device=device)[0].voxel_iou_kato18 for device in ("cuda", "cpu")
     )
     assert on_gpu == pytest.approx(on_cpu, abs=0.02)
 

@@ -18,7 +18,7 @@ from learn3d import commands
 from learn3d.commands import packages
 from learn3d.commands import train as train_command
 from learn3d.config import load_config
-from learn3d.experiments.evaluation_report import COLUMNS
+from learn3d.experiments.measurement import MEASURES
 from learn3d.terminal import INTERRUPTED
 from learn3d.training import Summary
 
@@ -85,7 +85,7 @@ def test_the_help_of_evaluate_explains_every_column(command, monkeypatch) -> Non
     monkeypatch.setenv("COLUMNS", "200")
     out = command("evaluate", "--help")[1]
     assert " RUN [RUN ...]" in out
-    for column in COLUMNS.values():
+    for column, _ in MEASURES.values():
         assert any(line.startswith(f"  {column}: ") and len(line) > len(column) + 30 for line in out.splitlines()), (
             column
         )

@@ -1,4 +1,4 @@
-"""What tests of the tables share: options and a report."""
+"""Fixtures of the tests of tables: requests, and reports of results that nobody has trained."""
 
 from __future__ import annotations
 
@@ -11,31 +11,30 @@ import pytest
 import stub_work
 
 from learn3d.experiments import experiment
-from learn3d.experiments.experiment import Call, run_experiment
-from learn3d.experiments.plan import Options
+from learn3d.experiments.experiment import run_experiment
+from learn3d.experiments.plan import Request
 
 
 @pytest.fixture
-def options(tmp_path: Path) -> Callable[..., Options]:
-    """Options of two methods on one category, with changes."""
+def request_for(tmp_path: Path) -> Callable[..., Request]:
+    """A request for a table with two methods on one category, with changes."""
 
-    def make(**changes: object) -> Options:
+    def make(table: str = "kato", **changes: object) -> Request:
         given = {"categories": ("airplane",), "methods": ("vanilla", "proposed"), "iterations": 6, "batch_size": 4}
-        return Options(tmp_path / "data", tmp_path / "out", **(given | changes))
+        return Request(table, tmp_path / "data", tmp_path / "out", **(given | changes))
 
     return make
 
 
 @pytest.fixture
 def make(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Makes a table of results that nobody has trained, in this process."""
-    monkeypatch.setattr(experiment, "run_tasks", stub_work.carry_out_here)
+    """`run_experiment` with untrained results, in this process."""
+    monkeypatch.setattr(experiment, "run_tasks", stub_work.run_tasks_here)
     return functools.partial(run_experiment, work=stub_work.work)
 
 
 @pytest.fixture
-def report(tmp_path: Path, make: Callable[..., int]) -> dict:
+def report(tmp_path: Path, make: Callable[..., int], request_for: Callable[..., Request]) -> dict:
     """The report of a table of two categories and three seeds in `tmp_path / "out"`."""
-    asked = {"categories": ("airplane", "chair"), "methods": ("vanilla", "proposed"), "iterations": 6, "batch_size": 4}
-    assert make(Call("kato", Options(tmp_path / "data", tmp_path / "out", seeds=3, **asked), jobs=2)) == 0
+    assert make(request_for(categories=("airplane", "chair"), seeds=3, jobs=2)) == 0
     return json.loads((tmp_path / "out" / "kato.json").read_text())

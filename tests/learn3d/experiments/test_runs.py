@@ -21,15 +21,14 @@ import pytest
 import stub_work
 
 from learn3d.distributed import tasks
-from learn3d.experiments import experiment, results
-from learn3d.experiments.experiment import Call, carry_out, run_experiment
-from learn3d.experiments.plan import Options, plan_runs
-from learn3d.experiments.tables import TABLES
+from learn3d.experiments import experiment
+from learn3d.experiments.experiment import run_experiment, train_and_test
+from learn3d.experiments.plan import Request, plan_runs
 from learn3d.training import Summary
 
 
-def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys, options) -> None:
-    call = Call("kato", options(categories=("fails", "airplane"), methods=("vanilla",), threads=3), jobs=2)
+def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys, request_for) -> None:
+    call = request_for(categories=("fails", "airplane"), methods=("vanilla",), threads=3, jobs=2)
     assert run_experiment(call, work=stub_work.work) == 1
     shown = capsys.readouterr().err
     assert "FAILED fails/vanilla-seed0; the end of its log:" in shown
@@ -44,17 +43,17 @@ def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys, options) -> No
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="POSIX signals")
 @pytest.mark.skipif(os.name != "posix", reason="a pipe without a reader ends otherwise there")
-def test_runs_go_on_where_nobody_reads_their_progress(tmp_path, monkeypatch, options) -> None:
+def test_runs_go_on_where_nobody_reads_their_progress(tmp_path, monkeypatch, request_for) -> None:
     for name in ("stdout", "stderr"):
         reading, writing = os.pipe()
         os.close(reading)
         monkeypatch.setattr(sys, name, open(writing, "w"))
-    assert run_experiment(Call("kato", options(methods=("vanilla",))), work=stub_work.work) == 0
+    assert run_experiment(request_for(methods=("vanilla",)), work=stub_work.work) == 0
     assert (tmp_path / "out" / "kato.md").is_file()
 
 
-def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, options) -> None:
-    call = Call("kato", options(categories=("waits", "airplane")), jobs=2)
+def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, request_for) -> None:
+    call = request_for(categories=("waits", "airplane"), jobs=2)
     logs = [tmp_path / f"out/runs/waits/{name}-seed0/log.txt" for name in ("vanilla", "proposed")]
 
     def interrupt() -> None:
@@ -71,7 +70,7 @@ def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, optio
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals")
 @pytest.mark.parametrize(("nohup", "status"), [(True, 0), (False, 130)])
-def test_a_closed_terminal_stops_the_runs_except_under_nohup(monkeypatch, nohup, status, options) -> None:
+def test_a_closed_terminal_stops_the_runs_except_under_nohup(monkeypatch, nohup, status, request_for) -> None:
     executor = tasks._executor
 
     @contextlib.contextmanager
@@ -83,7 +82,7 @@ def test_a_closed_terminal_stops_the_runs_except_under_nohup(monkeypatch, nohup,
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN if nohup else signal.SIG_DFL)
     monkeypatch.setattr(tasks, "_executor", hang_up)
     try:
-        assert run_experiment(Call("kato", options(methods=("vanilla",))), work=stub_work.work) == status
+        assert run_experiment(request_for(methods=("vanilla",)), work=stub_work.work) == status
     finally:
         signal.signal(signal.SIGHUP, before)
 
@@ -91,8 +90,8 @@ def test_a_closed_terminal_stops_the_runs_except_under_nohup(monkeypatch, nohup,
 def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, capsys) -> None:
     """Two steps in a worker; then only the measurement; then a refusal to measure it on other data."""
     small = ("precision=fp32", "encoder=conv-small", "generator=sphere-small")
-    given = Options(tiny_folder, tmp_path / "out", ("airplane",), ("vanilla",), 2, 4, changes=small, threads=1)
-    assert run_experiment(Call("kato", given)) == 0
+    given = Request("kato", tiny_folder, tmp_path / "out", ("airplane",), ("vanilla",), 2, 4, changes=small, threads=1)
+    assert run_experiment(given) == 0
     folder = tmp_path / "out" / "runs" / "airplane" / "vanilla-seed0"
     result = json.loads((folder / "test.json").read_text())
     assert (result["iterations"], result["step"], result["images"]) == (2, 2, 24)
@@ -102,8 +101,8 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, capsys) -> No
     assert {"chamfer_l1", "f_score", "mmd", "mmd_paper"} <= set(result)
 
     (folder / "test.json").unlink()
-    run = plan_runs(TABLES["kato"], given)[0]
-    assert carry_out(run, fresh=False)
+    run = plan_runs(given)[0]
+    assert train_and_test(run, fresh=False)
     assert json.loads((folder / "test.json").read_text())["voxel_iou_kato18"] == result["voxel_iou_kato18"]
     assert (folder / "log.txt").read_text().count("training: ") == 1, "only measured again"
 
@@ -112,15 +111,15 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, capsys) -> No
         shutil.copy(tiny_folder / f"02691156_{name}.npz", tmp_path)
     moved = dataclasses.replace(run, config=dataclasses.replace(run.config, data=tmp_path))
     with pytest.raises(ValueError, match="other training data"):
-        carry_out(moved, fresh=False)
+        train_and_test(moved, fresh=False)
 
 
-def test_a_run_goes_on_or_starts_anew(finished_run, tiny_folder, options, tmp_path, monkeypatch) -> None:
+def test_a_run_goes_on_or_starts_anew(finished_run, tiny_folder, request_for, tmp_path, monkeypatch) -> None:
     (tmp_path / "out/runs/airplane").mkdir(parents=True)
     shutil.copytree(finished_run, tmp_path / "out/runs/airplane/proposed-seed0")
     small = ("precision=fp32", "encoder=conv-small", "generator=sphere-small")
-    given = dataclasses.replace(options(methods=("proposed",), iterations=9, changes=small), data=tiny_folder)
-    (run,) = plan_runs(TABLES["kato"], given)
+    given = dataclasses.replace(request_for(methods=("proposed",), iterations=9, changes=small), data=tiny_folder)
+    (run,) = plan_runs(given)
     calls = []
 
     def train(config, **how):
@@ -128,19 +127,19 @@ def test_a_run_goes_on_or_starts_anew(finished_run, tiny_folder, options, tmp_pa
         return Summary(config.output, 5, False, 0.0, 0, 0.0, 0.0)
 
     monkeypatch.setattr(experiment, "train", train)
-    monkeypatch.setattr(results, "measure", lambda run: pytest.fail("a stopped run is not measured"))
-    assert not carry_out(run, fresh=False)
-    assert not carry_out(run, fresh=True)
+    monkeypatch.setattr(experiment, "measure", lambda *_, **__: pytest.fail("a stopped run is not measured"))
+    assert not train_and_test(run, fresh=False)
+    assert not train_and_test(run, fresh=True)
     (run.folder / "config.json").unlink()
-    assert not carry_out(run, fresh=False), "a checkpoint alone is a run, too"
+    assert not train_and_test(run, fresh=False), "a checkpoint alone is a run, too"
     shutil.rmtree(run.folder)
-    assert not carry_out(run, fresh=False)
+    assert not train_and_test(run, fresh=False)
     goes_on, new = {"resume": True, "overwrite": False}, {"resume": False, "overwrite": True}
     assert calls == [goes_on, new, goes_on, new]
 
 
-def test_a_run_that_dies_is_a_failed_one(capsys, options) -> None:
-    assert run_experiment(Call("kato", options(categories=("dies",), methods=("vanilla",))), work=stub_work.work) == 1
+def test_a_run_that_dies_is_a_failed_one(capsys, request_for) -> None:
+    assert run_experiment(request_for(categories=("dies",), methods=("vanilla",)), work=stub_work.work) == 1
     assert "FAILED dies/vanilla-seed0" in capsys.readouterr().err
 
 
@@ -151,11 +150,11 @@ import sys
 sys.path[:0] = {sys.path!r}
 from pathlib import Path
 import stub_work
-from learn3d.experiments.experiment import Call, run_experiment
-from learn3d.experiments.plan import Options
+from learn3d.experiments.experiment import run_experiment
+from learn3d.experiments.plan import Request
 if __name__ == "__main__":
-    given = Options(Path("data"), Path({str(tmp_path)!r}), ("waits",), ("vanilla",), 6, 4, threads=1)
-    run_experiment(Call("kato", given), work=stub_work.work)
+    given = Request("kato", Path("data"), Path({str(tmp_path)!r}), ("waits",), ("vanilla",), 6, 4, threads=1)
+    run_experiment(given, work=stub_work.work)
 """
     (tmp_path / "parent.py").write_text(code)
     log = tmp_path / "runs/waits/vanilla-seed0/log.txt"

@@ -9,8 +9,8 @@ import pytest
 
 from learn3d.experiments import published
 from learn3d.experiments.experiment import describe_tables
-from learn3d.experiments.tables import TABLES
-from learn3d.presets import METHODS
+from learn3d.experiments.tables import TABLES, VARIANTS
+from learn3d.presets import METHODS, PRESETS
 
 
 @pytest.mark.parametrize("name", ["KATO", "PRGAN", "KAR", "ABLATION", "MMD", "PASCAL"])
@@ -25,26 +25,21 @@ def test_a_method_of_ones_own_leaves_the_tables_alone(monkeypatch) -> None:
     assert runpy.run_module("learn3d.experiments.tables")["TABLES"].keys() == TABLES.keys()
 
 
-def test_tables_take_rows_of_the_paper_and_share_runs() -> None:
-    of_the_paper = {"kato", "prgan", "kar", "ablation", "bins", "mmd", "multi-view", "pascal"}
-    assert set(TABLES) == of_the_paper | {"plus", "plus-single", "precision"}
-    variants: dict[str, object] = {}
+def test_rows_name_variants_baselines_and_published_figures() -> None:
+    used = {variant for table in TABLES.values() for variant in table.rows.values() if variant}
+    assert used == set(VARIANTS), "every variant is a row of a table"
+    assert {variant.preset for variant in VARIANTS.values()} <= set(PRESETS)
     for table in TABLES.values():
-        assert table.baseline in [row.label for row in table.rows]
-        quoted = [row.label for row in table.rows if row.published is not None]
-        assert table.name not in of_the_paper or [row.label for row in table.rows if row.label != "Plus"] == quoted
-        for variant in table.variants:
-            assert variants.setdefault(variant.name, variant) == variant, "one name, two meanings"
-    assert len(TABLES["bins"].rows) == 7
-    assert TABLES["kar"].rows[2].variant in TABLES["bins"].variants
+        assert table.baseline in table.rows
+        assert set(table.published) <= set(table.rows)
+        assert all(variant or label in table.published for label, variant in table.rows.items())
+    assert TABLES["kar"].rows["Proposed"] in TABLES["bins"].rows.values()
 
 
 def test_the_list_has_every_table_with_its_rows() -> None:
-    """What `tools/experiment.py --list` prints."""
     lines = describe_tables().splitlines()
-    for table in TABLES.values():
-        start = lines.index(f"{table.name}: {table.title}") + 2
-        for line, row in zip(lines[start:], table.rows, strict=False):
-            assert line.startswith(f"  {row.label}: {row.variant.name if row.variant else 'quoted'}"), line
-            assert "not in this version" not in line
+    for name, table in TABLES.items():
+        start = lines.index(f"{name}: {table.title}") + 2
+        for line, (label, variant) in zip(lines[start:], table.rows.items(), strict=False):
+            assert line.startswith(f"  {label}: {variant or 'quoted'}"), line
     assert "  w/o prior: without-prior, preset peng2020-kato, lambda_prior=0" in describe_tables()

@@ -44,7 +44,7 @@ def config(tmp_path, monkeypatch) -> DatasetConfig:
 @pytest.fixture
 def here(monkeypatch) -> None:
     """Shards are made in this process: starting Python and torch takes seconds."""
-    monkeypatch.setattr(sharded, "run_tasks", stub_work.carry_out_here)
+    monkeypatch.setattr(sharded, "run_tasks", stub_work.run_tasks_here)
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -19,7 +19,7 @@ from plotly.offline import get_plotlyjs
 
 from learn3d.data.readers import kato
 from learn3d.evaluation import evaluate
-from learn3d.experiments.evaluation_report import evaluate_runs
+from learn3d.experiments.measurement import evaluate_runs
 from learn3d.methods import Grids
 from learn3d.pages import report
 from learn3d.pages.report import write_report
@@ -90,12 +90,12 @@ def test_names_of_objects_are_text(tmp_path, runs, tiny_set, monkeypatch) -> Non
 def test_figures_are_those_of_evaluate(tmp_path, runs, which) -> None:
     path = tmp_path / "page.html"
     write_report(runs, path, split="train", which=which)
-    wanted = evaluate_runs(runs, split="train", which=which)["results"]
+    wanted = evaluate_runs(runs, split="train", which=which)
     found = Page(path)
     rows = re.findall(r"<b>(.+)</b> \[(.+), (.+)\]</td>\n<td>[^<]*</td><td>([^<]+)</td>", path.read_text())
     assert len(rows) == 2 and rows[0] != rows[1]
     for (iou, low, high, mmd), result in zip(rows, wanted, strict=True):
-        assert (iou, mmd) == (f"{result['voxel_iou_kato18']:.3f}", f"{result['mmd']:.3f}")
+        assert (iou, mmd) == (f"{result.voxel_iou_kato18:.3f}", f"{result.mmd:.3f}")
         assert float(low) <= float(iou) <= float(high)
     method, config, _ = checkpoint.load_method(checkpoint.find(runs[0], which))
     dataset = checkpoint.load_data(config, "train")
