@@ -10,11 +10,11 @@ from pydantic import Field
 from learn3d.data import conventions
 from learn3d.data.categories import synset_of
 from learn3d.data.layouts import Layout
-from learn3d.make_data.writers import writer_of
+from learn3d.make_data.writers import WRITERS
 from learn3d.settings import Count, FilePath, Weight, checked
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-HOW = ("shards", "jobs", "cluster")  # options that say how it is made, not what
+HOW = ("shards", "jobs", "cluster")  # options on which no file depends
 Amount = Annotated[int, Field(ge=0)]
 
 
@@ -82,8 +82,8 @@ class DatasetConfig:
         return self.front or ("z" if self.procedural else "y" if self.up.endswith("x") else "x")
 
     def complete(self) -> DatasetConfig:
-        """The same with the layout's own numbers where none are given; ValueError where they do not go with it."""
-        writer = writer_of(self.layout)
+        """Fill in the layout's own numbers of views, test and val; ValueError if the settings do not go with it."""
+        writer = WRITERS[self.layout]
         defaults = {"views": writer.default_views, "test": writer.default_test, "val": writer.default_val}
         config = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
         if writer.fixed_views and config.views != writer.default_views:
@@ -91,5 +91,5 @@ class DatasetConfig:
         for split in ("test", "val"):
             if defaults[split] == 0 and getattr(config, split) != 0:
                 raise ValueError(f"the layout {self.layout} has no {split} split; leave {split} at 0")
-        writer.check(config.output, config.category, config.test, config.augment)
+        writer.check(config.output, config.test, config.augment)
         return config

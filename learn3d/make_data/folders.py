@@ -1,23 +1,20 @@
-"""The folder that a data set is written to: what is there, whether there is room, and the move to the final names."""
+"""The folder of a data set: is there room, and new files that replace the old ones all together."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
-from collections.abc import Iterable
+import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from learn3d.files.writing import check_target
 from learn3d.terminal import stop_on_signal
 
 
-def existing(folder: Path, paths: Iterable[str]) -> list[str]:
-    """Those of the relative paths that exist in the folder."""
-    return [path for path in paths if (folder / path).exists()]
-
-
 def check_room(folder: Path, needed: int, what: str) -> None:
-    """Make the folder; OSError where it cannot be written into or its disk has less than `needed` bytes free."""
+    """Make the folder; raise OSError if it is not writable or its disk has less than `needed` bytes free."""
     check_target(folder, "--output", folder=True)
     folder.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(folder).free
@@ -28,14 +25,21 @@ def check_room(folder: Path, needed: int, what: str) -> None:
         )
 
 
-def publish(new: Path, folder: Path, paths: list[str], old: list[str], trash: Path) -> None:
-    """Move the files and folders `paths` from `new` to `folder`, and those in `old` from there to `trash` before.
+@contextlib.contextmanager
+def publishing(folder: Path, paths: Sequence[str]) -> Iterator[Path]:
+    """Give a temporary folder in `folder`; its files and folders `paths` replace those of `folder` in the end.
 
-    All on one file system, so that nothing is copied. The caller removes `trash`. An interruption waits until all is in
-    place: files of two data sets do not go together.
+    What is missing there is removed here; all other files stay. After an exception nothing changes. It is all on one
+    file system, so nothing is copied, and an interruption waits until all is in place: files of two data sets do not go
+    together.
     """
-    with stop_on_signal():
-        moves = [(folder / path, trash / path) for path in old] + [(new / path, folder / path) for path in paths]
-        for source, target in moves:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(source, target)
+    with tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=folder) as temporary:
+        new, old = Path(temporary) / "new", Path(temporary) / "old"
+        new.mkdir()
+        yield new
+        with stop_on_signal():
+            for source, target in ((folder, old), (new, folder)):
+                for path in paths:
+                    if (source / path).exists():
+                        (target / path).parent.mkdir(parents=True, exist_ok=True)
+                        os.replace(source / path, target / path)

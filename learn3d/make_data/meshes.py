@@ -1,7 +1,7 @@
-"""Where meshes come from: a folder of files, a mesh pack (npz) or the procedural generator.
+"""Sources of meshes: a folder of files, a mesh pack (npz) or the procedural generator.
 
 Every source is a list of `MeshSource`, in an order that does not depend on the file system. Reading one raises
-ValueError where the file cannot be read, and `checked` where a mesh cannot be used, each with the reason.
+ValueError if the file cannot be read, and `checked` if a mesh cannot be used, each with the reason.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import trimesh
 
 from learn3d.files import npz, sandbox
 from learn3d.files.meshes import EXTENSIONS, RawMesh, read_mesh
+from learn3d.make_data.config import DatasetConfig
 
 SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
 
@@ -30,10 +31,24 @@ class MeshSource:
     read: Callable[[], RawMesh]  # it can be pickled
 
 
+def list_sources(config: DatasetConfig) -> tuple[list[MeshSource], dict[str, int]]:
+    """The meshes that `config` names, and the number of other files beside them per extension."""
+    if config.procedural:
+        return procedural_sources(config.category, config.procedural, config.seed), {}
+    source = Path(config.source)
+    if source.is_dir():
+        return folder_sources(source)
+    if source.is_file() and source.suffix == ".npz":
+        return pack_sources(source), {}
+    if source.exists():
+        raise ValueError(f"the source must be a folder of meshes or a mesh pack (.npz), got the file {source}")
+    raise FileNotFoundError(f"there is no folder or mesh pack {source}")
+
+
 def folder_sources(folder: Path) -> tuple[list[MeshSource], Counter[str]]:
     """The mesh files below a folder, sorted by relative path, and how many files of which other extension it ignored.
 
-    Raises ValueError where the folder holds no mesh file.
+    Raises ValueError if the folder holds no mesh file.
     """
     files = sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.relative_to(folder).as_posix())
     meshes = [path for path in files if path.suffix.lower() in EXTENSIONS]
@@ -51,7 +66,7 @@ def folder_sources(folder: Path) -> tuple[list[MeshSource], Counter[str]]:
 def pack_sources(path: Path) -> list[MeshSource]:
     """The meshes of a pack: an npz file with `n` and v0 float [V, 3], f0 int [F, 3], v1, f1, ... (never pickled).
 
-    Raises ValueError where the file is no such pack.
+    Raises ValueError if the file is no such pack.
     """
     wanted = "an npz file with n (how many), v0, f0, v1, f1, ... and no pickled objects"
     try:
@@ -103,7 +118,7 @@ def object_names(sources: list[MeshSource]) -> list[str]:
 
 
 def checked(mesh: RawMesh, max_faces: int) -> RawMesh:
-    """The mesh with the vertices that no face uses dropped; ValueError with the reason where it cannot be rendered."""
+    """The mesh with the vertices that no face uses dropped; ValueError with the reason if it cannot be rendered."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise ValueError(f"not a triangle mesh: vertices {list(vertices.shape)}, faces {list(faces.shape)}")
@@ -133,7 +148,7 @@ def fit_to_box(vertices: np.ndarray) -> np.ndarray:
 
 
 def is_watertight(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """True where every edge has exactly two faces: by vertex number, or with vertices at equal positions taken as one.
+    """True if every edge has exactly two faces: by vertex number, or with vertices at equal positions taken as one.
 
     The second suits formats that repeat vertices (STL); the first, closed parts that touch each other.
     """

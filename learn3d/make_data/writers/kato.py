@@ -1,66 +1,56 @@
-"""Writes Kato's layout (see `learn3d.data.readers.kato`): two npz files per split."""
+"""Writes Kato's layout (see `learn3d.data.readers.kato`)."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
-import torch
 
 from learn3d.data import conventions
 from learn3d.data.dataset import SPLITS
-from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import kato
 from learn3d.make_data.writers.writer import RenderedObject, Writer
 
 
 class KatoWriter(Writer):
-    """`{synset}_{split}_images.npz` and `{synset}_{split}_voxels.npz`; a split is in memory until it is complete."""
+    """`{synset}_{split}_images.npz`: uint8 [N, 24, 4, 64, 64], RGB = 255 - composite over white, and alpha.
 
-    image_size = conventions.IMAGE_SIZE
-    default_views = conventions.NUM_VIEWS
+    `{synset}_{split}_voxels.npz`: bool [N, 32, 32, 32], axes (y, x, -z) of the object frame. View k has azimuth -15 k,
+    elevation 30, distance 2.732 and half a field of view of 15 degrees.
+    """
+
     fixed_views = True
-    bytes_per_view = 4 * conventions.IMAGE_SIZE**2
-    convention = conventions.KATO
-    card: ClassVar = {
-        "images": "uint8 [N, 24, 4, 64, 64]: RGB = 255 - composite over white, alpha",
-        "voxels": "bool [N, 32, 32, 32], axes (y, x, -z) of the object frame",
-        "views": "azimuth -15 k, elevation 30, distance 2.732, half field of view 15 degrees",
-    }
 
     def __init__(self, folder: Path, category: str) -> None:
         super().__init__(folder, category)
-        self._split, self._done = "", 0
+        self._split, self._count = "", 0
 
     @classmethod
     def paths(cls, category: str) -> tuple[str, ...]:
         return tuple(path.name for split in SPLITS for path in kato.split_paths("", category, split))
 
-    def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        return conventions.view_poses(torch.arange(count))
-
     def start(self, split: str, most: int) -> None:
         self._save()
-        self._split, self._done = split, 0
-        self._images = np.empty(
-            (most, conventions.NUM_VIEWS, 4, conventions.IMAGE_SIZE, conventions.IMAGE_SIZE), dtype=np.uint8
-        )
+        self._split, self._count = split, 0
+        self._images = np.empty((most, conventions.NUM_VIEWS, 4, self.image_size, self.image_size), dtype=np.uint8)
         self._voxels = np.empty((most, *(conventions.VOXEL_SIZE,) * 3), dtype=bool)
 
     def write(self, item: RenderedObject) -> None:
-        self._images[self._done, :, :3] = 255 - item.rgb.transpose(0, 3, 1, 2)
-        self._images[self._done, :, 3] = item.alpha
-        self._voxels[self._done] = item.voxels
-        self._done += 1
+        self._images[self._count, :, :3] = 255 - item.rgb.transpose(0, 3, 1, 2)
+        self._images[self._count, :, 3] = item.alpha
+        self._voxels[self._count] = item.voxels
+        self._count += 1
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Images and voxels of the split so far; the split that is being written is kept in memory."""
+        return self._images[: self._count], self._voxels[: self._count]
 
     def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
         self._save()
         return objects
 
     def _save(self) -> None:
-        if self._done:
-            images, voxels = kato.split_paths(self.folder, self.category, self._split)
-            np.savez_compressed(images, self._images[: self._done])
-            np.savez_compressed(voxels, self._voxels[: self._done])
-        self._done = 0
+        if self._count:
+            paths = kato.split_paths(self.folder, self.category, self._split)
+            for path, array in zip(paths, self.arrays(), strict=True):
+                np.savez_compressed(path, array)

@@ -1,4 +1,4 @@
-"""What every layout's writer has in common: it is given one rendered object at a time."""
+"""The interface of the writers of all layouts, and what several of them use: cameras, colours, PNG files."""
 
 from __future__ import annotations
 
@@ -8,20 +8,24 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import torch
+from PIL import Image
 from torch import Tensor
 
-from learn3d.data.conventions import VoxelConvention, mesh_to_object
+from learn3d.data import conventions
 from learn3d.data.poses import Poses
 
 #: From the object frame to ShapeNet's coordinates (right-handed, y up, front x): [3, 3], determinant -1.
-WORLD_FROM_OBJECT = mesh_to_object("y", "x").T
+WORLD_FROM_OBJECT = conventions.mesh_to_object("y", "x").T
+#: Camera distance over the least distance from which the whole bounding sphere is seen.
+RELATIVE_DISTANCES = (1.02, 1.25)
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedObject:
     """One object, rendered from n cameras."""
 
-    name: str  # unique in the category, fit for a file name
+    name: str  # unique in the category, valid as a file name
     split: str
     vertices: Tensor  # float32 [V, 3] in the layout's object frame, as `Writer.place` returned them
     faces: Tensor  # int64 [F, 3]
@@ -29,39 +33,47 @@ class RenderedObject:
     rgb: np.ndarray  # uint8 [n, S, S, 3], shaded, over white
     alpha: np.ndarray  # uint8 [n, S, S]: 255 * `nmr.render_silhouette`
     voxels: np.ndarray  # bool [32, 32, 32], as `Writer.voxelize` returned them
-    rng: np.random.Generator  # for what else is random in its files (backgrounds, points)
+    rng: np.random.Generator  # for other random content of the files: backgrounds, surface points
 
     def over(self, backgrounds: np.ndarray) -> np.ndarray:
-        """The pictures over backgrounds instead of white; both are uint8 [n, S, S, 3]."""
+        """Composite the images over backgrounds instead of white; both are uint8 [n, S, S, 3]."""
         clear = 1 - self.alpha[..., None] / np.float32(255)
         return np.rint(self.rgb + (backgrounds.astype(np.float32) - 255) * clear).clip(0, 255).astype(np.uint8)
 
     def rgba(self) -> np.ndarray:
-        """The pictures without the white: colours and alpha, uint8 [n, S, S, 4]; colours are 0 where alpha is."""
+        """The images with straight alpha, uint8 [n, S, S, 4]; colours are 0 where alpha is 0."""
         share = self.alpha[..., None] / np.float32(255)
         color = (self.rgb - 255 * (1 - share)) / np.maximum(share, 1 / 255)
         color = np.where(share > 0, np.rint(color).clip(0, 255), 0).astype(np.uint8)
         return np.concatenate([color, self.alpha[..., None]], axis=-1)
 
+    def world_to_camera(self) -> np.ndarray:
+        """Extrinsics [R | t] float64 [n, 3, 4]: ShapeNet's coordinates to camera axes (x right, y down, z away)."""
+        matrices = self.poses.cameras().projection().plain().matrix.numpy().astype(np.float64)
+        matrices[:, :, :3] = matrices[:, :, :3] @ WORLD_FROM_OBJECT.T
+        return matrices
+
 
 class Writer(ABC):
-    """One category in one layout, written below `folder` (an empty, temporary one) object by object.
+    """One category in one layout, written object by object below `folder`, which is empty and temporary.
 
-    `make_dataset` calls `start` and then `write` for the objects of each split (train, val, test), then `finish`.
-    After that it moves what is in `paths(category)` and `shared` to its final place.
+    For the objects of each split (train, val, test) `start` is called once and `write` for each; then `finish` once.
+    After that the files and folders of `paths(category)` and `shared` are moved to their final place. The class
+    docstring of a layout describes its files, and becomes part of the data set's card.
+
+    Without other values a layout has the images, cameras and voxel axes of Kato's.
     """
 
-    image_size: ClassVar[int]
-    default_views: ClassVar[int]  # views per object unless the user asks for another number
-    fixed_views: ClassVar[bool] = False  # no other number is allowed
-    default_test: ClassVar[float] = 0.2  # shares of the splits unless the user says; 0 where there is no such split
+    image_size: ClassVar[int] = conventions.IMAGE_SIZE
+    default_views: ClassVar[int] = conventions.NUM_VIEWS  # per object
+    fixed_views: ClassVar[bool] = False  # True if no other number of views is allowed
+    default_test: ClassVar[float] = 0.2  # share of the test split; 0 if the layout has no such split
     default_val: ClassVar[float] = 0.1
-    bytes_per_view: ClassVar[int]  # an upper estimate for the check of the disk
-    convention: ClassVar[VoxelConvention]
-    shared: ClassVar[tuple[str, ...]] = ()  # files with entries of all categories of the folder
+    extra_bytes_per_view: ClassVar[int] = 0  # bytes per view beside colours and mask, to estimate the disk space
+    convention: ClassVar[conventions.VoxelConvention] = conventions.KATO
+    shared: ClassVar[tuple[str, ...]] = ()  # files with entries for all categories of the folder
     turn: ClassVar[np.ndarray] = np.eye(3)  # from the frame of `mesh_to_object` to the layout's object frame
-    objects_fill: ClassVar[str] = "box centred at the origin, longest side 1"
-    card: ClassVar[dict[str, str]]  # what is in the files, for people
+    diagonal: ClassVar[float | None] = None  # of the object's bounding box; None: its longest side is 1
 
     def __init__(self, folder: Path, category: str) -> None:
         self.folder = folder
@@ -70,27 +82,28 @@ class Writer(ABC):
     @classmethod
     @abstractmethod
     def paths(cls, category: str) -> tuple[str, ...]:
-        """Files and folders, relative to the data set's, that belong to the category alone."""
+        """Files and folders, relative to the data set's folder, that belong to the category alone."""
 
     @classmethod
-    def check(cls, output: Path, category: str, test: float, augment: int) -> None:
-        """Raises ValueError where the settings, or files that are there already, do not go with the layout."""
+    def check(cls, output: Path, test: float, augment: int) -> None:
+        """Raise ValueError if the settings, or files in the folder `output`, do not go with the layout."""
         return None
 
     def place(self, vertices: np.ndarray) -> np.ndarray:
         """Vertices [V, 3] (box centred, longest side 1, frame of `mesh_to_object`) in the layout's object frame."""
-        return vertices if self.turn is Writer.turn else vertices @ self.turn.T
+        vertices = vertices @ self.turn.T
+        return vertices if self.diagonal is None else vertices / (np.linalg.norm(np.ptp(vertices, 0)) / self.diagonal)
 
-    @abstractmethod
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> Poses:
-        """The `count` cameras that look at the placed vertices."""
+        """The `count` cameras that look at the placed vertices [V, 3]."""
+        return conventions.view_poses(torch.arange(count))
 
     def voxelize(self, vertices: Tensor, faces: Tensor) -> np.ndarray:
         """Occupancy bool [32, 32, 32] of the placed mesh in the axes of the layout."""
         return self.convention.voxelize(vertices, faces)[0].numpy()
 
     def start(self, split: str, most: int) -> None:
-        """`most` objects of a split, or fewer, follow."""
+        """Prepare for at most `most` objects of a split."""
         return None
 
     @abstractmethod
@@ -98,8 +111,46 @@ class Writer(ABC):
         """Write, or keep, one object."""
 
     def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
-        """Complete the files; `objects` are the names written per split, `output` is where the files will go.
+        """Complete the files; `objects` are the names written per split, `output` is the final folder.
 
         Returns the names per split as readers of the layout will see them.
         """
         return objects
+
+
+def uniform(rng: np.random.Generator, limits: tuple[float, float], count: int) -> np.ndarray:
+    """Draw float32 [count] in [low, high), rounded to 4 decimals so that text files hold exactly the same numbers.
+
+    A value that rounding brings up to `high` becomes `low`, the same angle.
+    """
+    low, high = limits
+    values = np.round(rng.uniform(low, high, count), 4)
+    return np.where(values >= high, low, values).astype(np.float32)
+
+
+def distances(rng: np.random.Generator, vertices: np.ndarray, half_fov_deg: np.ndarray) -> np.ndarray:
+    """Draw distances float32 [count] from which the bounding sphere of vertices [V, 3] around 0 fits into the image."""
+    radius = float(np.linalg.norm(vertices, axis=1).max())
+    least = radius / np.sin(np.deg2rad(half_fov_deg.astype(np.float64)))
+    return np.round(least * rng.uniform(*RELATIVE_DISTANCES, len(least)), 4).astype(np.float32)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write uint8 [H, W] (grey), [H, W, 3] or [H, W, 4], with the folders on the way."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).save(path, compress_level=4)
+
+
+def photo_background(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw an out-of-focus background: colours that change slowly, blotches and noise. uint8 [H, W, 3]."""
+    corners = rng.uniform(40, 230, (2, 2, 3))
+    blotches = rng.normal(0, 25, (8, 8, 1))
+    grain = rng.normal(0, 4, (height, width, 1))
+    smooth = _enlarge(corners, height, width) + _enlarge(np.repeat(blotches, 3, axis=2), height, width)
+    return (smooth + grain).clip(0, 255).astype(np.uint8)
+
+
+def _enlarge(small: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Bilinear: [h, w, 3] -> float32 [H, W, 3]."""
+    channels = [Image.fromarray(small[..., c].astype(np.float32)) for c in range(3)]
+    return np.stack([np.asarray(c.resize((width, height), Image.Resampling.BILINEAR)) for c in channels], axis=-1)

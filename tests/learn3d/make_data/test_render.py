@@ -22,8 +22,8 @@ from learn3d.data.readers import kato
 from learn3d.make_data import meshes, render
 from learn3d.make_data.contact_sheet import draw_sheet, make_row
 from learn3d.make_data.render import DatasetConfig, make_dataset, split_objects
-from learn3d.make_data.report import lacking
-from learn3d.make_data.writers import writer_of
+from learn3d.make_data.report import missing_split_warnings
+from learn3d.make_data.writers import WRITERS
 
 
 @pytest.fixture
@@ -360,26 +360,20 @@ def test_a_data_set_without_training_objects_is_not_made(tmp_path, folder):
 
 
 @pytest.mark.parametrize(
-    ("objects", "said"),
+    ("layout", "objects", "said"),
     [
-        ({"train": 2}, "no val and no test split: training cannot be validated"),
-        ({"train": 2, "test": 1}, "no val split: train with --val-split test, or make the set again"),
-        ({"train": 2, "val": 1}, "no test split: evaluate with --split val, or make the set again"),
-        ({"train": 2, "val": 1, "test": 1}, None),
+        ("kato", {"train": 2}, "no val and no test split: training cannot be validated"),
+        ("kato", {"train": 2, "test": 1}, "no val split: train with --val-split test, or make the set again"),
+        ("kato", {"train": 2, "val": 1}, "no test split: evaluate with --split val, or make the set again"),
+        ("kato", {"train": 2, "val": 1, "test": 1}, None),
+        ("pascal3d", {"train": 2}, "no val split: training cannot be validated"),
+        ("pascal3d", {"train": 2, "val": 1}, None),  # these layouts have no test and no val split
+        ("r2n2", {"train": 2, "test": 1}, None),
     ],
 )
-def test_splits_that_are_missing_are_a_warning(objects, said):
-    (warning,) = lacking(writer_of("kato"), objects) or [None]
+def test_missing_splits_are_a_warning(layout, objects, said):
+    (warning,) = missing_split_warnings(WRITERS[layout], objects) or [None]
     assert warning is said is None or (warning.startswith(said) and "3 meshes or more" in warning)
-
-
-def test_splits_that_the_layout_has_not_are_no_warning():
-    assert (
-        lacking(writer_of("pascal3d"), {"train": 2, "val": 1})
-        == lacking(writer_of("r2n2"), {"train": 2, "test": 1})
-        == []
-    )
-    assert lacking(writer_of("pascal3d"), {"train": 2})[0].startswith("no val split: training cannot be validated")
 
 
 def test_two_meshes_end_with_a_warning(tmp_path):

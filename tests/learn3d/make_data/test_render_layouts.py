@@ -12,7 +12,7 @@ from lopsided_meshes import lopsided_mesh, make, write_meshes
 from PIL import Image
 
 from learn3d.data.layouts import LAYOUTS
-from learn3d.make_data.writers import writer_of
+from learn3d.make_data.writers import WRITERS
 
 SYNSET = "03001627"
 
@@ -116,4 +116,4 @@ def test_errors_of_settings(tmp_path, folder):
 
 
 def test_every_layout_has_a_writer():
-    assert len({writer_of(layout) for layout in LAYOUTS}) == len(LAYOUTS)
+    assert len({WRITERS[layout] for layout in LAYOUTS}) == len(LAYOUTS)

@@ -56,10 +56,10 @@ def test_the_objects_are_those_of_one_process(config, tmp_path, capsys) -> None:
     make_dataset(DatasetConfig(output=tmp_path / "one", **NUMBERS), progress=False)
     assert sharded.make_shards(config) == 0
     out, err = capsys.readouterr()
-    assert "chair: 4 meshes used, 0 skipped" in out and "objects: test 1, val 1, train 4" in out
+    assert "chair: 4 meshes used, 0 skipped" in out and "objects: train 4, val 1, test 1" in out
     assert "[4/4] " in err
     assert "train 1: 2 objects, 0 meshes skipped" in (config.output / "03001627" / "train-00001.log").read_text()
-    assert (config.output / "03001627" / "contact.png").is_file()
+    assert (config.output / "03001627_contact.png").is_file()
     for split in ("train", "val", "test"):
         one, other = (load_dataset("kato", f, "chair", split) for f in (tmp_path / "one", config.output))
         assert len(one) == len(other) and len(other.images.files) == (2 if split == "train" else 1)

@@ -9,12 +9,12 @@ import torch
 
 import nmr
 from learn3d.data.poses import Poses
-from learn3d.make_data.writers import writer_of
+from learn3d.make_data.writers import WRITERS
 
 
 def views(layout: str, radius: float, count: int, seed: int) -> Poses:
     """The cameras of a layout around an object of that radius."""
-    writer = writer_of(layout)(Path("unused"), "chair")
+    writer = WRITERS[layout](Path("unused"), "chair")
     return writer.views(np.array([[radius, 0.0, 0.0]]), count, np.random.default_rng(seed))
 
 
@@ -47,7 +47,7 @@ def test_the_whole_object_is_seen():
 
 def test_pascal3d_rotations_are_upright_but_for_the_tilt():
     in_object_frame = views("pascal3d", 0.8, 500, 2).rotation.double().numpy()
-    rotations = in_object_frame @ writer_of("pascal3d").turn
+    rotations = in_object_frame @ WRITERS["pascal3d"].turn
     np.testing.assert_allclose(np.linalg.det(rotations), 1, rtol=1e-6)
     np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (500, 1, 1)), atol=1e-6)
     up = rotations[:, :, 1]  # the object's y in the picture: right, up, away
