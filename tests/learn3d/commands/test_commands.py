@@ -220,7 +220,7 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, command
     status, out, _ = command("evaluate", finished_run, "--split", "val", "--json", tmp_path / "t.json")
     report = json.loads((tmp_path / "t.json").read_text())
     assert (status, report["protocol"]["split"]) == (0, "val")
-    assert f"{report['results'][0]['voxel_iou']:.4f}" in out
+    assert f"{report['results'][0]['voxel_iou_kato18']:.4f}" in out
 
 
 @pytest.mark.parametrize(
