@@ -9,23 +9,21 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from learn3d.make_data.shapes.airplane import make_airplane
-from learn3d.make_data.shapes.car import make_car
-from learn3d.make_data.shapes.chair import make_chair
-from learn3d.make_data.shapes.lamp import make_lamp
-from learn3d.make_data.shapes.sofa import make_sofa
-from learn3d.make_data.shapes.table import make_table
+from learn3d.make_data.shapes import airplane, car, chair, lamp, sofa, table
+from learn3d.make_data.shapes.draw import Draw
+from learn3d.make_data.shapes.parts import assemble
 
-_MAKERS = {
-    "airplane": make_airplane,
-    "car": make_car,
-    "chair": make_chair,
-    "lamp": make_lamp,
-    "sofa": make_sofa,
-    "table": make_table,
+# The recipes of each category, with their weights: a shape is made by one of them.
+_RECIPES = {
+    "airplane": airplane.KINDS,
+    "car": car.KINDS,
+    "chair": chair.KINDS,
+    "lamp": lamp.KINDS,
+    "sofa": sofa.KINDS,
+    "table": table.KINDS,
 }
 
-CATEGORIES: tuple[str, ...] = tuple(_MAKERS)
+CATEGORIES: tuple[str, ...] = tuple(_RECIPES)
 
 
 def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
@@ -58,10 +56,11 @@ def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
     >>> chair.is_watertight
     True
     """
-    if category not in _MAKERS:
+    if category not in _RECIPES:
         raise ValueError(f"category must be one of {', '.join(CATEGORIES)}; got {category!r}")
     if not isinstance(rng, np.random.Generator):
         raise TypeError(
             f"rng must be a numpy.random.Generator, got {type(rng).__name__}; use numpy.random.default_rng(seed)"
         )
-    return _MAKERS[category](rng)
+    draw = Draw(rng)
+    return assemble(draw.pick(_RECIPES[category])(draw))

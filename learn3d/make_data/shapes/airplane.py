@@ -1,32 +1,355 @@
-"""Procedural airplanes: which kind, then its own recipe."""
+"""Procedural airplanes, fuselage about 1 long."""
 
 from __future__ import annotations
 
 import numpy as np
-import trimesh
 
-from learn3d.make_data.shapes.airplane_jets import airliner, business_jet, fighter, flying_wing, supersonic
-from learn3d.make_data.shapes.airplane_propellers import biplane, glider, light_plane, turboprop, twin_boom, warbird
-from learn3d.make_data.shapes.parts import assemble
-from learn3d.make_data.shapes.sampling import pick
+from learn3d.make_data.shapes.airplane_parts import (
+    Planform,
+    along_z,
+    canopy,
+    engines_at_tail,
+    engines_under_wing,
+    fin,
+    fuselage,
+    jet_nozzle,
+    landing_gear,
+    nacelle,
+    propeller,
+    streamlined,
+    tail,
+    whole_wing,
+    winglets,
+)
+from learn3d.make_data.shapes.draw import Draw
+from learn3d.make_data.shapes.parts import Part, bar, box, ellipse, ellipsoid, loft, rectangle, tube, wing
 
 
-def make_airplane(rng: np.random.Generator) -> trimesh.Trimesh:
-    """A random airplane."""
-    maker = pick(
-        rng,
-        {
-            airliner: 4.0,
-            business_jet: 1.5,
-            turboprop: 2.0,
-            light_plane: 3.0,
-            glider: 1.0,
-            fighter: 3.0,
-            warbird: 1.5,
-            biplane: 0.8,
-            supersonic: 0.6,
-            flying_wing: 0.6,
-            twin_boom: 0.7,
-        },
+def airliner(draw: Draw) -> Part:
+    """A jet airliner, or a freighter with high wings, T-tail and upswept rear."""
+    radius, freighter = draw(0.042, 0.068), draw.maybe(0.25)
+    tall, nose, nose_power, tail_start = draw(0.95, 1.15), draw(1.6, 3.0) * radius, draw(1.7, 2.2), draw(0.58, 0.72)
+    upsweep = draw(0.5, 0.9) if freighter else draw(0.25, 0.6)
+    plane = fuselage(radius, tall, nose, nose_power, tail_start, upsweep=upsweep, droop=draw(0.1, 0.35))
+    half, sweep, root, tip = draw(0.40, 0.56), draw(15, 38), draw(0.15, 0.21), draw(0.035, 0.07)
+    dihedral, z = draw(-4, 0) if freighter else draw(3, 8), draw(0.1, 0.17)
+    kink = draw(0.25, 0.42) if draw.maybe(0.7) else 0.0
+    plan = Planform(half, root, tip, sweep, dihedral, z, y=0.8 * radius if freighter else -0.6 * radius, kink=kink)
+    plane += plan.wing()
+    if freighter:
+        plane += ellipsoid((1.5 * radius, 0.7 * radius, 0.32), (0, 0.85 * radius, plan.z - 0.1))
+    mount = "wing" if freighter else draw.pick({"wing": 4, "tail": 1, "tail3": 0.5, "wing3": 0.4})
+    size = draw(0.35, 0.58) * radius
+    if mount.startswith("wing"):
+        two = draw.maybe(0.35 if freighter else 0.7)
+        size *= 1.25 if two else 0.9
+        for share in (draw(0.28, 0.4),) if two else (0.3, draw(0.55, 0.65)):
+            plane += engines_under_wing(draw, plan, share, size)
+    else:
+        plane += engines_at_tail(draw, radius, 0.9 * size, z=draw(-0.32, -0.24))
+    if mount.endswith("3"):
+        plane += nacelle(0.9 * size, 4.5 * size).moved(y=1.35 * radius, z=-0.36)
+    plane += tail(draw, "T" if freighter or mount.startswith("tail") else "conventional", radius, swept=True)
+    if draw.maybe(0.4):
+        plane += winglets(draw, plan)
+    if not freighter and draw.maybe(0.12):  # an upper deck
+        plane += ellipsoid((1.5 * radius, 1.5 * radius, 0.4), (0, 0.75 * radius, 0.27))
+    if draw.maybe(0.25):
+        plane += landing_gear(radius, radius * draw(1.5, 2.0), main_x=1.2 * radius, main_z=-0.02, other_z=0.38)
+    return plane
+
+
+def business_jet(draw: Draw) -> Part:
+    """A small jet with engines at the tail."""
+    radius = draw(0.052, 0.075)
+    plane = fuselage(radius, nose=draw(0.14, 0.24), nose_power=1.6, tail_start=0.6, upsweep=0.35, droop=0.3)
+    size = draw.measures(half=(0.4, 0.52), root=(0.15, 0.2), tip=(0.045, 0.07), sweep_deg=(2, 34), dihedral_deg=(2, 6))
+    plan = Planform(**size, z=draw(0.02, 0.08), y=-0.75 * radius)
+    plane += plan.wing() + engines_at_tail(draw, radius, draw(0.026, 0.036), z=-0.2)
+    plane += tail(draw, draw.pick({"T": 3, "cross": 1, "V": 0.4}), radius, swept=True)
+    if draw.maybe(0.5):
+        plane += winglets(draw, plan)
+    if draw.maybe(0.25):  # tanks at the wing tips
+        x, y, z, chord = plan.at(1.0)
+        plane += ellipsoid((0.035, 0.035, 0.2), (x, y, z - 0.5 * chord)).both_sides()
+    return plane
+
+
+def fighter(draw: Draw) -> Part:
+    """A jet fighter: delta, swept or trapezoid wings, one or two fins, canards, stores under the wings."""
+    radius, twin = draw(0.05, 0.068), draw.maybe(0.45)
+    form = draw.measures(tall=(0.9, 1.15), nose=(0.3, 0.42), nose_power=(1.05, 1.4))
+    form |= draw.measures(tail_radius=(0.65, 0.85), exponent=(2.0, 3.2))
+    shape = draw.pick({"delta": 2.5, "swept": 2, "trapezoid": 2, "forward": 0.3})
+    root, tip, sweep, z = {
+        "delta": (draw(0.42, 0.52), draw(0.02, 0.06), draw(46, 58), 0.1),
+        "swept": (draw(0.2, 0.28), draw(0.08, 0.12), draw(35, 50), 0.12),
+        "trapezoid": (draw(0.28, 0.38), draw(0.06, 0.1), draw(25, 42), 0.06),
+        "forward": (draw(0.22, 0.28), 0.1, draw(-28, -18), -0.08),
+    }[shape]
+    half = draw(0.28, 0.4) if shape == "delta" else draw(0.3, 0.4)
+    if shape == "delta":
+        half = min(half, 0.9 * root / np.tan(np.radians(sweep)))
+    plan = Planform(half, root, tip, sweep, draw(-5, 2), z, draw(-0.3, 0.6) * radius, thickness=0.06)
+    plane = fuselage(radius, tail_start=0.75, **form) + plan.wing()
+    plane += canopy(0.9 * radius, 1.1 * radius, draw(0.18, 0.28), 0.8 * radius, draw(0.15, 0.22))
+    plane += _two_engines(draw, radius) if twin else _one_engine(draw, radius)
+    if draw.maybe(0.55 if twin else 0.1):
+        cant, x, height = draw(0, 25), draw(0.9, 1.4) * radius, draw(0.13, 0.19)
+        upright = fin(height, 0.19, 0.08, draw(30, 45), z=-0.27)
+        plane += upright.rotated("z", -cant).moved(x, 0.3 * radius).both_sides()
+    else:
+        height = draw(0.17, 0.25) + 0.6 * radius
+        plane += fin(height, draw(0.2, 0.3), 0.09, draw(35, 52), z=-0.2).moved(y=0.3 * radius)
+    if shape != "delta":
+        plane += Planform(draw(0.17, 0.23), 0.15, 0.06, draw(30, 45), -3, -0.34, 0.0, thickness=0.06).wing()
+        if draw.maybe(0.4):  # strakes from the wing root towards the nose
+            outer = (2.0 * radius, plan.y, z - 0.03, 0.7 * root, 0.05)
+            plane += wing([(0.0, plan.y, z + 0.2, root + 0.1, 0.05), outer]).both_sides()
+    elif draw.maybe(0.5):  # canards
+        plane += Planform(draw(0.15, 0.2), 0.11, 0.04, 45, 4, 0.24, 0.35 * radius, thickness=0.06).wing()
+    return plane + _stores(draw, plan)
+
+
+def _two_engines(draw: Draw, radius: float) -> Part:
+    """Two tunnels beside the fuselage, each with a slanted intake and a nozzle."""
+    wide = draw(0.8, 1.25) * radius
+    rings = []
+    for z, w, h, y in ((0.14, 0.9, 1.3, -0.3), (0.0, 1.0, 1.4, -0.2), (-0.3, 1.0, 1.3, 0), (-0.48, 0.8, 0.9, 0.1)):
+        outline = rectangle(w * wide, h * wide, 0.3 * wide, 2)
+        slant = (0.05 if z > 0.1 else 0.0) * (outline[:, 1] / wide)
+        rings.append(np.stack([wide + outline[:, 0], y * wide + outline[:, 1], z + slant], 1))
+    return (loft(rings) + jet_nozzle(0.42 * wide, 0.07).moved(wide, 0.08 * wide, -0.5)).both_sides()
+
+
+def _one_engine(draw: Draw, radius: float) -> Part:
+    """A nozzle at the rear, and an intake on both sides, at the chin, or in the nose (not visible)."""
+    intake = {
+        "side": box((0.8 * radius, 1.2 * radius, 0.34), (0.95 * radius, 0.1 * radius, 0.03), 0.02).both_sides(),
+        "chin": box((1.2 * radius, 0.9 * radius, 0.3), (0, -0.9 * radius, 0.06), 0.02),
+        "nose": Part(),
+    }
+    return intake[draw.pick(tuple(intake))] + jet_nozzle(0.75 * radius, 0.08).moved(z=-0.52)
+
+
+def _stores(draw: Draw, plan: Planform) -> Part:
+    """Up to three tanks or missiles under each wing, or at its tip."""
+    part = Part()
+    number = draw.count(0, 3)
+    for share in sorted({(0.4, 0.6, 0.8, 1.0)[draw.count(0, 3)] for _ in range(number)}):
+        x, y, z, chord = plan.at(share)
+        size, at_tip = (0.022, 0.022, draw(0.14, 0.26)), share == 1
+        store = ellipsoid(size, (x, y - (0 if at_tip else 0.026), z - 0.4 * chord), 8, 6)
+        pylon = Part() if at_tip else box((0.01, 0.03, 0.06), (x, y - 0.012, z - 0.45 * chord))
+        part += (store + pylon).both_sides()
+    return part
+
+
+def supersonic(draw: Draw) -> Part:
+    """A supersonic transport or delta bomber: a needle on a long delta, engine boxes below."""
+    radius = draw(0.024, 0.036)
+    plane = fuselage(radius, nose=draw(0.2, 0.3), nose_power=1.15, tail_start=0.72, droop=0.3)
+    half, root = draw(0.2, 0.3), draw(0.5, 0.62)
+    z, y = 0.2, -0.6 * radius
+    t = np.linspace(0, 1, 7)
+    lead = z - root * (0.95 - draw(0.0, 0.12) * (1 - t)) * t ** draw(0.7, 1.05)
+    chord = np.maximum(lead - (z - root - 0.03 * t), 0.03)
+    plane += whole_wing([(half * s, y, a, c, 0.035) for s, a, c in zip(t, lead, chord, strict=True)])
+    for x in (0.3, 0.45) if draw.maybe(0.6) else (0.4,):
+        plane += box((0.035, 0.035, 0.22), (x * half, y - 0.018, z - root + 0.08), 0.006).both_sides()
+    plane += fin(draw(0.1, 0.16), 0.26, 0.07, 55, z=-0.2)
+    if draw.maybe(0.4):  # canards
+        plane += Planform(0.1, 0.08, 0.03, 45, 0, 0.33, 0.3 * radius, thickness=0.05).wing()
+    return plane
+
+
+def flying_wing(draw: Draw) -> Part:
+    """A flying wing with a faired body; jets, buried intakes or pusher propellers; perhaps fins."""
+    sweep, half, root, tip = draw(22, 40), draw(0.55, 0.8), draw(0.34, 0.5), draw(0.05, 0.14)
+    plan = Planform(half, root, tip, sweep, draw(0, 4), 0.2, 0.0, draw(0.25, 0.4), thickness=0.13)
+    plane = plan.wing()
+    plane += ellipsoid((draw(0.12, 0.2), draw(0.1, 0.15), 1.15 * root), (0, 0.015, 0.2 - 0.48 * root))
+    kind = draw.pick(("humps", "props", "pods"))
+    for share in (0.2,) if draw.maybe(0.5) else (0.17, 0.33):
+        x, y, z, chord = plan.at(share)
+        if kind == "humps":
+            plane += ellipsoid((0.09, 0.07, 0.8 * chord), (x, y + 0.02, z - 0.45 * chord)).both_sides()
+        elif kind == "pods":
+            plane += nacelle(0.03, 0.14).moved(x, y + 0.045, z - 0.6 * chord).both_sides()
+        else:
+            pod = streamlined(0.022, 0.2).rotated("y", 180).moved(x, y, z - chord + 0.05)
+            plane += (pod + propeller(draw, 0.09, 3, hub=0.014).moved(x, y, z - chord - 0.05)).both_sides()
+    if draw.maybe(0.4):
+        x, y, z, chord = plan.at(0.97)
+        plane += fin(draw(0.08, 0.14), max(chord, 0.09), 0.05, 35, z=z).moved(x, y - 0.02).both_sides()
+    return plane
+
+
+def turboprop(draw: Draw) -> Part:
+    """A twin or four-engined propeller plane."""
+    radius, high = draw(0.05, 0.075), draw.maybe(0.55)
+    form = draw.measures(tall=(0.95, 1.2), nose=(0.1, 0.2), tail_start=(0.5, 0.66), upsweep=(0.3, 0.8))
+    plane = fuselage(radius, **form, droop=0.2, exponent=draw.pick((2.0, 2.0, 2.6, 4.0)))
+    size = draw.measures(half=(0.48, 0.62), root=(0.11, 0.16), tip=(0.05, 0.1), sweep_deg=(0, 6), dihedral_deg=(0, 6))
+    plan = Planform(**size, z=draw(0.08, 0.18), y=0.85 * radius if high else -0.65 * radius)
+    plane += plan.wing()
+    two = draw.maybe(0.65)
+    thick, blades, disc = draw(0.02, 0.03), draw.count(2, 6), draw(0.07, 0.1)
+    for share in (draw(0.26, 0.34),) if two else (0.27, 0.56):
+        x, y, z, chord = plan.at(share)
+        long = chord + draw(0.08, 0.13)
+        y = y - 0.2 * thick
+        pod = streamlined(thick, long).moved(x, y, z - 0.5 * long + 0.075)
+        plane += (pod + propeller(draw, disc, blades, hub=0.55 * thick).moved(x, y, z + 0.075)).both_sides()
+    kind = {"T": 2, "conventional": 2, "cross": 0.7} if high else {"conventional": 3, "twin": 1.2, "T": 0.6}
+    plane += tail(draw, draw.pick(kind), radius, swept=draw.maybe(0.5))
+    if draw.maybe(0.2):
+        plane += landing_gear(radius, 1.8 * radius, main_x=1.1 * radius, main_z=0.02, other_z=0.36)
+    return plane
+
+
+def light_plane(draw: Draw) -> Part:
+    """A single-engined light plane; sometimes on floats."""
+    radius, high, pusher = draw(0.065, 0.085), draw.maybe(0.55), draw.maybe(0.1)
+    form = draw.measures(tall=(1.05, 1.35), nose=(0.08, 0.22), nose_power=(2.0, 3.2), tail_start=(0.36, 0.48))
+    form |= draw.measures(upsweep=(0.0, 0.4), tail_radius=(0.15, 0.3), exponent=(2.0, 4.5))
+    tall = 1.2 * radius
+    size = draw.measures(half=(0.5, 0.72), root=(0.14, 0.2), tip=(0.09, 0.14), sweep_deg=(0, 4))
+    dihedral, z = draw(0, 3) if high else draw(3, 8), draw(0.16, 0.24)
+    y, shape = (
+        tall * draw(1.05, 1.2) if high else -0.7 * tall,
+        draw.pick(("straight", "straight", "elliptic", "kinked")),
     )
-    return assemble(maker(rng))
+    plan = Planform(**size, dihedral_deg=dihedral, z=z, y=y, shape=shape)
+    plane = fuselage(radius, **form) + plan.wing()
+    if high:
+        plane += box((1.5 * radius, 1.1 * tall, 0.2), (0, 0.62 * tall, 0.14), 0.03)
+    else:
+        plane += canopy(1.5 * radius, 1.3 * tall, draw(0.24, 0.36), 0.72 * tall, 0.1)
+    plane += propeller(draw, draw(0.11, 0.16), draw.count(2, 3), hub=0.025).moved(z=-0.515 if pusher else 0.497)
+    swept = draw.maybe(0.5)
+    plane += tail(draw, draw.pick({"conventional": 4, "T": 1, "V": 0.6, "cross": 0.5}), radius, swept)
+    if high and draw.maybe(0.6):
+        x, y, z, chord = plan.at(draw(0.4, 0.6))
+        plane += bar((0.6 * radius, -0.6 * tall, z - 0.4 * chord), (x, y, z - 0.4 * chord), 0.018, 0.01).both_sides()
+    if draw.maybe(0.12):
+        return plane + _floats(draw, radius, tall)
+    if draw.maybe(0.75):
+        main_z, other_z = (0.03, 0.4) if draw.maybe(0.6) else (0.25, -0.46)
+        plane += landing_gear(tall, tall + draw(0.05, 0.09), 2.0 * radius, main_z, other_z)
+    return plane
+
+
+def _floats(draw: Draw, radius: float, tall: float) -> Part:
+    """A pair of floats on struts."""
+    x, y = 2.2 * radius, -tall - draw(0.08, 0.11)
+    hull = fuselage(0.035, nose=0.25, nose_power=1.8, tail_start=0.5, upsweep=0.9, length=draw(0.65, 0.8))
+    part = hull.moved(x, y, 0.12)
+    for z in (0.24, 0.02):
+        part += bar((0.5 * radius, -0.6 * tall, z), (x, y + 0.02, z), 0.016)
+        part += bar((0.0, y + 0.02, z), (x, y + 0.02, z), 0.012)
+    return part.both_sides()
+
+
+def glider(draw: Draw) -> Part:
+    """A sailplane: a slender pod and boom under very long wings."""
+    radius = draw(0.042, 0.055)
+    plane = fuselage(radius, 1.25, 0.26, 1.8, tail_start=0.33, tail_power=0.75, tail_radius=0.22, upsweep=0.1)
+    size = draw.measures(half=(0.9, 1.35), root=(0.085, 0.12), tip=(0.03, 0.055), sweep_deg=(0, 3), dihedral_deg=(2, 6))
+    y = draw(0.3, 0.9) * radius
+    plan = Planform(**size, z=0.16, y=y, shape=draw.pick(("straight", "elliptic", "kinked")))
+    plane += plan.wing() + canopy(1.5 * radius, 1.6 * radius, 0.26, 0.75 * radius, 0.27)
+    plane += tail(draw, draw.pick({"T": 3, "conventional": 1, "V": 0.5}), 0.9 * radius)
+    return plane + (winglets(draw, plan) if draw.maybe(0.4) else Part())
+
+
+def warbird(draw: Draw) -> Part:
+    """A propeller fighter or a twin-engined bomber of the 1940s."""
+    radius, twin, radial = draw(0.058, 0.08), draw.maybe(0.35), draw.maybe(0.4)
+    tall, nose = draw(1.1, 1.3), 0.07 if radial and not twin else draw(0.12, 0.25)
+    nose_power, tail_start = 3.0 if radial else 2.0, draw(0.4, 0.5)
+    plane = fuselage(radius, tall, nose, nose_power, tail_start, tail_radius=0.15, upsweep=0.35)
+    size = draw.measures(half=(0.5, 0.66), root=(0.19, 0.25), tip=(0.07, 0.12), sweep_deg=(2, 9), dihedral_deg=(3, 7))
+    z, y = draw(0.14, 0.2), draw(-0.8, 0.2) * radius
+    plan = Planform(**size, z=z, y=y, shape=draw.pick(("elliptic", "straight", "gull")))
+    plane += plan.wing()
+    plane += canopy(0.95 * radius, 1.2 * radius, draw(0.16, 0.34), 1.05 * radius, draw(-0.02, 0.1))
+    disc = draw(0.12, 0.16)
+    if twin:
+        x, y, z, chord = plan.at(0.32)
+        pod = streamlined(0.04, chord + 0.15).moved(x, y, z - 0.5 * chord)
+        plane += (pod + propeller(draw, disc, 3, hub=0.022).moved(x, y, z + 0.075)).both_sides()
+    else:
+        plane += propeller(draw, disc, draw.count(2, 4), hub=0.032).moved(z=0.495)
+    plane += tail(draw, "twin" if twin and draw.maybe(0.5) else "conventional", radius)
+    if draw.maybe(0.3):
+        plane += landing_gear(0.8 * radius, radius + 0.1, main_x=0.16, main_z=0.2, other_z=-0.46)
+    return plane
+
+
+def biplane(draw: Draw) -> Part:
+    """A biplane, or rarely a triplane, with struts and fixed gear."""
+    radius = draw(0.06, 0.075)
+    plane = fuselage(radius, 1.2, 0.06, 3.0, tail_start=0.35, tail_radius=0.2, exponent=draw(2, 5))
+    gap, stagger = draw(0.16, 0.22), draw(-0.03, 0.1)
+    decks = 3 if draw.maybe(0.2) else 2
+    chord, half = draw(0.13, 0.18) * (0.8 if decks == 3 else 1), draw(0.42, 0.58)
+    z, low = draw(0.24, 0.3), -0.9 * radius
+    shape = draw.pick(("straight", "elliptic"))
+    plans = []
+    for t in np.linspace(0, 1, decks):
+        reach = half * (1 if t == 1 else draw(0.85, 1.0))
+        y = low + t * (gap + radius)
+        plans.append(Planform(reach, chord, 0.9 * chord, 0, 1.5, z + t * stagger, y, shape=shape))
+        plane += plans[-1].wing()
+    bottom, top = plans[0], plans[-1]
+    for share in (0.75,) if draw.maybe(0.5) else (0.45, 0.85):
+        x = share * bottom.half
+        (_, y0, z0, c0), (_, y1, z1, c1) = (plan.at(x / plan.half) for plan in (bottom, top))
+        for along in (0.2, 0.7):
+            plane += bar((x, y0, z0 - along * c0), (x, y1, z1 - along * c1), 0.013).both_sides()
+    for z in (top.z - 0.2 * chord, top.z - 0.7 * chord):
+        plane += bar((0.7 * radius, 0.5 * radius, z), (0.08, top.y, z), 0.012).both_sides()
+    plane += propeller(draw, draw(0.12, 0.15), 2, hub=0.025).moved(z=0.495)
+    plane += tail(draw, "conventional", radius)
+    return plane + landing_gear(radius, 2.6 * radius, main_x=0.11, main_z=0.27, other_z=-0.46)
+
+
+def twin_boom(draw: Draw) -> Part:
+    """A central pod between two booms that carry the tail."""
+    radius, x = draw(0.05, 0.07), draw(0.14, 0.22)
+    pod = fuselage(radius, 1.15, 0.2, 1.8, tail_start=0.5, tail_radius=0.35, length=draw(0.42, 0.6))
+    size = draw.measures(half=(0.55, 0.75), root=(0.16, 0.21), tip=(0.06, 0.11), sweep_deg=(0, 6), dihedral_deg=(1, 5))
+    plan = Planform(**size, z=0.14, y=0.0)
+    plane = pod.moved(z=0.12) + plan.wing() + canopy(1.1 * radius, 1.4 * radius, 0.24, 0.8 * radius, 0.16)
+    _, y, z, _ = plan.at(x / plan.half)
+    thick = draw(0.024, 0.036)
+    front = z + (0.1 if draw.maybe(0.7) else 0.0)
+    path = [(x, y, front - s * (front + 0.5)) for s in (0, 0.04, 0.12, 0.3, 0.6, 1)]
+    boom = tube(path, np.array([0.3, 0.7, 1.0, 1.0, 0.6, 0.4]) * thick, ellipse(2, 2, 10))
+    if front > z:
+        boom += propeller(draw, min(0.12, 0.75 * x), 3, hub=0.02).moved(x, y, front)
+    else:
+        plane += propeller(draw, min(0.1, 0.7 * x), 3, hub=0.03).moved(z=-0.2)
+        plane += along_z([(1, -0.5), (1, 0.5)], 0.03, 0.2, 10).moved(z=-0.11)
+    height = draw(0.12, 0.18)
+    boom += fin(height, 0.12, 0.07, draw(5, 30), z=-0.38).moved(x, y - 0.02)
+    level = y + draw(0.0, 0.95) * height - 0.02
+    drift = 0.35 * (level - y)
+    plane += wing([(side * 1.1 * x, level, -0.39 - drift, 0.09, 0.1) for side in (-1, 1)])
+    return plane + boom.both_sides()
+
+
+KINDS = {
+    airliner: 4.0,
+    business_jet: 1.5,
+    turboprop: 2.0,
+    light_plane: 3.0,
+    glider: 1.0,
+    fighter: 3.0,
+    warbird: 1.5,
+    biplane: 0.8,
+    supersonic: 0.6,
+    flying_wing: 0.6,
+    twin_boom: 0.7,
+}

@@ -1,16 +1,53 @@
-"""Procedural cars, in metres: the measures of each kind of body, and what is fitted to it."""
+"""Procedural cars, in metres: a body lofted from bumper to bumper, wheels, mirrors, a roof box or a spoiler."""
 
 from __future__ import annotations
 
-import numpy as np
-import trimesh
+from dataclasses import dataclass
+from functools import partial
 
-from learn3d.make_data.shapes.car_body import TYRE, Body, hull, road_wheel
-from learn3d.make_data.shapes.parts import Solid, assemble, bar, both_sides, box, rectangle, slab, wing
-from learn3d.make_data.shapes.sampling import maybe, pick
+import numpy as np
+
+from learn3d.make_data.shapes.draw import Draw
+from learn3d.make_data.shapes.parts import Part, bar, box, join, loft, rectangle, revolve, rounded_path, slab, wing
+
+TYRE = 0.22  # width of the wheels
+
+
+@dataclass(frozen=True)
+class Body:
+    """The measures of a car body: in metres, or as shares of the length (0 = front bumper) and of the height."""
+
+    length: float
+    width: float
+    height: float
+    wheel: float  # radius of the wheels, metres
+    clearance: float  # height of the floor over the ground, metres
+    bonnet: float  # length of the bonnet, a share
+    screen: float  # length of the windscreen behind it, a share
+    roof: float  # end of the roof, a share
+    window: float  # end of the rear window and start of the boot or bed, a share
+    belt: float  # height of the shoulder line under the windows, a share
+    lean: float  # inward lean of the side windows per height
+    has_bed: bool = False  # an open box behind the cabin
+
+    @property
+    def shoulder(self) -> float:
+        """Height of the shoulder line in metres; it stays above the wheel arches."""
+        return max(self.belt * self.height, 2 * self.wheel + 0.15)
+
+    @property
+    def axles(self) -> tuple[float, float]:
+        """Distance of the front and of the rear axle from the front bumper, in metres."""
+        return self.wheel + 0.48, self.length - self.wheel - 0.44
+
+    @property
+    def boot(self) -> float:
+        """Start of the boot or bed, in metres from the front bumper."""
+        return min(self.window * self.length, self.length - 0.12)
+
 
 # The least and the largest measures of each kind, in the order of the fields of Body.
-_KINDS = {
+_MEASURES = {
     #               length width height wheel clear. bonnet screen roof window belt  lean
     "sedan":     (( 4.2,  1.70,  1.38,  0.30,  0.14,  0.25,  0.14, 0.66,  0.80, 0.56, 0.20),
                   ( 5.2,  1.92,  1.52,  0.35,  0.20,  0.31,  0.19, 0.74,  0.90, 0.64, 0.40)),
@@ -29,48 +66,126 @@ _KINDS = {
 }  # fmt: skip
 
 
-def make_car(rng: np.random.Generator) -> trimesh.Trimesh:
-    """A random car."""
-    weights = {"sedan": 2.5, "hatchback": 2, "wagon": 1.2, "coupe": 1.8, "suv": 1.8, "van": 1.6, "pickup": 1.6}
-    kind = pick(rng, weights)
-    body = Body(*rng.uniform(*_KINDS[kind]), has_bed=kind == "pickup")
-    solids = [hull(body), *_wheels(rng, body), *_mirrors(rng, body)]
-    if kind in ("hatchback", "wagon", "suv", "van") and maybe(rng, 0.4):
-        solids += _roof_box(rng, body)
-    if kind == "coupe" and maybe(rng, 0.5):
-        solids += _spoiler(rng, body)
-    return assemble(solids)
+def car(draw: Draw, kind: str) -> Part:
+    """A car of one of the kinds of `_MEASURES`."""
+    measures = [draw(*limits) for limits in zip(*_MEASURES[kind], strict=True)]
+    body = Body(*measures, has_bed=kind == "pickup")
+    part = _hull(body) + _wheels(draw, body) + _mirrors(draw, body)
+    if kind in ("hatchback", "wagon", "suv", "van") and draw.maybe(0.4):
+        part += _roof_box(draw, body)
+    if kind == "coupe" and draw.maybe(0.5):
+        part += _spoiler(draw, body)
+    return part
 
 
-def _wheels(rng: np.random.Generator, body: Body) -> list[Solid]:
-    """Four wheels on two axles."""
-    x, y = (body.width - TYRE) / 2 - 0.02, body.wheel
-    wheel = road_wheel(body.wheel, TYRE, rng.uniform(0.1, 0.6)).moved(x, y)
-    axle = bar((-x, y, 0), (x, y, 0), 0.1)
-    return [part.moved(z=body.length / 2 - s) for s in body.axles for part in (*both_sides(wheel), axle)]
+def _hull(body: Body) -> Part:
+    """The body: cross-sections from front to rear, with the wheel arches cut into their lower corners."""
+    side_view = _side_view(body)
+    bed = (body.boot + 0.06, body.length - 0.08) if body.has_bed else (body.length, body.length)
+    arch = body.wheel + 0.055  # radius of the wheel arches
+    s = _stations(body, [*side_view[:, 0], *(end + t for end in bed for t in (-0.015, 0.015))], arch)
+    to_front, to_rear = s / body.length, 1 - s / body.length
+
+    # Measures of each cross-section, all [S]. Widths are halves.
+    top = np.interp(s, side_view[:, 0], side_view[:, 1])
+    width = body.width / 2 * (1 - 0.15 * np.clip(1 - to_front / 0.18, 0, 1) ** 2)
+    width = width * (1 - 0.06 * np.clip(1 - to_rear / 0.15, 0, 1) ** 2)
+    floor = body.clearance + 0.12 * np.clip(1 - to_front / 0.08, 0, 1) + 0.15 * np.clip(1 - to_rear / 0.1, 0, 1)
+    inner = np.full_like(s, body.width / 2 - TYRE - 0.06)  # of the floor between the wheels
+    cut = floor + 0.002  # lower edge of the sides
+    for axle in body.axles:
+        over_wheel = body.wheel + np.sqrt(np.maximum(arch**2 - (s - axle) ** 2, 0.0))
+        cut = np.where(np.abs(s - axle) < arch, np.maximum(cut, over_wheel), cut)
+    shoulder = np.minimum(body.shoulder, top - 0.03)
+    middle = np.maximum(0.55 * floor + 0.45 * shoulder, 0.5 * (cut + shoulder))
+    edge = np.maximum(top - 0.045 - 0.1 * np.clip(top - shoulder - 0.1, 0, 0.3), shoulder + 0.01)  # of the roof
+    roof = np.maximum(0.96 * width - 0.03 - body.lean * (edge - shoulder), 0.45 * width)
+    rim, bottom = shoulder + 0.02, np.full_like(s, body.shoulder - 0.38)  # of the bed
+    hump = np.maximum(bottom + 0.004, np.minimum(cut + 0.03, rim - 0.03))  # the wheel arch seen from the bed
+
+    # The right half of each cross-section: points (x, y) from the middle of the floor outwards and up to the middle.
+    zero = np.zeros_like(s)
+    lower = [(zero, floor), (inner, floor), (inner, cut), (0.95 * width, cut), (width, middle)]
+    cabin = [
+        (0.97 * width, shoulder),
+        (0.97 * width - 0.03, shoulder + 0.006),
+        (roof, edge),
+        (0.88 * roof, 0.5 * (edge + top)),
+        (0.6 * roof, top - 0.008),
+        (0.3 * roof, top - 0.002),
+        (zero, top),
+    ]
+    bed_inside = [
+        (0.97 * width, shoulder),
+        (0.95 * width - 0.02, rim),
+        (0.92 * width - 0.05, rim - 0.01),
+        (0.9 * width - 0.06, hump),
+        (inner - 0.03, hump - 0.001),
+        (inner - 0.032, bottom),
+        (zero, bottom),
+    ]
+    upper = np.where((bed[0] < s) & (s < bed[1]), np.array(bed_inside), np.array(cabin))
+    right = np.concatenate([np.array(lower), upper]).transpose(2, 0, 1)  # [S, 12, 2]
+    ring = np.concatenate([right, right[:, -2:0:-1] * [-1, 1]], 1)
+    z = np.broadcast_to((body.length / 2 - s)[:, None, None], (*ring.shape[:2], 1))
+    return loft(np.concatenate([ring, z], 2))
 
 
-def _mirrors(rng: np.random.Generator, body: Body) -> list[Solid]:
+def _side_view(body: Body) -> np.ndarray:
+    """The upper edge of the body seen from the side [N, 2]: metres from the front bumper, and height."""
+    length, belt, height = body.length, body.shoulder, body.height
+    cowl, roof_rear = body.bonnet * length, body.roof * length
+    roof_front = cowl + body.screen * length
+    front = [(0, 0.75 * belt), (0.06, 0.9 * belt), (0.22, belt), (cowl, belt + 0.08)]
+    roof = [(roof_front, height), ((roof_front + roof_rear) / 2, height + 0.015), (roof_rear, height - 0.02)]
+    rear = [(body.boot, belt + 0.07), (length - 0.08, belt + 0.04), (length, 0.85 * belt)]
+    line = rounded_path([*front, *roof, *rear], 0.12, 2)
+    line[:, 0] = np.maximum.accumulate(line[:, 0] + 1e-4 * np.arange(len(line)))
+    return line
+
+
+def _stations(body: Body, corners: list[float], arch: float) -> np.ndarray:
+    """The places of the cross-sections [S], in metres from the front bumper: at every corner and along the arches."""
+    around_axle = arch * np.append([-1.02, 1.02], 0.999 * np.cos(np.linspace(0, np.pi, 8)))
+    s = np.concatenate([corners, np.linspace(0, body.length, 7), *(axle + around_axle for axle in body.axles)])
+    s = np.unique(s[(s >= 0) & (s <= body.length)].round(3))
+    return s[np.append(True, np.diff(s) > 0.004)]
+
+
+def _wheels(draw: Draw, body: Body) -> Part:
+    """Four wheels on two axles, their hubs dished on both sides."""
+    x, y, dish = (body.width - TYRE) / 2 - 0.02, body.wheel, draw(0.1, 0.6)
+    rim = np.array([(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)])
+    profile = np.concatenate([rim, rim[::-1] * [1, -1]]) * [body.wheel, TYRE / 2]
+    wheel = revolve(profile, 16).rotated("z", 90).moved(x, y)
+    pair = wheel.both_sides() + bar((-x, y, 0), (x, y, 0), 0.1)
+    return join(pair.moved(z=body.length / 2 - s) for s in body.axles)
+
+
+def _mirrors(draw: Draw, body: Body) -> Part:
     """Wing mirrors at the foot of the windscreen."""
     half, y, z = body.width / 2, body.shoulder + 0.07, (0.5 - body.bonnet) * body.length - 0.2
-    mirror = box((rng.uniform(0.14, 0.22), rng.uniform(0.09, 0.16), 0.08), (half + 0.07, y, z), 0.03)
-    return both_sides(mirror) + both_sides(bar((0.85 * half, y - 0.09, z), (half + 0.04, y - 0.01, z), 0.05))
+    mirror = box((draw(0.14, 0.22), draw(0.09, 0.16), 0.08), (half + 0.07, y, z), 0.03)
+    return (mirror + bar((0.85 * half, y - 0.09, z), (half + 0.04, y - 0.01, z), 0.05)).both_sides()
 
 
-def _roof_box(rng: np.random.Generator, body: Body) -> list[Solid]:
+def _roof_box(draw: Draw, body: Body) -> Part:
     """Two bars across the roof that carry a box."""
     start, end = body.bonnet + body.screen, body.roof
     z, long = (0.5 - (start + end) / 2) * body.length, 0.8 * (end - start) * body.length
     half = 0.35 * body.width - 0.5 * body.lean * (body.height - body.shoulder)
-    solids = [box((2 * half, 0.12, 0.06), (0, body.height + 0.01, z + s * 0.3 * long)) for s in (-1, 1)]
-    outline = rectangle(rng.uniform(1.0, 1.8) * half, long, 0.2, 3)
-    return [*solids, slab(outline, rng.uniform(0.18, 0.35), 0.1).moved(y=body.height + 0.05, z=z)]
+    bars = join(box((2 * half, 0.12, 0.06), (0, body.height + 0.01, z + s * 0.3 * long)) for s in (-1, 1))
+    outline = rectangle(draw(1.0, 1.8) * half, long, 0.2, 3)
+    return bars + slab(outline, draw(0.18, 0.35), 0.1).moved(y=body.height + 0.05, z=z)
 
 
-def _spoiler(rng: np.random.Generator, body: Body) -> list[Solid]:
+def _spoiler(draw: Draw, body: Body) -> Part:
     """A wing on two stays over the tail."""
-    half, z = 0.42 * body.width, rng.uniform(0.15, 0.4) - body.length / 2
-    high = rng.uniform(0.1, 0.3)
+    half, z, high = 0.42 * body.width, draw(0.15, 0.4) - body.length / 2, draw(0.1, 0.3)
     y = body.shoulder + high
     stay = box((0.05, high + 0.3, 0.14), (0.7 * half, y - high / 2 - 0.13, z - 0.13))
-    return [wing([(-half, y, z, 0.3, 0.12), (half, y, z, 0.3, 0.12)]), *both_sides(stay)]
+    return wing([(-half, y, z, 0.3, 0.12), (half, y, z, 0.3, 0.12)]) + stay.both_sides()
+
+
+_WEIGHTS = {"sedan": 2.5, "hatchback": 2, "wagon": 1.2, "coupe": 1.8, "suv": 1.8, "van": 1.6, "pickup": 1.6}
+KINDS = {partial(car, kind=kind): weight for kind, weight in _WEIGHTS.items()}

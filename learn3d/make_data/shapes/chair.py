@@ -1,29 +1,34 @@
-"""Procedural chairs, in metres: a seat, a support, a back and arms, each of many kinds; and one-piece chairs."""
+"""Procedural chairs, in metres: a seat on a support with a back and arms, moulded shells, club and barrel chairs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-import trimesh
 
-from learn3d.make_data.shapes import supports
-from learn3d.make_data.shapes.chair_backs import back_parts
-from learn3d.make_data.shapes.chair_bodies import barrel_chair, club_chair, shell_chair
+from learn3d.make_data.shapes.chair_backs import make_back
+from learn3d.make_data.shapes.draw import Draw
 from learn3d.make_data.shapes.parts import (
-    Solid,
-    assemble,
+    Part,
     bar,
     between,
-    both_sides,
+    box,
     ellipse,
+    loft,
     post,
     rectangle,
     rounded_path,
+    sheet,
     slab,
     tube,
 )
-from learn3d.make_data.shapes.sampling import maybe, pick
+from learn3d.make_data.shapes.supports import feet, four_legs, support
+
+# Weights of the supports of each family of chairs.
+_DINING = {"legs": 6, "loops": 1, "cantilever": 1, "cross": 0.8, "panels": 0.6, "disc": 0.7, "star": 0.4, "rocker": 0.5}
+_LOUNGE = {"legs": 2.5, "loops": 2, "cantilever": 1, "rocker": 1, "star": 0.6, "panels": 0.7, "cross": 0.7}
+_BAR = {"legs": 3, "disc": 1.5, "loops": 1, "panels": 0.3}
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,7 @@ class Seat:
 
     width: float
     depth: float
-    height: float  # of the top of the seat over the floor
+    height: float  # height of the top of the seat over the floor
     thickness: float
     exponent: float  # outline: 2 = ellipse ... 8 = rectangle
 
@@ -41,99 +46,178 @@ class Seat:
         return -self.depth / 2 * (1 - min(abs(2 * x / self.width), 0.99) ** self.exponent) ** (1 / self.exponent)
 
 
-def make_chair(rng: np.random.Generator) -> trimesh.Trimesh:
-    """A random chair."""
-    family = pick(rng, {"dining": 5, "office": 1.5, "shell": 2, "club": 1.5, "lounge": 1.5, "bar": 1, "barrel": 1})
-    maker = {"shell": shell_chair, "club": club_chair, "barrel": barrel_chair}.get(family)
-    return assemble(maker(rng) if maker else _jointed_chair(rng, family))
-
-
-def _jointed_chair(rng: np.random.Generator, family: str) -> list[Solid]:
-    """A chair put together from a seat, a support, a back and arms."""
-    width, depth = rng.uniform(0.40, 0.54), rng.uniform(0.40, 0.50)
-    height, recline, back_height = rng.uniform(0.42, 0.5), rng.uniform(2, 14), rng.uniform(0.32, 0.62)
-    cushioned = maybe(rng, 0.3)
+def jointed_chair(draw: Draw, family: str) -> Part:
+    """A dining, office, lounge or bar chair, put together from a seat, a support, a back and arms."""
+    width, depth, height = draw(0.40, 0.54), draw(0.40, 0.50), draw(0.42, 0.5)
+    recline, back_height, cushioned = draw(2, 14), draw(0.32, 0.62), draw.maybe(0.3)
     if family == "lounge":
-        width, depth = rng.uniform(0.52, 0.7), rng.uniform(0.52, 0.66)
-        height, recline, back_height = rng.uniform(0.28, 0.40), rng.uniform(15, 30), rng.uniform(0.4, 0.75)
-        cushioned = maybe(rng, 0.6)
+        width, depth, height = draw(0.52, 0.7), draw(0.52, 0.66), draw(0.28, 0.40)
+        recline, back_height, cushioned = draw(15, 30), draw(0.4, 0.75), draw.maybe(0.6)
     elif family == "office":
-        width, depth, cushioned = rng.uniform(0.46, 0.56), rng.uniform(0.44, 0.52), True
-        back_height = rng.uniform(0.4, 0.75)
+        width, depth, back_height, cushioned = draw(0.46, 0.56), draw(0.44, 0.52), draw(0.4, 0.75), True
     elif family == "bar":
-        width, depth = rng.uniform(0.36, 0.44), rng.uniform(0.34, 0.42)
-        height, back_height = rng.uniform(0.62, 0.78), rng.uniform(0.14, 0.4)
-    elif maybe(rng, 0.15):
-        back_height = rng.uniform(0.65, 0.85)  # a throne
-    exponent = pick(rng, {8.0: 4, 5.0: 2, 3.0: 1.5, 2.0: 1})
-    thickness = rng.uniform(0.07, 0.13) if cushioned else rng.uniform(0.025, 0.05)
-    seat = Seat(width, depth, height, thickness, exponent)
+        width, depth, height, back_height = draw(0.36, 0.44), draw(0.34, 0.42), draw(0.62, 0.78), draw(0.14, 0.4)
+    elif draw.maybe(0.15):
+        back_height = draw(0.65, 0.85)  # a throne
+    exponent = draw.pick({8.0: 4, 5.0: 2, 3.0: 1.5, 2.0: 1})
+    seat = Seat(width, depth, height, draw(0.07, 0.13) if cushioned else draw(0.025, 0.05), exponent)
 
-    taper = rng.uniform(0.8, 1.0) if maybe(rng, 0.4) else 1.0  # narrower at the rear
+    taper = draw(0.8, 1.0) if draw.maybe(0.4) else 1.0  # narrower at the rear
     outline = ellipse(width, depth, 24, exponent)
     outline = outline * np.stack([1 + (taper - 1) * (0.5 - outline[:, 1] / depth), np.ones(len(outline))], 1)
-    top = slab(outline, thickness, bevel=(0.35 if cushioned else 0.2) * thickness)
-    solids = [top.moved(y=height - thickness)]
+    under = height - seat.thickness
+    part = slab(outline, seat.thickness, bevel=(0.35 if cushioned else 0.2) * seat.thickness).moved(y=under)
 
-    if family == "office":
-        kind = "star"
-    elif family == "bar":
-        kind = pick(rng, {"legs": 3, "disc": 1.5, "loops": 1, "panels": 0.3})
-    elif family == "lounge":
-        kinds = {"legs": 2.5, "loops": 2, "cantilever": 1, "rocker": 1, "star": 0.6, "panels": 0.7, "cross": 0.7}
-        kind = pick(rng, kinds)
-    else:
-        kinds = {"legs": 6, "loops": 1, "cantilever": 1, "cross": 0.8, "panels": 0.6, "disc": 0.7, "star": 0.4}
-        kind = pick(rng, kinds | {"rocker": 0.5})
-    under = height - thickness
+    weights = {"bar": _BAR, "lounge": _LOUNGE, "dining": _DINING}
+    kind = "star" if family == "office" else draw.pick(weights[family])
     spread = 0.5 * 0.35 ** (1 / exponent)  # well inside the outline
     half_x, half_z = spread * width * (0.5 + 0.5 * taper) - 0.03, spread * depth - 0.03
-    solids += supports.base(rng, kind, half_x, half_z, under)
+    part += support(draw, kind, half_x, half_z, under)
+    if family == "bar" and not draw.maybe(0.8):  # a stool
+        return part
 
-    stile_x = 0.5 * width * taper - 0.03 if exponent > 4 else 0.36 * width
-    if family != "bar" or maybe(rng, 0.8):  # the others are stools
-        curve = seat.rear(stile_x) - seat.rear(0.0) if exponent <= 4 else 0.0
-        curve = max(curve, rng.uniform(0.0, 0.08) if maybe(rng, 0.6) else 0.0)
-        back, rise = back_parts(rng, family, stile_x, back_height, curve)
-        solids += [_leaned(part, seat, recline) for part in back]
-        arm_chance = {"office": 0.6, "lounge": 0.6, "bar": 0.1}.get(family, 0.3)
-        if maybe(rng, arm_chance) and back_height > 0.3:
-            edge = max(stile_x, half_x) if exponent <= 4 else 0.5 * width - 0.02
-            solids += _arms(rng, seat, edge, stile_x, recline, curve + rise)
-    return solids
-
-
-def _leaned(part: Solid, seat: Seat, recline_deg: float) -> Solid:
-    """A part of the back, drawn in the plane z = 0 above y = 0, put on the rear of the seat and leaned backwards."""
-    return part.rotated("x", -recline_deg).moved(y=seat.height - 0.5 * seat.thickness, z=-seat.depth / 2 + 0.03)
+    angular = exponent > 4
+    stile_x = 0.5 * width * taper - 0.03 if angular else 0.36 * width
+    curve = 0.0 if angular else seat.rear(stile_x) - seat.rear(0.0)
+    curve = max(curve, draw(0.0, 0.08) if draw.maybe(0.6) else 0.0)
+    back, bulge = make_back(draw, family, stile_x, back_height, curve)
+    part += back.rotated("x", -recline).moved(y=height - 0.5 * seat.thickness, z=-depth / 2 + 0.03)
+    arm_chance = {"office": 0.6, "lounge": 0.6, "bar": 0.1, "dining": 0.3}[family]
+    if draw.maybe(arm_chance) and back_height > 0.3:
+        edge = 0.5 * width - 0.02 if angular else max(stile_x, half_x)
+        part += _arm(draw, seat, edge, stile_x, recline, curve + bulge).both_sides()
+    return part
 
 
-def _arms(
-    rng: np.random.Generator, seat: Seat, edge: float, stile_x: float, recline_deg: float, bow: float
-) -> list[Solid]:
-    """A pair of arms from the back's stile to the front of the seat."""
-    rise = rng.uniform(0.17, 0.26)
+def _arm(draw: Draw, seat: Seat, edge: float, stile_x: float, recline_deg: float, bow: float) -> Part:
+    """An arm from the stile of the back, which starts `bow` before the rear edge, to the front of the seat."""
+    rise = draw(0.17, 0.26)
     y = seat.height + rise
     rear = -seat.depth / 2 + 0.03 + bow - np.tan(np.radians(recline_deg)) * rise
-    front = seat.depth * rng.uniform(0.15, 0.45)
+    front = seat.depth * draw(0.15, 0.45)
     foot_z = min(front, seat.depth * 0.3)
-    kind = pick(rng, {"post": 3, "panel": 0.8, "loop": 1.5, "swoop": 1.5, "cantilever": 0.7})
-    size = rng.uniform(0.025, 0.05)
+    kind = draw.pick({"post": 3, "panel": 0.8, "loop": 1.5, "swoop": 1.5, "cantilever": 0.7})
+    size = draw(0.025, 0.05)
     base = seat.height - 0.6 * seat.thickness
-    rest = rectangle(size * rng.uniform(1.0, 2.0), 0.7 * size, segments=1)
+    rest = rectangle(size * draw(1.0, 2.0), 0.7 * size, segments=1)
     start = (stile_x, y, rear - 0.01)
     if kind == "panel":
-        return both_sides(between((edge - 0.02, base - 0.02, rear), (edge + 0.03, y, front + 0.02), 0.012))
+        return between((edge - 0.02, base - 0.02, rear), (edge + 0.03, y, front + 0.02), 0.012)
     if kind == "loop":
         path = [start, (edge + 0.02, y, front), (edge + 0.02, base, foot_z), (edge - 0.06, base, foot_z)]
-        return both_sides(tube(rounded_path(path, 0.09), 0.011 + 0.2 * size))
+        return tube(rounded_path(path, 0.09), 0.011 + 0.2 * size)
     if kind == "swoop":
         path = [start, (edge, y + 0.02, 0.2 * front), (edge, y - 0.4 * rise, front), (edge - 0.01, base, foot_z)]
-        return both_sides(tube(rounded_path(path, 0.12, 5), 1.0, rest, side=(1, 0, 0)))
+        return tube(rounded_path(path, 0.12, 5), 1.0, rest, side=(1, 0, 0))
     arm = tube(rounded_path([start, (edge, y, 0.0), (edge, y, front)], 0.1), 1.0, rest, side=(1, 0, 0))
     if kind == "cantilever":
-        return both_sides(arm) + both_sides(bar((edge - 0.01, base, rear / 2), (edge, y, rear / 2), 0.03, 0.05))
-    outline = ellipse(0.8 * size, 0.8 * size, 8) if maybe(rng, 0.5) else rectangle(0.8 * size, 0.8 * size)
-    bulge = rng.uniform(0.8, 1.5)
-    front_post = post((edge - 0.012, base, foot_z), (edge, y, foot_z), outline, [(0, 1), (0.5, bulge), (1, 0.9)])
-    return both_sides(arm) + both_sides(front_post)
+        return arm + bar((edge - 0.01, base, rear / 2), (edge, y, rear / 2), 0.03, 0.05)
+    outline = ellipse(0.8 * size, 0.8 * size, 8) if draw.maybe(0.5) else rectangle(0.8 * size, 0.8 * size)
+    profile = [(0, 1), (0.5, draw(0.8, 1.5)), (1, 0.9)]
+    return arm + post((edge - 0.012, base, foot_z), (edge, y, foot_z), outline, profile)
+
+
+def shell_chair(draw: Draw) -> Part:
+    """A moulded bucket: one curved sheet for seat and back, on any support."""
+    width, depth, height = draw(0.42, 0.62), draw(0.40, 0.52), draw(0.36, 0.47)
+    back, lean, curl, wings = draw(0.25, 0.5), draw(0.05, 0.2), draw(0.0, 0.07), draw(0.0, 0.22)
+    front, rear = depth / 2, -depth / 2
+    path = [(0, -0.03, front), (0, 0, front - 0.08), (0, -0.02, rear + 0.05), (0, back, rear - lean)]
+    path = rounded_path(path, draw(0.1, 0.2), 5)
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    t = np.linspace(0, 1, 18)[:, None]  # along the middle line, from the front edge to the top of the back
+    v = np.linspace(-1, 1, 15)[None]  # across
+    y, z = (np.interp(t * length[-1], length, path[:, k]) for k in (1, 2))
+    ease = np.clip((t - 0.3) / 0.4, 0, 1)
+    ease = ease**2 * (3 - 2 * ease)
+    span = 0.5 * width * (1 - draw(-0.1, 0.35) * ease) * (1 - np.clip((t - 0.75) / 0.25, 0, 1) ** 3 * draw(0.1, 0.6))
+    span = span * (1 - 0.25 * np.clip(1 - t / 0.15, 0, 1) ** 2)
+    # The rims are lifted off the seat and pulled forward off the back; `wings` makes arms of them about the hip.
+    hip = np.exp(-(((t - 0.5) / 0.25) ** 2))
+    lift = (curl * np.abs(v) ** 2.5 + wings * hip * np.abs(v) ** 3) * (1 - 0.7 * ease)
+    pull = (curl + wings * hip) * np.abs(v) ** 2.5 * ease
+    part = sheet(np.stack([span * v, y + lift, z + pull], 2), draw(0.018, 0.035)).moved(y=height)
+    part += slab(ellipse(0.8 * width, 0.8 * depth, 20, 5), 0.03).moved(y=height - 0.045)
+    kind = draw.pick({"legs": 2, "star": 1, "disc": 1, "loops": 1, "rocker": 0.5})
+    if kind == "legs":
+        return part + four_legs(draw, 0.34 * width, 0.34 * depth, height - 0.035, plain=True)
+    return part + support(draw, kind, 0.37 * width, 0.38 * depth, height - 0.035)
+
+
+def club_chair(draw: Draw) -> Part:
+    """An upholstered armchair: a block seat, thick arms and back, perhaps wings, on short feet."""
+    width, depth, arm, arm_height = draw(0.68, 0.95), draw(0.68, 0.9), draw(0.09, 0.2), draw(0.5, 0.66)
+    back, back_height, foot = draw(0.12, 0.24), draw(0.66, 1.1), draw(0.03, 0.2)
+    seat_height, soft, lean = draw(0.36, 0.46), draw(0.02, 0.06), draw(0, 14)
+    half, inner, front, rear = width / 2, width / 2 - arm, depth / 2, -depth / 2
+    split, hip = seat_height - draw(0.1, 0.16), rear + back
+    part = between((-half + 0.02, foot, rear + 0.02), (half - 0.02, split + 0.01, front - 0.03), 0.02)
+    part += between((-inner - 0.02, split, rear + 0.05), (inner + 0.02, seat_height, front), soft)
+    upright = between((-inner - 0.05, split - 0.1, rear), (inner + 0.05, back_height, hip), soft)
+    part += upright.rotated("x", -lean, (0, split, hip))
+    kind = draw.pick(("box", "rolled", "sloped"))
+    if kind == "sloped":
+        heights = (arm_height - draw(0.03, 0.12), arm_height + 0.05)
+        outline = rectangle(arm, 1.0, 0.03, 3)
+        rings = [
+            np.stack([half - arm / 2 + outline[:, 0], foot + (outline[:, 1] + 0.5) * (h - foot), np.full(16, z)], 1)
+            for z, h in zip((front - 0.01, rear + 0.02), heights, strict=True)
+        ]
+        part += loft(rings).both_sides()
+    else:
+        part += between((inner, foot, rear + 0.02), (half, arm_height, front - 0.01), soft).both_sides()
+        if kind == "rolled":
+            x = half - arm / 2
+            part += bar((x, arm_height, rear + 0.03), (x, arm_height, front), 1.35 * arm).both_sides()
+    if draw.maybe(0.35) and back_height > 0.8:  # wings
+        t = np.linspace(0, 1, 6)[:, None]
+        reach = draw(0.18, 0.3) * np.sin(np.pi * (0.12 + 0.8 * t)) ** 0.7
+        z = hip - 0.06 + np.linspace(0, 1, 4)[None] * (reach + 0.06)
+        y = arm_height - 0.05 + t * (back_height - arm_height) + 0 * z
+        z = z - np.tan(np.radians(lean)) * (y - split)
+        part += sheet(np.stack([np.full_like(z, inner + 0.02), y, z], 2), draw(0.04, 0.08)).both_sides()
+    if foot > 0.05:
+        part += feet(draw, half - 0.07, front - 0.08, foot + 0.02)
+    if draw.maybe(0.25):
+        pillow = between((-0.2, seat_height, hip), (0.2, seat_height + 0.3, hip + 0.13), 0.06)
+        part += pillow.rotated("x", -lean - 8, (0, seat_height, hip))
+    return part
+
+
+def barrel_chair(draw: Draw) -> Part:
+    """A round seat with a back that wraps around it and falls towards the arms."""
+    radius, height, rise, fall = draw(0.26, 0.38), draw(0.36, 0.47), draw(0.22, 0.5), draw(0.0, 0.8)
+    reach = np.radians(draw(80, 150))
+    angle = np.linspace(-reach, reach, 25)
+    thickness = draw.pick((0.025, 0.04, 0.09)) * draw(0.9, 1.2)
+    top = rise * (1 - fall * (1 - np.cos(angle)) / (1 - np.cos(reach)))
+    gap = np.minimum(draw(0.1, 0.22), 0.5 * top) if draw.maybe(0.4) else None  # between seat and back, at each angle
+    bottom = -0.06 if gap is None else gap
+    y = bottom + np.linspace(0, 1, 4)[:, None] * (top - bottom)
+    r = radius - 0.3 * thickness + draw(0.0, 0.12) * np.maximum(y, 0.0)
+    part = sheet(np.stack([r * np.sin(angle), y, -r * np.cos(angle)], 2), thickness).moved(y=height)
+    cushion = draw(0.06, 0.14)
+    under = height - cushion
+    part += slab(ellipse(2 * radius, 2 * radius, 28, draw.pick((2.0, 2.0, 3.0))), cushion).moved(y=under)
+    if gap is not None:
+        for a in np.linspace(-0.92 * reach, 0.92 * reach, draw.count(4, 11)):
+            x, z, top_y = radius * np.sin(a), -radius * np.cos(a), height + np.interp(a, angle, gap) + 0.02
+            part += bar((0.93 * x, height - 0.5 * cushion, 0.93 * z), (0.99 * x, top_y, 0.99 * z), 0.022)
+    if draw.maybe(0.2):  # a solid drum down to the floor
+        return part + slab(ellipse(1.9 * radius, 1.9 * radius, 28), under + 0.02, 0.02)
+    kind = draw.pick({"legs": 3, "disc": 1, "star": 0.7, "loops": 0.7})
+    part += support(draw, kind, 0.66 * radius, 0.66 * radius, under)
+    if kind in ("legs", "loops") and draw.maybe(0.3):
+        part += box((1.2 * radius, 0.02, 1.2 * radius), (0, under - 0.01, 0))
+    return part
+
+
+KINDS = {
+    partial(jointed_chair, family="dining"): 5,
+    partial(jointed_chair, family="office"): 1.5,
+    shell_chair: 2,
+    club_chair: 1.5,
+    partial(jointed_chair, family="lounge"): 1.5,
+    partial(jointed_chair, family="bar"): 1,
+    barrel_chair: 1,
+}

@@ -1,14 +1,15 @@
-"""Closed solids for procedural shapes, all of them lofts: boxes, slabs, posts, tubes, revolved profiles, sheets, wings.
+"""Closed parts of procedural shapes, all of them lofts: boxes, slabs, posts, tubes, revolved profiles, sheets, wings.
 
-A `Solid` is a stack of rings of equal size. Joined in order and closed at the ends, it is watertight whatever the rings
-are, so a shape made of solids is a union of closed, outward oriented components. Axes: x right, y up, z forward.
+A loft is watertight whatever its rings are, so a shape made of lofts is a union of closed components.
+Axes: x right, y up, z forward.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -20,47 +21,59 @@ Point = Sequence[float] | np.ndarray
 THIN, STEP = 0.06, 0.031
 
 
-@dataclass(frozen=True)
-class Solid:
-    """A stack of rings that `assemble` turns into one closed component."""
+class Loft(NamedTuple):
+    """A closed surface: a stack of rings of equal size, joined in order and closed at the ends."""
 
     rings: np.ndarray  # [R, N, 3] float64; neighbours in R and in N are joined
     ends: str = "fan"  # first and last ring: "fan" about their mean, "strip" between point i and N-1-i, "ring" = join
 
-    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
-        """The solid shifted by (x, y, z)."""
-        return Solid(self.rings + np.array([x, y, z]), self.ends)
 
-    def scaled(self, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> Solid:
-        """The solid scaled about the origin; a negative factor mirrors it."""
-        return Solid(self.rings * np.array([x, y, z]), self.ends)
+@dataclass(frozen=True)
+class Part:
+    """Closed surfaces that are moved, turned and mirrored together; `a + b` joins two parts."""
 
-    def mirrored(self) -> Solid:
-        """The solid on the other side of the plane x = 0."""
-        return self.scaled(x=-1.0)
+    lofts: tuple[Loft, ...] = ()
 
-    def rotated(self, axis: str, angle_deg: float, about: Point = (0.0, 0.0, 0.0)) -> Solid:
-        """The solid turned right-handedly about the x, y or z axis through the point `about`."""
+    def __add__(self, other: Part) -> Part:
+        return Part(self.lofts + other.lofts)
+
+    def _mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> Part:
+        return Part(tuple(Loft(function(rings), ends) for rings, ends in self.lofts))
+
+    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Part:
+        """The part shifted by (x, y, z)."""
+        return self._mapped(lambda rings: rings + np.array([x, y, z]))
+
+    def scaled(self, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> Part:
+        """The part scaled about the origin; a negative factor mirrors it."""
+        return self._mapped(lambda rings: rings * np.array([x, y, z]))
+
+    def rotated(self, axis: str, angle_deg: float, about: Point = (0.0, 0.0, 0.0)) -> Part:
+        """The part turned right-handedly about the x, y or z axis through the point `about`."""
         i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
         cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
         matrix = np.eye(3)
         matrix[[i, i, j, j], [i, j, i, j]] = cosine, -sine, sine, cosine
-        return Solid((self.rings - np.asarray(about)) @ matrix.T + np.asarray(about), self.ends)
+        return self._mapped(lambda rings: (rings - np.asarray(about)) @ matrix.T + np.asarray(about))
+
+    def both_sides(self) -> Part:
+        """The part and its mirror image in the plane x = 0."""
+        pairs = zip(self.lofts, self.scaled(x=-1.0).lofts, strict=True)
+        return Part(tuple(loft for pair in pairs for loft in pair))
+
+    def around(self, angles_deg: Iterable[float]) -> Part:
+        """A copy of the part turned about the y axis by each of the angles."""
+        return join(self.rotated("y", angle) for angle in angles_deg)
 
 
-def both_sides(solid: Solid) -> list[Solid]:
-    """The solid and its mirror image in x = 0."""
-    return [solid, solid.mirrored()]
+def join(parts: Iterable[Part]) -> Part:
+    """All the parts as one."""
+    return Part(tuple(loft for part in parts for loft in part.lofts))
 
 
-def both_sides_of(parts: list[Solid]) -> list[Solid]:
-    """The parts and their mirror images."""
-    return [solid for part in parts for solid in both_sides(part)]
-
-
-def all_moved(parts: Iterable[Solid], x: float = 0.0, y: float = 0.0, z: float = 0.0) -> list[Solid]:
-    """The parts shifted by (x, y, z) together."""
-    return [part.moved(x, y, z) for part in parts]
+def loft(rings: np.ndarray | Sequence[np.ndarray], ends: str = "fan") -> Part:
+    """The part made of one stack of rings [R, N, 3]."""
+    return Part((Loft(np.asarray(rings), ends),))
 
 
 # --- outlines: closed curves [N, 2], counter-clockwise, star-shaped about their mean --------------------------------
@@ -97,47 +110,50 @@ def inset(outline: np.ndarray, distance: float) -> np.ndarray:
     return outline - mitre * (2.0 * distance / np.maximum((mitre**2).sum(1, keepdims=True), 0.5))
 
 
-# --- solids ----------------------------------------------------------------------------------------------------------
+# --- parts -----------------------------------------------------------------------------------------------------------
 
 
-def slab(outline: np.ndarray, thickness: float, bevel: float | None = None) -> Solid:
+def _prism(outline: np.ndarray, rims: Sequence[tuple[float, float]], axes: tuple[int, int, int]) -> Part:
+    """Copies of an outline in the first two axes, each inset by a distance, at a level along the third axis."""
+    rings = np.empty((len(rims), len(outline), 3))
+    for ring, (distance, level) in zip(rings, rims, strict=True):
+        ring[:, axes[:2]] = inset(outline, distance)
+        ring[:, axes[2]] = level
+    return loft(rings)
+
+
+def slab(outline: np.ndarray, thickness: float, bevel: float | None = None) -> Part:
     """A plate with the given outline in (x, z), from y = 0 to `thickness`, its rims bevelled."""
     bevel = 0.2 * thickness if bevel is None else min(bevel, 0.45 * thickness)
-    inner = inset(outline, bevel)
-    levels = [(inner, 0.0), (outline, bevel), (outline, thickness - bevel), (inner, thickness)]
-    return Solid(np.stack([np.stack([o[:, 0], np.full(len(o), y), o[:, 1]], 1) for o, y in levels]))
+    return _prism(outline, [(bevel, 0.0), (0.0, bevel), (0.0, thickness - bevel), (bevel, thickness)], (0, 2, 1))
 
 
-def box(size: Point, center: Point = (0.0, 0.0, 0.0), radius: float | None = None) -> Solid:
+def box(size: Point, center: Point = (0.0, 0.0, 0.0), radius: float | None = None) -> Part:
     """A box of the given size [3] about `center`, its edges rounded (radius None: 12 % of the shortest side)."""
-    size = np.asarray(size, dtype=float)
-    axis = int(np.argmax(size))  # lofted along its longest side
+    shortest, axis = np.min(size), int(np.argmax(size))  # lofted along its longest side
     i, j = (axis + 1) % 3, (axis + 2) % 3
-    radius = 0.12 * size.min() if radius is None else min(radius, 0.45 * size.min())
-    outline = rectangle(size[i], size[j], radius, 1 if radius < 0.2 * size.min() else 3)
-    inner = inset(outline, 0.6 * radius)
-    half = 0.5 * size[axis]
-    rings = np.empty((4, len(outline), 3))
-    for ring, shape, along in zip(rings, (inner, outline, outline, inner), (-1, -1, 1, 1), strict=True):
-        ring[:, i], ring[:, j] = shape[:, 0], shape[:, 1]
-        ring[:, axis] = along * (half if shape is inner else half - 0.6 * radius)
-    return Solid(rings + np.asarray(center, dtype=float))
+    radius = 0.12 * shortest if radius is None else min(radius, 0.45 * shortest)
+    outline = rectangle(size[i], size[j], radius, 1 if radius < 0.2 * shortest else 3)
+    half, rim = 0.5 * size[axis], 0.6 * radius
+    return _prism(outline, [(rim, -half), (0.0, rim - half), (0.0, half - rim), (rim, half)], (i, j, axis)).moved(
+        *center
+    )
 
 
-def between(lower: Point, upper: Point, radius: float | None = None) -> Solid:
+def between(lower: Point, upper: Point, radius: float | None = None) -> Part:
     """The rounded box with the given lower and upper corner."""
     lower, upper = np.minimum(lower, upper), np.maximum(lower, upper)
     return box(upper - lower, (lower + upper) / 2, radius)
 
 
-def post(foot: Point, head: Point, outline: np.ndarray, profile: Sequence[tuple[float, float]]) -> Solid:
+def post(foot: Point, head: Point, outline: np.ndarray, profile: Sequence[tuple[float, float]]) -> Part:
     """A (slanted) post with horizontal sections; profile = [(height 0 at the foot .. 1, scale of the outline)]."""
     foot, head = np.asarray(foot, dtype=float), np.asarray(head, dtype=float)
     section = np.stack([outline[:, 0], np.zeros(len(outline)), outline[:, 1]], 1)
-    return Solid(np.stack([foot + t * (head - foot) + scale * section for t, scale in profile]))
+    return loft(np.stack([foot + t * (head - foot) + scale * section for t, scale in profile]))
 
 
-def revolve(profile: Sequence[Point], sides: int = 16, hollow: bool = False) -> Solid:
+def revolve(profile: Sequence[Point], sides: int = 16, hollow: bool = False) -> Part:
     """The solid of revolution about the y axis of the profile [(radius > 0, y)].
 
     With `hollow` the profile is a closed loop that stays off the axis (a lamp shade, an engine nacelle).
@@ -145,10 +161,10 @@ def revolve(profile: Sequence[Point], sides: int = 16, hollow: bool = False) -> 
     profile = np.asarray(profile, dtype=float)
     angle = np.arange(sides) * (2.0 * np.pi / sides)
     radius, y = np.maximum(profile[:, :1], 1e-4), np.repeat(profile[:, 1:], sides, 1)
-    return Solid(np.stack([radius * np.cos(angle), y, radius * np.sin(angle)], 2), "ring" if hollow else "fan")
+    return loft(np.stack([radius * np.cos(angle), y, radius * np.sin(angle)], 2), "ring" if hollow else "fan")
 
 
-def ellipsoid(size: Point, center: Point = (0.0, 0.0, 0.0), sides: int = 14, stacks: int = 8) -> Solid:
+def ellipsoid(size: Point, center: Point = (0.0, 0.0, 0.0), sides: int = 14, stacks: int = 8) -> Part:
     """An ellipsoid of the given size [3] about `center`."""
     angle = np.linspace(-0.5, 0.5, stacks + 1) * np.pi
     profile = np.stack([np.maximum(np.cos(angle), 0.02), np.sin(angle)], 1) * 0.5
@@ -178,7 +194,7 @@ def tube(
     section: np.ndarray | None = None,
     closed: bool = False,
     side: Point = (0.0, 0.0, 1.0),
-) -> Solid:
+) -> Part:
     """A tube along a path [P, 3] whose section (a circle, or [N, 2] times radius) keeps its thickness in the bends.
 
     The first axis of the section points along `side` as far as the path allows; radius is a number or [P].
@@ -209,10 +225,10 @@ def tube(
             bend = bend / size
             ring = ring + (ring @ bend)[:, None] * bend * (1.0 / max(ahead[k] @ tangent[k], 0.4) - 1.0)
         rings.append(path[k] + ring)
-    return Solid(np.stack(rings), "ring" if closed else "fan")
+    return loft(np.stack(rings), "ring" if closed else "fan")
 
 
-def bar(start: Point, end: Point, width: float, height: float | None = None, side: Point = (0.0, 0.0, 1.0)) -> Solid:
+def bar(start: Point, end: Point, width: float, height: float | None = None, side: Point = (0.0, 0.0, 1.0)) -> Part:
     """A straight bar: round with diameter `width`, or rectangular, width (along `side`) by height."""
     section = (
         ellipse(width, width, 6)
@@ -222,17 +238,17 @@ def bar(start: Point, end: Point, width: float, height: float | None = None, sid
     return tube([start, end], 1.0, section, side=side)
 
 
-def sheet(surface: np.ndarray, thickness: float) -> Solid:
+def sheet(surface: np.ndarray, thickness: float) -> Part:
     """A curved plate: the surface grid [U, V, 3] thickened by `thickness` along its normals (to both sides)."""
     along = np.gradient(surface, axis=0)
     across = np.gradient(surface, axis=1)
     normal = np.cross(along, across)
     normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-12)
     front, back = surface + 0.5 * thickness * normal, surface - 0.5 * thickness * normal
-    return Solid(np.concatenate([front, back[:, ::-1]], 1), "strip")
+    return loft(np.concatenate([front, back[:, ::-1]], 1), "strip")
 
 
-def wing(sections: Sequence[Sequence[float]], points: int = 7, upright: bool = False) -> Solid:
+def wing(sections: Sequence[Sequence[float]], points: int = 7, upright: bool = False) -> Part:
     """A wing through airfoil sections (span, rise, leading edge z, chord, thickness / chord), nose towards +z.
 
     The span runs along x and the rise along y; `upright` exchanges the two (a fin). The airfoil is the symmetric
@@ -246,10 +262,10 @@ def wing(sections: Sequence[Sequence[float]], points: int = 7, upright: bool = F
     for span, rise, z, chord, ratio in sections:
         x, y = np.full(2 * points, span), rise + thickness * chord * ratio
         rings.append(np.stack([y, x, z - chordwise * chord] if upright else [x, y, z - chordwise * chord], 1))
-    return Solid(np.stack(rings), "strip")
+    return loft(np.stack(rings), "strip")
 
 
-# --- from solids to a mesh -------------------------------------------------------------------------------------------
+# --- from parts to a mesh -------------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=1024)
@@ -288,16 +304,16 @@ def _refined(rings: np.ndarray, ends: str) -> np.ndarray:
     return (1 - w) * track[k] + w * track[k + 1]
 
 
-def assemble(solids: Sequence[Solid]) -> trimesh.Trimesh:
-    """The solids as one mesh of closed, outward oriented components; box centred at the origin, longest side 1."""
-    lower = np.min([s.rings.min((0, 1)) for s in solids], 0)
-    upper = np.max([s.rings.max((0, 1)) for s in solids], 0)
+def assemble(part: Part) -> trimesh.Trimesh:
+    """The part as a mesh of closed, outward oriented components; box centred at the origin, longest side 1."""
+    lower = np.min([rings.min((0, 1)) for rings, _ in part.lofts], 0)
+    upper = np.max([rings.max((0, 1)) for rings, _ in part.lofts], 0)
     vertices, faces, offset = [], [], 0
-    for solid in solids:
-        rings = _refined((solid.rings - (lower + upper) / 2) / (upper - lower).max(), solid.ends)
-        triangles = _loft_faces(len(rings), rings.shape[1], solid.ends)
+    for rings, ends in part.lofts:
+        rings = _refined((rings - (lower + upper) / 2) / (upper - lower).max(), ends)
+        triangles = _loft_faces(len(rings), rings.shape[1], ends)
         points = rings.reshape(-1, 3)
-        if solid.ends == "fan":
+        if ends == "fan":
             points = np.concatenate([points, rings[[0, -1]].mean(1)])
         p, q, r = (points[triangles[:, k]] - points[0] for k in range(3))
         if np.einsum("ij,ij->", p, np.cross(q, r)) < 0.0:  # six times the signed volume

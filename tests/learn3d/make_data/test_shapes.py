@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 import nmr
 from learn3d.make_data.shapes import CATEGORIES, make_shape
+from learn3d.make_data.shapes.draw import Draw
 from learn3d.make_data.shapes.parts import (
     assemble,
     bar,
@@ -28,7 +29,6 @@ from learn3d.make_data.shapes.parts import (
     tube,
     wing,
 )
-from learn3d.make_data.shapes.sampling import pick
 
 SEEDS = 100
 
@@ -143,7 +143,7 @@ def test_a_seed_instead_of_a_generator_is_refused() -> None:
         make_shape("chair", 3)  # type: ignore[arg-type]
 
 
-# --- the solids ------------------------------------------------------------------------------------------------------
+# --- the parts -------------------------------------------------------------------------------------------------------
 
 
 def _grid() -> np.ndarray:
@@ -152,7 +152,7 @@ def _grid() -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("solid", "volume"),
+    ("part", "volume"),
     [
         (box((2, 3, 1), radius=0.01), 6.0),
         (slab(rectangle(2, 3, 0.01), 0.5, bevel=0.01), 3.0),
@@ -172,20 +172,24 @@ def _grid() -> np.ndarray:
     ],
     ids=lambda value: None if isinstance(value, float) else "",
 )
-def test_solids_are_closed_and_have_the_volume_of_the_formula(solid, volume: float) -> None:
-    mesh = assemble([solid])
-    extent = np.ptp(solid.rings.reshape(-1, 3), axis=0).max()
+def test_parts_are_closed_and_have_the_volume_of_the_formula(part, volume: float) -> None:
+    mesh = assemble(part)
+    extent = np.ptp(part.lofts[0].rings.reshape(-1, 3), axis=0).max()
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.volume * extent**3 == pytest.approx(volume, rel=0.03)
-    mirrored = assemble([solid.mirrored()])
+    mirrored = assemble(part.scaled(x=-1))
     assert mirrored.volume == pytest.approx(mesh.volume)
 
 
 def test_rotation_is_right_handed() -> None:
     point = box((0.1, 0.1, 0.1), (1, 0, 0))
-    np.testing.assert_allclose(point.rotated("z", 90).rings.mean((0, 1)), (0, 1, 0), atol=1e-12)
-    np.testing.assert_allclose(point.rotated("y", 90).rings.mean((0, 1)), (0, 0, -1), atol=1e-12)
-    np.testing.assert_allclose(point.rotated("x", 90, (0, 1, 0)).rings.mean((0, 1)), (1, 1, -1), atol=1e-12)
+    turned = {
+        (0, 1, 0): point.rotated("z", 90),
+        (0, 0, -1): point.rotated("y", 90),
+        (1, 1, -1): point.rotated("x", 90, about=(0, 1, 0)),
+    }
+    for center, part in turned.items():
+        np.testing.assert_allclose(part.lofts[0].rings.mean((0, 1)), center, atol=1e-12)
 
 
 def test_inset_moves_every_side_by_the_distance() -> None:
@@ -200,13 +204,13 @@ def test_rounded_path_stays_near_the_corner() -> None:
 
 def test_thin_bars_do_not_vanish_between_the_rays_of_the_voxeliser() -> None:
     """A slanted rod much thinner than a voxel stays one piece from end to end."""
-    voxels = _voxelize(assemble([bar((0, 0, 0), (0.35, 0.98, 0.27), 0.006)]))
+    voxels = _voxelize(assemble(bar((0, 0, 0), (0.35, 0.98, 0.27), 0.006)))
     assert ndimage.label(voxels, np.ones((3, 3, 3)))[1] == 1
     assert voxels.any((0, 2)).sum() >= 31
 
 
 def test_pick_follows_the_weights() -> None:
-    rng = np.random.default_rng(0)
-    draws = [pick(rng, {"a": 3.0, "b": 1.0, "c": 0.0}) for _ in range(2000)]
-    assert draws.count("a") == pytest.approx(1500, abs=80)
-    assert draws.count("c") == 0
+    draw = Draw(np.random.default_rng(0))
+    picks = [draw.pick({"a": 3.0, "b": 1.0, "c": 0.0}) for _ in range(2000)]
+    assert picks.count("a") == pytest.approx(1500, abs=80)
+    assert picks.count("c") == 0
