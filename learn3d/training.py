@@ -12,14 +12,13 @@ from pathlib import Path
 import torch
 
 from learn3d.config import TrainConfig
-from learn3d.data.augment import augment
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.layouts import LAYOUTS, load_dataset
+from learn3d.data.layouts import load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
-from learn3d.data.sampling import sample_indices
+from learn3d.data.sampling import batches
 from learn3d.device import keep_freed_memory, oversubscription_warning, resolve_precision
 from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
-from learn3d.methods import DatasetInfo, create_method
+from learn3d.methods import create_method
 from learn3d.presets import PRESETS
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Progress
@@ -62,15 +61,12 @@ def train(
             train_set.check_masks(),
             oversubscription_warning(torch.get_num_threads(), group.local_world_size),
         )
-        shape = _shape_of(train_set, config)
+        info = train_set.info(find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None)
         precision = resolve_precision(config.precision, config.device)
         how = {"device": config.device, "precision": precision, "seed": config.seed, "schedule": config.schedule}
-        method = create_method(config.settings, shape, **how)
-        sample = functools.partial(sample_indices, train_set, config.sampling, config.batch_size, config.seed)
-        changed = functools.partial(augment, names=config.augment, seed=config.seed, inverted=train_set.inverted)
-        first = train_set.batch(sample(1), group.rows, voxels=False)
-        method.check_batch(changed(first, step=1))  # before an older run is cleared away
-        run = Run(config, method, shape, fingerprint_of(train_set, precision), group)
+        method = create_method(config.settings, info, **how)
+        method.check_batch(next(batches(train_set, config, rows=group.rows)))  # before an older run is cleared away
+        run = Run(config, method, info, fingerprint_of(train_set, precision), group)
         progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:  # also after a kill between the last save and the end
             return dataclasses.replace(_summary(config, progress, started), was_finished=True)
@@ -81,13 +77,10 @@ def train(
                 log.say(f"warning: {warning}")
             log.say(_describe(config, precision, train_set, val_set, progress, group))
             if config.settings.wants_mirror_plane:
-                log.say(_about_plane(shape.mirror_plane_deg))
-            indices = sample(progress.step + 1)
-            for step in range(progress.step + 1, config.iterations + 1):
-                batch = train_set.batch(indices, group.rows, voxels=False)
-                indices = sample(step + 1)
-                train_set.prepare(indices, group.rows)
-                losses = method.take_step(changed(batch, step=step), step)
+                log.say(_about_plane(info.mirror_plane_deg))
+            start = progress.step + 1
+            for step, batch in enumerate(batches(train_set, config, start, group.rows), start):
+                losses = method.take_step(batch, step)
                 # With the losses of the step before: some methods train one network in odd steps, another in even ones.
                 recent = progress.losses | losses
                 seconds = before + time.monotonic() - started
@@ -122,13 +115,6 @@ def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDat
     progress = progress and is_watched()
     train_set = load("train", views_per_object=config.views_per_object, progress=progress)
     return train_set, load(config.val_split)
-
-
-def _shape_of(train_set: ViewDataset, config: TrainConfig) -> DatasetInfo:
-    plane = find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None
-    box = train_set.convention.box if LAYOUTS[config.layout].voxels else None
-    known = (train_set.num_views, train_set.num_classes, train_set.pose_features, train_set.inverted)
-    return DatasetInfo(*known, mirror_plane_deg=plane, cube_side=box)
 
 
 def _about_plane(plane_deg: float | None) -> str:

@@ -6,9 +6,11 @@ import dataclasses
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from learn3d.data.batch import Batch, StepViews
@@ -17,9 +19,22 @@ from learn3d.data.crops import Crops, join
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.data.stored import StoredArray
 from learn3d.data.view_bins import AngleBins
+from learn3d.settings import checked
 
 MASK_SIZE = 64
 SPLITS = ("train", "val", "test")
+
+
+@checked
+class DatasetInfo:
+    """Facts about the data that a method needs before it builds its networks. They are saved in every checkpoint."""
+
+    num_views: Annotated[int, Field(ge=0, le=100_000)]  # K pose classes
+    num_classes: Annotated[int, Field(ge=1, le=10_000)] = 1  # categories in the set
+    pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # of a camera: eye position 3, rotation 9, unknown 0
+    inverted: bool = False  # colours are stored as 255 - colour
+    mirror_plane_deg: float | None = None  # result of `data.mirror_plane`; None: no plane, or it was not asked for
+    cube_side: float | None = None  # side of the cube, centred at the origin, that holds all objects; None: unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +115,12 @@ class ViewDataset:
     def pose_features(self) -> int:
         """Numbers that describe a pose (`Poses.features`); 0 where poses are not known."""
         return 0 if self.poses is None else self.poses.num_features
+
+    def info(self, mirror_plane_deg: float | None = None) -> DatasetInfo:
+        """The facts that a method needs, with the mirror plane of the objects, if it is known."""
+        known = (self.num_views, self.num_classes, self.pose_features, self.inverted)
+        cube_side = None if self.voxels is None else self.convention.box
+        return DatasetInfo(*known, mirror_plane_deg=mirror_plane_deg, cube_side=cube_side)
 
     def batch(self, indices: Tensor, rows: Tensor | None = None, *, voxels: bool = True) -> Batch:
         """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU.

@@ -1,17 +1,45 @@
-"""Which samples a training step sees: functions of (data set, seed, step) alone, so that resuming needs no memory."""
+"""The batches of a training: functions of (data set, seed, step) alone, so that resuming needs no memory of them."""
 
 from __future__ import annotations
 
 import functools
-from typing import Literal
+from collections.abc import Iterator, Sequence
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from learn3d.data.augment import Augmentation, augment
+from learn3d.data.batch import Batch
 from learn3d.data.dataset import ViewDataset
 
 Sampling = Literal["views", "pairs", "classes"]
+
+
+class BatchOptions(Protocol):
+    """The options of a run that its batches depend on; a `TrainConfig` has them."""
+
+    sampling: Sampling
+    batch_size: int
+    augment: Sequence[Augmentation]
+    seed: int
+    iterations: int
+
+
+def batches(dataset: ViewDataset, options: BatchOptions, start: int = 1, rows: Tensor | None = None) -> Iterator[Batch]:
+    """The batches of the training steps `start` .. `options.iterations`, sampled and augmented, without voxels.
+
+    While a step uses a batch, a thread reads the next one from the disk, if the data set is there. With `rows`, int64
+    [b], a batch has only these rows of the step's batch: those of one of several processes.
+    """
+    indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, start)
+    for step in range(start, options.iterations + 1):
+        batch = dataset.batch(indices, rows, voxels=False)
+        if step < options.iterations:
+            indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, step + 1)
+            dataset.prepare(indices, rows)
+        yield augment(batch, options.augment, options.seed, step, inverted=dataset.inverted)
 
 
 def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, seed: int, step: int) -> Tensor:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import abc
 import contextlib
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
 import nmr
 from learn3d.data.batch import Batch
-from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.dataset import MASK_SIZE, DatasetInfo
 from learn3d.data.poses import Poses
 from learn3d.device import autocast
 from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup, all_reduce_gradients
@@ -22,19 +21,6 @@ from learn3d.methods.optimization import CONSTANT_LR, EMA, TrainingSchedule, ada
 from learn3d.methods.settings import MeshSettings, MethodSettings
 from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.networks import GENERATORS, MeshGenerator, Symmetry, SymmetryOption, create_encoder, network_input
-from learn3d.settings import checked
-
-
-@checked
-class DatasetInfo:
-    """What a method must know about its data before it builds its networks. Saved in every checkpoint."""
-
-    num_views: Annotated[int, Field(ge=0, le=100_000)]  # K pose classes
-    num_classes: Annotated[int, Field(ge=1, le=10_000)] = 1  # categories in the set
-    pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # of a camera: eye position 3, rotation 9, unknown 0
-    inverted: bool = False  # colours are stored as 255 - colour
-    mirror_plane_deg: float | None = None  # what `data.mirror_plane` found; None: nothing, or it was not asked for
-    cube_side: float | None = None  # side of the cube, centred at the origin, in which all objects lie; None: not known
 
 
 def plane_of(symmetry: SymmetryOption, info: DatasetInfo) -> Symmetry | None:

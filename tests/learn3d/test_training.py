@@ -372,7 +372,7 @@ def test_resume_refuses_other_poses(tiny_config, tiny_set, finished_run, monkeyp
 
 def test_resume_refuses_another_mirror_plane(tiny_config, finished_run, monkeypatch) -> None:
     change_metadata(
-        monkeypatch, lambda m: dataclasses.replace(m, shape=dataclasses.replace(m.info, mirror_plane_deg=7.5))
+        monkeypatch, lambda m: dataclasses.replace(m, info=dataclasses.replace(m.info, mirror_plane_deg=7.5))
     )
     with pytest.raises(ValueError, match=r"was trained on data of .*mirror_plane_deg=7\.5"):
         train(tiny_config(finished_run), resume=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from learn3d.data.augment import augment
 from learn3d.data.conventions import KATO
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.poses import LookAtPoses, RotationPoses, wrap_deg
-from learn3d.data.sampling import sample_indices
+from learn3d.data.sampling import batches, sample_indices
 from learn3d.data.view_bins import AngleBins
 from learn3d.methods import DatasetInfo, create_method
 from learn3d.presets import PRESETS
@@ -295,3 +296,15 @@ def test_a_white_background_stays_white(tiny_set) -> None:
     natural = dataclasses.replace(batch, images=torch.cat([255 - colors, mask], dim=1))
     changed = augment(natural, ("colors",), 0, 1, inverted=False).images
     assert torch.equal(255 - changed[:, :3], augment(batch, ("colors",), 0, 1).images[:, :3])
+
+
+@pytest.mark.parametrize("rows", [None, torch.tensor([1, 3])])
+def test_batches_are_sampled_and_augmented_from_any_step_on(tiny_set, rows) -> None:
+    options = SimpleNamespace(sampling="views", batch_size=4, augment=("flip", "channels"), seed=5, iterations=6)
+    found = list(batches(tiny_set, options, 3, rows))
+    assert len(found) == 4
+    for step, batch in enumerate(found, 3):
+        samples = sample_indices(tiny_set, "views", 4, 5, step)
+        wanted = augment(tiny_set.batch(samples, rows, voxels=False), ("flip", "channels"), 5, step)
+        assert batch.voxels is None and torch.equal(batch.images, wanted.images)
+        assert torch.equal(batch.poses.azimuth_deg, wanted.poses.azimuth_deg)
