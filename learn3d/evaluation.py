@@ -20,6 +20,7 @@ from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.losses import mmd_from_distances
 from learn3d.methods import Grids, Meshes, Method
 from learn3d.methods.surfaces import grid_surface
+from learn3d.pictures.surfaces import Surface
 
 #: What brings the predicted shapes of a batch to the true ones before they are compared; see `evaluate`.
 Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]
@@ -169,7 +170,7 @@ def evaluate(
                         hollow = dataset.convention.exceeds_grid(shapes.vertices, name)
                     overlaps.append(torch.stack([precision, recall, hollow.to(precision)], dim=1))
             if truth is not None:
-                points = _surface_points(shapes, generator)
+                points = [_sample(surface, generator) for surface in shapes.surfaces()]
                 distances += [_compare(a, truth[b]) for a, b in zip(points, batch.object_ids.tolist(), strict=True)]
             if dataset.voxels is None and dataset.poses is not None and isinstance(shapes, Meshes):
                 silhouettes.append(_silhouette_ious(shapes, dataset.batch(others[chosen])))
@@ -279,12 +280,12 @@ def mean_mmd(
     left out: between two single codes the MMD is a constant (6.19), whatever they are. Distances within a view are
     computed once, not once per pair. Several processes share the pairs.
     """
-    groups = [group for view in view_ids.unique() if len(group := codes[view_ids == view]) > 1]
+    of_views = [codes[view_ids == view] for view in view_ids.unique()]
     size = codes_per_view(view_ids, per_view=per_view)
     if size == 0:
         return {}
-    groups = [group[:size].double() for group in groups]
-    norms = [group.square().sum(1) for group in groups]
+    groups = [of_view[:size].double() for of_view in of_views if len(of_view) > 1]
+    norms = [codes_of_view.square().sum(1) for codes_of_view in groups]
 
     def distances(i: int, j: int) -> Tensor:
         squared = torch.addmm(norms[j].expand(size, size), groups[i], groups[j].T, alpha=-2)
@@ -324,19 +325,14 @@ def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Ten
     if dataset.voxels is None:
         return None
     grids = (grid for part in parts for grid in dataset.convention.to_object(torch.from_numpy(dataset.voxels[part])))
-    return [_sample(*grid_surface(grid.float(), box=dataset.convention.box), generator) for grid in grids]
+    return [_sample(grid_surface(grid.float(), box=dataset.convention.box), generator) for grid in grids]
 
 
-def _surface_points(shapes: Meshes | Grids, generator: torch.Generator) -> list[Tensor]:
-    if isinstance(shapes, Meshes):
-        return [_sample(vertices, shapes.faces, generator) for vertices in shapes.vertices]
-    return [_sample(*grid_surface(grid, level=shapes.threshold), generator) for grid in shapes.occupancy]
-
-
-def _sample(vertices: Tensor, faces: Tensor, generator: torch.Generator) -> Tensor:
-    if len(faces) == 0:
+def _sample(surface: Surface, generator: torch.Generator) -> Tensor:
+    """Points [P, 3] on a surface; [0, 3] if it is empty."""
+    if len(surface.faces) == 0:
         return torch.empty(0, 3)
-    return nmr.metrics.sample_surface(vertices, faces, SURFACE_POINTS, generator=generator).points
+    return nmr.metrics.sample_surface(surface.vertices, surface.faces, SURFACE_POINTS, generator=generator).points
 
 
 def _compare(a: Tensor, b: Tensor) -> tuple[float, float]:

@@ -14,7 +14,6 @@ from PIL import Image
 from torch import nn
 
 import nmr
-from learn3d import figures
 from learn3d.config import TrainConfig
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.crops import Crops
@@ -22,11 +21,12 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.framing import OBJECT_SHARE, check_mask, mask_box, read_photo, read_picture, threshold_mask
 from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.data.poses import LookAtPoses, Poses
-from learn3d.figures import Surface
 from learn3d.files import limits, writing
 from learn3d.methods import MeshMethod, Method
 from learn3d.methods.refinement import refine
 from learn3d.networks.encoders import centre
+from learn3d.pictures.sheets import natural_colors, save_gif, save_png, tile
+from learn3d.pictures.surfaces import Surface, azimuths_deg, draw_around, turntable
 from learn3d.runs import checkpoint
 from learn3d.runs.export import small_model
 
@@ -118,7 +118,7 @@ class Model(NamedTuple):
 
     def shown(self, stored: np.ndarray) -> np.ndarray:
         """Images uint8 [..., 4, S, S] as stored -> uint8 [..., S, S, 3] for people."""
-        return figures.natural_colors(stored, inverted=LAYOUTS[self.config.layout].inverted)
+        return natural_colors(stored, inverted=LAYOUTS[self.config.layout].inverted)
 
 
 def load_model(run: Path | None, which: str = "last") -> Model:
@@ -138,10 +138,10 @@ def reconstruct(
     """
     pixels = torch.from_numpy(images)
     if poses is None:
-        return figures.as_meshes(method.decode(method.encode(pixels)))
+        return method.decode(method.encode(pixels)).surfaces()
     if not isinstance(method, MeshMethod):
         raise ValueError("only meshes can be fitted to masks, and this run predicts voxels; leave out --refine")
-    return figures.as_meshes(refine(method, pixels, masks, poses))
+    return refine(method, pixels, masks, poses).surfaces()
 
 
 @torch.no_grad()
@@ -236,12 +236,12 @@ def save_reconstruction(
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.{suffix}" for suffix in _suffixes(mesh_format)]
     export_mesh(paths[0], surface)
-    figures.save_gif(paths[1], figures.turntable(surface, frames=frames, image_size=image_size))
+    save_gif(paths[1], turntable(surface, frames=frames, image_size=image_size))
     start = input_azimuth_deg(surface, mask) if azimuth_deg is None else azimuth_deg
-    views = figures.draw_around(surface, [start - 60 * k for k in range(6)], image_size=STRIP_SIZE)
+    views = draw_around(surface, [start - 60 * k for k in range(6)], image_size=STRIP_SIZE)
     titles = ["input", "mask", "from the input's side", *(f"turned by {60 * k}°" for k in range(1, 6))]
     shown = [_pixels(picture), _pixels(np.repeat(mask[..., None], 3, axis=2))]
-    figures.save_png(paths[2], figures.tile([[*shown, *views]], titles, tile_size=STRIP_SIZE))
+    save_png(paths[2], tile([[*shown, *views]], titles, tile_size=STRIP_SIZE))
     return paths
 
 
@@ -359,7 +359,7 @@ def _save_all(
     options: dict[str, Any],
 ) -> list[Path]:
     written = []
-    azimuths = [None] * len(names) if poses is None else figures.azimuths_deg(poses).tolist()
+    azimuths = [None] * len(names) if poses is None else azimuths_deg(poses).tolist()
     for name, picture, mask, surface, azimuth in zip(names, pictures, masks, surfaces, azimuths, strict=True):
         written += save_reconstruction(folder, name, picture, mask, surface, azimuth_deg=azimuth, **options)
     return written

@@ -8,11 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learn3d import figures
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.evaluation import evaluate
+from learn3d.figures.grids import picture_grid
 from learn3d.methods import Method
+from learn3d.pictures.sheets import save_png
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.folder import PICTURES
 from learn3d.runs.log import RunLog, SilentLog
@@ -51,11 +52,11 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog | S
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
     """Write pictures/<step>.png: the same few validation images every time, of different objects and views."""
     with method.ema_weights():
-        grid = figures.picture_grid(method, val_set, picture_samples(val_set, PICTURE_ROWS))
+        grid = picture_grid(method, val_set, picture_samples(val_set, PICTURE_ROWS))
     folder = config.output / PICTURES
     try:
         folder.mkdir(exist_ok=True)
-        figures.save_png(folder / f"{step:06}.png", grid)
+        save_png(folder / f"{step:06}.png", grid)
     except OSError as error:
         log.warn("pictures cannot be written", error, "training goes on")
     log.picture(step, config.val_split, grid)

@@ -10,9 +10,9 @@ import torch
 import tyro
 
 import nmr
-from learn3d.figures.drawing import Surface, draw_surface, save_gif
 from learn3d.make_data.meshes import fit_to_box, procedural_sources
-from learn3d.make_data.sheets import tile
+from learn3d.pictures.sheets import save_gif, tile
+from learn3d.pictures.surfaces import Surface, draw_surface
 
 CATEGORIES = ("airplane", "car", "chair", "lamp", "sofa", "table")
 

@@ -10,10 +10,10 @@ import torch
 import tyro
 
 import nmr
-from learn3d.figures.drawing import Surface, draw_around, save_png
 from learn3d.make_data.shapes import CATEGORIES, make_shape
-from learn3d.make_data.sheets import tile
-from learn3d.make_data.studio import photograph
+from learn3d.pictures.sheets import save_png, tile
+from learn3d.pictures.studio import photograph
+from learn3d.pictures.surfaces import Surface, draw_around
 from learn3d.reconstruction import load_model, reconstruct
 
 SIDE = 120  # of each small picture, in pixels

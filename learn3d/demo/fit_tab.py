@@ -11,10 +11,10 @@ from PIL import Image
 from torch import Tensor
 
 import nmr
-from learn3d import figures
 from learn3d.data.conventions import mesh_to_object
-from learn3d.figures import Surface
 from learn3d.make_data.shapes import make_shape
+from learn3d.pictures.sheets import stack, tile
+from learn3d.pictures.surfaces import Surface, draw_around
 
 #: Where the eye of each orthographic camera stands, and what is up there; object frame, 1 is the picture's border.
 SIDES = {"front": ((0, 0, -5), (0, 1, 0)), "side": ((5, 0, 0), (0, 1, 0)), "top": ((0, 5, 0), (0, 0, 1))}
@@ -87,10 +87,10 @@ def _small(mask: np.ndarray) -> Tensor:
 def _picture(surface: Surface, names: list[str], images: Tensor, target: Tensor, step: int) -> np.ndarray:
     palette = np.array([(255, 255, 255), _TARGET, _FITTED, _BOTH], np.uint8)
     overlays = palette[((target > 0.5) + 2 * (images > 0.5)).int().numpy()]
-    (view,) = figures.draw_around(surface, [-30.0 - 2.0 * step], image_size=2 * SIZE)
+    (view,) = draw_around(surface, [-30.0 - 2.0 * step], image_size=2 * SIZE)
     tiles = [
-        figures.tile([[picture]], [title], tile_size=2 * SIZE)
+        tile([[picture]], [title], tile_size=2 * SIZE)
         for picture, title in zip([*overlays, view], [*names, "mesh"], strict=True)
     ]
     rows = [np.concatenate(tiles[k : k + 2], axis=1) for k in range(0, len(tiles), 2)]
-    return figures.drawing.stacked(rows)
+    return stack(rows)

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from learn3d import figures
 from learn3d.data.framing import TOLERANCE, read_picture, threshold_mask
 from learn3d.demo import fit_tab, picture_tab
 from learn3d.demo.fit_tab import SIDES
 from learn3d.demo.picture_tab import Picture
-from learn3d.figures import Surface
 from learn3d.files.findings import DamagedFile
 from learn3d.make_data.shapes import CATEGORIES
+from learn3d.pictures.sheets import save_png
+from learn3d.pictures.surfaces import Surface
 from learn3d.reconstruction import Model, load_model
 from learn3d.terminal import stop_on_signal
 
@@ -219,7 +219,7 @@ def fit_page(root: Path) -> None:
         return _shown(surface, "fitted", -30, root)
 
     paper = str(root / "paper.png")  # a file: each picture that is given as an array is written anew while it is sent
-    figures.save_png(Path(paper), np.full((_CANVAS, _CANVAS, 3), 255, np.uint8))
+    save_png(Path(paper), np.full((_CANVAS, _CANVAS, 3), 255, np.uint8))
     gr.Markdown("Paint one object from two or three sides, or take an example: a sphere is then fitted to it.")
     examples = _example_buttons()
     with gr.Row():

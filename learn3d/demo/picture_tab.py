@@ -12,9 +12,9 @@ from PIL import Image
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.framing import TOLERANCE, check_mask, read_picture, threshold_mask
-from learn3d.figures import CLAY, Surface
 from learn3d.make_data.shapes import make_shape
-from learn3d.make_data.studio import photograph
+from learn3d.pictures.studio import photograph
+from learn3d.pictures.surfaces import CLAY, Surface
 from learn3d.reconstruction import Model, export_mesh, input_azimuth_deg, reconstruct
 
 SIDE = 512  # pixels of the square on which pictures lie; the networks see 64 to 224

@@ -12,20 +12,10 @@ import nmr
 from learn3d.data.conventions import view_poses
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import wrap_deg
-from learn3d.figures.drawing import (
-    Surface,
-    as_meshes,
-    azimuths_deg,
-    common_zoom,
-    draw_surface,
-    magnified,
-    natural_colors,
-    orbit,
-    to_uint8,
-)
-from learn3d.make_data.sheets import TILE, tile
 from learn3d.methods import Method
 from learn3d.methods.surfaces import grid_surface
+from learn3d.pictures.sheets import TILE, magnify, natural_colors, tile, to_uint8
+from learn3d.pictures.surfaces import Surface, azimuths_deg, common_zoom, draw_surface, orbit
 
 TURNS_DEG = (0, 60, 120, 180, 240, 300)
 GRID_COLUMNS = ("input", "target", "rendering", "same view", *(f"+{turn}°" for turn in TURNS_DEG[1:]))
@@ -42,7 +32,7 @@ def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.nd
     batch = dataset.batch(indices)
     training = method.training
     method.set_training(False)
-    shapes = as_meshes(method.decode(method.encode(batch.images)))
+    shapes = method.decode(method.encode(batch.images)).surfaces()
     method.set_training(training)
     inputs = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
     rows = []
@@ -75,17 +65,17 @@ def comparison_grid(
         raise ValueError(f"{dataset.category}, {dataset.split} has no true voxels to show")
     batch = dataset.batch(samples)
     poses = [batch.poses[torch.tensor([i])] for i in range(len(samples))]
-    shapes = {label: as_meshes(method.decode(method.encode(batch.images))) for label, method in methods}
+    shapes = {label: method.decode(method.encode(batch.images)).surfaces() for label, method in methods}
     if truth:
         grids = dataset.convention.to_object(batch.voxels.float())
-        true_shapes = [Surface(*grid_surface(grid, box=dataset.convention.box)) for grid in grids]
+        true_shapes = [grid_surface(grid, box=dataset.convention.box) for grid in grids]
         shapes = {"truth": true_shapes, **shapes}
     if len(shapes) < len(methods) + truth:
         raise ValueError(f"the methods need different labels, got {[label for label, _ in methods]}")
     cameras = [orbit(pose, TURNS_DEG) for pose in poses]
     zoom = common_zoom([pair for of_one in shapes.values() for pair in zip(of_one, cameras, strict=True)], batch.masks)
     cameras = [orbit(pose, TURNS_DEG, zoom=zoom) for pose in poses]
-    inputs = list(magnified(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom))
+    inputs = list(magnify(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom))
     drawn = {  # label -> pictures [6, S, S, 3] of each image
         label: [draw_surface(s, c, image_size=tile_size) for s, c in zip(of_one, cameras, strict=True)]
         for label, of_one in shapes.items()

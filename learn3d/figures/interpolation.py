@@ -11,19 +11,10 @@ from torch import Tensor
 
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import Poses, wrap_deg
-from learn3d.figures.drawing import (
-    Surface,
-    as_meshes,
-    azimuths_deg,
-    common_zoom,
-    draw_surface,
-    magnified,
-    natural_colors,
-    orbit,
-)
 from learn3d.figures.runs import encode
-from learn3d.make_data.sheets import TILE, tile
 from learn3d.methods import Method
+from learn3d.pictures.sheets import TILE, magnify, natural_colors, tile
+from learn3d.pictures.surfaces import Surface, azimuths_deg, common_zoom, draw_surface, orbit
 
 AZIMUTHS_DEG = (-135.0, -45.0)  # the two viewpoints, oblique for whichever axis the object faces
 
@@ -61,10 +52,10 @@ def interpolation_strip(
     the images.
     """
     batch = dataset.batch(samples)
-    shapes = as_meshes(method.decode(walk(method.encode(batch.images), steps)))
+    shapes = method.decode(walk(method.encode(batch.images), steps)).surfaces()
     pictures, zoom = _draw(shapes, batch.poses, batch.masks, azimuths, TILE)
     inputs: list[np.ndarray | None] = [None] * len(shapes)
-    inputs[::steps] = list(magnified(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom))
+    inputs[::steps] = list(magnify(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom))
     titles = [title or "input", *(f"azimuth {azimuth:g}°" for azimuth in azimuths)]
     return tile([inputs, *pictures], row_titles=titles)
 
@@ -84,7 +75,7 @@ def morph(
     uint8 [n * steps, len(azimuths), S, S, 3], S = `image_size`.
     """
     batch = dataset.batch(samples)
-    shapes = as_meshes(method.decode(walk(method.encode(batch.images), steps, closed=True)))
+    shapes = method.decode(walk(method.encode(batch.images), steps, closed=True)).surfaces()
     pictures, _ = _draw(shapes, batch.poses, batch.masks, azimuths, image_size)
     return pictures.swapaxes(0, 1)
 

@@ -13,12 +13,12 @@ from learn3d.config import load_config
 from learn3d.data.conventions import Definition
 from learn3d.evaluation import spread_samples
 from learn3d.figures import codes, curves, plots, polar
-from learn3d.figures.drawing import azimuths_deg, save_gif, save_png, stacked, with_ending
 from learn3d.figures.grids import comparison_grid, spread_views
 from learn3d.figures.interpolation import interpolation_strip, morph, typical_views
 from learn3d.figures.runs import Run, by_dataset, encode, name_runs, title_of
 from learn3d.files import writing
-from learn3d.make_data.sheets import tile
+from learn3d.pictures.sheets import save_gif, save_png, stack, tile, with_suffix
+from learn3d.pictures.surfaces import azimuths_deg
 
 IMAGES = 6  # rows of a grid of one category
 IMAGES_PER_CATEGORY = 2  # rows of each of several categories
@@ -49,8 +49,8 @@ def save_grid(
         title = dataset.category if len(groups) > 1 else ""
         methods = [(run.label, run.method) for run in group]
         blocks.append(comparison_grid(methods, dataset, samples, truth=truth, title=title, tile_size=TILE_SIZE))
-    path = with_ending(_in_folder(output), ".png")
-    save_png(path, stacked(blocks, gap=10))
+    path = with_suffix(_in_folder(output), ".png")
+    save_png(path, stack(blocks, gap=10))
     return path
 
 
@@ -84,8 +84,8 @@ def save_interpolation(
             strips.append(interpolation_strip(run.method, run.dataset, samples, steps=steps, title=titles[-1]))
             morphs.append(morph(run.method, run.dataset, samples, steps=FRAMES, image_size=MORPH_SIZE))
     frames = [tile(rows, tile_size=MORPH_SIZE, row_titles=titles) for rows in zip(*morphs, strict=True)]
-    paths = [with_ending(_in_folder(output), suffix) for suffix in (".png", ".gif")]
-    save_png(paths[0], stacked(strips, gap=10))
+    paths = [with_suffix(_in_folder(output), suffix) for suffix in (".png", ".gif")]
+    save_png(paths[0], stack(strips, gap=10))
     save_gif(paths[1], np.stack(frames))
     return paths
 
@@ -108,7 +108,7 @@ def save_curves(paths: Sequence[Path], output: Path, *, labels: Sequence[str] = 
 def save_polar(runs: Sequence[Run], output: Path, *, definition: Definition = "kato18") -> list[Path]:
     """IoU by the azimuth of the input view as PNG and SVG, and the figures in it as JSON."""
     profiles = [polar.measure(title_of(run, runs), run.method, run.dataset, definition) for run in runs]
-    path = with_ending(_in_folder(output), ".json")
+    path = with_suffix(_in_folder(output), ".json")
     writing.write_json(path, {"voxels": definition, "profiles": [p.to_json() for p in profiles]})
     return [*plots.save_figure(polar.plot_profiles(profiles), output), path]
 

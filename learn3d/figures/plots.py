@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 import numpy as np
 import skimage.color
 
-from learn3d.figures.drawing import with_ending
 from learn3d.files import writing
+from learn3d.pictures.sheets import with_suffix
 
 if TYPE_CHECKING:
     from matplotlib.colors import ListedColormap
@@ -87,6 +87,6 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 160) -> list[Path]:
     for suffix, options in ((".png", {"dpi": dpi}), (".svg", {"metadata": {"Date": None}})):
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix[1:], bbox_inches="tight", **options)
-        written.append(with_ending(path, suffix))
+        written.append(with_suffix(path, suffix))
         writing.write_bytes(written[-1], buffer.getvalue())
     return written

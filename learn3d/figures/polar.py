@@ -19,8 +19,8 @@ from learn3d.data.conventions import Definition
 from learn3d.data.dataset import ViewDataset
 from learn3d.evaluation import occupancy
 from learn3d.figures import plots
-from learn3d.figures.drawing import azimuths_deg
 from learn3d.methods import Method
+from learn3d.pictures.surfaces import azimuths_deg
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,11 +16,11 @@ from learn3d.data import conventions
 from learn3d.data.dataset import SPLITS
 from learn3d.make_data import meshes
 from learn3d.make_data.config import DatasetConfig
-from learn3d.make_data.contact_sheet import ROWS, make_row
 from learn3d.make_data.folders import check_room, publishing
 from learn3d.make_data.report import DatasetReport, report_files, write_report
-from learn3d.make_data.studio import KEY_LIGHT, photograph, studio_lights
 from learn3d.make_data.writers import WRITERS, RenderedObject, Writer
+from learn3d.pictures.contact_sheet import ROWS, make_row
+from learn3d.pictures.studio import KEY_LIGHT, photograph, studio_lights
 
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
 

@@ -13,9 +13,9 @@ from learn3d.data import conventions
 from learn3d.data.categories import synset_of
 from learn3d.files.writing import write_json
 from learn3d.make_data.config import HOW, DatasetConfig
-from learn3d.make_data.contact_sheet import LEGEND, draw_sheet
 from learn3d.make_data.writers import WRITERS, Writer
 from learn3d.make_data.writers.writer import write_png
+from learn3d.pictures.contact_sheet import LEGEND, draw_sheet
 from learn3d.terminal import plain
 
 MOST_LISTED = 100  # skipped meshes in the text of a report; its JSON lists all

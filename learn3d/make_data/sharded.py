@@ -21,11 +21,11 @@ from learn3d.distributed.tasks import Task, run_tasks
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.files.writing import write_json
 from learn3d.make_data.config import DatasetConfig
-from learn3d.make_data.contact_sheet import ROWS
 from learn3d.make_data.folders import check_room, publishing
 from learn3d.make_data.render import Item, Part, check_train, copies_of, render_meshes, split_items
 from learn3d.make_data.report import DatasetReport, report_files, settings_of, write_report
 from learn3d.make_data.writers import KatoWriter
+from learn3d.pictures.contact_sheet import ROWS
 from learn3d.terminal import INTERRUPTED, note, say, stop_on_signal
 
 OBJECTS_PER_SHARD = 512  # 201 MB of images

@@ -10,6 +10,8 @@ import torch.nn.functional as F
 from skimage.measure import marching_cubes
 from torch import Tensor
 
+from learn3d.pictures.surfaces import Surface
+
 
 @dataclass(frozen=True, eq=False)
 class Meshes:
@@ -19,6 +21,11 @@ class Meshes:
     faces: Tensor  # int64 [F, 3]
     colors: Tensor | None = None  # float32 [B, V, 3] in [0, 1]: R, G, B of each vertex; None: no colours are predicted
 
+    def surfaces(self) -> list[Surface]:
+        """The shapes one by one."""
+        colors = [None] * len(self.vertices) if self.colors is None else self.colors
+        return [Surface(vertices, self.faces, color) for vertices, color in zip(self.vertices, colors, strict=True)]
+
 
 @dataclass(frozen=True, eq=False)
 class Grids:
@@ -26,6 +33,10 @@ class Grids:
 
     occupancy: Tensor  # float32 [B, s, s, s] in [0, 1]; axes (x, y, z) of the object frame over the box [-0.5, 0.5]
     threshold: float = 0.5  # occupied above it
+
+    def surfaces(self) -> list[Surface]:
+        """The shapes one by one as triangles, by marching cubes at the threshold."""
+        return [grid_surface(grid, level=self.threshold) for grid in self.occupancy]
 
     def occupied(self, size: int) -> Tensor:
         """Bool [B, size, size, size]: where the mean over the cell is above the threshold; s is a multiple of size."""
@@ -35,17 +46,17 @@ class Grids:
         return F.avg_pool3d(self.occupancy[:, None], factor)[:, 0] > self.threshold
 
 
-def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> tuple[Tensor, Tensor]:
+def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> Surface:
     """Marching cubes: the surface of a grid [s, s, s] with axes (x, y, z) over the cube [-box/2, box/2].
 
-    Returns vertices float32 [V, 3] in the object frame and faces int64 [F, 3]; both empty where no cell is above
-    `level`. Cells at the border are closed. The faces are wound as `nmr.icosphere`'s (normals outwards by the
-    right-hand rule in these axes).
+    The surface is empty if no cell is above `level`. Cells at the border are closed. The faces are wound as
+    `nmr.icosphere`'s (normals outwards by the right-hand rule in these axes).
     """
     size = grid.shape[-1]
     padded = np.pad(grid.detach().cpu().float().numpy(), 1)
     if not padded.max() > level:
-        return torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int64)
+        return Surface(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int64))
     vertices, faces, _, _ = marching_cubes(padded, level, gradient_direction="ascent")
     centred = (vertices - 0.5) / size - 0.5  # cell i of the padded grid has its centre at (i - 1 + 1/2) / size
-    return torch.from_numpy((centred * box).astype(np.float32)), torch.from_numpy(faces.astype(np.int64))
+    points = torch.from_numpy((centred * box).astype(np.float32))
+    return Surface(points, torch.from_numpy(faces.astype(np.int64)))

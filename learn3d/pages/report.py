@@ -20,13 +20,13 @@ from learn3d.evaluation import Evaluation, evaluate
 from learn3d.experiments.measurement import MEASURES
 from learn3d.experiments.plan import command_line
 from learn3d.experiments.statistics import Interval, percentile_interval, resampled_means
-from learn3d.figures import azimuths_deg
 from learn3d.figures.curves import TITLES, Curve, Key, panels, read_metrics
 from learn3d.figures.plots import COLORS
 from learn3d.figures.polar import profile
 from learn3d.figures.runs import Run, open_runs
 from learn3d.files import writing
 from learn3d.pages.shapes import Faces, pack_shapes
+from learn3d.pictures.surfaces import azimuths_deg
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.runs.checkpoint import Metadata

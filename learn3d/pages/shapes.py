@@ -13,9 +13,9 @@ from PIL import Image
 
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.poses import LookAtPoses, Poses
-from learn3d.figures import Surface, as_meshes, natural_colors
 from learn3d.figures.runs import Run
 from learn3d.methods.surfaces import grid_surface
+from learn3d.pictures.sheets import natural_colors
 from learn3d.terminal import plain
 
 UNIT = 1e-4  # of stored coordinates, which are int16: they reach to 3.3, objects to 1
@@ -34,10 +34,10 @@ def pack_shapes(runs: Sequence[Run], samples: Sequence[int], faces: Faces) -> li
     largest = max((run.dataset for run in runs), key=lambda dataset: dataset.image_size)
     batch = largest.batch(torch.tensor(samples))
     images = [run.dataset.batch(torch.tensor(samples)).images for run in runs]
-    shapes = [as_meshes(run.method.decode(run.method.encode(own))) for run, own in zip(runs, images, strict=True)]
+    shapes = [run.method.decode(run.method.encode(own)).surfaces() for run, own in zip(runs, images, strict=True)]
     if batch.voxels is not None:
         grids = largest.convention.to_object(batch.voxels).float()
-        shapes.append([Surface(*grid_surface(grid, box=largest.convention.box)) for grid in grids])
+        shapes.append([grid_surface(grid, box=largest.convention.box) for grid in grids])
     pictures = natural_colors(batch.images.numpy(), inverted=largest.inverted)
     eyes = _eyes(batch.poses, len(samples))
     items = []

@@ -23,7 +23,7 @@ FLOORS = (
     {"presets"},
     {"methods"},
     {"networks", "losses"},
-    {"distributed"},
+    {"distributed", "pictures"},
     {"data"},
     {"device", "settings", "terminal"},
     {"files"},

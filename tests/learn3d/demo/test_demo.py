@@ -15,7 +15,7 @@ from PIL import Image
 import nmr
 from learn3d.data.framing import threshold_mask
 from learn3d.demo import fit_tab, picture_tab
-from learn3d.figures import Surface
+from learn3d.pictures.surfaces import Surface
 from learn3d.reconstruction import input_azimuth_deg, load_model
 from learn3d.runs import export as exporting
 from learn3d.runs.export import export

@@ -12,9 +12,23 @@ import torch
 from PIL import Image
 
 import nmr
-from learn3d import figures
 from learn3d.data.poses import LookAtPoses, RotationPoses
+from learn3d.figures.grids import picture_grid
 from learn3d.methods import DatasetInfo, Grids, Meshes, Method, create_method
+from learn3d.pictures.sheets import (
+    HEADER,
+    MARGIN,
+    TILE,
+    magnify,
+    natural_colors,
+    save_gif,
+    save_png,
+    stack,
+    tile,
+    to_uint8,
+    with_suffix,
+)
+from learn3d.pictures.surfaces import Surface, azimuths_deg, common_zoom, draw_surface, orbit, turntable
 from learn3d.presets import PRESETS
 
 
@@ -33,32 +47,32 @@ def egg() -> tuple[torch.Tensor, torch.Tensor]:
 def test_natural_colors_undo_the_inversion() -> None:
     stored = np.zeros((2, 4, 3, 5), np.uint8)  # background: black, no alpha
     stored[1, 0, 2, 4] = 255  # red stored at full strength is cyan
-    colors = figures.natural_colors(stored)
+    colors = natural_colors(stored)
     assert colors.shape == (2, 3, 5, 3)
     assert (colors[0] == 255).all()
     assert colors[1, 2, 4].tolist() == [0, 255, 255]
-    assert figures.natural_colors(stored, inverted=False)[1, 2, 4].tolist() == [255, 0, 0]
+    assert natural_colors(stored, inverted=False)[1, 2, 4].tolist() == [255, 0, 0]
 
 
 def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set) -> None:
     method = create_vanilla()
-    grid = figures.picture_grid(method, tiny_set, torch.tensor([3, 30]))
-    step = figures.TILE + figures.MARGIN
-    assert grid.shape == (figures.HEADER + 2 * step + figures.MARGIN, 9 * step + figures.MARGIN, 3)
+    grid = picture_grid(method, tiny_set, torch.tensor([3, 30]))
+    step = TILE + MARGIN
+    assert grid.shape == (HEADER + 2 * step + MARGIN, 9 * step + MARGIN, 3)
     assert grid.dtype == np.uint8
 
     def cell(row: int, column: int) -> np.ndarray:
-        y, x = figures.HEADER + figures.MARGIN + row * step, figures.MARGIN + column * step
-        return grid[y : y + figures.TILE, x : x + figures.TILE]
+        y, x = HEADER + MARGIN + row * step, MARGIN + column * step
+        return grid[y : y + TILE, x : x + TILE]
 
     def resized(picture: np.ndarray) -> np.ndarray:
-        return np.asarray(Image.fromarray(picture).resize((figures.TILE,) * 2, Image.Resampling.BICUBIC))
+        return np.asarray(Image.fromarray(picture).resize((TILE,) * 2, Image.Resampling.BICUBIC))
 
-    unknown = figures.picture_grid(method, dataclasses.replace(tiny_set, poses=None), torch.tensor([3, 30]))
+    unknown = picture_grid(method, dataclasses.replace(tiny_set, poses=None), torch.tensor([3, 30]))
     assert unknown.shape == grid.shape, "drawn from view 0"
     batch = tiny_set.batch(torch.tensor([3, 30]))
-    assert np.array_equal(cell(1, 0), resized(figures.natural_colors(batch.images[1].numpy())))
-    assert np.array_equal(cell(1, 1), resized(figures.to_uint8(batch.masks[1])))
+    assert np.array_equal(cell(1, 0), resized(natural_colors(batch.images[1].numpy())))
+    assert np.array_equal(cell(1, 1), resized(to_uint8(batch.masks[1])))
     rendered = cell(0, 2)[..., 0] > 127
     assert 0.3 < rendered.mean() < 0.45  # the untrained sphere covers a disk of radius 0.34 of the side
     for column in range(3, 9):
@@ -72,10 +86,10 @@ def test_shaded_views_agree_with_the_renderings_at_the_poses(egg, kind) -> None:
     if kind == "rotation":  # the same cameras without perspective, the last one rolled by 25 degrees
         poses = RotationPoses(torch.stack([rotation(-75, 30), rotation(-40, 30), rotation(100, -10, roll_deg=25)]))
     silhouettes = nmr.render_silhouette(vertices[None].expand(3, -1, -1), faces, poses.cameras(), image_size=256) > 0.5
-    first = figures.orbit(poses[torch.tensor([0])], [0, 35, -35])  # the second pose is 35 degrees on
-    last = figures.orbit(poses[torch.tensor([2])], [0])
-    surface = figures.Surface(vertices, faces)
-    shaded = [(figures.draw_surface(surface, c, image_size=256) < 205).any(axis=3) for c in (first, last)]
+    first = orbit(poses[torch.tensor([0])], [0, 35, -35])  # the second pose is 35 degrees on
+    last = orbit(poses[torch.tensor([2])], [0])
+    surface = Surface(vertices, faces)
+    shaded = [(draw_surface(surface, c, image_size=256) < 205).any(axis=3) for c in (first, last)]
 
     def overlap(a: np.ndarray, b: torch.Tensor) -> float:
         return float((a & b.numpy()).sum() / (a | b.numpy()).sum())
@@ -100,18 +114,18 @@ def test_azimuths_are_read_from_poses_of_either_kind() -> None:
     look_at = LookAtPoses(torch.tensor([-75.0, 190.0]), 30.0, 2.732, 15.0)
     rotations = RotationPoses(torch.stack([rotation(-75, 30), rotation(190, -20, roll_deg=40)]))
     for poses in (look_at, rotations):
-        assert figures.azimuths_deg(poses).tolist() == pytest.approx([-75, -170], abs=1e-4)
+        assert azimuths_deg(poses).tolist() == pytest.approx([-75, -170], abs=1e-4)
 
 
 def test_an_orbit_needs_one_pose() -> None:
     with pytest.raises(ValueError, match="one camera, got 2 poses"):
-        figures.orbit(LookAtPoses(torch.zeros(2), 30.0, 2.732, 15.0), [0])
+        orbit(LookAtPoses(torch.zeros(2), 30.0, 2.732, 15.0), [0])
 
 
 def test_the_light_goes_with_the_camera() -> None:
-    sphere = figures.Surface(*nmr.icosphere(4))
-    cameras = figures.orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 25.0), [0, 60, 180, 300])
-    pictures = figures.draw_surface(sphere, cameras, image_size=32).astype(int)
+    sphere = Surface(*nmr.icosphere(4))
+    cameras = orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 25.0), [0, 60, 180, 300])
+    pictures = draw_surface(sphere, cameras, image_size=32).astype(int)
     brightness = [picture[10:22, 10:22].mean() for picture in pictures]
     assert max(brightness) - min(brightness) < 4
     assert pictures[0][10:16].mean() > pictures[0][16:22].mean() + 8  # and it comes from above
@@ -120,81 +134,79 @@ def test_the_light_goes_with_the_camera() -> None:
 def test_shapes_are_drawn_in_their_colours() -> None:
     vertices, faces = nmr.icosphere(3)
     red = torch.tensor([1.0, 0.0, 0.0]).expand_as(vertices)
-    cameras = figures.orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 25.0), [0])
-    (surface,) = figures.as_meshes(Meshes(vertices[None], faces, red[None]))
-    middle = figures.draw_surface(surface, cameras, image_size=32)[0, 16, 16]
+    cameras = orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 25.0), [0])
+    (surface,) = Meshes(vertices[None], faces, red[None]).surfaces()
+    middle = draw_surface(surface, cameras, image_size=32)[0, 16, 16]
     assert middle[0] > 120 and middle[1:].max() < 10
 
 
 def test_grids_are_drawn_where_their_cells_are() -> None:
     occupancy = torch.zeros(2, 16, 16, 16)
     occupancy[0, 2:6, 8:14, 15:] = 1.0  # touches the far end of z
-    full, empty = figures.as_meshes(Grids(occupancy))
+    full, empty = Grids(occupancy).surfaces()
     low, high = full.vertices.amin(dim=0), full.vertices.amax(dim=0)
     half = 0.5 / 16  # the surface runs half way between the centres of neighbouring cells: through their border
     assert low.tolist() == pytest.approx([2 / 16 - 0.5, 8 / 16 - 0.5, 15 / 16 - 0.5], abs=half / 8)
     assert high.tolist() == pytest.approx([6 / 16 - 0.5, 14 / 16 - 0.5, 0.5], abs=half / 8)
     assert len(empty.faces) == 0
-    cameras = figures.orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 15.0), [0, 90])
-    pictures = figures.draw_surface(empty, cameras, image_size=8)
+    cameras = orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 15.0), [0, 90])
+    pictures = draw_surface(empty, cameras, image_size=8)
     assert pictures.shape == (2, 8, 8, 3)
     assert (pictures == 255).all()
-    assert (figures.draw_surface(full, cameras, image_size=32) < 250).any()
+    assert (draw_surface(full, cameras, image_size=32) < 250).any()
 
 
 def test_common_zoom_fills_the_picture_with_the_largest_shape_or_mask(egg) -> None:
     pose, turns = LookAtPoses(torch.zeros(1), 0.0, 2.732, 15.0), [0, 90]
-    surface, small = figures.Surface(*egg), figures.Surface(egg[0] * 0.3, egg[1])
-    cameras, no_masks = figures.orbit(pose, turns), torch.zeros(1, 64, 64)
-    zoom = figures.common_zoom([(surface, cameras), (small, cameras)], no_masks)
-    picture = figures.draw_surface(surface, figures.orbit(pose, turns, zoom=zoom), image_size=100)[0]
+    surface, small = Surface(*egg), Surface(egg[0] * 0.3, egg[1])
+    cameras, no_masks = orbit(pose, turns), torch.zeros(1, 64, 64)
+    zoom = common_zoom([(surface, cameras), (small, cameras)], no_masks)
+    picture = draw_surface(surface, orbit(pose, turns, zoom=zoom), image_size=100)[0]
     columns = np.flatnonzero((picture < 250).any(axis=(0, 2)))
     assert 1 <= columns[0] <= 4  # 5 % of the half side are left free
     assert columns[-1] == 99 - columns[0]
     masks = no_masks.clone()
     masks[0, 16:48, 20:56] = 1.0  # reaches 24 / 32 of the half side
-    assert figures.common_zoom([(small, cameras)], masks) == pytest.approx(0.95 / (23.5 / 32), rel=1e-6)
-    assert figures.common_zoom([(small, cameras)], torch.ones(1, 64, 64)) == 1.0
+    assert common_zoom([(small, cameras)], masks) == pytest.approx(0.95 / (23.5 / 32), rel=1e-6)
+    assert common_zoom([(small, cameras)], torch.ones(1, 64, 64)) == 1.0
 
 
 def test_magnified_keeps_the_middle() -> None:
     pictures = np.zeros((1, 40, 40, 3), np.uint8)
     pictures[:, 10:30, 10:30] = 255
-    assert figures.drawing.magnified(pictures, 2.0).shape == (1, 20, 20, 3)
-    assert (figures.drawing.magnified(pictures, 2.0) == 255).all()
-    assert np.array_equal(figures.drawing.magnified(pictures, 1.0), pictures)
+    assert magnify(pictures, 2.0).shape == (1, 20, 20, 3)
+    assert (magnify(pictures, 2.0) == 255).all()
+    assert np.array_equal(magnify(pictures, 1.0), pictures)
 
 
 def test_a_sheet_has_titles_free_places_and_rules() -> None:
     black = np.zeros((8, 8, 3), np.uint8)
-    plain = figures.tile([[black, None], [black, black]], tile_size=20)
-    step = 20 + figures.MARGIN
-    assert plain.shape == (2 * step + figures.MARGIN, 2 * step + figures.MARGIN, 3)
-    assert plain[figures.MARGIN + 5, figures.MARGIN + 5].tolist() == [0, 0, 0]
-    assert (plain[: step - 1, step + figures.MARGIN :] == 255).all()  # the free place
-    titled = figures.tile(
-        [[black, None], [black, black]], ["a", "b"], tile_size=20, row_titles=["one", "two"], rules=[1]
-    )
+    plain = tile([[black, None], [black, black]], tile_size=20)
+    step = 20 + MARGIN
+    assert plain.shape == (2 * step + MARGIN, 2 * step + MARGIN, 3)
+    assert plain[MARGIN + 5, MARGIN + 5].tolist() == [0, 0, 0]
+    assert (plain[: step - 1, step + MARGIN :] == 255).all()  # the free place
+    titled = tile([[black, None], [black, black]], ["a", "b"], tile_size=20, row_titles=["one", "two"], rules=[1])
     left = titled.shape[1] - plain.shape[1]
-    assert left > 10 and titled.shape[0] == plain.shape[0] + figures.HEADER
-    assert (titled[: figures.HEADER] < 128).any() and (titled[figures.HEADER :, :left] < 128).any()
-    rule = titled[figures.HEADER + step + figures.MARGIN // 2]
+    assert left > 10 and titled.shape[0] == plain.shape[0] + HEADER
+    assert (titled[:HEADER] < 128).any() and (titled[HEADER:, :left] < 128).any()
+    rule = titled[HEADER + step + MARGIN // 2]
     assert len(np.unique(rule, axis=0)) == 1 and rule[0, 0] not in (0, 255)
 
 
 def test_pictures_are_put_below_each_other() -> None:
     low, high = np.zeros((10, 30, 3), np.uint8), np.zeros((20, 40, 3), np.uint8)
-    both = figures.drawing.stacked([low, high], gap=4)
+    both = stack([low, high], gap=4)
     assert both.shape == (34, 40, 3) and (both[10:14] == 255).all() and (both[14:] == 0).all()
 
 
 def test_endings_are_replaced_only_where_they_are_those_of_pictures() -> None:
-    assert figures.drawing.with_ending(Path("a/b.png"), ".svg") == Path("a/b.svg")
-    assert figures.drawing.with_ending(Path("a/lambda-0.5"), ".svg") == Path("a/lambda-0.5.svg")
+    assert with_suffix(Path("a/b.png"), ".svg") == Path("a/b.svg")
+    assert with_suffix(Path("a/lambda-0.5"), ".svg") == Path("a/lambda-0.5.svg")
 
 
 def test_turntable_turns(egg) -> None:
-    frames = figures.turntable(figures.Surface(*egg), frames=4, image_size=48)
+    frames = turntable(Surface(*egg), frames=4, image_size=48)
     assert frames.shape == (4, 48, 48, 3)
     widths = [(frame < 250).any(axis=(0, 2)).sum() for frame in frames]
     assert widths[0] > 1.5 * widths[1]
@@ -205,10 +217,10 @@ def test_turntable_turns(egg) -> None:
 
 
 def test_png_and_gif_can_be_read_back(tmp_path, egg) -> None:
-    frames = figures.turntable(figures.Surface(*egg), frames=3, image_size=32)
-    figures.save_png(tmp_path / "a.png", frames[0])
+    frames = turntable(Surface(*egg), frames=3, image_size=32)
+    save_png(tmp_path / "a.png", frames[0])
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), frames[0])
-    figures.save_gif(tmp_path / "a.gif", frames, frames_per_second=10)
+    save_gif(tmp_path / "a.gif", frames, frames_per_second=10)
     with Image.open(tmp_path / "a.gif") as image:
         assert (image.n_frames, image.size, image.info["duration"], image.info["loop"]) == (3, (32, 32), 100, 0)
         first = np.asarray(image.convert("RGB")).astype(int)

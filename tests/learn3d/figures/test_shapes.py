@@ -11,16 +11,18 @@ from PIL import Image
 from torch import Tensor
 
 import nmr
-from learn3d import figures
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.evaluation import evaluate
 from learn3d.figures import interpolation, paper, polar
-from learn3d.figures.grids import spread_views
+from learn3d.figures.grids import comparison_grid, spread_views
+from learn3d.figures.interpolation import interpolation_strip, morph
 from learn3d.figures.runs import Run, encode
 from learn3d.methods import Grids, Meshes, Method
+from learn3d.pictures.sheets import HEADER, MARGIN, TILE, magnify, natural_colors
+from learn3d.pictures.surfaces import Surface, azimuths_deg, common_zoom, draw_surface, orbit
 
-STEP = figures.TILE + figures.MARGIN
+STEP = TILE + MARGIN
 SPHERE, FACES = nmr.icosphere(2)
 
 
@@ -59,41 +61,41 @@ class GridEllipsoids(Ellipsoids):
         return Grids(torch.sigmoid(20 * (1 - (points / codes[:, None, None, None]).norm(dim=-1))))
 
 
-def shapes(method: Method, dataset: ViewDataset, samples: Tensor) -> list[figures.Surface]:
-    return figures.as_meshes(method.decode(method.encode(dataset.batch(samples).images)))
+def shapes(method: Method, dataset: ViewDataset, samples: Tensor) -> list[Surface]:
+    return method.decode(method.encode(dataset.batch(samples).images)).surfaces()
 
 
 def cell(grid: np.ndarray, row: int, column: int, *, top: int, left: int = 0) -> np.ndarray:
-    y, x = top + figures.MARGIN + row * STEP, left + figures.MARGIN + column * STEP
-    return grid[y : y + figures.TILE, x : x + figures.TILE]
+    y, x = top + MARGIN + row * STEP, left + MARGIN + column * STEP
+    return grid[y : y + TILE, x : x + TILE]
 
 
 def test_methods_are_drawn_from_the_same_views(tiny_set) -> None:
     samples, methods = torch.tensor([3, 40]), [("large", Ellipsoids()), ("small", GridEllipsoids(0.5))]
-    grid = figures.comparison_grid(methods, tiny_set, samples)
-    top, left = figures.HEADER, grid.shape[1] - 7 * STEP - figures.MARGIN
+    grid = comparison_grid(methods, tiny_set, samples)
+    top, left = HEADER, grid.shape[1] - 7 * STEP - MARGIN
     poses = [tiny_set.poses[samples[i : i + 1]] for i in (0, 1)]
-    cameras = [figures.orbit(pose, [0, 60, 120, 180, 240, 300]) for pose in poses]
+    cameras = [orbit(pose, [0, 60, 120, 180, 240, 300]) for pose in poses]
     drawn = [pair for _, method in methods for pair in zip(shapes(method, tiny_set, samples), cameras, strict=True)]
-    zoom = figures.common_zoom(drawn, tiny_set.batch(samples).masks)
+    zoom = common_zoom(drawn, tiny_set.batch(samples).masks)
     assert zoom > 1
     for k, (_, method) in enumerate(methods):
         surface = shapes(method, tiny_set, samples)[1]
-        views = figures.draw_surface(surface, figures.orbit(poses[1], [0, 300], zoom=zoom), image_size=figures.TILE)
+        views = draw_surface(surface, orbit(poses[1], [0, 300], zoom=zoom), image_size=TILE)
         assert np.array_equal(cell(grid, 2 + k, 1, top=top, left=left), views[0])
         assert np.array_equal(cell(grid, 2 + k, 6, top=top, left=left), views[1])
-    picture = figures.drawing.magnified(figures.natural_colors(tiny_set.images[samples.numpy()]), zoom)[0]
-    resized = np.asarray(Image.fromarray(picture).resize((figures.TILE,) * 2, Image.Resampling.BICUBIC))
+    picture = magnify(natural_colors(tiny_set.images[samples.numpy()]), zoom)[0]
+    resized = np.asarray(Image.fromarray(picture).resize((TILE,) * 2, Image.Resampling.BICUBIC))
     assert np.array_equal(cell(grid, 0, 0, top=top, left=left), resized)
 
 
 def test_methods_stand_below_each_other(tiny_set) -> None:
     methods = [("large", Ellipsoids()), ("small", Ellipsoids(0.4)), ("nothing", Ellipsoids(0.0))]
-    grid = figures.comparison_grid(methods, tiny_set, torch.tensor([3, 40]))
-    left = grid.shape[1] - 7 * STEP - figures.MARGIN
-    assert grid.shape[0] == figures.HEADER + 6 * STEP + figures.MARGIN
+    grid = comparison_grid(methods, tiny_set, torch.tensor([3, 40]))
+    left = grid.shape[1] - 7 * STEP - MARGIN
+    assert grid.shape[0] == HEADER + 6 * STEP + MARGIN
     assert 30 < left < 120  # the labels
-    cells = [[cell(grid, row, column, top=figures.HEADER, left=left) for column in range(7)] for row in range(6)]
+    cells = [[cell(grid, row, column, top=HEADER, left=left) for column in range(7)] for row in range(6)]
     ink = (np.array(cells) < 250).mean(axis=(2, 3, 4))
     assert (ink[[0, 3], 0] > 0.05).all() and (ink[[1, 2, 4, 5], 0] == 0).all()  # the input: in the first row alone
     assert (ink[[0, 3], 1:] > 3 * ink[[1, 4], 1:]).all()
@@ -102,39 +104,39 @@ def test_methods_stand_below_each_other(tiny_set) -> None:
 
 
 def test_the_truth_is_shown_as_it_was_seen(tiny_set) -> None:
-    grid = figures.comparison_grid([("a", Ellipsoids())], tiny_set, torch.tensor([3, 30]), truth=True)
+    grid = comparison_grid([("a", Ellipsoids())], tiny_set, torch.tensor([3, 30]), truth=True)
     voxels = tiny_set.convention.to_object(torch.from_numpy(tiny_set.voxels[[0, 1]]).float())
-    pose, true = tiny_set.poses[torch.tensor([30])], figures.as_meshes(Grids(voxels))
-    cameras = [figures.orbit(tiny_set.poses[torch.tensor([i])], [0, 60, 120, 180, 240, 300]) for i in (3, 30)]
+    pose, true = tiny_set.poses[torch.tensor([30])], Grids(voxels).surfaces()
+    cameras = [orbit(tiny_set.poses[torch.tensor([i])], [0, 60, 120, 180, 240, 300]) for i in (3, 30)]
     own = shapes(Ellipsoids(), tiny_set, torch.tensor([3, 30]))
     masks = tiny_set.batch(torch.tensor([3, 30])).masks
-    zoom = figures.common_zoom([*zip(true, cameras, strict=True), *zip(own, cameras, strict=True)], masks)
-    views = figures.draw_surface(true[1], figures.orbit(pose, [0, 60], zoom=zoom), image_size=figures.TILE)
-    left = grid.shape[1] - 7 * STEP - figures.MARGIN
+    zoom = common_zoom([*zip(true, cameras, strict=True), *zip(own, cameras, strict=True)], masks)
+    views = draw_surface(true[1], orbit(pose, [0, 60], zoom=zoom), image_size=TILE)
+    left = grid.shape[1] - 7 * STEP - MARGIN
     for column in (0, 1):
-        assert np.array_equal(cell(grid, 2, 1 + column, top=figures.HEADER, left=left), views[column])
-    three = figures.comparison_grid([("a", Ellipsoids()), ("b", Ellipsoids())], tiny_set, torch.tensor([3]), truth=True)
-    assert three.shape[0] == figures.HEADER + 3 * STEP + figures.MARGIN
+        assert np.array_equal(cell(grid, 2, 1 + column, top=HEADER, left=left), views[column])
+    three = comparison_grid([("a", Ellipsoids()), ("b", Ellipsoids())], tiny_set, torch.tensor([3]), truth=True)
+    assert three.shape[0] == HEADER + 3 * STEP + MARGIN
     with pytest.raises(ValueError, match="different labels"):
-        figures.comparison_grid([("truth", Ellipsoids())], tiny_set, torch.tensor([3]), truth=True)
+        comparison_grid([("truth", Ellipsoids())], tiny_set, torch.tensor([3]), truth=True)
     with pytest.raises(ValueError, match="airplane, test has no true voxels to show"):
-        figures.comparison_grid(
+        comparison_grid(
             [("a", Ellipsoids())], dataclasses.replace(tiny_set, voxels=None), torch.tensor([3]), truth=True
         )
 
 
 def test_comparisons_need_methods_of_different_names(tiny_set) -> None:
     with pytest.raises(ValueError, match="at least one method"):
-        figures.comparison_grid([], tiny_set, torch.tensor([0]))
+        comparison_grid([], tiny_set, torch.tensor([0]))
     with pytest.raises(ValueError, match=r"different labels, got \['a', 'a'\]"):
-        figures.comparison_grid([("a", Ellipsoids()), ("a", Ellipsoids())], tiny_set, torch.tensor([0]))
+        comparison_grid([("a", Ellipsoids()), ("a", Ellipsoids())], tiny_set, torch.tensor([0]))
 
 
 def test_images_for_figures_are_spread_over_objects_and_views(tiny_set) -> None:
     samples = spread_views(tiny_set, 6)
     assert len(set(samples.tolist())) == 6
     assert np.bincount(tiny_set.object_ids[samples.numpy()]).tolist() == [2, 2, 2]
-    azimuths = np.sort(figures.azimuths_deg(tiny_set.poses[samples]).numpy() % 360)
+    azimuths = np.sort(azimuths_deg(tiny_set.poses[samples]).numpy() % 360)
     assert np.diff(np.append(azimuths, azimuths[0] + 360)).min() >= 15
     assert torch.equal(samples[:3], spread_views(tiny_set, 3))
     assert sorted(spread_views(tiny_set, 72).tolist()) == list(range(72))
@@ -164,16 +166,16 @@ def test_a_walk_goes_through_every_code_in_equal_steps() -> None:
 @pytest.mark.parametrize("method", [Ellipsoids(), GridEllipsoids()])
 def test_a_strip_starts_and_ends_with_the_reconstructions(tiny_set, method) -> None:
     samples, azimuths = torch.tensor([3, 30, 60]), (-20.0, 70.0)
-    strip = figures.interpolation_strip(method, tiny_set, samples, steps=2, azimuths=azimuths)
-    left = strip.shape[1] - 5 * STEP - figures.MARGIN
-    assert strip.shape[0] == 3 * STEP + figures.MARGIN
-    way = figures.as_meshes(method.decode(interpolation.walk(encode(method, tiny_set, samples), 2)))
+    strip = interpolation_strip(method, tiny_set, samples, steps=2, azimuths=azimuths)
+    left = strip.shape[1] - 5 * STEP - MARGIN
+    assert strip.shape[0] == 3 * STEP + MARGIN
+    way = method.decode(interpolation.walk(encode(method, tiny_set, samples), 2)).surfaces()
     pose = LookAtPoses(torch.zeros(1), 30.0, 2.732, 15.0)
-    cameras = figures.orbit(pose, azimuths)
-    zoom = figures.common_zoom([(surface, cameras) for surface in way], tiny_set.batch(samples).masks)
+    cameras = orbit(pose, azimuths)
+    zoom = common_zoom([(surface, cameras) for surface in way], tiny_set.batch(samples).masks)
     ends = shapes(method, tiny_set, samples)
     for column, end in zip((0, 2, 4), ends, strict=True):
-        views = figures.draw_surface(end, figures.orbit(pose, azimuths, zoom=zoom), image_size=figures.TILE)
+        views = draw_surface(end, orbit(pose, azimuths, zoom=zoom), image_size=TILE)
         for row in (0, 1):
             seen = cell(strip, 1 + row, column, top=0, left=left).astype(int)
             assert np.abs(seen - views[row]).mean() < 0.1
@@ -183,19 +185,19 @@ def test_a_strip_starts_and_ends_with_the_reconstructions(tiny_set, method) -> N
 
 def test_a_morph_is_an_endless_loop_through_the_images(tiny_set) -> None:
     samples, method = torch.tensor([3, 30, 60]), Ellipsoids()
-    frames = figures.morph(method, tiny_set, samples, steps=3, azimuths=(0.0, 90.0), image_size=40)
+    frames = morph(method, tiny_set, samples, steps=3, azimuths=(0.0, 90.0), image_size=40)
     assert frames.shape == (9, 2, 40, 40, 3)
-    again = figures.morph(method, tiny_set, samples[[1, 2, 0]], steps=3, azimuths=(0.0, 90.0), image_size=40)
+    again = morph(method, tiny_set, samples[[1, 2, 0]], steps=3, azimuths=(0.0, 90.0), image_size=40)
     assert np.array_equal(np.roll(frames, -3, axis=0), again)
     assert not np.array_equal(frames[0], frames[3])
     with pytest.raises(ValueError, match="at least one azimuth"):
-        figures.morph(method, tiny_set, samples, azimuths=())
+        morph(method, tiny_set, samples, azimuths=())
 
 
 def test_images_of_an_interpolation_are_of_different_objects_seen_alike(tiny_set) -> None:
     samples = interpolation.typical_views(Ellipsoids(), tiny_set, 3, azimuth_deg=-40.0)
     assert sorted(tiny_set.object_ids[samples.numpy()].tolist()) == [0, 1, 2]
-    assert figures.azimuths_deg(tiny_set.poses[samples]).tolist() == pytest.approx([-45.0] * 3)
+    assert azimuths_deg(tiny_set.poses[samples]).tolist() == pytest.approx([-45.0] * 3)
     with pytest.raises(ValueError, match="takes 2 to 3 images here"):
         interpolation.typical_views(Ellipsoids(), tiny_set, 4)
 

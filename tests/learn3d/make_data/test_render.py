@@ -20,10 +20,10 @@ from learn3d.data import conventions
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.readers import kato
 from learn3d.make_data import meshes, render
-from learn3d.make_data.contact_sheet import draw_sheet, make_row
 from learn3d.make_data.render import DatasetConfig, make_dataset, split_objects
 from learn3d.make_data.report import missing_split_warnings
 from learn3d.make_data.writers import WRITERS
+from learn3d.pictures.contact_sheet import draw_sheet, make_row
 
 
 @pytest.fixture

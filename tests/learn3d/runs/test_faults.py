@@ -22,7 +22,7 @@ import pytest
 import torch
 from runs import check_same
 
-from learn3d import figures, training
+from learn3d import training, validation
 from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.runs import checkpoint, log
 from learn3d.runs import folder as run_folder
@@ -146,9 +146,9 @@ def test_metrics_and_pictures_wait_for_room_and_never_stop_a_run(
 ) -> None:
     from tensorboard.summary.writer.record_writer import RecordWriter
 
-    disk, save_png, write = Disk(), figures.save_png, RecordWriter.write
+    disk, save_png, write = Disk(), validation.save_png, RecordWriter.write
     monkeypatch.setattr(log, "open", disk.open, raising=False)
-    monkeypatch.setattr(figures, "save_png", lambda *a: full() if disk.full else save_png(*a))
+    monkeypatch.setattr(validation, "save_png", lambda *a: full() if disk.full else save_png(*a))
     monkeypatch.setattr(RecordWriter, "write", lambda *a: full() if disk.full else write(*a))
     monkeypatch.setattr("threading.excepthook", lambda arguments: None)  # TensorBoard's thread tells as well
 

@@ -1,25 +1,19 @@
-"""Drawing shapes and putting pictures together and into files; nothing here knows a method or a data set."""
+"""Pictures of shapes: cameras around them, and how they are drawn."""
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 import nmr
 from learn3d.data.conventions import DISTANCE
 from learn3d.data.poses import LookAtPoses, Poses
-from learn3d.files import writing
-from learn3d.make_data.studio import photograph, studio_lights
-from learn3d.methods import Grids, Meshes
-from learn3d.methods.surfaces import grid_surface
+from learn3d.pictures.studio import photograph, studio_lights
 
 CLAY = (0.62, 0.68, 0.78)
 _LIGHT = (-0.5, 0.45, -0.75)  # towards the light: left of, above and behind the camera, in its own axes
@@ -32,14 +26,6 @@ class Surface(NamedTuple):
     vertices: Tensor  # float32 [V, 3], object frame
     faces: Tensor  # int64 [F, 3]; F = 0 is an empty shape, of which nothing is drawn
     colors: Tensor | None = None  # float32 [V, 3] in [0, 1], R, G, B of each vertex; None: clay
-
-
-def as_meshes(shapes: Meshes | Grids) -> list[Surface]:
-    """The predicted shapes one by one as triangles; grids by marching cubes at their threshold."""
-    if isinstance(shapes, Meshes):
-        colors = [None] * len(shapes.vertices) if shapes.colors is None else shapes.colors
-        return [Surface(vertices, shapes.faces, color) for vertices, color in zip(shapes.vertices, colors, strict=True)]
-    return [Surface(*grid_surface(grid, level=shapes.threshold)) for grid in shapes.occupancy]
 
 
 def orbit(poses: Poses, turns_deg: Sequence[float], *, zoom: float = 1.0) -> nmr.LookAt | nmr.Orthographic:
@@ -145,62 +131,3 @@ def draw_around(
 def turntable(surface: Surface, *, frames: int = 36, image_size: int = 256) -> np.ndarray:
     """One full turn around a shape: uint8 [frames,S,S,3]."""
     return draw_around(surface, [-360.0 * frame / frames for frame in range(frames)], image_size=image_size)
-
-
-def natural_colors(images: np.ndarray, *, inverted: bool = True) -> np.ndarray:
-    """Stored images uint8 [..., 4, H, W] -> uint8 [..., H, W, 3] as a person wants to see them.
-
-    inverted: colours stored as 255 - colour over black, see `ViewDataset.inverted`.
-    """
-    colors = np.moveaxis(images[..., :3, :, :], -3, -1)
-    return 255 - colors if inverted else colors
-
-
-def to_uint8(values: Tensor) -> np.ndarray:
-    """Grey values in [0,1], any shape -> uint8 with a last axis of 3 equal channels."""
-    grey = (values.detach().cpu().float().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    return np.repeat(grey[..., None], 3, axis=-1)
-
-
-def stacked(blocks: Sequence[np.ndarray], *, gap: int = 0) -> np.ndarray:
-    """Pictures uint8 [h,w,3] below each other, flush left."""
-    width = max(block.shape[1] for block in blocks)
-    padding = [((0, gap if i < len(blocks) - 1 else 0), (0, width - b.shape[1]), (0, 0)) for i, b in enumerate(blocks)]
-    return np.concatenate([np.pad(b, p, constant_values=255) for b, p in zip(blocks, padding, strict=True)])
-
-
-def magnified(pictures: np.ndarray, zoom: float) -> np.ndarray:
-    """The central part of pictures uint8 [N,h,w,3], a share 1 / zoom of each side; they become smaller by it."""
-    height, width = pictures.shape[1:3]
-    top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
-    return pictures[:, top : height - top, left : width - left]
-
-
-def with_ending(path: Path, suffix: str) -> Path:
-    """The path with the ending of another kind of picture, such as ".svg"; a name without one gets it added."""
-    path = Path(path)
-    return path.with_suffix(suffix) if path.suffix in (".png", ".svg", ".gif", ".json") else Path(f"{path}{suffix}")
-
-
-def save_png(path: Path, rgb: np.ndarray) -> None:
-    """Write a picture uint8 [H,W,3]."""
-    buffer = io.BytesIO()
-    Image.fromarray(rgb).save(buffer, format="PNG", optimize=True)
-    writing.write_bytes(path, buffer.getvalue())
-
-
-def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0) -> None:
-    """Write an endless animation from frames uint8 [N,H,W,3]."""
-    buffer = io.BytesIO()
-    palette = Image.Palette.ADAPTIVE
-    first, *others = [Image.fromarray(frame).convert("P", palette=palette, colors=64) for frame in frames]
-    first.save(
-        buffer,
-        format="GIF",
-        save_all=True,
-        append_images=others,
-        duration=round(1000 / frames_per_second),
-        loop=0,
-        optimize=True,
-    )
-    writing.write_bytes(path, buffer.getvalue())

@@ -9,7 +9,7 @@ import torch
 import nmr
 from learn3d.data.conventions import view_cameras
 from learn3d.data.poses import RotationPoses
-from learn3d.make_data.studio import BACK_LIGHT, photograph, studio_lights
+from learn3d.pictures.studio import BACK_LIGHT, photograph, studio_lights
 
 WHITE = np.ones(3, dtype=np.float32)
 
