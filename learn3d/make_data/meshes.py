@@ -12,13 +12,16 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
 
 from learn3d.files import npz, sandbox
 from learn3d.files.meshes import EXTENSIONS, RawMesh, read_mesh
-from learn3d.make_data.config import DatasetConfig
+
+if TYPE_CHECKING:  # workers read meshes without torch
+    from learn3d.make_data.config import DatasetConfig
 
 SIDECARS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".txt", ".md", ".json")  # files that belong beside meshes
 

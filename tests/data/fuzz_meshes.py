@@ -17,10 +17,10 @@ from mutations import Target
 from PIL import Image
 
 import nmr.neural_renderer as nr
-from learn3d.make_data import mesh_text, meshes
-from learn3d.make_data.debian import packages
+from learn3d.make_data import meshes
+from learn3d.make_data.debian import mesh_text, packages
 from learn3d.make_data.debian.furniture import CATALOGUE, furniture_models
-from learn3d.make_data.mesh_cleaning import clean_mesh
+from learn3d.make_data.debian.mesh_cleaning import clean_mesh
 
 
 def mesh_target(tmp: Path) -> Target:

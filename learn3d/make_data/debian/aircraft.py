@@ -12,8 +12,8 @@ import trimesh
 from tqdm import tqdm
 
 from learn3d.files import limits
+from learn3d.make_data.debian.mesh_text import Part, read_ac3d
 from learn3d.make_data.debian.packages import Candidate, Package, read_package
-from learn3d.make_data.mesh_text import Part, read_ac3d
 
 AIRCRAFT_PACKAGE = "flightgear-data-ai"
 AIRCRAFT_FOLDER = "usr/share/games/flightgear/AI/Aircraft/"

@@ -12,14 +12,13 @@ import zlib
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import NoReturn
 
 import numpy as np
 from tqdm import tqdm
 
 from learn3d.files import limits
+from learn3d.make_data.debian.mesh_text import read_obj
 from learn3d.make_data.debian.packages import Candidate, Package, read_package
-from learn3d.make_data.mesh_text import read_obj
 
 FURNITURE_PACKAGES = ("sweethome3d-furniture", "sweethome3d-furniture-nonfree")  # the second is optional
 CATALOGUE = "PluginFurnitureCatalog.properties"
@@ -116,9 +115,9 @@ def furniture_models(
                     yield None
                     continue
                 try:
-                    read = partial(_read_furniture, _member(archive, str(model)), model.suffix, entry)
+                    text = _member(archive, str(model))
                 except ValueError as error:
-                    read = partial(_refuse, str(error))
+                    text = error  # is raised when the model is read: other models go on
                 yield Candidate(
                     category=category,
                     title=entry["name"],
@@ -127,19 +126,17 @@ def furniture_models(
                     package=package,
                     source=f"{catalogue}!/{model}",
                     stem=f"{PurePosixPath(catalogue).stem}-{model.stem}",
-                    read=read,
+                    read=partial(_read_furniture, text, model.suffix, entry),
                 )
 
 
-def _read_furniture(text: str, suffix: str, entry: dict[str, str]) -> tuple[np.ndarray, np.ndarray]:
+def _read_furniture(text: str | ValueError, suffix: str, entry: dict[str, str]) -> tuple[np.ndarray, np.ndarray]:
+    if isinstance(text, ValueError):
+        raise text
     if suffix.lower() != ".obj":
         raise ValueError(f"only OBJ models are read, this is {suffix or 'nothing'}")
     vertices, faces = read_obj(text)
     return place_furniture(vertices, entry), faces
-
-
-def _refuse(reason: str) -> NoReturn:
-    raise ValueError(reason)
 
 
 def _member(archive: zipfile.ZipFile, path: str) -> str:

@@ -24,7 +24,7 @@ _HEADER_BYTES = 2**20  # between the contents of two files of an archive; long n
 
 
 class PackageMissing(ValueError):
-    """The package is not where it was looked for; the message says what to do."""
+    """The package was not found; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -54,22 +54,21 @@ class Candidate:
 def download_package(name: str, folder: Path) -> Package:
     """Download one package with `apt-get download` (no root, no installation) into `folder`.
 
-    Raises PackageMissing when apt-get is not there, does not know the package, or fails.
+    Raises PackageMissing if apt-get is not installed, does not know the package, or fails.
     """
     if shutil.which("apt-get") is None:
         raise PackageMissing(
             f"apt-get is not on this machine, so {name} cannot be downloaded; "
             "put its .deb file into a folder and name it with --packages-dir"
         )
-    command = ["apt-get", "download", "-q", name]
     quiet = {"capture_output": True, "text": True, "errors": "replace", "stdin": subprocess.DEVNULL}
-    result = subprocess.run(command, cwd=folder, check=False, **quiet)
+    result = subprocess.run(["apt-get", "download", "-q", name], cwd=folder, check=False, **quiet)
     if result.returncode != 0 or not any(folder.glob(f"{name}_*.deb")):
-        reason = next((line for line in result.stderr.splitlines() if line.startswith("E:")), "E: no reason given")
-        component = "the component non-free" if name.endswith("-nonfree") else "the component main"
+        reason = next((line[3:] for line in result.stderr.splitlines() if line.startswith("E:")), "no reason given")
+        component = "non-free" if name.endswith("-nonfree") else "main"
         raise PackageMissing(
-            f"apt-get could not download {name} ({reason[3:]}); run `apt-get update` as root first, "
-            f"and see that {component} is enabled in the apt sources"
+            f"apt-get could not download {name} ({reason}); run `apt-get update` as root first, "
+            f"and see that the component {component} is enabled in the apt sources"
         )
     return find_package(name, folder)
 
@@ -88,58 +87,56 @@ def find_package(name: str, folder: Path) -> Package:
 def read_package(package: Package, suffixes: tuple[str, ...], licences: Path) -> Iterator[tuple[str, bytes]]:
     """Each plain file of the package whose path ends in one of `suffixes`, as (path without leading /, content).
 
-    The order is that of the archive. Symbolic links and devices are passed over. The package's copyright file is
+    The order is that of the archive. Symbolic links and devices are left out. The package's copyright file is
     written to LICENCES/NAME.copyright.
     Raises ValueError for archives that cannot be read and for more than 2 GiB in all.
     """
-    notice, total = f"/doc/{package.name}/copyright", 0
-    for path, size, read in _files_of_archive(package.path):
-        if not path.endswith((*suffixes, notice)):
-            continue
-        total += size
-        if total > (most := limits.PACKAGE_WANTED_BYTES):
-            raise ValueError(f"{package.name} is refused: its files {', '.join(suffixes)} have more than {most} bytes")
-        if path.endswith(notice):
-            licences.mkdir(exist_ok=True)
-            (licences / f"{package.name}.copyright").write_bytes(read())
-        else:
-            yield path, read()
-
-
-def _files_of_archive(deb: Path) -> Iterator[tuple[str, int, Callable[[], bytes]]]:
-    """The plain files of a .deb: path without leading /, bytes, and how to read them before the next is asked for."""
     if shutil.which("dpkg-deb") is None:
         raise ValueError("dpkg-deb is not on this machine; install dpkg (Debian, Ubuntu, Homebrew and others have it)")
-    check_file(deb, limits.PACKAGE_BYTES, "a Debian package")
-    command = ["dpkg-deb", "--fsys-tarfile", str(deb)]
+    check_file(package.path, limits.PACKAGE_BYTES, "a Debian package")
+    file, notice, licence, total = package.path.name, f"/doc/{package.name}/copyright", None, 0
+    command = ["dpkg-deb", "--fsys-tarfile", str(package.path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
         stream = _Stream(process.stdout)
         try:
             with tarfile.open(fileobj=stream, mode="r|") as tar:
                 for number, member in enumerate(tar):
                     if number >= limits.PACKAGE_MEMBERS:
-                        raise ValueError(f"{deb.name} is refused: it has more than {number} members")
+                        raise ValueError(f"{file} is refused: it has more than {number} members")
                     stream.expect(member.size)
-                    if member.isreg():
-                        yield member.name.removeprefix("./").lstrip("/"), member.size, tar.extractfile(member).read
-            while stream.read(2**16):  # what follows the last file, so that dpkg-deb can end
+                    path = member.name.removeprefix("./").lstrip("/")
+                    if not member.isreg() or not path.endswith((*suffixes, notice)):
+                        continue
+                    total += member.size
+                    if total > (most := limits.PACKAGE_WANTED_BYTES):
+                        wanted = ", ".join(suffixes)
+                        raise ValueError(f"{package.name} is refused: its files {wanted} have more than {most} bytes")
+                    content = tar.extractfile(member).read()
+                    if path.endswith(notice):
+                        licence = content
+                    else:
+                        yield path, content
+            while stream.read(2**16):  # bytes after the last file, so that dpkg-deb can end
                 pass
             if process.wait() != 0:
                 raise OSError("it is damaged")
         except (tarfile.TarError, EOFError, OSError) as error:
-            raise ValueError(f"{deb.name} cannot be read as a Debian package ({error}); download it again") from error
+            raise ValueError(f"{file} cannot be read as a Debian package ({error}); download it again") from error
         finally:
             process.kill()
+    if licence is not None:
+        licences.mkdir(exist_ok=True)
+        (licences / f"{package.name}.copyright").write_bytes(licence)
 
 
 class _Stream:
-    """A tar archive as it is unpacked, stopped where a header is far larger than headers are: tarfile keeps them."""
+    """A tar archive as it is unpacked, stopped if a header is far larger than headers are: tarfile keeps them."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file, self._left, self._total = file, _HEADER_BYTES, limits.PACKAGE_BYTES
 
     def expect(self, size: int) -> None:
-        """A file of that size follows, and then another header."""
+        """Allow a file of that size and one more header."""
         self._left = size + _HEADER_BYTES
 
     def read(self, size: int) -> bytes:

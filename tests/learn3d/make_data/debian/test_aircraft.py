@@ -7,7 +7,7 @@ import pytest
 from small_packages import box
 
 from learn3d.make_data.debian.aircraft import is_airplane_file, turn_to_front, without_effects
-from learn3d.make_data.mesh_text import Part, triangulate
+from learn3d.make_data.debian.mesh_text import Part, triangulate
 
 
 @pytest.mark.parametrize(

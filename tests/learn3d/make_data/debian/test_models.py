@@ -21,7 +21,7 @@ def test_recipe_writes_meshes_index_and_reasons(debs: Path, tmp_path: Path):
     assert [row["licence"] for row in rows] == ["GPL-2+", "Free Art License 1.3", "CC0"]
     assert {row["version"] for row in rows} == {"1:2.0-1"}
     assert rows[1]["source"] == "Test.sh3f!/m/chair.obj"
-    reasons = {drop.title: drop.reason for drop in report.dropped}
+    reasons = {drop["title"]: drop["reason"] for drop in report.dropped}
     assert reasons["Red chair"] == "near-duplicate of chair/test-chair (surface IoU 1.000)"
     assert reasons["Tall chair"].startswith("stretched near-duplicate of chair/test-chair")
     assert "vertex" in reasons["Broken table"]
@@ -60,7 +60,7 @@ def test_two_runs_give_the_same_bytes(debs: Path, tmp_path: Path):
 
 def test_duplicates_are_kept_when_asked_for(debs: Path, tmp_path: Path):
     report = fetch(tmp_path / "out", debs, category="chair", duplicate_iou=1, stretched_iou=1)
-    assert [model.file for model in report.models] == [
+    assert [model["file"] for model in report.models] == [
         "chair/test-chair-2.ply",
         "chair/test-chair.ply",
         "chair/test-copy.ply",
@@ -109,4 +109,4 @@ def test_long_names_and_gaps_take_no_square_of_their_length(debs: Path, tmp_path
     files = {f"./{AIRCRAFT}/Plane/Models/plane.ac": text.encode(), f"./{AIRCRAFT}/Plane/plane.xml": about.encode()}
     deb(debs, "flightgear-data-ai", files)
     report = fetch(tmp_path / "out", debs, category="airplane")
-    assert [(model.title, model.author) for model in report.models] == [("Plane plane", "B. Maker")]
+    assert [(model["title"], model["author"]) for model in report.models] == [("Plane plane", "B. Maker")]

@@ -23,14 +23,14 @@ def test_members_that_point_outside_write_nothing_there(debs: Path, tmp_path: Pa
     sh3f = catalogue([entry("Chair", "chair")], {"m/chair.obj": CHAIR, "../../evil.obj": CHAIR})
     deb(debs, "sweethome3d-furniture", {notice: b"licence", "/usr/../../evil.sh3f": sh3f})
     report = fetch(tmp_path / "out", debs, category="chair")
-    assert [model.source for model in report.models] == ["evil.sh3f!/m/chair.obj"]
+    assert [model["source"] for model in report.models] == ["evil.sh3f!/m/chair.obj"]
     assert (tmp_path / "out/licences/sweethome3d-furniture.copyright").read_bytes() == b"licence"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["debs", "out"]
 
 
 def test_oversized_models_are_left_out(debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(limits, "CATALOGUE_MEMBER_BYTES", len(CHAIR) - 1)
-    reasons = [drop.reason for drop in fetch(tmp_path / "out", debs, category="chair").dropped]
+    reasons = [drop["reason"] for drop in fetch(tmp_path / "out", debs, category="chair").dropped]
     assert len(reasons) == 3 and all("at most" in reason for reason in reasons)
 
 
@@ -40,7 +40,7 @@ def test_models_that_are_not_deflated_are_left_out(debs: Path, tmp_path: Path):
         archive.writestr("m/chair.obj", CHAIR)
     deb(debs, "sweethome3d-furniture", {"usr/Test.sh3f": content.getvalue()})
     (dropped,) = fetch(tmp_path / "out", debs, category="chair").dropped
-    assert "only deflate is read" in dropped.reason
+    assert "only deflate is read" in dropped["reason"]
 
 
 @pytest.mark.parametrize("content", [b"", b"!<arch>\n", None])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_packages import AIRPLANE, ac_object, ac_text
 
-from learn3d.make_data.mesh_text import read_ac3d, read_obj, triangulate
+from learn3d.make_data.debian.mesh_text import read_ac3d, read_obj, triangulate
 
 
 def test_ac3d_tree_names_and_transforms():

@@ -1,4 +1,4 @@
-"""Readers of the two text formats of the Debian meshes: OBJ and AC3D, which trimesh does not know.
+"""Readers of the two text formats of the Debian meshes: OBJ, and AC3D, which trimesh does not know.
 
 Only the geometry is read: positions and polygons, the latter cut into triangles. trimesh reads OBJ, too, but makes a
 fan of every polygon, which covers the gaps of concave ones (the backs of some chairs).
@@ -14,8 +14,6 @@ import numpy as np
 
 from learn3d.files import limits
 
-Polygon = Sequence[int]
-
 
 @dataclass(frozen=True)
 class Part:
@@ -28,12 +26,9 @@ class Part:
 
 def read_obj(text: str) -> tuple[np.ndarray, np.ndarray]:
     """Vertices float64 [V, 3] and triangles int64 [F, 3] of a Wavefront OBJ text; ValueError if it is malformed."""
-    rows: list[list[str]] = []
-    polygons: list[Polygon] = []
+    rows, polygons = [], []
     for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
-        fields = line.split()
-        if not fields:
-            continue
+        fields = line.split() or [""]
         if fields[0] == "v":
             rows.append(fields[1:4])
         elif fields[0] == "f" and len(fields) > 3:
@@ -51,21 +46,61 @@ def read_ac3d(text: str, skip: Callable[[str], bool] = lambda name: False) -> li
 
     An object whose name `skip` accepts is left out with its children; so are lines (surface types 1 and 2).
     Convention of FlightGear's models: nose towards -x, y up, left wing towards +z.
-    Raises ValueError when the text is not AC3D or ends too early.
+    Raises ValueError if the text is not AC3D or ends too early.
     """
     lines = iter(text.splitlines())
     if not next(lines, "").startswith("AC3D"):
         raise ValueError("an AC3D file starts with AC3D")
     parts: list[Part] = []
-    # One entry per open ancestor: [children still to come, rotation of row vectors, translation, skipped].
-    stack: list[list] = [[1, np.eye(3), np.zeros(3), False]]
     try:
-        for line in lines:
-            if line.startswith("OBJECT") and stack:
-                _read_object(lines, stack, parts, skip)
-    except (StopIteration, IndexError) as error:
-        raise ValueError("the AC3D file ends in the middle of an object") from error
+        _read_objects(lines, 1, np.eye(3), np.zeros(3), skip, parts)
+    except (StopIteration, IndexError, RecursionError) as error:
+        raise ValueError("the AC3D file ends in the middle of an object, or its objects are nested too deep") from error
     return parts
+
+
+def _read_objects(
+    lines: Iterator[str],
+    count: int,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    skip: Callable[[str], bool],
+    parts: list[Part],
+) -> None:
+    """Add `count` objects and their children to `parts`; rotation [3, 3] (of row vectors) is that of their parent."""
+    while count > 0 and (line := next(lines, None)) is not None:
+        if not line.startswith("OBJECT"):
+            continue
+        count -= 1
+        name, vertices, polygons, kind, key = "", np.zeros((0, 3)), [], -1, ""
+        turn, shift = np.eye(3), np.zeros(3)
+        while key != "kids":
+            key, _, value = _next(lines).partition(" ")
+            if key == "name":
+                name = value.strip().strip('"')
+            elif key == "data":
+                size = int(value)
+                while size > 0:  # free text of `size` characters, which may look like anything
+                    size -= len(next(lines)) + 1
+            elif key == "loc":
+                shift = np.array(value.split()[:3], dtype=np.float64)
+            elif key == "rot":
+                turn = np.array(value.split()[:9], dtype=np.float64).reshape(3, 3)
+            elif key == "numvert":
+                rows = [_next(lines).split()[:3] for _ in range(int(value))]
+                vertices = np.array(rows, dtype=np.float64).reshape(-1, 3)
+            elif key == "SURF":
+                kind = int(value, 16) & 0xF
+            elif key == "refs":
+                polygon = [int(_next(lines).split()[0]) for _ in range(int(value))]
+                if kind == 0 and len(polygon) > 2:
+                    polygons.append(polygon)
+        turn, shift = turn @ rotation, shift @ rotation + translation
+        kept = [] if skip(name) else parts
+        if polygons:
+            placed = vertices @ turn + shift
+            kept.append(Part(name, placed, triangulate(polygons, placed)))
+        _read_objects(lines, int(value), turn, shift, skip, kept)
 
 
 def _next(lines: Iterator[str]) -> str:
@@ -75,53 +110,12 @@ def _next(lines: Iterator[str]) -> str:
     return line
 
 
-def _read_object(lines: Iterator[str], stack: list[list], parts: list[Part], skip: Callable[[str], bool]) -> None:
-    """Read one AC3D object up to its `kids` line; push it as the ancestor of its children."""
-    stack[-1][0] -= 1
-    _, rotation, translation, skipped = stack[-1]
-    name, vertices, polygons, kind = "", np.zeros((0, 3)), [], -1
-    own_rotation, own_translation = np.eye(3), np.zeros(3)
-    while True:
-        key, _, value = _next(lines).partition(" ")
-        if key == "name":
-            name = value.strip().strip('"')
-        elif key == "data":
-            size = int(value)
-            while size > 0:  # free text of `size` characters, which may look like anything
-                size -= len(next(lines)) + 1
-        elif key == "loc":
-            own_translation = np.array(value.split()[:3], dtype=np.float64)
-        elif key == "rot":
-            own_rotation = np.array(value.split()[:9], dtype=np.float64).reshape(3, 3)
-        elif key == "numvert":
-            vertices = np.array([_next(lines).split()[:3] for _ in range(int(value))], dtype=np.float64).reshape(-1, 3)
-        elif key == "SURF":
-            kind = int(value, 16) & 0xF
-        elif key == "refs":
-            polygon = [int(_next(lines).split()[0]) for _ in range(int(value))]
-            if kind == 0 and len(polygon) > 2:
-                polygons.append(polygon)
-        elif key == "kids":
-            children = int(value)
-            break
-    translation = own_translation @ rotation + translation
-    rotation = own_rotation @ rotation
-    skipped = skipped or skip(name)
-    if polygons and not skipped:
-        placed = vertices @ rotation + translation
-        parts.append(Part(name, placed, triangulate(polygons, placed)))
-    if children > 0:
-        stack.append([children, rotation, translation, skipped])
-    while stack and stack[-1][0] == 0:
-        stack.pop()
+def triangulate(polygons: Sequence[Sequence[int]], vertices: np.ndarray) -> np.ndarray:
+    """Triangles int64 [F, 3] of simple polygons, convex or not; ValueError if an index is outside of `vertices`.
 
-
-def triangulate(polygons: Sequence[Polygon], vertices: np.ndarray) -> np.ndarray:
-    """Triangles int64 [F, 3] of simple polygons, convex or not; ValueError when an index is outside of `vertices`.
-
-    A polygon is cut into a fan from its first corner where that does not fold over, else by its ears.
+    A polygon is cut into a fan from its first corner if that does not fold over, else by its ears.
     """
-    by_size: dict[int, list[Polygon]] = {}
+    by_size: dict[int, list[Sequence[int]]] = {}
     for polygon in polygons:
         if min(polygon) < 0 or max(polygon) >= len(vertices):  # of any size: before they become an array
             worst = max(polygon, key=abs)
@@ -139,11 +133,11 @@ def triangulate(polygons: Sequence[Polygon], vertices: np.ndarray) -> np.ndarray
         areas = np.cross(points[:, 1:-1], points[:, 2:])
         folded = ((areas * normals[:, None]).sum(axis=2) < 0).any(axis=1)
         triangles.append(corners[~folded][:, fan].reshape(-1, 3))
-        triangles += [corners[i][np.array(_ears(points[i], normals[i]))] for i in np.flatnonzero(folded)]
+        triangles += [corners[i][np.array(_cut_ears(points[i], normals[i]))] for i in np.flatnonzero(folded)]
     return np.concatenate(triangles)
 
 
-def _ears(points: np.ndarray, normal: np.ndarray) -> list[tuple[int, int, int]]:
+def _cut_ears(points: np.ndarray, normal: np.ndarray) -> list[tuple[int, int, int]]:
     """Triangles of one polygon [N, 3], cut in the coordinate plane that sees most of it; all N corners are used."""
     axis = int(np.abs(normal).argmax())
     u, v = (axis + 1) % 3, (axis + 2) % 3

@@ -15,7 +15,7 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
     """The welded mesh with its box centred at the origin and its longest side 1.
 
     Vertices closer than about 1e-5 of the longest side become one; faces without area, repeated faces (in whatever
-    winding) and unused vertices go. Raises ValueError when nothing solid is left or a coordinate is not finite.
+    winding) and unused vertices go. Raises ValueError if nothing solid is left or a coordinate is not finite.
     """
     raw = checked(RawMesh(vertices, faces), limits.MESH_FACES)
     mesh = trimesh.Trimesh(fit_to_box(raw.vertices), raw.faces, process=False)
@@ -38,8 +38,7 @@ def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: b
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     extents = high - low
     scale = np.where(extents > 0, extents, 1.0) if per_axis else extents.max()
-    points = ((vertices - (low + high) / 2) / scale + 0.5) * size
-    corners = points[faces]
+    corners = (((vertices - (low + high) / 2) / scale + 0.5) * size)[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     steps = np.maximum(np.ceil(3 * edges).astype(np.int64), 1)
     grid = np.zeros((size, size, size), dtype=bool)
@@ -49,9 +48,8 @@ def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: b
         weights = np.stack([i, j, count - i - j], axis=1) / count
         chosen = corners[steps == count]
         for part in np.array_split(chosen, 1 + len(chosen) * len(weights) // _SAMPLES):
-            cells = (weights @ part).reshape(-1, 3)
-            cells = np.clip(np.floor(cells).astype(np.int64), 0, size - 1)
-            grid[cells[:, 0], cells[:, 1], cells[:, 2]] = True
+            cells = np.clip(np.floor((weights @ part).reshape(-1, 3)).astype(np.int64), 0, size - 1)
+            grid[tuple(cells.T)] = True
     return grid
 
 

@@ -7,8 +7,8 @@ import pytest
 from memory_checks import at_most
 from small_packages import box
 
-from learn3d.make_data.mesh_cleaning import clean_mesh, overlap, surface_grid
-from learn3d.make_data.mesh_text import triangulate
+from learn3d.make_data.debian.mesh_cleaning import clean_mesh, overlap, surface_grid
+from learn3d.make_data.debian.mesh_text import triangulate
 from learn3d.make_data.meshes import is_watertight
 
 
