@@ -39,7 +39,7 @@ WAITING = 16  # visitors; the next one is asked to come back
 _MASK = (0, 200, 235)  # few objects have this colour
 _CANVAS = 320  # pixels of a silhouette
 _STRENGTH = 0.55  # opacity of the mask over the picture
-_PICTURES = [".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"]
+_PICTURES = [".png", ".jpg", ".jpeg", ".webp", ".bmp"]
 _ALONE = {"concurrency_limit": 1, "concurrency_id": "networks", "show_progress": "minimal"}  # one visitor at a time
 _EDITOR = {"sources": [], "transforms": [], "layers": False, "buttons": [], "format": "png", "fixed_canvas": True}
 _EDITOR |= {"brush": gr.Brush(20, [(f"rgb{_MASK}", _STRENGTH)], color_mode="fixed"), "eraser": gr.Eraser(20)}

@@ -1,4 +1,4 @@
-"""What is wrong with the files of a data set: errors that name the file, and a list of them.
+"""Faults of the files of a data set: errors that name the file, and a list of them.
 
 A reader parses an object in steps, each through `Findings.attempt`. With strict findings (`load`) the first step that
 fails raises; otherwise (`problems`) it is noted and the next one follows, so that both see exactly the same.
@@ -16,9 +16,7 @@ R = TypeVar("R")
 FETCH_AGAIN = "Perhaps the download or copy was cut short: fetch it again"
 
 
-class DamagedFile(ValueError):
-    """A file that is there, but not as it should be."""
-
+class _NamesFile(Exception):
     def __init__(self, path: Path, message: str) -> None:
         super().__init__(f"{path}: {message}")
         self.path, self.message = path, message
@@ -27,29 +25,26 @@ class DamagedFile(ValueError):
         return type(self), (self.path, self.message)  # so that it can be pickled
 
 
-class MissingFile(FileNotFoundError):
+class DamagedFile(_NamesFile, ValueError):
+    """A file that is there, but not as it should be."""
+
+
+class MissingFile(_NamesFile, FileNotFoundError):
     """A file or folder that should be there."""
-
-    def __init__(self, path: Path, message: str) -> None:
-        super().__init__(f"{path}: {message}")
-        self.path, self.message = path, message
-
-    def __reduce__(self) -> tuple[type, tuple[Path, str]]:
-        return type(self), (self.path, self.message)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong with a file: an error stops `load`, a warning does not."""
+    """One fault of a file: an error stops `load`, a warning does not."""
 
     path: str
-    message: str  # what is wrong, what was expected
+    message: str  # the fault, and what was expected
     severity: Literal["error", "warning"] = "error"
 
 
 @dataclass
 class Findings:
-    """What was found wrong while something was read."""
+    """Faults that were found while something was read."""
 
     strict: bool = False  # raise the first error, drop warnings
     problems: list[Problem] = field(default_factory=list)
@@ -62,7 +57,7 @@ class Findings:
             return self.take(error)
 
     def take(self, result: Any) -> Any:
-        """A result of `sandbox.read_all`; None with a note where it says what is wrong with its file."""
+        """A result of `sandbox.read_all`; None with a note if it is a fault of its file."""
         if not isinstance(result, (DamagedFile, MissingFile)):
             return result
         if self.strict:

@@ -1,4 +1,4 @@
-"""Mesh files that somebody else may have made: all triangles and their colours, read by trimesh in a worker process."""
+"""Untrusted mesh files: all triangles and their colours, read by trimesh in the sandbox."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from learn3d.files import limits, sandbox
 from learn3d.files.findings import DamagedFile, MissingFile
-from learn3d.files.images import opening_only
+from learn3d.files.images import open_texture
 from learn3d.files.reading import read_bytes
 
 EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # what trimesh reads without further packages
-TEXTURES = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "DDS")
-_TEXT = (".obj", ".off", ".mtl")
 _MEMORY_PER_BYTE = 30  # trimesh takes some 20 times the size of a text file
-_BYTES_PER_SECOND = 2e6  # a text file of 100 MB takes 20 seconds
+_BYTES_PER_SECOND = 1e6  # trimesh reads twice as many
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,14 +27,14 @@ class RawMesh:
 
     vertices: np.ndarray  # float64 [V, 3]
     faces: np.ndarray  # int64 [F, 3]
-    face_colors: np.ndarray | None = None  # float32 [F, 3], RGB in [0, 1], NaN or None where the file gives none
+    face_colors: np.ndarray | None = None  # float32 [F, 3], RGB in [0, 1]; NaN or None if the file gives none
 
 
 def read_mesh(path: Path, root: Path | None = None) -> RawMesh:
-    """All triangles of a mesh file, scenes concatenated with their transforms, with their colours where it has any.
+    """All triangles of a mesh file, scenes concatenated with their transforms, with their colours if it has any.
 
     root: the folder out of which files that it refers to (materials, textures, buffers) are read; None: its own.
-    Raises ValueError with the reason where it cannot be read, holds no triangle, or has over 256 MiB.
+    Raises ValueError with the reason if it cannot be read, holds no triangle, or has over 256 MiB.
     """
     try:
         return sandbox.read(_read, path, path.parent if root is None else root, wanted="a mesh file")
@@ -44,16 +43,15 @@ def read_mesh(path: Path, root: Path | None = None) -> RawMesh:
 
 
 def _read(path: Path, root: Path) -> RawMesh:
-    """In a worker: the mesh; what trimesh raises is put into words there."""
+    """The mesh, in the sandbox."""
     import trimesh
 
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
-    content = _as_utf8(read_bytes(path, limits.MESH_FILE_BYTES, "a mesh file"), path.suffix)
-    sandbox.allow(_MEMORY_PER_BYTE * len(content), len(content) / _BYTES_PER_SECOND)
-    kind, beside = path.suffix.lower().lstrip("."), _files_below(path.parent, root.resolve())
-    with opening_only(TEXTURES):
-        scene = trimesh.load(io.BytesIO(content), file_type=kind, resolver=beside, force="scene", process=False)
-        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    Image.open = open_texture
+    content, kind = io.BytesIO(_content(path)), path.suffix.lower().lstrip(".")
+    beside = _FilesBelow(root.resolve(), path.parent)
+    scene = trimesh.load(content, file_type=kind, resolver=beside, force="scene", process=False)
+    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise DamagedFile(path, "no faces")
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
@@ -64,13 +62,36 @@ def _read(path: Path, root: Path) -> RawMesh:
     )
 
 
-def _as_utf8(content: bytes, suffix: str) -> bytes:
-    """A text file, or the text at the head of a PLY file, in UTF-8: comments and names may be in Latin-1."""
-    end = len(content) if suffix.lower() in _TEXT else 0
-    if suffix.lower() == ".ply":
-        end = max(0, content.find(b"end_header"))
-    elif suffix.lower() == ".stl" and content.startswith(b"solid"):
-        end = content.find(b"\n") if b"facet" in content[:1000] else 0
+class _FilesBelow:
+    """A resolver for trimesh: the files that a mesh in `folder` refers to, none from outside of `root`."""
+
+    def __init__(self, root: Path, folder: Path) -> None:
+        self.root, self.folder = root, folder
+
+    def get(self, name: str) -> bytes:
+        path = (self.folder / str(name).strip()).resolve()
+        if not path.is_relative_to(self.root):
+            raise ValueError(f"it refers to {name!r}, which is outside of {self.root}")
+        return _content(path)
+
+    __getitem__ = get
+
+    def namespaced(self, namespace: str) -> _FilesBelow:
+        return _FilesBelow(self.root, self.folder / namespace)
+
+    def keys(self) -> list[str]:
+        return []
+
+
+def _content(path: Path) -> bytes:
+    """A file; a text, also that at the head of a PLY file, in UTF-8: comments and names may be in Latin-1."""
+    content = read_bytes(path, limits.MESH_FILE_BYTES, "a mesh file, or a file that a mesh refers to")
+    sandbox.allow(_MEMORY_PER_BYTE * len(content), len(content) / _BYTES_PER_SECOND)
+    suffix = path.suffix.lower()
+    is_text = suffix in (".obj", ".off", ".mtl")
+    if suffix == ".stl":  # a binary one has 50 bytes for each of as many triangles as its header says
+        is_text = len(content) != 84 + 50 * int.from_bytes(content[80:84], "little")
+    end = content.find(b"end_header") + 1 if suffix == ".ply" else len(content) * is_text
     try:
         content[:end].decode()
         return content
@@ -78,36 +99,8 @@ def _as_utf8(content: bytes, suffix: str) -> bytes:
         return content[:end].decode("latin-1").encode() + content[end:]
 
 
-def _files_below(folder: Path, root: Path) -> Any:
-    """A trimesh resolver of names in `folder`, which gives nothing out that lies outside of `root`."""
-    from trimesh.resolvers import Resolver
-
-    class Below(Resolver):
-        def __init__(self) -> None:
-            """There is nothing to keep."""
-
-        def get(self, name: str) -> bytes:
-            path = (folder / str(name).strip()).resolve()
-            if not path.is_relative_to(root):
-                raise ValueError(f"it refers to {name!r}, which lies outside of {root}")
-            content = read_bytes(path, limits.MESH_FILE_BYTES, "a file that a mesh refers to")
-            sandbox.allow(_MEMORY_PER_BYTE * len(content))
-            return _as_utf8(content, path.suffix)
-
-        def namespaced(self, namespace: str) -> Resolver:
-            return _files_below(folder / namespace, root)
-
-        def keys(self) -> list[str]:
-            return []
-
-        def write(self, name: str, data: bytes) -> None:
-            raise ValueError("a mesh that is read writes nothing")
-
-    return Below()
-
-
 def _part_colors(part: Any) -> np.ndarray:
-    """Face colours float32 [F, 3] of a trimesh.Trimesh; a texture is sampled at the vertices. NaN where it has none."""
+    """Face colours float32 [F, 3] of a trimesh.Trimesh; a texture is sampled at the vertices. NaN if it has none."""
     none = np.full((len(part.faces), 3), np.nan, dtype=np.float32)
     visual = part.visual
     if visual is None or not visual.defined:

@@ -1,7 +1,7 @@
-"""Arrays out of npz files: functions for worker processes, which decompress straight into shared memory.
+"""Arrays out of npz files: functions for the sandbox, which decompress straight into shared memory.
 
-Nothing is unpacked to disk, and no pickle runs code: NumPy stores an object array (images of different sizes, say) as a
-pickle, and of what a pickle may ask for only the four functions that make NumPy's arrays are given out.
+No pickle runs code: NumPy stores an object array (images of different sizes, say) as a pickle, and a pickle is given
+the four functions that make NumPy's arrays and nothing else.
 """
 
 from __future__ import annotations
@@ -10,21 +10,16 @@ import functools
 import math
 import os
 import pickle
-import struct
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from learn3d.files import limits, sandbox
-
-try:
-    from isal import isal_zlib as zlib  # twice as fast
-except ImportError:
-    import zlib
+from learn3d.files.reading import open_file
 
 _BYTES_PER_SECOND = 3e7  # ten times slower than decompression is
 
@@ -45,7 +40,7 @@ def keys(path: Path) -> list[str]:
 
 
 def header(path: Path, key: str) -> Header:
-    """What the array `key` is, without reading it."""
+    """Type and shape of the array `key`, which is not read."""
     with _archive(path).open(_member(path, key)) as file:
         return _header(file)[0]
 
@@ -53,30 +48,26 @@ def header(path: Path, key: str) -> Header:
 def read(path: Path, key: str, most: int | None = None) -> np.ndarray:
     """The array `key`, of numbers or bools.
 
-    most: refuse arrays above so many bytes. None: it is not known how large it may be, and then one that unpacks to
-    very many times its size is taken for a trap.
+    most: bytes above which an array is refused. None: unknown, and an array that unpacks to very many times its size is
+    taken for a trap.
     """
     info = _member(path, key, most)
     with _archive(path).open(info) as file:
         head, fortran = _header(file)
-        start = file.tell()
-    size = math.prod(head.shape) * head.dtype.itemsize
-    if head.dtype.kind not in "biuf":
-        kind = "pickled objects" if head.dtype.hasobject else str(head.dtype)
-        raise ValueError(f"the values of {key!r} must be numbers, got {kind}")
-    if size != info.file_size - start:
-        raise ValueError(f"{key!r} is {head}, which takes {size} bytes, but {info.file_size - start} are there")
-    sandbox.allow(seconds=size / _BYTES_PER_SECOND)
-    array = sandbox.empty((math.prod(head.shape),), head.dtype)
-    content = array.view(np.uint8)
-    at, checksum = -start, 0
-    for piece in _pieces(path, info):
-        checksum = zlib.crc32(piece, checksum)
-        new = np.frombuffer(piece, np.uint8)[max(0, -at) :]
-        content[max(0, at) : max(0, at) + len(new)] = new  # a ValueError where there is more than promised
-        at += len(piece)
-    if at != size or checksum != info.CRC:
-        raise ValueError(f"{key!r} ends early or has another checksum than it should")
+        size, there = math.prod(head.shape) * head.dtype.itemsize, info.file_size - file.tell()
+        if head.dtype.kind not in "biuf":
+            kind = "pickled objects" if head.dtype.hasobject else str(head.dtype)
+            raise ValueError(f"the values of {key!r} must be numbers, got {kind}")
+        if size != there:
+            raise ValueError(f"{key!r} is {head}, which takes {size} bytes, but {there} are there")
+        sandbox.allow(seconds=size / _BYTES_PER_SECOND)
+        array, at = sandbox.empty((math.prod(head.shape),), head.dtype), 0
+        content = array.view(np.uint8)
+        while piece := file.read(2**20):  # zipfile compares the checksum at the end
+            content[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
+            at += len(piece)
+    if at != size:
+        raise ValueError(f"{key!r} ends early")
     if head.dtype.kind == "b" and size and content.max() > 1:  # such bools compute wrongly
         raise ValueError(f"the bools of {key!r} have values other than 0 and 1")
     return array.reshape(head.shape, order="F" if fortran else "C")
@@ -101,12 +92,11 @@ def read_ragged(path: Path, key: str) -> np.ndarray | tuple[np.ndarray, list[tup
     for k, item in enumerate(items):
         if type(item) is not np.ndarray or item.dtype != np.uint8:
             raise ValueError(f"{key}[{k}] must be an array of uint8, got {getattr(item, 'dtype', type(item).__name__)}")
-    if sum(item.nbytes for item in items) > info.file_size:
-        raise ValueError(f"the arrays of {key!r} take more bytes than the file has")  # one of them listed many times
-    flat, at = sandbox.empty((sum(item.nbytes for item in items),), np.uint8), 0
-    for item in items:
-        flat[at : at + item.nbytes] = item.reshape(-1)
-        at += item.nbytes
+    size = sum(item.nbytes for item in items)
+    if size > info.file_size:  # one of them is listed many times
+        raise ValueError(f"the arrays of {key!r} take more bytes than the file has")
+    flat = sandbox.empty((size,), np.uint8)
+    np.concatenate([item.reshape(-1) for item in items], out=flat) if len(items) else None
     return flat, [item.shape for item in items]
 
 
@@ -117,56 +107,54 @@ def read_with_items(path: Path, key: str, others: dict[str, int]) -> list[Any]:
     return [first, *(read(path, name, count * size) for name, size in others.items())]
 
 
+def _make_array(kind: type, shape: Any, code: Any) -> np.ndarray:
+    """An array to be filled by its state, as NumPy's `_reconstruct` makes it."""
+    return np.empty(0, np.uint8)
+
+
+_ALLOWED = {
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+    ("numpy.core.multiarray", "_reconstruct"): _make_array,
+    ("numpy._core.multiarray", "_reconstruct"): _make_array,
+    ("_codecs", "encode"): lambda text, _: text.encode("latin-1"),  # for bytes in protocol 2
+}
+
+
 class _Arrays(pickle.Unpickler):
     """Unpickles NumPy's arrays and nothing else."""
 
-    _MAKERS = {  # noqa: RUF012
-        ("numpy", "ndarray"): np.ndarray,
-        ("numpy", "dtype"): np.dtype,
-        ("_codecs", "encode"): lambda text, _: text.encode("latin-1"),  # how protocol 2 writes bytes
-    }
-
     def find_class(self, module: str, name: str) -> Any:
-        if module in ("numpy.core.multiarray", "numpy._core.multiarray") and name == "_reconstruct":
-            return _make
-        try:
-            return self._MAKERS[module, name]
-        except KeyError:
-            raise ValueError(f"its pickle asks for {module}.{name}, which no array needs; nothing was run") from None
-
-
-def _make(kind: type, shape: Any, code: Any) -> np.ndarray:
-    """An array to be filled by its state, as NumPy's function of the same place makes it."""
-    return np.ndarray.__new__(np.ndarray, (0,), np.uint8)
+        if (module, name) not in _ALLOWED:
+            raise ValueError(f"its pickle asks for {module}.{name}, which no array needs; nothing was run")
+        return _ALLOWED[module, name]
 
 
 def _archive(path: Path) -> zipfile.ZipFile:
     status = os.stat(path)
-    return _opened(path, status.st_mtime_ns, status.st_size)
+    return _opened(path, status.st_ino, status.st_mtime_ns, status.st_size)
 
 
-@functools.lru_cache(maxsize=1)  # a pack of meshes is asked for one after the other
-def _opened(path: Path, time: int, size: int) -> zipfile.ZipFile:
+@functools.lru_cache(maxsize=1)  # the arrays of a pack of meshes are asked for one after the other
+def _opened(path: Path, *_: int) -> zipfile.ZipFile:
     try:
-        return zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, NotImplementedError, struct.error, OSError) as error:
+        return zipfile.ZipFile(open_file(path, limits.ARRAY_BYTES, "an npz file"))
+    except zipfile.BadZipFile as error:
         raise ValueError(f"it is not an npz file: {error}") from error
 
 
 def _member(path: Path, key: str, most: int | None = None) -> zipfile.ZipInfo:
-    """The npy file of the array `key`, if it promises no more than can be."""
+    """The npy file of the array `key`, if it promises no more bytes than it may have."""
     archive = _archive(path)
     try:
         info = archive.getinfo(f"{key}.npy")
     except KeyError:
         raise ValueError(f"it has no array {key!r}; it holds the keys {keys(path)[:8]}") from None
-    bound = limits.ARRAY_BYTES if most is None else most + 1000  # the header has 128
-    if info.file_size > bound:
-        raise ValueError(f"{key!r} would unpack to {info.file_size} bytes; at most {bound} are read")
-    if most is None and info.file_size > max(limits.SMALL_BYTES, limits.EXPANSION * info.compress_size):
-        raise ValueError(f"{key!r} would unpack to {info.file_size / max(1, info.compress_size):.0f} times its size")
-    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
-        raise ValueError(f"{key!r} is encrypted or compressed with method {info.compress_type}")
+    if most is None:
+        most = min(limits.ARRAY_BYTES, max(limits.SMALL_BYTES, limits.EXPANSION * info.compress_size))
+    if info.file_size > most + 1000:  # the header has 128
+        times = info.file_size / max(1, info.compress_size)
+        raise ValueError(f"{key!r} would unpack to {info.file_size} bytes, {times:.0f} times its size; at most {most}")
     return info
 
 
@@ -181,16 +169,3 @@ def _header(file: BinaryIO) -> tuple[Header, bool]:
     if not all(type(n) is int and n >= 0 for n in shape):
         raise ValueError(f"its header states the shape {str(shape)[:100]}")
     return Header(dtype, shape), fortran
-
-
-def _pieces(path: Path, info: zipfile.ZipInfo) -> Iterator[bytes]:
-    """The content of a member, unpacked piece by piece."""
-    with open(path, "rb") as file:
-        file.seek(info.header_offset + 26)
-        name, extra = struct.unpack("<HH", file.read(4))
-        file.seek(name + extra, 1)
-        unpack = zlib.decompressobj(-15).decompress if info.compress_type == zipfile.ZIP_DEFLATED else bytes
-        left = info.compress_size
-        while left > 0 and (packed := file.read(min(left, 2**16))):
-            left -= len(packed)
-            yield unpack(packed)

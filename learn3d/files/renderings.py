@@ -1,7 +1,7 @@
-"""Renderings and tables of cameras of one object: functions for worker processes.
+"""Renderings and tables of cameras of one object: functions for the sandbox.
 
 A view comes back as the network's image, uint8 [4, size, size], the mask to be matched, uint8 [64, 64], and the
-brightest value of its mask at full size, which tells an empty one.
+brightest value of its mask at full size, which is 0 if the mask is empty.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def read_with_alpha(path: Path, size: int) -> View:
     color, alpha = split_alpha(image)
     if alpha is None:
         raise DamagedFile(path, f"has the channels {image.mode}; expected RGBA, whose alpha is the mask")
-    return _shrunk(color, alpha, size)
+    return *shrink(color, alpha, size), int(alpha.max())
 
 
 def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
@@ -39,16 +39,18 @@ def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
         if depth.size != image.size:
             sizes = [f"{i.width}x{i.height} pixels" for i in (depth, image)]
             raise DamagedFile(depth_path, f"is {sizes[0]}, but {path.name} is {sizes[1]}")
-        mask = np.where(_grey(depth_path, depth) < 250, 255, 0).astype(np.uint8)
+        is_deep = depth.mode.startswith("I")  # 16 bits, of which the high byte counts
+        grey = np.asarray(depth) >> 8 if is_deep else np.asarray(depth.convert("L"))
+        mask = np.where(grey < 250, 255, 0).astype(np.uint8)
     elif mask is None:
         raise MissingFile(depth_path, f"is missing, and {path.name} has no alpha channel; expected the depth image")
-    return _shrunk(color, mask, size)
+    return *shrink(color, mask, size), int(mask.max())
 
 
 def read_exactly(path: Path, size: int) -> np.ndarray:
     """An image of exactly this size, colours over white, uint8 [size, size, 3]."""
     image = open_image(path, RENDERINGS, limits.RENDER_SIDE)
-    if image.size != (size, size) or image.mode.startswith(("I", "F")):
+    if image.size != (size, size) or image.mode.startswith("I"):
         found = f"{image.width}x{image.height} pixels of the format {image.mode}"
         raise DamagedFile(path, f"is {found}; expected {size}x{size} of 8 bits")
     return split_alpha(image)[0]
@@ -65,7 +67,7 @@ def _read_square(path: Path, size: int) -> Image.Image:
 
 
 def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None where there is none."""
+    """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None if the image has none."""
     if image.mode == "P":
         image = image.convert("RGBA" if "transparency" in image.info else "RGB")
     if image.mode not in ("RGBA", "LA", "PA"):
@@ -75,22 +77,6 @@ def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
     white = Image.new("RGB", image.size, (255, 255, 255))
     white.paste(image, mask=alpha)
     return np.asarray(white), np.asarray(alpha)
-
-
-def _grey(path: Path, depth: Image.Image) -> np.ndarray:
-    """Depth in 8 bits: the high byte of 16, the luminance of colours."""
-    if depth.mode.startswith("I"):
-        values = np.asarray(depth)
-        if values.min() < 0 or values.max() > 65535:
-            raise DamagedFile(path, f"has values {values.min()} .. {values.max()}; expected 8 or 16 bits")
-        return values >> 8
-    if depth.mode == "F":
-        raise DamagedFile(path, "holds floating-point numbers; expected 8 or 16 bits")
-    return np.asarray(depth.convert("L"))
-
-
-def _shrunk(color: np.ndarray, mask: np.ndarray, size: int) -> View:
-    return *shrink(color, mask, size), int(mask.max())
 
 
 def shrink(color: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -126,20 +112,19 @@ def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
     lines = [line.split() for line in text.splitlines() if line.strip()]
     if len(lines) < rows:
         raise DamagedFile(path, f"has {len(lines)} rows, {rows} are needed; expected {wanted}. {FETCH_AGAIN}")
-    table = np.empty((rows, columns))
+    table = np.full((rows, columns), np.nan)
     for k, line in enumerate(lines[:rows]):
         try:
-            if len(line) < columns:
-                raise ValueError
             table[k] = [float(word) for word in line[:columns]]
+            sound = len(line) >= columns and np.isfinite(table[k]).all()
         except ValueError:
-            raise DamagedFile(path, f"row {k} is {' '.join(line)!r}; expected {wanted}") from None
-        if not np.isfinite(table[k]).all():
-            raise DamagedFile(path, f"row {k} has numbers that are not finite; expected {wanted}")
+            sound = False
+        if not sound:
+            raise DamagedFile(path, f"row {k} is {' '.join(line)!r}; expected {wanted}, all finite")
     return table
 
 
 def check_folder(path: Path, wanted: str) -> None:
-    """Raise MissingFile where there is no such folder."""
+    """Raise MissingFile if there is no such folder."""
     if not path.is_dir():
         raise MissingFile(path, f"is missing; expected {wanted}")

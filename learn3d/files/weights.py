@@ -1,4 +1,4 @@
-"""Pretrained weights that somebody else may have made: a function for worker processes."""
+"""Untrusted pretrained weights: a function for the sandbox."""
 
 from __future__ import annotations
 
@@ -15,22 +15,18 @@ SECONDS = 30.0
 
 
 def read_state_dict(path: Path) -> dict[str, np.ndarray]:
-    """The tensors of a state dict (.safetensors, or what torch.save writes), floating-point ones as float32 or float64.
+    """The tensors of a state dict (.safetensors or from torch.save), floating-point ones as float32 or float64.
 
-    Nothing in the file is executed (weights_only). Raises DamagedFile for what is no state dict of plain numbers.
+    Nothing in the file is executed (weights_only). Raises DamagedFile if it is no state dict of plain numbers.
     """
-    sandbox.allow(4 * check_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18"))
     import torch
+    from safetensors.torch import load_file
 
-    if path.suffix == ".safetensors":
-        from safetensors.torch import load_file
-
-        weights = load_file(path)
-    else:
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-    if not isinstance(weights, dict) or not all(
-        isinstance(name, str) and isinstance(value, torch.Tensor) for name, value in weights.items()
-    ):
+    sandbox.allow(4 * check_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18"))
+    is_torch = path.suffix != ".safetensors"
+    weights = torch.load(path, map_location="cpu", weights_only=True) if is_torch else load_file(path)
+    kinds = {(str, torch.Tensor)}
+    if not isinstance(weights, dict) or not {(type(name), type(value)) for name, value in weights.items()} <= kinds:
         raise DamagedFile(path, f"must hold a state dict (names -> tensors), got {type(weights).__name__}")
     arrays = {}
     for name, value in weights.items():

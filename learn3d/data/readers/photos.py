@@ -37,7 +37,7 @@ PROPERTIES = LayoutProperties(voxels=False, inverted=True, options=("image_size"
 AZIMUTH_WIDTHS_DEG = (15, 20, 30, 45, 60, 90)
 ELEVATION_WIDTH_DEG = 20
 PHOTOS_PER_CLASS = 8  # on average, at least: fewer tell a discriminator nothing
-_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"}
+_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp"}
 _SCALE_ODD = 1.7  # the same, worth a warning: half an angle for a whole one makes 2
 _SCALE_OFF = 5.0  # times larger or smaller than the distances say: then they are in another unit
 

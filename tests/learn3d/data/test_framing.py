@@ -155,7 +155,7 @@ def test_unreadable_photos_are_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"a.png: has no transparency and no mask: give a mask image"):
         read_photo(save(tmp_path / "a.png", colors))
     (tmp_path / "b.heic").write_bytes(b"\0\0\0\x18ftypheic")
-    with pytest.raises(ValueError, match=r"b.heic: .*Convert HEIC to JPEG"):
+    with pytest.raises(ValueError, match=r"b.heic: .*the kind PNG, JPEG, WEBP, BMP. Convert it"):
         read_photo(tmp_path / "b.heic")
     content = save(tmp_path / "c.png", np.random.default_rng(0).integers(0, 256, (90, 90, 3), np.uint8)).read_bytes()
     (tmp_path / "c.png").write_bytes(content[: len(content) // 2])
@@ -163,14 +163,13 @@ def test_unreadable_photos_are_named(tmp_path: Path) -> None:
         read_photo(tmp_path / "c.png")
 
 
-@pytest.mark.parametrize("kind", [np.uint16, np.int32, np.float32])
-def test_photos_of_more_than_8_bits_are_refused(tmp_path: Path, kind: type) -> None:
+def test_photos_of_more_than_8_bits_are_refused(tmp_path: Path) -> None:
     """Pillow cuts their values off at 255, which leaves all white."""
-    path = save(tmp_path / "a.tif", np.full((8, 6), 30_000, kind))
+    path = save(tmp_path / "a.png", np.full((8, 6), 30_000, np.uint16))
     mask = save(tmp_path / "m.png", np.full((8, 6), 255, np.uint8))
-    with pytest.raises(ValueError, match=r"a.tif: has more than 8 bits a pixel and channel \(.*\); save it with 8"):
+    with pytest.raises(ValueError, match=r"a.png: has more than 8 bits a pixel and channel \(.*\); save it with 8"):
         read_photo(path, mask)
-    assert read_photo(mask, save(tmp_path / "m.tif", np.full((8, 6), 65_535, np.uint16)))[1].min() == 255
+    assert read_photo(mask, save(tmp_path / "n.png", np.full((8, 6), 65_535, np.uint16)))[1].min() == 255
 
 
 def test_wrong_masks_are_told_apart() -> None:

@@ -115,7 +115,7 @@ FAULTS = {
     "03.png: is 72x60 pixels": lambda f: save(renders(f) / "03.png", np.zeros((60, 72, 4), np.uint8)),
     "rendering_metadata.txt: is missing": lambda f: (renders(f) / "rendering_metadata.txt").unlink(),
     "rendering_metadata.txt: has 23 rows, 24 are needed": rewrite_row(0, ""),
-    "rendering_metadata.txt: row 0 has numbers that are not finite": rewrite_row(0, "inf 25 0 0.8 25"),
+    "rendering_metadata.txt: row 0 is 'inf 25 0 0.8 25'": rewrite_row(0, "inf 25 0 0.8 25"),
     "row 1 has the yaw 10": rewrite_row(1, "10 27 10 0.8 25"),
     "row 1 has azimuth -10, elevation 27 and distance -1.75": rewrite_row(1, "10 27 0 -1 25"),
     "model.binvox: is missing": lambda f: grid(f).unlink(),
