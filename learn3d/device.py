@@ -7,7 +7,6 @@ there is nothing to do: every function hands on the tensor that it was given, an
 from __future__ import annotations
 
 import ctypes
-import os
 import sys
 from typing import Literal
 
@@ -45,22 +44,6 @@ def check_device(device: str) -> None:
     """Raise a ValueError when CUDA is asked for and absent."""
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device 'cuda' was asked for, but this PyTorch sees no CUDA device; use device 'cpu'")
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def oversubscription_warning(threads: int, processes: int) -> str:
-    """What to warn of where the threads of all processes on this machine are more than its cores; "" otherwise.
-
-    Threads meet hundreds of times a step, and all wait for one that has no core.
-    """
-    if threads == 1 or threads * processes <= cores():
-        return ""
-    have = f"{threads} threads" if processes == 1 else f"{processes} processes of {threads} threads each"
-    return f"{have} on {cores()} cores wait for each other; --threads {max(1, cores() // processes)} is faster"
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:

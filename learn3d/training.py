@@ -6,26 +6,22 @@ import contextlib
 import dataclasses
 import functools
 import time
-from dataclasses import dataclass
-from pathlib import Path
-
-import torch
 
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import batches
-from learn3d.device import keep_freed_memory, oversubscription_warning, resolve_precision
+from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.methods import create_method
-from learn3d.presets import PRESETS
 from learn3d.runs import folder as run_folder
-from learn3d.runs.checkpoint import Progress
 from learn3d.runs.faults import advice_on_errors
-from learn3d.runs.log import RunLog, SilentLog
+from learn3d.runs.log import open_log
 from learn3d.runs.state import Run, fingerprint_of
+from learn3d.runs.summary import Summary, describe_run
 from learn3d.terminal import is_watched, stop_on_signal
+from learn3d.threads import ThreadTuner
 from learn3d.validation import draw, validate
 
 
@@ -46,45 +42,39 @@ def train(
     """
     started, folder = time.monotonic(), config.output
     keep_freed_memory()
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
-
+    threads = ThreadTuner(config.threads, processes=group.world_size)
     with run_folder.lock_folder(folder) if group.is_main else contextlib.nullcontext():
         if group.is_main and not resume:
-            run_folder.check_can_start(folder, overwrite)  # it is cleared when all else is well
+            run_folder.check_can_start(folder, overwrite)  # an older run is removed when all else is well
         group = group.split_batch(config.batch_size, config.sampling)
-
         train_set, val_set = load_splits(config, progress=group.is_main)
-        found = (
-            *train_set.notes,
-            *val_set.notes,
-            train_set.check_masks(),
-            oversubscription_warning(torch.get_num_threads(), group.local_world_size),
-        )
         info = train_set.info(find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None)
         precision = resolve_precision(config.precision, config.device)
         how = {"device": config.device, "precision": precision, "seed": config.seed, "schedule": config.schedule}
         method = create_method(config.settings, info, **how)
-        method.check_batch(next(batches(train_set, config, rows=group.rows)))  # before an older run is cleared away
+        method.check_batch(next(batches(train_set, config, rows=group.rows)))  # before an older run is removed
         run = Run(config, method, info, fingerprint_of(train_set, precision), group)
         progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:  # also after a kill between the last save and the end
-            return dataclasses.replace(_summary(config, progress, started), was_finished=True)
-        before = progress.seconds
+            return Summary.of(config, progress, started, was_finished=True)
+        before, start = progress.seconds, progress.step + 1
+        threads.resume(progress.threads)
 
-        with advice_on_errors(folder), stop_on_signal() as stop, _open_log(config, progress, group) as log:
-            for warning in filter(None, (*notes, *found)):
+        with advice_on_errors(folder), stop_on_signal() as stop, open_log(config, progress, group.is_main) as log:
+            warnings = (*notes, *train_set.notes, *val_set.notes, train_set.check_masks())
+            for warning in filter(None, (*warnings, threads.oversubscription_warning(group.local_world_size))):
                 log.say(f"warning: {warning}")
-            log.say(_describe(config, precision, train_set, val_set, progress, group))
-            if config.settings.wants_mirror_plane:
-                log.say(_about_plane(info.mirror_plane_deg))
-            start = progress.step + 1
+            for line in describe_run(run, progress, train_set, val_set, threads):
+                log.say(line)
             for step, batch in enumerate(batches(train_set, config, start, group.rows), start):
+                step_began = time.monotonic()
                 losses = method.take_step(batch, step)
+                if chosen := threads.after_step(time.monotonic() - step_began):
+                    log.say(f"step {step}: {chosen}")
                 # With the losses of the step before: some methods train one network in odd steps, another in even ones.
                 recent = progress.losses | losses
-                seconds = before + time.monotonic() - started
-                progress = dataclasses.replace(progress, step=step, losses=losses, seconds=seconds)
+                state = {"step": step, "losses": losses, "threads": threads.chosen}
+                progress = dataclasses.replace(progress, **state, seconds=before + time.monotonic() - started)
                 log.step(step, losses)
 
                 last, stopped_by = step == config.iterations, group.stopped_by(stop)
@@ -100,7 +90,7 @@ def train(
                     then = run_folder.resume_command(folder)
                     log.say(f"stopped by {stopped_by} after step {step}; continue with: {then}")
                     break
-            summary = _summary(config, progress, started)
+            summary = Summary.of(config, progress, started)
             log.note(str(summary))
     return summary
 
@@ -115,59 +105,3 @@ def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDat
     progress = progress and is_watched()
     train_set = load("train", views_per_object=config.views_per_object, progress=progress)
     return train_set, load(config.val_split)
-
-
-def _about_plane(plane_deg: float | None) -> str:
-    """What the symmetry "auto" came to."""
-    if plane_deg is None:
-        return (
-            "no mirror plane: the masks show none (it takes some 150 from all around), so shapes are not mirrored; "
-            "--symmetry names a plane"
-        )
-    return f"mirror plane: the one that a camera of azimuth {plane_deg:g} looks along, as the masks show"
-
-
-@dataclass(frozen=True)
-class Summary:
-    """How a call of `train` ended."""
-
-    folder: Path
-    step: int
-    finished: bool  # False when a signal stopped it
-    best_iou: float
-    best_step: int
-    seconds: float  # of this call
-    total_seconds: float  # of training, over all resumptions
-    was_finished: bool = False  # before this call
-
-    def __str__(self) -> str:
-        """How it ended, in a line."""
-        if self.was_finished:
-            end = f"was already finished at step {self.step}"
-        else:
-            end = f"{'finished' if self.finished else 'stopped'} at step {self.step} after {self.seconds / 60:.1f} min"
-            if self.total_seconds > self.seconds + 1:
-                end += f" ({self.total_seconds / 60:.1f} min of training in all)"
-        best = f"best validation IoU {self.best_iou:.4f} at step {self.best_step}; " if self.best_step else ""
-        return f"{end}; {best}everything is in {self.folder}"
-
-
-def _summary(config: TrainConfig, at: Progress, started: float) -> Summary:
-    finished, seconds = at.step == config.iterations, time.monotonic() - started
-    return Summary(config.output, at.step, finished, at.best_iou, at.best_step, seconds, at.seconds)
-
-
-def _open_log(config: TrainConfig, progress: Progress, group: ProcessGroup) -> RunLog | SilentLog:
-    return RunLog(config.output, start=progress.step, total=config.iterations) if group.is_main else SilentLog()
-
-
-def _describe(
-    config: TrainConfig, precision: str, train_set: ViewDataset, val_set: ViewDataset, at: Progress, group: ProcessGroup
-) -> str:
-    where = f"{config.device}, {precision}, {torch.get_num_threads()} threads"
-    if group.world_size > 1:
-        where += f" in each of {group.world_size} processes ({group.backend})"
-    data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
-    verb = f"resuming at step {at.step}" if at.step else "training"
-    name = f"{PRESETS[config.preset].label} ({config.preset})"
-    return f"{verb}: {name} on {config.category}, {data}; {where}; output {config.output}"

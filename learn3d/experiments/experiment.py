@@ -10,7 +10,6 @@ import torch
 from pydantic import ValidationError
 
 from learn3d.config import config_from_dict, differences, load_config
-from learn3d.device import cores
 from learn3d.distributed.tasks import Task, run_tasks
 from learn3d.experiments.formats import to_text, write_report
 from learn3d.experiments.measurement import Result, measure
@@ -22,6 +21,7 @@ from learn3d.files.reading import parse_json, read_bytes
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.terminal import INTERRUPTED, note, say
+from learn3d.threads import cores
 from learn3d.training import train
 
 LOG_FILE, RESULT_FILE = "log.txt", "test.json"  # in a run's folder

@@ -46,6 +46,7 @@ class Progress:
     best_step: AnyStep = 0
     seconds: Weight = 0.0  # spent in training, over all resumptions
     object_share: Share = 0.0  # side of the objects' bounding squares over that of the pictures, training mean
+    threads: Count | None = None  # CPU threads that the run has chosen by itself; None: fixed, or not chosen yet
     losses: dict[str, float] = dataclasses.field(default_factory=dict)  # of the last step, however large
 
 

@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from learn3d.config import TrainConfig
 from learn3d.files import writing
+from learn3d.runs.checkpoint import Progress
 from learn3d.runs.folder import JOURNAL, METRICS, TENSORBOARD
 from learn3d.terminal import is_watched, note, plain
 
@@ -183,6 +185,11 @@ class _Lines:
     def close(self) -> None:
         with contextlib.suppress(OSError):
             self._file.close()
+
+
+def open_log(config: TrainConfig, progress: Progress, is_main: bool) -> RunLog | SilentLog:
+    """The log of a run that goes on at `progress`; processes other than rank 0 report nothing."""
+    return RunLog(config.output, start=progress.step, total=config.iterations) if is_main else SilentLog()
 
 
 class SilentLog:

@@ -17,7 +17,6 @@ from learn3d.config import TrainConfig, check_resume, config_from_dict, config_t
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
 from learn3d.data.sampling import shuffled_epochs
-from learn3d.device import oversubscription_warning
 from learn3d.distributed.process_group import SINGLE_PROCESS
 from learn3d.methods import DatasetInfo, create_method
 from learn3d.methods.multi_view import MultiViewSettings
@@ -545,11 +544,6 @@ def test_another_precision_is_compared_with_what_auto_was(tiny_run, run_folder) 
     checkpoint.save(run_folder / "last.safetensors", tensors, metadata)
     with pytest.raises(ValueError, match="precision: 'fp32' in the run, 'bf16' asked for"):
         train(config, resume=True)
-
-
-@pytest.mark.parametrize(("threads", "processes", "named"), [(10**4, 1, True), (1, 1, False), (10**4, 2, True)])
-def test_more_threads_than_cores_are_named(threads: int, processes: int, named: bool) -> None:
-    assert ("--threads" in oversubscription_warning(threads, processes)) == named
 
 
 @pytest.mark.parametrize("preset", ["peng2020-kato", "peng2020-kato-vpl", "kato2018-kato"])

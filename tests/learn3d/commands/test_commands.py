@@ -20,7 +20,6 @@ from learn3d.commands import train as train_command
 from learn3d.config import load_config
 from learn3d.experiments.measurement import MEASURES
 from learn3d.terminal import INTERRUPTED
-from learn3d.training import Summary
 
 TOOLS = Path(__file__).parents[3] / "tools"
 

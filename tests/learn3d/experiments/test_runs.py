@@ -24,7 +24,7 @@ from learn3d.distributed import tasks
 from learn3d.experiments import experiment
 from learn3d.experiments.experiment import run_experiment, train_and_test
 from learn3d.experiments.plan import Request, plan_runs
-from learn3d.training import Summary
+from learn3d.runs.summary import Summary
 
 
 def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys, request_for) -> None:
