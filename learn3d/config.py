@@ -79,7 +79,8 @@ class TrainConfig:
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     """Arithmetic of the networks. auto: bf16 where it is faster (CUDA, CPUs with bf16 instructions), else fp32."""
     threads: Annotated[int, Field(ge=1, le=4096)] | None = None
-    """CPU threads for the networks. None: PyTorch's default, one per core."""
+    """Number of CPU threads. None: one or all, whichever makes the steps faster, tried at the beginning and when steps
+    become slow."""
     val_split: Literal["val", "test"] = "val"
     """Split used for validation during training (and for choosing the best checkpoint)."""
     validate_every: Step = 2000

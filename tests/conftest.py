@@ -6,6 +6,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+# One thread, as in tools/test.sh: bits depend on the number of threads, and tests share their cores.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 sys.path.insert(0, str(Path(__file__).parent / "data"))
 
 # A shell lets what it starts in the background ignore SIGINT, and so would the programs that tests start.

@@ -19,6 +19,7 @@ from learn3d.commands import packages
 from learn3d.commands import train as train_command
 from learn3d.config import load_config
 from learn3d.experiments.measurement import MEASURES
+from learn3d.runs.summary import Summary
 from learn3d.terminal import INTERRUPTED
 
 TOOLS = Path(__file__).parents[3] / "tools"
