@@ -46,243 +46,19 @@ struct Lens {
   }
 };
 
-template <class T>
-NMR_INLINE T larger(T a, T b) {
-  return a > b ? a : b;
-}
-
-template <class T>
-NMR_INLINE bool is_finite(T value) {
-  return std::abs(value) <= std::numeric_limits<T>::max();
-}
-
-// The image of a vertex. If there is none (the vertex is not finite, in the plane of the eye, or so close to it that x
-// / z^2 overflows), `size` is not finite and all else is undefined. (One number, because compilers do not vectorize
-// loops over `&&`.)
-template <class T>
-struct Sight {
-  T inverse_z;
-  T px, py;    // before the distortion
-  T qx, qy;    // after it, divided by the extent
-  T x, y, z;   // in renderer space
-  T slope;     // bound of the derivative of extent q by the vertex in camera axes, up to a factor below 10
-  T size;      // |x| + |y| + |z|
-};
-
-// x, y, z are relative to the origin. Images use divisions, which round as the published ones. Derivatives (kExact
-// false) use one reciprocal instead, which saves time.
-template <class T, bool kPerspective, bool kDistorted, bool kExact>
-NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
-  Sight<T> s;
-  const T ux = c.a[0] * x + c.a[1] * y + c.a[2] * z + c.a[3];
-  const T uy = c.a[4] * x + c.a[5] * y + c.a[6] * z + c.a[7];
-  s.z = c.a[8] * x + c.a[9] * y + c.a[10] * z + c.a[11];
-  s.inverse_z = kPerspective ? 1 / s.z : T(1);
-  s.px = !kPerspective ? ux : kExact ? ux / s.z : ux * s.inverse_z;
-  s.py = !kPerspective ? uy : kExact ? uy / s.z : uy * s.inverse_z;
-  const T reach = larger(larger(std::abs(s.px), std::abs(s.py)), T(1));
-  s.slope = kPerspective ? reach * std::abs(s.inverse_z) : T(1);
-  s.qx = s.px;
-  s.qy = s.py;
-  // q = p (1 + k1 r^2 + k2 r^4 + k3 r^6) + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y)
-  if (kDistorted) {
-    const T r2 = s.px * s.px + s.py * s.py, xy = s.px * s.py;
-    const T radial = 1 + r2 * (c.d[0] + r2 * (c.d[1] + r2 * c.d[4]));
-    s.qx = s.px * radial + 2 * c.d[2] * xy + c.d[3] * (r2 + 2 * s.px * s.px);
-    s.qy = s.py * radial + c.d[2] * (r2 + 2 * s.py * s.py) + 2 * c.d[3] * xy;
-    s.slope *= 1 + r2 * (std::abs(c.d[0]) + r2 * (std::abs(c.d[1]) + r2 * std::abs(c.d[4]))) +
-               reach * (std::abs(c.d[2]) + std::abs(c.d[3]));
-  }
-  s.qx = kExact ? s.qx / c.extent : s.qx * c.inverse_extent;
-  s.qy = kExact ? s.qy / c.extent : s.qy * c.inverse_extent;
-  s.x = c.k[0] * s.qx + c.k[1] * s.qy + c.k[2];
-  s.y = c.k[3] * s.qx + c.k[4] * s.qy + c.k[5];
-  s.size = s.slope < kLimit<T> ? std::abs(s.x) + std::abs(s.y) + std::abs(s.z) : std::numeric_limits<T>::infinity();
-  return s;
-}
-
-template <class T, bool kPerspective, bool kDistorted>
-NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T* __restrict points) {
-  const T infinity = std::numeric_limits<T>::infinity();
-  for (int l = 0; l < kGroup; ++l) {
-    const Sight<T> s = sight_of<T, kPerspective, kDistorted, true>(
-        c, vertices[3 * l] - c.o[0], vertices[3 * l + 1] - c.o[1], vertices[3 * l + 2] - c.o[2]);
-    points[3 * l] = is_finite(s.size) ? s.x : infinity;
-    points[3 * l + 1] = is_finite(s.size) ? s.y : infinity;
-    points[3 * l + 2] = is_finite(s.z) ? s.z : T(0);
-  }
-}
-
-// Adds the gradient of kGroup vertices to grad_vertices, and that of the camera to the partial sums. A vertex without
-// an image, or whose gradient would overflow although the upstream gradient is finite, gets gradient 0 and contributes
-// 0 to the camera. If the upstream gradient is infinite or NaN, that of the vertex and of the camera is NaN.
-template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
-NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, const T* __restrict grad_points,
-                               T* __restrict grad_vertices, T (*__restrict sums)[kGroup]) {
-  for (int l = 0; l < kGroup; ++l) {
-    T x = vertices[3 * l] - c.o[0], y = vertices[3 * l + 1] - c.o[1], z = vertices[3 * l + 2] - c.o[2];
-    T gx = grad_points[3 * l], gy = grad_points[3 * l + 1], gz = grad_points[3 * l + 2];
-    Sight<T> s = sight_of<T, kPerspective, kDistorted, false>(c, x, y, z);
-    T reach = larger(std::abs(s.qx), std::abs(s.qy)) + c.largest_k * s.slope;
-    if (kDistorted) {
-      const T r2 = 1 + s.px * s.px + s.py * s.py;
-      reach = (reach + c.largest_k * r2 * r2 * r2 * r2) * c.largest_d;
-    }
-    const T bound = ((std::abs(gx) + std::abs(gy)) * reach + std::abs(gz)) * c.largest_a *
-                    larger(larger(larger(std::abs(x), std::abs(y)), std::abs(z)), T(1));
-    const bool keep = is_finite(bound >= kLimit<T> ? std::numeric_limits<T>::infinity() : s.size);
-    // Values of skipped vertices are set to 0 before they are multiplied, so that no product is 0 * inf.
-    x = keep ? x : T(0), y = keep ? y : T(0), z = keep ? z : T(0);
-    const T nothing =
-        is_finite(s.size) ? gx * T(0) + gy * T(0) + gz * T(0) : T(0);  // NaN if the upstream gradient is not finite
-    gx = keep ? gx : nothing, gy = keep ? gy : nothing, gz = keep ? gz : nothing;
-    s.px = keep ? s.px : T(0), s.py = keep ? s.py : T(0);
-    s.qx = keep ? s.qx : T(0), s.qy = keep ? s.qy : T(0);
-    if (kPerspective) s.inverse_z = keep ? s.inverse_z : T(0);
-
-    const T gqx = (c.k[0] * gx + c.k[3] * gy) * c.inverse_extent;
-    const T gqy = (c.k[1] * gx + c.k[4] * gy) * c.inverse_extent;
-    T gpx = gqx, gpy = gqy;
-    if (kDistorted) {
-      const T r2 = s.px * s.px + s.py * s.py, xy = s.px * s.py;
-      const T radial = 1 + r2 * (c.d[0] + r2 * (c.d[1] + r2 * c.d[4]));
-      const T along = gqx * s.px + gqy * s.py;  // gradient of `radial`
-      const T g_r2 = along * (c.d[0] + r2 * (2 * c.d[1] + r2 * (3 * c.d[4]))) + gqx * c.d[3] + gqy * c.d[2];
-      const T cross = 2 * (gqx * c.d[2] + gqy * c.d[3]);  // gradient of x y
-      gpx = gqx * radial + cross * s.py + 4 * gqx * c.d[3] * s.px + 2 * g_r2 * s.px;
-      gpy = gqy * radial + cross * s.px + 4 * gqy * c.d[2] * s.py + 2 * g_r2 * s.py;
-      if (kSumCamera) {
-        sums[18][l] += along * r2;
-        sums[19][l] += along * r2 * r2;
-        sums[20][l] += 2 * gqx * xy + gqy * (r2 + 2 * s.py * s.py);
-        sums[21][l] += gqx * (r2 + 2 * s.px * s.px) + 2 * gqy * xy;
-        sums[22][l] += along * r2 * r2 * r2;
-      }
-    }
-    const T gux = kPerspective ? gpx * s.inverse_z : gpx, guy = kPerspective ? gpy * s.inverse_z : gpy;
-    const T guz = kPerspective ? gz - (gux * s.px + guy * s.py) : gz;
-    grad_vertices[3 * l] += c.a[0] * gux + c.a[4] * guy + c.a[8] * guz;
-    grad_vertices[3 * l + 1] += c.a[1] * gux + c.a[5] * guy + c.a[9] * guz;
-    grad_vertices[3 * l + 2] += c.a[2] * gux + c.a[6] * guy + c.a[10] * guz;
-    if (kSumCamera) {
-      const T gu[3] = {gux, guy, guz}, g[2] = {gx, gy};
-      for (int i = 0; i < 3; ++i) {
-        sums[4 * i][l] += gu[i] * x;
-        sums[4 * i + 1][l] += gu[i] * y;
-        sums[4 * i + 2][l] += gu[i] * z;
-        sums[4 * i + 3][l] += gu[i];
-      }
-      for (int i = 0; i < 2; ++i) {
-        sums[12 + 3 * i][l] += g[i] * s.qx;
-        sums[13 + 3 * i][l] += g[i] * s.qy;
-        sums[14 + 3 * i][l] += g[i];
-      }
-    }
-  }
-}
-
 // Consecutive vertices of one image: their first row in the vertices and in the points.
 struct Run {
   int64_t image, vertices, points, count;
 };
 
-// The last, incomplete group of a run is copied and padded with NaN vertices, which have no image.
-template <class T>
-struct Padded {
-  T vertices[3 * kGroup], grad_points[3 * kGroup], out[3 * kGroup];
+}  // namespace
+}  // namespace nmr
 
-  Padded(const T* from, int64_t count) : grad_points{}, out{} {
-    std::fill_n(vertices, 3 * kGroup, std::numeric_limits<T>::quiet_NaN());
-    std::copy_n(from, 3 * count, vertices);
-  }
-};
+#define NMR_LEVEL_FILE "project_lanes.h"
+#include "levels.h"
 
-template <class T, bool kPerspective, bool kDistorted>
-NMR_INLINE void forward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run) {
-  const T* vertices = args.vertices + 3 * run.vertices;
-  T* points = args.points + 3 * run.points;
-  const int64_t whole = run.count / kGroup * kGroup, rest = run.count - whole;
-  Padded<T> last(vertices + 3 * whole, rest);
-  for (int64_t n = 0; n < run.count; n += kGroup)  // one call, so that it is inlined into each clone
-    forward_lanes<T, kPerspective, kDistorted>(lens, n < whole ? vertices + 3 * n : last.vertices,
-                                               n < whole ? points + 3 * n : last.out);
-  std::copy_n(last.out, 3 * rest, points + 3 * whole);
-}
-
-template <class T>
-NMR_INLINE void forward_run_body(const Project<T>& args, const Run& run) {
-  const Lens<T> lens(args, run.image);
-  if (!lens.usable) {
-    T* points = args.points + 3 * run.points;
-    for (int64_t n = 0; n < run.count; ++n) {
-      points[3 * n] = points[3 * n + 1] = std::numeric_limits<T>::infinity();
-      points[3 * n + 2] = 0;
-    }
-  } else if (!args.perspective) {
-    forward_run_of<T, false, false>(args, lens, run);
-  } else if (!args.distortion) {
-    forward_run_of<T, true, false>(args, lens, run);
-  } else {
-    forward_run_of<T, true, true>(args, lens, run);
-  }
-}
-
-template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
-NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run, T* grad_vertices,
-                                double* total) {
-  T sums[kSums][kGroup] = {};
-  const T* vertices = args.vertices + 3 * run.vertices;
-  const T* grad_points = args.grad_points + 3 * run.points;
-  const int64_t whole = run.count / kGroup * kGroup, rest = run.count - whole;
-  Padded<T> last(vertices + 3 * whole, rest);
-  std::copy_n(grad_points + 3 * whole, 3 * rest, last.grad_points);
-  std::copy_n(grad_vertices + 3 * whole, 3 * rest, last.out);
-  for (int64_t n = 0; n < run.count; n += kGroup) {
-    const bool inside = n < whole;
-    backward_lanes<T, kPerspective, kDistorted, kSumCamera>(lens, inside ? vertices + 3 * n : last.vertices,
-                                                            inside ? grad_points + 3 * n : last.grad_points,
-                                                            inside ? grad_vertices + 3 * n : last.out, sums);
-  }
-  std::copy_n(last.out, 3 * rest, grad_vertices + 3 * whole);
-  if (!kSumCamera) return;
-  for (int k = 0; k < kSums; ++k) {
-    total[k] = 0;
-    for (int l = 0; l < kGroup; ++l) total[k] += static_cast<double>(sums[k][l]);
-  }
-  // u depends on v - origin and q on p / extent.
-  const double* t = total;
-  for (int j = 0; j < 3; ++j)
-    total[kSums + j] = -(double(lens.a[j]) * t[3] + double(lens.a[4 + j]) * t[7] + double(lens.a[8 + j]) * t[11]);
-  total[kSums + 3] = -(double(lens.k[0]) * t[12] + double(lens.k[1]) * t[13] + double(lens.k[3]) * t[15] +
-                       double(lens.k[4]) * t[16]) / double(lens.extent);
-}
-
-// total: kTotals gradients of the camera, summed over this run, or nullptr.
-template <class T>
-NMR_INLINE void backward_run_body(const Project<T>& args, const Run& run, T* grad_vertices, double* total) {
-  const Lens<T> lens(args, run.image);
-  if (!lens.usable) {
-    if (total) std::fill_n(total, kTotals, 0.0);
-  } else if (!args.perspective) {
-    total ? backward_run_of<T, false, false, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, false, false, false>(args, lens, run, grad_vertices, total);
-  } else if (!args.distortion) {
-    total ? backward_run_of<T, true, false, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, true, false, false>(args, lens, run, grad_vertices, total);
-  } else {
-    total ? backward_run_of<T, true, true, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, true, true, false>(args, lens, run, grad_vertices, total);
-  }
-}
-
-NMR_CLONES void forward_run(const Project<float>& args, const Run& run) { forward_run_body(args, run); }
-NMR_CLONES void forward_run(const Project<double>& args, const Run& run) { forward_run_body(args, run); }
-NMR_CLONES void backward_run(const Project<float>& args, const Run& run, float* grad_vertices, double* total) {
-  backward_run_body(args, run, grad_vertices, total);
-}
-NMR_CLONES void backward_run(const Project<double>& args, const Run& run, double* grad_vertices, double* total) {
-  backward_run_body(args, run, grad_vertices, total);
-}
+namespace nmr {
+namespace {
 
 struct ProjectScratch {
   std::vector<Run> runs;
@@ -315,7 +91,8 @@ template <class T>
 void project_forward(const Project<T>& args) {
   const ScratchUse use;
   const std::vector<Run>& runs = runs_of(args, thread_scratch<ProjectScratch>());
-  parallel_for(static_cast<int64_t>(runs.size()), args.num_threads, [&](int64_t r) { forward_run(args, runs[r]); });
+  parallel_for(static_cast<int64_t>(runs.size()), args.num_threads,
+               [&](int64_t r) { NMR_AT_BEST_LEVEL(forward_run, args, runs[r]); });
 }
 
 template <class T>
@@ -340,7 +117,7 @@ void project_backward(const Project<T>& args) {
     std::fill_n(grad, 3 * runs[task].count, T(0));
     for (int64_t b = 0; b < images; ++b) {
       const int64_t r = b * tasks + task;
-      backward_run(args, runs[r], grad, totals ? totals + r * kTotals : nullptr);
+      NMR_AT_BEST_LEVEL(backward_run, args, runs[r], grad, totals ? totals + r * kTotals : nullptr);
     }
   });
   if (!sum_camera) return;

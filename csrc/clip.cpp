@@ -17,20 +17,13 @@ constexpr int64_t kLanes = 16;
 
 // Whether a depth lies behind the plane. NaN does not: such a face is not drawn anyway.
 template <class T>
-NMR_INLINE bool any_behind_body(const T* vertices, int64_t count, T near) {
+bool any_behind(const T* vertices, int64_t count, T near) {
   int32_t behind[kLanes] = {};
   int64_t v = 0;
   for (; v + kLanes <= count; v += kLanes)
     for (int64_t l = 0; l < kLanes; ++l) behind[l] |= vertices[3 * (v + l) + 2] < near;
   for (; v < count; ++v) behind[0] |= vertices[3 * v + 2] < near;
   return std::any_of(behind, behind + kLanes, [](int32_t any) { return any != 0; });
-}
-
-NMR_CLONES bool any_behind(const float* vertices, int64_t count, float near) {
-  return any_behind_body(vertices, count, near);
-}
-NMR_CLONES bool any_behind(const double* vertices, int64_t count, double near) {
-  return any_behind_body(vertices, count, near);
 }
 
 // Triangles that are left of a face with 0, 1, 2, 3 corners behind the plane.

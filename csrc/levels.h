@@ -1,15 +1,16 @@
-// Compiles one file of lane code for several instruction sets (levels) and lets the program choose at run time:
+// Compiles one file of inner loops for several instruction sets (levels) and lets the program choose at run time:
 //
 //   #define NMR_LEVEL_FILE "sweep.h"   // functions and templates only: no #include, no namespace, no include guard
 //   #include "levels.h"
 //   ...
-//   NMR_AT_BEST_LEVEL(sweep_faces, image, faces);   // calls base::sweep_faces, v3::sweep_faces, ...
+//   NMR_AT_BEST_LEVEL(sweep_faces, image, faces);   // calls base::sweep_faces, v3::sweep_faces or v4::sweep_faces
 //
 // The file is included once per level, each time in a namespace of its own that also holds the lanes (level_lanes.h)
-// of that level. Its own includes stand above, so that nothing of the standard library is compiled for a level and
-// then shared with code for all processors: a function of a level never has the name of one that another file could
-// call. Levels other than `base` exist for x86-64 with GCC 12 or later and glibc, if NMR_MULTIVERSION is defined.
-// NMR_CPU_LEVEL=base in the environment keeps a process at that level; results do not depend on it.
+// of that level. Loops over plain arrays are vectorized by the compiler, others use lanes. Its own includes stand
+// above, so that nothing of the standard library is compiled for a level and then shared with code for all processors:
+// a function of a level never has the name of one that another file could call. Levels other than `base` exist for
+// x86-64 with GCC 12 or later and glibc, if NMR_MULTIVERSION is defined. NMR_CPU_LEVEL=base or v3 in the environment
+// keeps a process at that level; results do not depend on it.
 #include <cstdint>
 #include <cstring>
 #include <type_traits>
@@ -31,20 +32,34 @@ namespace {
 }  // namespace nmr
 
 #if NMR_LEVELS
+#define NMR_AVX2 1
 #pragma GCC push_options
 #pragma GCC target("arch=x86-64-v3")
 namespace nmr {
 namespace v3 {
 namespace {
-#define NMR_AVX2 1
 #include "level_lanes.h"
 #include NMR_LEVEL_FILE
-#undef NMR_AVX2
 }  // namespace
 }  // namespace v3
 }  // namespace nmr
 #pragma GCC pop_options
-#define NMR_AT_BEST_LEVEL(function, ...) (cpu_level() == 3 ? v3::function(__VA_ARGS__) : base::function(__VA_ARGS__))
+#pragma GCC push_options
+#pragma GCC target("arch=x86-64-v4")
+namespace nmr {
+namespace v4 {
+namespace {
+#include "level_lanes.h"
+#include NMR_LEVEL_FILE
+}  // namespace
+}  // namespace v4
+}  // namespace nmr
+#pragma GCC pop_options
+#undef NMR_AVX2
+#define NMR_AT_BEST_LEVEL(function, ...)          \
+  (cpu_level() == 4   ? v4::function(__VA_ARGS__) \
+   : cpu_level() == 3 ? v3::function(__VA_ARGS__) \
+                      : base::function(__VA_ARGS__))
 #else
 #define NMR_AT_BEST_LEVEL(function, ...) base::function(__VA_ARGS__)
 #endif

@@ -15,16 +15,6 @@
 #define NMR_LEVELS 0
 #endif
 
-// A function marked NMR_CLONES is compiled for three levels of x86-64, and the loader chooses one. Only code that is
-// inlined into it is compiled with it, so functions called in its loops are marked NMR_INLINE. The macro is empty on
-// other processors, with other compilers, with GCC before 12 (which does not know the levels), and without glibc
-// (which makes the choice at load time).
-#if NMR_LEVELS
-#define NMR_CLONES __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4")))
-#else
-#define NMR_CLONES
-#endif
-
 #if defined(__GNUC__)
 #define NMR_INLINE inline __attribute__((always_inline))
 #elif defined(_MSC_VER)
@@ -46,12 +36,14 @@ NMR_INLINE int64_t lowest_bit(uint32_t bits) {
 #endif
 }
 
-// The level of this processor that lane code is compiled for (levels.h): 3 for x86-64-v3, else 1.
+// The highest level of this processor that inner loops are compiled for (levels.h): 4 for x86-64-v4, 3 for v3, else 1.
 inline int cpu_level() {
 #if NMR_LEVELS
   static const int level = [] {
     const char* wanted = std::getenv("NMR_CPU_LEVEL");
-    return __builtin_cpu_supports("x86-64-v3") && !(wanted && std::strcmp(wanted, "base") == 0) ? 3 : 1;
+    const auto is_wanted = [wanted](const char* name) { return wanted && std::strcmp(wanted, name) == 0; };
+    if (is_wanted("base") || !__builtin_cpu_supports("x86-64-v3")) return 1;
+    return is_wanted("v3") || !__builtin_cpu_supports("x86-64-v4") ? 3 : 4;
   }();
   return level;
 #else

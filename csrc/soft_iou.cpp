@@ -17,26 +17,10 @@ struct Totals {
 }  // namespace
 }  // namespace nmr
 
-#define NMR_LEVEL_FILE "soft_iou_sums.h"
+#define NMR_LEVEL_FILE "soft_iou_lanes.h"
 #include "levels.h"
 
 namespace nmr {
-namespace {
-
-// d (I / U) / dp = (t (U + I) - I) / U^2, and the same with p and t exchanged.
-template <class T>
-NMR_INLINE void gradient_body(const T* __restrict other, T factor, T offset, T* __restrict grad, int64_t count) {
-  for (int64_t n = 0; n < count; ++n) grad[n] = factor * other[n] - offset;
-}
-
-NMR_CLONES void gradient_of(const float* other, float factor, float offset, float* grad, int64_t count) {
-  gradient_body(other, factor, offset, grad, count);
-}
-NMR_CLONES void gradient_of(const double* other, double factor, double offset, double* grad, int64_t count) {
-  gradient_body(other, factor, offset, grad, count);
-}
-
-}  // namespace
 
 template <class T>
 void soft_iou_forward(const SoftIou<T>& args) {
@@ -58,8 +42,9 @@ void soft_iou_backward(const SoftIou<T>& args) {
     const T factor = static_cast<T>(scale * (either + both)), offset = static_cast<T>(scale * both);
     const int64_t first = b * args.count;
     if (args.grad_prediction)
-      gradient_of(args.target + first, factor, offset, args.grad_prediction + first, args.count);
-    if (args.grad_target) gradient_of(args.prediction + first, factor, offset, args.grad_target + first, args.count);
+      NMR_AT_BEST_LEVEL(gradient_of, args.target + first, factor, offset, args.grad_prediction + first, args.count);
+    if (args.grad_target)
+      NMR_AT_BEST_LEVEL(gradient_of, args.prediction + first, factor, offset, args.grad_target + first, args.count);
   });
 }
 

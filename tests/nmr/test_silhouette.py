@@ -311,9 +311,9 @@ def test_any_instruction_set_gives_the_same_bits():
             capture_output=True,
             env={**os.environ, "NMR_CPU_LEVEL": level},
         ).stdout
-        for level in ("base", "")
+        for level in ("base", "v3", "")
     ]
-    assert outputs[0] == outputs[1] and len(outputs[0].split()) == 2
+    assert outputs[0] == outputs[1] == outputs[2] and len(outputs[0].split()) == 2
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc/self/statm")

@@ -1,4 +1,4 @@
-// Sums of the products and of the values of two images; included by levels.h for every instruction set.
+// The loops of the soft intersection over union; included by levels.h for every instruction set.
 
 // Adds p t and p + t of kLanes pairs to partial sums.
 template <class T>
@@ -34,4 +34,10 @@ Totals totals_of(const T* p, const T* t, int64_t count) {
     }
   }
   return totals;
+}
+
+// d (I / U) / dp = (t (U + I) - I) / U^2, and the same with p and t exchanged.
+template <class T>
+void gradient_of(const T* __restrict other, T factor, T offset, T* __restrict grad, int64_t count) {
+  for (int64_t n = 0; n < count; ++n) grad[n] = factor * other[n] - offset;
 }
