@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from learn3d.make_data.shapes import airplane, car, chair, lamp, sofa, table
-from learn3d.make_data.shapes.draw import Draw
-from learn3d.make_data.shapes.parts import assemble
+from . import airplane, car, chair, lamp, sofa, table
+from .draw import Draw
+from .parts import assemble
 
 # The recipes of each category, with their weights: a shape is made by one of them.
 _RECIPES = {

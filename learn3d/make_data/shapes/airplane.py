@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from learn3d.make_data.shapes.airplane_parts import (
+from .airplane_parts import (
     Planform,
-    along_z,
     canopy,
-    engines_at_tail,
-    engines_under_wing,
     fin,
     fuselage,
+    gear,
     jet_nozzle,
-    landing_gear,
     nacelle,
+    pod,
     propeller,
-    streamlined,
     tail,
-    whole_wing,
-    winglets,
+    tail_engines,
 )
-from learn3d.make_data.shapes.draw import Draw
-from learn3d.make_data.shapes.parts import Part, bar, box, ellipse, ellipsoid, loft, rectangle, tube, wing
+from .draw import Draw
+from .parts import Part, bar, box, ellipse, ellipsoid, loft, rectangle, revolve, tube, wing
 
 
 def airliner(draw: Draw) -> Part:
@@ -44,18 +40,18 @@ def airliner(draw: Draw) -> Part:
         two = draw.maybe(0.35 if freighter else 0.7)
         size *= 1.25 if two else 0.9
         for share in (draw(0.28, 0.4),) if two else (0.3, draw(0.55, 0.65)):
-            plane += engines_under_wing(draw, plan, share, size)
+            plane += plan.engines(draw, share, size)
     else:
-        plane += engines_at_tail(draw, radius, 0.9 * size, z=draw(-0.32, -0.24))
+        plane += tail_engines(draw, radius, 0.9 * size, z=draw(-0.32, -0.24))
     if mount.endswith("3"):
         plane += nacelle(0.9 * size, 4.5 * size).moved(y=1.35 * radius, z=-0.36)
     plane += tail(draw, "T" if freighter or mount.startswith("tail") else "conventional", radius, swept=True)
     if draw.maybe(0.4):
-        plane += winglets(draw, plan)
+        plane += plan.winglets(draw)
     if not freighter and draw.maybe(0.12):  # an upper deck
         plane += ellipsoid((1.5 * radius, 1.5 * radius, 0.4), (0, 0.75 * radius, 0.27))
     if draw.maybe(0.25):
-        plane += landing_gear(radius, radius * draw(1.5, 2.0), main_x=1.2 * radius, main_z=-0.02, other_z=0.38)
+        plane += gear(radius, radius * draw(1.5, 2.0), main_x=1.2 * radius, main_z=-0.02, other_z=0.38)
     return plane
 
 
@@ -65,10 +61,10 @@ def business_jet(draw: Draw) -> Part:
     plane = fuselage(radius, nose=draw(0.14, 0.24), nose_power=1.6, tail_start=0.6, upsweep=0.35, droop=0.3)
     size = draw.measures(half=(0.4, 0.52), root=(0.15, 0.2), tip=(0.045, 0.07), sweep_deg=(2, 34), dihedral_deg=(2, 6))
     plan = Planform(**size, z=draw(0.02, 0.08), y=-0.75 * radius)
-    plane += plan.wing() + engines_at_tail(draw, radius, draw(0.026, 0.036), z=-0.2)
+    plane += plan.wing() + tail_engines(draw, radius, draw(0.026, 0.036), z=-0.2)
     plane += tail(draw, draw.pick({"T": 3, "cross": 1, "V": 0.4}), radius, swept=True)
     if draw.maybe(0.5):
-        plane += winglets(draw, plan)
+        plane += plan.winglets(draw)
     if draw.maybe(0.25):  # tanks at the wing tips
         x, y, z, chord = plan.at(1.0)
         plane += ellipsoid((0.035, 0.035, 0.2), (x, y, z - 0.5 * chord)).both_sides()
@@ -154,7 +150,7 @@ def supersonic(draw: Draw) -> Part:
     t = np.linspace(0, 1, 7)
     lead = z - root * (0.95 - draw(0.0, 0.12) * (1 - t)) * t ** draw(0.7, 1.05)
     chord = np.maximum(lead - (z - root - 0.03 * t), 0.03)
-    plane += whole_wing([(half * s, y, a, c, 0.035) for s, a, c in zip(t, lead, chord, strict=True)])
+    plane += wing([(half * s, y, a, c, 0.035) for s, a, c in zip(t, lead, chord, strict=True)], whole=True)
     for x in (0.3, 0.45) if draw.maybe(0.6) else (0.4,):
         plane += box((0.035, 0.035, 0.22), (x * half, y - 0.018, z - root + 0.08), 0.006).both_sides()
     plane += fin(draw(0.1, 0.16), 0.26, 0.07, 55, z=-0.2)
@@ -177,8 +173,8 @@ def flying_wing(draw: Draw) -> Part:
         elif kind == "pods":
             plane += nacelle(0.03, 0.14).moved(x, y + 0.045, z - 0.6 * chord).both_sides()
         else:
-            pod = streamlined(0.022, 0.2).rotated("y", 180).moved(x, y, z - chord + 0.05)
-            plane += (pod + propeller(draw, 0.09, 3, hub=0.014).moved(x, y, z - chord - 0.05)).both_sides()
+            body = pod(0.022, 0.2).rotated("y", 180).moved(x, y, z - chord + 0.05)
+            plane += (body + propeller(draw, 0.09, 3, hub=0.014).moved(x, y, z - chord - 0.05)).both_sides()
     if draw.maybe(0.4):
         x, y, z, chord = plan.at(0.97)
         plane += fin(draw(0.08, 0.14), max(chord, 0.09), 0.05, 35, z=z).moved(x, y - 0.02).both_sides()
@@ -199,12 +195,12 @@ def turboprop(draw: Draw) -> Part:
         x, y, z, chord = plan.at(share)
         long = chord + draw(0.08, 0.13)
         y = y - 0.2 * thick
-        pod = streamlined(thick, long).moved(x, y, z - 0.5 * long + 0.075)
-        plane += (pod + propeller(draw, disc, blades, hub=0.55 * thick).moved(x, y, z + 0.075)).both_sides()
+        body = pod(thick, long).moved(x, y, z - 0.5 * long + 0.075)
+        plane += (body + propeller(draw, disc, blades, hub=0.55 * thick).moved(x, y, z + 0.075)).both_sides()
     kind = {"T": 2, "conventional": 2, "cross": 0.7} if high else {"conventional": 3, "twin": 1.2, "T": 0.6}
     plane += tail(draw, draw.pick(kind), radius, swept=draw.maybe(0.5))
     if draw.maybe(0.2):
-        plane += landing_gear(radius, 1.8 * radius, main_x=1.1 * radius, main_z=0.02, other_z=0.36)
+        plane += gear(radius, 1.8 * radius, main_x=1.1 * radius, main_z=0.02, other_z=0.36)
     return plane
 
 
@@ -236,7 +232,7 @@ def light_plane(draw: Draw) -> Part:
         return plane + _floats(draw, radius, tall)
     if draw.maybe(0.75):
         main_z, other_z = (0.03, 0.4) if draw.maybe(0.6) else (0.25, -0.46)
-        plane += landing_gear(tall, tall + draw(0.05, 0.09), 2.0 * radius, main_z, other_z)
+        plane += gear(tall, tall + draw(0.05, 0.09), 2.0 * radius, main_z, other_z)
     return plane
 
 
@@ -260,7 +256,7 @@ def glider(draw: Draw) -> Part:
     plan = Planform(**size, z=0.16, y=y, shape=draw.pick(("straight", "elliptic", "kinked")))
     plane += plan.wing() + canopy(1.5 * radius, 1.6 * radius, 0.26, 0.75 * radius, 0.27)
     plane += tail(draw, draw.pick({"T": 3, "conventional": 1, "V": 0.5}), 0.9 * radius)
-    return plane + (winglets(draw, plan) if draw.maybe(0.4) else Part())
+    return plane + (plan.winglets(draw) if draw.maybe(0.4) else Part())
 
 
 def warbird(draw: Draw) -> Part:
@@ -277,13 +273,13 @@ def warbird(draw: Draw) -> Part:
     disc = draw(0.12, 0.16)
     if twin:
         x, y, z, chord = plan.at(0.32)
-        pod = streamlined(0.04, chord + 0.15).moved(x, y, z - 0.5 * chord)
-        plane += (pod + propeller(draw, disc, 3, hub=0.022).moved(x, y, z + 0.075)).both_sides()
+        body = pod(0.04, chord + 0.15).moved(x, y, z - 0.5 * chord)
+        plane += (body + propeller(draw, disc, 3, hub=0.022).moved(x, y, z + 0.075)).both_sides()
     else:
         plane += propeller(draw, disc, draw.count(2, 4), hub=0.032).moved(z=0.495)
     plane += tail(draw, "twin" if twin and draw.maybe(0.5) else "conventional", radius)
     if draw.maybe(0.3):
-        plane += landing_gear(0.8 * radius, radius + 0.1, main_x=0.16, main_z=0.2, other_z=-0.46)
+        plane += gear(0.8 * radius, radius + 0.1, main_x=0.16, main_z=0.2, other_z=-0.46)
     return plane
 
 
@@ -312,7 +308,7 @@ def biplane(draw: Draw) -> Part:
         plane += bar((0.7 * radius, 0.5 * radius, z), (0.08, top.y, z), 0.012).both_sides()
     plane += propeller(draw, draw(0.12, 0.15), 2, hub=0.025).moved(z=0.495)
     plane += tail(draw, "conventional", radius)
-    return plane + landing_gear(radius, 2.6 * radius, main_x=0.11, main_z=0.27, other_z=-0.46)
+    return plane + gear(radius, 2.6 * radius, main_x=0.11, main_z=0.27, other_z=-0.46)
 
 
 def twin_boom(draw: Draw) -> Part:
@@ -331,7 +327,7 @@ def twin_boom(draw: Draw) -> Part:
         boom += propeller(draw, min(0.12, 0.75 * x), 3, hub=0.02).moved(x, y, front)
     else:
         plane += propeller(draw, min(0.1, 0.7 * x), 3, hub=0.03).moved(z=-0.2)
-        plane += along_z([(1, -0.5), (1, 0.5)], 0.03, 0.2, 10).moved(z=-0.11)
+        plane += revolve([(0.03, -0.1), (0.03, 0.1)], 10).rotated("x", 90).moved(z=-0.11)
     height = draw(0.12, 0.18)
     boom += fin(height, 0.12, 0.07, draw(5, 30), z=-0.38).moved(x, y - 0.02)
     level = y + draw(0.0, 0.95) * height - 0.02
@@ -340,16 +336,5 @@ def twin_boom(draw: Draw) -> Part:
     return plane + boom.both_sides()
 
 
-KINDS = {
-    airliner: 4.0,
-    business_jet: 1.5,
-    turboprop: 2.0,
-    light_plane: 3.0,
-    glider: 1.0,
-    fighter: 3.0,
-    warbird: 1.5,
-    biplane: 0.8,
-    supersonic: 0.6,
-    flying_wing: 0.6,
-    twin_boom: 0.7,
-}
+KINDS = {airliner: 4.0, business_jet: 1.5, turboprop: 2.0, light_plane: 3.0, glider: 1.0, fighter: 3.0, warbird: 1.5}
+KINDS |= {biplane: 0.8, supersonic: 0.6, flying_wing: 0.6, twin_boom: 0.7}

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from learn3d.make_data.shapes.draw import Draw
-from learn3d.make_data.shapes.parts import Part, bar, ellipse, ellipsoid, loft, rectangle, revolve, tube, wing
+from .draw import Draw
+from .parts import Part, bar, ellipse, ellipsoid, loft, rectangle, revolve, tube, wing
 
 # Shares of the half span at which a wing of each shape needs a section, beside its middle and its tip.
 _STATIONS = {
@@ -56,12 +56,23 @@ class Planform:
     def wing(self) -> Part:
         """The whole wing, tip to tip, in one piece."""
         shares = {0.0, 1.0, *([self.kink] if self.kink > 0.0 else _STATIONS[self.shape])}
-        return whole_wing([(*self.at(share), self.thickness) for share in sorted(shares)])
+        return wing([(*self.at(share), self.thickness) for share in sorted(shares)], whole=True)
 
+    def engines(self, draw: Draw, share: float, radius: float) -> Part:
+        """Jet engines with their pylons, hung under (and before) both wings at a share of the half span."""
+        x, y, z, chord = self.at(share)
+        length = draw(3.0, 4.6) * radius
+        drop = draw(1.1, 1.5) * radius
+        forward = z + draw(0.0, 0.3) * length
+        lower = (y - drop + 0.6 * radius, x, forward + 0.25 * length, 0.9 * length, 0.08)
+        pylon = wing([lower, (y, x, z - 0.05 * chord, 0.5 * chord, 0.1)], upright=True)
+        return (pylon + nacelle(radius, length).moved(x, y - drop, forward)).both_sides()
 
-def whole_wing(right: list[tuple[float, ...]]) -> Part:
-    """A wing from tip to tip through the sections of its right half, the first of which is in the middle."""
-    return wing([(-x, *rest) for x, *rest in right[:0:-1]] + right)
+    def winglets(self, draw: Draw) -> Part:
+        """Upturned wing tips."""
+        x, y, z, chord = self.at(1.0)
+        tip = fin(draw(0.05, 0.085), chord, 0.5 * chord, draw(25, 50), z=z, thickness=0.1)
+        return tip.rotated("z", -draw(0, 30)).moved(x - 0.004, y - 0.004).both_sides()
 
 
 def fuselage(
@@ -142,18 +153,7 @@ def nacelle(radius: float, length: float) -> Part:
     return along_z(cowl, radius, length, 14, hollow=True) + along_z(core, radius, length, 14)
 
 
-def engines_under_wing(draw: Draw, plan: Planform, share: float, radius: float) -> Part:
-    """Jet engines with their pylons, hung under (and before) both wings at the given share of the half span."""
-    x, y, z, chord = plan.at(share)
-    length = draw(3.0, 4.6) * radius
-    drop = draw(1.1, 1.5) * radius
-    forward = z + draw(0.0, 0.3) * length
-    lower = (y - drop + 0.6 * radius, x, forward + 0.25 * length, 0.9 * length, 0.08)
-    pylon = wing([lower, (y, x, z - 0.05 * chord, 0.5 * chord, 0.1)], upright=True)
-    return (pylon + nacelle(radius, length).moved(x, y - drop, forward)).both_sides()
-
-
-def engines_at_tail(draw: Draw, radius: float, size: float, z: float) -> Part:
+def tail_engines(draw: Draw, radius: float, size: float, z: float) -> Part:
     """A pair of jet engines on short stubs at the rear fuselage."""
     x, y = 0.8 * radius + 1.1 * size, draw(0.1, 0.6) * radius
     stub = wing([(0.0, y, z + 0.02, 0.09, 0.12), (x, y, z + 0.01, 0.08, 0.12)])
@@ -172,7 +172,7 @@ def propeller(draw: Draw, radius: float, blades: int, hub: float) -> Part:
     return part
 
 
-def streamlined(radius: float, length: float) -> Part:
+def pod(radius: float, length: float) -> Part:
     """A drop-shaped body along z, its blunt end forward, centred."""
     profile = np.array([(0.1, 0), (0.3, 0.05), (0.6, 0.15), (0.95, 0.35), (1.0, 0.6), (0.85, 0.85), (0.55, 1)])
     return along_z(profile - [0, 0.5], radius, length, 12)
@@ -191,28 +191,21 @@ def canopy(width: float, height: float, length: float, y: float, z: float) -> Pa
     return loft(rings * np.concatenate([np.ones_like(rings[..., :2]), stretch], 2)).moved(0, y, z)
 
 
-def winglets(draw: Draw, plan: Planform) -> Part:
-    """Upturned wing tips."""
-    x, y, z, chord = plan.at(1.0)
-    tip = fin(draw(0.05, 0.085), chord, 0.5 * chord, draw(25, 50), z=z, thickness=0.1)
-    return tip.rotated("z", -draw(0, 30)).moved(x - 0.004, y - 0.004).both_sides()
-
-
-def landing_gear(belly: float, drop: float, main_x: float, main_z: float, other_z: float) -> Part:
+def gear(belly: float, drop: float, main_x: float, main_z: float, other_z: float) -> Part:
     """A main gear at +-main_x and a nose wheel (tail wheel if behind it), `drop` below the axis of the fuselage.
 
     belly is the radius of the fuselage there.
     """
-    main, top = wheel(0.026), -0.5 * belly
+    main, top = _wheel(0.026), -0.5 * belly
     part = bar((0.4 * main_x, top, main_z), (main_x, -drop, main_z), 0.016).both_sides()
     part += main.moved(main_x + 0.004, -drop, main_z).both_sides()
     if other_z < main_z:
         leg = bar((0, 0, other_z), (0, -0.06, other_z - 0.01), 0.014)
-        return part + leg + wheel(0.015).moved(y=-0.065, z=other_z - 0.01)
+        return part + leg + _wheel(0.015).moved(y=-0.065, z=other_z - 0.01)
     return part + bar((0, top, other_z), (0, -drop, other_z), 0.016) + main.moved(y=-drop, z=other_z)
 
 
-def wheel(radius: float) -> Part:
+def _wheel(radius: float) -> Part:
     """A wheel about the x axis."""
     t = 0.35 * radius
     return revolve([(0.7 * radius, -t), (radius, -0.6 * t), (radius, 0.6 * t), (0.7 * radius, t)], 12).rotated("z", 90)

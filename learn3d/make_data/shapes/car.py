@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from learn3d.make_data.shapes.draw import Draw
-from learn3d.make_data.shapes.parts import Part, bar, box, join, loft, rectangle, revolve, rounded_path, slab, wing
+from .draw import Draw
+from .parts import Part, bar, box, join, loft, rectangle, revolve, rounded_path, slab, wing
 
 TYRE = 0.22  # width of the wheels
 
@@ -39,11 +39,6 @@ class Body:
     def axles(self) -> tuple[float, float]:
         """Distance of the front and of the rear axle from the front bumper, in metres."""
         return self.wheel + 0.48, self.length - self.wheel - 0.44
-
-    @property
-    def boot(self) -> float:
-        """Start of the boot or bed, in metres from the front bumper."""
-        return min(self.window * self.length, self.length - 0.12)
 
 
 # The least and the largest measures of each kind, in the order of the fields of Body.
@@ -80,14 +75,29 @@ def car(draw: Draw, kind: str) -> Part:
 
 def _hull(body: Body) -> Part:
     """The body: cross-sections from front to rear, with the wheel arches cut into their lower corners."""
-    side_view = _side_view(body)
-    bed = (body.boot + 0.06, body.length - 0.08) if body.has_bed else (body.length, body.length)
+    length, belt, boot = body.length, body.shoulder, min(body.window * body.length, body.length - 0.12)
+    bed = (boot + 0.06, length - 0.08) if body.has_bed else (length, length)  # start and end of the open box
+
+    # The upper edge of the body seen from the side: distance from the front bumper, and height.
+    cowl, roof_rear = body.bonnet * length, body.roof * length
+    roof_front = cowl + body.screen * length
+    side_view = [(0, 0.75 * belt), (0.06, 0.9 * belt), (0.22, belt), (cowl, belt + 0.08), (roof_front, body.height)]
+    side_view += [((roof_front + roof_rear) / 2, body.height + 0.015), (roof_rear, body.height - 0.02)]
+    side_view += [(boot, belt + 0.07), (length - 0.08, belt + 0.04), (length, 0.85 * belt)]
+    line = rounded_path(side_view, 0.12, 2)
+    line[:, 0] = np.maximum.accumulate(line[:, 0] + 1e-4 * np.arange(len(line)))
+
+    # The distances of the cross-sections from the front bumper [S]: at every corner, arch and end of the bed.
     arch = body.wheel + 0.055  # radius of the wheel arches
-    s = _stations(body, [*side_view[:, 0], *(end + t for end in bed for t in (-0.015, 0.015))], arch)
-    to_front, to_rear = s / body.length, 1 - s / body.length
+    around_axle = arch * np.append([-1.02, 1.02], 0.999 * np.cos(np.linspace(0, np.pi, 8)))
+    ends = [end + side for end in bed for side in (-0.015, 0.015)]
+    s = np.concatenate([line[:, 0], np.linspace(0, length, 7), *(a + around_axle for a in body.axles), ends])
+    s = np.unique(s[(s >= 0) & (s <= length)].round(3))
+    s = s[np.append(True, np.diff(s) > 0.004)]
 
     # Measures of each cross-section, all [S]. Widths are halves.
-    top = np.interp(s, side_view[:, 0], side_view[:, 1])
+    to_front, to_rear = s / length, 1 - s / length
+    top = np.interp(s, *line.T)
     width = body.width / 2 * (1 - 0.15 * np.clip(1 - to_front / 0.18, 0, 1) ** 2)
     width = width * (1 - 0.06 * np.clip(1 - to_rear / 0.15, 0, 1) ** 2)
     floor = body.clearance + 0.12 * np.clip(1 - to_front / 0.08, 0, 1) + 0.15 * np.clip(1 - to_rear / 0.1, 0, 1)
@@ -96,60 +106,25 @@ def _hull(body: Body) -> Part:
     for axle in body.axles:
         over_wheel = body.wheel + np.sqrt(np.maximum(arch**2 - (s - axle) ** 2, 0.0))
         cut = np.where(np.abs(s - axle) < arch, np.maximum(cut, over_wheel), cut)
-    shoulder = np.minimum(body.shoulder, top - 0.03)
+    shoulder = np.minimum(belt, top - 0.03)
     middle = np.maximum(0.55 * floor + 0.45 * shoulder, 0.5 * (cut + shoulder))
     edge = np.maximum(top - 0.045 - 0.1 * np.clip(top - shoulder - 0.1, 0, 0.3), shoulder + 0.01)  # of the roof
     roof = np.maximum(0.96 * width - 0.03 - body.lean * (edge - shoulder), 0.45 * width)
-    rim, bottom = shoulder + 0.02, np.full_like(s, body.shoulder - 0.38)  # of the bed
+    rim, bottom = shoulder + 0.02, np.full_like(s, belt - 0.38)  # of the bed
     hump = np.maximum(bottom + 0.004, np.minimum(cut + 0.03, rim - 0.03))  # the wheel arch seen from the bed
 
     # The right half of each cross-section: points (x, y) from the middle of the floor outwards and up to the middle.
     zero = np.zeros_like(s)
-    lower = [(zero, floor), (inner, floor), (inner, cut), (0.95 * width, cut), (width, middle)]
-    cabin = [
-        (0.97 * width, shoulder),
-        (0.97 * width - 0.03, shoulder + 0.006),
-        (roof, edge),
-        (0.88 * roof, 0.5 * (edge + top)),
-        (0.6 * roof, top - 0.008),
-        (0.3 * roof, top - 0.002),
-        (zero, top),
-    ]
-    bed_inside = [
-        (0.97 * width, shoulder),
-        (0.95 * width - 0.02, rim),
-        (0.92 * width - 0.05, rim - 0.01),
-        (0.9 * width - 0.06, hump),
-        (inner - 0.03, hump - 0.001),
-        (inner - 0.032, bottom),
-        (zero, bottom),
-    ]
-    upper = np.where((bed[0] < s) & (s < bed[1]), np.array(bed_inside), np.array(cabin))
-    right = np.concatenate([np.array(lower), upper]).transpose(2, 0, 1)  # [S, 12, 2]
-    ring = np.concatenate([right, right[:, -2:0:-1] * [-1, 1]], 1)
-    z = np.broadcast_to((body.length / 2 - s)[:, None, None], (*ring.shape[:2], 1))
-    return loft(np.concatenate([ring, z], 2))
-
-
-def _side_view(body: Body) -> np.ndarray:
-    """The upper edge of the body seen from the side [N, 2]: metres from the front bumper, and height."""
-    length, belt, height = body.length, body.shoulder, body.height
-    cowl, roof_rear = body.bonnet * length, body.roof * length
-    roof_front = cowl + body.screen * length
-    front = [(0, 0.75 * belt), (0.06, 0.9 * belt), (0.22, belt), (cowl, belt + 0.08)]
-    roof = [(roof_front, height), ((roof_front + roof_rear) / 2, height + 0.015), (roof_rear, height - 0.02)]
-    rear = [(body.boot, belt + 0.07), (length - 0.08, belt + 0.04), (length, 0.85 * belt)]
-    line = rounded_path([*front, *roof, *rear], 0.12, 2)
-    line[:, 0] = np.maximum.accumulate(line[:, 0] + 1e-4 * np.arange(len(line)))
-    return line
-
-
-def _stations(body: Body, corners: list[float], arch: float) -> np.ndarray:
-    """The places of the cross-sections [S], in metres from the front bumper: at every corner and along the arches."""
-    around_axle = arch * np.append([-1.02, 1.02], 0.999 * np.cos(np.linspace(0, np.pi, 8)))
-    s = np.concatenate([corners, np.linspace(0, body.length, 7), *(axle + around_axle for axle in body.axles)])
-    s = np.unique(s[(s >= 0) & (s <= body.length)].round(3))
-    return s[np.append(True, np.diff(s) > 0.004)]
+    lower_x = [zero, inner, inner, 0.95 * width, width, 0.97 * width]
+    lower_y = [floor, floor, cut, cut, middle, shoulder]
+    cabin_x = [0.97 * width - 0.03, roof, 0.88 * roof, 0.6 * roof, 0.3 * roof, zero]
+    cabin_y = [shoulder + 0.006, edge, 0.5 * (edge + top), top - 0.008, top - 0.002, top]
+    bed_x = [0.95 * width - 0.02, 0.92 * width - 0.05, 0.9 * width - 0.06, inner - 0.03, inner - 0.032, zero]
+    bed_y = [rim, rim - 0.01, hump, hump - 0.001, bottom, bottom]
+    upper = np.where((bed[0] < s) & (s < bed[1]), [bed_x, bed_y], [cabin_x, cabin_y])
+    x, y = np.concatenate([[lower_x, lower_y], upper], 1).transpose(0, 2, 1)  # [S, 12]
+    x, y = np.concatenate([x, -x[:, -2:0:-1]], 1), np.concatenate([y, y[:, -2:0:-1]], 1)
+    return loft(np.stack([x, y, np.broadcast_to((length / 2 - s)[:, None], x.shape)], 2))
 
 
 def _wheels(draw: Draw, body: Body) -> Part:

@@ -7,23 +7,10 @@ from functools import partial
 
 import numpy as np
 
-from learn3d.make_data.shapes.chair_backs import make_back
-from learn3d.make_data.shapes.draw import Draw
-from learn3d.make_data.shapes.parts import (
-    Part,
-    bar,
-    between,
-    box,
-    ellipse,
-    loft,
-    post,
-    rectangle,
-    rounded_path,
-    sheet,
-    slab,
-    tube,
-)
-from learn3d.make_data.shapes.supports import feet, four_legs, support
+from .chair_backs import make_back
+from .draw import Draw
+from .parts import Part, bar, between, ellipse, post, rectangle, rounded_path, sheet, slab, tube
+from .supports import feet, legs, support
 
 # Weights of the supports of each family of chairs.
 _DINING = {"legs": 6, "loops": 1, "cantilever": 1, "cross": 0.8, "panels": 0.6, "disc": 0.7, "star": 0.4, "rocker": 0.5}
@@ -39,11 +26,6 @@ class Seat:
     depth: float
     height: float  # height of the top of the seat over the floor
     thickness: float
-    exponent: float  # outline: 2 = ellipse ... 8 = rectangle
-
-    def rear(self, x: float) -> float:
-        """z of the rear edge at the distance x from the middle."""
-        return -self.depth / 2 * (1 - min(abs(2 * x / self.width), 0.99) ** self.exponent) ** (1 / self.exponent)
 
 
 def jointed_chair(draw: Draw, family: str) -> Part:
@@ -59,8 +41,8 @@ def jointed_chair(draw: Draw, family: str) -> Part:
         width, depth, height, back_height = draw(0.36, 0.44), draw(0.34, 0.42), draw(0.62, 0.78), draw(0.14, 0.4)
     elif draw.maybe(0.15):
         back_height = draw(0.65, 0.85)  # a throne
-    exponent = draw.pick({8.0: 4, 5.0: 2, 3.0: 1.5, 2.0: 1})
-    seat = Seat(width, depth, height, draw(0.07, 0.13) if cushioned else draw(0.025, 0.05), exponent)
+    exponent = draw.pick({8.0: 4, 5.0: 2, 3.0: 1.5, 2.0: 1})  # outline of the seat: 2 = ellipse ... 8 = rectangle
+    seat = Seat(width, depth, height, draw(0.07, 0.13) if cushioned else draw(0.025, 0.05))
 
     taper = draw(0.8, 1.0) if draw.maybe(0.4) else 1.0  # narrower at the rear
     outline = ellipse(width, depth, 24, exponent)
@@ -78,8 +60,8 @@ def jointed_chair(draw: Draw, family: str) -> Part:
 
     angular = exponent > 4
     stile_x = 0.5 * width * taper - 0.03 if angular else 0.36 * width
-    curve = 0.0 if angular else seat.rear(stile_x) - seat.rear(0.0)
-    curve = max(curve, draw(0.0, 0.08) if draw.maybe(0.6) else 0.0)
+    rear_edge = depth / 2 * (1 - (2 * stile_x / width) ** exponent) ** (1 / exponent)  # -z of the seat at x = stile_x
+    curve = max(0.0 if angular else depth / 2 - rear_edge, draw(0.0, 0.08) if draw.maybe(0.6) else 0.0)
     back, bulge = make_back(draw, family, stile_x, back_height, curve)
     part += back.rotated("x", -recline).moved(y=height - 0.5 * seat.thickness, z=-depth / 2 + 0.03)
     arm_chance = {"office": 0.6, "lounge": 0.6, "bar": 0.1, "dining": 0.3}[family]
@@ -140,7 +122,7 @@ def shell_chair(draw: Draw) -> Part:
     part += slab(ellipse(0.8 * width, 0.8 * depth, 20, 5), 0.03).moved(y=height - 0.045)
     kind = draw.pick({"legs": 2, "star": 1, "disc": 1, "loops": 1, "rocker": 0.5})
     if kind == "legs":
-        return part + four_legs(draw, 0.34 * width, 0.34 * depth, height - 0.035, plain=True)
+        return part + legs(draw, 0.34 * width, 0.34 * depth, height - 0.035, plain=True)
     return part + support(draw, kind, 0.37 * width, 0.38 * depth, height - 0.035)
 
 
@@ -155,20 +137,11 @@ def club_chair(draw: Draw) -> Part:
     part += between((-inner - 0.02, split, rear + 0.05), (inner + 0.02, seat_height, front), soft)
     upright = between((-inner - 0.05, split - 0.1, rear), (inner + 0.05, back_height, hip), soft)
     part += upright.rotated("x", -lean, (0, split, hip))
-    kind = draw.pick(("box", "rolled", "sloped"))
-    if kind == "sloped":
-        heights = (arm_height - draw(0.03, 0.12), arm_height + 0.05)
-        outline = rectangle(arm, 1.0, 0.03, 3)
-        rings = [
-            np.stack([half - arm / 2 + outline[:, 0], foot + (outline[:, 1] + 0.5) * (h - foot), np.full(16, z)], 1)
-            for z, h in zip((front - 0.01, rear + 0.02), heights, strict=True)
-        ]
-        part += loft(rings).both_sides()
-    else:
-        part += between((inner, foot, rear + 0.02), (half, arm_height, front - 0.01), soft).both_sides()
-        if kind == "rolled":
-            x = half - arm / 2
-            part += bar((x, arm_height, rear + 0.03), (x, arm_height, front), 1.35 * arm).both_sides()
+    kind, x = draw.pick(("box", "rolled", "low")), half - arm / 2
+    level = seat_height + 0.06 if kind == "low" else arm_height
+    part += between((inner, foot, rear + 0.02), (half, level, front - 0.01), soft).both_sides()
+    if kind == "rolled":
+        part += bar((x, level, rear + 0.03), (x, level, front), 1.35 * arm).both_sides()
     if draw.maybe(0.35) and back_height > 0.8:  # wings
         t = np.linspace(0, 1, 6)[:, None]
         reach = draw(0.18, 0.3) * np.sin(np.pi * (0.12 + 0.8 * t)) ** 0.7
@@ -178,9 +151,6 @@ def club_chair(draw: Draw) -> Part:
         part += sheet(np.stack([np.full_like(z, inner + 0.02), y, z], 2), draw(0.04, 0.08)).both_sides()
     if foot > 0.05:
         part += feet(draw, half - 0.07, front - 0.08, foot + 0.02)
-    if draw.maybe(0.25):
-        pillow = between((-0.2, seat_height, hip), (0.2, seat_height + 0.3, hip + 0.13), 0.06)
-        part += pillow.rotated("x", -lean - 8, (0, seat_height, hip))
     return part
 
 
@@ -206,10 +176,7 @@ def barrel_chair(draw: Draw) -> Part:
     if draw.maybe(0.2):  # a solid drum down to the floor
         return part + slab(ellipse(1.9 * radius, 1.9 * radius, 28), under + 0.02, 0.02)
     kind = draw.pick({"legs": 3, "disc": 1, "star": 0.7, "loops": 0.7})
-    part += support(draw, kind, 0.66 * radius, 0.66 * radius, under)
-    if kind in ("legs", "loops") and draw.maybe(0.3):
-        part += box((1.2 * radius, 0.02, 1.2 * radius), (0, under - 0.01, 0))
-    return part
+    return part + support(draw, kind, 0.66 * radius, 0.66 * radius, under)
 
 
 KINDS = {

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from learn3d.make_data.shapes.draw import Draw
-from learn3d.make_data.shapes.parts import Part, bar, between, ellipse, post, rectangle, rounded_path, sheet, tube
+from .draw import Draw
+from .parts import Part, bar, between, ellipse, post, rectangle, rounded_path, sheet, tube
 
 _KINDS = {"ladder": 2, "slats": 2, "spindles": 1, "splat": 1.2, "cross": 0.8, "open": 1.0, "lattice": 0.7, "band": 1.0}
 _KINDS |= {"panel": 1.2, "hoop": 1.2, "solid": 2.0}

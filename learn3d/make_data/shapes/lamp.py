@@ -4,19 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from learn3d.make_data.shapes.draw import Draw
-from learn3d.make_data.shapes.parts import (
-    Part,
-    bar,
-    ellipse,
-    ellipsoid,
-    join,
-    rectangle,
-    revolve,
-    rounded_path,
-    slab,
-    tube,
-)
+from .draw import Draw
+from .parts import Part, bar, ellipse, ellipsoid, join, rectangle, revolve, rounded_path, slab, tube
 
 
 def _shell(radius: np.ndarray, y: np.ndarray, sides: int = 20) -> Part:

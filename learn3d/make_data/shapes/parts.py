@@ -135,9 +135,8 @@ def box(size: Point, center: Point = (0.0, 0.0, 0.0), radius: float | None = Non
     radius = 0.12 * shortest if radius is None else min(radius, 0.45 * shortest)
     outline = rectangle(size[i], size[j], radius, 1 if radius < 0.2 * shortest else 3)
     half, rim = 0.5 * size[axis], 0.6 * radius
-    return _prism(outline, [(rim, -half), (0.0, rim - half), (0.0, half - rim), (rim, half)], (i, j, axis)).moved(
-        *center
-    )
+    rims = [(rim, -half), (0.0, rim - half), (0.0, half - rim), (rim, half)]
+    return _prism(outline, rims, (i, j, axis)).moved(*center)
 
 
 def between(lower: Point, upper: Point, radius: float | None = None) -> Part:
@@ -248,12 +247,15 @@ def sheet(surface: np.ndarray, thickness: float) -> Part:
     return loft(np.concatenate([front, back[:, ::-1]], 1), "strip")
 
 
-def wing(sections: Sequence[Sequence[float]], points: int = 7, upright: bool = False) -> Part:
+def wing(sections: list[Sequence[float]], points: int = 7, upright: bool = False, whole: bool = False) -> Part:
     """A wing through airfoil sections (span, rise, leading edge z, chord, thickness / chord), nose towards +z.
 
-    The span runs along x and the rise along y; `upright` exchanges the two (a fin). The airfoil is the symmetric
-    four-digit NACA thickness, closed by a blunt trailing edge.
+    The span runs along x and the rise along y; `upright` exchanges the two (a fin). `whole` mirrors the sections of
+    the right half, the first of which is in the middle. The airfoil is the symmetric four-digit NACA thickness, closed
+    by a blunt trailing edge.
     """
+    if whole:
+        sections = [(-x, *rest) for x, *rest in sections[:0:-1]] + sections
     angle = np.linspace(0.0, np.pi, points)
     c = 0.5 * (1.0 - np.cos(angle))  # dense at the leading edge (0) and the trailing edge (1)
     half = 5.0 * (0.2969 * np.sqrt(c) - 0.1260 * c - 0.3516 * c**2 + 0.2843 * c**3 - 0.1015 * c**4) + 0.02

@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from learn3d.make_data.shapes.draw import Draw
-from learn3d.make_data.shapes.parts import Part, bar, between, ellipse, join, sheet, slab
-from learn3d.make_data.shapes.supports import feet, support
+from .draw import Draw
+from .parts import Part, bar, between, ellipse, join, sheet, slab
+from .supports import feet, support
 
 
 def _cushions(lower: tuple[float, float, float], upper: tuple[float, float, float], count: int) -> Part:

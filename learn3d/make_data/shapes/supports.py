@@ -7,36 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from learn3d.make_data.shapes.draw import Draw
-from learn3d.make_data.shapes.parts import (
-    Part,
-    bar,
-    between,
-    ellipse,
-    ellipsoid,
-    join,
-    post,
-    rectangle,
-    revolve,
-    rounded_path,
-    slab,
-    tube,
-)
-
-
-def support(draw: Draw, kind: str, half_x: float, half_z: float, height: float) -> Part:
-    """A support of one of the kinds legs, star, disc, loops, cantilever, cross, panels, rocker."""
-    make = {
-        "legs": four_legs,
-        "star": star_pedestal,
-        "disc": disc_pedestal,
-        "loops": loops,
-        "cantilever": cantilever,
-        "cross": crossed_legs,
-        "panels": panels,
-        "rocker": rocker,
-    }[kind]
-    return make(draw, half_x, half_z, height)
+from .draw import Draw
+from .parts import Part, bar, between, ellipse, ellipsoid, join, post, rectangle, revolve, rounded_path, slab, tube
 
 
 def leg_profile(draw: Draw) -> tuple[list[tuple[float, float]], bool]:
@@ -59,7 +31,7 @@ def leg_profile(draw: Draw) -> tuple[list[tuple[float, float]], bool]:
     return profile, kind in ("turned", "baluster")
 
 
-def four_legs(
+def legs(
     draw: Draw, half_x: float, half_z: float, height: float, size: float | None = None, plain: bool = False
 ) -> Part:
     """Four legs, straight or splayed, perhaps with stretchers and an apron; sometimes bent-wire (hairpin) legs.
@@ -127,7 +99,7 @@ def feet(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     return part
 
 
-def star_pedestal(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
+def star(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     """A column on a star of 3 to 6 arms, perhaps on castors, with a plate under the seat."""
     reach = draw(1.05, 1.3) * max(half_x, half_z)
     count = draw.pick({5: 3, 4: 2, 3: 0.6, 6: 0.5})
@@ -151,7 +123,7 @@ def star_pedestal(draw: Draw, half_x: float, half_z: float, height: float) -> Pa
     return part + slab(rectangle(1.2 * half_x, 1.2 * half_z), 0.03).moved(y=height - 0.025)
 
 
-def disc_pedestal(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
+def disc(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     """A column on a flat, domed or trumpet-shaped (tulip) foot."""
     reach = draw(0.8, 1.15) * min(half_x, half_z)
     thick = draw(0.02, 0.045) * (1 + height)
@@ -204,7 +176,7 @@ def cantilever(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     return tube(path, size / 2, side=(1, 0, 0)) + bars
 
 
-def crossed_legs(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
+def cross(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     """Legs that cross like scissors and the bars between them: at the sides (folding chair), or at front and rear."""
     size, deep = draw(0.022, 0.035), draw(1.2, 1.8)
     at_sides = draw.maybe(0.6)
@@ -245,3 +217,11 @@ def rocker(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
         rung = (half_x + 0.01, 0.4 * height, foot[2] + 0.4 * (head[2] - foot[2]))
         part += bar(rung * np.array([-1, 1, 1]), rung, 0.6 * size)
     return part
+
+
+_KINDS = {make.__name__: make for make in (legs, star, disc, loops, cantilever, cross, panels, rocker)}
+
+
+def support(draw: Draw, kind: str, half_x: float, half_z: float, height: float) -> Part:
+    """A support of one of the kinds legs, star, disc, loops, cantilever, cross, panels, rocker."""
+    return _KINDS[kind](draw, half_x, half_z, height)

@@ -6,21 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from learn3d.make_data.shapes.draw import Draw
-from learn3d.make_data.shapes.parts import (
-    Part,
-    bar,
-    between,
-    ellipse,
-    inset,
-    join,
-    rectangle,
-    revolve,
-    rounded_path,
-    slab,
-    tube,
-)
-from learn3d.make_data.shapes.supports import apron, four_legs, support
+from .draw import Draw
+from .parts import Part, bar, between, ellipse, inset, join, rectangle, revolve, rounded_path, slab, tube
+from .supports import apron, legs, support
 
 
 def _size(draw: Draw) -> tuple[float, float, float]:
@@ -59,7 +47,7 @@ def table_with_legs(draw: Draw) -> Part:
         return top + support(draw, kind, 0.45 * reach * length, 0.45 * reach * width, under)
     size = draw(0.035, 0.11) * (0.5 + 0.35 * length)
     half_x, half_z = reach * length / 2 - 0.6 * size, reach * width / 2 - 0.6 * size
-    table = top + four_legs(draw, half_x, half_z, under, size)
+    table = top + legs(draw, half_x, half_z, under, size)
     if draw.maybe(0.5):
         table += apron(half_x, half_z, under, draw(0.05, 0.16), 0.4 * size)
     return table
