@@ -1,7 +1,7 @@
 """Every layout against its description: masks and voxels are those of the TRUE mesh under the numbers in its files.
 
-Nothing here goes through our readers, and wherever the description is in right-handed world coordinates, so is the
-test: cameras are OpenCV's, the object frame and LookAt do not occur.
+Nothing here goes through our readers. If the description is in right-handed world coordinates, so is the test: cameras
+are OpenCV's, the object frame and LookAt do not occur.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from scipy.spatial.transform import Rotation
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
+from learn3d.data.poses import Poses
 from learn3d.data.readers.kar import KAR
 from learn3d.data.readers.pascal3d import PASCAL3D
-from learn3d.make_data.writers import RenderedObject
+from learn3d.make_data.writers import WRITERS, RenderedObject
 from learn3d.make_data.writers.r2n2 import binvox_bytes
 
 SYNSET = "03001627"
@@ -75,6 +76,26 @@ def assert_oriented(voxels: np.ndarray, vertices: torch.Tensor, faces: torch.Ten
     assert max(scores, key=scores.get) == ((0, 1, 2), (1, 1, 1)) and scores[(0, 1, 2), (1, 1, 1)] > 0.75
 
 
+def opencv_camera(eye: np.ndarray, focal: float, size: int) -> nmr.cameras.Camera:
+    """The camera at `eye`, in right-handed coordinates with y up, that looks at the origin; focal length in pixels."""
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0, 1, 0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pixels = [[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]
+    return nmr.cameras.from_opencv(pixels, rotation, -rotation @ eye, height=size, width=size, pixel_center=0.5)
+
+
+def read_image(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path)).astype(float)
+
+
+def views(layout: str, radius: float, count: int, seed: int) -> Poses:
+    """The cameras of a layout around an object of that radius."""
+    writer = WRITERS[layout](Path("unused"), "chair")
+    return writer.views(np.array([[radius, 0.0, 0.0]]), count, np.random.default_rng(seed))
+
+
 def test_dvr(tmp_path, folder):
     make(tmp_path, folder, "dvr", test=1)
     root = tmp_path / SYNSET
@@ -91,9 +112,9 @@ def test_dvr(tmp_path, folder):
         opencv = nmr.cameras.from_opencv(
             to_pixels @ camera[:3, :3], world[:3, :3], world[:3, 3], height=64, width=64, pixel_center=0.5
         )
-        mask = np.asarray(Image.open(root / name / "mask" / f"{k:04d}.png")).astype(float)
+        mask = read_image(root / name / "mask" / f"{k:04d}.png")
         assert_same_mask(mask, silhouette(vertices, faces, opencv, 64))
-        image = np.asarray(Image.open(root / name / "image" / f"{k:04d}.png"))
+        image = read_image(root / name / "image" / f"{k:04d}.png")
         assert image.shape == (64, 64, 3) and (image[mask == 0] == 255).all() and (image[mask == 255] < 255).any()
     # file k is at azimuth 15 k of Kato's Blender scene: from the front, x, at 0, and seen from -z at 90 degrees
     eye = -cameras["world_mat_6"][:3, :3].T @ cameras["world_mat_6"][:3, 3]
@@ -126,7 +147,7 @@ def test_kar(tmp_path, folder):
         elevations += [row[1] for row in rows]
         for i, (azimuth, elevation, _, distance) in enumerate(rows):
             camera = nmr.LookAt.from_angles([distance], [elevation], [azimuth], half_fov_deg=14.9314)
-            rgba = np.asarray(Image.open(root / f"render_{i}.png")).astype(float)
+            rgba = read_image(root / f"render_{i}.png")
             assert rgba.shape == (224, 224, 4)
             assert_same_mask(rgba[..., 3], silhouette(in_object_frame(vertices), faces, camera, 224))
             assert (rgba[rgba[..., 3] == 0] == 0).all() and rgba[rgba[..., 3] > 0][:, :3].min() > 20
@@ -185,15 +206,10 @@ def test_r2n2(tmp_path, folder):
             assert 0 <= azimuth < 360 and 25 <= elevation < 30 and yaw == 0 and 0.65 <= ratio < 0.95 and fov == 25
             a, e = np.deg2rad([azimuth, elevation])
             eye = 1.75 * ratio * np.array([np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)])
-            forward = -eye / np.linalg.norm(eye)
-            right = np.cross(forward, [0, 1, 0]) / np.cos(e)
-            rotation = np.stack([right, np.cross(forward, right), forward])
-            focal = 2.1875 * 137 / 2
-            pixels = [[focal, 0, 68.5], [0, focal, 68.5], [0, 0, 1]]
-            opencv = nmr.cameras.from_opencv(pixels, rotation, -rotation @ eye, height=137, width=137, pixel_center=0.5)
-            rgba = np.asarray(Image.open(root / f"{k:02d}.png")).astype(float)
+            rgba = read_image(root / f"{k:02d}.png")
             assert rgba.shape == (137, 137, 4)
-            assert_same_mask(rgba[..., 3], silhouette(vertices * side, faces, opencv, 137))
+            camera = opencv_camera(eye, 2.1875 * 137 / 2, 137)
+            assert_same_mask(rgba[..., 3], silhouette(vertices * side, faces, camera, 137))
 
 
 def test_colours_are_unmixed_from_white_and_mixed_with_backgrounds():
@@ -270,18 +286,50 @@ def test_photos(tmp_path, folder):
     assert sorted(row["file"] for row in rows) == sorted(p.name for p in (tmp_path / "chair" / "images").iterdir())
     for row in rows[:4]:
         vertices, faces = true_mesh(folder, row["object"])
-        azimuth, elevation, distance, fov = (
-            float(row[name]) for name in ("azimuth_deg", "elevation_deg", "distance", "fov_deg")
-        )
+        azimuth, elevation, distance, fov = map(float, list(row.values())[1:5])
         a, e = np.deg2rad([azimuth, elevation])  # anti-clockwise from the front, seen from above: x is front, -z right
         eye = distance * np.array([np.cos(e) * np.cos(a), np.sin(e), -np.cos(e) * np.sin(a)])
-        forward = -eye / np.linalg.norm(eye)
-        right = np.cross(forward, [0, 1, 0]) / np.cos(e)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        focal = 128 / np.tan(np.deg2rad(fov / 2))
-        pixels = [[focal, 0, 128], [0, focal, 128], [0, 0, 1]]
-        opencv = nmr.cameras.from_opencv(pixels, rotation, -rotation @ eye, height=256, width=256, pixel_center=0.5)
-        mask = np.asarray(Image.open(tmp_path / "chair" / "masks" / row["file"])).astype(float)
-        assert_same_mask(mask, silhouette(vertices, faces, opencv, 256))
-        image = np.asarray(Image.open(tmp_path / "chair" / "images" / row["file"]))
+        camera = opencv_camera(eye, 128 / np.tan(np.deg2rad(fov / 2)), 256)
+        mask = read_image(tmp_path / "chair" / "masks" / row["file"])
+        assert_same_mask(mask, silhouette(vertices, faces, camera, 256))
+        image = read_image(tmp_path / "chair" / "images" / row["file"])
         assert image.shape == (256, 256, 3) and image[mask == 0].std() > 5
+
+
+def test_ranges_and_decimals():
+    kar, r2n2, photos = (views(layout, 0.7, 4000, 0) for layout in ("kar", "r2n2", "photos"))
+    for poses, azimuths, elevations in (
+        (kar, (-180, 180), (-20, 40)),
+        (r2n2, (-360, 0), (25, 30)),
+        (photos, (-180, 180), (-10, 50)),
+    ):
+        for values, (low, high) in ((poses.azimuth_deg, azimuths), (poses.elevation_deg, elevations)):
+            assert low <= values.min() and values.max() <= high
+            spread = torch.histc(values, 8, low, high) / len(values)  # uniform
+            assert (spread - 1 / 8).abs().max() < 0.03
+            rounded = np.float32([float(f"{value:.4f}") for value in values.tolist()])
+            np.testing.assert_array_equal(rounded, values.numpy())
+    assert (r2n2.azimuth_deg > -360).all()  # R2N2's [0, 360)
+    ratios = r2n2.distance / 1.75
+    assert 0.65 <= ratios.min() and ratios.max() < 0.95 and ratios.max() - ratios.min() > 0.28
+    assert 12 <= photos.half_fov_deg.min() and photos.half_fov_deg.max() <= 25
+
+
+def test_the_whole_object_is_seen():
+    vertices, faces = nmr.icosphere(3)
+    for poses in (views("kar", 0.8, 30, 1), views("photos", 0.8, 30, 1)):
+        alpha = nmr.render_silhouette(0.8 * vertices, faces, poses.cameras(), image_size=64)
+        assert not alpha[:, [0, -1]].any() and not alpha[:, :, [0, -1]].any()
+        assert (alpha.mean((1, 2)) > 0.3).all()  # and not from afar
+
+
+def test_pascal3d_rotations_are_upright_but_for_the_tilt():
+    in_object_frame = views("pascal3d", 0.8, 500, 2).rotation.double().numpy()
+    rotations = in_object_frame @ WRITERS["pascal3d"].turn
+    np.testing.assert_allclose(np.linalg.det(rotations), 1, rtol=1e-6)
+    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (500, 1, 1)), atol=1e-6)
+    up = rotations[:, :, 1]  # the object's y in the picture: right, up, away
+    tilt = np.rad2deg(np.arctan2(up[:, 0], up[:, 1]))
+    assert np.abs(tilt).max() <= 15 and np.ptp(tilt) > 25
+    elevation = np.rad2deg(np.arcsin(-up[:, 2]))  # seen from above, up comes towards the camera
+    assert -10 <= elevation.min() < -5 and 35 < elevation.max() <= 40
