@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import typing
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, SkipValidation
 
@@ -16,93 +17,91 @@ from learn3d.files import limits
 from learn3d.files.findings import DamagedFile
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.methods import LRSchedule, MethodSettings, TrainingSchedule
-from learn3d.presets import PRESETS
-from learn3d.settings import Count, FilePath, Items, Step, checked
+from learn3d.presets import PRESETS, full_name
+from learn3d.settings import Count, FilePath, Items, Rare, Step, checked
 
 DEFAULT_PRESET = "plus-kato"
 
-_FROM_PRESET = ("settings", "layout", "sampling", "augment", "iterations", "batch_size", "lr_schedule")
-_FROM_PRESET += ("warmup_steps", "ema_decay")  # options that the preset decides where they are None
+#: Options that the preset decides if they are None.
+FROM_PRESET = ("settings", "layout", "sampling", "augment", "iterations", "batch_size", "lr_schedule", "warmup_steps")
+FROM_PRESET += ("ema_decay",)
 
-
-def _known_preset(name: str) -> str:
-    if name not in PRESETS:
-        raise ValueError(f"must be one of {', '.join(PRESETS)}, got {name!r}")
-    return name
+T = TypeVar("T")
+_MAY_DIFFER = "a resumed run may have another value"  # it decides how to compute or report, not what is learnt
+MayDiffer = Annotated[T, _MAY_DIFFER]
 
 
 @checked
 class TrainConfig:
     """One training run. It is saved with the run (config.json and in every checkpoint)."""
 
-    data: FilePath
+    data: MayDiffer[FilePath]
     """Folder with the data set's files, such as 02691156_train_images.npz (what `learn3d make-dataset` writes)."""
     category: Annotated[str, Field(min_length=1)]
-    """Object class to train on: a name such as airplane or chair, a synset id, or the file prefix of your own set.
+    """Object category to train on: a name such as airplane or chair, a synset id, or the file prefix of your own set.
     Several, separated by commas, are trained on together."""
-    output: FilePath
+    output: MayDiffer[FilePath]
     """Folder of this run: checkpoints, metrics, pictures. It must be new or empty unless you resume or overwrite."""
-    preset: Annotated[str, AfterValidator(_known_preset)] = DEFAULT_PRESET
-    """Published experiment whose settings apply where nothing else is said."""
-    settings: Annotated[MethodSettings | None, SkipValidation] = None
-    """Settings of the method. None: the preset's."""
+    preset: Annotated[str, AfterValidator(full_name)] = DEFAULT_PRESET
+    """Method, or preset of a method for other data, that decides the defaults of the other options."""
+    settings: Rare[Annotated[MethodSettings | None, SkipValidation]] = None
+    """Settings of the method (default: the preset's)."""
     layout: Layout | None = None
-    """Layout of the data set. None: the preset's."""
-    view_bins: str | None = None
-    """Pose classes as cells of azimuth and elevation in degrees, such as 15x20. None: the layout's own, 15x20
-    for kar; where cameras are fixed, one class for each."""
-    views_per_object: Count | None = None
-    """Train on so many views of every object (kar, r2n2: the first; else drawn at random, the same in every run). None:
-    what the layout's protocol uses, one for Kar's, else all."""
-    sampling: Sampling | None = None
-    """What a batch is made of: views (each on its own), pairs (two views of an object) or classes (drawn uniformly).
-    None: the preset's."""
-    augment: Annotated[tuple[Augmentation, ...], Items] | None = None
-    """Random changes of the training images. None: the preset's."""
-    iterations: Step | None = None
-    """Number of training steps. None: the preset's."""
+    """Arrangement of the files of the data set, see docs/data-sets.md."""
+    view_bins: Rare[str | None] = None
+    """View classes as cells of azimuth and elevation in degrees, such as 15x20 (default: 15x20 for kar; one class for
+    each camera if cameras are fixed)."""
+    views_per_object: Rare[Count | None] = None
+    """Number of views of each object to train on: the first ones for kar and r2n2, else drawn at random, the same in
+    every run (default: the layout's protocol, one for kar, else all)."""
+    sampling: Rare[Sampling | None] = None
+    """How a batch is drawn: views (each on its own), pairs (two views of an object) or classes (categories drawn
+    uniformly)."""
+    augment: Rare[Annotated[tuple[Augmentation, ...], Items] | None] = None
+    """Random changes of the training images (--augment without a name: none)."""
+    iterations: MayDiffer[Step | None] = None
+    """Number of training steps."""
     batch_size: Annotated[int, Field(ge=1, le=65_536)] | None = None
-    """Images per step. None: the preset's."""
-    lr_schedule: LRSchedule | None = None
-    """How the learning rate changes over the run. linear, cosine: it falls to 0. step: to a tenth in the last 5 % of
-    all iterations. None: the preset's, constant for most."""
-    warmup_steps: Annotated[int, Field(ge=0, le=10**9)] | None = None
-    """Steps over which the learning rate grows from 0 at the beginning. None: the preset's, 0 for most, and
-    never more than a tenth of the iterations."""
-    ema_decay: Annotated[float, Field(ge=0, lt=1)] | None = None
-    """Also keep an exponential moving average of all weights, with this decay a step, such as 0.999. Validation, the
-    best checkpoint, evaluation and reconstruction use it. 0: no average. None: the preset's, 0 for most."""
+    """Images per training step."""
+    lr_schedule: Rare[LRSchedule | None] = None
+    """Course of the learning rate over the run. linear, cosine: it falls to 0. step: it falls to a tenth for the last
+    5 % of all iterations."""
+    warmup_steps: Rare[Annotated[int, Field(ge=0, le=10**9)] | None] = None
+    """Steps over which the learning rate grows from 0 at the beginning (default: the preset's, and never more than a
+    tenth of the iterations)."""
+    ema_decay: Rare[Annotated[float, Field(ge=0, lt=1)] | None] = None
+    """Decay, for each step, of an exponential moving average of all weights, which validation, the best checkpoint,
+    evaluation and reconstruction use. 0: no average."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial weights and of the order of the images."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where the networks run. Rendering runs on the CPU."""
-    precision: Literal["auto", "bf16", "fp32"] = "auto"
-    """Arithmetic of the networks. auto: bf16 where it is faster (CUDA, CPUs with bf16 instructions), else fp32."""
-    threads: Annotated[int, Field(ge=1, le=4096)] | None = None
-    """Number of CPU threads. None: one or all, whichever makes the steps faster, tried at the beginning and when steps
-    become slow."""
-    val_split: Literal["val", "test"] = "val"
-    """Split used for validation during training (and for choosing the best checkpoint)."""
-    validate_every: Step = 2000
+    device: MayDiffer[Literal["cpu", "cuda"]] = "cpu"
+    """Device on which the networks run. Rendering runs on the CPU."""
+    precision: Rare[Literal["auto", "bf16", "fp32"]] = "auto"
+    """Arithmetic of the networks. auto: bf16 if it is faster (CUDA, CPUs with bf16 instructions), else fp32."""
+    threads: MayDiffer[Annotated[int, Field(ge=1, le=4096)] | None] = None
+    """Number of CPU threads (default: one or all, whichever makes the steps faster, tried at the beginning and when
+    steps become slow)."""
+    val_split: Rare[MayDiffer[Literal["val", "test"]]] = "val"
+    """Split for validation during training, and for choosing the best checkpoint."""
+    validate_every: MayDiffer[Step] = 2000
     """Steps between validations (voxel IoU and MMD); the last step is always validated."""
-    max_val_images: Count | None = None
-    """Validate on this many images, spread evenly over the objects and views of the split. None: all."""
-    pictures_every: Step = 1000
+    max_val_images: Rare[MayDiffer[Count | None]] = None
+    """Number of images to validate on, spread evenly over the objects and views of the split (default: all)."""
+    pictures_every: Rare[MayDiffer[Step]] = 1000
     """Steps between picture grids."""
-    checkpoint_every: Step = 1000
+    checkpoint_every: Rare[MayDiffer[Step]] = 1000
     """Steps between saves of the last checkpoint."""
-    keep_checkpoints: Step = 2
+    keep_checkpoints: Rare[MayDiffer[Step]] = 2
     """Number of checkpoints to keep: last.safetensors and the ones before it, in checkpoints/."""
-    log_every: Step = 50
+    log_every: Rare[MayDiffer[Step]] = 50
     """Steps between logged losses. A method that trains its networks in turns logs the losses of the last two steps."""
 
     def __post_init__(self) -> None:
         preset = PRESETS[self.preset]
-        given_warmup = self.warmup_steps is not None
-        for name in _FROM_PRESET:
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, getattr(preset, name))
-        if not given_warmup:
+        chosen = {name: getattr(preset, name) for name in FROM_PRESET if getattr(self, name) is None}
+        for name, value in chosen.items():
+            object.__setattr__(self, name, value)
+        if "warmup_steps" in chosen:
             object.__setattr__(self, "warmup_steps", min(self.warmup_steps, self.iterations // 10))
         if type(self.settings) is not type(preset.settings):
             raise ValueError(
@@ -125,15 +124,8 @@ class TrainConfig:
 
     @property
     def schedule(self) -> TrainingSchedule:
-        """What the method must know about the run."""
+        """Course of the training, which the method follows."""
         return TrainingSchedule(self.iterations, self.lr_schedule, self.warmup_steps, self.ema_decay)
-
-
-#: Options that a resumed run may change: they say where and how long to compute and what to report, not what to learn.
-RESUME_MAY_CHANGE = frozenset(
-    {"data", "output", "iterations", "device", "threads", "val_split", "max_val_images", "validate_every"}
-    | {"pictures_every", "checkpoint_every", "keep_checkpoints", "log_every"}
-)
 
 
 def config_to_dict(config: TrainConfig) -> dict[str, Any]:
@@ -147,8 +139,8 @@ def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
         if not isinstance(values, dict):
             raise ValueError(f"must hold options by name ({{...}}), got {type(values).__name__}")
         preset, settings = values.get("preset", DEFAULT_PRESET), values.get("settings")
-        if isinstance(settings, dict) and isinstance(preset, str) and preset in PRESETS:
-            values = values | {"settings": type(PRESETS[preset].settings)(**settings)}
+        if isinstance(settings, dict) and isinstance(preset, str):
+            values = values | {"settings": type(PRESETS[full_name(preset)].settings)(**settings)}
         return TrainConfig(**values)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
@@ -167,26 +159,26 @@ def load_config(path: Path) -> TrainConfig:
     return config_from_dict(values, source=str(path))
 
 
+_MAY_DIFFER_NAMES = {
+    name
+    for name, hint in typing.get_type_hints(TrainConfig, include_extras=True).items()
+    if _MAY_DIFFER in getattr(hint, "__metadata__", ())
+}
+
+
 def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
-    """What makes `config` another run than `saved`: one line per option that a resumed run may not change."""
+    """Reasons why `config` is another run than `saved`: a line for each option that must not differ."""
     old, new = (_flat(c) for c in (saved, config))
-    allowed = RESUME_MAY_CHANGE
-    dependent = _what_depends_on_iterations(config)
-    if dependent is not None:
-        allowed -= {"iterations"}
+    varies = config.settings.varies_over_run
+    if config.lr_schedule != "constant":
+        varies = f"the schedule {config.lr_schedule}"
+    allowed = _MAY_DIFFER_NAMES - ({"iterations"} if varies else set())
     return [
         f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"
-        + f" ({dependent} depends on it)" * (name == "iterations")
+        + f" ({varies} depends on it)" * (name == "iterations")
         for name in dict.fromkeys([*old, *new])
         if name not in allowed and old.get(name) != new.get(name)
     ]
-
-
-def _what_depends_on_iterations(config: TrainConfig) -> str | None:
-    """What makes every step depend on the number of steps of the whole run."""
-    if config.lr_schedule != "constant":
-        return f"the schedule {config.lr_schedule}"
-    return config.settings.varies_over_run
 
 
 def check_resume(config: TrainConfig, saved: TrainConfig) -> None:
@@ -196,8 +188,7 @@ def check_resume(config: TrainConfig, saved: TrainConfig) -> None:
 
 
 def _flat(config: TrainConfig) -> dict[str, Any]:
-    """Options by name, the method's settings among them. The preset is only where they came from."""
-    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(TrainConfig)}
+    """Options by name, the method's settings among them, without the preset, which only says where they came from."""
+    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(TrainConfig) if f.name != "preset"}
     settings = values.pop("settings")
-    del values["preset"]
     return {"method": type(settings).__name__.removesuffix("Settings")} | values | dataclasses.asdict(settings)

@@ -1,12 +1,12 @@
-"""Presets: every setting of a published experiment, named <paper>-<data set>[-<variant>], each with its source.
+"""Presets: the options of an experiment, named <source>-<data set>[-<variant>]: a publication, or "plus".
 
-A preset fills in what the command line leaves out; every setting can be given on its own.
+A preset fills in what the command line leaves out; every option can be given on its own.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import Layout
@@ -17,11 +17,12 @@ from learn3d.methods.plus import PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.methods.prgan import PrGANSettings
 from learn3d.methods.vpl import VPLSettings
+from learn3d.terminal import unknown_name
 
 
 @dataclass(frozen=True)
 class Preset:
-    """One published experiment."""
+    """Options of one experiment, and where they come from."""
 
     label: str  # what tables call it
     settings: MethodSettings  # of the method, which is decided by their type
@@ -36,22 +37,30 @@ class Preset:
     ema_decay: float = 0.0  # of the exponential moving average of the weights a step; 0: no average
 
 
-#: Short names of the methods, accepted wherever a preset is: those on Kato's data.
+class NamedMethod(NamedTuple):
+    """A method with a short name."""
+
+    preset: str  # its preset for Kato's data
+    summary: str  # a line for `learn3d train --help`
+
+
+#: Short names of the methods, accepted wherever a preset is.
 METHODS = {
-    "proposed": "peng2020-kato",
-    "plus": "plus-kato",
-    "vanilla": "peng2020-kato-vanilla",
-    "multi-view": "kato2018-kato",
-    "vpl": "peng2020-kato-vpl",
-    "prgan": "gadelha2017-kato",
+    "plus": NamedMethod("plus-kato", "the default: proposed, with mirror symmetry and a loss at novel views"),
+    "proposed": NamedMethod("peng2020-kato", "pose-invariant codes from single views (Peng et al. 2020)"),
+    "vanilla": NamedMethod("peng2020-kato-vanilla", "encoder and mesh generator alone, on single views"),
+    "multi-view": NamedMethod("kato2018-kato", "the same on pairs of views of an object (Kato et al. 2018)"),
+    "vpl": NamedMethod("peng2020-kato-vpl", "novel views must look as plausible as the input's (Kato and Harada 2019)"),
+    "prgan": NamedMethod("gadelha2017-kato", "a GAN of voxel grids, then an encoder (PrGAN, Gadelha et al. 2017)"),
 }
 
 
 def full_name(name: str) -> str:
     """The name of a preset, from that or from the short name of a method. Raises ValueError for any other."""
-    if METHODS.get(name, name) not in PRESETS:
-        raise ValueError(f"there is no preset {name!r}; choose one of {', '.join([*METHODS, *PRESETS])}")
-    return METHODS.get(name, name)
+    preset = METHODS[name].preset if name in METHODS else name
+    if preset not in PRESETS:
+        raise ValueError(unknown_name("preset", name, [*METHODS, *PRESETS]))
+    return preset
 
 
 _CODE = "published code of Peng et al. 2020"
@@ -101,27 +110,28 @@ _PASCAL_VPL = VPLSettings(
 )
 
 
-def _vpl_on_kar(label: str, iterations: int, detail: str, **changes: float | bool) -> Preset:
-    settings, source = replace(_KAR_VPL, **changes), f"{_VPL_CODE}: train_shapenet.sh, {detail}"
-    augment = ("flip", "channels")
-    return Preset(label, settings, "kar", iterations, 64, source, "classes", augment)
-
-
-def _vpl_on_pascal(label: str, iterations: int, detail: str, **changes: float) -> Preset:
-    settings, source = replace(_PASCAL_VPL, **changes), f"{_VPL_CODE}: train_pascal.sh, {detail}"
-    source += ", without lambda_perceptual"
-    return Preset(label, settings, "pascal3d", iterations, 16, source, "classes", ("crop", "flip-image"))
-
-
-_CLASS = {"class_conditional": True, "lambda_discriminator": 0.2}
-_BASELINE = {"lambda_discriminator": 0.0}
 _VPL_PRESETS: dict[str, Preset] = {
     "peng2020-kato-vpl": Preset("VPL", VPLSettings(), "kato", 20_000, 128, f"{_CODE}: its VPL for Kato's data"),
-    "kato2019-kar": _vpl_on_kar("VPL", 100_000, "shapenet_single_sil_nv1_uvr"),
-    "kato2019-kar-class": _vpl_on_kar("VPL (class-conditional)", 100_000, "shapenet_single_sil_nv1_uvr_cc", **_CLASS),
-    "kato2019-kar-baseline": _vpl_on_kar("VPL baseline", 50_000, "shapenet_single_sil_nv1", **_BASELINE),
-    "kato2019-pascal": _vpl_on_pascal("VPL", 80_000, "pascal_proposed_color"),
-    "kato2019-pascal-baseline": _vpl_on_pascal("VPL baseline", 5_000, "pascal_baseline_color", **_BASELINE),
+    "kato2019-kar": Preset(
+        "VPL",
+        _KAR_VPL,
+        "kar",
+        100_000,
+        64,
+        f"{_VPL_CODE}: train_shapenet.sh, shapenet_single_sil_nv1_uvr",
+        sampling="classes",
+        augment=("flip", "channels"),
+    ),
+    "kato2019-pascal": Preset(
+        "VPL",
+        _PASCAL_VPL,
+        "pascal3d",
+        80_000,
+        16,
+        f"{_VPL_CODE}: train_pascal.sh, pascal_proposed_color, without lambda_perceptual",
+        sampling="classes",
+        augment=("crop", "flip-image"),
+    ),
 }
 
 
@@ -165,18 +175,13 @@ _PLUS = replace(
     ema_decay=0.99,
 )
 
-#: "peng2020-kato" is what the published code computes (and what the paper's tables were
-#: made with); "-printed" is every equation as printed, with the sign slip of the projection loss corrected. Both place
-#: the vertices at 0.5 * (unit sphere + displacement), as the published code does: the text's unit sphere is larger than
-#: the image at the data set's camera, so that no edge is visible and the silhouette gives no gradient.
+#: "peng2020-kato" is what the published code computes, and what the paper's tables were made with. The equations as
+#: printed (with the sign slip of the projection loss corrected) need adversarial_form "probability" and prior_form
+#: "norm". Both place the vertices at 0.5 * (unit sphere + displacement), as the published code does: the text's unit
+#: sphere is larger than the image at the data set's camera, so that no edge is visible and the silhouette gives no
+#: gradient.
 PRESETS: dict[str, Preset] = {
     "peng2020-kato": _KATO,
-    "peng2020-kato-printed": replace(
-        _KATO,
-        label="Proposed (printed losses)",
-        settings=PoseInvariantSettings(adversarial_form="probability", prior_form="norm"),
-        source=f"{_PAPER}, eqs. 4 and 5 as printed; the generator keeps the factor 0.5",
-    ),
     "peng2020-kato-vanilla": _vanilla(_KATO, f"{_PAPER}: the baseline trained on single views"),
     "plus-kato": _PLUS,
     "peng2020-kar": _KAR,

@@ -73,6 +73,11 @@ def _sentence(error: Any, cls: type) -> str:
     return f"{name} {said}, got {error['input']!r:.200}"
 
 
+def split_names(text: str) -> tuple[str, ...]:
+    """The names in a list with commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
 def _path(value: Any) -> Path:
     if not isinstance(value, (str, Path)) or not str(value) or "\0" in str(value):
         raise ValueError(f"must be the path of a file or folder, got {value!r:.200}")
@@ -90,5 +95,7 @@ Pixels = Annotated[int, Field(ge=1, le=1024)]  # side of the networks' images; 2
 #: Of a network's first layer, whose widest layer has eight times as many: up to 4.1 GB; 128 in the papers.
 Channels = Annotated[int, Field(ge=1, le=512)]
 LayerChannels = Annotated[int, Field(ge=1, le=1024)]  # of each layer that a setting names
+RARE = "shown by --help-all, not by --help"  # a mark of an option
+Rare = Annotated[T, RARE]
 FilePath = Annotated[Path, BeforeValidator(_path)]
 Items = Field(strict=False)  # Annotated[tuple[...], Items]: JSON has lists alone

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import functools
 import os
 import re
 import signal
+import socket
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import ParamSpec, TextIO
 
@@ -19,13 +21,11 @@ INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 _COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-def without_traceback(
-    *errors: type[Exception], label: Callable[[], str] = str
-) -> Callable[[Callable[P, int]], Callable]:
-    """Decorates the main function of a command, which returns an exit status: errors are said in one line on stderr.
+def without_traceback(*errors: type[Exception]) -> Callable[[Callable[P, int]], Callable[P, int]]:
+    """Decorates the main function of a command, which returns an exit status: errors become one line on stderr.
 
-    ValueError, OSError and the given errors end it with status 1 and the line "error: ", `label()`, the message. Ctrl-C
-    ends it with status 130. Any other error is a bug and keeps its traceback.
+    ValueError, OSError and the given errors end it with status 1 and the line "error: ", `rank_label()`, the message.
+    Ctrl-C ends it with status 130. Any other error is a bug and keeps its traceback.
     """
 
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
@@ -36,7 +36,7 @@ def without_traceback(
                 say("", end="")  # what a library has printed, and Python still holds back
                 return status
             except (ValueError, OSError, *errors) as error:
-                note(f"error: {label()}{error}")
+                note(f"error: {rank_label()}{error}")
                 return 1
             except KeyboardInterrupt:
                 note("interrupted; what was saved before is as it was")
@@ -45,6 +45,13 @@ def without_traceback(
         return ending
 
     return decorate
+
+
+def rank_label() -> str:
+    """The beginning of a message of this process: "rank 1 on <host>: ", or "" without torchrun."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return ""
+    return f"rank {os.environ.get('RANK')} on {socket.gethostname()}: "
 
 
 def plain(text: str) -> str:
@@ -81,6 +88,14 @@ def _print(text: str, stream: TextIO, end: str) -> None:
         # Python flushes once more when it ends. See "Note on SIGPIPE" in the documentation of `signal`.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         raise
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
+    """The message about a name that does not exist: the names that it may be meant to be, and all that there are."""
+    known = list(known)
+    near = " or ".join(map(repr, difflib.get_close_matches(name, known, n=2)))
+    advice = f"did you mean {near}? There are" if near else "choose one of"
+    return f"there is no {kind} {name!r}; {advice} {', '.join(known)}"
 
 
 def align(rows: Sequence[Sequence[str]]) -> str:

@@ -1,38 +1,36 @@
-"""Open a page in the browser that turns pictures into meshes, and fits a mesh to silhouettes that you draw.
-
-Examples:
-  learn3d demo
-  learn3d demo --run runs/vanilla runs/proposed    (meshes of both, side by side)
-"""
+"""`learn3d demo`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from learn3d.commands.parsing import parse
+import tyro
+
+from learn3d.commands.command import Command
 from learn3d.terminal import say
 
 
 @dataclass(frozen=True)
-class Command:
-    """What is asked for."""
+class Demo(Command):
+    """Open a page in the browser that turns pictures into meshes, and fits a mesh to silhouettes that you draw.
 
-    run: tuple[Path, ...] = ()
-    """Run folders (or checkpoint files) of trained models; without any, the small one that comes with the package."""
+    Examples:
+      learn3d demo
+      learn3d demo --run runs/vanilla runs/proposed    (meshes of both, side by side)
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.arg(name="run")] = ()
+    """Run folders (or checkpoint files) of trained models (default: the small model of the package)."""
     port: int = 7860
-    """Where the page is: http://HOST:PORT."""
+    """Port of the page's address, http://HOST:PORT."""
     host: str = "127.0.0.1"
-    """Address that is listened on. 0.0.0.0: anybody in the network can use the page."""
+    """Address to listen on. With 0.0.0.0 anybody in the network can use the page."""
     browser: bool = True
-    """Only print the address, and open no browser."""
+    """Open a browser, or only print the address."""
 
+    def run(self) -> None:
+        from learn3d.demo.page import serve
 
-def run(arguments: Sequence[str]) -> int:
-    """Serve the page until Ctrl-C."""
-    command = parse(Command, arguments, name="demo", about=__doc__)
-    from learn3d.demo.page import serve
-
-    serve(command.run, host=command.host, port=command.port, browser=command.browser, report=say)
-    return 0
+        serve(self.runs, host=self.host, port=self.port, browser=self.browser, report=say)

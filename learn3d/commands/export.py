@@ -1,40 +1,37 @@
-"""Write the networks of a run into one small file to give away: half precision, nothing that only training needs.
-
-Example:
-  learn3d export --run runs/chair --output chair.safetensors
-  learn3d reconstruct photo.png --run chair.safetensors --output meshes
-"""
+"""`learn3d export`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated
 
-from learn3d.commands.parsing import parse
+import tyro
+
+from learn3d.commands.command import Command, Which
 from learn3d.terminal import say
 
 
 @dataclass(frozen=True)
-class Command:
-    """What is asked for."""
+class Export(Command):
+    """Write the networks of a run into one small file to give away: half precision, nothing that only training needs.
 
-    run: Path
+    Example:
+      learn3d export --run runs/chair --output chair.safetensors
+      learn3d reconstruct photo.png --run chair.safetensors --output meshes
+    """
+
+    source: Annotated[Path, tyro.conf.arg(name="run")]
     """Run folder (or checkpoint file) of the trained model."""
     output: Path
     """File to write, .safetensors."""
-    checkpoint: Literal["last", "best"] = "last"
-    """Which networks of a run: the last ones, or those with the best validation IoU."""
+    which: Which = "last"
+    """Networks of a run to use: the last ones, or those with the best validation IoU."""
 
+    def run(self) -> None:
+        from learn3d.files.writing import check_target
+        from learn3d.runs.export import export
 
-def run(arguments: Sequence[str]) -> int:
-    """Write the file, and say how large it is."""
-    command = parse(Command, arguments, name="export", about=__doc__)
-    from learn3d.files.writing import check_target
-    from learn3d.runs.export import export
-
-    check_target(command.output, "--output")
-    size = export(command.run, command.output, which=command.checkpoint)
-    say(f"{command.output} ({size / 1e6:.1f} MB)")
-    return 0
+        check_target(self.output, "--output")
+        size = export(self.source, self.output, which=self.which)
+        say(f"{self.output} ({size / 1e6:.1f} MB)")

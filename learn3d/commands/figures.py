@@ -1,156 +1,159 @@
-"""Draw the paper's figures from trained runs.
-
-Examples:
-  learn3d figures all --runs runs/vanilla runs/proposed --output pictures
-  learn3d figures grid --runs runs/vanilla runs/proposed --output pictures/comparison.png
-  learn3d figures tsne --runs runs/vanilla runs/proposed --output pictures/tsne.png
-  learn3d figures interpolation --runs runs/proposed --output pictures/interpolation.png
-  learn3d figures curves --runs runs/vanilla runs/proposed --output pictures/curves.png
-  learn3d figures polar --runs runs/vanilla runs/proposed --output pictures/polar.png
-"""
+"""`learn3d figures`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Annotated, ClassVar, Literal
 
+import tyro
+
+from learn3d.commands.command import Command, OnDataset
 from learn3d.commands.packages import missing_package
-from learn3d.commands.parsing import parse
+from learn3d.figures import paper
+from learn3d.figures.runs import Run, open_runs
+from learn3d.files.writing import check_target
 from learn3d.terminal import note, say
-
-if TYPE_CHECKING:
-    from learn3d.figures.runs import Run
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drawn:
-    """What every figure takes."""
+class Figure:
+    """Options of every figure."""
+
+    packages: ClassVar[tuple[str, ...]] = ()  # needed beside those that drawing images needs
 
     output: Path
     """File to write; its ending is replaced by those of the files that the figure consists of."""
-    runs: tuple[Path, ...] = ()
+    runs: tuple[Path, ...]
     """Folders of training runs (or checkpoint files), in the order in which they are shown."""
     labels: tuple[str, ...] = ()
-    """What to call each run, if not by its preset."""
+    """Names of the runs (default: those of their presets)."""
+
+    @classmethod
+    def lacks(cls) -> str:
+        """What must be installed for the figure, "" if nothing is missing."""
+        absent = [package for package in cls.packages if find_spec(package) is None]
+        return missing_package(absent[0]) if absent else ""
+
+    def draw(self) -> list[Path]:
+        """Draw, and return the files."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measured(Drawn):
-    """What figures of networks and data take."""
-
-    data: Path | None = None
-    """Folder of the data set, if not the one each run was trained on."""
-    category: str | None = None
-    """Class to show, if not the one each run was trained on."""
-    split: Literal["train", "val", "test"] = "test"
-    """Part of the data set."""
-    checkpoint: Literal["last", "best"] = "last"
-    """Which networks of a run: the last ones, or those with the best validation IoU."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where the networks run."""
+class FigureOnDataset(OnDataset, Figure):
+    """Options of figures that show networks at work on a data set."""
 
     def open(self) -> list[Run]:
         """The runs with their data."""
-        from learn3d.figures.runs import open_runs
-
-        options = {"data": self.data, "category": self.category, "split": self.split, "device": self.device}
-        return open_runs(self.runs, labels=self.labels, which=self.checkpoint, report_progress=note, **options)
+        return open_runs(self.runs, labels=self.labels, report_progress=note, **self.where)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Grid(Measured):
+class Grid(FigureOnDataset):
     """Test images and each run's shape from the input's view and five more (PNG)."""
 
     images: int | None = None
-    """How many images, spread over objects and views. None given: 6, or 2 of each of several classes."""
+    """Number of images, spread over objects and views (default: 6, or 2 of each of several categories)."""
     indices: tuple[int, ...] = ()
-    """Samples of the data set to show instead."""
+    """Samples of the data set to show (default: as --images says)."""
     truth: bool = False
     """Show the true voxels, too."""
 
+    def draw(self) -> list[Path]:
+        options = {"images": self.images, "indices": self.indices, "truth": self.truth}
+        return [paper.save_grid(self.open(), self.output, **options)]
+
 
 @dataclass(frozen=True, kw_only=True)
-class Tsne(Measured):
+class Tsne(FigureOnDataset):
     """Shape codes of test images in the plane, coloured by the view (PNG, SVG)."""
 
+    packages = ("matplotlib", "sklearn")
+
+    def draw(self) -> list[Path]:
+        return paper.save_tsne(self.open(), self.output)
+
 
 @dataclass(frozen=True, kw_only=True)
-class Interpolation(Measured):
+class Interpolation(FigureOnDataset):
     """Shapes between those of some test images: a strip (PNG) and a morph (GIF)."""
 
     images: int = 3
-    """How many images, of typical but different objects."""
+    """Number of images, of typical but different objects."""
     indices: tuple[int, ...] = ()
-    """Samples of the data set to use instead."""
+    """Samples of the data set to use (default: as --images says)."""
     steps: int = 4
     """Steps from one image to the next in the strip."""
 
+    def draw(self) -> list[Path]:
+        options = {"images": self.images, "indices": self.indices, "steps": self.steps}
+        return paper.save_interpolation(self.open(), self.output, **options)
+
 
 @dataclass(frozen=True, kw_only=True)
-class Curves(Drawn):
+class Curves(Figure):
     """Losses, validation IoU and MMD over the steps, a band over seeds (PNG, SVG)."""
 
+    packages = ("matplotlib",)
+
+    def draw(self) -> list[Path]:
+        return paper.save_curves(self.runs, self.output, labels=self.labels)
+
 
 @dataclass(frozen=True, kw_only=True)
-class Polar(Measured):
+class Polar(FigureOnDataset):
     """IoU by the azimuth of the input view, and agreement of the shapes from different views (PNG, SVG, JSON)."""
 
+    packages = ("matplotlib",)
+
     voxels: Literal["kato18", "kato19"] = "kato18"
-    """Voxeliser of the shapes."""
+    """Voxelizer of the shapes."""
+
+    def draw(self) -> list[Path]:
+        return paper.save_polar(self.open(), self.output, definition=self.voxels)
 
 
 @dataclass(frozen=True, kw_only=True)
-class All(Measured):
+class All(FigureOnDataset):
     """Every figure with its defaults, as far as data and runs allow; --output is a folder."""
+
+    def draw(self) -> list[Path]:
+        without = {name: kind.lacks() for name, kind in FIGURES.items() if kind.lacks()}
+        options = {"labels": self.labels, "without": without, "say": note}
+        return paper.save_all(self.open(), self.runs, self.output, **options)
 
 
 FIGURES = {"all": All, "grid": Grid, "tsne": Tsne, "interpolation": Interpolation, "curves": Curves, "polar": Polar}
-PACKAGES = {"tsne": ("matplotlib", "sklearn"), "curves": ("matplotlib",), "polar": ("matplotlib",)}
 
 
-def run(arguments: Sequence[str]) -> int:
-    """Draw, and print the paths of the files."""
-    name, *rest = arguments or ["--help"]
-    if name not in FIGURES:
-        if not {"-h", "--help", "--help-all"} & {name, *rest}:
-            raise ValueError(f"there is no figure {name!r}; choose one of {', '.join(FIGURES)}")
-        described = "\n".join(f"  {name:13}  {figure.__doc__}" for name, figure in FIGURES.items())
-        say(f"usage: learn3d figures FIGURE --runs RUN [RUN ...] --output PATH [OPTIONS]\n\n{described}\n")
-        say("learn3d figures FIGURE --help has the options of a figure.\n")
-        say(__doc__.partition("\n")[2].strip())
-        return 0
-    command = parse(FIGURES[name], rest, name=f"figures {name}", about=FIGURES[name].__doc__)
-    lacking = {f: reason for f in PACKAGES if (reason := _lacking(f))}
-    if name in lacking:
-        raise ValueError(f"the figure {name} {lacking[name]}")
-    from learn3d.figures import paper
-    from learn3d.files.writing import check_target
+@dataclass(frozen=True)
+class Figures(Command):
+    """Draw the paper's figures from trained runs.
 
-    where, runs = command.output, command.runs
-    check_target(where if name == "all" else where.parent, "--output", folder=True)
-    if name == "curves":
-        paths = paper.save_curves(runs, where, labels=command.labels)
-    elif name == "polar":
-        paths = paper.save_polar(command.open(), where, definition=command.voxels)
-    elif name == "tsne":
-        paths = paper.save_tsne(command.open(), where)
-    elif name == "grid":
-        options = {"images": command.images, "indices": command.indices, "truth": command.truth}
-        paths = [paper.save_grid(command.open(), where, **options)]
-    elif name == "interpolation":
-        options = {"images": command.images, "indices": command.indices, "steps": command.steps}
-        paths = paper.save_interpolation(command.open(), where, **options)
-    else:
-        paths = paper.save_all(command.open(), runs, where, labels=command.labels, without=lacking, say=note)
-    for path in paths:
-        say(str(path))
-    return 0
+    Examples:
+      learn3d figures all --runs runs/vanilla runs/proposed --output pictures
+      learn3d figures grid --runs runs/vanilla runs/proposed --output pictures/comparison.png
+      learn3d figures tsne --runs runs/vanilla runs/proposed --output pictures/tsne.png
+      learn3d figures interpolation --runs runs/proposed --output pictures/interpolation.png
+      learn3d figures curves --runs runs/vanilla runs/proposed --output pictures/curves.png
+      learn3d figures polar --runs runs/vanilla runs/proposed --output pictures/polar.png
+    """
 
+    figure: (
+        Annotated[All, tyro.conf.subcommand("all")]
+        | Annotated[Grid, tyro.conf.subcommand("grid")]
+        | Annotated[Tsne, tyro.conf.subcommand("tsne")]
+        | Annotated[Interpolation, tyro.conf.subcommand("interpolation")]
+        | Annotated[Curves, tyro.conf.subcommand("curves")]
+        | Annotated[Polar, tyro.conf.subcommand("polar")]
+    )
 
-def _lacking(figure: str) -> str:
-    """What to say where a package that the figure needs is not installed."""
-    absent = [package for package in PACKAGES[figure] if find_spec(package) is None]
-    return missing_package(absent[0]) if absent else ""
+    def run(self) -> None:
+        figure = self.figure
+        if reason := figure.lacks():
+            raise ValueError(f"the figure {type(figure).__name__.lower()} {reason}")
+        check_target(figure.output if isinstance(figure, All) else figure.output.parent, "--output", folder=True)
+        for path in figure.draw():
+            say(str(path))

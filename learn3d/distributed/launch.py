@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import socket
 import time
 from collections.abc import Iterator
 from datetime import timedelta
@@ -20,6 +19,7 @@ from torch.distributed.rendezvous import rendezvous
 
 from learn3d.device import check_device
 from learn3d.distributed.process_group import SINGLE_PROCESS, LostPeerError, ProcessGroup, first_sentence
+from learn3d.terminal import rank_label
 
 TIMEOUT = timedelta(minutes=10)  # how long a process waits for the others before it gives up
 GRACE_SECONDS = 2.0  # how long a failing process waits before it ends, so that the one with the first error ends first
@@ -72,13 +72,6 @@ def init_process_group(device: str) -> Iterator[ProcessGroup]:
             raise SystemExit(1) from None
         raise
     dist.destroy_process_group()
-
-
-def rank_label() -> str:
-    """The beginning of a message of this process: "rank 1 on <host>: ", or "" without torchrun."""
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return ""
-    return f"rank {os.environ.get('RANK')} on {socket.gethostname()}: "
 
 
 def all_true(store: dist.Store, rank: int, world_size: int, value: bool) -> bool:

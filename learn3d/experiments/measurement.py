@@ -64,7 +64,8 @@ MEASURES = {
 
 def describe_measures() -> str:
     """One line for each column of figures of `format_table`."""
-    return "\n".join(f"  {header}: {definition}" for header, definition in MEASURES.values())
+    width = max(len(header) for header, _ in MEASURES.values())
+    return "\n".join(f"  {header:{width}}  {definition}" for header, definition in MEASURES.values())
 
 
 Number = Annotated[float, Field(ge=-MOST, le=MOST)] | None

@@ -14,6 +14,8 @@ from learn3d.config import TrainConfig
 from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.experiments.tables import TABLES, VARIANTS, Table, Variant
 from learn3d.presets import PRESETS
+from learn3d.settings import Rare, split_names
+from learn3d.terminal import unknown_name
 
 _FIRST = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")  # in every command line
 _NOT_CHANGEABLE = (*_FIRST, "settings", "layout")  # by --set: the request or the table decides them
@@ -24,25 +26,47 @@ class Request:
     """The table that is asked for, and the choices of the user."""
 
     table: str
-    data: Path  # folder of the data set
-    output: Path  # folder of all runs and reports
-    categories: tuple[str, ...] = ()  # (): the table's
-    methods: tuple[str, ...] = ()  # labels of rows or names of variants; (): all
-    iterations: int | None = None  # None: the preset's
-    batch_size: int | None = None  # None: the preset's
-    seeds: int | None = None  # seeds 0 .. seeds - 1; None: the table's
-    layout: Layout | None = None  # None: the table's
-    device: Literal["cpu", "cuda"] = "cpu"
-    threads: int | None = None  # of each run; None: the cores divided by `jobs`
-    changes: tuple[str, ...] = ()  # "name=value" or "method:name=value": settings and training options
-    jobs: int = 1  # runs at a time
-    cluster: str | None = None  # address or scheduler file of a Dask cluster
-    overwrite: bool = False  # replace runs that were started with other options
-    report_only: bool = False  # train nothing
+    """Name of the table, see --list."""
+    data: Path
+    """Folder of the data set."""
+    output: Path
+    """Folder of runs and reports; all tables can share one."""
+    category: str = ""
+    """Categories, separated by commas, each trained by itself (default: the table's)."""
+    methods: tuple[str, ...] = ()
+    """Methods of the table: labels of rows, or names of variants (default: all)."""
+    iterations: int | None = None
+    """Training steps of every run (default: the preset's)."""
+    batch_size: int | None = None
+    """Images per training step (default: the preset's)."""
+    seeds: int | None = None
+    """Number of seeds, 0 .. seeds - 1 (default: the table's)."""
+    layout: Rare[Layout | None] = None
+    """Layout of the data set (default: the table's)."""
+    device: Rare[Literal["cpu", "cuda"]] = "cpu"
+    """Device on which the networks run."""
+    threads: Rare[int | None] = None
+    """CPU threads of each run (default: cores, or OMP_NUM_THREADS, divided by --jobs)."""
+    set: tuple[str, ...] = ()
+    """Settings and training options to change, as NAME=VALUE in all methods that have them, or as METHOD:NAME=VALUE in
+    one (default: none)."""
+    jobs: int = 1
+    """Runs at a time, each in a process of its own with its share of the cores."""
+    cluster: Rare[str | None] = None
+    """Address or scheduler file of the Dask cluster that runs them, see docs/scale.md (default: they run here)."""
+    overwrite: bool = False
+    """Start runs anew that are there with other options."""
+    report_only: bool = False
+    """Train nothing: report the runs that are complete."""
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """The names in `category`."""
+        return split_names(self.category)
 
     def __post_init__(self) -> None:
         if self.table not in TABLES:
-            raise ValueError(f"there is no table {self.table!r}; choose one of {', '.join(TABLES)} (see --list)")
+            raise ValueError(f"{unknown_name('table', self.table, TABLES)} (see --list)")
         if self.jobs < 1:
             raise ValueError(f"jobs must be a number of processes, at least 1, got {self.jobs}")
         if self.seeds is not None and self.seeds < 1:
@@ -102,7 +126,7 @@ def plan_runs(request: Request) -> list[PlannedRun]:
     if layout in LAYOUTS and not LAYOUTS[layout].voxels:
         raise ValueError(f"the layout {layout!r} has no true voxels, so that no run of the table could be measured")
     variants = [variant for variant in selected_rows(table, request.table, request.methods).values() if variant]
-    changes = _parse_changes(variants, table, request.changes)
+    changes = _parse_changes(variants, table, request.set)
     return [
         PlannedRun(name, category, seed, _configure(request, layout, name, changes[name], category, seed))
         for category in request.categories or table.categories

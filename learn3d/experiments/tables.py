@@ -13,7 +13,7 @@ from learn3d.data.layouts import Layout
 from learn3d.experiments import published
 from learn3d.experiments.published import CATEGORIES, PublishedRow
 from learn3d.methods.plus import PlusSettings
-from learn3d.presets import METHODS
+from learn3d.presets import full_name
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def _plus(data: str, changes: Mapping[str, Any] | None = None, **options: Any) -
 
 
 def _kato(changes: Mapping[str, Any], method: str = "proposed", **options: Any) -> Variant:
-    return Variant(METHODS[method], changes, **options)
+    return Variant(full_name(method), changes, **options)
 
 
 #: By name. Without the confusion loss the discriminator has no effect on the encoder, so its own loss is off, too.

@@ -11,7 +11,7 @@ from learn3d.data import conventions
 from learn3d.data.categories import synset_of
 from learn3d.data.layouts import Layout
 from learn3d.make_data.writers import WRITERS
-from learn3d.settings import Count, FilePath, Weight, checked
+from learn3d.settings import Count, FilePath, Rare, Weight, checked
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 HOW = ("shards", "jobs", "cluster")  # options on which no file depends
@@ -27,39 +27,41 @@ class DatasetConfig:
     category: str
     """Name of the category. Kato's 13 names become synset ids in the names of files."""
     layout: Layout = "kato"
-    """Whose files and viewpoints."""
+    """Published data set whose files and viewpoints are made, see docs/data-sets.md."""
     views: Count | None = None
-    """Views of each object. None: 20 for kar, 24 for r2n2, 8 for pascal3d, 12 for photos. kato and dvr have 24."""
+    """Views of each object (default: 20 for kar, 24 for r2n2, 8 for pascal3d, 12 for photos; kato and dvr always have
+    24)."""
     source: FilePath | None = None
-    """Folder of meshes (searched with all folders in it), or a mesh pack (.npz)."""
+    """Folder of meshes, searched with all folders in it, or a mesh pack .npz (default: --procedural is given)."""
     procedural: Amount = 0
-    """Make so many shapes with the procedural generator instead of reading meshes."""
+    """Make this many shapes with the procedural generator instead of reading meshes."""
     test: Weight | None = None
-    """Part of the meshes for the test split: a share below 1 (then at least 4 meshes), or their number. None: 0.2;
-    pascal3d has no test split."""
+    """Part of the meshes for the test split: a share below 1 (then at least 4 meshes), or their number (default: 0.2;
+    pascal3d has no test split)."""
     val: Weight | None = None
-    """The same for the validation split, 0 for none. None: 0.1, for pascal3d 0.2; r2n2 has no validation split."""
+    """Part of the meshes for the validation split, 0 for none (default: 0.1, for pascal3d 0.2; r2n2 has no validation
+    split)."""
     augment: Amount = 0
     """Copies of each mesh to train on, besides itself, with every axis scaled by a random 0.75 .. 1.25."""
     up: Axis = "y"
     """Axis of the mesh files that points up."""
     front: Axis | None = None
-    """Axis of the mesh files that faces the camera of view 0. None: x (y where up is x), for procedural shapes z."""
-    color: Literal["random", "mesh"] = "random"
-    """Colour every object in one random light colour, or as its file says where it says something."""
-    max_faces: Count = 1_000_000
+    """Axis of the mesh files that faces the camera of view 0 (default: x, or y if x is up; z for procedural shapes)."""
+    color: Rare[Literal["random", "mesh"]] = "random"
+    """Colour every object in one random light colour, or as its file says if it names colours."""
+    max_faces: Rare[Count] = 1_000_000
     """Skip meshes with more faces."""
-    seed: Amount = 0
+    seed: Rare[Amount] = 0
     """Seed of the splits, scales, colours, views and procedural shapes."""
     overwrite: bool = False
     """Replace files of this category that are already in the folder."""
     shards: bool = False
     """Write shards, which training reads piece by piece: for data sets that do not fit into memory (docs/scale.md).
-    Only for the layout kato. A killed call is continued by the same command."""
+    Only for the layout kato. The same command continues an interrupted one."""
     jobs: Count = 1
     """Shards that are made at a time, each in a process of its own."""
-    cluster: str | None = None
-    """Make shards on a Dask cluster: the address or the scheduler file of its scheduler. None: on this machine."""
+    cluster: Rare[str | None] = None
+    """Address or scheduler file of the Dask cluster that makes the shards (default: they are made here)."""
 
     def __post_init__(self) -> None:
         if (self.source is None) == (self.procedural == 0):

@@ -35,8 +35,8 @@ class PoseInvariantSettings(MeshSettings):
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1)."""
     lambda_smooth_end: Positive | None = None
-    """Weight of the smoothness loss at the end of the run, approached by a constant factor a step. None: lambda_smooth
-    throughout."""
+    """Weight of the smoothness loss at the end of the run, approached by a constant factor a step. If it is None the
+    weight stays lambda_smooth."""
     lambda_volume: Weight = 0.0
     """Weight of the volume that shapes enclose."""
     lambda_classification: Weight = 1.0

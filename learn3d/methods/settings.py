@@ -53,8 +53,8 @@ class MeshSettings(MethodSettings):
     layers (Kato and Harada 2019)."""
     symmetry: SymmetryOption = None
     """Vertical plane at which shapes are mirrored: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that
-    looks along it (0 is x = 0). auto: the plane at which the training masks mirror each other, if they do. None: shapes
-    are not mirrored."""
+    looks along it (0 is x = 0). auto: the plane at which the training masks mirror each other, if they do. Shapes are
+    not mirrored if it is None."""
     learning_rate: Positive = 1e-4
     """Adam's learning rate, the same for all networks."""
 

@@ -43,8 +43,8 @@ class VPLSettings(MeshSettings):
     """
 
     encoder: Literal["conv", "preact-resnet18", "resnet18"] = "conv"
-    """conv: three convolutions, 64-pixel RGB and mask. preact-resnet18: RGB on grey. resnet18: RGB, may be pretrained.
-    The last two take any multiple of 32 pixels (--image-size)."""
+    """Network from images to codes. conv: three convolutions, 64-pixel RGB and mask. preact-resnet18: RGB on grey.
+    resnet18: RGB, may be pretrained. The last two take any multiple of 32 pixels (--image-size)."""
     pretrained: FilePath | None = None
     """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's (default: random
     weights); its batch norms stay frozen then. The encoder gets natural colours, however the data set stores them."""

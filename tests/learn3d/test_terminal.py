@@ -14,13 +14,12 @@ import pytest
 from learn3d.commands import main
 from learn3d.terminal import align, say, without_traceback
 
-TOOLS = Path(__file__).parents[2] / "tools"
 INTERRUPTED = "interrupted; what was saved before is as it was\n"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT to another process")
 def test_an_interrupted_data_set_leaves_nothing(tmp_path) -> None:
-    command = [sys.executable, str(TOOLS / "make_dataset.py"), "--output", str(tmp_path / "data")]
+    command = [sys.executable, "-m", "learn3d", "make-dataset", "--output", str(tmp_path / "data")]
     command += ["--category", "chair", "--procedural", "500"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 120
@@ -35,7 +34,7 @@ def test_an_interrupted_data_set_leaves_nothing(tmp_path) -> None:
 
 
 def test_errors_are_a_line_and_mistakes_of_ours_are_not_hidden(capsys) -> None:
-    @without_traceback(FloatingPointError, label=lambda: "rank 1: ")
+    @without_traceback(FloatingPointError)
     def main(error: Exception | None) -> int:
         if error:
             raise error
@@ -44,7 +43,7 @@ def test_errors_are_a_line_and_mistakes_of_ours_are_not_hidden(capsys) -> None:
     assert main(None) == 7
     for error in (ValueError("a"), FileNotFoundError("b"), FloatingPointError("c")):
         assert main(error) == 1
-        assert capsys.readouterr().err == f"error: rank 1: {error}\n"
+        assert capsys.readouterr().err == f"error: {error}\n"
     with pytest.raises(TypeError):
         main(TypeError("d"))
 

@@ -28,7 +28,7 @@ from learn3d.make_data.debian.aircraft import AIRCRAFT_PACKAGE, aircraft_models
 from learn3d.make_data.debian.furniture import FURNITURE_PACKAGES, furniture_models
 from learn3d.make_data.debian.mesh_cleaning import clean_mesh, overlap, surface_grid
 from learn3d.make_data.folders import publishing
-from learn3d.settings import FilePath, checked
+from learn3d.settings import FilePath, checked, split_names
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side when surfaces are compared
@@ -45,15 +45,16 @@ class FetchConfig:
     output: FilePath
     """Folder to write."""
     category: str = ",".join(CATEGORIES)
-    """Which of the six categories, separated by commas."""
+    """Categories, separated by commas."""
     packages_dir: FilePath | None = None
-    """Folder with the .deb files (default: they are downloaded with apt-get)."""
+    """Folder with the .deb files (default: apt-get downloads them)."""
     overwrite: bool = False
     """Replace an earlier output."""
     duplicate_iou: Overlap = 0.85
     """Two surfaces whose overlap is greater are one model; 1 keeps all."""
     stretched_iou: Overlap = 0.85
-    """The same with both boxes stretched to cubes; 1 keeps stretched copies."""
+    """Two surfaces whose overlap is greater when both boxes are stretched to cubes are one model; 1 keeps stretched
+    copies."""
 
     def __post_init__(self) -> None:
         if not self.categories or set(self.categories) - set(CATEGORIES):
@@ -61,7 +62,7 @@ class FetchConfig:
 
     @property
     def categories(self) -> tuple[str, ...]:
-        return tuple(name.strip() for name in self.category.split(",") if name.strip())
+        return split_names(self.category)
 
 
 @dataclass(frozen=True)

@@ -92,9 +92,8 @@ def test_seeds_are_one_curve(call, finished_run, tmp_path) -> None:
 def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> None:
     output = ("--output", tmp_path / "x")
     for arguments, message in (
-        (("grid",), "at least one run folder or checkpoint"),
-        (("curves",), "at least one run folder"),
-        (("polar",), "at least one run folder or checkpoint"),
+        (("grid", "--runs"), "at least one run folder or checkpoint"),
+        (("curves", "--runs"), "at least one run folder"),
         (("grid", "--runs", tmp_path / "nowhere"), "nowhere"),
         (("grid", "--runs", finished_run, "--labels", "a", "b"), "there are 1 runs but 2 labels"),
         (("grid", "--runs", finished_run, "--images", 0), "has 24 images, 0 were asked for"),

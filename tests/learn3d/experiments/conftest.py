@@ -20,7 +20,7 @@ def request_for(tmp_path: Path) -> Callable[..., Request]:
     """A request for a table with two methods on one category, with changes."""
 
     def make(table: str = "kato", **changes: object) -> Request:
-        given = {"categories": ("airplane",), "methods": ("vanilla", "proposed"), "iterations": 6, "batch_size": 4}
+        given = {"category": "airplane", "methods": ("vanilla", "proposed"), "iterations": 6, "batch_size": 4}
         return Request(table, tmp_path / "data", tmp_path / "out", **(given | changes))
 
     return make
@@ -36,5 +36,5 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
 @pytest.fixture
 def report(tmp_path: Path, make: Callable[..., int], request_for: Callable[..., Request]) -> dict:
     """The report of a table of two categories and three seeds in `tmp_path / "out"`."""
-    assert make(request_for(categories=("airplane", "chair"), seeds=3, jobs=2)) == 0
+    assert make(request_for(category="airplane,chair", seeds=3, jobs=2)) == 0
     return json.loads((tmp_path / "out" / "kato.json").read_text())

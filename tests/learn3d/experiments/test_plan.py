@@ -7,7 +7,7 @@ import shlex
 
 import pytest
 
-from learn3d.commands import train
+from learn3d.commands.train import Train
 from learn3d.experiments import published
 from learn3d.experiments.plan import Request, command_line, plan_runs
 from learn3d.experiments.tables import TABLES, VARIANTS
@@ -15,14 +15,14 @@ from learn3d.presets import PRESETS
 
 
 def test_runs_of_a_table_have_names_and_configurations(tmp_path) -> None:
-    runs = plan_runs(Request("ablation", tmp_path, tmp_path / "out", categories=("chair", "lamp"), seeds=2))
+    runs = plan_runs(Request("ablation", tmp_path, tmp_path / "out", category="chair,lamp", seeds=2))
     assert len({run.folder for run in runs}) == len(runs) == 4 * 2 * 2
     run = next(run for run in runs if run.name == "chair/without-adversarial-seed1")
     assert run.folder == tmp_path / "out" / "runs" / "chair" / "without-adversarial-seed1"
     settings = run.config.settings
     assert (settings.lambda_adversarial, settings.lambda_classification, settings.lambda_prior) == (0, 0, 1)
     assert (run.config.seed, run.config.iterations, run.config.batch_size) == (1, 20_000, 128)
-    bins = plan_runs(Request("bins", tmp_path, tmp_path, categories=("chair",)))
+    bins = plan_runs(Request("bins", tmp_path, tmp_path, category="chair"))
     assert [(run.config.view_bins, run.config.layout) for run in bins] == [(width, "kar") for width in published.BINS]
 
 
@@ -67,13 +67,13 @@ def test_plus_sees_as_many_images_as_the_proposed_method(table, plus, proposed, 
 
 def test_changes_reach_the_methods_that_they_name(request_for) -> None:
     changes = ("precision=fp32", "Vanilla-AE:learning-rate=3e-4", "lambda_smooth=0.5", "augment=flip-image,channels")
-    vanilla, proposed = plan_runs(request_for(changes=changes))
+    vanilla, proposed = plan_runs(request_for(set=changes))
     assert (vanilla.config.settings.learning_rate, proposed.config.settings.learning_rate) == (3e-4, 1e-4)
     for run in (vanilla, proposed):
         assert run.config.settings.lambda_smooth == 0.5
         assert (run.config.precision, run.config.augment) == ("fp32", ("flip-image", "channels"))
     for text in ("prgan:discriminator_channels=8,16,32,64", "discriminator-channels=[8,16,32,64]"):
-        (run,) = plan_runs(request_for("prgan", methods=("prgan",), changes=(text,)))
+        (run,) = plan_runs(request_for("prgan", methods=("prgan",), set=(text,)))
         assert run.config.settings.discriminator_channels == (8, 16, 32, 64)
 
 
@@ -82,13 +82,13 @@ def test_changes_reach_the_methods_that_they_name(request_for) -> None:
     [
         ({"table": "katoo"}, "no table 'katoo'; choose one of kato, prgan"),
         ({"methods": ("vpn",)}, "no method 'vpn'; it has vanilla, vpl, proposed"),
-        ({"changes": ("lambda_x=1",)}, "no setting 'lambda_x'; there are encoder"),
-        ({"changes": ("lambda_prior",)}, "written as name=value"),
-        ({"changes": ("pascal:lambda_prior=1",)}, "names the method 'pascal'; there are vanilla, proposed"),
-        ({"changes": ("seed=1",)}, "seed has an option of its own"),
-        ({"changes": ("lambda_prior=-1",)}, "lambda_prior must be"),
-        ({"table": "prgan", "methods": ("prgan",), "changes": ("discriminator_channels=8,a",)}, "discriminator_chan"),
-        ({"categories": ("chair", "chair")}, "categories must be different"),
+        ({"set": ("lambda_x=1",)}, "no setting 'lambda_x'; there are encoder"),
+        ({"set": ("lambda_prior",)}, "written as name=value"),
+        ({"set": ("pascal:lambda_prior=1",)}, "names the method 'pascal'; there are vanilla, proposed"),
+        ({"set": ("seed=1",)}, "seed has an option of its own"),
+        ({"set": ("lambda_prior=-1",)}, "lambda_prior must be"),
+        ({"table": "prgan", "methods": ("prgan",), "set": ("discriminator_channels=8,a",)}, "discriminator_chan"),
+        ({"category": "chair,chair"}, "categories must be different"),
         ({"seeds": 0}, "seeds must be"),
         ({"jobs": 0}, "jobs must be"),
         ({"report_only": True, "overwrite": True}, "give one of them"),
@@ -105,6 +105,6 @@ def test_wrong_requests_are_named(given, message, request_for) -> None:
 def test_the_command_of_a_run_gives_its_configuration(tmp_path, table: str) -> None:
     changes = ("precision=fp32", "augment=flip-image,channels", "max_val_images=4")
     changes += {"kato": ("vpl:anti_aliasing=false",), "prgan": ("perspective=true",)}.get(table, ("lambda_prior=0.25",))
-    asked = {"iterations": 7, "layout": "kar", "changes": changes}
+    asked = {"iterations": 7, "layout": "kar", "set": changes}
     for run in plan_runs(Request(table, tmp_path / "a b", tmp_path, ("chair",), **asked)):
-        assert train.read(shlex.split(command_line(run.config))[2:]).config == run.config
+        assert Train.parse("train", shlex.split(command_line(run.config))[2:]).config == run.config

@@ -48,7 +48,7 @@ def test_seeds_that_were_measured_on_different_objects_have_no_mean(report, tmp_
     result["objects"]["names"][0] = "another"
     path.write_text(json.dumps(result))
     with pytest.raises(ValueError, match="measured on different test objects"):
-        make(request_for(categories=("airplane", "chair"), seeds=3, report_only=True))
+        make(request_for(category="airplane,chair", seeds=3, report_only=True))
 
 
 def test_mmd_is_compared_by_ratio(tmp_path, make, request_for) -> None:

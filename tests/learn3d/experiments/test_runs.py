@@ -28,7 +28,7 @@ from learn3d.runs.summary import Summary
 
 
 def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys, request_for) -> None:
-    call = request_for(categories=("fails", "airplane"), methods=("vanilla",), threads=3, jobs=2)
+    call = request_for(category="fails,airplane", methods=("vanilla",), threads=3, jobs=2)
     assert run_experiment(call, work=stub_work.work) == 1
     shown = capsys.readouterr().err
     assert "FAILED fails/vanilla-seed0; the end of its log:" in shown
@@ -53,7 +53,7 @@ def test_runs_go_on_where_nobody_reads_their_progress(tmp_path, monkeypatch, req
 
 
 def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, request_for) -> None:
-    call = request_for(categories=("waits", "airplane"), jobs=2)
+    call = request_for(category="waits,airplane", jobs=2)
     logs = [tmp_path / f"out/runs/waits/{name}-seed0/log.txt" for name in ("vanilla", "proposed")]
 
     def interrupt() -> None:
@@ -90,7 +90,7 @@ def test_a_closed_terminal_stops_the_runs_except_under_nohup(monkeypatch, nohup,
 def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, capsys) -> None:
     """Two steps in a worker; then only the measurement; then a refusal to measure it on other data."""
     small = ("precision=fp32", "encoder=conv-small", "generator=sphere-small")
-    given = Request("kato", tiny_folder, tmp_path / "out", ("airplane",), ("vanilla",), 2, 4, changes=small, threads=1)
+    given = Request("kato", tiny_folder, tmp_path / "out", "airplane", ("vanilla",), 2, 4, set=small, threads=1)
     assert run_experiment(given) == 0
     folder = tmp_path / "out" / "runs" / "airplane" / "vanilla-seed0"
     result = json.loads((folder / "test.json").read_text())
@@ -118,7 +118,7 @@ def test_a_run_goes_on_or_starts_anew(finished_run, tiny_folder, request_for, tm
     (tmp_path / "out/runs/airplane").mkdir(parents=True)
     shutil.copytree(finished_run, tmp_path / "out/runs/airplane/proposed-seed0")
     small = ("precision=fp32", "encoder=conv-small", "generator=sphere-small")
-    given = dataclasses.replace(request_for(methods=("proposed",), iterations=9, changes=small), data=tiny_folder)
+    given = dataclasses.replace(request_for(methods=("proposed",), iterations=9, set=small), data=tiny_folder)
     (run,) = plan_runs(given)
     calls = []
 
@@ -139,7 +139,7 @@ def test_a_run_goes_on_or_starts_anew(finished_run, tiny_folder, request_for, tm
 
 
 def test_a_run_that_dies_is_a_failed_one(capsys, request_for) -> None:
-    assert run_experiment(request_for(categories=("dies",), methods=("vanilla",)), work=stub_work.work) == 1
+    assert run_experiment(request_for(category="dies", methods=("vanilla",)), work=stub_work.work) == 1
     assert "FAILED dies/vanilla-seed0" in capsys.readouterr().err
 
 
@@ -153,7 +153,7 @@ import stub_work
 from learn3d.experiments.experiment import run_experiment
 from learn3d.experiments.plan import Request
 if __name__ == "__main__":
-    given = Request("kato", Path("data"), Path({str(tmp_path)!r}), ("waits",), ("vanilla",), 6, 4, threads=1)
+    given = Request("kato", Path("data"), Path({str(tmp_path)!r}), "waits", ("vanilla",), 6, 4, threads=1)
     run_experiment(given, work=stub_work.work)
 """
     (tmp_path / "parent.py").write_text(code)

@@ -70,7 +70,7 @@ def test_runs_made_by_hand_are_adopted_and_others_are_named(request_for) -> None
     assert "val_split: 'test' chose the run's best networks" in find_conflict(with_best)
     for changes, words in (
         ({"batch_size": 5}, "batch_size: 4 in the run, 5 asked for"),
-        ({"changes": ("lambda_prior=0.5",)}, "lambda_prior: 1.0 in the run, 0.5 asked for"),
+        ({"set": ("lambda_prior=0.5",)}, "lambda_prior: 1.0 in the run, 0.5 asked for"),
     ):
         (other,) = plan_runs(request_for(methods=("proposed",), **changes))
         assert words in find_conflict(other)
