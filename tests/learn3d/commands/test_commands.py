@@ -45,7 +45,7 @@ def test_options_reach_the_configuration(tmp_path) -> None:
     assert config.augment == ("flip-image", "channels")
     assert (command.overwrite, command.resume) == (True, False)
     assert config.iterations == 20_000
-    assert read(f"{words} --symmetry auto --no-clamp-to-cube").config.settings.symmetry == "auto"
+    assert read(f"{words} --symmetry auto --clamp-to-cube").config.settings.symmetry == "auto"
 
 
 @pytest.mark.parametrize(
