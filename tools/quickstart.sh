@@ -14,27 +14,28 @@ out=$PWD/quickstart
 trap 'echo; echo "stopped; what is finished is in $out"; exit 130' INT
 
 setup report
+learn3d=$PWD/.venv/bin/learn3d
 mkdir -p "$out" || fail "cannot make the folder $out"
 
 step "Making $objects ${category}s, each rendered from 24 views"
-"$python" tools/make_dataset.py --output "$out/data" --category "$category" --procedural "$objects" --overwrite
+"$learn3d" make-dataset --output "$out/data" --category "$category" --procedural "$objects" --overwrite
 
 train() { # method, steps
     step "Training the method '$1' for $2 steps"
-    "$python" tools/train.py --data "$out/data" --category "$category" --preset "$1" --output "$out/$1" \
+    "$learn3d" train --data "$out/data" --category "$category" --preset "$1" --output "$out/$1" \
         --overwrite --iterations "$2" --validate-every $(($2 / 4)) --pictures-every $(($2 / 4)) --checkpoint-every $(($2 / 4))
 }
 train plus "$steps"
 train vanilla $((steps / 4))
 
 step "Measuring both on the test objects, which neither has seen"
-"$python" tools/evaluate.py "$out/plus" "$out/vanilla" --data "$out/data" --json "$out/evaluation.json"
+"$learn3d" evaluate "$out/plus" "$out/vanilla" --data "$out/data" --json "$out/evaluation.json"
 
 step "Reconstructing four test images"
-"$python" tools/reconstruct.py --run "$out/plus" --data "$out/data" --indices 31 85 58 15 --output "$out/meshes"
+"$learn3d" reconstruct --run "$out/plus" --data "$out/data" --indices 31 85 58 15 --output "$out/meshes"
 
 step "Writing the report"
-"$python" tools/report.py "$out/plus" "$out/vanilla" --data "$out/data" --output "$out/report.html"
+"$learn3d" report "$out/plus" "$out/vanilla" --data "$out/data" --output "$out/report.html"
 
 cat <<TEXT
 

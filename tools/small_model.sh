@@ -4,17 +4,17 @@
 # picture stood. Usage: bash tools/small_model.sh. Settings: STEPS, OBJECTS, OUT (environment). Half an hour on two cores.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-python=${PYTHON:-.venv/bin/python}
+learn3d=${LEARN3D:-.venv/bin/learn3d}
 out=${OUT:-output/small-model}
 categories=airplane,car,chair,lamp,sofa,table
 
 for category in ${categories//,/ }; do
-    "$python" tools/make_dataset.py --output "$out/data" --layout kar --views 12 --category "$category" \
+    "$learn3d" make-dataset --output "$out/data" --layout kar --views 12 --category "$category" \
         --procedural "${OBJECTS:-250}" --overwrite
 done
-"$python" tools/train.py --data "$out/data" --layout kar --views-per-object 12 --category "$categories" --preset plus \
+"$learn3d" train --data "$out/data" --layout kar --views-per-object 12 --category "$categories" --preset plus \
     --encoder conv-centred --generator sphere-small --bank-size 6144 --iterations "${STEPS:-24000}" --validate-every 6000 \
     --output "$out/run" --overwrite
-"$python" tools/evaluate.py "$out/run" --data "$out/data" --json "$out/evaluation.json"
+"$learn3d" evaluate "$out/run" --data "$out/data" --json "$out/evaluation.json"
 mkdir -p learn3d/models
-"$python" tools/export.py --run "$out/run" --output learn3d/models/small.safetensors
+"$learn3d" export --run "$out/run" --output learn3d/models/small.safetensors

@@ -52,7 +52,7 @@ class Command:
             about = cls.about(arguments, everything)
         if brief and any(tyro.conf.Suppress in _marks(o.type) for o in _options(cls, None, defaults, brief=True)):
             about += f"\n\nlearn3d {name} --help-all shows more options."
-        return tyro.cli(
+        build = tyro.cli(
             cls,
             args=["--help"] if everything else arguments,
             prog=f"learn3d {name}",
@@ -60,6 +60,7 @@ class Command:
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
             registry=_registry(defaults, brief),
         )
+        return build()
 
     def run(self) -> int | None:
         """Do the work; returns the exit status if that is not 0."""
@@ -120,7 +121,8 @@ def _registry(defaults: Mapping[str, Any], brief: bool) -> ConstructorRegistry:
         if not dataclasses.is_dataclass(info.type):
             return None
         fields = tuple(_options(info.type, info.default, defaults, brief))
-        return StructConstructorSpec(lambda **values: _build(info.type, defaults, values), fields)
+        # It is built afterwards: tyro would catch the ValueError of a value that is not allowed.
+        return StructConstructorSpec(functools.partial(functools.partial, _build, info.type, defaults), fields)
 
     return registry
 
@@ -150,12 +152,13 @@ def _options(
         yield StructFieldSpec(field.name, tyro.conf.Suppress[hint] if hidden else hint, value, text)
 
 
-def _build(kind: type, defaults: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
-    """The dataclass of these options."""
+def _build(kind: type, defaults: Mapping[str, Any], /, **values: Any) -> Any:
+    """The dataclass of these options. The value of a subcommand is a call that builds it."""
     hints, given = typing.get_type_hints(kind), {}
     for field in dataclasses.fields(kind):
         inner = _inner(hints[field.name], defaults.get(field.name))
-        given[field.name] = _build(inner, defaults, values) if inner else values[field.name]
+        value = _build(inner, defaults, **values) if inner else values[field.name]
+        given[field.name] = value() if isinstance(value, functools.partial) else value
     return kind(**given)
 
 

@@ -135,6 +135,8 @@ def test_the_help_of_evaluate_explains_every_column(command, monkeypatch) -> Non
         ("train --data {tmp}/no --category chair --output {tmp}/run", "data set is with --data"),
         ("train --output {tmp} --preset kato", "there is no preset 'kato'; "),
         ("train --data x --category chair --output {tmp} --resume --overwrite", "folder of a"),
+        ("train --data x --category chair --output {tmp}/run --batch-size 0", "batch_size must be at least 1, got 0"),
+        ("make-dataset --output {tmp}/x --category chair", "give either --source"),
         ("train --data {data} --category lamp --output {tmp}/run", "the folder holds: airplane train"),
         ("evaluate {tmp}", "there is no checkpoint"),
         ("evaluate", "give at least one run"),
@@ -247,7 +249,7 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, command
     status, out, _ = command("evaluate", finished_run, "--split", "val", "--json", tmp_path / "t.json")
     report = json.loads((tmp_path / "t.json").read_text())
     assert (status, report["protocol"]["split"]) == (0, "val")
-    assert f"{report['results'][0]['voxel_iou']:.4f}" in out
+    assert f"{report['results'][0]['voxel_iou_kato18']:.4f}" in out
 
 
 @pytest.mark.parametrize(

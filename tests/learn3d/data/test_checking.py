@@ -15,7 +15,6 @@ from shapenet_files import CHAIR, write_kar
 from learn3d.commands import main
 from learn3d.data.checking import check_folder
 
-TOOL = Path(__file__).parents[3] / "tools" / "check_dataset.py"
 LISTS = {"train": ["b1"], "val": ["c2"], "test": ["a0"]}
 
 

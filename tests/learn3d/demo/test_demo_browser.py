@@ -26,7 +26,6 @@ if CHROMIUM is None:
 if os.name != "posix":
     pytest.skip("sends SIGINT to another process", allow_module_level=True)
 
-TOOL = Path(__file__).parents[3] / "tools" / "demo.py"
 ARGUMENTS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 NO_WEBGPU = "WebGPU"  # the viewer of meshes tries it first, says so, and takes WebGL
 PATIENCE = 90_000  # milliseconds
@@ -39,7 +38,7 @@ def server(finished_run, tmp_path_factory) -> Iterator[tuple[subprocess.Popen, s
     shutil.copytree(finished_run, folder / "other")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    words = [sys.executable, str(TOOL), "--port", str(port), "--no-browser", "--run", str(finished_run)]
+    words = [sys.executable, "-m", "learn3d", "demo", "--port", str(port), "--no-browser", "--run", str(finished_run)]
     pipes = {"stdout": subprocess.PIPE, "stderr": (folder / "errors.txt").open("w"), "text": True}
     environment = os.environ | {"TMPDIR": str(folder)}
     with subprocess.Popen([*words, str(folder / "other")], env=environment, **pipes) as process:

@@ -266,10 +266,11 @@ def test_the_mmd_is_the_entry_of_its_table(outcomes: dict[str, Outcome]) -> None
     assert f"(x {ratio:.2f})" in outcomes["mmd"].files["md"]
 
 
-def test_the_class_conditional_preset_goes_from_meshes_to_meshes(laboratory: Laboratory, tmp_path: Path) -> None:
+def test_a_class_conditional_model_goes_from_meshes_to_meshes(laboratory: Laboratory, tmp_path: Path) -> None:
     """make_dataset (two categories) -> train -> evaluate -> reconstruct, each by its command."""
     data, run = laboratory.folder / "kar", laboratory.folder / "conditional"
-    words = ["--preset", "kato2019-kar-class", "--data", data, "--category", f"{CATEGORY},chair", "--output", run]
+    words = ["--preset", "kato2019-kar", "--class-conditional", "--data", data, "--category", f"{CATEGORY},chair"]
+    words += ["--output", run]
     words += ["--iterations", 2, "--batch-size", 4, "--precision", "fp32", "--threads", 1, "--max-val-images", 6]
     words += [word for change in _VPL for word in f"--{change.replace('_', '-')}".split("=")]
     status, _, said = call_tool("train", *words)

@@ -1,7 +1,8 @@
 """The paper's claims in small: the method raises the IoU, and pose confusion takes the view out of the codes.
 
 `test_the_method_raises_the_iou` is the comparison of the README's quick start, a little shorter: 250 procedural
-airplanes from 24 views, the paper's networks, 600 steps of 128, by tools/experiment.py. Some four minutes on two cores.
+airplanes from 24 views, the paper's networks, 600 steps of 128, by `learn3d experiment`.
+Some four minutes on two cores.
 
 The other is smaller: 16 airplanes from four sides, every image on its own, small networks, 1,200 steps: some 40 s for
 each of two trainings. Measured: MMD of confusion alone, without the prior, 0.73, 0.40, 0.02 of Vanilla-AE's with seeds
@@ -78,7 +79,7 @@ def test_the_method_raises_the_iou(tmp_path: Path) -> None:
     )
     words = ["kato", "--data", data, "--output", output, "--category", "airplane", "--methods", "vanilla", "proposed"]
     words += ["--iterations", 600, "--jobs", 2, "--threads", 1, "--set", "validate_every=600"]
-    command = [sys.executable, Path(__file__).parents[3] / "tools" / "experiment.py", *words]
+    command = [sys.executable, "-m", "learn3d", "experiment", *words]
     subprocess.run([str(word) for word in command], check=True)
     report = json.loads((output / "kato.json").read_text())
     vanilla, proposed = (row["cells"]["airplane"] for row in report["rows"])

@@ -36,7 +36,7 @@ SMALL = {
     "learning_rate": 2e-3,
 }
 SHAPENET = replace(PRESETS["kato2019-kar"].settings, **SMALL)
-SHAPENET_CLASS = replace(PRESETS["kato2019-kar-class"].settings, **SMALL)
+SHAPENET_CLASS = replace(SHAPENET, class_conditional=True, lambda_discriminator=0.2)
 PASCAL = replace(PRESETS["kato2019-pascal"].settings, **SMALL, encoder="preact-resnet18", object_scale=0.6)
 FORMS = {"reimplemented": REIMPLEMENTED, "shapenet": SHAPENET, "class": SHAPENET_CLASS, "pascal": PASCAL}
 SHAPE = DatasetInfo(num_views=3, num_classes=2)
@@ -282,10 +282,7 @@ def test_presets_of_vpl() -> None:
     assert VPL_PRESETS == [
         "peng2020-kato-vpl",
         "kato2019-kar",
-        "kato2019-kar-class",
-        "kato2019-kar-baseline",
         "kato2019-pascal",
-        "kato2019-pascal-baseline",
     ]
     for name in VPL_PRESETS:
         preset = PRESETS[name]
@@ -295,10 +292,7 @@ def test_presets_of_vpl() -> None:
     assert weights == {
         "peng2020-kato-vpl": (20_000, 1.0),
         "kato2019-kar": (100_000, 0.1),
-        "kato2019-kar-class": (100_000, 0.2),
-        "kato2019-kar-baseline": (50_000, 0.0),
         "kato2019-pascal": (80_000, 0.5),
-        "kato2019-pascal-baseline": (5_000, 0.0),
     }
 
 

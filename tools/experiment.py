@@ -1,8 +1,0 @@
-"""The command `learn3d experiment`, from a source folder."""
-
-import sys
-
-from learn3d.commands import main
-
-if __name__ == "__main__":
-    sys.exit(main("experiment"))
