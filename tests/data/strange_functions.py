@@ -57,7 +57,8 @@ def chatter(path: Path) -> str:
 
 def shared(path: Path, count: int) -> np.ndarray:
     array = sandbox.empty((count,), np.float64)
-    array[:] = np.arange(count)
+    array[:] = 1
+    array[-1] = count - 1
     return array
 
 
@@ -68,3 +69,9 @@ def arrays(path: Path) -> dict[str, object]:
 
 def modules(path: Path) -> list[str]:
     return sorted(sys.modules)
+
+
+def slip(path: Path) -> object:
+    if not path:
+        never = 1
+    return never
