@@ -1,4 +1,4 @@
-"""The terminal: how a command ends, what is printed there, and the signals that ask for the end."""
+"""The terminal: the end of a command, the lines that it prints, and the signals that ask it to stop."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from typing import ParamSpec, TextIO
 P = ParamSpec("P")
 
 INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
-#: What a terminal would obey, what turns the direction of reading, and halves of characters, which cannot be written.
-_COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+#: Control characters, those that turn the direction of reading, and halves of characters, which cannot be written.
+_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def without_traceback(*errors: type[Exception]) -> Callable[[Callable[P, int]], Callable[P, int]]:
-    """Decorates the main function of a command, which returns an exit status: errors become one line on stderr.
+    """Decorator of the main function of a command, which returns an exit status: errors become one line on stderr.
 
     ValueError, OSError and the given errors end it with status 1 and the line "error: ", `rank_label()`, the message.
     Ctrl-C ends it with status 130. Any other error is a bug and keeps its traceback.
@@ -30,10 +30,10 @@ def without_traceback(*errors: type[Exception]) -> Callable[[Callable[P, int]], 
 
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
         @functools.wraps(main)
-        def ending(*arguments: P.args, **options: P.kwargs) -> int:
+        def run(*arguments: P.args, **options: P.kwargs) -> int:
             try:
                 status = main(*arguments, **options)
-                say("", end="")  # what a library has printed, and Python still holds back
+                say("", end="")  # flushes the lines that a library has printed
                 return status
             except (ValueError, OSError, *errors) as error:
                 note(f"error: {rank_label()}{error}")
@@ -42,7 +42,7 @@ def without_traceback(*errors: type[Exception]) -> Callable[[Callable[P, int]], 
                 note("interrupted; what was saved before is as it was")
                 return INTERRUPTED
 
-        return ending
+        return run
 
     return decorate
 
@@ -56,13 +56,13 @@ def rank_label() -> str:
 
 def plain(text: str) -> str:
     r"""The text with control characters but tabs and line ends written out (\x1b): names in it may be a stranger's."""
-    return _COMMANDS.sub(lambda found: ascii(found[0])[1:-1], text)
+    return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 def say(text: str, *, end: str = "\n") -> None:
-    """Print a line of the results, as `plain` has it; where nobody reads it any more (`| head`), that is no error.
+    """Print a line of the results, by way of `plain`. A reader that has left (`| head`) is no error.
 
-    Raises OSError where it cannot be written for another reason (`> file` on a full disk): the result is lost then.
+    Raises OSError if it cannot be written for another reason (`> file` on a full disk): the result is lost then.
     """
     if sys.stdout is not None:  # closed before the program began (`>&-`)
         with contextlib.suppress(BrokenPipeError):
@@ -70,14 +70,14 @@ def say(text: str, *, end: str = "\n") -> None:
 
 
 def note(text: str) -> None:
-    """Print a line about the progress on stderr, apart from the results; no work ends because it cannot be written."""
+    """Print a line about the progress on stderr, apart from the results. If that fails, work goes on."""
     if sys.stderr is not None:
         with contextlib.suppress(OSError, ValueError):  # ValueError: it was closed
             _print(text, sys.stderr, "\n")
 
 
 def is_watched() -> bool:
-    """Whether progress is seen by somebody: stderr is a terminal (it may be closed, or never have been open)."""
+    """Whether stderr is a terminal (it may be closed, or never have been open)."""
     return sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty()
 
 
@@ -107,40 +107,33 @@ def align(rows: Sequence[Sequence[str]]) -> str:
 
 @dataclass
 class Stop:
-    """The signal that asked for the end: its name, or "" while there was none."""
+    """The name of the signal that asked to stop, "" if there was none."""
 
     name: str = ""
 
 
 @contextlib.contextmanager
 def stop_on_signal() -> Iterator[Stop]:
-    """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop; a second SIGINT interrupts at once."""
-    stop = Stop()
+    """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop; a second SIGINT interrupts at once.
 
-    def handle(number: int) -> None:
+    SIGHUP comes when the terminal is closed. If it is ignored (nohup) it stays so. Outside the main thread, to which
+    Python gives all signals, nothing happens.
+    """
+    stop, previous = Stop(), {}
+
+    def handle(number: int, _: object) -> None:
         if stop.name and number == signal.SIGINT:
             raise KeyboardInterrupt
         stop.name = signal.Signals(number).name
 
-    with handled_by(handle):
-        yield stop
-
-
-@contextlib.contextmanager
-def handled_by(handle: Callable[[int], None]) -> Iterator[None]:
-    """Call `handle` with the number of each SIGINT, SIGTERM and SIGHUP while the block runs.
-
-    SIGHUP comes when the terminal is closed. Where it is ignored (nohup) it stays so.
-    """
     numbers = [signal.SIGINT, signal.SIGTERM]
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
-    previous: dict[int, object] = {}
     try:
         for number in numbers:
-            with contextlib.suppress(ValueError):  # not the main thread: leave signals alone
-                previous[number] = signal.signal(number, lambda received, frame: handle(received))
-        yield
+            with contextlib.suppress(ValueError):  # not the main thread
+                previous[number] = signal.signal(number, handle)
+        yield stop
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -93,7 +93,7 @@ def _complete(
         for run in runs
         if run.folder not in done
     ]
-    return run_tasks(tasks, request.output, jobs=request.jobs, cluster=request.cluster)
+    return run_tasks(tasks, jobs=request.jobs, cluster=request.cluster)
 
 
 def read_result(path: Path) -> Result:

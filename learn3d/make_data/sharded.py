@@ -58,7 +58,7 @@ def make_shards(config: DatasetConfig) -> int:
                 given = (config, folder / split, split, number, items[start : start + step], threads)
                 tasks.append(Task(f"{split} {number}", make_shard, given, folder / f"{split}-{number:05d}.log"))
     note(f"{config.category}: {sum(counts.values())} shards, {len(tasks)} to be made; logs: {folder / '*.log'}")
-    failed = run_tasks(tasks, folder, jobs=config.jobs, cluster=config.cluster)
+    failed = run_tasks(tasks, jobs=config.jobs, cluster=config.cluster)
     for name, tail in failed.items():
         note(f"\nFAILED {name}; the end of the log:\n{tail}")
     missing = [f"{s} {k}" for s, count in counts.items() for k in range(count) if made(folder / s, k) is None]

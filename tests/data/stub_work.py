@@ -6,7 +6,6 @@ import contextlib
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from learn3d.config import config_to_dict
@@ -76,7 +75,7 @@ def fail_if_started(run: PlannedRun, fresh: bool) -> bool:
     raise ValueError("started")
 
 
-def run_tasks_here(tasks: Sequence[Task], folder: Path, **options: object) -> dict[str, str]:
+def run_tasks_here(tasks: Sequence[Task], **options: object) -> dict[str, str]:
     """Run tasks in this process: starting Python and torch takes seconds."""
     for task in tasks:
         task.log.parent.mkdir(parents=True, exist_ok=True)
