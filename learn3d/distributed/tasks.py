@@ -53,7 +53,8 @@ def run_tasks(
     A failing task does not stop the others. SIGINT, SIGTERM or SIGHUP stop all of them: nothing new is started, and
     each running task saves its state. Returns the end of the log of every failed task, by the task's name.
 
-    cluster: the address of a Dask scheduler (tcp://HOST:8786), or the file that it writes with --scheduler-file. When a worker dies another one takes over its task, three times at most; when the scheduler ends, its tasks fail.
+    cluster: the address of a Dask scheduler (tcp://HOST:8786), or the file that it writes with --scheduler-file. If a
+    worker dies another one takes over its task, three times at most. If the scheduler ends, its tasks fail.
 
     Raises OSError if no scheduler answers.
     """
