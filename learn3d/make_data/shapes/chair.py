@@ -1,4 +1,4 @@
-"""Procedural chairs, in metres: a seat on a support with a back and arms, moulded shells, club and barrel chairs."""
+"""Procedural chairs, in metres: a seat on a support with a back and arms, moulded shells, armchairs, barrel chairs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 from .chair_backs import make_back
 from .draw import Draw
 from .parts import Part, bar, between, ellipse, post, rectangle, rounded_path, sheet, slab, tube
-from .supports import feet, legs, support
+from .sofa import upholstered
+from .supports import legs, support
 
 # Weights of the supports of each family of chairs.
 _DINING = {"legs": 6, "loops": 1, "cantilever": 1, "cross": 0.8, "panels": 0.6, "disc": 0.7, "star": 0.4, "rocker": 0.5}
@@ -126,34 +127,6 @@ def shell_chair(draw: Draw) -> Part:
     return part + support(draw, kind, 0.37 * width, 0.38 * depth, height - 0.035)
 
 
-def club_chair(draw: Draw) -> Part:
-    """An upholstered armchair: a block seat, thick arms and back, perhaps wings, on short feet."""
-    width, depth, arm, arm_height = draw(0.68, 0.95), draw(0.68, 0.9), draw(0.09, 0.2), draw(0.5, 0.66)
-    back, back_height, foot = draw(0.12, 0.24), draw(0.66, 1.1), draw(0.03, 0.2)
-    seat_height, soft, lean = draw(0.36, 0.46), draw(0.02, 0.06), draw(0, 14)
-    half, inner, front, rear = width / 2, width / 2 - arm, depth / 2, -depth / 2
-    split, hip = seat_height - draw(0.1, 0.16), rear + back
-    part = between((-half + 0.02, foot, rear + 0.02), (half - 0.02, split + 0.01, front - 0.03), 0.02)
-    part += between((-inner - 0.02, split, rear + 0.05), (inner + 0.02, seat_height, front), soft)
-    upright = between((-inner - 0.05, split - 0.1, rear), (inner + 0.05, back_height, hip), soft)
-    part += upright.rotated("x", -lean, (0, split, hip))
-    kind, x = draw.pick(("box", "rolled", "low")), half - arm / 2
-    level = seat_height + 0.06 if kind == "low" else arm_height
-    part += between((inner, foot, rear + 0.02), (half, level, front - 0.01), soft).both_sides()
-    if kind == "rolled":
-        part += bar((x, level, rear + 0.03), (x, level, front), 1.35 * arm).both_sides()
-    if draw.maybe(0.35) and back_height > 0.8:  # wings
-        t = np.linspace(0, 1, 6)[:, None]
-        reach = draw(0.18, 0.3) * np.sin(np.pi * (0.12 + 0.8 * t)) ** 0.7
-        z = hip - 0.06 + np.linspace(0, 1, 4)[None] * (reach + 0.06)
-        y = arm_height - 0.05 + t * (back_height - arm_height) + 0 * z
-        z = z - np.tan(np.radians(lean)) * (y - split)
-        part += sheet(np.stack([np.full_like(z, inner + 0.02), y, z], 2), draw(0.04, 0.08)).both_sides()
-    if foot > 0.05:
-        part += feet(draw, half - 0.07, front - 0.08, foot + 0.02)
-    return part
-
-
 def barrel_chair(draw: Draw) -> Part:
     """A round seat with a back that wraps around it and falls towards the arms."""
     radius, height, rise, fall = draw(0.26, 0.38), draw(0.36, 0.47), draw(0.22, 0.5), draw(0.0, 0.8)
@@ -183,7 +156,7 @@ KINDS = {
     partial(jointed_chair, family="dining"): 5,
     partial(jointed_chair, family="office"): 1.5,
     shell_chair: 2,
-    club_chair: 1.5,
+    partial(upholstered, seats=1): 1.5,
     partial(jointed_chair, family="lounge"): 1.5,
     partial(jointed_chair, family="bar"): 1,
     barrel_chair: 1,

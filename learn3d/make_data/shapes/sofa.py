@@ -17,31 +17,41 @@ def _cushions(lower: tuple[float, float, float], upper: tuple[float, float, floa
     return join(between((left + 0.008, *lower[1:]), (right - 0.008, *upper[1:]), 0.05) for left, right in edges)
 
 
-def block_sofa(draw: Draw) -> Part:
-    """Two to four seats between upholstered arms, the back in one piece or with a cushion for each seat."""
-    seats = draw.pick({2: 3, 3: 4, 4: 1})
+def upholstered(draw: Draw, seats: int) -> Part:
+    """An armchair (one seat, perhaps with wings) or a sofa: a block, cushions, a leaned back, and arms or none."""
     half, depth = seats * draw(0.27, 0.36), draw(0.75, 1.0)
-    foot, seat, high = draw(0.05, 0.16), draw(0.36, 0.46), draw(0.66, 0.95)
+    foot, seat, high = draw(0.05, 0.16), draw(0.36, 0.46), draw(0.66, 0.95 if seats > 1 else 1.1)
     back, lean, soft = draw(0.14, 0.24), draw(0, 12), draw(0.02, 0.06)
     front, rear, low = depth / 2, -depth / 2, seat - draw(0.1, 0.17)
-    sofa = between((-half, foot, rear), (half, low + 0.005, front - 0.03), 0.02)
-    sofa += _cushions((-half, low, rear + 0.7 * back), (half, seat, front), draw.pick((1, seats, seats)))
+    part = between((-half, foot, rear), (half, low + 0.005, front - 0.03), 0.02)
+    part += _cushions((-half, low, rear + 0.7 * back), (half, seat, front), draw.pick((1, seats, seats)))
     upright = between((-half, low - 0.1, rear), (half, high, rear + back), soft)
     if draw.maybe(0.5):
         top = high + draw(-0.08, 0.08)
         upright += _cushions((-half, seat - 0.05, rear + 0.4 * back), (half, top, rear + 1.6 * back), seats)
-    sofa += upright.rotated("x", -lean, (0, low, rear + back))
-    sofa += feet(draw, half - 0.08, front - 0.09, foot + 0.015)
+    if seats == 1 and high > 0.8 and draw.maybe(0.35):  # wings
+        t = np.linspace(0, 1, 6)[:, None]
+        reach = draw(0.18, 0.3) * np.sin(np.pi * (0.12 + 0.8 * t)) ** 0.7
+        z = rear + back - 0.06 + np.linspace(0, 1, 4)[None] * (reach + 0.06)
+        y = seat + 0.1 + t * (high - seat - 0.1) + 0 * z
+        upright += sheet(np.stack([np.full_like(z, half - 0.03), y, z], 2), draw(0.04, 0.08)).both_sides()
+    part += upright.rotated("x", -lean, (0, low, rear + back))
+    part += feet(draw, half - 0.08, front - 0.09, foot + 0.015)
     kind = draw.pick({"box": 3, "rolled": 2, "low": 1, "none": 0.7})
     if kind == "none":
-        return sofa
+        return part
     wide = draw(0.1, 0.24)
     level = seat + 0.06 if kind == "low" else min(draw(0.52, 0.68), high - 0.03)
     arm = between((half - 0.01, foot, rear), (half + wide, level, front - 0.01), soft)
     if kind == "rolled":
         x, y = half + 0.5 * wide, level - 0.05
         arm += bar((x, y, rear + 0.02), (x, y, front), 1.3 * wide, 1.3 * wide)
-    return sofa + arm.both_sides()
+    return part + arm.both_sides()
+
+
+def block_sofa(draw: Draw) -> Part:
+    """Two to four seats between upholstered arms."""
+    return upholstered(draw, seats=draw.pick({2: 3, 3: 4, 4: 1}))
 
 
 def corner_sofa(draw: Draw) -> Part:
