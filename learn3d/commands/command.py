@@ -34,7 +34,7 @@ class Command:
     """Base class of all commands."""
 
     @classmethod
-    def about(cls, arguments: Sequence[str], everything: bool) -> str:
+    def about(cls, everything: bool) -> str:
         """The text above the options in --help, or, with `everything`, in --help-all."""
         return inspect.getdoc(cls) or ""
 
@@ -49,7 +49,7 @@ class Command:
         defaults, everything = cls.defaults(arguments), "--help-all" in arguments
         about, brief = "", bool({"-h", "--help"} & set(arguments)) and not everything
         if brief or everything:
-            about = cls.about(arguments, everything)
+            about = cls.about(everything)
         if brief and any(tyro.conf.Suppress in _marks(o.type) for o in _options(cls, None, defaults, brief=True)):
             about += f"\n\nlearn3d {name} --help-all shows more options."
         build = tyro.cli(
@@ -57,7 +57,7 @@ class Command:
             args=["--help"] if everything else arguments,
             prog=f"learn3d {name}",
             description=wrap(about),
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
+            config=(tyro.conf.OmitArgPrefixes,),
             registry=_registry(defaults, brief),
         )
         return build()
@@ -121,8 +121,8 @@ def _registry(defaults: Mapping[str, Any], brief: bool) -> ConstructorRegistry:
         if not dataclasses.is_dataclass(info.type):
             return None
         fields = tuple(_options(info.type, info.default, defaults, brief))
-        # It is built afterwards: tyro would catch the ValueError of a value that is not allowed.
-        return StructConstructorSpec(functools.partial(functools.partial, _build, info.type, defaults), fields)
+        # It is built afterwards: tyro would catch the ValueError of a value that is refused.
+        return StructConstructorSpec(lambda **values: functools.partial(_build, info.type, defaults, values), fields)
 
     return registry
 
@@ -152,13 +152,12 @@ def _options(
         yield StructFieldSpec(field.name, tyro.conf.Suppress[hint] if hidden else hint, value, text)
 
 
-def _build(kind: type, defaults: Mapping[str, Any], /, **values: Any) -> Any:
-    """The dataclass of these options. The value of a subcommand is a call that builds it."""
+def _build(kind: type, defaults: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+    """The dataclass of these options."""
     hints, given = typing.get_type_hints(kind), {}
     for field in dataclasses.fields(kind):
         inner = _inner(hints[field.name], defaults.get(field.name))
-        value = _build(inner, defaults, **values) if inner else values[field.name]
-        given[field.name] = value() if isinstance(value, functools.partial) else value
+        given[field.name] = _build(inner, defaults, values) if inner else values[field.name]
     return kind(**given)
 
 

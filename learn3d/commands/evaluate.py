@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -27,11 +26,11 @@ class Evaluate(OnDataset):
     """Write the figures, with protocol and versions, to this file, too (default: to none)."""
 
     @classmethod
-    def about(cls, arguments: Sequence[str], everything: bool) -> str:
+    def about(cls, everything: bool) -> str:
         from learn3d.experiments.measurement import describe_measures
 
         columns = "Columns of the table (means over the images, then over the categories; - if there is no value):"
-        return f"{super().about(arguments, everything)}\n\n{columns}\n{describe_measures()}"
+        return f"{super().about(everything)}\n\n{columns}\n{describe_measures()}"
 
     def run(self) -> None:
         from learn3d.experiments.measurement import evaluate_runs, format_table, to_json

@@ -48,9 +48,9 @@ class Train(Command):
     """Replace an earlier run in --output."""
 
     @classmethod
-    def about(cls, arguments: Sequence[str], everything: bool) -> str:
+    def about(cls, everything: bool) -> str:
         lines = [f"  {name:10}  {method.summary}" for name, method in METHODS.items()]
-        text = "\n".join([super().about(arguments, everything), "", "Methods (--preset NAME):", *lines])
+        text = "\n".join([super().about(everything), "", "Methods (--preset NAME):", *lines])
         if not everything:
             return text
         lines = [f"  {name:23}  {preset.label}; {preset.source}" for name, preset in PRESETS.items()]

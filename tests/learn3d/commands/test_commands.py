@@ -27,8 +27,7 @@ from learn3d.terminal import INTERRUPTED
 TOOLS = Path(__file__).parents[3] / "tools"
 
 
-FIGURES = [("figures", name) for name in ("all", "grid", "tsne", "interpolation", "curves", "polar")]
-PAGES = [(name,) for name in commands.COMMANDS] + FIGURES
+PAGES = [(name,) for name in commands.COMMANDS]
 PAGES += [("train", "--preset", name) for name in ("proposed", "multi-view", "vpl", "prgan")]
 
 
@@ -78,7 +77,7 @@ def test_the_program_lists_its_commands(command) -> None:
         ("train --data x --category y --output z --iteration 3", "--iterations"),
         ("train --data x --category y --output z --no-clamp-to-cub", "--no-clamp-to-cube"),
         ("check-dataset x --moost 3", "--most"),
-        ("figures polr", "polar"),
+        ("figures --output x --runs y polr", "polar"),
         ("experiment kaot --data x --output y", "'kato'"),
     ],
 )
