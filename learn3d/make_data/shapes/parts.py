@@ -61,6 +61,10 @@ class Part:
         pairs = zip(self.lofts, self.scaled(x=-1.0).lofts, strict=True)
         return Part(tuple(loft for pair in pairs for loft in pair))
 
+    def four_corners(self) -> Part:
+        """The part and its mirror images in the planes x = 0, z = 0 and both."""
+        return (self + self.scaled(z=-1.0)).both_sides()
+
     def around(self, angles_deg: Iterable[float]) -> Part:
         """A copy of the part turned about the y axis by each of the angles."""
         return join(self.rotated("y", angle) for angle in angles_deg)

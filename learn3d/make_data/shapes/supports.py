@@ -69,12 +69,10 @@ def legs(
 
 def _hairpin_legs(half_x: float, half_z: float, height: float, splay: float) -> Part:
     """Four V-shaped legs of bent wire under a plate."""
-    part = Part()
-    for s in (1, -1):
-        foot = (half_x + splay, 0.006, s * (half_z + splay))
-        for head in ((half_x - 0.1, height + 0.01, s * half_z), (half_x, height + 0.01, s * (half_z - 0.1))):
-            part += bar(foot, head, 0.013).both_sides()
-    return part + between((-half_x - 0.01, height - 0.012, -half_z), (half_x + 0.01, height + 0.005, half_z))
+    foot, level = (half_x + splay, 0.006, half_z + splay), height + 0.01
+    leg = bar(foot, (half_x - 0.1, level, half_z), 0.013) + bar(foot, (half_x, level, half_z - 0.1), 0.013)
+    plate = between((-half_x - 0.01, height - 0.012, -half_z), (half_x + 0.01, height + 0.005, half_z))
+    return leg.four_corners() + plate
 
 
 def apron(half_x: float, half_z: float, top: float, depth: float, thickness: float) -> Part:
@@ -88,15 +86,11 @@ def feet(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     """Four short feet under a block: tapered blocks, cones or bun feet."""
     size, kind = draw(0.045, 0.08), draw.pick(("block", "cone", "bun"))
     if kind == "bun":
-        bun = ellipsoid((1.4 * size, height, 1.4 * size))
-        return join(bun.moved(half_x, height / 2, z).both_sides() for z in (half_z, -half_z))
+        return ellipsoid((1.4 * size, height, 1.4 * size), (half_x, height / 2, half_z)).four_corners()
     outline = rectangle(size, size, segments=1) if kind == "block" else ellipse(size, size, 10)
     lean = 0.03 if draw.maybe(0.4) else 0.0
-    part = Part()
-    for s in (1, -1):
-        foot, head = (half_x + lean, 0, s * (half_z + lean)), (half_x, height, s * half_z)
-        part += post(foot, head, outline, [(0, 0.6), (1, 1)]).both_sides()
-    return part
+    foot, head = (half_x + lean, 0, half_z + lean), (half_x, height, half_z)
+    return post(foot, head, outline, [(0, 0.6), (1, 1)]).four_corners()
 
 
 def star(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
@@ -111,7 +105,7 @@ def star(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
         middle = hub + draw(0.4, 0.7) * (height - hub)
         column += [(1.1 * thick, middle), (0.65 * thick, middle + 0.01)]
     part = revolve([*column, (0.7 * thick, height + 0.01)], 10)
-    turn = 90.0 if count % 2 else (0, 180 / count)[draw.count(0, 1)]
+    turn = 90.0 if count % 2 else draw.count(0, 1) * 180 / count
     width = draw(0.8, 1.4) * 2 * thick
     path = [(0.3 * thick, hub, 0), (0.4 * reach, 0.7 * hub + 0.3 * low, 0), (reach, low + 0.012, 0)]
     path = rounded_path(path, 0.1, 3)
