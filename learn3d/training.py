@@ -20,8 +20,8 @@ from learn3d.runs.faults import advice_on_errors
 from learn3d.runs.log import open_log
 from learn3d.runs.state import Run, fingerprint_of
 from learn3d.runs.summary import Summary, describe_run
+from learn3d.runs.threads import ThreadTuner
 from learn3d.terminal import is_watched, stop_on_signal
-from learn3d.threads import ThreadTuner
 from learn3d.validation import draw, validate
 
 

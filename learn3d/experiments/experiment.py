@@ -20,8 +20,8 @@ from learn3d.files import limits, writing
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
+from learn3d.runs.threads import cores
 from learn3d.terminal import INTERRUPTED, note, say
-from learn3d.threads import cores
 from learn3d.training import train
 
 LOG_FILE, RESULT_FILE = "log.txt", "test.json"  # in a run's folder

@@ -11,7 +11,7 @@ from learn3d.data.dataset import ViewDataset
 from learn3d.presets import PRESETS
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.state import Run
-from learn3d.threads import ThreadTuner
+from learn3d.runs.threads import ThreadTuner
 
 
 def describe_run(

@@ -275,7 +275,7 @@ def test_a_class_conditional_model_goes_from_meshes_to_meshes(laboratory: Labora
     words += [word for change in _VPL for word in f"--{change.replace('_', '-')}".split("=")]
     status, _, said = call_tool("train", *words)
     assert status == 0, said
-    assert checkpoint.load_metadata(run / "last.safetensors").shape.num_classes == 2
+    assert checkpoint.load_metadata(run / "last.safetensors").info.num_classes == 2
     tensors, _ = checkpoint.load(run / "last.safetensors")
     (name,) = (name for name in tensors if name.startswith("network.discriminator.classes.") and "original" in name)
     assert tensors[name].shape[1] == 2, "the discriminator is told one of two classes"

@@ -97,8 +97,8 @@ METADATA = {
     "config": ({"config": [1]}, "config .* must hold options by name"),
     "fingerprint": ({"fingerprint": {"samples": []}}, "samples must be"),
     "versions": ({"versions": None}, "versions must be"),
-    "classes": ({"shape": {"num_views": 10**9}}, "num_views must be at most"),
-    "missing": ({"shape": {}}, "num_views is missing"),
+    "classes": ({"info": {"num_views": 10**9}}, "num_views must be at most"),
+    "missing": ({"info": {}}, "num_views is missing"),
 }
 
 

@@ -9,10 +9,10 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from learn3d import threads, training
+from learn3d import training
 from learn3d.methods.pose_invariant import PoseInvariant
-from learn3d.runs import checkpoint
-from learn3d.threads import SLOWER, TRIAL, WINDOW, ThreadTuner
+from learn3d.runs import checkpoint, threads
+from learn3d.runs.threads import SLOWER, TRIAL, WINDOW, ThreadTuner
 from learn3d.training import train
 
 
