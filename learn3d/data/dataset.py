@@ -16,8 +16,8 @@ from torch import Tensor
 from learn3d.data.batch import Batch, StepViews
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
 from learn3d.data.crops import Crops, join
+from learn3d.data.disk_array import DiskArray
 from learn3d.data.poses import LookAtPoses, Poses
-from learn3d.data.stored import StoredArray
 from learn3d.data.view_bins import AngleBins
 from learn3d.settings import checked
 
@@ -48,22 +48,22 @@ class ViewDataset:
 
     category: str  # what the user called it; several names are joined by commas
     split: str
-    images: np.ndarray | StoredArray  # uint8 [M, 4, S, S]: R, G, B and the mask
+    images: np.ndarray | DiskArray  # uint8 [M, 4, S, S]: R, G, B and the mask
     poses: Poses | None  # M camera poses; None where they are not known
     view_ids: np.ndarray  # int64 (int32 where on disk) [M] in 0 .. K-1: pose classes
     view_names: tuple[str, ...]  # K names of the pose classes
     object_ids: np.ndarray  # likewise, in 0 .. N-1
     object_names: tuple[str, ...]  # N names, as in the files
     voxels: (
-        np.ndarray | StoredArray | None
+        np.ndarray | DiskArray | None
     )  # bool [N, 32, 32, 32] in the data set's own axes; None where there is no ground truth
     convention: VoxelConvention  # how predictions are brought into those axes
-    masks: np.ndarray | StoredArray | None = (
+    masks: np.ndarray | DiskArray | None = (
         None  # uint8 [M, 64, 64] silhouettes to be matched; None: the images' fourth channel
     )
     class_ids: np.ndarray | None = None  # int64 [N]: category of each object, None for a single category
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
-    points: np.ndarray | StoredArray | None = (
+    points: np.ndarray | DiskArray | None = (
         None  # float32 [N, P, 3]: points on the true surfaces in the object frame, where known
     )
     inverted: bool = True  # colours stored as 255 - colour over black (Kato's form), or as they are
@@ -172,7 +172,7 @@ class ViewDataset:
         """Begin to read what `batch` will be asked for next, where it is on disk."""
         samples = (indices if rows is None else indices[rows]).numpy()
         for array in (self.images, self.masks):
-            if isinstance(array, StoredArray):
+            if isinstance(array, DiskArray):
                 array.prepare(samples)
 
     def digest(self, *, voxels: bool = True) -> int:
@@ -265,14 +265,14 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
         if other.view_names != first.view_names or other.images.shape[1:] != first.images.shape[1:]:
             raise ValueError(f"{other.category} and {first.category} differ in view classes or image size")
 
-    def joined(name: str) -> np.ndarray | StoredArray | None:
+    def joined(name: str) -> np.ndarray | DiskArray | None:
         parts = [getattr(d, name) for d in datasets]
         if any(part is None for part in parts):
             return None
-        stored = [isinstance(part, StoredArray) for part in parts]
+        stored = [isinstance(part, DiskArray) for part in parts]
         if any(stored) and not all(stored):
             raise ValueError(f"of {', '.join(d.category for d in datasets)} some are in shards; convert all, or none")
-        return StoredArray.join(parts) if all(stored) else np.concatenate(parts)
+        return DiskArray.join(parts) if all(stored) else np.concatenate(parts)
 
     starts = np.cumsum([0] + [d.num_objects for d in datasets])[:-1]
     return dataclasses.replace(
@@ -289,15 +289,15 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
     )
 
 
-def _crc(array: np.ndarray | StoredArray, crc: int) -> int:
-    if isinstance(array, StoredArray):
-        return zlib.crc32(array.crc().to_bytes(4, "little"), crc)
+def _crc(array: np.ndarray | DiskArray, crc: int) -> int:
+    if isinstance(array, DiskArray):
+        return zlib.crc32(array.digest().to_bytes(4, "little"), crc)
     return zlib.crc32(np.ascontiguousarray(array), crc)
 
 
-def _taken(array: np.ndarray | StoredArray, samples: np.ndarray) -> np.ndarray | StoredArray:
+def _taken(array: np.ndarray | DiskArray, samples: np.ndarray) -> np.ndarray | DiskArray:
     """Rows of an array, which stay where they are."""
-    return array.select(samples) if isinstance(array, StoredArray) else array[samples]
+    return array.select(samples) if isinstance(array, DiskArray) else array[samples]
 
 
 def _join_poses(poses: list[Poses | None]) -> Poses | None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import nmr
+from learn3d.files import limits
 
 
 def wrap_deg(angle_deg: Tensor) -> Tensor:
@@ -45,6 +46,13 @@ class LookAtPoses:
     def __getitem__(self, indices: Tensor) -> LookAtPoses:
         """The poses of the samples `indices`, int64 [B]."""
         return LookAtPoses(*(value[indices] if isinstance(value, Tensor) else value for value in self._values()))
+
+    def in_range(self) -> Tensor:
+        """Which poses are finite and within `files.limits`: bool [M]."""
+        (near, far), (narrow, wide) = limits.DISTANCE, limits.FOV_DEG
+        azimuth, elevation, distance, half_fov = map(torch.as_tensor, self._values())
+        sound = (azimuth.abs() <= limits.ANGLE_DEG) & (elevation.abs() < 90)
+        return sound & (distance >= near) & (distance <= far) & (half_fov > narrow / 2) & (half_fov < wide / 2)
 
     def cameras(self) -> nmr.LookAt:
         """The M cameras as one batch."""
@@ -92,6 +100,10 @@ class RotationPoses:
 
     def __getitem__(self, indices: Tensor) -> RotationPoses:
         return RotationPoses(self.rotation[indices], self.depth_offset)
+
+    def in_range(self) -> Tensor:
+        """Which rotations, with or without a reflection, are finite and not flat: bool [M]."""
+        return torch.linalg.det(self.rotation.nan_to_num()).ne(0) & self.rotation.isfinite().all(2).all(1)
 
     def cameras(self) -> nmr.cameras.Projection:
         """The M cameras as one batch."""

@@ -16,7 +16,7 @@ import torch
 from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS, ViewDataset
 from learn3d.data.readers import kato
-from learn3d.data.shards import finish_set, made, remove, write_shard
+from learn3d.data.shards import finish_set, remove, shard_path, write_shard
 from learn3d.distributed.tasks import Task, run_tasks
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.files.writing import write_json
@@ -54,14 +54,16 @@ def make_shards(config: DatasetConfig) -> int:
         starts = range(0, len(items), step)
         counts[split] = len(starts)
         for number, start in enumerate(starts):
-            if made(folder / split, number) is None:
+            if not shard_path(folder / split, number).is_file():
                 given = (config, folder / split, split, number, items[start : start + step], threads)
                 tasks.append(Task(f"{split} {number}", make_shard, given, folder / f"{split}-{number:05d}.log"))
     note(f"{config.category}: {sum(counts.values())} shards, {len(tasks)} to be made; logs: {folder / '*.log'}")
     failed = run_tasks(tasks, jobs=config.jobs, cluster=config.cluster)
     for name, tail in failed.items():
         note(f"\nFAILED {name}; the end of the log:\n{tail}")
-    missing = [f"{s} {k}" for s, count in counts.items() for k in range(count) if made(folder / s, k) is None]
+    missing = [
+        f"{s} {k}" for s, count in counts.items() for k in range(count) if not shard_path(folder / s, k).is_file()
+    ]
     if missing:
         note(f"{len(missing)} shards are missing ({', '.join(missing[:5])} ...); the same command makes them")
         return 1 if failed else INTERRUPTED

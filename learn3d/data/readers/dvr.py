@@ -45,7 +45,7 @@ from learn3d.files.findings import FETCH_AGAIN, DamagedFile, Findings, MissingFi
 from learn3d.files.reading import read_text
 from learn3d.files.sandbox import Call
 
-PROPERTIES = LayoutProperties(voxels=False, inverted=True, options=("progress",))
+PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("progress",))
 POINTS = 10_000  # kept of each object's point cloud, which holds 100,000
 _EYE_TOLERANCE = 0.01  # units of the object frame
 _LEAST_COSINE = 0.9995

@@ -50,9 +50,14 @@ from learn3d.files.findings import FETCH_AGAIN, DamagedFile, Findings, MissingFi
 from learn3d.files.reading import parse_json, read_bytes, read_text
 from learn3d.files.sandbox import Call
 
-PROPERTIES = LayoutProperties(voxels=True, inverted=False, options=("image_size", "views_per_object", "progress"))
 #: The .mat volumes, as the paper's code reads them: axes (-z, y, x) of the object frame.
 KAR = VoxelConvention("kar", swap=(1, 3), flip=(1,), kato18_scale=INNER)
+PROPERTIES = LayoutProperties(
+    voxels=True,
+    convention=KAR,
+    inverted=False,
+    options=("image_size", "views_per_object", "progress"),
+)
 NUM_RENDERS = 20
 HALF_FOV_DEG = math.degrees(math.atan(16 / 60))  # 14.9314
 VIEW_BINS = "15x20"  # K = 72

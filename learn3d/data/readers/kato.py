@@ -29,7 +29,7 @@ from learn3d.files import npz
 from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
 from learn3d.files.sandbox import Call, read_all
 
-PROPERTIES = LayoutProperties(voxels=True, inverted=True)
+PROPERTIES = LayoutProperties(voxels=True, convention=KATO, inverted=True)
 VIEW_NAMES = tuple(f"azimuth {AZIMUTH_STEP_DEG * view:g}°" for view in range(NUM_VIEWS))
 
 _KEY = "arr_0"

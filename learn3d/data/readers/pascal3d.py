@@ -39,9 +39,11 @@ from learn3d.files import npz
 from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
 from learn3d.files.sandbox import Call, read_all
 
-PROPERTIES = LayoutProperties(voxels=True, inverted=False, angles=False, stretched=True, options=("image_size",))
 #: The grid spans [-1, 1]; axes (-x, -z, -y) of the object frame.
 PASCAL3D = VoxelConvention("pascal3d", swap=(2, 3), flip=(1, 2, 3), box=2.0)
+PROPERTIES = LayoutProperties(
+    voxels=True, convention=PASCAL3D, inverted=False, angles=False, stretched=True, options=("image_size",)
+)
 IMAGE_SIZE = 224
 CATEGORIES = ("aeroplane", "car", "chair")
 FILES = {"train": ("train", "imagenet"), "val": ("val",), "test": ("val",)}

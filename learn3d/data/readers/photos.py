@@ -33,7 +33,7 @@ from learn3d.data.view_bins import AngleBins
 from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
 from learn3d.files.sandbox import Call, read_all
 
-PROPERTIES = LayoutProperties(voxels=False, inverted=True, options=("image_size", "progress"))
+PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("image_size", "progress"))
 AZIMUTH_WIDTHS_DEG = (15, 20, 30, 45, 60, 90)
 ELEVATION_WIDTH_DEG = 20
 PHOTOS_PER_CLASS = 8  # on average, at least: fewer tell a discriminator nothing

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from learn3d.data.conventions import VoxelConvention
+
 
 @dataclass(frozen=True)
 class LayoutProperties:
     """What is true of all data sets of a layout."""
 
     voxels: bool  # there are true shapes, with which voxel IoU can be measured
+    convention: VoxelConvention  # axes of the true shapes
     inverted: bool  # colours are stored as 255 - colour over black, see `ViewDataset.inverted`
     validation: bool = True  # there is a split "val"; without one, networks are validated on "test"
     angles: bool = True  # cameras have azimuth and elevation, whose cells can serve as view classes

@@ -52,11 +52,15 @@ from learn3d.files import renderings, volumes
 from learn3d.files.findings import DamagedFile, Findings, Problem
 from learn3d.files.sandbox import Call
 
-PROPERTIES = LayoutProperties(
-    voxels=True, inverted=False, validation=False, options=("image_size", "views_per_object", "progress")
-)
 #: binvox's grids: axes (-z, y, -x) of the object frame, backwards. They span the cube that binvox fits to the object.
 R2N2 = VoxelConvention("r2n2", swap=(1, 3), flip=(1, 3), kato18_scale=INNER)
+PROPERTIES = LayoutProperties(
+    voxels=True,
+    convention=R2N2,
+    inverted=False,
+    validation=False,
+    options=("image_size", "views_per_object", "progress"),
+)
 NUM_RENDERS = 24
 DISTANCE = 1.75  # of the ratio 1
 HALF_FOV_DEG = math.degrees(math.atan(16 / 35))

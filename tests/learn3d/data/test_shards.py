@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import subprocess
 import sys
+import time
+import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from lopsided_meshes import write_meshes
 from runs import same_bits
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 
 from learn3d.data import shards
 from learn3d.data.checking import check_folder
+from learn3d.data.disk_array import DiskArray
 from learn3d.data.layouts import load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import sample_indices
-from learn3d.data.stored import StoredArray
 from learn3d.files.findings import DamagedFile
 from learn3d.make_data.render import DatasetConfig, make_dataset
 from learn3d.runs import checkpoint
@@ -56,7 +62,7 @@ def test_every_layout_keeps_its_batches(layout, meshes, tmp_path, command, small
     before = load_dataset(layout, tmp_path / "data", "chair", "train")
     before = before.select(np.argsort(before.object_ids, kind="stable"))  # as they come in shards of one object
     after = load_dataset(layout, tmp_path / "shards", "chair", "train")
-    assert isinstance(after.images, StoredArray) and after.notes == ()
+    assert isinstance(after.images, DiskArray) and after.notes == ()
     for name in ("view_names", "object_names", "convention", "inverted", "num_views", "pose_features", "image_size"):
         assert getattr(after, name) == getattr(before, name), name
     order = torch.randperm(len(before))
@@ -107,8 +113,9 @@ def test_a_run_is_measured_alike(finished_run, stored, tiny_folder, command, tmp
     for name, folder in {"memory": tiny_folder, "disk": stored}.items():
         words = ("--data", folder, "--json", tmp_path / f"{name}.json")
         assert command("evaluate", finished_run, *words)[0] == 0
-        found.append(json.loads((tmp_path / f"{name}.json").read_text()))
-    assert str(found[0]).replace(str(tiny_folder), "") == str(found[1]).replace(str(stored), "")
+        text = (tmp_path / f"{name}.json").read_text()
+        found.append(text.replace(str(tiny_folder), "DATA").replace(str(stored), "DATA"))
+    assert found[0] == found[1]
 
 
 def test_a_stopped_run_goes_on(tiny_config, stored, tmp_path) -> None:
@@ -159,53 +166,65 @@ def test_several_categories(stored, tiny_folder, tmp_path) -> None:
     assert torch.equal(batch.images[2], alone.batch(torch.tensor([1])).images[0])
     assert batch.class_ids.tolist() == [0, 1, 2] and batch.object_ids.tolist() == [0, n, 2 * n]
     few = both.with_few_views(2)
-    assert isinstance(few.images, StoredArray) and len(few) == 6 * n
+    assert isinstance(few.images, DiskArray) and len(few) == 6 * n
     assert few.digest() != both.digest()
 
 
+def shard_file(stored: Path, number: int = 0, split: str = "train") -> Path:
+    return shards.shard_path(stored / "02691156" / split, number)
+
+
+def flip_byte(path: Path, at: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1
+    path.write_bytes(content)
+
+
 def test_a_damaged_shard_is_named_and_left_out(stored, tiny_config, tmp_path, capsys, command) -> None:
-    folder = stored / "02691156" / "train"
     whole = load_dataset("kato", stored, "airplane", "train")
-    images = folder / "00001.images.npy"
-    images.write_bytes(images.read_bytes()[:-1000])
+    path = shard_file(stored, 1)
+    path.write_bytes(path.read_bytes()[:-1000])
     part = load_dataset("kato", stored, "airplane", "train")
     assert part.num_objects == whole.num_objects - 1 and len(part) == len(whole) - 24
     (note,) = part.notes
-    assert note.startswith("left out shard 1 of ") and str(images) in note
+    assert note.startswith("left out one of 3 shards: ") and str(path) in note
     assert part.digest() != whole.digest()
     assert train(dataclasses.replace(tiny_config(tmp_path / "run"), data=stored)).finished
-    assert str(images) in capsys.readouterr().err
+    assert str(path) in capsys.readouterr().err
     status, out, _ = command("check-dataset", stored)
-    assert status == 1 and str(images) in out
+    assert status == 1 and str(path) in out
 
 
 def test_nothing_is_measured_on_a_part_of_a_split(finished_run, stored, command) -> None:
-    path = stored / "02691156" / "test" / "00000.views.npz"
-    other = stored / "02691156" / "train"
-    for file in other.glob("00001.*"):
-        (path.parent / file.name).write_bytes(file.read_bytes())
+    path = shard_file(stored, split="test")
+    shard_file(stored, 1, "test").write_bytes(shard_file(stored, 1).read_bytes())
     description = path.with_name("set.json")
     description.write_text(description.read_text().replace('"shards": 1', '"shards": 2'))
     assert command("evaluate", finished_run, "--data", stored)[0] == 0
     path.unlink()
     status, _, said = command("evaluate", finished_run, "--data", stored)
-    assert status == 1 and "test is not whole: left out shard 0 of 2" in said and str(path) in said
+    assert status == 1 and f"test is not whole: left out 1 of 2 shards, which are missing: {path}" in said
 
 
 def test_overwriting_leaves_what_is_not_a_shard(stored, tiny_folder, command) -> None:
     folder = stored / "02691156" / "train"
     (folder / "photograph.png").write_bytes(b"mine")
-    (folder / "00007.images.npy").write_bytes(b"of an earlier, larger set")
+    (folder / "00007.safetensors").write_bytes(b"of an earlier, larger set")
     assert command("convert-dataset", "--data", tiny_folder, "--output", stored, "--overwrite")[0] == 0
     assert (folder / "photograph.png").read_bytes() == b"mine"
-    assert not (folder / "00007.images.npy").exists()
+    assert not (folder / "00007.safetensors").exists()
     assert load_dataset("kato", stored, "airplane", "train").num_objects == 3
 
 
-@pytest.mark.parametrize("name", ["00000.json", "00000.views.npz", "00000.voxels.npy"])
-@pytest.mark.parametrize("content", [None, b"", b"{}", b"\x93NUMPY\x01\x00v\x00{'descr': '<f8'}"])
-def test_damage_of_every_file(stored, name, content) -> None:
-    path = stored / "02691156" / "train" / name
+def test_any_tool_that_knows_safetensors_opens_a_shard(stored, tiny_set) -> None:
+    tensors = load_file(shard_file(stored, 1))
+    np.testing.assert_array_equal(tensors["images"], tiny_set.images[24:48])
+    assert tensors["images.checksums"][5] == zlib.crc32(tiny_set.images[29])
+
+
+@pytest.mark.parametrize("content", [None, b"", b"{}", b"\xff" * 50, b"\x02\0\0\0\0\0\0\0{}"])
+def test_a_file_that_is_no_shard_is_named(stored, content) -> None:
+    path = shard_file(stored)
     path.unlink()
     if content is not None:
         path.write_bytes(content)
@@ -213,22 +232,95 @@ def test_damage_of_every_file(stored, name, content) -> None:
     assert str(path) in note
 
 
-def test_changed_pixels_are_found(stored, command) -> None:
-    path = stored / "02691156" / "train" / "00000.images.npy"
-    content = bytearray(path.read_bytes())
-    content[-1] ^= 1
-    path.write_bytes(content)
+def rewrite(stored: Path, **changes) -> Path:
+    """Shard 0 with other tensors and correct checksums; None leaves one out."""
+    path = shard_file(stored)
+    with safe_open(path, "np") as file:
+        metadata = json.loads(file.metadata()["shard"])
+    arrays = {name: value for name, value in (load_file(path) | changes).items() if value is not None}
+    for name in {"images", "voxels"} & changes.keys():
+        arrays[f"{name}.checksums"] = np.array([zlib.crc32(row) for row in changes[name]], np.uint32)
+    tables = {name: arrays[name] for name in arrays if name not in ("images", "voxels")}
+    metadata["crc"] = shards._crc(metadata["objects"], tables)
+    save_file(arrays, path, {"shard": json.dumps(metadata)})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"azimuth_deg": np.full(24, np.nan, np.float32)}, "the pose of view 0 is out of range"),
+        ({"sides": np.full(24, 2, np.float32)}, r"sides must lie in 0 .. 1"),
+        ({"view_ids": np.full(24, 24, np.int32)}, r"view_ids must lie in 0 .. 23"),
+        ({"object_ids": np.full(24, -1, np.int32)}, r"object_ids must lie in 0 .. 0"),
+        ({"sides": None}, "it has no sides"),
+        ({"azimuth_deg": np.zeros(23, np.float32)}, r"azimuth_deg is F32 [23]; expected F32 [24]"),
+        ({"images": np.zeros((24, 4, 32, 32), np.uint8)}, r"images is U8 [24, 4, 32, 32]; expected U8 [24, 4, 64, 64]"),
+        ({"other": np.zeros(24, np.float32)}, "KeyError: 'other'"),
+    ],
+)
+def test_tables_that_cannot_be_are_refused(stored, changes, message) -> None:
+    path = rewrite(stored, **changes)
+    (note,) = load_dataset("kato", stored, "airplane", "train").notes
+    assert str(path) in note and message in note
+
+
+def test_bools_other_than_0_and_1_are_refused(stored) -> None:
+    path = rewrite(stored, voxels=np.full((1, 32, 32, 32), 7, np.uint8).view(np.bool_))
+    with pytest.raises(DamagedFile, match=f"{path}: .*its bools have values other than 0 and 1"):
+        load_dataset("kato", stored, "airplane", "train").batch(torch.tensor([0]))
+
+
+def test_a_changed_pixel_is_not_trained_on(stored, tiny_config, tmp_path, command) -> None:
+    path = shard_file(stored)
+    flip_byte(path, path.read_bytes().index(load_file(path)["images"].tobytes()) + 9)
+    with pytest.raises(DamagedFile, match=f"{path}: cannot be used any more .* another CRC-32"):
+        train(dataclasses.replace(tiny_config(tmp_path / "run", iterations=18), data=stored))
     status, out, _ = command("check-dataset", stored)
-    assert status == 1 and f"{path}: its content is not what was written" in out
+    assert status == 1 and f"{path}: cannot be used" in out
+
+
+def test_a_changed_table_is_left_out(stored) -> None:
+    path = shard_file(stored)
+    flip_byte(path, path.read_bytes().index(load_file(path)["azimuth_deg"].tobytes()) + 9)
+    (note,) = load_dataset("kato", stored, "airplane", "train").notes
+    assert note.startswith(f"left out one of 3 shards: {path}") and "another CRC-32" in note
+
+
+def test_a_shard_that_changed_after_a_kill_is_noticed(stored, tiny_config, tmp_path) -> None:
+    """With the old checksums by the first batch, with new ones before it."""
+    config = dataclasses.replace(tiny_config(tmp_path / "run"), data=stored)
+    train(dataclasses.replace(config, iterations=2))
+    other = 255 - load_file(shard_file(stored))["images"]
+    rewrite(stored, images=other)
+    with pytest.raises(ValueError, match="other training data"):
+        train(config, resume=True)
+
+
+def test_pipes_and_devices_are_refused_at_once(stored) -> None:
+    for number, make in enumerate((os.mkfifo, lambda path: os.symlink("/dev/zero", path))):
+        shard_file(stored, number).unlink()
+        make(shard_file(stored, number))
+    notes = load_dataset("kato", stored, "airplane", "train").notes
+    assert len(notes) == 2 and all("it is no plain file" in note for note in notes)
+
+
+def test_a_set_that_claims_a_million_shards_is_one_note(stored) -> None:
+    path = stored / "02691156" / "train" / "set.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "shards": 10**6}))
+    began = time.process_time()
+    (note,) = load_dataset("kato", stored, "airplane", "train").notes
+    assert note.startswith(f"left out 999997 of 1000000 shards, which are missing: {shard_file(stored, 3)}")
+    assert time.process_time() - began < 2
 
 
 def test_a_file_that_is_cut_short_later_is_an_error(stored) -> None:
     dataset = load_dataset("kato", stored, "airplane", "train")
-    path = stored / "02691156" / "train" / "00000.images.npy"
+    path = shard_file(stored)
     path.write_bytes(path.read_bytes()[:200])
     dataset.prepare(torch.tensor([0, 1]))
-    for _ in range(2):  # what was read ahead, and what is read now
-        with pytest.raises(DamagedFile, match=r"00000\.images\.npy: cannot be read any more"):
+    for _ in range(2):  # rows that were read ahead, and rows that are read now
+        with pytest.raises(DamagedFile, match=r"00000\.safetensors: cannot be used any more \(it ends early\)"):
             dataset.batch(torch.tensor([0, 1]))
 
 
@@ -239,7 +331,7 @@ def test_another_layout_or_set_file(stored) -> None:
     assert check_folder("kato", stored).errors == 0
     path = stored / "02691156" / "train" / "set.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "shards": 0}))
-    with pytest.raises(DamagedFile, match=r"set\.json: is no description of shards \(shards: "):
+    with pytest.raises(DamagedFile, match=r"set\.json: is no description of shards \(shards must "):
         load_dataset("kato", stored, "airplane", "train")
 
 
@@ -257,10 +349,8 @@ def test_what_is_read_ahead_is_what_was_asked_for(stored) -> None:
 def test_each_of_several_processes_reads_its_own_rows(stored, tiny_folder, monkeypatch) -> None:
     dataset, indices = load_dataset("kato", stored, "airplane", "train"), torch.tensor([5, 60, 33, 2, 41])
     whole = load_dataset("kato", tiny_folder, "airplane", "train").batch(indices)
-    read, original = [], StoredArray._read
-    monkeypatch.setattr(
-        StoredArray, "_read", lambda array, rows: (read.extend(rows.tolist()), original(array, rows))[1]
-    )
+    read, original = [], DiskArray._read
+    monkeypatch.setattr(DiskArray, "_read", lambda array, rows: (read.extend(rows.tolist()), original(array, rows))[1])
     for rank, rows in enumerate((torch.tensor([0, 1, 2]), torch.tensor([3, 4]))):
         dataset.prepare(indices, rows)
         part = dataset.batch(indices, rows, voxels=False)

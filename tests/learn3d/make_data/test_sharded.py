@@ -106,10 +106,10 @@ def test_a_killed_call_is_continued(config, here, tmp_path, monkeypatch) -> None
     words = ["--output", str(config.output), "--shards", "--jobs", "2"]
     words += [str(word) for name, value in NUMBERS.items() for word in (f"--{name}", value)]
     for kind in (signal.SIGKILL, signal.SIGTERM):
-        begun = len(list(config.output.glob("*/*/[0-9]*[0-9].json")))
+        begun = len(list(config.output.glob("*/*/[0-9]*.safetensors")))
         with subprocess.Popen([sys.executable, tmp_path / "make.py", *words], start_new_session=True) as process:
             deadline = time.monotonic() + 60
-            while len(list(config.output.glob("*/*/[0-9]*[0-9].json"))) <= begun and time.monotonic() < deadline:
+            while len(list(config.output.glob("*/*/[0-9]*.safetensors"))) <= begun and time.monotonic() < deadline:
                 time.sleep(0.01)
             with contextlib.suppress(ProcessLookupError):
                 if kind == signal.SIGKILL:
