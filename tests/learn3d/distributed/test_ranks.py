@@ -25,7 +25,6 @@ from safetensors.torch import load_file
 from train_in_ranks import evaluate_last, linear_optimizer
 
 from learn3d.config import TrainConfig, config_to_dict
-from learn3d.data import augment as augmentation
 from learn3d.distributed import launch
 from learn3d.distributed.launch import all_true, init_process_group, rank_label
 from learn3d.distributed.process_group import SINGLE_PROCESS, LostPeerError, ProcessGroup
@@ -82,24 +81,6 @@ def test_each_row_belongs_to_one_process(world: int, batch_size: int, sampling: 
 def test_too_many_processes_are_refused(batch_size: int, sampling: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         ProcessGroup(0, 3).split_batch(batch_size, sampling)
-
-
-def test_too_many_processes_are_refused_before_data_are_read(tiny_config, tmp_path) -> None:
-    with pytest.raises(ValueError, match="a batch of 4 is too small for 5 processes"):
-        train(tiny_config(tmp_path / "run", data=tmp_path / "nowhere"), group=ProcessGroup(1, 5))
-
-
-@pytest.mark.parametrize("names", [("flip",), ("flip-image", "channels"), ("channels", "flip"), ("colors",)])
-def test_parts_of_a_batch_are_changed_as_the_whole_is(tiny_set, names: tuple[str, ...]) -> None:
-    indices = torch.tensor([3, 50, 7, 30, 31])
-    whole = augmentation.augment(tiny_set.batch(indices), names, 0, 1)
-    for rows in (torch.tensor([0, 1, 2]), torch.tensor([3, 4])):
-        part = augmentation.augment(tiny_set.batch(indices, rows), names, 0, 1)
-        assert torch.equal(part.images, whole.images[rows])
-        assert torch.equal(part.masks, whole.masks[rows])
-        assert torch.equal(part.poses.azimuth_deg, whole.poses.azimuth_deg[rows])
-        assert torch.equal(part.step_views.poses.azimuth_deg, whole.poses.azimuth_deg)
-        assert torch.equal(part.step_views.view_ids, whole.view_ids)
 
 
 def test_without_torchrun_there_is_one_process(monkeypatch) -> None:
@@ -191,7 +172,6 @@ def test_all_data_count_when_processes_compare_them(tiny_set, name: str) -> None
         other = dataclasses.replace(value, azimuth_deg=value.azimuth_deg.roll(1))
     else:
         other = np.roll(value, 1, axis=0)
-    assert own.digest() == dataclasses.replace(own).digest()
     assert dataclasses.replace(own, **{name: other}).digest() != own.digest()
 
 

@@ -23,6 +23,7 @@ TINY = {"encoder": "conv-small", "generator": "sphere-small"}
 #: A run of each method with tiny networks.
 METHODS = {
     "proposed": TINY,
+    "plus": TINY | {"preset": "plus-kato", "bank_size": 8},
     "multi-view": TINY | {"preset": "kato2018-kato"},
     "vpl": {"preset": "peng2020-kato-vpl", "generator": "sphere-small", "discriminator_channels": 2},
     "prgan": {"preset": "gadelha2017-kato", "encoder_from_step": 3}

@@ -13,8 +13,6 @@ from learn3d.methods import DatasetInfo, create_method
 from learn3d.methods.optimization import TrainingSchedule
 from learn3d.methods.plus import MaskBank, Plus, PlusSettings
 from learn3d.presets import PRESETS
-from learn3d.runs.checkpoint import load
-from learn3d.training import train
 
 SMALL = PlusSettings(encoder="conv-small", generator="sphere-small", bank_size=4)
 
@@ -81,12 +79,6 @@ def test_the_weight_of_the_smoothness_falls_over_the_run(tiny_set, batch) -> Non
     assert make(lambda_smooth_end=None).weights_at(5) == make().weights
 
 
-def test_a_weight_on_the_volume(batch) -> None:
-    assert "volume" not in make().take_step(batch, 1)
-    method = make(lambda_volume=0.1)
-    assert method.take_step(batch, 1)["volume"] > 0
-
-
 def test_the_loss_at_novel_views_waits_for_a_full_mask_bank(batch) -> None:
     method = make(bank_size=6)
     assert "novel_view" not in method.take_step(batch, 1)
@@ -134,35 +126,11 @@ def test_an_image_and_its_mirror_image_have_one_code(batch) -> None:
         assert not torch.equal(free.encode(batch.images), free.encode(batch.images.flip(3)))
 
 
-def test_an_interrupted_run_resumes_bit_for_bit(tiny_config, run_folder, tmp_path) -> None:
-    options = {"preset": "plus-kato", "bank_size": 8, "warmup_steps": 1, "iterations": 6, "lr_schedule": "constant"}
-    options["lambda_smooth_end"] = None
-    whole = tiny_config(tmp_path / "whole", **options)
-    train(whole)
-    train(dataclasses.replace(whole, output=run_folder, iterations=3))
-    train(dataclasses.replace(whole, output=run_folder), resume=True)
-    tensors = [load(folder / "last.safetensors")[0] for folder in (tmp_path / "whole", run_folder)]
-    assert tensors[0].keys() == tensors[1].keys()
-    assert "network.mask_bank.masks" in tensors[0]
-    assert all(torch.equal(a, tensors[1][name]) for name, a in tensors[0].items())
-
-
 def test_the_length_of_a_run_whose_smoothness_falls_is_kept(tiny_config, tmp_path) -> None:
     config = tiny_config(tmp_path, preset="plus-kato", lr_schedule="constant", iterations=6)
     assert differences(dataclasses.replace(config, iterations=7), config) == [
         "iterations: 6 in the run, 7 asked for (lambda_smooth_end depends on it)"
     ]
-
-
-def test_presets() -> None:
-    for name, symmetry in {"plus-kato": "auto", "plus-kar": "auto", "plus-pascal": "z"}.items():
-        preset = PRESETS[name]
-        assert (preset.lr_schedule, preset.warmup_steps, preset.ema_decay) == ("cosine", 100, 0.99)
-        assert preset.settings.symmetry == symmetry
-        assert (preset.settings.lambda_novel_view > 0) == (name != "plus-kar"), (
-            "cameras of a class differ in Kar's data"
-        )
-        assert "flip-image" not in preset.augment, "the method flips images itself, and tells the discriminator"
 
 
 def test_warm_up_of_a_short_run(tiny_config, tmp_path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 
@@ -27,7 +26,6 @@ from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenera
 from learn3d.networks.preact_resnet import PreactResNet18
 from learn3d.presets import PRESETS
 
-VPL_PRESETS = [name for name, preset in PRESETS.items() if isinstance(preset.settings, VPLSettings)]
 REIMPLEMENTED = VPLSettings(discriminator_channels=8, lambda_discriminator=0.1, learning_rate=1e-3)
 SMALL = {
     "image_size": 32,
@@ -125,38 +123,6 @@ def test_a_few_steps_lower_the_projection_loss(form: str) -> None:
     assert torch.equal(method.encode(batch.images[:1]), codes[:1]) or torch.allclose(
         method.encode(batch.images[:1]), codes[:1], atol=1e-5
     )
-
-
-def test_bf16_and_wider_batches_take_steps() -> None:
-    for settings in (REIMPLEMENTED, SHAPENET_CLASS):
-        method = create_method(settings, SHAPE, device="cpu", precision="bf16", seed=0)
-        for step in (1, 2):
-            losses = method.take_step(make_batch(settings.image_size, 3), step)
-            assert all(np.isfinite(list(losses.values())))
-
-
-@pytest.mark.parametrize("form", ["reimplemented", "shapenet"])
-def test_training_repeats_itself(form: str) -> None:
-    runs = []
-    for _ in range(2):
-        method = create(FORMS[form])
-        runs.append([method.take_step(make_batch(FORMS[form].image_size, 4), step) for step in (1, 2)])
-    assert runs[0] == runs[1]
-
-
-@pytest.mark.parametrize("form", ["reimplemented", "class"])
-def test_training_goes_on_from_its_saved_state(form: str) -> None:
-    batch = make_batch(FORMS[form].image_size, 4)
-    method, other = create(FORMS[form]), create(FORMS[form])
-    method.take_step(batch, 1)
-    for name, network in method.networks.items():
-        other.networks[name].load_state_dict(network.state_dict())
-        other.optimizers[name].load_state_dict(deepcopy(method.optimizers[name].state_dict()))
-    runs = []
-    for continued in (method, other):
-        torch.manual_seed(1)
-        runs.append([continued.take_step(batch, step) for step in (2, 3)])
-    assert runs[0] == runs[1]
 
 
 def test_alternating_steps_train_one_side() -> None:
@@ -276,24 +242,6 @@ def test_input_mask_is_the_target_at_its_size() -> None:
     method = create(settings)
     method.predict = lambda images: VPL.predict(method, batch.images)
     assert method.take_step(faint, 1)["projection"] == losses[0]
-
-
-def test_presets_of_vpl() -> None:
-    assert VPL_PRESETS == [
-        "peng2020-kato-vpl",
-        "kato2019-kar",
-        "kato2019-pascal",
-    ]
-    for name in VPL_PRESETS:
-        preset = PRESETS[name]
-        assert isinstance(preset.settings, VPLSettings)
-        assert "published code" in preset.source
-    weights = {n: (PRESETS[n].iterations, PRESETS[n].settings.lambda_discriminator) for n in VPL_PRESETS}
-    assert weights == {
-        "peng2020-kato-vpl": (20_000, 1.0),
-        "kato2019-kar": (100_000, 0.1),
-        "kato2019-pascal": (80_000, 0.5),
-    }
 
 
 @pytest.mark.parametrize(

@@ -39,13 +39,6 @@ def test_the_object_takes_the_same_part_wherever_and_however_large_it_is() -> No
     assert (centred[1:] - centred[:1]).abs().mean() < 0.02
 
 
-def test_an_object_keeps_its_proportions() -> None:
-    image = torch.zeros(1, 4, 64, 64)
-    image[:, :, 10:50, 30:40] = 1
-    top, bottom, left, right = box(centre(image)[0])
-    assert abs((bottom - top) / (right - left) - 4) < 0.4
-
-
 def test_the_background_goes_on_beyond_the_border_and_the_mask_does_not() -> None:
     image = torch.ones(1, 4, 64, 64)
     image[:, 3, :, 40:] = 0  # the object fills the height: it must become smaller

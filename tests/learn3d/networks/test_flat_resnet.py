@@ -62,12 +62,6 @@ def test_pretrained_batch_norms_stay_as_they_are(weights: Path) -> None:
     assert not [name for name in changed if "bn" in name or "downsample.1" in name]
 
 
-def test_from_scratch_batch_norms_are_trained() -> None:
-    network = FlatResNet18(32)
-    assert all(norm.training and norm.weight.requires_grad for norm in norms(network))
-    assert not any(norm.training for norm in norms(network.eval()))
-
-
 def test_size_must_be_a_multiple_of_32() -> None:
     with pytest.raises(ValueError, match="multiple of 32 for FlatResNet18, got 100"):
         FlatResNet18(100)

@@ -77,15 +77,6 @@ def test_patch_is_as_published() -> None:
     assert narrow(torch.rand(2, 224, 224), torch.rand(2, 9)).shape == (2, 31, 31)
 
 
-@pytest.mark.parametrize("network", [SpectralPatchDiscriminator(3, 4), PatchDiscriminator(3, 4)])
-def test_patch_logits_depend_on_the_view(network: nn.Module) -> None:
-    network.eval()
-    silhouettes = torch.rand(2, 64, 64)
-    first, second = (network(silhouettes, eyes) for eyes in (torch.ones(2, 3), torch.tensor([[1.0, 1, 1], [1, 1, -2]])))
-    assert torch.equal(first[0], second[0])
-    assert not torch.allclose(first[1], second[1])
-
-
 def test_class_conditioning_is_a_projection_on_the_last_features() -> None:
     torch.manual_seed(0)
     network = SpectralPatchDiscriminator(3, channels=4, num_classes=3).eval()
@@ -100,15 +91,6 @@ def test_class_conditioning_is_a_projection_on_the_last_features() -> None:
     product = (vectors[:, :, None, None] * features[0]).sum(1)
     torch.testing.assert_close(logits, plain[0][:, 0] + product[:, ::2, ::2])
     assert not torch.allclose(network(silhouettes, views, torch.tensor([1, 2]))[0], logits[0])
-
-
-def test_state_of_spectral_norms_is_saved() -> None:
-    network, other = (SpectralPatchDiscriminator(3, channels=4, num_classes=2) for _ in range(2))
-    inputs = torch.rand(2, 64, 64), torch.rand(2, 3), torch.tensor([0, 1])
-    network(*inputs)
-    other.load_state_dict(network.state_dict())
-    assert torch.equal(network(*inputs), other(*inputs))  # in training mode: power iterations go on from the same state
-    assert torch.equal(network.eval()(*inputs), other.eval()(*inputs))
 
 
 def test_gradient_reversal_has_sign_and_scale() -> None:

@@ -16,7 +16,6 @@ from safetensors.torch import load_file, save_file
 
 from learn3d.files import limits
 from learn3d.runs import checkpoint
-from learn3d.runs.checkpoint import Progress
 
 
 class StandIn:
@@ -87,12 +86,7 @@ def test_tensors_that_overlap_or_lie_outside(path, change):
 METADATA = {
     "a word": ({"progress": {"step": "abc"}}, "step must be a whole number, got 'abc'"),
     "negative": ({"progress": {"step": -1}}, "step must be at least 0"),
-    "bool": ({"progress": {"best_step": True}}, "best_step must be a whole number"),
-    "huge": ({"progress": {"step": 10**200}}, "step must be"),
-    "seconds": ({"progress": {"seconds": "long"}}, "seconds must be a number"),
-    "share above one": ({"progress": {"object_share": 1.5}}, "object_share must be at most 1"),
     "losses": ({"progress": {"losses": {"total": "high"}}}, "losses must be a number"),
-    "losses as a list": ({"progress": {"losses": [1.0]}}, "losses must be"),
     "unknown": ({"progress": {"surprise": 1}}, "there is no option 'surprise'"),
     "config": ({"config": [1]}, "config .* must hold options by name"),
     "fingerprint": ({"fingerprint": {"samples": []}}, "samples must be"),
@@ -144,7 +138,6 @@ MOMENTS = {
     "not finite": ({"optimizer.encoder.0.exp_avg_sq": torch.full((2, 3), float("inf"))}, "not finite"),
     "many steps": ({"optimizer.encoder.0.step": torch.zeros(2)}, r"torch.float32 \[2\], wanted torch.float32 \[\]"),
     "no parameter": ({"optimizer.encoder.7.step": torch.tensor(1.0)}, "belongs to none of the 2 parameters"),
-    "no number": ({"optimizer.encoder.x.step": torch.tensor(1.0)}, "belongs to none of the 2 parameters"),
     "negative": ({"optimizer.encoder.-1.step": torch.tensor(1.0)}, "belongs to none of the 2 parameters"),
     "half a state": ({"optimizer.encoder.0.step": None}, "other entries"),
 }
@@ -166,8 +159,6 @@ OPTIMIZERS = {
     "fused": lambda parameters: torch.optim.AdamW(parameters, fused=True, amsgrad=True),
     "SGD": lambda parameters: torch.optim.SGD(parameters, lr=0.1, momentum=0.9),
     "Adafactor": torch.optim.Adafactor,
-    "NAdam": torch.optim.NAdam,
-    "Adagrad": torch.optim.Adagrad,
     "ASGD": torch.optim.ASGD,
 }
 
@@ -196,9 +187,3 @@ def test_any_optimizer_goes_on_as_if_it_had_not_been_saved(tmp_path, name):
     resumed = OPTIMIZERS[name](other.parameters())
     checkpoint.restore_optimizer("encoder", resumed, loaded, about.optimizers["encoder"])
     assert all(torch.equal(a, b) for a, b in zip(steps(network, optimizer), steps(other, resumed), strict=True))
-
-
-def test_losses_may_be_as_large_as_those_that_a_run_goes_on_with(tmp_path):
-    progress = Progress(step=3, losses={"smoothness": float(torch.finfo(torch.float32).max), "total": 1e41})
-    checkpoint.save(tmp_path / "a.safetensors", {"x": torch.zeros(1)}, metadata(progress=progress))
-    assert checkpoint.load_metadata(tmp_path / "a.safetensors").progress == progress
