@@ -41,7 +41,7 @@ def server(finished_run, tmp_path_factory) -> Iterator[tuple[subprocess.Popen, s
     words = [sys.executable, "-m", "learn3d", "demo", "--port", str(port), "--no-browser", "--run", str(finished_run)]
     pipes = {"stdout": subprocess.PIPE, "stderr": (folder / "errors.txt").open("w"), "text": True}
     environment = os.environ | {"TMPDIR": str(folder)}
-    with subprocess.Popen([*words, str(folder / "other")], env=environment, **pipes) as process:
+    with subprocess.Popen([*words, str(folder / "other")], env=environment, cwd=folder, **pipes) as process:
         process.folder = folder
         line = process.stdout.readline()
         assert "the page is at" in line, (folder / "errors.txt").read_text()
