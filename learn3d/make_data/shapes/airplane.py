@@ -4,19 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .airplane_parts import (
-    Planform,
-    canopy,
-    fin,
-    fuselage,
-    gear,
-    jet_nozzle,
-    nacelle,
-    pod,
-    propeller,
-    tail,
-    tail_engines,
-)
+from .airplane_parts import Planform, canopy, fin, fuselage, gear, nacelle, nozzle, pod, propeller, tail, tail_engines
 from .draw import Draw
 from .parts import Part, bar, box, ellipse, ellipsoid, loft, rectangle, revolve, tube, wing
 
@@ -115,7 +103,7 @@ def _two_engines(draw: Draw, radius: float) -> Part:
         outline = rectangle(w * wide, h * wide, 0.3 * wide, 2)
         slant = (0.05 if z > 0.1 else 0.0) * (outline[:, 1] / wide)
         rings.append(np.stack([wide + outline[:, 0], y * wide + outline[:, 1], z + slant], 1))
-    return (loft(rings) + jet_nozzle(0.42 * wide, 0.07).moved(wide, 0.08 * wide, -0.5)).both_sides()
+    return (loft(rings) + nozzle(0.42 * wide, 0.07).moved(wide, 0.08 * wide, -0.5)).both_sides()
 
 
 def _one_engine(draw: Draw, radius: float) -> Part:
@@ -125,7 +113,7 @@ def _one_engine(draw: Draw, radius: float) -> Part:
         "chin": box((1.2 * radius, 0.9 * radius, 0.3), (0, -0.9 * radius, 0.06), 0.02),
         "nose": Part(),
     }
-    return intake[draw.pick(tuple(intake))] + jet_nozzle(0.75 * radius, 0.08).moved(z=-0.52)
+    return intake[draw.pick(tuple(intake))] + nozzle(0.75 * radius, 0.08).moved(z=-0.52)
 
 
 def _stores(draw: Draw, plan: Planform) -> Part:

@@ -25,13 +25,13 @@ class Planform:
     half: float  # half of the span
     root: float  # chord in the middle
     tip: float  # chord at the tip
-    sweep_deg: float  # of the leading edge, backwards
-    dihedral_deg: float  # upwards
-    z: float  # of the leading edge in the middle
-    y: float  # height in the middle
+    sweep_deg: float  # sweep of the leading edge, backwards
+    dihedral_deg: float  # rise of the wing towards the tip
+    z: float  # position of the leading edge in the middle
+    y: float  # height of the wing in the middle
     kink: float = 0.0  # share of the half span at which the trailing edge bends (0: straight trailing edge)
     shape: str = "straight"  # "straight", "elliptic", "kinked" (constant chord, then tapered) or "gull"
-    thickness: float = 0.12  # over the chord
+    thickness: float = 0.12  # thickness over chord
 
     def at(self, share: float) -> tuple[float, float, float, float]:
         """x, y, z of the leading edge and chord at a share (0..1) of the half span."""
@@ -90,8 +90,9 @@ def fuselage(
 ) -> Part:
     """A fuselage along z from +length/2 (nose) to -length/2, `tall` times as high as wide.
 
-    nose is its length as a share of the whole, nose_power its bluntness (1 = cone, 2 = ellipse); upsweep lifts the
-    end of the tail and droop lowers the tip of the nose, in radii; tail_radius is the radius left at the end.
+    The nose takes the share `nose` of the length, and the tail all behind the share `tail_start`. nose_power is the
+    bluntness of the nose (1 = cone, 2 = ellipse). upsweep lifts the end of the tail and droop lowers the tip of the
+    nose, both in radii. tail_radius is the radius at the end, in radii. exponent shapes the section as in `ellipse`.
     """
     ahead = np.array([0.0, 0.02, 0.07, 0.16, 0.3, 0.5, 0.75, 1.0])
     behind = np.array([0.15, 0.35, 0.6, 0.85, 1.0])
@@ -178,7 +179,7 @@ def pod(radius: float, length: float) -> Part:
     return along_z(profile - [0, 0.5], radius, length, 12)
 
 
-def jet_nozzle(radius: float, length: float) -> Part:
+def nozzle(radius: float, length: float) -> Part:
     """An open jet nozzle along z, centred."""
     profile = [(0.8, -1), (1, 1), (0.9, 1.02), (0.02, 0.9), (0.02, 0.7), (0.8, 0.6), (0.7, -1)]
     return revolve(np.array(profile) * [radius, -0.5 * length], 12, hollow=True).rotated("x", -90)

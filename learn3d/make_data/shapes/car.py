@@ -95,22 +95,22 @@ def _hull(body: Body) -> Part:
     s = np.unique(s[(s >= 0) & (s <= length)].round(3))
     s = s[np.append(True, np.diff(s) > 0.004)]
 
-    # Measures of each cross-section, all [S]. Widths are halves.
+    # Heights and half widths of each cross-section, all [S].
     to_front, to_rear = s / length, 1 - s / length
     top = np.interp(s, *line.T)
     width = body.width / 2 * (1 - 0.15 * np.clip(1 - to_front / 0.18, 0, 1) ** 2)
     width = width * (1 - 0.06 * np.clip(1 - to_rear / 0.15, 0, 1) ** 2)
     floor = body.clearance + 0.12 * np.clip(1 - to_front / 0.08, 0, 1) + 0.15 * np.clip(1 - to_rear / 0.1, 0, 1)
-    inner = np.full_like(s, body.width / 2 - TYRE - 0.06)  # of the floor between the wheels
+    inner = np.full_like(s, body.width / 2 - TYRE - 0.06)  # the floor between the wheels
     cut = floor + 0.002  # lower edge of the sides
     for axle in body.axles:
         over_wheel = body.wheel + np.sqrt(np.maximum(arch**2 - (s - axle) ** 2, 0.0))
         cut = np.where(np.abs(s - axle) < arch, np.maximum(cut, over_wheel), cut)
     shoulder = np.minimum(belt, top - 0.03)
     middle = np.maximum(0.55 * floor + 0.45 * shoulder, 0.5 * (cut + shoulder))
-    edge = np.maximum(top - 0.045 - 0.1 * np.clip(top - shoulder - 0.1, 0, 0.3), shoulder + 0.01)  # of the roof
+    edge = np.maximum(top - 0.045 - 0.1 * np.clip(top - shoulder - 0.1, 0, 0.3), shoulder + 0.01)  # rim of the roof
     roof = np.maximum(0.96 * width - 0.03 - body.lean * (edge - shoulder), 0.45 * width)
-    rim, bottom = shoulder + 0.02, np.full_like(s, belt - 0.38)  # of the bed
+    rim, bottom = shoulder + 0.02, np.full_like(s, belt - 0.38)  # heights of the bed
     hump = np.maximum(bottom + 0.004, np.minimum(cut + 0.03, rim - 0.03))  # the wheel arch seen from the bed
 
     # The right half of each cross-section: points (x, y) from the middle of the floor outwards and up to the middle.

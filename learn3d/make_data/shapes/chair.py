@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -19,16 +18,6 @@ _LOUNGE = {"legs": 2.5, "loops": 2, "cantilever": 1, "rocker": 1, "star": 0.6, "
 _BAR = {"legs": 3, "disc": 1.5, "loops": 1, "panels": 0.3}
 
 
-@dataclass(frozen=True)
-class Seat:
-    """The measures of a seat that legs, back and arms are fitted to (metres)."""
-
-    width: float
-    depth: float
-    height: float  # height of the top of the seat over the floor
-    thickness: float
-
-
 def jointed_chair(draw: Draw, family: str) -> Part:
     """A dining, office, lounge or bar chair, put together from a seat, a support, a back and arms."""
     width, depth, height = draw(0.40, 0.54), draw(0.40, 0.50), draw(0.42, 0.5)
@@ -43,13 +32,13 @@ def jointed_chair(draw: Draw, family: str) -> Part:
     elif draw.maybe(0.15):
         back_height = draw(0.65, 0.85)  # a throne
     exponent = draw.pick({8.0: 4, 5.0: 2, 3.0: 1.5, 2.0: 1})  # outline of the seat: 2 = ellipse ... 8 = rectangle
-    seat = Seat(width, depth, height, draw(0.07, 0.13) if cushioned else draw(0.025, 0.05))
+    thickness = draw(0.07, 0.13) if cushioned else draw(0.025, 0.05)
 
     taper = draw(0.8, 1.0) if draw.maybe(0.4) else 1.0  # narrower at the rear
     outline = ellipse(width, depth, 24, exponent)
     outline = outline * np.stack([1 + (taper - 1) * (0.5 - outline[:, 1] / depth), np.ones(len(outline))], 1)
-    under = height - seat.thickness
-    part = slab(outline, seat.thickness, bevel=(0.35 if cushioned else 0.2) * seat.thickness).moved(y=under)
+    under = height - thickness
+    part = slab(outline, thickness, bevel=(0.35 if cushioned else 0.2) * thickness).moved(y=under)
 
     weights = {"bar": _BAR, "lounge": _LOUNGE, "dining": _DINING}
     kind = "star" if family == "office" else draw.pick(weights[family])
@@ -64,24 +53,26 @@ def jointed_chair(draw: Draw, family: str) -> Part:
     rear_edge = depth / 2 * (1 - (2 * stile_x / width) ** exponent) ** (1 / exponent)  # -z of the seat at x = stile_x
     curve = max(0.0 if angular else depth / 2 - rear_edge, draw(0.0, 0.08) if draw.maybe(0.6) else 0.0)
     back, bulge = make_back(draw, family, stile_x, back_height, curve)
-    part += back.rotated("x", -recline).moved(y=height - 0.5 * seat.thickness, z=-depth / 2 + 0.03)
+    part += back.rotated("x", -recline).moved(y=height - 0.5 * thickness, z=-depth / 2 + 0.03)
     arm_chance = {"office": 0.6, "lounge": 0.6, "bar": 0.1, "dining": 0.3}[family]
     if draw.maybe(arm_chance) and back_height > 0.3:
         edge = 0.5 * width - 0.02 if angular else max(stile_x, half_x)
-        part += _arm(draw, seat, edge, stile_x, recline, curve + bulge).both_sides()
+        part += _arm(draw, depth, height, thickness, edge, stile_x, recline, curve + bulge).both_sides()
     return part
 
 
-def _arm(draw: Draw, seat: Seat, edge: float, stile_x: float, recline_deg: float, bow: float) -> Part:
-    """An arm from the stile of the back, which starts `bow` before the rear edge, to the front of the seat."""
+def _arm(
+    draw: Draw, depth: float, height: float, thickness: float, edge: float, stile_x: float, lean_deg: float, bow: float
+) -> Part:
+    """An arm from the stile of a back that leans and bows forward by `bow`, at the edge of the seat, to its front."""
     rise = draw(0.17, 0.26)
-    y = seat.height + rise
-    rear = -seat.depth / 2 + 0.03 + bow - np.tan(np.radians(recline_deg)) * rise
-    front = seat.depth * draw(0.15, 0.45)
-    foot_z = min(front, seat.depth * 0.3)
+    y = height + rise
+    rear = -depth / 2 + 0.03 + bow - np.tan(np.radians(lean_deg)) * rise
+    front = depth * draw(0.15, 0.45)
+    foot_z = min(front, depth * 0.3)
     kind = draw.pick({"post": 3, "panel": 0.8, "loop": 1.5, "swoop": 1.5, "cantilever": 0.7})
     size = draw(0.025, 0.05)
-    base = seat.height - 0.6 * seat.thickness
+    base = height - 0.6 * thickness
     rest = rectangle(size * draw(1.0, 2.0), 0.7 * size, segments=1)
     start = (stile_x, y, rear - 0.01)
     if kind == "panel":

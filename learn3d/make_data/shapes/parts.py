@@ -1,7 +1,7 @@
-"""Closed parts of procedural shapes, all of them lofts: boxes, slabs, posts, tubes, revolved profiles, sheets, wings.
+"""Closed parts of procedural shapes: boxes, slabs, posts, tubes, revolved profiles, sheets, wings.
 
-A loft is watertight whatever its rings are, so a shape made of lofts is a union of closed components.
-Axes: x right, y up, z forward.
+All of them are lofts. A loft is watertight whatever its rings are, so a shape made of lofts is a union of closed
+components. Axes: x right, y up, z forward.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-Point = Sequence[float] | np.ndarray
+Point = Sequence[float] | np.ndarray  # (x, y, z); in a profile (radius, y)
 
 # Bars thinner than THIN (of the longest side of the whole shape) get a ring at least every STEP: a voxeliser that casts
 # rays on a 32^3 grid can miss a bar between two grid lines, but it also marks the cell of every vertex.
@@ -25,7 +25,7 @@ class Loft(NamedTuple):
     """A closed surface: a stack of rings of equal size, joined in order and closed at the ends."""
 
     rings: np.ndarray  # [R, N, 3] float64; neighbours in R and in N are joined
-    ends: str = "fan"  # first and last ring: "fan" about their mean, "strip" between point i and N-1-i, "ring" = join
+    ends: str  # the end rings are closed by a "fan" about their mean or a "strip" (i to N-1-i), or joined to a "ring"
 
 
 @dataclass(frozen=True)
@@ -233,12 +233,9 @@ def tube(
 
 def bar(start: Point, end: Point, width: float, height: float | None = None, side: Point = (0.0, 0.0, 1.0)) -> Part:
     """A straight bar: round with diameter `width`, or rectangular, width (along `side`) by height."""
-    section = (
-        ellipse(width, width, 6)
-        if height is None
-        else rectangle(width, height, segments=1 if max(width, height) > 0.04 else 0)
-    )
-    return tube([start, end], 1.0, section, side=side)
+    if height is None:
+        return tube([start, end], 1.0, ellipse(width, width, 6), side=side)
+    return tube([start, end], 1.0, rectangle(width, height, segments=int(max(width, height) > 0.04)), side=side)
 
 
 def sheet(surface: np.ndarray, thickness: float) -> Part:
