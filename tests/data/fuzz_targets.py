@@ -4,37 +4,98 @@ from __future__ import annotations
 
 import contextlib
 import json
+import random
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import fuzz_meshes
 import mutations as m
 import numpy as np
+import small_packages
 import stub_work
 import torch
+import trimesh
 from lopsided_meshes import write_meshes
-from mutations import Target
 from PIL import Image
 from runs import metadata
 
+import nmr.neural_renderer as nr
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict, load_config
 from learn3d.data.framing import read_photo
 from learn3d.data.readers import READERS
-from learn3d.data.readers.photo_table import read_table, split_objects
 from learn3d.experiments.experiment import read_result
 from learn3d.figures.curves import read_metrics
 from learn3d.files import sandbox, weights
-from learn3d.files.reading import parse_json
+from learn3d.make_data import meshes
+from learn3d.make_data.debian import mesh_text, packages
+from learn3d.make_data.debian.furniture import furniture_models
+from learn3d.make_data.debian.mesh_cleaning import clean_mesh
 from learn3d.make_data.render import DatasetConfig, make_dataset
 from learn3d.runs import checkpoint, log
 
 ERRORS = (ValueError, FileNotFoundError, OSError)  # what a reader may raise
 
 
-def check_layout(layout: str, split: str) -> Callable[[Path], None]:
-    """Reads a split by `load` and by the scan; both must agree on whether it can be read."""
+@dataclass
+class Target:
+    """A folder of sound files, those to damage with the damage that suits each, and what reads the folder."""
+
+    folder: Path
+    damaged: dict[str, m.Mutation]
+    read: Callable[[Path], None]
+
+
+SETTINGS = {
+    "kato": {"test": 1, "val": 0},
+    "dvr": {"test": 1, "val": 0},
+    "kar": {"test": 1, "val": 0, "views": 2},
+    "r2n2": {},
+    "pascal3d": {"val": 1, "views": 2},
+    "photos": {"test": 1, "val": 0, "views": 2},
+}
+NPZ = m.damage_zip(m.damage_npy)
+FILES: dict[str, dict[str, m.Mutation]] = {  # of each layout, one of each kind; ID is an object of the split
+    "kato": {"03001627_test_images.npz": NPZ, "03001627_test_voxels.npz": NPZ},
+    "dvr": {
+        "03001627/ID/cameras.npz": NPZ,
+        "03001627/ID/pointcloud.npz": NPZ,
+        "03001627/ID/image/0000.png": m.damage_png,
+        "03001627/ID/mask/0003.png": m.damage_png,
+        "03001627/softras_test.lst": m.damage_text,
+    },
+    "kar": {
+        "renders/03001627/ID/render_0.png": m.damage_png,
+        "renders/03001627/ID/depth_1.png": m.damage_png,
+        "renders/03001627/ID/view.txt": m.damage_text,
+        "voxels/modelVoxels32/03001627/ID.mat": m.damage,
+        "splits.json": m.damage_json,
+    },
+    "r2n2": {
+        "ShapeNetRendering/03001627/ID/rendering/00.png": m.damage_png,
+        "ShapeNetRendering/03001627/ID/rendering/rendering_metadata.txt": m.damage_text,
+        "ShapeNetVox32/03001627/ID/model.binvox": m.damage,
+    },
+    "pascal3d": {"chair_val.npz": NPZ},
+    "photos": {"chair/poses.csv": m.damage_text, "chair/images/ID": m.damage_png},
+}
+
+
+def layout_target(tmp: Path, layout: str) -> Target:
+    """A made data set; `load` and the scan must agree on whether it can be read."""
+    source, folder, split = tmp / "meshes", tmp / layout, "val" if layout == "pascal3d" else "test"
+    source.mkdir()
+    write_meshes(source)
+    config = DatasetConfig(output=folder, category="chair", source=source, layout=layout, **SETTINGS[layout])
+    make_dataset(config, progress=False)
+    first = {
+        "dvr": lambda: (folder / "03001627" / "softras_test.lst").read_text().split()[0],
+        "kar": lambda: json.loads((folder / "splits.json").read_text())["03001627"]["test"][0],
+        "r2n2": lambda: max(p.name for p in (folder / "ShapeNetRendering" / "03001627").iterdir()),
+        "photos": lambda: next(
+            row.split(",")[0] for row in (folder / "chair" / "poses.csv").read_text().split("\n") if ",test" in row
+        ),
+    }.get(layout, str)()
     reader = READERS[layout]
 
     def read(folder: Path) -> None:
@@ -54,70 +115,25 @@ def check_layout(layout: str, split: str) -> Callable[[Path], None]:
         if dataset.points is not None:
             assert np.isfinite(dataset.points).all()
 
-    return read
+    return Target(folder, {name.replace("ID", first): how for name, how in FILES[layout].items()}, read)
 
 
-SETTINGS = {
-    "kato": {"test": 1, "val": 0},
-    "dvr": {"test": 1, "val": 0},
-    "kar": {"test": 1, "val": 0, "views": 2},
-    "r2n2": {},
-    "pascal3d": {"val": 1, "views": 2},
-    "photos": {"test": 1, "val": 0, "views": 2},
-}
+class StandIn:
+    """As much of a method as a checkpoint asks for, after a step."""
 
+    def __init__(self) -> None:
+        self.networks = {"encoder": torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))}
+        self.optimizers = {"encoder": torch.optim.Adam(self.networks["encoder"].parameters(), fused=True)}
 
-def layout_target(tmp: Path, layout: str) -> Target:
-    """A made data set, and one file of each kind of the split that is read."""
-    source, folder = tmp / "meshes", tmp / layout
-    source.mkdir()
-    write_meshes(source)
-    config = DatasetConfig(output=folder, category="chair", source=source, layout=layout, **SETTINGS[layout])
-    make_dataset(config, progress=False)
-    npz, split = m.damage_zip(m.damage_npy), "val" if layout == "pascal3d" else "test"
-    first = None
-    if layout == "dvr":
-        first = (folder / "03001627" / "softras_test.lst").read_text().split()[0]
-    elif layout == "kar":
-        first = json.loads((folder / "splits.json").read_text())["03001627"]["test"][0]
-    elif layout == "r2n2":
-        first = sorted(p.name for p in (folder / "ShapeNetRendering" / "03001627").iterdir())[-1]
-    elif layout == "photos":
-        rows = (folder / "chair" / "poses.csv").read_text().split("\n")
-        first = next(row.split(",")[0] for row in rows if ",test" in row)
-    files: dict[str, dict[str, m.Mutation]] = {
-        "kato": {"03001627_test_images.npz": npz, "03001627_test_voxels.npz": npz},
-        "dvr": {
-            f"03001627/{first}/cameras.npz": npz,
-            f"03001627/{first}/pointcloud.npz": npz,
-            f"03001627/{first}/image/0000.png": m.damage_png,
-            f"03001627/{first}/mask/0003.png": m.damage_png,
-            "03001627/softras_test.lst": m.damage_text,
-        },
-        "kar": {
-            f"renders/03001627/{first}/render_0.png": m.damage_png,
-            f"renders/03001627/{first}/depth_1.png": m.damage_png,
-            f"renders/03001627/{first}/view.txt": m.damage_text,
-            f"voxels/modelVoxels32/03001627/{first}.mat": m.damage,
-            "splits.json": m.damage_json,
-        },
-        "r2n2": {
-            f"ShapeNetRendering/03001627/{first}/rendering/00.png": m.damage_png,
-            f"ShapeNetRendering/03001627/{first}/rendering/rendering_metadata.txt": m.damage_text,
-            f"ShapeNetVox32/03001627/{first}/model.binvox": m.damage,
-        },
-        "pascal3d": {"chair_val.npz": npz},
-        "photos": {"chair/poses.csv": m.damage_text, f"chair/images/{first}": m.damage_png},
-    }
-    return Target(folder, files[layout], check_layout(layout, split))
+    def step(self) -> None:
+        self.networks["encoder"](torch.ones(2, 3)).sum().backward()
+        self.optimizers["encoder"].step()
 
 
 def checkpoint_target(tmp: Path) -> Target:
     torch.manual_seed(0)
     method = StandIn()
-    loss = method.networks["encoder"](torch.ones(2, 3)).sum()
-    loss.backward()
-    method.optimizers["encoder"].step()
+    method.step()
     tensors = checkpoint.network_tensors(method) | {"random.cpu": torch.get_rng_state()}
     tensors |= checkpoint.optimizer_state("encoder", method.optimizers["encoder"])[0]
     checkpoint.save(tmp / "last.safetensors", tensors, metadata())
@@ -129,19 +145,9 @@ def checkpoint_target(tmp: Path) -> Target:
         fresh = StandIn()
         checkpoint.restore_networks(fresh, tensors, path)
         checkpoint.restore_optimizer("encoder", fresh.optimizers["encoder"], tensors, about.optimizers, path)
-        fresh.networks["encoder"](torch.ones(2, 3)).sum().backward()
-        fresh.optimizers["encoder"].step()
+        fresh.step()
 
     return Target(tmp, {"last.safetensors": m.damage_safetensors}, read)
-
-
-class StandIn:
-    """As much of a method as a checkpoint asks for."""
-
-    def __init__(self) -> None:
-        self.networks = {"encoder": torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))}
-        parameters = self.networks["encoder"].parameters()
-        self.optimizers = {"encoder": torch.optim.Adam(parameters, fused=True)}
 
 
 def weights_target(tmp: Path) -> Target:
@@ -166,11 +172,8 @@ def config_target(tmp: Path) -> Target:
     return Target(tmp, {"config.json": m.damage_json}, read)
 
 
-RESULT: dict[str, Any] = stub_work.result().model_dump()
-
-
 def results_target(tmp: Path) -> Target:
-    (tmp / "test.json").write_text(json.dumps(RESULT))
+    (tmp / "test.json").write_text(stub_work.result().model_dump_json())
     lines = [json.dumps({"step": step, "split": "train", "total": 1 / step, "mmd": 2.0}) for step in range(1, 6)]
     (tmp / "metrics.jsonl").write_text("\n".join(lines) + "\n")
 
@@ -178,13 +181,8 @@ def results_target(tmp: Path) -> Target:
         with contextlib.suppress(ValueError):
             for curve in read_metrics(folder).values():
                 assert curve.steps.shape == curve.values.shape
-        kept = (folder / "metrics.jsonl").read_bytes()
-        try:
-            log._forget_after(folder / "metrics.jsonl", 3)
-        finally:
-            (folder / "metrics.jsonl").write_bytes(kept)
-        result = read_result(folder / "test.json")
-        sums, defined = result.objects.sums("kato18")
+        log._forget_after(folder / "metrics.jsonl", 3)
+        sums, defined = read_result(folder / "test.json").objects.sums("kato18")
         assert sums.shape == defined.shape and np.isfinite(sums).all()
 
     return Target(tmp, {"test.json": m.damage_json, "metrics.jsonl": m.damage_text}, read)
@@ -192,12 +190,11 @@ def results_target(tmp: Path) -> Target:
 
 def photo_target(tmp: Path) -> Target:
     rng = np.random.default_rng(0)
-    image = Image.fromarray(rng.integers(0, 256, (40, 30, 3), np.uint8))
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    names = ["a.jpg", "a.webp", "a.bmp", "a.tiff", "a.png"]
+    image, exif = Image.fromarray(rng.integers(0, 256, (40, 30, 3), np.uint8)), Image.Exif()
+    exif[0x0112] = 6  # turned
+    names = ["a.jpg", "a.webp", "a.bmp", "a.png"]
     for name in names:
-        image.save(tmp / name, exif=exif) if name != "a.bmp" else image.save(tmp / name)
+        image.save(tmp / name, **({"exif": exif} if name != "a.bmp" else {}))
     Image.fromarray(rng.integers(0, 2, (40, 30), np.uint8) * 255).save(tmp / "mask.png")
 
     def read(folder: Path) -> None:
@@ -209,38 +206,120 @@ def photo_target(tmp: Path) -> Target:
     return Target(tmp, dict.fromkeys([*names, "mask.png"], m.damage) | {"a.png": m.damage_png}, read)
 
 
-def table_target(tmp: Path) -> Target:
-    row = {"file": "a.jpg", "azimuth_deg": 30, "elevation_deg": 20, "distance": 3, "fov_deg": 40, "object": "a"}
-    rows = [row | {"file": f"{k}.jpg", "object": f"o{k}", "split": "train"} for k in range(4)]
-    lines = [",".join(rows[0]), *(",".join(map(str, r.values())) for r in rows)]
-    (tmp / "poses.csv").write_text("\n".join(lines) + "\n")
+OBJ = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0.5\nv 0.5 0.5 2\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl red\n"
+OBJ += "f 1/1 2/2 3/3 4/1\nusemtl blue\nf 1/1 2/2 5/3\nf 2//1 3//1 5//1\nf -5 -4 -3 -2 -1\n"
+MTL = "newmtl red\nKd 1 0 0\nmap_Kd a.png\nnewmtl blue\nKd 0 0 1\n"
+
+
+def write_obj(folder: Path) -> dict[str, m.Mutation]:
+    """A textured OBJ file."""
+    folder.mkdir(exist_ok=True)
+    (folder / "a.obj").write_text(OBJ)
+    (folder / "a.mtl").write_text(MTL)
+    Image.new("RGB", (4, 4), (200, 10, 10)).save(folder / "a.png")
+    return {"a.obj": m.damage_text, "a.mtl": m.damage_text, "a.png": m.damage_png}
+
+
+def mesh_target(tmp: Path) -> Target:
+    damaged = write_obj(tmp / "formats")
+    folder = tmp / "formats"
+    ball = trimesh.creation.icosphere(1)
+    ball.visual.vertex_colors = np.arange(4 * len(ball.vertices)).reshape(-1, 4) % 256
+    scene = trimesh.Scene([ball, trimesh.creation.box(transform=trimesh.transformations.translation_matrix([1, 2, 3]))])
+    for name in ("a.off", "a.ply", "a.stl", "a.glb"):
+        (scene if name == "a.glb" else ball).export(folder / name)
+    ball.export(folder / "b.ply", encoding="ascii")
+    for name, content in scene.export(file_type="gltf").items():
+        (folder / name).write_bytes(content)
+    plain = [path.name for path in folder.iterdir() if path.suffix in (".stl", ".glb", ".bin", ".ply")]
+    damaged |= dict.fromkeys(plain, m.damage) | dict.fromkeys(["a.off", "b.ply"], m.damage_text)
 
     def read(folder: Path) -> None:
-        photos, faults = read_table(folder / "poses.csv")
-        assert all(np.isfinite([p.azimuth_deg, p.distance, p.fov_deg]).all() for p in photos)
-        assert all(isinstance(fault, str) for fault in faults)
-        split_objects(folder / "poses.csv", photos)
+        for source in meshes.folder_sources(folder)[0]:
+            with contextlib.suppress(ValueError):
+                checked = meshes.checked(source.read(), 10_000)
+                assert np.isfinite(checked.vertices).all() and checked.faces.max() < len(checked.vertices)
 
-    return Target(tmp, {"poses.csv": m.damage_text}, read)
+    return Target(folder, damaged | {"model.gltf": m.damage_json}, read)
 
 
-def json_target(tmp: Path) -> Target:
-    (tmp / "a.json").write_text(json.dumps(RESULT))
-    return Target(tmp, {"a.json": m.damage_json}, lambda folder: parse_json((folder / "a.json").read_bytes()))
+def mesh_text_target(tmp: Path) -> Target:
+    (tmp / "a.obj").write_text(OBJ)
+    (tmp / "a.ac").write_text(small_packages.ac_text(*small_packages.AIRPLANE))
+
+    def read(folder: Path) -> None:
+        parts = [mesh_text.read_obj((folder / "a.obj").read_text("latin-1"))]
+        parts += [(part.vertices, part.faces) for part in mesh_text.read_ac3d((folder / "a.ac").read_text("latin-1"))]
+        for vertices, faces in parts:
+            assert not len(faces) or 0 <= faces.min() <= faces.max() < len(vertices)
+            with contextlib.suppress(ValueError):
+                clean_mesh(vertices, faces)
+
+    return Target(tmp, {"a.obj": m.damage_text, "a.ac": m.damage_text}, read)
+
+
+def pack_target(tmp: Path) -> Target:
+    box = trimesh.creation.box()
+    np.savez(tmp / "pack.npz", n=2, v0=box.vertices, f0=box.faces, v1=box.vertices, f1=box.faces)
+
+    def read(folder: Path) -> None:
+        for source in meshes.pack_sources(folder / "pack.npz"):
+            with contextlib.suppress(ValueError):
+                meshes.checked(source.read(), 10_000)
+
+    return Target(tmp, {"pack.npz": NPZ}, read)
+
+
+def debian_target(tmp: Path) -> Target:
+    entries = [
+        small_packages.entry(name, name, width="4", modelRotation="1 0 0 0 1 0 0 0 1") for name in ("chair", "a")
+    ]
+    models = {"m/chair.obj": small_packages.CHAIR, "m/a.obj": OBJ}
+    files = {"usr/share/x.sh3f": small_packages.catalogue(entries, models)}
+    path = small_packages.deb(tmp, "sweethome3d-furniture", files)
+
+    def damage(rng: random.Random, content: bytes) -> bytes:
+        """The catalogue in it, the tar archive under its compression, or plain damage."""
+        kind, name = rng.choice(["xz", "gz", "bz2"]), rng.choice([*files, *files, *files, "n" * 300, "../x", "/x"])
+        damaged = m.damage_zip(m.damage_text)(rng, *files.values())
+        tar = small_packages.tar_of({name: damaged}, kind)
+        return rng.choice(
+            [small_packages.deb_of(tar, kind), small_packages.deb_of(m.damage(rng, tar), kind), m.damage(rng, content)]
+        )
+
+    def read(folder: Path) -> None:
+        package = packages.find_package("sweethome3d-furniture", folder)
+        for candidate in furniture_models(package, ("chair",), folder / "licences", False):
+            if candidate is not None:
+                candidate.title.encode()
+                with contextlib.suppress(ValueError):
+                    clean_mesh(*candidate.read())
+
+    return Target(tmp, {path.name: damage}, read)
+
+
+def drop_in_target(tmp: Path) -> Target:
+    def read(folder: Path) -> None:
+        for bilinear in (True, False):
+            vertices, faces, textures = nr.load_obj(
+                folder / "a.obj", load_texture=True, texture_size=2, use_bilinear=bilinear
+            )
+            assert 0 <= faces.min() <= faces.max() < len(vertices) and len(textures) == len(faces)
+            assert vertices.isfinite().all() and textures.isfinite().all()
+
+    return Target(tmp, write_obj(tmp), read)
 
 
 TARGETS: dict[str, Callable[[Path], Target]] = {
     **{layout: partial(layout_target, layout=layout) for layout in SETTINGS},
-    "meshes": fuzz_meshes.mesh_target,
-    "mesh text": fuzz_meshes.mesh_text_target,
-    "mesh pack": fuzz_meshes.pack_target,
-    "debian": fuzz_meshes.debian_target,
+    "meshes": mesh_target,
+    "mesh text": mesh_text_target,
+    "mesh pack": pack_target,
+    "debian": debian_target,
     "checkpoint": checkpoint_target,
     "weights": weights_target,
     "config": config_target,
     "results": results_target,
     "photographs": photo_target,
-    "tables": table_target,
-    "neural_renderer": fuzz_meshes.drop_in_target,
-    "json": json_target,
+    "neural_renderer": drop_in_target,
 }

@@ -10,49 +10,24 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 Mutation = Callable[[random.Random, bytes], bytes]
 
-
-@dataclass
-class Target:
-    """A folder of sound files, those to damage with the damage that suits each, and what reads the folder."""
-
-    folder: Path
-    damaged: dict[str, Mutation]
-    read: Callable[[Path], None]
-
-
+# fmt: off
 WORDS = [b"nan", b"-inf", b"1e400", b"-1", b"0", b"99999999999999999999", b"1" * 400, b"9" * 5000, b"0x10", b"",
-         b"1e-320", b"../../x", b"/etc/x", b"\0", b"\xff\xfe", b'"', b"{", b"[" * 3000, b"4294967296"]  # fmt: skip
-VALUES: list[Any] = [
-    None,
-    True,
-    -1,
-    0,
-    1,
-    2**31,
-    2**63,
-    10**200,
-    1.5,
-    -1e308,
-    "",
-    "abc",
-    "../..",
-    "\0",
-    [],
-    {},
-    [1],
-    {"a": 1},
-    "F4",  # types of tensors
-    "F8_E8M0",
-    "BOOL",
-    "C64",
-]
+         b"1e-320", b"../../x", b"/etc/x", b"\0", b"\xff\xfe", b'"', b"{", b"[" * 3000, b"4294967296"]
+VALUES: list[Any] = [None, True, -1, 0, 1, 2**31, 2**63, 10**200, 1.5, -1e308, "", "abc", "../..", "\0", [], {}, [1],
+                     {"a": 1}, "F4", "F8_E8M0", "BOOL", "C64"]  # the last are types of tensors
 SIZES = [0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**60, 2**63, 2**64 - 1]
+HEADERS = {  # parts of an npy file's header, and replacements
+    rb"'descr': '[^']*'": [b"'descr': " + kind for kind in (b"'|O'", b"'<f8'", b"'|b1'", b"'>i2'", b"'<U9'", b"'<f16'",
+                                                            b"[('a','<f4')]", b"5")],
+    rb"\([0-9, ]*\)": [b"()", b"(-1,)", b"(1000000000000,)", b"(0,)", b"(2**9,)", b"(1,1,1)", b"(((((",
+                       b"(0,99999999999)", b"-" * 3000 + b"1"],
+    rb"False": [b"True", b"5", b"None"],
+}
+# fmt: on
 
 
 def damage(rng: random.Random, content: bytes) -> bytes:
@@ -60,31 +35,26 @@ def damage(rng: random.Random, content: bytes) -> bytes:
     data = bytearray(content)
     for _ in range(rng.choice([1, 1, 1, 2, 4])):
         at = rng.randrange(len(data) + 1) if rng.random() < 0.6 else rng.randrange(min(len(data), 200) + 1)
-        length = rng.choice([1, 2, 4, 8, 40, 1000])
-        kind = rng.randrange(8)
-        if kind == 0:
-            data = data[:at]
-        elif kind == 1 and at < len(data):
-            data[at] ^= 1 << rng.randrange(8)
-        elif kind == 2:
-            value = rng.choice(SIZES).to_bytes(8, rng.choice(["little", "big"]))
-            data[at : at + 8] = value if rng.random() < 0.5 else value.strip(b"\0")[:8]
-        elif kind == 3:
-            data[at:at] = rng.randbytes(length)
-        elif kind == 4:
-            del data[at : at + length]
-        elif kind == 5:
-            data[at:at] = data[at : at + length]
-        elif kind == 6:
-            other = rng.randrange(len(data) + 1)
-            data[at : at + length] = data[other : other + length]
-        else:
-            data[at : at + length] = bytes([rng.choice([0, 255, 10, 32])]) * length
+        length, other = rng.choice([1, 2, 4, 8, 40, 1000]), rng.randrange(len(data) + 1)
+        value = rng.choice(SIZES).to_bytes(8, rng.choice(["little", "big"]))
+        end, new = rng.choice(
+            [
+                (len(data), b""),  # cut short
+                (at + 1, bytes([byte ^ 1 << rng.randrange(8) for byte in data[at : at + 1]])),
+                (at + 8, value if rng.random() < 0.5 else value.strip(b"\0")),
+                (at, rng.randbytes(length)),
+                (at + length, b""),
+                (at, data[at : at + length]),
+                (at + length, data[other : other + length]),
+                (at + length, bytes([rng.choice([0, 255, 10, 32])]) * length),
+            ]
+        )
+        data[at:end] = new
     return bytes(data)
 
 
 def damage_text(rng: random.Random, content: bytes) -> bytes:
-    """Words and lines replaced, repeated, moved, dropped; or plain damage."""
+    """Words and lines replaced, repeated, dropped; or plain damage."""
     if rng.random() < 0.2:
         return damage(rng, content)
     lines = content.split(b"\n")
@@ -96,43 +66,34 @@ def damage_text(rng: random.Random, content: bytes) -> bytes:
             words[2 * rng.randrange((len(words) + 1) // 2)] = rng.choice(WORDS)
             lines[at] = b"".join(words)
         elif kind == 3 and lines:
-            lines.insert(rng.randrange(len(lines)), lines[at])
-        elif kind == 4 and lines:
             del lines[at]
         else:
-            lines.insert(at, rng.randbytes(rng.randrange(20)))
+            lines.insert(at, rng.choice([*lines[at : at + 1], rng.randbytes(rng.randrange(20))]))
     return b"\n".join(lines)
 
 
 def damage_json(rng: random.Random, content: bytes) -> bytes:
-    """Values of any kind where others stood, names dropped and added; or damaged text."""
+    """Values replaced by others of any kind, names dropped and added; or damaged text."""
     if rng.random() < 0.2:
         return damage_text(rng, content)
-    value = json.loads(content)
-    for _ in range(rng.choice([1, 1, 2])):
-        value = _changed(rng, value)
-    text = json.dumps(value)
+    text = json.dumps(_changed(rng, json.loads(content)))
     return text.replace("1e+308", rng.choice(["Infinity", "NaN", "1e999"])).encode()
 
 
 def _changed(rng: random.Random, value: Any) -> Any:
     if not isinstance(value, (dict, list)) or not value or rng.random() < 0.1:
         return rng.choice(VALUES)
-    if isinstance(value, dict):
-        key = rng.choice(list(value))
-        kind = rng.random()
-        if kind < 0.15:
-            return {name: item for name, item in value.items() if name != key}
-        if kind < 0.25:
-            return value | {rng.choice(["", "x", "../x", "method", "n" * 300]): rng.choice(VALUES)}
-        return value | {key: _changed(rng, value[key])}
-    at = rng.randrange(len(value))
-    kind = rng.random()
+    changed, kind = value.copy(), rng.random()
+    key = rng.choice(list(value)) if isinstance(value, dict) else rng.randrange(len(value))
     if kind < 0.15:
-        return value[:at] + value[at + 1 :]
-    if kind < 0.25:
-        return value + value[at : at + 1]
-    return [*value[:at], _changed(rng, value[at]), *value[at + 1 :]]
+        del changed[key]
+    elif kind < 0.25 and isinstance(value, dict):
+        changed[rng.choice(["", "x", "../x", "method", "n" * 300])] = rng.choice(VALUES)
+    elif kind < 0.25:
+        changed.append(value[key])
+    else:
+        changed[key] = _changed(rng, value[key])
+    return changed
 
 
 def damage_zip(inner: Mutation = damage) -> Mutation:
@@ -149,10 +110,9 @@ def damage_zip(inner: Mutation = damage) -> Mutation:
             members[at] = name, inner(rng, data)
         elif kind < 0.85:
             del members[at]
-        elif kind < 0.95:
-            members[at] = rng.choice(["../x.npy", "/x.npy", "a\\b.npy", "x\x00.npy", name[:-1]]), data
         else:
-            members.append(members[at])
+            others = ["../x.npy", "/x.npy", "a\\b.npy", "x\x00.npy", name[:-1]]
+            members.append((name if kind < 0.9 else rng.choice(others), data))
         out = io.BytesIO()
         method = rng.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2])
         with zipfile.ZipFile(out, "w", method) as archive:
@@ -168,16 +128,10 @@ def damage_npy(rng: random.Random, content: bytes) -> bytes:
     if rng.random() < 0.4 or content[:6] != b"\x93NUMPY":
         return damage(rng, content)
     (length,) = struct.unpack_from("<H", content, 8)
-    header, rest = content[10 : 10 + length], content[10 + length :]
-    swaps = [(rb"'descr': '[^']*'", [b"'descr': '|O'", b"'descr': '<f8'", b"'descr': '|b1'", b"'descr': '>i2'",
-                                     b"'descr': '<U9'", b"'descr': [('a','<f4')]", b"'descr': '<f16'", b"'descr': 5"]),
-             (rb"\([0-9, ]*\)", [b"()", b"(-1,)", b"(1000000000000,)", b"(0,)", b"(2**9,)", b"(1,1,1)", b"(((((",
-                                 b"(0,99999999999)", b"-" * 3000 + b"1"]),
-             (rb"False", [b"True", b"5", b"None"])]  # fmt: skip
-    pattern, choices = rng.choice(swaps)
-    header = re.sub(pattern, lambda _: rng.choice(choices), header).rstrip()
+    pattern = rng.choice(list(HEADERS))
+    header = re.sub(pattern, lambda _: rng.choice(HEADERS[pattern]), content[10 : 10 + length]).rstrip()
     header += b" " * max(0, 118 - len(header)) + b"\n"
-    return content[:8] + struct.pack("<H", len(header)) + header + rest
+    return content[:8] + struct.pack("<H", len(header)) + header + content[10 + length :]
 
 
 def damage_png(rng: random.Random, content: bytes) -> bytes:
@@ -198,10 +152,10 @@ def damage_png(rng: random.Random, content: bytes) -> bytes:
     else:
         chosen[1] = damage(rng, chosen[1]) if rng.random() < 0.7 else chosen[1]
         chosen[0] = rng.choice([chosen[0], chosen[0], b"tRNS", b"PLTE", b"zTXt", b"iCCP", b"eXIf", b"acTL", b"IEND"])
-    body = [
+    parts = [
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
     ]
-    return content[:8] + b"".join(body)
+    return content[:8] + b"".join(parts)
 
 
 def damage_safetensors(rng: random.Random, content: bytes) -> bytes:
@@ -210,12 +164,10 @@ def damage_safetensors(rng: random.Random, content: bytes) -> bytes:
         return damage(rng, content)
     (length,) = struct.unpack_from("<Q", content)
     header, rest = json.loads(content[8 : 8 + length]), content[8 + length :]
-    if rng.random() < 0.5 and "__metadata__" in header:
-        names = header["__metadata__"]
+    text = damage_json(rng, json.dumps(header).encode())
+    if rng.random() < 0.5 and (names := header.get("__metadata__")):
         name = rng.choice(list(names))
         names[name] = damage_json(rng, names[name].encode()).decode("utf-8", "replace")
         text = json.dumps(header).encode()
-    else:
-        text = damage_json(rng, json.dumps(header).encode())
     stated = rng.choice([len(text)] * 6 + SIZES)
     return struct.pack("<Q", stated) + text + rest

@@ -57,29 +57,35 @@ CHAIR = obj_text(((0, 4, 0), (4, 5, 4)), ((0, 5, 0), (4, 10, 0.5)), ((0, 0, 0), 
 TABLE = obj_text(((0, 4, 0), (8, 5, 5)), ((3, 0, 2), (5, 4, 3)))
 
 
-def deb(folder: Path, name: str, files: dict[str, bytes | None], version: str = "1%3a2.0-1") -> Path:
-    """A package of these files; None makes a symbolic link that leads out of it."""
+def tar_of(files: dict[str, bytes | None], kind: str = "xz") -> bytes:
+    """A tar archive of these files; None makes a symbolic link that leads out of it."""
     data = io.BytesIO()
-    with tarfile.open(fileobj=data, mode="w:xz") as tar:
+    with tarfile.open(fileobj=data, mode=f"w:{kind}") as tar:
         for path, content in files.items():
             info = tarfile.TarInfo(path)
             if content is None:
                 info.type, info.linkname = tarfile.SYMTYPE, "/etc/hostname"
-                tar.addfile(info)
             else:
                 info.size = len(content)
-                tar.addfile(info, io.BytesIO(content))
+            tar.addfile(info, io.BytesIO(content or b""))
+    return data.getvalue()
+
+
+def deb_of(data: bytes, kind: str = "xz") -> bytes:
+    """A Debian package around a tar archive of this compression."""
+    out = b"!<arch>\n"
+    members = {"debian-binary": b"2.0\n", "control.tar.xz": b"odd", f"data.tar.{kind}": data}
+    for name, content in members.items():
+        out += f"{name:<16}{0:<12}{0:<6}{0:<6}{'100644':<8}{len(content):<10}`\n".encode()
+        out += content + b"\n" * (len(content) % 2)
+    return out
+
+
+def deb(folder: Path, name: str, files: dict[str, bytes | None], version: str = "1%3a2.0-1") -> Path:
+    """A package of these files in the folder."""
     folder.mkdir(exist_ok=True)
     file = folder / f"{name}_{version}_all.deb"
-    with file.open("wb") as out:
-        out.write(b"!<arch>\n")
-        for member, content in (
-            ("debian-binary", b"2.0\n"),
-            ("control.tar.xz", b"odd"),
-            ("data.tar.xz", data.getvalue()),
-        ):
-            out.write(f"{member:<16}{0:<12}{0:<6}{0:<6}{'100644':<8}{len(content):<10}`\n".encode())
-            out.write(content + b"\n" * (len(content) % 2))
+    file.write_bytes(deb_of(tar_of(files)))
     return file
 
 

@@ -10,9 +10,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from fuzz_meshes import deb_bytes
 from memory_checks import at_most
-from small_packages import CHAIR, catalogue, deb, entry, fetch
+from small_packages import CHAIR, catalogue, deb, deb_of, entry, fetch, tar_of
 
 from learn3d.files import limits
 from learn3d.make_data.debian import packages
@@ -125,6 +124,7 @@ def test_a_tar_header_that_unpacks_to_very_much_is_not_kept(debs: Path, tmp_path
 
 @pytest.mark.parametrize("kind", ["gz", "bz2", "xz"])
 def test_packages_of_every_compression_are_read(dpkg: None, tmp_path: Path, kind: str):
-    (tmp_path / "p_1_all.deb").write_bytes(deb_bytes({"usr/a.ac": b"1" * 30_000, "usr/b.ac": b"2"}, kind))
+    content = tar_of({"usr/a.ac": b"1" * 30_000, "usr/b.ac": b"2"}, kind)
+    (tmp_path / "p_1_all.deb").write_bytes(deb_of(content, kind))
     found = dict(packages.read_package(packages.find_package("p", tmp_path), (".ac",), tmp_path / "licences"))
     assert found == {"usr/a.ac": b"1" * 30_000, "usr/b.ac": b"2"}
