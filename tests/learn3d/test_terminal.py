@@ -21,7 +21,7 @@ INTERRUPTED = "interrupted; what was saved before is as it was\n"
 def test_an_interrupted_data_set_leaves_nothing(tmp_path) -> None:
     command = [sys.executable, "-m", "learn3d", "make-dataset", "--output", str(tmp_path / "data")]
     command += ["--category", "chair", "--procedural", "500"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 120
         while not list(tmp_path.glob("data/.make_dataset_*/new")) and time.monotonic() < deadline:
             assert process.poll() is None, process.stderr.read()
