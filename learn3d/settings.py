@@ -66,7 +66,8 @@ def _sentence(error: Any, cls: type) -> str:
     if error["type"] == "unexpected_keyword_argument":
         return f"there is no option {name!r} (but {', '.join(field.name for field in fields(cls))})"
     if error["type"] == "value_error":  # raised by a validator, which says what came
-        return f"{name} {error['ctx']['error']}".strip()
+        message = str(error["ctx"]["error"])
+        return message if name in message.split() else f"{name} {message}".strip()
     said = error["msg"]
     for theirs, ours in _WORDS.items():
         said = said.replace(theirs, ours)

@@ -122,7 +122,7 @@ def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"preset": "kato"}, "preset must be one of peng2020-kato, "),
+        ({"preset": "kato"}, "^there is no preset 'kato'; did you mean 'plus-kato'?"),
         ({"settings": MultiViewSettings()}, "'plus-kato' takes PlusSettings, got MultiViewSettings"),
         ({"layout": "shapenet"}, "layout must be 'kato'"),
         ({"sampling": "all"}, "sampling must be 'views'"),
