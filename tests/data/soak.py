@@ -18,10 +18,10 @@ import tiny_networks
 
 from learn3d import training, validation
 from learn3d.config import config_from_dict
-from learn3d.runs.log import RunLog
+from learn3d.runs import log
 
 
-class Soaked(RunLog):
+class Soaked(log.RunLog):
     every = 100
     cpu_before = 0.0
 
@@ -44,5 +44,5 @@ if __name__ == "__main__":
     Soaked.every = int(sys.argv[2])
     tiny_networks.put_in_place()
     validation.PICTURE_ROWS = 1
-    training.RunLog = Soaked
+    log.RunLog = Soaked
     training.train(config)
