@@ -1,5 +1,7 @@
 // The loops of the smoothness loss over edges; included by levels.h for every instruction set.
 
+// Not a vector of Eigen: GCC does not inline its constructors into code for another level, and the loops over lanes
+// are then not vectorized (six times the instructions).
 template <class T>
 struct Vec3 {
   T x, y, z;

@@ -95,6 +95,7 @@ void uv_levels_py(const Array<T>& vertices, const Indices& faces, const std::opt
   args.mesh = mesh_batch(vertices, faces, mesh_starts);
   args.uv = uv_args(uv, corners, face_index, weights, starts, num_threads);
   require_face_index(face_index, args.mesh, num_threads);
+  require(args.uv.num_faces == args.mesh.num_faces, "corners must be those of the faces, got " + shape_of(corners));
   require(grids.ndim() == 3, "grids must have shape [I, L, 3], got " + shape_of(grids));
   args.images = require_grids(grids, (int64_t(1) << 31) - 1);
   require_images(args.images, args.uv.batch);

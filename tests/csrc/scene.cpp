@@ -2,543 +2,327 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstring>
 #include <string_view>
 #include <type_traits>
 
 namespace nmr::test {
 namespace {
 
-// Streams of noise, one per input.
-enum Stream : uint64_t {
-  kGradAlpha = 1,
-  kGradWeights,
-  kGradDepth,
-  kGradDepthImage,
-  kTextures,
-  kGradColors,
-  kAttributes,
-  kGradValues,
-  kImage,
-  kBackground,
-  kMatrix,
-  kIntrinsics,
-  kDistortion,
-  kGradPoints,
-  kGradLoss,
-  kFaceIndex,
-  kGradResolved,
-  kOrigin,
-  kExtent,
-  kGradPose,
-  kTexels,
-  kGradPyramid,
-  kUV,
-  kGradSampled,
-  kGradNormals,
-  kLights,
-  kViewer,
-  kLitColors,
-  kGradLit,
-  kGradSoft
-};
+using std::string_view;
 
-bool is_upstream(Stream stream) {
-  return stream == kGradAlpha || stream == kGradWeights || stream == kGradDepth || stream == kGradDepthImage ||
-         stream == kGradColors || stream == kGradValues || stream == kGradPoints ||
-         stream == kGradLoss || stream == kGradResolved || stream == kGradPose || stream == kGradPyramid ||
-         stream == kGradSampled || stream == kGradNormals || stream == kGradLit || stream == kGradSoft;
-}
-
-// Noise for one input of the stages. The array belongs to the thread and keeps its storage until the next scene.
 template <class T>
-std::vector<T>& input(const Scene<T>& scene, Stream stream, int64_t size) {
-  static thread_local std::vector<T> inputs[64];
-  using Limits = std::numeric_limits<T>;
-  constexpr T special[] = {Limits::quiet_NaN(),
-                           Limits::infinity(),
-                           -Limits::infinity(),
-                           Limits::max(),
-                           Limits::lowest(),
-                           Limits::denorm_min(),
-                           T(1e30),
-                           T(0)};
-  std::vector<T>& values = inputs[stream];
-  resize(values, size);
-  for (int64_t n = 0; n < size; ++n) values[n] = static_cast<T>(noise(64 * scene.seed + stream, n));
-  if (scene.hostile_upstream && is_upstream(stream))
-    for (int64_t n = 0; n < size; ++n)
-      if (std::abs(values[n]) < T(1) / 16) values[n] = special[static_cast<int>((values[n] + T(1) / 16) * 64) % 8];
-  return values;
-}
+struct Run {
+  const Scene<T>& s;
+  Results<T>& r;
+  const int threads;
 
-// Face index maps that no rasterizer made: any entry that names a face of its image.
-template <class T>
-void make_up_face_index(const Scene<T>& scene, std::vector<int32_t>& face_index) {
-  const int64_t per_image = scene.raster().pixels();
-  for (int64_t n = 0; n < scene.pixels(); ++n) {
-    const int64_t choices = 2 * scene.mesh().face_count(n / per_image) + 1;
-    const double u = (noise(64 * scene.seed + kFaceIndex, n) + 1) / 2;
-    face_index[n] = static_cast<int32_t>(u * static_cast<double>(choices)) - 1;
+  const MeshBatch<T> mesh = s.mesh();
+  const Size raster = s.raster();
+  const int64_t pixels = s.pixels(), image_pixels = s.batch * s.image.pixels(), rows = s.rows(), C = s.channels;
+  const int64_t seed = static_cast<int64_t>(s.seed), groups = s.packed() || !s.per_image_values ? 1 : s.batch;
+  const int32_t* face_index = nullptr;
+  const T* weights = nullptr;
+
+  // Noise for one input of the stages. Upstream gradients have names that begin with "grad".
+  T* in(const char* name, int64_t size) {
+    using Limits = std::numeric_limits<T>;
+    constexpr T special[] = {Limits::quiet_NaN(), Limits::infinity(), -Limits::infinity(),  Limits::max(),
+                             Limits::lowest(),    T(1e30),            Limits::denorm_min(), T(0)};
+    std::vector<T>& values = r.inputs.resize(name, size);
+    const uint64_t stream = stream_of(name);
+    for (int64_t n = 0; n < size; ++n) values[n] = static_cast<T>(noise(stream, n));
+    const bool upstream = string_view(name).substr(0, 4) == "grad";
+    for (T& x : values)
+      if (upstream && s.hostile_upstream && std::abs(x) < T(1) / 16) x = special[static_cast<int>((x + T(1) / 16) * 64) % 8];
+    if (s.poisoned && string_view(name) == s.poisoned) std::fill_n(values.begin(), size / s.batch, special[0]);
+    return values.data();
   }
-}
+  uint64_t stream_of(const char* name) const {
+    uint64_t stream = s.seed;
+    for (char c : string_view(name)) stream = 31 * stream + static_cast<uint64_t>(c);
+    return stream;
+  }
+  T* out(const char* name, int64_t size) { return r.out(name, size); }
+  T* out_if(bool wanted, const char* name, int64_t size) {
+    T* values = out(name, wanted ? size : 0);
+    return wanted ? values : nullptr;
+  }
+  const T* in_if(bool wanted, const char* name, int64_t size) {
+    const T* values = in(name, wanted ? size : 0);
+    return wanted ? values : nullptr;
+  }
 
-template <class T>
-void run_silhouette(const Scene<T>& s, Results<T>& r, int num_threads) {
-  const int64_t size = s.batch * s.image.pixels();
-  unwritten(r.alpha, size);
-  silhouette_forward(SilhouetteForward<T>{r.face_index.data(), s.batch, s.image, s.anti_aliasing, r.alpha.data(), num_threads});
-  const std::vector<T>& grad_alpha = input(s, kGradAlpha, size);
-  unwritten(r.grad_silhouette, 3 * s.rows());
-  unwritten(r.grad_local, 3 * s.rows());
-  SilhouetteBackward<T> args{
-      s.mesh(), s.image, s.anti_aliasing, s.eps, r.face_index.data(), grad_alpha.data(), r.grad_silhouette.data(), num_threads};
-  silhouette_backward(args);
-  args.grad_vertices = r.grad_local.data();
-  local_gradient(args);
-}
+  // `channels` values at the vertices of the faces, and their gradients.
+  Interpolate<T> interpolate(const T* attributes, int64_t attribute_batch, int64_t channels, T* grad, T* grad_weights) {
+    return {face_index, weights, s.batch, raster, attributes, attribute_batch, s.num_vertices, channels, s.faces.data(),
+            s.num_faces, s.faces_per_image, mesh.starts, nullptr, nullptr, grad, grad_weights, threads};
+  }
 
-template <class T>
-void run_fragments(const Scene<T>& s, Results<T>& r, int num_threads) {
-  unwritten(r.weights, 3 * s.pixels());
-  unwritten(r.depth, s.pixels());
-  unwritten(r.grad_fragments, 3 * s.rows());
-  const std::vector<T>&grad_weights = input(s, kGradWeights, 3 * s.pixels()),
-        &grad_depth = input(s, kGradDepth, s.pixels());
-  Fragments<T> args{s.mesh(),
-                    s.raster(),
-                    s.far,
-                    r.face_index.data(),
-                    r.weights.data(),
-                    r.depth.data(),
-                    s.no_grad_weights ? nullptr : grad_weights.data(),
-                    s.no_grad_depth ? nullptr : grad_depth.data(),
-                    r.grad_fragments.data(),
-                    num_threads};
-  fragments_forward(args);
-  fragments_backward(args);
+  void all() {
+    surfaces();
+    clip();
+    silhouettes();
+    fragments();
+    shading();
+    texture_images();
+    lights();
+    edges();
+    camera();
+    poses();
+    smoothness();
+    soft_iou();
+    voxels();
+  }
 
-  const int64_t size = s.batch * s.image.pixels();
-  unwritten(r.depth_image, size);
-  unwritten(r.grad_depth, 3 * s.rows());
-  const std::vector<T>& grad_image = input(s, kGradDepthImage, size);
-  DepthImage<T> image{s.mesh(),
-                      s.image,
-                      s.anti_aliasing,
-                      s.far,
-                      r.face_index.data(),
-                      r.depth_image.data(),
-                      grad_image.data(),
-                      r.grad_depth.data(),
-                      num_threads};
-  depth_forward(image);
-  depth_backward(image);
-}
+  // The face index map; SoftRas's silhouette; the nearest one to three faces.
+  void surfaces() {
+    const RasterSettings<T> settings{raster, s.fill_back, s.near, s.far};
+    int32_t* index = r.template out<int32_t>("face_index", pixels);
+    face_index = index;
+    rasterize(Rasterize<T>{mesh, settings, index, threads});
+    const int64_t layers = 1 + seed % 3;
+    rasterize_layers(RasterizeLayers<T>{mesh, settings, layers, r.template out<int32_t>("layers", layers * pixels), threads});
 
-template <class T>
-void run_shading(const Scene<T>& s, Results<T>& r, int num_threads) {
-  const int64_t ts = s.texture_size, C = s.channels, groups = s.packed() ? 1 : s.per_image_values ? s.batch : 1;
-  const int64_t* starts = s.packed() ? s.starts.data() : nullptr;
-  const std::vector<T>& textures = input(s, kTextures, groups * s.num_faces * ts * ts * ts * C);
-  const std::vector<T>& grad_colors = input(s, kGradColors, s.pixels() * C);
-  unwritten(r.colors, s.pixels() * C);
-  unwritten(r.grad_textures, textures.size());
-  TextureCubes<T> cubes{r.face_index.data(),
-                        r.weights.data(),
-                        s.batch,
-                        s.raster(),
-                        textures.data(),
-                        groups,
-                        s.num_faces,
-                        starts,
-                        ts,
-                        C,
-                        s.eps,
-                        r.colors.data(),
-                        grad_colors.data(),
-                        r.grad_textures.data(),
-                        num_threads};
-  texture_cubes_forward(cubes);
-  texture_cubes_backward(cubes);
+    const T sigma = seed % 7 < 3 ? T(1e-4) : seed % 7 < 5 ? T(1e-2) : T(0.3);
+    const SoftSettings<T> soft{settings, sigma, seed % 5 == 0 ? T(100) : T(7) * sigma};
+    T* clear = out("clear", pixels);
+    soft_forward(SoftForward<T>{mesh, soft, clear, threads});
+    soft_backward(SoftBackward<T>{mesh, soft, clear, in("grad_clear", pixels), out("grad_soft", 3 * rows), threads});
 
-  const std::vector<T>& attributes = input(s, kAttributes, groups * s.num_vertices * C);
-  const std::vector<T>& grad_values = input(s, kGradValues, s.pixels() * C);
-  unwritten(r.values, s.pixels() * C);
-  unwritten(r.grad_attributes, attributes.size());
-  unwritten(r.grad_weights, 3 * s.pixels());
-  Interpolate<T> values{r.face_index.data(),
-                        r.weights.data(),
-                        s.batch,
-                        s.raster(),
-                        attributes.data(),
-                        groups,
-                        s.num_vertices,
-                        C,
-                        s.faces.data(),
-                        s.num_faces,
-                        s.faces_per_image,
-                        starts,
-                        r.values.data(),
-                        grad_values.data(),
-                        r.grad_attributes.data(),
-                        r.grad_weights.data(),
-                        num_threads};
-  interpolate_forward(values);
-  interpolate_backward(values);
-}
-
-// Textures of 1 to 5 texels a side, shared or one for each image, with or without mipmaps; uv in [-1.5, 1.5).
-template <class T>
-void run_texture_images(const Scene<T>& s, Results<T>& r, int num_threads) {
-  const int64_t groups = s.packed() || !s.per_image_values ? 1 : s.batch, C = s.channels,
-                seed = static_cast<int64_t>(s.seed);
-  const int64_t images = s.per_image_values && s.batch > 0 ? s.batch : 1, levels = seed % 2 ? 3 : 1;
-  static thread_local std::vector<int64_t> grids;
-  resize(grids, 3 * images * levels);
-  int64_t count = 0, whole = 0;
-  for (int64_t i = 0; i < images; ++i) {
-    Size size{1 + (seed + 2 * i) % 5, 1 + (seed / 2 + i) % 5};
-    whole += size.pixels();
-    for (int64_t level = 0; level < levels; ++level) {
-      int64_t* grid = grids.data() + 3 * (i * levels + level);
-      grid[0] = count;
-      grid[1] = size.height;
-      grid[2] = size.width;
-      count += size.pixels();
-      size = {std::max(size.height / 2, int64_t(1)), std::max(size.width / 2, int64_t(1))};
+    for (int64_t n = 0; n < pixels && s.foreign_face_index; ++n) {
+      const double u = (noise(stream_of("face_index"), n) + 1) / 2;
+      index[n] = static_cast<int32_t>(u * static_cast<double>(2 * mesh.face_count(n / raster.pixels()) + 1)) - 1;
     }
+    if (s.given_face_index) std::copy_n(s.given_face_index, pixels, index);
   }
-  const std::vector<T>&texels = input(s, kTexels, whole * C), &grad_pyramid = input(s, kGradPyramid, count * C);
-  unwritten(r.pyramid, count * C);
-  unwritten(r.grad_texels, whole * C);
-  const Mipmaps<T> mipmaps{images,        levels,           grids.data(),        C,
-                           texels.data(), r.pyramid.data(), grad_pyramid.data(), r.grad_texels.data(),
-                           num_threads};
-  mipmaps_forward(mipmaps);
-  mipmaps_backward(mipmaps);
 
-  std::vector<T>& uv = input(s, kUV, groups * s.num_vertices * 2);
-  for (T& x : uv) x *= T(1.5);
-  unwritten(r.grad_uv, static_cast<int64_t>(uv.size()));
-  unwritten(r.grad_uv_weights, 3 * s.pixels());
-  const Interpolate<T> at{r.face_index.data(),
-                          r.weights.data(),
-                          s.batch,
-                          s.raster(),
-                          uv.data(),
-                          groups,
-                          s.num_vertices,
-                          2,
-                          s.faces.data(),
-                          s.num_faces,
-                          s.faces_per_image,
-                          s.packed() ? s.starts.data() : nullptr,
-                          nullptr,
-                          nullptr,
-                          r.grad_uv.data(),
-                          s.no_grad_weights ? nullptr : r.grad_uv_weights.data(),
-                          num_threads};
-  unwritten(r.level, s.pixels());
-  uv_levels(UVLevels<T>{at, s.mesh(), grids.data(), images, levels, r.level.data()});
-  const std::vector<T>& grad_sampled = input(s, kGradSampled, s.pixels() * C);
-  unwritten(r.sampled, s.pixels() * C);
-  unwritten(r.grad_sampled_texels, count * C);
-  const SampleUV<T> sample{at,
-                           r.pyramid.data(),
-                           count,
-                           C,
-                           grids.data(),
-                           images,
-                           levels,
-                           levels > 1 ? r.level.data() : nullptr,
-                           static_cast<Wrap>(seed / 4 % 3),
-                           r.sampled.data(),
-                           grad_sampled.data(),
-                           r.grad_sampled_texels.data()};
-  sample_uv_forward(sample);
-  sample_uv_backward(sample);
-}
-
-// Up to two directional and two point lights, shared or one set for each image, with or without highlights; or the
-// normals themselves.
-template <class T>
-void run_lights(const Scene<T>& s, Results<T>& r, int num_threads) {
-  const int64_t seed = static_cast<int64_t>(s.seed), rows = s.per_image_values ? s.batch : 1;
-  const bool smooth = seed & 1;
-  const int64_t count = smooth ? s.rows() : s.packed() ? s.num_faces : s.batch * s.num_faces;
-  unwritten(r.normals, 3 * count);
-  unwritten(r.grad_normals_vertices, 3 * s.rows());
-  const std::vector<T>& grad_normals = input(s, kGradNormals, 3 * count);
-  const Normals<T> normals{s.mesh(),   smooth, r.normals.data(), grad_normals.data(), r.grad_normals_vertices.data(),
-                           num_threads};
-  normals_forward(normals);
-  normals_backward(normals);
-
-  constexpr int64_t kKinds = static_cast<int64_t>(Light::count), kWidths[kKinds] = {1, 3, 1, 3, 3, 1, 3, 3, 1, 1, 1};
-  const int64_t directional = seed / 2 % 3, points = seed / 8 % 3, highlights = seed / 32 % 2;
-  const int64_t lights[kKinds] = {1, 1, directional, 1, directional, points, 1, points, 1, highlights, highlights};
-  int64_t layout[3 * kKinds], num_parameters = 0;
-  for (int64_t n = 0; n < kKinds; ++n) {
-    layout[3 * n] = num_parameters;
-    layout[3 * n + 1] = n % 3 == 0 ? rows : 1;
-    layout[3 * n + 2] = lights[n];
-    num_parameters += layout[3 * n + 1] * lights[n] * kWidths[n];
+  void clip() {
+    int64_t* counts = r.template out<int64_t>("clip_counts", 2 * s.batch);
+    clip_count(ClipCount<T>{mesh, s.near, counts, threads});
+    int64_t* starts = r.template out<int64_t>("clip_starts", 2 * s.batch + 2);
+    starts[0] = starts[1] = 0;
+    for (int64_t n = 0; n < 2 * s.batch; ++n) starts[n + 2] = starts[n] + counts[n] + (seed % 4 == 0);  // or room to spare
+    const int64_t P = starts[2 * s.batch], M = starts[2 * s.batch + 1];
+    clip_faces(ClipFaces<T>{mesh, s.near, starts, r.template out<int64_t>("clip_faces", 3 * M),
+                            r.template out<int32_t>("clip_source", M), r.template out<int64_t>("clip_corners", 3 * M),
+                            r.template out<int64_t>("clip_ends", 4 * P), threads});
   }
-  std::vector<T>&parameters = input(s, kLights, num_parameters), &viewer = input(s, kViewer, 5 * s.batch);
-  for (int64_t n = 0; n < kKinds; ++n)  // numbered so that those of the first image do not depend on the size of the batch
-    for (int64_t k = 0; k < layout[3 * n + 1] * lights[n] * kWidths[n]; ++k) {
-      const T x = static_cast<T>(noise(64 * s.seed + kLights, 1000 * n + k));
-      parameters[layout[3 * n] + k] = T(1) / 4 + x * x;
+
+  void silhouettes() {
+    silhouette_forward(SilhouetteForward<T>{face_index, s.batch, s.image, s.anti_aliasing, out("alpha", image_pixels), threads});
+    SilhouetteBackward<T> args{mesh, s.image, s.anti_aliasing, s.eps, face_index, in("grad_alpha", image_pixels),
+                               out("grad_silhouette", 3 * rows), threads};
+    silhouette_backward(args);
+    args.grad_vertices = out("grad_local", 3 * rows);
+    local_gradient(args);
+  }
+
+  void fragments() {
+    T* weights_out = out("weights", 3 * pixels);
+    const Fragments<T> args{mesh, raster, s.far, face_index, weights_out, out("depth", pixels),
+                            in_if(!s.no_grad_weights, "grad_weights", 3 * pixels), in_if(!s.no_grad_depth, "grad_depth", pixels),
+                            out("grad_fragments", 3 * rows), threads};
+    fragments_forward(args);
+    fragments_backward(args);
+    weights = weights_out;
+    const DepthImage<T> image{mesh, s.image, s.anti_aliasing, s.far, face_index, out("depth_image", image_pixels),
+                              in("grad_depth_image", image_pixels), out("grad_depth_vertices", 3 * rows), threads};
+    depth_forward(image);
+    depth_backward(image);
+  }
+
+  void shading() {
+    const int64_t size = groups * s.num_faces * s.texture_size * s.texture_size * s.texture_size * C;
+    const TextureCubes<T> cubes{face_index, weights, s.batch, raster, in("textures", size), groups, s.num_faces, mesh.starts,
+                                s.texture_size, C, s.eps, out("colors", pixels * C), in("grad_colors", pixels * C),
+                                out("grad_textures", size), threads};
+    texture_cubes_forward(cubes);
+    texture_cubes_backward(cubes);
+    const int64_t count = groups * s.num_vertices * C;
+    Interpolate<T> args = interpolate(in("attributes", count), groups, C, out("grad_attributes", count),
+                                      out("grad_value_weights", 3 * pixels));
+    args.values = out("values", pixels * C);
+    args.grad_values = in("grad_values", pixels * C);
+    interpolate_forward(args);
+    interpolate_backward(args);
+  }
+
+  // Textures of 1 to 5 texels a side, shared or one for each image, with or without mipmaps; uv in [-1.5, 1.5).
+  void texture_images() {
+    const int64_t images = s.per_image_values && s.batch > 0 ? s.batch : 1, levels = seed % 2 ? 3 : 1;
+    int64_t* grids = r.tables.resize("grids", 3 * images * levels).data();
+    int64_t count = 0, whole = 0;
+    for (int64_t i = 0; i < images; ++i) {
+      Size size{1 + (seed + 2 * i) % 5, 1 + (seed / 2 + i) % 5};
+      whole += size.pixels();
+      for (int64_t level = 0; level < levels; ++level) {
+        int64_t* grid = grids + 3 * (i * levels + level);
+        grid[0] = count, grid[1] = size.height, grid[2] = size.width;
+        count += size.pixels();
+        size = {std::max(size.height / 2, int64_t(1)), std::max(size.width / 2, int64_t(1))};
+      }
     }
-  for (int64_t b = 0; b < s.batch; ++b) {
-    viewer[5 * b + 3] = T(seed / 4 % 2);
-    viewer[5 * b + 4] = viewer[5 * b + 4] < 0 ? T(-1) : T(1);
+    T* pyramid = out("pyramid", count * C);
+    const Mipmaps<T> mipmaps{images, levels, grids, C, in("texels", whole * C), pyramid, in("grad_pyramid", count * C),
+                             out("grad_texels", whole * C), threads};
+    mipmaps_forward(mipmaps);
+    mipmaps_backward(mipmaps);
+
+    const int64_t size = groups * s.num_vertices * 2;
+    T* uv = in("uv", size);
+    for (int64_t n = 0; n < size; ++n) uv[n] *= T(1.5);
+    const Interpolate<T> at =
+        interpolate(uv, groups, 2, out("grad_uv", size), out_if(!s.no_grad_weights, "grad_uv_weights", 3 * pixels));
+    T* level = out("level", pixels);
+    uv_levels(UVLevels<T>{at, mesh, grids, images, levels, level});
+    const SampleUV<T> sample{at, pyramid, count, C, grids, images, levels, levels > 1 ? level : nullptr,
+                             static_cast<Wrap>(seed / 4 % 3), out("sampled", pixels * C), in("grad_sampled", pixels * C),
+                             out("grad_sampled_texels", count * C)};
+    sample_uv_forward(sample);
+    sample_uv_backward(sample);
   }
-  const int64_t C = seed % 3 == 0 ? 1 : 3;
-  const bool lit = seed % 8 != 6, colored = lit && seed % 5 != 0;
-  const std::vector<T>&colors = input(s, kLitColors, s.pixels() * C), &grad_lit = input(s, kGradLit, 3 * s.pixels());
-  unwritten(r.lit, 3 * s.pixels());
-  unwritten(r.grad_lit_colors, colored ? s.pixels() * C : 0);
-  unwritten(r.grad_lit_normals, 3 * count);
-  unwritten(r.grad_lights, lit ? num_parameters : 0);
-  unwritten(r.grad_lit_vertices, 3 * s.rows());
-  unwritten(r.grad_lit_weights, 3 * s.pixels());
-  Lit<T> args{};
-  args.at = Interpolate<T>{r.face_index.data(),
-                           r.weights.data(),
-                           s.batch,
-                           s.raster(),
-                           s.vertices.data(),
-                           s.batch,
-                           s.num_vertices,
-                           3,
-                           s.faces.data(),
-                           s.num_faces,
-                           s.faces_per_image,
-                           s.packed() ? s.starts.data() : nullptr,
-                           nullptr,
-                           nullptr,
-                           r.grad_lit_vertices.data(),
-                           r.grad_lit_weights.data(),
-                           num_threads};
-  args.normals = r.normals.data();
-  args.normal_batch = s.packed() ? 0 : s.batch;
-  args.smooth = smooth;
-  args.viewer = viewer.data();
-  if (lit) {
-    args.parameters = parameters.data();
+
+  // Up to two directional and two point lights, shared or one set for each image, with or without highlights; or the
+  // normals themselves.
+  void lights() {
+    const bool smooth = seed & 1;
+    const int64_t count = smooth ? rows : s.packed() ? s.num_faces : s.batch * s.num_faces;
+    T* unit = out("normals", 3 * count);
+    const Normals<T> normals{mesh, smooth, unit, in("grad_normals", 3 * count), out("grad_normals_vertices", 3 * rows), threads};
+    normals_forward(normals);
+    normals_backward(normals);
+
+    constexpr int64_t kKinds = static_cast<int64_t>(Light::count), kWidths[kKinds] = {1, 3, 1, 3, 3, 1, 3, 3, 1, 1, 1};
+    const int64_t directional = seed / 2 % 3, points = seed / 8 % 3, highlights = seed / 32 % 2;
+    const int64_t number[kKinds] = {1, 1, directional, 1, directional, points, 1, points, 1, highlights, highlights};
+    int64_t *layout = r.tables.resize("layout", 3 * kKinds).data(), num_parameters = 0;
+    for (int64_t n = 0; n < kKinds; ++n) {
+      layout[3 * n] = num_parameters;
+      layout[3 * n + 1] = n % 3 == 0 && s.per_image_values ? s.batch : 1;
+      layout[3 * n + 2] = number[n];
+      num_parameters += layout[3 * n + 1] * number[n] * kWidths[n];
+    }
+    T *parameters = in("lights", num_parameters), *viewer = in("viewer", 5 * s.batch);
+    for (int64_t n = 0; n < kKinds; ++n)  // those of the first image do not depend on the size of the batch
+      for (int64_t k = 0; k < layout[3 * n + 1] * number[n] * kWidths[n]; ++k) {
+        const T x = static_cast<T>(noise(stream_of("lights"), 1000 * n + k));
+        parameters[layout[3 * n] + k] = T(1) / 4 + x * x;
+      }
+    for (int64_t b = 0; b < s.batch; ++b) {
+      viewer[5 * b + 3] = T(seed / 4 % 2);
+      viewer[5 * b + 4] = viewer[5 * b + 4] < 0 ? T(-1) : T(1);
+    }
+    const bool lit = seed % 8 != 6, colored = lit && seed % 5 != 0;
+    Lit<T> args{};
+    args.at = interpolate(s.vertices.data(), s.batch, 3, out("grad_lit_vertices", 3 * rows), out("grad_lit_weights", 3 * pixels));
+    args.normals = unit;
+    args.normal_batch = s.packed() ? 0 : s.batch;
+    args.smooth = smooth;
+    args.viewer = viewer;
+    args.parameters = lit ? parameters : nullptr;
     args.layout = layout;
     args.num_parameters = num_parameters;
-    args.grad_parameters = r.grad_lights.data();
+    args.channels = seed % 3 == 0 ? 1 : 3;
+    args.colors = in_if(colored, "lit_colors", pixels * args.channels);
+    args.lit = out("lit", 3 * pixels);
+    args.grad_lit = in("grad_lit", 3 * pixels);
+    args.grad_colors = out_if(colored, "grad_lit_colors", pixels * args.channels);
+    args.grad_normals = out("grad_lit_normals", 3 * count);
+    args.grad_parameters = out_if(lit, "grad_lights", num_parameters);
+    lit_forward(args);
+    lit_backward(args);
   }
-  if (colored) {
-    args.colors = colors.data();
-    args.channels = C;
-    args.grad_colors = r.grad_lit_colors.data();
-  }
-  args.lit = r.lit.data();
-  args.grad_lit = grad_lit.data();
-  args.grad_normals = r.grad_lit_normals.data();
-  lit_forward(args);
-  lit_backward(args);
-}
 
-// SoftRas's silhouette, and the nearest one to three faces.
-template <class T>
-void run_surfaces(const Scene<T>& s, Results<T>& r, int num_threads) {
-  const RasterSettings<T> raster{s.raster(), s.fill_back, s.near, s.far};
-  const int64_t layers = 1 + static_cast<int64_t>(s.seed) % 3;
-  resize(r.layers, layers * s.pixels());
-  std::fill(r.layers.begin(), r.layers.end(), std::numeric_limits<int32_t>::min());
-  rasterize_layers(RasterizeLayers<T>{s.mesh(), raster, layers, r.layers.data(), num_threads});
-
-  const T sigma = s.seed % 4 == 0 ? T(1e-4) : s.seed % 4 == 1 ? T(1e-2) : T(0.3);
-  const SoftSettings<T> settings{raster, sigma, s.seed % 5 == 0 ? T(100) : T(7) * sigma};
-  unwritten(r.clear, s.pixels());
-  unwritten(r.grad_soft, 3 * s.rows());
-  soft_forward(SoftForward<T>{s.mesh(), settings, r.clear.data(), num_threads});
-  const std::vector<T>& grad_clear = input(s, kGradSoft, s.pixels());
-  soft_backward(
-      SoftBackward<T>{s.mesh(), settings, r.clear.data(), grad_clear.data(), r.grad_soft.data(), num_threads});
-}
-
-template <class T>
-void run_clip(const Scene<T>& s, Results<T>& r, int num_threads) {
-  resize(r.clip_counts, 2 * s.batch);
-  std::fill(r.clip_counts.begin(), r.clip_counts.end(), -1);
-  clip_count(ClipCount<T>{s.mesh(), s.near, r.clip_counts.data(), num_threads});
-  const int64_t spare = s.seed % 4 == 0;
-  resize(r.clip_starts, 2 * s.batch + 2);
-  r.clip_starts[0] = r.clip_starts[1] = 0;
-  for (int64_t n = 0; n < 2 * s.batch; ++n) r.clip_starts[n + 2] = r.clip_starts[n] + r.clip_counts[n] + spare;
-  const int64_t P = r.clip_starts[2 * s.batch], M = r.clip_starts[2 * s.batch + 1];
-  resize(r.clip_faces, 3 * M);
-  resize(r.clip_corners, 3 * M);
-  resize(r.clip_ends, 4 * P);
-  resize(r.clip_source, M);
-  for (auto* indices : {&r.clip_faces, &r.clip_corners, &r.clip_ends}) std::fill(indices->begin(), indices->end(), -1);
-  std::fill(r.clip_source.begin(), r.clip_source.end(), -1);
-  clip_faces(ClipFaces<T>{s.mesh(), s.near, r.clip_starts.data(), r.clip_faces.data(), r.clip_source.data(),
-                          r.clip_corners.data(), r.clip_ends.data(), num_threads});
-}
-
-template <class T>
-void run_edges(const Scene<T>& s, Results<T>& r, int num_threads) {
-  const std::vector<T>& image = input(s, kImage, s.pixels() * s.channels);
-
-  const int64_t size = s.batch * s.image.pixels() * s.channels;
-  const std::vector<T>& grad_resolved = input(s, kGradResolved, size);
-  unwritten(r.resolved, size);
-  unwritten(r.grad_image, image.size());
-  unwritten(r.grad_background, s.batch * s.channels);
-  unwritten(r.grad_edges, 3 * s.rows());
   // Half of the scenes have a background, of their own for each image or one for all.
-  const int64_t background_batch = s.per_image_values ? s.batch : 1;
-  const std::vector<T>& colors = input(s, kBackground, background_batch * s.channels);
-  const T* background = s.fill_back ? colors.data() : nullptr;
-  Resolve<T> resolve{
-      s.batch,    s.image,          s.anti_aliasing,   s.channels,           r.face_index.data(), image.data(),
-      background, background_batch, r.resolved.data(), grad_resolved.data(), r.grad_image.data(), r.grad_background.data(),
-      num_threads};
-  edges_backward(EdgesBackward<T>{s.mesh(), s.image, s.anti_aliasing, s.eps, r.face_index.data(), image.data(), s.channels,
-                                  background, background_batch, grad_resolved.data(), r.grad_edges.data(), num_threads});
-  resolve_forward(resolve);
-  resolve_backward(resolve);
-}
-
-// A camera per image: nearly the identity, three units back.
-template <class T>
-void run_camera(const Scene<T>& s, Results<T>& r, int num_threads) {
-  std::vector<T>&matrix = input(s, kMatrix, 12 * s.batch), &intrinsics = input(s, kIntrinsics, 6 * s.batch);
-  std::vector<T>& distortion = input(s, kDistortion, 5 * s.batch);
-  for (int64_t b = 0; b < s.batch; ++b) {
-    for (int k = 0; k < 12; ++k) matrix[12 * b + k] = matrix[12 * b + k] / 8 + T(k % 5 == 0) + (k == 11 ? T(2) : T(0));
-    for (int k = 0; k < 6; ++k) intrinsics[6 * b + k] = intrinsics[6 * b + k] / 8 + T(k % 4 == 0);
-    for (int k = 0; k < 5; ++k) distortion[5 * b + k] /= 16;
+  void edges() {
+    const int64_t size = image_pixels * C, backgrounds = s.per_image_values ? s.batch : 1;
+    const T *image = in("image", pixels * C), *grad = in("grad_resolved", size);
+    const T* background = in_if(s.fill_back, "background", backgrounds * C);
+    edges_backward(EdgesBackward<T>{mesh, s.image, s.anti_aliasing, s.eps, face_index, image, C, background, backgrounds, grad,
+                                    out("grad_edges", 3 * rows), threads});
+    const Resolve<T> resolve{s.batch, s.image, s.anti_aliasing, C, face_index, image, background, backgrounds,
+                             out("resolved", size), grad, out("grad_image", pixels * C), out("grad_background", s.batch * C),
+                             threads};
+    resolve_forward(resolve);
+    resolve_backward(resolve);
   }
-  const std::vector<T>& grad_points = input(s, kGradPoints, 3 * s.rows());
-  unwritten(r.points, 3 * s.rows());
-  unwritten(r.grad_world, 3 * s.rows());
-  unwritten(r.grad_matrix, 12 * s.batch);
-  unwritten(r.grad_intrinsics, 6 * s.batch);
-  const bool distorted = s.distorted && s.perspective, placed = !s.distorted;
-  unwritten(r.grad_distortion, distorted ? 5 * s.batch : 0);
-  std::vector<T>&origin = input(s, kOrigin, 3 * s.batch), &extent = input(s, kExtent, s.batch);
-  for (T& x : extent) x = T(0.25) + x * x;
-  unwritten(r.grad_origin, placed ? 3 * s.batch : 0);
-  unwritten(r.grad_extent, placed ? s.batch : 0);
-  const auto pointer = [](bool wanted, auto& values) { return wanted ? values.data() : nullptr; };
-  Project<T> args{s.vertices.data(),
-                  s.packed() ? s.starts.data() : nullptr,
-                  s.batch,
-                  s.batch,
-                  s.num_vertices,
-                  matrix.data(),
-                  intrinsics.data(),
-                  pointer(distorted, distortion),
-                  pointer(placed, origin),
-                  pointer(placed, extent),
-                  s.perspective,
-                  r.points.data(),
-                  grad_points.data(),
-                  r.grad_world.data(),
-                  r.grad_matrix.data(),
-                  r.grad_intrinsics.data(),
-                  pointer(distorted, r.grad_distortion),
-                  pointer(placed, r.grad_origin),
-                  pointer(placed, r.grad_extent),
-                  num_threads};
-  project_forward(args);
-  project_backward(args);
-}
 
-// Directions from the vertices, with whatever they hold; a pose for each pair of them.
-template <class T>
-void run_pose(const Scene<T>& s, Results<T>& r) {
-  const int64_t poses = s.rows() / 2;
-  const T *forward = s.vertices.data(), *up = forward + 3 * poses;
-  const std::vector<T>& grad_matrix = input(s, kGradPose, 12 * poses);
-  unwritten(r.pose, 12 * poses);
-  unwritten(r.grad_forward, 3 * poses);
-  unwritten(r.grad_up, 3 * poses);
-  const Pose<T> args{forward, up, poses, r.pose.data(), grad_matrix.data(), r.grad_forward.data(), r.grad_up.data()};
-  pose_forward(args);
-  pose_backward(args);
-}
-
-// The edges are made up: corners of consecutive faces of the first mesh. Packed vertices count as one mesh.
-template <class T>
-void run_smoothness(const Scene<T>& s, Results<T>& r, int num_threads) {
-  const int64_t num_edges = s.batch > 0 ? s.mesh().face_count(0) : 0, batch = s.packed() ? 1 : s.batch;
-  static thread_local std::vector<int64_t> edges;
-  resize(edges, 4 * num_edges);
-  for (int64_t f = 0; f < num_edges; ++f) {
-    const int64_t* face = s.faces.data() + 3 * f;
-    for (int k = 0; k < 3; ++k) edges[4 * f + k] = face[k];
-    edges[4 * f + 3] = s.faces[3 * ((f + 1) % num_edges) + 1];
+  // A camera per image: nearly the identity, three units back.
+  void camera() {
+    const bool distorted = s.distorted && s.perspective, placed = !s.distorted;
+    const int64_t B = s.batch;
+    T *matrix = in("matrix", 12 * B), *intrinsics = in("intrinsics", 6 * B), *distortion = in("distortion", 5 * B);
+    T *origin = in("origin", 3 * B), *extent = in("extent", B);
+    for (int64_t n = 0; n < 12 * B; ++n) matrix[n] = matrix[n] / 8 + T(n % 12 % 5 == 0) + T(n % 12 == 11 ? 2 : 0);
+    for (int64_t n = 0; n < 6 * B; ++n) intrinsics[n] = intrinsics[n] / 8 + T(n % 6 % 4 == 0);
+    for (int64_t n = 0; n < 5 * B; ++n) distortion[n] /= 16;
+    for (int64_t b = 0; b < B; ++b) extent[b] = T(0.25) + extent[b] * extent[b];
+    const Project<T> args{s.vertices.data(), mesh.starts, B, B, s.num_vertices, matrix, intrinsics, distorted ? distortion : nullptr,
+                          placed ? origin : nullptr, placed ? extent : nullptr, s.perspective, out("points", 3 * rows),
+                          in("grad_points", 3 * rows), out("grad_world", 3 * rows), out("grad_matrix", 12 * B),
+                          out("grad_intrinsics", 6 * B), out_if(distorted, "grad_distortion", 5 * B),
+                          out_if(placed, "grad_origin", 3 * B), out_if(placed, "grad_extent", B), threads};
+    project_forward(args);
+    project_backward(args);
   }
-  const std::vector<T>& grad_loss = input(s, kGradLoss, batch);
-  unwritten(r.loss, batch);
-  unwritten(r.grad_loss, 3 * s.rows());
-  Smoothness<T> args{s.vertices.data(), edges.data(), batch, s.num_vertices, num_edges, r.loss.data(), grad_loss.data(),
-                     r.grad_loss.data(), num_threads};
-  smoothness_forward(args);
-  smoothness_backward(args);
-}
 
-template <class T>
-void run_voxels(const Scene<T>& s, Results<T>& r, int num_threads) {
-  static thread_local std::vector<float> vertices;
-  resize(vertices, static_cast<int64_t>(s.vertices.size()));
-  std::copy(s.vertices.begin(), s.vertices.end(), vertices.begin());
-  const int64_t cells = s.grid_size * s.grid_size * s.grid_size;
-  for (auto* voxels : {&r.voxels, &r.touched_voxels}) {
-    resize(*voxels, s.batch * cells);
-    std::fill(voxels->begin(), voxels->end(), 2);
+  // Directions from the vertices, with whatever they hold; a pose for each pair of them.
+  void poses() {
+    const int64_t count = rows / 2;
+    const Pose<T> args{s.vertices.data(), s.vertices.data() + 3 * count, count, out("pose", 12 * count),
+                       in("grad_pose", 12 * count), out("grad_forward", 3 * count), out("grad_up", 3 * count)};
+    pose_forward(args);
+    pose_backward(args);
   }
-  const MeshBatch<float> mesh{vertices.data(), s.faces.data(), s.batch, s.num_vertices, s.num_faces, s.faces_per_image,
-                              s.packed() ? s.starts.data() : nullptr};
-  voxelize(Voxelize{mesh, s.grid_size, false, reinterpret_cast<bool*>(r.voxels.data()), num_threads});
-  voxelize(Voxelize{mesh, s.grid_size, true, reinterpret_cast<bool*>(r.touched_voxels.data()), num_threads});
-}
 
-// Every index that clipping gives lies within what it indexes.
-template <class T>
-const char* broken_clip(const Scene<T>& scene, const Results<T>& r) {
-  const MeshBatch<T> mesh = scene.mesh();
-  for (int64_t b = 0; b < scene.batch; ++b) {
-    const int64_t V = mesh.vertex_count(b), F = mesh.face_count(b), first = mesh.vertex_start(b);
-    const int64_t P = r.clip_starts[2 * b + 2] - r.clip_starts[2 * b];
-    for (int64_t f = r.clip_starts[2 * b + 1]; f < r.clip_starts[2 * b + 3]; ++f) {
-      if (r.clip_source[f] < 0 || r.clip_source[f] >= std::max<int64_t>(F, 1)) return "a drawn face is part of a face";
-      for (int k = 0; k < 3; ++k) {
-        const int64_t v = r.clip_faces[3 * f + k], corner = r.clip_corners[3 * f + k];
-        if (V > 0 && (v < 0 || v >= V + P)) return "a corner of a drawn face is a vertex or a new vertex";
-        if (corner < 0 || corner >= 3 + std::max<int64_t>(P, 1)) return "a corner of a drawn face lies on its face";
-      }
+  // The edges are made up: corners of consecutive faces of the first mesh. Packed vertices count as one mesh.
+  void smoothness() {
+    const int64_t num_edges = s.batch > 0 ? mesh.face_count(0) : 0, batch = s.packed() ? 1 : s.batch;
+    int64_t* edges = r.tables.resize("edges", 4 * num_edges).data();
+    for (int64_t f = 0; f < num_edges; ++f) {
+      std::copy_n(s.faces.data() + 3 * f, 3, edges + 4 * f);
+      edges[4 * f + 3] = s.faces[3 * ((f + 1) % num_edges) + 1];
     }
-    for (int64_t p = r.clip_starts[2 * b]; p < r.clip_starts[2 * b + 2] && F > 0; ++p)
-      for (int k = 0; k < 4; ++k) {
-        const int64_t end = r.clip_ends[4 * p + k];
-        if (k < 2 ? end < first || end >= first + V : end < 0 || end > 2)
-          return "a new vertex lies between two corners";
-      }
+    const Smoothness<T> args{s.vertices.data(), edges, batch, s.num_vertices, num_edges, out("loss", batch), in("grad_loss", batch),
+                             out("grad_loss_vertices", 3 * rows), threads};
+    smoothness_forward(args);
+    smoothness_backward(args);
   }
-  return nullptr;
-}
+
+  // Of the raster's soft silhouettes and noise in [0, 1].
+  void soft_iou() {
+    T* target = in("target", pixels);
+    for (int64_t n = 0; n < pixels; ++n) target[n] = std::abs(target[n]);
+    double* areas = r.areas.resize("areas", 2 * s.batch).data();
+    const SoftIou<T> args{r.get("clear").data(), target, s.batch, raster.pixels(), areas, out("iou", s.batch), in("grad_iou", s.batch),
+                          out("grad_prediction", pixels), out("grad_target", pixels), threads};
+    soft_iou_forward(args);
+    soft_iou_backward(args);
+  }
+
+  void voxels() {
+    static thread_local Arrays<float> memory;
+    std::vector<float>& vertices = memory.resize("vertices", static_cast<int64_t>(s.vertices.size()));
+    std::copy(s.vertices.begin(), s.vertices.end(), vertices.begin());
+    const MeshBatch<float> batch{vertices.data(), s.faces.data(), s.batch, s.num_vertices, s.num_faces, s.faces_per_image, mesh.starts};
+    for (const bool touched : {false, true}) {
+      const int64_t cells = s.grid_size * s.grid_size * s.grid_size;
+      unsigned char* filled = r.template out<unsigned char>(touched ? "touched" : "voxels", s.batch * cells);
+      voxelize(Voxelize{batch, s.grid_size, touched, reinterpret_cast<bool*>(filled), threads});
+    }
+  }
+};
 
 template <class T>
 bool all_finite(const std::vector<T>& values) {
-  for (T x : values)
-    if (!std::isfinite(x)) return false;
-  return true;
+  return std::all_of(values.begin(), values.end(), [](T x) { return std::isfinite(x); });
 }
 
 // Every coordinate is a multiple of 1/256 within +-16, and no depth is nearer to 0 than that: areas and depths are far
 // from underflow and overflow, so that every derivative is finite.
 template <class T>
 bool is_tame(const Scene<T>& scene) {
-  for (int64_t n = 0; n < static_cast<int64_t>(scene.vertices.size()); ++n) {
+  for (size_t n = 0; n < scene.vertices.size(); ++n) {
     const T x = scene.vertices[n] * 256;
     if (!(std::abs(x) <= 4096) || x != std::round(x) || (n % 3 == 2 && x == 0)) return false;
   }
@@ -547,7 +331,6 @@ bool is_tame(const Scene<T>& scene) {
 
 constexpr size_t kDifferent = ~size_t(0);
 
-// The same bits; any NaN is a NaN.
 template <class Number>
 bool same(const Number* a, const Number* b, size_t size) {
   if (size == 0 || std::memcmp(a, b, size * sizeof(Number)) == 0) return true;
@@ -559,49 +342,32 @@ bool same(const Number* a, const Number* b, size_t size) {
   return false;
 }
 
-// The name of the first result of which the first numbers, as many as `share(name, size in a, size in b)`, differ; or
-// nullptr.
+// The name of the first result of which the first numbers, as many as `share(name, size in a, size in b)`, differ; or "".
 template <class T, class Share>
 const char* compare(const Results<T>& a, const Results<T>& b, const Share& share) {
-  struct Array {
-    const void* data;
-    size_t size;
-  } arrays[64];
-  size_t count = 0;
-  const char* different = nullptr;
-  a.for_each([&](const char*, const auto& values) { arrays[count++] = {values.data(), values.size()}; });
-  count = 0;
-  b.for_each([&](const char* name, const auto& values) {
-    const Array other = arrays[count++];
-    const size_t size = share(name, other.size, values.size());
-    using Number = std::decay_t<decltype(values[0])>;
-    if (!different && (size == kDifferent || !same(static_cast<const Number*>(other.data), values.data(), size)))
-      different = name;
-  });
+  const char* different = "";
+  const auto list = [&](const auto& these, const auto& others) {
+    for (size_t n = 0; n < these.arrays.size(); ++n) {
+      const auto &x = these.arrays[n].values, &y = others.arrays[n].values;
+      const size_t size = share(string_view(these.arrays[n].name), x.size(), y.size());
+      if (!*different && (size == kDifferent || !same(x.data(), y.data(), size))) different = these.arrays[n].name;
+    }
+  };
+  std::apply([&](const auto&... these) { (list(these, std::get<std::decay_t<decltype(these)>>(b.lists)), ...); }, a.lists);
   return different;
+}
+
+size_t if_equal(size_t a, size_t b) { return a == b ? a : kDifferent; }
+
+bool is_one_of(string_view name, std::initializer_list<string_view> names) {
+  return std::find(names.begin(), names.end(), name) != names.end();
 }
 
 }  // namespace
 
 template <class T>
-void run_stages(const Scene<T>& scene, int num_threads, Results<T>& r) {
-  resize(r.face_index, scene.pixels());
-  std::fill(r.face_index.begin(), r.face_index.end(), std::numeric_limits<int32_t>::min());
-  rasterize(
-      Rasterize<T>{scene.mesh(), {scene.raster(), scene.fill_back, scene.near, scene.far}, r.face_index.data(), num_threads});
-  run_surfaces(scene, r, num_threads);
-  if (scene.foreign_face_index) make_up_face_index(scene, r.face_index);
-  run_clip(scene, r, num_threads);
-  run_silhouette(scene, r, num_threads);
-  run_fragments(scene, r, num_threads);
-  run_shading(scene, r, num_threads);
-  run_texture_images(scene, r, num_threads);
-  run_lights(scene, r, num_threads);
-  run_edges(scene, r, num_threads);
-  run_camera(scene, r, num_threads);
-  run_pose(scene, r);
-  run_smoothness(scene, r, num_threads);
-  run_voxels(scene, r, num_threads);
+void run_stages(const Scene<T>& scene, int num_threads, Results<T>& results) {
+  Run<T>{scene, results, num_threads}.all();
 }
 
 template <class T>
@@ -636,145 +402,138 @@ Scene<T> first_image(const Scene<T>& scene) {
 
 template <class T>
 const char* first_difference(const Results<T>& a, const Results<T>& b) {
-  return compare(a, b,
-                 [](const char*, size_t size_a, size_t size_b) { return size_a == size_b ? size_a : kDifferent; });
+  return compare(a, b, [](string_view, size_t size_a, size_t size_b) { return if_equal(size_a, size_b); });
 }
 
 template <class T>
 const char* depends_on_company(const Scene<T>& scene, const Results<T>& together, const Results<T>& alone) {
-  const bool shared = !scene.per_image_values && !scene.packed();
-  return compare(together, alone, [&](const char* name, size_t, size_t size) {
-    const std::string_view which = name;
-    if (which == "pose" || which == "grad_forward" || which == "grad_up") return size_t(0);  // not of an image
-    if (scene.packed() && (which == "loss" || which == "grad_loss")) return size_t(0);
-    if (shared && (which == "grad_textures" || which == "grad_attributes" || which == "grad_uv")) return size_t(0);
-    if (!scene.per_image_values && which == "grad_sampled_texels") return size_t(0);
-    if (which == "grad_lights") return size_t(0);
-    return size;
+  return compare(together, alone, [&](string_view name, size_t, size_t size) {
+    const bool summed =
+        is_one_of(name, {"pose", "grad_forward", "grad_up", "grad_lights"}) ||
+        (scene.packed() && is_one_of(name, {"loss", "grad_loss_vertices"})) ||
+        (!scene.per_image_values && name == "grad_sampled_texels") ||
+        (!scene.per_image_values && !scene.packed() && is_one_of(name, {"grad_textures", "grad_attributes", "grad_uv"}));
+    return summed ? 0 : size;
   });
 }
 
 template <class T>
 const char* depends_on_packing(const Results<T>& stacked, const Results<T>& packed) {
-  return compare(stacked, packed, [](const char* name, size_t size_a, size_t size_b) {
-    const std::string_view which = name;
-    if (which == "loss" || which == "grad_loss") return size_t(0);
-    return size_a == size_b ? size_a : kDifferent;
+  return compare(stacked, packed, [](string_view name, size_t size_a, size_t size_b) {
+    return is_one_of(name, {"loss", "grad_loss_vertices"}) ? 0 : if_equal(size_a, size_b);
   });
 }
 
 template <class T>
 const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
+  const char* broken = "";
+  const auto check = [&broken](bool holds, const char* sentence) {
+    if (!holds && !*broken) broken = sentence;
+  };
+  const auto check_all = [&](std::initializer_list<const char*> names, const auto& holds, const char* sentence) {
+    for (const char* name : names)
+      for (T x : r.get(name)) check(holds(x), sentence);
+  };
   const MeshBatch<T> mesh = scene.mesh();
   const Size raster = scene.raster(), image = scene.image;
-  const int64_t H = raster.height, W = raster.width, C = scene.channels;
-  for (int64_t b = 0; b < scene.batch; ++b) {
-    const int64_t F = mesh.face_count(b), limit = scene.fill_back || scene.foreign_face_index ? 2 * F : F;
-    const int32_t* face_index = r.face_index.data() + b * raster.pixels();
-    for (int64_t n = 0; n < raster.pixels(); ++n) {
-      const int32_t id = face_index[n];
-      if (id < -1 || id >= limit) return "face_index names a face of its image, or -1";
-      if (id < 0 || scene.foreign_face_index) continue;
-      const int64_t* face = mesh.image_faces(b) + 3 * (id % F);
-      const T x = static_cast<T>(2 * (n % W) + 1 - W) / static_cast<T>(W),
-              y = static_cast<T>(H - 1 - 2 * (n / W)) / static_cast<T>(H);
-      bool left = false, right = false, above = false, below = false;
-      for (int k = 0; k < 3; ++k) {
-        const T* v = mesh.image_vertices(b) + 3 * face[k];
-        if (!std::isfinite(v[0]) || !std::isfinite(v[1]) || std::isnan(v[2]))
-          return "a face with a NaN or an infinite x or y is not drawn";
-        left |= v[0] <= x;
-        right |= v[0] >= x;
-        below |= v[1] <= y;
-        above |= v[1] >= y;
-      }
-      if (!(left && right && above && below)) return "a face covers no centre outside its bounding box";
-    }
-    for (int64_t n = 0; n < image.pixels(); ++n) {
-      const int32_t* pixel =
-          scene.anti_aliasing ? face_index + 2 * (n / image.width) * W + 2 * (n % image.width) : face_index + n;
-      const int covered = scene.anti_aliasing
-                              ? (pixel[0] >= 0) + (pixel[1] >= 0) + (pixel[W] >= 0) + (pixel[W + 1] >= 0)
-                              : 4 * (pixel[0] >= 0);
-      if (r.alpha[b * image.pixels() + n] != T(covered) / 4) return "alpha is the covered share of a pixel";
-    }
-  }
-  if (const char* broken = broken_clip(scene, r)) return broken;
-  const size_t layers = r.face_index.empty() ? 0 : r.layers.size() / r.face_index.size();
-  for (size_t n = 0; n < r.layers.size(); ++n) {
-    const int32_t id = r.layers[n],
-                  F = static_cast<int32_t>(mesh.face_count(static_cast<int64_t>(n / layers) / raster.pixels()));
-    if (id < -1 || id >= (scene.fill_back ? 2 * F : F)) return "a layer names a face of its image, or -1";
-    if (n % layers > 0 && id >= 0 && (r.layers[n - 1] < 0 || r.layers[n - 1] == id))
-      return "layers are different faces, then -1";
-    if (n % layers == 0 && !scene.foreign_face_index && id != r.face_index[n / layers])
-      return "the first layer is the face index map";
-  }
-  for (T clear : r.clear)
-    if (!(clear >= 0 && clear <= 1)) return "a soft silhouette lies in [0, 1]";
-  for (T x : r.normals)
-    if (!(std::abs(x) <= T(1.00001))) return "a normal has the length 1 or 0";
-  for (const std::vector<unsigned char>* voxels : {&r.voxels, &r.touched_voxels})
-    for (unsigned char cell : *voxels)
-      if (cell > 1) return "a cell is filled or empty";
-  for (size_t n = 0; n < r.points.size(); ++n)
-    if (n % 3 == 2 ? !std::isfinite(r.points[n]) : std::isnan(r.points[n]))
-      return "a projected vertex has a depth and a place, or is at infinity";
-  for (size_t n = 0; n < r.pose.size(); ++n)
-    if (std::isfinite(r.pose[n]) != std::isfinite(r.pose[n - n % 12]) || std::isinf(r.pose[n]))
-      return "a pose is finite or all NaN";
-  for (size_t n = 0; n < r.depth.size(); ++n) {
-    if (r.face_index[n] >= 0) continue;
-    if (r.depth[n] != scene.far) return "the background's depth is far";
-    for (int k = 0; k < 3; ++k)
-      if (r.weights[3 * n + k] != 0) return "the background's weights are 0";
-    for (int64_t c = 0; c < C && !r.values.empty(); ++c)
-      if (r.values[C * n + c] != 0 || r.colors[C * n + c] != 0 || r.sampled[C * n + c] != 0 ||
-          r.lit[3 * n + c % 3] != 0)
-        return "the background's colours are 0";
-  }
-  for (T level : r.level)
-    if (!(level >= 0 && level <= 2)) return "a mipmap level is one that there is";
-  for (const auto* grad : {&r.grad_silhouette, &r.grad_local, &r.grad_edges, &r.grad_soft})
-    for (size_t n = 2; n < grad->size(); n += 3)
-      if ((*grad)[n] != 0) return "the gradients of silhouettes and edges have no z";
-  if (!scene.hostile_upstream) {
-    if (!all_finite(r.grad_local)) return "the silhouette's local gradient is finite";
-    if (!scene.foreign_face_index && !all_finite(r.grad_silhouette)) return "the silhouette's gradient is finite";
-    if (!scene.foreign_face_index && !all_finite(r.grad_edges)) return "the edges' gradient is finite";
-    for (const auto* grad :
-         {&r.grad_world, &r.grad_matrix, &r.grad_intrinsics, &r.grad_distortion, &r.grad_origin, &r.grad_extent})
-      if (!all_finite(*grad)) return "the gradient of the projection is finite";
-    if (!all_finite(r.grad_soft)) return "the soft silhouette's gradient is finite";
-    if (!all_finite(r.grad_forward) || !all_finite(r.grad_up)) return "the gradient of a pose is finite";
-  }
-  if (scene.foreign_face_index || !is_tame(scene)) return nullptr;
+  const int64_t H = raster.height, W = raster.width;
+  const bool foreign = scene.foreign_face_index;
+  const std::vector<int32_t>&face_index = r.template get<int32_t>("face_index"), &layers = r.template get<int32_t>("layers");
 
-  for (size_t n = 0; n < r.depth.size(); ++n) {
-    if (r.face_index[n] < 0) continue;
-    const T* w = r.weights.data() + 3 * n;
-    if (!(std::abs(w[0] + w[1] + w[2] - 1) <= T(1e-4))) return "the weights of a covered pixel sum to 1";
-    if (!(r.depth[n] > scene.near * T(0.99) && r.depth[n] < scene.far * T(1.01)))
-      return "a covered pixel's depth lies between near and far";
+  for (size_t n = 0; n < face_index.size(); ++n) {
+    const int64_t b = static_cast<int64_t>(n) / raster.pixels(), x = static_cast<int64_t>(n) % W, y = static_cast<int64_t>(n) / W % H;
+    const int64_t F = mesh.face_count(b), id = face_index[n];
+    check(id >= -1 && id < (scene.fill_back || foreign ? 2 * F : F), "face_index names a face of its image, or -1");
+    if (id < 0 || foreign || *broken) continue;
+    const T centre[2] = {static_cast<T>(2 * x + 1 - W) / static_cast<T>(W), static_cast<T>(H - 1 - 2 * y) / static_cast<T>(H)};
+    bool below[2] = {false, false}, above[2] = {false, false};
+    for (int k = 0; k < 3; ++k) {
+      const T* v = mesh.image_vertices(b) + 3 * mesh.image_faces(b)[3 * (id % F) + k];
+      check(std::isfinite(v[0]) && std::isfinite(v[1]) && !std::isnan(v[2]), "a face that is not finite is not drawn");
+      for (int axis = 0; axis < 2; ++axis) below[axis] |= v[axis] <= centre[axis], above[axis] |= v[axis] >= centre[axis];
+    }
+    check(below[0] && below[1] && above[0] && above[1], "a face covers no centre outside its bounding box");
   }
-  const char* not_finite = nullptr;
-  if (scene.hostile_upstream) return nullptr;
-  r.for_each([&](const char* name, const auto& values) {
-    if constexpr (std::is_same_v<std::decay_t<decltype(values[0])>, T>)
-      if (!not_finite && &values != &r.points && &values != &r.pose &&
-          !(scene.no_grad_weights && &values == &r.grad_uv_weights) && !all_finite(values))
-        not_finite = name;
-  });
-  return not_finite;
+  for (int64_t n = 0; n < scene.batch * image.pixels(); ++n) {
+    const int64_t step = scene.anti_aliasing ? 2 : 1, b = n / image.pixels(), y = n / image.width % image.height, x = n % image.width;
+    int covered = 0;
+    for (int64_t k = 0; k < step * step; ++k)
+      covered += face_index[b * raster.pixels() + (step * y + k / step) * W + step * x + k % step] >= 0;
+    check(r.get("alpha")[n] == T(covered) / T(step * step), "alpha is the covered share of a pixel");
+  }
+  const size_t count = face_index.empty() ? 0 : layers.size() / face_index.size();
+  for (size_t n = 0; n < layers.size(); ++n) {
+    const int64_t id = layers[n], F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
+    check(id >= -1 && id < (scene.fill_back ? 2 * F : F), "a layer names a face of its image, or -1");
+    if (n % count > 0) check(id < 0 || (layers[n - 1] >= 0 && layers[n - 1] != id), "layers are different faces, then -1");
+    if (n % count == 0 && !foreign) check(id == face_index[n / count], "the first layer is the face index map");
+  }
+
+  const std::vector<int64_t>&starts = r.template get<int64_t>("clip_starts"), &corners = r.template get<int64_t>("clip_corners");
+  for (int64_t b = 0; b < scene.batch; ++b) {
+    const int64_t V = mesh.vertex_count(b), F = mesh.face_count(b), first = mesh.vertex_start(b), P = starts[2 * b + 2] - starts[2 * b];
+    for (int64_t f = starts[2 * b + 1]; f < starts[2 * b + 3]; ++f) {
+      const int64_t source = r.template get<int32_t>("clip_source")[f];
+      check(source >= 0 && source < std::max<int64_t>(F, 1), "a drawn face is part of a face");
+      for (int64_t n = 3 * f; n < 3 * f + 3; ++n) {
+        const int64_t v = r.template get<int64_t>("clip_faces")[n];
+        check(V == 0 || (v >= 0 && v < V + P), "a corner of a drawn face is a vertex or a new vertex");
+        check(corners[n] >= 0 && corners[n] < 3 + std::max<int64_t>(P, 1), "a corner of a drawn face lies on its face");
+      }
+    }
+    for (int64_t n = 4 * starts[2 * b]; n < 4 * starts[2 * b + 2] && F > 0; ++n) {
+      const int64_t end = r.template get<int64_t>("clip_ends")[n];
+      check(n % 4 < 2 ? end >= first && end < first + V : end >= 0 && end <= 2, "a new vertex lies between two corners");
+    }
+  }
+
+  check_all({"clear"}, [](T x) { return x >= 0 && x <= 1; }, "a soft silhouette lies in [0, 1]");
+  check_all({"normals"}, [](T x) { return std::abs(x) <= T(1.00001); }, "a normal has the length 1 or 0");
+  check_all({"level"}, [](T x) { return x >= 0 && x <= 2; }, "a mipmap level is one that there is");
+  for (const char* name : {"voxels", "touched"})
+    for (unsigned char cell : r.template get<unsigned char>(name)) check(cell <= 1, "a cell is filled or empty");
+  const std::vector<T>&points = r.get("points"), &pose = r.get("pose"), &depth = r.get("depth"), &weights = r.get("weights");
+  for (size_t n = 0; n < points.size(); ++n)
+    check(n % 3 == 2 ? std::isfinite(points[n]) : !std::isnan(points[n]), "a projected vertex has a depth and a place, or is at infinity");
+  for (size_t n = 0; n < pose.size(); ++n)
+    check(std::isfinite(pose[n]) == std::isfinite(pose[n - n % 12]) && !std::isinf(pose[n]), "a pose is finite or all NaN");
+  for (const char* name : {"grad_silhouette", "grad_local", "grad_edges", "grad_soft"})
+    for (size_t n = 2; n < r.get(name).size(); n += 3) check(r.get(name)[n] == 0, "the gradients of silhouettes and edges have no z");
+  const auto background_is_0 = [&](const char* name, size_t n) {
+    const size_t channels = r.get(name).size() / depth.size();
+    for (size_t c = 0; c < channels; ++c) check(r.get(name)[channels * n + c] == 0, "the background's weights and colours are 0");
+  };
+  const bool tame = !foreign && is_tame(scene);
+  for (size_t n = 0; n < depth.size(); ++n) {
+    if (face_index[n] < 0) {
+      check(depth[n] == scene.far, "the background's depth is far");
+      for (const char* name : {"weights", "values", "colors", "sampled", "lit"}) background_is_0(name, n);
+    } else if (tame) {
+      const T* w = weights.data() + 3 * n;
+      check(std::abs(w[0] + w[1] + w[2] - 1) <= T(1e-4), "the weights of a covered pixel sum to 1");
+      check(depth[n] > scene.near * T(0.99) && depth[n] < scene.far * T(1.01), "a covered pixel's depth lies between near and far");
+    }
+  }
+  if (scene.hostile_upstream) return broken;
+
+  const auto finite = [](T x) { return std::isfinite(x); };
+  check_all({"grad_local", "grad_world", "grad_matrix", "grad_intrinsics", "grad_distortion", "grad_origin", "grad_extent",
+             "grad_soft", "grad_forward", "grad_up", "iou", "grad_prediction", "grad_target"},
+            finite, "a gradient is finite");
+  if (!foreign) check_all({"grad_silhouette", "grad_edges"}, finite, "a gradient of edges is finite");
+  if (!tame) return broken;
+  for (const auto& array : std::get<Arrays<T>>(r.lists).arrays)
+    if (!is_one_of(array.name, {"points", "pose"})) check(all_finite(array.values), array.name);
+  return broken;
 }
 
-#define NMR_INSTANTIATE(T)                                                                                 \
-  template void run_stages(const Scene<T>&, int, Results<T>&);                                             \
-  template Scene<T> packed(const Scene<T>&);                                                               \
-  template Scene<T> first_image(const Scene<T>&);                                                          \
-  template const char* first_difference(const Results<T>&, const Results<T>&);                             \
-  template const char* depends_on_company(const Scene<T>&, const Results<T>&, const Results<T>&);          \
-  template const char* depends_on_packing(const Results<T>&, const Results<T>&);                           \
+#define NMR_INSTANTIATE(T)                                                                        \
+  template void run_stages(const Scene<T>&, int, Results<T>&);                                    \
+  template Scene<T> packed(const Scene<T>&);                                                      \
+  template Scene<T> first_image(const Scene<T>&);                                                 \
+  template const char* first_difference(const Results<T>&, const Results<T>&);                    \
+  template const char* depends_on_company(const Scene<T>&, const Results<T>&, const Results<T>&); \
+  template const char* depends_on_packing(const Results<T>&, const Results<T>&);                  \
   template const char* broken_promise(const Scene<T>&, const Results<T>&);
 NMR_INSTANTIATE(float)
 NMR_INSTANTIATE(double)

@@ -2,9 +2,11 @@
 // target and the instruction count.
 #pragma once
 
-#include <algorithm>
 #include <cstdint>
+#include <cstring>
+#include <deque>
 #include <limits>
+#include <tuple>
 #include <vector>
 
 #include "../../csrc/stages.h"
@@ -21,37 +23,6 @@ inline double noise(uint64_t seed, uint64_t index) {
 }
 
 template <class T>
-std::vector<T> noise_array(uint64_t seed, int64_t size) {
-  std::vector<T> values(size);
-  for (int64_t n = 0; n < size; ++n) values[n] = static_cast<T>(noise(seed, n));
-  return values;
-}
-
-// Sizes an array that is used for scene after scene. It keeps its storage, but in sanitizer builds has exactly this
-// size, so that accesses beyond it are seen.
-template <class T>
-void resize(std::vector<T>& values, int64_t size) {
-#ifdef NMR_FRESH_SCRATCH
-  if (values.capacity() != static_cast<size_t>(size)) std::vector<T>().swap(values);
-#endif
-  values.resize(size);
-}
-
-// Memory that a stage must overwrite: what stays NaN was forgotten.
-template <class T>
-void unwritten(std::vector<T>& values, int64_t size) {
-  resize(values, size);
-  std::fill(values.begin(), values.end(), std::numeric_limits<T>::quiet_NaN());
-}
-
-template <class T>
-std::vector<T> unwritten(int64_t size) {
-  return std::vector<T>(size, std::numeric_limits<T>::quiet_NaN());
-}
-
-inline Size square(int64_t size) { return {size, size}; }
-
-template <class T>
 struct Scene {
   int64_t batch = 0, num_vertices = 0, num_faces = 0;  // as in MeshBatch: packed, the sums over all meshes
   bool faces_per_image = false;
@@ -59,117 +30,79 @@ struct Scene {
   std::vector<int64_t> faces;
   std::vector<int64_t> starts;  // empty unless packed
 
-  Size image = square(8);
+  Size image{8, 8};
   bool anti_aliasing = true, fill_back = true;
   T near = T(0.1), far = T(100), eps = T(1e-4);
   int64_t channels = 3, texture_size = 2, grid_size = 4;
-  bool per_image_values = false;  // textures and attributes of each image, not shared
+  bool per_image_values = false;              // textures and attributes of each image, not shared
   bool perspective = true, distorted = true;  // the camera; undistorted ones have an origin and an extent
-  bool foreign_face_index = false;            // backward stages get a made-up face index map: any in range is allowed
-  bool hostile_upstream = false;  // NaN, infinities and huge numbers among the upstream gradients
   bool no_grad_weights = false, no_grad_depth = false;  // optional upstream gradients and results of a backward stage
-  uint64_t seed = 1;           // of textures, attributes, cameras and upstream gradients
+  bool foreign_face_index = false;                // backward stages get a made-up face index map: any in range is allowed
+  const int32_t* given_face_index = nullptr;      // or this one
+  bool hostile_upstream = false;                  // NaN, infinities and huge numbers among the upstream gradients
+  const char* poisoned = nullptr;                 // the upstream gradient that is NaN in the first image
+  uint64_t seed = 1;                              // of textures, attributes, cameras and upstream gradients
 
   bool packed() const { return !starts.empty(); }
   Size raster() const { return raster_of(image, anti_aliasing); }
-  int64_t raster_size() const { return raster().width; }  // of a square raster
   int64_t pixels() const { return batch * raster().pixels(); }
+  int64_t rows() const { return packed() ? num_vertices : batch * num_vertices; }  // of vertices
   MeshBatch<T> mesh() const {
-    return {vertices.data(),
-            faces.data(),
-            batch,
-            num_vertices,
-            num_faces,
-            faces_per_image,
-            packed() ? starts.data() : nullptr};
+    const int64_t* first = packed() ? starts.data() : nullptr;
+    return {vertices.data(), faces.data(), batch, num_vertices, num_faces, faces_per_image, first};
   }
   void add_start() {  // of the next packed mesh, or the end
     starts.push_back(num_vertices);
     starts.push_back(num_faces);
   }
-  int64_t rows() const { return packed() ? num_vertices : batch * num_vertices; }  // of vertices
 };
 
+// Arrays by name. An array keeps its storage from scene to scene, but in sanitizer builds has exactly the size asked
+// for, so that accesses beyond it are seen.
+template <class Number>
+struct Arrays {
+  struct Array {
+    const char* name;
+    std::vector<Number> values;
+  };
+  std::deque<Array> arrays;
+
+  std::vector<Number>& get(const char* name) {
+    for (Array& array : arrays)
+      if (array.name == name || std::strcmp(array.name, name) == 0) return array.values;
+    return arrays.emplace_back(Array{name, {}}).values;
+  }
+  std::vector<Number>& resize(const char* name, int64_t size) {
+    std::vector<Number>& values = get(name);
+#ifdef NMR_FRESH_SCRATCH
+    if (values.capacity() != static_cast<size_t>(size)) std::vector<Number>().swap(values);
+#endif
+    values.resize(size);
+    return values;
+  }
+};
+
+// What the stages computed.
 template <class T>
 struct Results {
-  std::vector<int32_t> face_index;
-  std::vector<int64_t> clip_counts, clip_starts, clip_faces, clip_corners, clip_ends;
-  std::vector<int32_t> clip_source;
-  std::vector<T> alpha, grad_silhouette, grad_local;
-  std::vector<T> weights, depth, grad_fragments;
-  std::vector<T> depth_image, grad_depth;
-  std::vector<T> colors, grad_textures;
-  std::vector<T> values, grad_attributes, grad_weights;
-  std::vector<T> pyramid, grad_texels, level, sampled, grad_sampled_texels, grad_uv, grad_uv_weights;
-  std::vector<T> normals, grad_normals_vertices, lit, grad_lit_colors, grad_lit_normals, grad_lights, grad_lit_vertices,
-      grad_lit_weights;
-  std::vector<int32_t> layers;
-  std::vector<T> clear, grad_soft;
-  std::vector<T> resolved, grad_image, grad_background;
-  std::vector<T> grad_edges;
-  std::vector<T> points, grad_world, grad_matrix, grad_intrinsics, grad_distortion, grad_origin, grad_extent;
-  std::vector<T> pose, grad_forward, grad_up;
-  std::vector<T> loss, grad_loss;
-  std::vector<unsigned char> voxels, touched_voxels;
+  using Lists = std::tuple<Arrays<T>, Arrays<int32_t>, Arrays<int64_t>, Arrays<unsigned char>>;
+  mutable Lists lists;
+  Arrays<T> inputs;
+  Arrays<int64_t> tables;
+  Arrays<double> areas;
 
-  template <class Visit>
-  void for_each(const Visit& visit) const {
-    visit("face_index", face_index);
-    visit("clip_counts", clip_counts);
-    visit("clip_starts", clip_starts);
-    visit("clip_faces", clip_faces);
-    visit("clip_corners", clip_corners);
-    visit("clip_ends", clip_ends);
-    visit("clip_source", clip_source);
-    visit("alpha", alpha);
-    visit("grad_silhouette", grad_silhouette);
-    visit("grad_local", grad_local);
-    visit("weights", weights);
-    visit("depth", depth);
-    visit("grad_fragments", grad_fragments);
-    visit("depth_image", depth_image);
-    visit("grad_depth", grad_depth);
-    visit("colors", colors);
-    visit("grad_textures", grad_textures);
-    visit("values", values);
-    visit("grad_attributes", grad_attributes);
-    visit("grad_weights", grad_weights);
-    visit("pyramid", pyramid);
-    visit("grad_texels", grad_texels);
-    visit("level", level);
-    visit("sampled", sampled);
-    visit("grad_sampled_texels", grad_sampled_texels);
-    visit("grad_uv", grad_uv);
-    visit("grad_uv_weights", grad_uv_weights);
-    visit("normals", normals);
-    visit("grad_normals_vertices", grad_normals_vertices);
-    visit("lit", lit);
-    visit("grad_lit_colors", grad_lit_colors);
-    visit("grad_lit_normals", grad_lit_normals);
-    visit("grad_lights", grad_lights);
-    visit("grad_lit_vertices", grad_lit_vertices);
-    visit("grad_lit_weights", grad_lit_weights);
-    visit("layers", layers);
-    visit("clear", clear);
-    visit("grad_soft", grad_soft);
-    visit("resolved", resolved);
-    visit("grad_image", grad_image);
-    visit("grad_background", grad_background);
-    visit("grad_edges", grad_edges);
-    visit("points", points);
-    visit("grad_world", grad_world);
-    visit("grad_matrix", grad_matrix);
-    visit("grad_intrinsics", grad_intrinsics);
-    visit("grad_distortion", grad_distortion);
-    visit("grad_origin", grad_origin);
-    visit("grad_extent", grad_extent);
-    visit("pose", pose);
-    visit("grad_forward", grad_forward);
-    visit("grad_up", grad_up);
-    visit("loss", loss);
-    visit("grad_loss", grad_loss);
-    visit("voxels", voxels);
-    visit("touched_voxels", touched_voxels);
+  template <class Number = T>
+  const std::vector<Number>& get(const char* name) const {
+    return std::get<Arrays<Number>>(lists).get(name);
+  }
+  // Memory that a stage must overwrite: NaN or an impossible number remains if it was forgotten.
+  template <class Number = T>
+  Number* out(const char* name, int64_t size) {
+    using Limits = std::numeric_limits<Number>;
+    constexpr Number kUnwritten = Limits::has_quiet_NaN ? Limits::quiet_NaN() : Limits::is_signed ? Limits::min() : Limits::max();
+    std::vector<Number>& values = std::get<Arrays<Number>>(lists).resize(name, size);
+    values.assign(size, kUnwritten);
+    return values.data();
   }
 };
 
@@ -192,21 +125,20 @@ Scene<T> packed(const Scene<T>& scene);
 template <class T>
 Scene<T> first_image(const Scene<T>& scene);
 
-// The name of the first result that differs in a bit, or nullptr. Any NaN is a NaN.
+// Comparisons bit by bit (any NaN is a NaN) give the name of the first result that differs, or "".
+
 template <class T>
 const char* first_difference(const Results<T>& a, const Results<T>& b);
 
-// The name of the first result of first_image(scene) that is not the beginning of the batch's, or nullptr. Sums over
-// the batch are not compared.
+// Whether the results of first_image(scene) are the beginning of the batch's. Sums over the batch are not compared.
 template <class T>
 const char* depends_on_company(const Scene<T>& scene, const Results<T>& together, const Results<T>& alone);
 
-// The name of the first result that packing changed, or nullptr. A packed batch is one mesh to the smoothness loss: not
-// compared.
+// A packed batch is one mesh to the smoothness loss, which is not compared.
 template <class T>
 const char* depends_on_packing(const Results<T>& stacked, const Results<T>& packed);
 
-// What holds for every scene, however hostile; nullptr, or a sentence that says what does not.
+// What holds for every scene, however hostile: "", or a sentence that does not hold.
 template <class T>
 const char* broken_promise(const Scene<T>& scene, const Results<T>& results);
 
