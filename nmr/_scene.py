@@ -28,6 +28,7 @@ from .cameras import Camera
 from .cameras.projection import ProjectingCamera
 from .fragments import Fragments
 from .lights import Lights
+from .ops.raster import RasterSettings
 from .textures import Colors
 
 LARGEST_IMAGE = 8192
@@ -36,7 +37,7 @@ Meshes = Tensor | Sequence[Tensor]
 
 
 class Scene(NamedTuple):
-    """Checked arguments: meshes before and after the camera, and height and width of the raster.
+    """Checked arguments: meshes before and after the camera, and the settings of the render.
 
     If faces cross the near plane, ``clipped`` has the meshes that are drawn. Face index maps are then of these.
     """
@@ -44,63 +45,48 @@ class Scene(NamedTuple):
     world: Tensor
     mesh: MeshBatch
     camera: Camera | None
-    raster: tuple[int, int]
+    settings: RasterSettings
     clipped: Clipped | None = None
 
     @property
     def drawn(self) -> MeshBatch:
         return self.mesh if self.clipped is None else self.clipped.mesh
 
-    def rasterize(self, fill_back: bool, near: float, far: float) -> Tensor:
-        return ops.rasterize(*self.drawn[:3], *self.raster, bool(fill_back), float(near), float(far))
+    def rasterize(self) -> Tensor:
+        settings = self.settings
+        return ops.rasterize(*self.drawn[:3], *settings.raster, *settings[3:6])
 
-    def rasterize_layers(self, layers: int, fill_back: bool, near: float, far: float) -> Tensor:
-        return ops.rasterize_layers(*self.drawn[:3], *self.raster, layers, bool(fill_back), float(near), float(far))
+    def rasterize_layers(self, layers: int) -> Tensor:
+        settings = self.settings
+        return ops.rasterize_layers(*self.drawn[:3], *settings.raster, layers, *settings[3:6])
 
-    def silhouette(
-        self, anti_aliasing: bool, fill_back: bool, near: float, far: float, eps: float, local: bool = False
-    ):
-        height, width = (size // 2 if anti_aliasing else size for size in self.raster)
-        return ops.silhouette(
-            *self.drawn[:3],
-            height,
-            width,
-            bool(anti_aliasing),
-            bool(fill_back),
-            float(near),
-            float(far),
-            float(eps),
-            local,
-        )
+    def silhouette(self, local: bool) -> tuple[Tensor, Tensor]:
+        return ops.silhouette(*self.drawn[:3], *self.settings, local)
 
-    def soft_silhouette(
-        self, anti_aliasing: bool, fill_back: bool, near: float, far: float, sigma: float, dist_eps: float
-    ) -> Tensor:
-        reach = sigma * math.log(1 / dist_eps - 1)
-        settings = bool(fill_back), float(near), float(far), float(sigma), reach
-        clear = ops.soft_silhouette(*self.drawn[:3], *self.raster, *settings)
-        return 1 - average(clear.unsqueeze(-1), anti_aliasing).squeeze(-1)
+    def soft_silhouette(self, sigma: float, dist_eps: float) -> Tensor:
+        settings, reach = self.settings, sigma * math.log(1 / dist_eps - 1)
+        clear = ops.soft_silhouette(*self.drawn[:3], *settings.raster, *settings[3:6], float(sigma), reach)
+        return 1 - average(clear.unsqueeze(-1), settings.anti_aliasing).squeeze(-1)
 
-    def depth(self, face_index: Tensor, anti_aliasing: bool, far: float) -> Tensor:
-        return ops.depth_image(*self.drawn[:3], face_index, bool(anti_aliasing), float(far))
+    def depth(self, face_index: Tensor) -> Tensor:
+        return ops.depth_image(*self.drawn[:3], face_index, self.settings.anti_aliasing, self.settings.far)
 
-    def fragments(self, face_index: Tensor, anti_aliasing: bool, far: float, eps: float) -> Fragments:
+    def fragments(self, face_index: Tensor) -> Fragments:
         """Those of a face index map ``[B, H, W]``, or of layers ``[B, H, W, K]``."""
         if face_index.ndim == 4:
-            layers = [self._weights_and_depth(layer, far) for layer in face_index.unbind(-1)]
+            layers = [self._weights_and_depth(layer) for layer in face_index.unbind(-1)]
             weights, depth = (torch.stack(x, dim=3) for x in zip(*layers, strict=True))
         else:
-            weights, depth = self._weights_and_depth(face_index, far)
-        drawn, drawn_face_index = self.drawn, face_index
+            weights, depth = self._weights_and_depth(face_index)
+        drawn_face_index = face_index
         if self.clipped is not None:
             face_index = self.clipped.face_index(face_index)
-        settings = bool(anti_aliasing), float(eps)
-        return Fragments(
-            face_index, weights, depth, self.mesh, self.world, self.camera, *settings, drawn, drawn_face_index
-        )
+        anti_aliasing, eps = self.settings.anti_aliasing, self.settings.eps
+        shown = face_index, weights, depth, self.mesh, self.world, self.camera
+        return Fragments(*shown, anti_aliasing, eps, self.drawn, drawn_face_index)
 
-    def _weights_and_depth(self, face_index: Tensor, far: float) -> tuple[Tensor, Tensor]:
-        weights, depth = ops.fragments(*self.drawn[:3], face_index, float(far))
+    def _weights_and_depth(self, face_index: Tensor) -> tuple[Tensor, Tensor]:
+        weights, depth = ops.fragments(*self.drawn[:3], face_index, self.settings.far)
         return weights if self.clipped is None else self.clipped.weights(face_index, weights), depth
 
     def face_index(self, face_index: Tensor) -> Tensor:
@@ -115,6 +101,7 @@ def make_scene(
     camera: Camera | None,
     image_size: int | tuple[int, int],
     anti_aliasing: bool,
+    fill_back: bool,
     near: float,
     far: float,
     clip: bool,
@@ -139,9 +126,9 @@ def make_scene(
     mesh = mesh._replace(faces=check_faces(mesh.faces, mesh.batch, mesh.vertices.device))
     check_depth_range(near, far, mesh.vertices.dtype)
     check_eps(eps, mesh.vertices.dtype)
-    scale = 2 if anti_aliasing else 1
     clipped = clip_near(world, mesh, camera, near, far) if clip else None
-    return Scene(world, mesh, camera, (scale * height, scale * width), clipped)
+    settings = RasterSettings(height, width, bool(anti_aliasing), bool(fill_back), float(near), float(far), float(eps))
+    return Scene(world, mesh, camera, settings, clipped)
 
 
 def shade(

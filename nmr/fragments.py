@@ -206,54 +206,16 @@ class Fragments:
             matrix, intrinsics, _, origin, _ = (x if x is None else x.detach() for x in projection.parameters())
             viewer = ops.viewer_of(matrix, intrinsics, origin, projection.perspective)
             return viewer.to(self.weights).expand(batch, 5)
-        side = torch.where(self._probe_right_handed(), -1.0, 1.0).to(self.weights)
         eye = getattr(self.camera, "eye", None)
         if eye is None and needs_eye:
             raise ValueError(
                 "highlights need the eye of the camera: "
                 f"give {type(self.camera).__name__} an attribute eye, [3] or [B, 3], in world space"
             )
-        eye = side.new_zeros(1, 3) if eye is None else as_floats(eye, "eye", "[3] or [B, 3]").detach().to(side)
+        eye = as_floats((0.0, 0.0, 0.0) if eye is None else eye, "eye", "[3] or [B, 3]").detach().to(self.weights)
         eye = eye.reshape(-1, 3).expand(batch, 3)
-        return torch.cat([eye, torch.ones_like(side), side], dim=1)
-
-    def _probe_right_handed(self) -> Tensor:
-        """Whether a camera that is not one of nmr's sees a right-handed world: bool ``[B, 1]``.
-
-        Tested by transforming three short perpendicular edges at the farthest point that is seen. They are tried in
-        several lengths; the longest counts that lies in front of the eye as a whole.
-        """
-        with torch.no_grad():
-            batch, pixels = self.sided_face_index.shape[0], self.sided_face_index.shape[1:].numel()
-            depth = torch.where(self.covered, self.depth, -1.0).reshape(batch, pixels)
-            farthest = depth.argmax(1)
-            images = torch.arange(batch, device=self.sided_face_index.device)
-            weights = self.weights.reshape(batch, pixels, 3)[images, farthest]
-            face_index = self.sided_face_index.reshape(batch, pixels)[images, farthest]
-            world = usable(self.world)
-            at = weights.view(batch, 1, 1, 3), self.mesh.starts
-            point = ops.interpolate(world, self.faces, face_index.view(batch, 1, 1).contiguous(), *at).view(batch, 1, 3)
-            if self.mesh.starts is None:
-                extent = (world.amax(1) - world.amin(1)).amax(-1) if world.shape[1] else world.new_ones(len(world))
-            else:
-                parts = world.split(self.mesh.vertex_counts)
-                extent = torch.stack([(v.amax(0) - v.amin(0)).amax() if len(v) else v.new_ones(()) for v in parts])
-            corners = torch.cat([world.new_zeros(1, 3), torch.eye(3, dtype=world.dtype, device=world.device)])
-            lengths = 10.0 ** torch.arange(-1, -6, -1, dtype=world.dtype, device=world.device)
-            steps = extent.view(-1, 1, 1, 1) * lengths.view(1, -1, 1, 1) * corners  # [B or 1, lengths, 4, 3]
-            probes = (point.unsqueeze(1) + steps).flatten(1, 2)
-            if self.mesh.starts is None:
-                seen = self.camera.transform(probes)
-            else:
-                starts = probes.shape[1] * torch.arange(batch + 1, device="cpu").view(-1, 1).expand(-1, 2)
-                seen = self.camera.transform(probes.reshape(-1, 3), starts=starts.contiguous())
-            seen = seen.reshape(batch, steps.shape[1], 4, 3)
-            sides = seen[:, :, 1:] - seen[:, :, :1]
-            a, b, c = sides.unbind(2)
-            product = (torch.linalg.cross(a, b, dim=-1) * c).sum(-1)
-            in_front = (seen[..., 2] > 0).all(-1) & product.isfinite() & (product != 0)
-            longest = in_front.int().argmax(1, keepdim=True)  # the first that passes
-            return (product.gather(1, longest) < 0) & in_front.any(1, keepdim=True)
+        side = -1.0 if getattr(self.camera, "right_handed", False) else 1.0
+        return torch.cat([eye, eye.new_tensor([1.0, side]).expand(batch, 2)], dim=1)
 
     def resolve(self, image: Tensor) -> Tensor:
         """The image ``[B, h, w, C]`` of a shaded raster ``[B, H, W, C]``, with NMR's gradient.

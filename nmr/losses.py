@@ -10,7 +10,7 @@ import math
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
+from torch.autograd.forward_ad import unpack_dual
 
 from . import ops
 from ._validate import check_number, check_vertices, describe
@@ -66,7 +66,9 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     _check_mask(target)
     dtype = torch.float64 if prediction.dtype == torch.float64 else torch.float32
     prediction, target = prediction.flatten(1).to(dtype), target.flatten(1).to(dtype)
-    if prediction.is_cpu and target.is_cpu and forward_ad._current_level < 0:
+    compiling = torch.compiler.is_compiling()
+    forward_mode = not compiling and any(unpack_dual(x).tangent is not None for x in (prediction, target))
+    if prediction.is_cpu and target.is_cpu and not forward_mode:
         iou, _ = ops.soft_iou(prediction, target)
     else:
         iou = _soft_iou(prediction, target)

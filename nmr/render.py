@@ -87,7 +87,7 @@ def render(
     if not listed or not outputs or len(set(outputs)) != len(outputs):
         raise ValueError(f"outputs must be a tuple of one or more different names out of {OUTPUTS}, got {outputs!r}")
     check_choice(gradient, "gradient", ("nmr", "local"))
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
     images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the requested order
     white = "rgb" in images and colors is None and lights is None
     if white:
@@ -99,19 +99,19 @@ def render(
             "other rgb images with gradient 'nmr'"
         )
     if white or ("alpha" in images and "rgb" not in images):
-        alpha, face_index = scene.silhouette(anti_aliasing, fill_back, near, far, eps, gradient == "local")
+        alpha, face_index = scene.silhouette(gradient == "local")
         if "alpha" in images:
             images["alpha"] = alpha
         if white:
             covered = alpha.unsqueeze(-1)
             images["rgb"] = covered + (1 - covered) * behind[:, None, None]
     else:
-        face_index = scene.rasterize(fill_back, near, far)
+        face_index = scene.rasterize()
     if "depth" in images:
-        images["depth"] = scene.depth(face_index, anti_aliasing, far)
+        images["depth"] = scene.depth(face_index)
     shaded = "rgb" in images and not white
     if shaded or "normals" in images or "fragments" in images:
-        fragments = scene.fragments(face_index, anti_aliasing, far, eps)
+        fragments = scene.fragments(face_index)
         if shaded:
             image, behind = shade(fragments, colors, lights, background, interpolation_gradient)
             if "alpha" in images:
@@ -282,8 +282,8 @@ def render_silhouette(
     torch.Size([2, 64, 64])
     """
     check_choice(gradient, "gradient", ("nmr", "local"))
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
-    alpha, _ = scene.silhouette(anti_aliasing, fill_back, near, far, eps, gradient == "local")
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
+    alpha, _ = scene.silhouette(gradient == "local")
     return alpha
 
 
@@ -335,13 +335,13 @@ def render_soft_silhouette(
     >>> camera = nmr.LookAt([0.0, 0.0, -5.0])
     >>> soft = nmr.render_soft_silhouette(vertices, faces, camera, sigma=1e-3, image_size=64)
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip)
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip)
     sigma, dist_eps = check_number(sigma, "sigma"), check_number(dist_eps, "dist_eps")
     if not torch.finfo(scene.mesh.vertices.dtype).tiny <= sigma < float("inf"):
         raise ValueError(f"sigma must be positive in {scene.mesh.vertices.dtype} and finite, got {sigma}")
     if not 0 < dist_eps < 0.5:
         raise ValueError(f"dist_eps must lie between 0 and 0.5, got {dist_eps}")
-    return scene.soft_silhouette(anti_aliasing, fill_back, near, far, sigma, dist_eps)
+    return scene.soft_silhouette(sigma, dist_eps)
 
 
 def render_depth(
@@ -380,8 +380,8 @@ def render_depth(
     >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
     >>> depth = nmr.render_depth(vertices, faces, camera, anti_aliasing=False)  # 2 in the middle
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip)
-    return scene.depth(scene.rasterize(fill_back, near, far), anti_aliasing, far)
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip)
+    return scene.depth(scene.rasterize())
 
 
 def render_normals(
@@ -422,8 +422,8 @@ def render_normals(
     >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
     >>> picture = (1 + nmr.render_normals(vertices, faces, camera, smooth=True)) / 2
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip)
-    fragments = scene.fragments(scene.rasterize(fill_back, near, far), anti_aliasing, far, 1e-4)
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip)
+    fragments = scene.fragments(scene.rasterize())
     return average(fragments.normals(smooth), anti_aliasing)
 
 
@@ -475,13 +475,9 @@ def render_fragments(
     >>> layers = nmr.render_fragments(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), faces_per_pixel=2)
     >>> thickness = layers.depth[..., 1] - layers.depth[..., 0]
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, near, far, clip, eps)
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
     layers = check_size(faces_per_pixel, "faces_per_pixel", 1024)
-    if layers == 1:
-        face_index = scene.rasterize(fill_back, near, far)
-    else:
-        face_index = scene.rasterize_layers(layers, fill_back, near, far)
-    return scene.fragments(face_index, anti_aliasing, far, eps)
+    return scene.fragments(scene.rasterize() if layers == 1 else scene.rasterize_layers(layers))
 
 
 @torch.no_grad()
@@ -515,6 +511,5 @@ def render_face_index(
     >>> face_index = nmr.render_face_index(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), image_size=64)
     >>> seen = torch.unique(face_index[face_index >= 0])
     """
-    scene = make_scene(vertices, faces, camera, image_size, False, near, far, clip)
-    face_index = scene.rasterize(fill_back, near, far)
-    return scene.face_index(face_index)
+    scene = make_scene(vertices, faces, camera, image_size, False, fill_back, near, far, clip)
+    return scene.face_index(scene.rasterize())

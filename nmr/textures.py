@@ -222,7 +222,7 @@ class UVTexture:
         if len(image) not in (1, batch):
             raise ValueError(f"image must be one for all {batch} images drawn, or one for each, got {len(image)}")
         sizes = [tuple(part.shape[:2]) for part in image]
-        levels = max(max(size).bit_length() for size in sizes) if self.filter == "mipmap" else 1
+        levels = max([1, *(max(size).bit_length() for size in sizes)]) if self.filter == "mipmap" else 1
         grids, first = [], 0
         for height, width in sizes:
             for _ in range(levels):
@@ -233,7 +233,8 @@ class UVTexture:
             texels = image.reshape(-1, image.shape[-1])
         else:
             texels = torch.cat([part.reshape(-1, part.shape[-1]) for part in image])
-        return texels.to(fragments.weights), torch.tensor(grids, device="cpu").view(len(sizes), levels, 3), first
+        grids = torch.tensor(grids, dtype=torch.int64, device="cpu").view(len(sizes), levels, 3)
+        return texels.to(fragments.weights), grids, first
 
 
 def _each(values: Tensor | tuple[Tensor, ...] | list[Tensor]) -> tuple[Tensor, ...]:

@@ -21,7 +21,8 @@ class Camera(Protocol):
     """The interface of cameras: any object that takes vertices to renderer space, differentiably.
 
     For batches ``[B, V, 3]``, a camera of your own needs only ``transform(vertices)``. For lists of meshes of different
-    sizes, ``transform`` must also take ``starts``.
+    sizes, ``transform`` must also take ``starts``. For normals and light it may have an attribute ``right_handed``,
+    whether the world is right-handed (default: False), and for highlights it needs ``eye``, ``[3]`` or ``[B, 3]``.
     """
 
     def transform(self, vertices: Tensor, starts: Tensor | None = None) -> Tensor:

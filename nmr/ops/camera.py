@@ -17,7 +17,7 @@ def pose(forward: Tensor, up: Tensor) -> Tensor:
     return matrix.to(forward.device)
 
 
-@torch.library.register_fake(pose)
+@torch.library.register_fake(pose.op)
 def _(forward, up):
     return forward.new_empty((forward.shape[0], 3, 4))
 
@@ -42,7 +42,7 @@ def pose_backward(forward: Tensor, up: Tensor, grad_matrix: Tensor) -> tuple[Ten
     return grad_forward.to(forward.device), grad_up.to(up.device)
 
 
-@torch.library.register_fake(pose_backward)
+@torch.library.register_fake(pose_backward.op)
 def _(forward, up, grad_matrix):
     return forward.new_empty(forward.shape), up.new_empty(up.shape)
 
@@ -80,7 +80,7 @@ def _points_shape(vertices, matrix, starts):
     return vertices.shape if starts is not None else (matrix.shape[0], *vertices.shape[1:])
 
 
-@torch.library.register_fake(project)
+@torch.library.register_fake(project.op)
 def _(vertices, matrix, intrinsics, distortion, origin, extent, starts, perspective):
     return vertices.new_empty(_points_shape(vertices, matrix, starts))
 
@@ -120,7 +120,7 @@ def project_backward(
     return tuple((host_empty(0, vertices.dtype) if grad is None else grad).to(vertices.device) for grad in grads)
 
 
-@torch.library.register_fake(project_backward)
+@torch.library.register_fake(project_backward.op)
 def _(vertices, matrix, intrinsics, distortion, origin, extent, starts, perspective, grad_points, wanted):
     inputs = vertices, matrix, intrinsics, distortion, origin, extent
     return tuple(vertices.new_empty(x.shape if want else 0) for x, want in zip(inputs, wanted, strict=True))

@@ -19,7 +19,7 @@ def clip_count(vertices: Tensor, faces: Tensor, starts: Tensor | None, near: flo
     return counts
 
 
-@torch.library.register_fake(clip_count)
+@torch.library.register_fake(clip_count.op)
 def _(vertices, faces, starts, near):
     return vertices.new_empty((batch_size(vertices, starts), 2), dtype=torch.int64, device="cpu")
 
@@ -52,7 +52,7 @@ def clip_faces(
     return tuple(x.to(vertices.device) for x in results)
 
 
-@torch.library.register_fake(clip_faces)
+@torch.library.register_fake(clip_faces.op)
 def _(vertices, faces, starts, near, new_starts, num_new, num_drawn):
     def indices(*shape, dtype=torch.int64):
         return vertices.new_empty(shape, dtype=dtype)

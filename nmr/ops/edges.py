@@ -37,7 +37,7 @@ def resolve(
     return resolved.to(image.device)
 
 
-@torch.library.register_fake(resolve)
+@torch.library.register_fake(resolve.op)
 def _(image, background, vertices, faces, starts, face_index, anti_aliasing, eps):
     return image.new_empty(_image_shape(image, anti_aliasing))
 
@@ -93,7 +93,7 @@ def resolve_backward(
     return grads[0].to(grad_resolved.device), grads[1].to(grad_resolved.device)
 
 
-@torch.library.register_fake(resolve_backward)
+@torch.library.register_fake(resolve_backward.op)
 def _(grad_resolved, background, face_index, anti_aliasing, of_image, of_background):
     shapes = _resolve_grad_shapes(grad_resolved, face_index, of_image, of_background)
     return grad_resolved.new_empty(shapes[0]), grad_resolved.new_empty(shapes[1])
@@ -124,7 +124,7 @@ def edges_backward(
     return grad_vertices.to(vertices.device)
 
 
-@torch.library.register_fake(edges_backward)
+@torch.library.register_fake(edges_backward.op)
 def _(vertices, faces, starts, face_index, image, background, grad_resolved, anti_aliasing, eps):
     return vertices.new_empty(vertices.shape)
 

@@ -29,7 +29,7 @@ def fragments(
     return weights.to(vertices.device), depth.to(vertices.device)
 
 
-@torch.library.register_fake(fragments)
+@torch.library.register_fake(fragments.op)
 def _(vertices, faces, starts, face_index, far):
     return vertices.new_empty((*face_index.shape, 3)), vertices.new_empty(face_index.shape)
 
@@ -65,7 +65,7 @@ def fragments_backward(
     return grad_vertices.to(vertices.device)
 
 
-@torch.library.register_fake(fragments_backward)
+@torch.library.register_fake(fragments_backward.op)
 def _(vertices, faces, starts, face_index, grad_weights, grad_depth):
     return vertices.new_empty(vertices.shape)
 
@@ -100,7 +100,7 @@ def depth_image(
     return depth.to(vertices.device)
 
 
-@torch.library.register_fake(depth_image)
+@torch.library.register_fake(depth_image.op)
 def _(vertices, faces, starts, face_index, anti_aliasing, far):
     return vertices.new_empty(_image_shape(face_index, anti_aliasing))
 
@@ -133,7 +133,7 @@ def depth_backward(
     return grad_vertices.to(vertices.device)
 
 
-@torch.library.register_fake(depth_backward)
+@torch.library.register_fake(depth_backward.op)
 def _(vertices, faces, starts, face_index, grad_depth, anti_aliasing):
     return vertices.new_empty(vertices.shape)
 

@@ -25,7 +25,7 @@ def normals(vertices: Tensor, faces: Tensor, starts: Tensor | None, smooth: bool
     return result.to(vertices.device)
 
 
-@torch.library.register_fake(normals)
+@torch.library.register_fake(normals.op)
 def _(vertices, faces, starts, smooth):
     return vertices.new_empty(_normals_shape(vertices, faces, smooth))
 
@@ -53,7 +53,7 @@ def normals_backward(
     return grad_vertices.to(vertices.device)
 
 
-@torch.library.register_fake(normals_backward)
+@torch.library.register_fake(normals_backward.op)
 def _(vertices, faces, starts, smooth, grad_normals):
     return torch.empty_like(vertices, memory_format=torch.contiguous_format)
 
@@ -90,7 +90,7 @@ def lit(
     return result.to(weights.device)
 
 
-@torch.library.register_fake(lit)
+@torch.library.register_fake(lit.op)
 def _(colors, normals, parameters, layout, viewer, vertices, faces, face_index, weights, starts, smooth):
     return weights.new_empty((*face_index.shape, 3))
 
@@ -140,7 +140,7 @@ def lit_backward(
     return tuple(grad.to(weights.device) for grad in grads)
 
 
-@torch.library.register_fake(lit_backward)
+@torch.library.register_fake(lit_backward.op)
 def _(
     colors, normals, parameters, layout, viewer, vertices, faces, face_index, weights, starts, smooth, grad_lit, needed
 ):
@@ -187,7 +187,7 @@ def viewer_of(matrix: Tensor, intrinsics: Tensor, origin: Tensor | None, perspec
     return torch.from_numpy(np.where(np.isfinite(result), result, 0)).to(matrix.device)
 
 
-@torch.library.register_fake(viewer_of)
+@torch.library.register_fake(viewer_of.op)
 def _(matrix, intrinsics, origin, perspective):
     sizes = [x.shape[0] for x in (matrix, intrinsics, origin) if x is not None]
     return matrix.new_empty((max(sizes), 5))

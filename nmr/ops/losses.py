@@ -21,7 +21,7 @@ def soft_iou(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     return iou.to(prediction.device), areas.to(prediction.device)
 
 
-@torch.library.register_fake(soft_iou)
+@torch.library.register_fake(soft_iou.op)
 def _(prediction, target):
     batch = prediction.shape[0]
     return prediction.new_empty(batch), prediction.new_empty((batch, 2), dtype=torch.float64)
@@ -63,7 +63,7 @@ def soft_iou_backward(
     return tuple(grad.to(prediction.device) for grad in grads)
 
 
-@torch.library.register_fake(soft_iou_backward)
+@torch.library.register_fake(soft_iou_backward.op)
 def _(prediction, target, areas, grad_iou, of_prediction, of_target):
     return (
         prediction.new_empty(prediction.shape if of_prediction else 0),

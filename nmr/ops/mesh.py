@@ -17,7 +17,7 @@ def smoothness(vertices: Tensor, edges: Tensor) -> Tensor:
     return loss.to(vertices.device)
 
 
-@torch.library.register_fake(smoothness)
+@torch.library.register_fake(smoothness.op)
 def _(vertices, edges):
     return vertices.new_empty(vertices.shape[0])
 
@@ -47,7 +47,7 @@ def smoothness_backward(vertices: Tensor, edges: Tensor, grad_loss: Tensor) -> T
     return grad_vertices.to(vertices.device)
 
 
-@torch.library.register_fake(smoothness_backward)
+@torch.library.register_fake(smoothness_backward.op)
 def _(vertices, edges, grad_loss):
     return vertices.new_empty(vertices.shape)
 
@@ -69,6 +69,6 @@ def voxels(vertices: Tensor, faces: Tensor, size: int, touched: bool) -> Tensor:
     return grid.to(vertices.device)
 
 
-@torch.library.register_fake(voxels)
+@torch.library.register_fake(voxels.op)
 def _(vertices, faces, size, touched):
     return vertices.new_empty((vertices.shape[0], size, size, size), dtype=torch.bool)

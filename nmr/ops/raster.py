@@ -1,10 +1,29 @@
 """Operators: which face is nearest at each pixel, and silhouettes with NMR's gradient or the local one."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from ._host import _C, batch_size, host_array, host_empty, no_second_derivative, num_threads
 from ._register import operator, register_autograd
+
+
+class RasterSettings(NamedTuple):
+    """The settings of a render, in the order in which the operators take them."""
+
+    height: int  # of the image
+    width: int
+    anti_aliasing: bool
+    fill_back: bool
+    near: float
+    far: float
+    eps: float
+
+    @property
+    def raster(self) -> tuple[int, int]:
+        scale = 2 if self.anti_aliasing else 1
+        return scale * self.height, scale * self.width
 
 
 def _face_index_map(vertices, faces, starts, height, width, fill_back, near, far) -> Tensor:
@@ -32,7 +51,7 @@ def rasterize(
     return _face_index_map(vertices, faces, starts, height, width, fill_back, near, far).to(vertices.device)
 
 
-@torch.library.register_fake(rasterize)
+@torch.library.register_fake(rasterize.op)
 def _(vertices, faces, starts, height, width, fill_back, near, far):
     return vertices.new_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
 
@@ -59,7 +78,7 @@ def rasterize_layers(
     return face_index.to(vertices.device)
 
 
-@torch.library.register_fake(rasterize_layers)
+@torch.library.register_fake(rasterize_layers.op)
 def _(vertices, faces, starts, height, width, layers, fill_back, near, far):
     return vertices.new_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
 
@@ -92,7 +111,7 @@ def silhouette(
     return alpha.to(vertices.device), face_index.to(vertices.device)
 
 
-@torch.library.register_fake(silhouette)
+@torch.library.register_fake(silhouette.op)
 def _(vertices, faces, starts, height, width, anti_aliasing, fill_back, near, far, eps, local):
     batch, scale = batch_size(vertices, starts), 2 if anti_aliasing else 1
     alpha = vertices.new_empty((batch, height, width))
@@ -100,20 +119,20 @@ def _(vertices, faces, starts, height, width, anti_aliasing, fill_back, near, fa
 
 
 def _silhouette_setup(ctx, inputs, output):
-    vertices, faces, starts, _, _, anti_aliasing, _, _, _, eps, local = inputs
+    vertices, faces, starts, *settings, ctx.local = inputs
     face_index = output[1]
     ctx.mark_non_differentiable(face_index)
     ctx.set_materialize_grads(False)  # no zeros in the shape of the face index map
     ctx.save_for_backward(vertices, faces, starts, face_index)
-    ctx.settings = anti_aliasing, eps
-    ctx.local = local
+    ctx.settings = RasterSettings(*settings)
 
 
 def _silhouette_backward(ctx, grad_alpha, _grad_face_index):
     if grad_alpha is None:
         return (None,) * 11
     gradient = local_gradient if ctx.local else silhouette_backward
-    return gradient(*ctx.saved_tensors, grad_alpha, *ctx.settings), *(None,) * 10
+    settings = ctx.settings
+    return gradient(*ctx.saved_tensors, grad_alpha, settings.anti_aliasing, settings.eps), *(None,) * 10
 
 
 register_autograd(silhouette, _silhouette_backward, _silhouette_setup)
@@ -140,7 +159,7 @@ def _gradient(kernel, vertices, faces, starts, face_index, grad_alpha, anti_alia
     return grad_vertices.to(vertices.device)
 
 
-@torch.library.register_fake(silhouette_backward)
+@torch.library.register_fake(silhouette_backward.op)
 def _(vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps):
     return vertices.new_empty(vertices.shape)
 
@@ -162,7 +181,7 @@ def local_gradient(
     return _gradient(_C.local_gradient, vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps)
 
 
-@torch.library.register_fake(local_gradient)
+@torch.library.register_fake(local_gradient.op)
 def _(vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps):
     return vertices.new_empty(vertices.shape)
 

@@ -29,7 +29,7 @@ def sample_texture_cubes(
     return colors.to(textures.device)
 
 
-@torch.library.register_fake(sample_texture_cubes)
+@torch.library.register_fake(sample_texture_cubes.op)
 def _(textures, face_index, weights, starts, eps):
     return textures.new_empty((*face_index.shape, textures.shape[-1]))
 
@@ -66,7 +66,7 @@ def texture_cubes_backward(
     return grad_textures.to(grad_colors.device)
 
 
-@torch.library.register_fake(texture_cubes_backward)
+@torch.library.register_fake(texture_cubes_backward.op)
 def _(face_index, weights, starts, grad_colors, shape, eps):
     return grad_colors.new_empty(shape)
 
@@ -96,7 +96,7 @@ def interpolate(
     return values.to(attributes.device)
 
 
-@torch.library.register_fake(interpolate)
+@torch.library.register_fake(interpolate.op)
 def _(attributes, corners, face_index, weights, starts):
     return attributes.new_empty((*face_index.shape, attributes.shape[-1]))
 
@@ -138,7 +138,7 @@ def interpolate_backward(
     return grad_attributes.to(attributes.device), grad_weights.to(attributes.device)
 
 
-@torch.library.register_fake(interpolate_backward)
+@torch.library.register_fake(interpolate_backward.op)
 def _(attributes, corners, face_index, weights, starts, grad_values, of_attributes, of_weights):
     return (
         attributes.new_empty(attributes.shape if of_attributes else 0),

@@ -27,7 +27,7 @@ def soft_silhouette(
     return clear.to(vertices.device)
 
 
-@torch.library.register_fake(soft_silhouette)
+@torch.library.register_fake(soft_silhouette.op)
 def _(vertices, faces, starts, height, width, fill_back, near, far, sigma, reach):
     return vertices.new_empty((batch_size(vertices, starts), height, width))
 
@@ -64,7 +64,7 @@ def soft_silhouette_backward(
     return grad_vertices.to(vertices.device)
 
 
-@torch.library.register_fake(soft_silhouette_backward)
+@torch.library.register_fake(soft_silhouette_backward.op)
 def _(vertices, faces, starts, clear, grad_clear, fill_back, near, far, sigma, reach):
     return vertices.new_empty(vertices.shape)
 

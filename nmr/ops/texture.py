@@ -23,7 +23,7 @@ def mipmaps(texels: Tensor, grids: Tensor, count: int) -> Tensor:
     return pyramid.to(texels.device)
 
 
-@torch.library.register_fake(mipmaps)
+@torch.library.register_fake(mipmaps.op)
 def _(texels, grids, count):
     return texels.new_empty((count, texels.shape[1]))
 
@@ -49,7 +49,7 @@ def mipmaps_backward(grad_pyramid: Tensor, grids: Tensor, count: int) -> Tensor:
     return grad_texels.to(grad_pyramid.device)
 
 
-@torch.library.register_fake(mipmaps_backward)
+@torch.library.register_fake(mipmaps_backward.op)
 def _(grad_pyramid, grids, count):
     return grad_pyramid.new_empty((count, grad_pyramid.shape[1]))
 
@@ -79,7 +79,7 @@ def uv_levels(
     return level.to(weights.device)
 
 
-@torch.library.register_fake(uv_levels)
+@torch.library.register_fake(uv_levels.op)
 def _(vertices, faces, mesh_starts, uv, corners, face_index, weights, starts, grids):
     return weights.new_empty(face_index.shape)
 
@@ -118,7 +118,7 @@ def sample_uv(
     return colors.to(texels.device)
 
 
-@torch.library.register_fake(sample_uv)
+@torch.library.register_fake(sample_uv.op)
 def _(texels, grids, level, uv, corners, face_index, weights, starts, wrap):
     return texels.new_empty((*face_index.shape, texels.shape[-1]))
 
@@ -161,7 +161,7 @@ def sample_uv_backward(
     return tuple(grad.to(texels.device) for grad in grads)
 
 
-@torch.library.register_fake(sample_uv_backward)
+@torch.library.register_fake(sample_uv_backward.op)
 def _(texels, grids, level, uv, corners, face_index, weights, starts, wrap, grad_colors, needed):
     like = texels, uv, weights
     return tuple(x.new_empty(x.shape if need else 0) for x, need in zip(like, needed, strict=True))

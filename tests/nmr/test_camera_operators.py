@@ -5,8 +5,6 @@ import torch
 
 from nmr import ops
 
-STARTS = torch.tensor([[0, 0], [3, 0], [7, 0]])
-
 
 def chain(vertices, matrix, intrinsics, distortion, origin, extent, perspective):
     """The definition of `project`, for a batch."""
@@ -56,33 +54,6 @@ def test_project_is_the_chain_and_its_gradient(perspective, distorted, shared):
         torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
 
 
-def test_project_without_origin_and_extent():
-    vertices, matrix, intrinsics, *_ = random_arguments(2, 5)
-    zero, one = torch.zeros(2, 3, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
-    wanted = chain(vertices, matrix, intrinsics, None, zero, one, True)
-    torch.testing.assert_close(ops.project(vertices, matrix, intrinsics, None, None, None, None, True), wanted)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_opcheck(dtype):
-    vertices, matrix, intrinsics, distortion, origin, extent = random_arguments(2, 7, dtype=dtype)
-    upstream = torch.randn(2, 7, 3, dtype=dtype)
-    wanted = [True, False, True, True, False, True]
-    packed = vertices.detach().reshape(14, 3), torch.tensor([[0, 0], [9, 0], [14, 0]])
-    torch.library.opcheck(ops.project, (packed[0], matrix, intrinsics, distortion, origin, extent, packed[1], True))
-    forward, up = torch.randn(2, 3, dtype=dtype), torch.randn(2, 3, dtype=dtype)
-    torch.library.opcheck(ops.pose_backward, (forward, up, torch.randn(2, 3, 4, dtype=dtype)))
-    torch.library.opcheck(
-        ops.project_backward,
-        (vertices, matrix, intrinsics, distortion, origin, extent, None, True, upstream, wanted),
-    )
-    for x in (vertices, matrix, intrinsics, distortion, origin, extent, forward, up):
-        x.requires_grad_()
-    torch.library.opcheck(ops.pose, (forward, up))
-    torch.library.opcheck(ops.project, (vertices, matrix, intrinsics, distortion, origin, extent, None, True))
-    torch.library.opcheck(ops.project, (vertices, matrix, intrinsics, None, None, None, None, False))
-
-
 @pytest.mark.parametrize("shared", [False, True])
 def test_same_bits_for_any_number_of_threads(shared):
     arguments = random_arguments(5, 1500, shared=shared, dtype=torch.float32)
@@ -97,38 +68,3 @@ def test_same_bits_for_any_number_of_threads(shared):
         torch.set_num_threads(before)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
-@pytest.mark.parametrize("index", range(1, 6))
-def test_the_operators_refuse_other_shapes(index):
-    """One more check than in the Python layer, so that no call reads outside an array."""
-    arguments = random_arguments(2, 4)
-    names = ["vertices", "matrix", "intrinsics", "distortion", "origin", "extent"]
-    arguments[index] = arguments[index][:, :1] if arguments[index].ndim > 1 else arguments[index][:1]
-    with pytest.raises(ValueError, match=f"{names[index]} must have shape"):
-        project(*arguments)
-
-
-@pytest.mark.parametrize(
-    "call, words",
-    [
-        (
-            lambda a: project(torch.rand(3, 4, 3).double(), *a[1:]),
-            r"vertices must have shape \[1, V, 3\] or \[B, V, 3\]",
-        ),
-        (lambda a: project(*a, starts=STARTS), r"packed vertices must have shape \[N, 3\]"),
-        (
-            lambda a: project(torch.rand(7, 3).double(), *(x[:1] for x in a[1:]), starts=STARTS),
-            "starts are those of 2 meshes",
-        ),
-        (lambda a: ops.pose(torch.rand(2, 2), torch.rand(2, 3)), r"forward must have shape \[B, 3\], got \[2, 2\]"),
-        (lambda a: ops.pose(torch.rand(2, 3), torch.rand(1, 3)), r"up must have shape \[2, 3\], got \[1, 3\]"),
-        (
-            lambda a: ops.project_backward(*a, None, True, torch.rand(2, 3, 3).double(), [True] + [False] * 5),
-            r"grad_points must have shape \[2, 4, 3\]",
-        ),
-    ],
-)
-def test_the_operators_refuse_what_does_not_fit(call, words):
-    with pytest.raises(ValueError, match=words):
-        call(random_arguments(2, 4))

@@ -45,24 +45,6 @@ def test_orthographic_keeps_sizes():
     torch.testing.assert_close(camera.transform(points), expected, atol=1e-6, rtol=0)
 
 
-def test_pinhole_counts_rows_from_the_top():
-    """An image of 480 x 640: the vertex at pixel (u, v) = (160, 120) is left of the centre and above it."""
-    K = [[500.0, 0.0, 320.0], [0.0, 400.0, 240.0], [0.0, 0.0, 1.0]]
-    camera = nmr.Pinhole(K, torch.eye(3), [0.0, 0.0, 2.0], orig_size=(480, 640))
-    vertex = torch.tensor([[(160 - 320) / 500 * 2, (120 - 240) / 400 * 2, 0.0]])
-    torch.testing.assert_close(camera.transform(vertex), torch.tensor([[[-0.5, 0.5, 2.0]]]))
-
-
-def test_points_from_angles():
-    torch.testing.assert_close(
-        points_from_angles(2.0, 0.0, 90.0).float(), torch.tensor([2.0, 0.0, 0.0]), atol=1e-6, rtol=0
-    )
-    torch.testing.assert_close(
-        points_from_angles(2.0, 90.0, 0.0).float(), torch.tensor([0.0, 2.0, 0.0]), atol=1e-6, rtol=0
-    )
-    assert points_from_angles([1.0, 2.0], 30.0, torch.tensor([0.0, 10.0])).shape == (2, 3)
-
-
 # --- the published values. None of the defects that are fixed here shows in these files: they have no batch of 3
 # (crossed along the batch) and no vertex on the optical axis (NaN). Those two are tested further down.
 
@@ -119,17 +101,6 @@ def test_the_tangent_is_rounded_to_nearest():
     assert np.array_equal(many.projection(torch.float32).extent.numpy(), wanted)
     each = [nmr.LookAt([0.0, 0.0, -1.0], half_fov_deg=x).projection(torch.float32).extent.item() for x in degrees]
     assert np.array_equal(np.float32(each), wanted)
-
-
-def test_published_points():
-    v = load_vector("cameras")
-    angles = v["distance"], v["elevation"], v["azimuth"]
-    exact = points_from_angles(*(torch.from_numpy(x) for x in angles))
-    np.testing.assert_allclose(exact, v["points"], rtol=0, atol=1e-6)
-    radians = (np.degrees(np.radians(x)) for x in angles[1:])
-    np.testing.assert_allclose(points_from_angles(v["distance"].tolist(), *radians), v["points_radians"], atol=1e-6)
-    for row, numbers in zip(v["points_scalar"], zip(*angles, strict=True), strict=True):
-        np.testing.assert_allclose(points_from_angles(*map(float, numbers)), row, rtol=0, atol=1e-6)
 
 
 def test_published_degenerate_poses():
@@ -192,17 +163,6 @@ def test_gradcheck_in_all_parameters(name):
     )
 
 
-def test_gradients_have_the_type_of_their_parameters():
-    eye = torch.tensor([0.0, 0.0, -2.0], dtype=torch.float64, requires_grad=True)
-    fov = torch.tensor(30.0, requires_grad=True)
-    vertices = torch.rand(1, 4, 3, requires_grad=True)
-    out = nmr.LookAt(eye, half_fov_deg=fov).transform(vertices)
-    out.square().sum().backward()
-    assert out.dtype == torch.float32
-    assert (eye.grad.dtype, fov.grad.dtype, vertices.grad.dtype) == (torch.float64, torch.float32, torch.float32)
-    assert fov.grad.shape == () and eye.grad.any() and fov.grad != 0
-
-
 def test_there_is_no_second_derivative():
     for x, make in (
         (parameter([0.3, 1.0, -3.0]), lambda x: nmr.LookAt(x).transform(torch.ones(1, 2, 3).double())),
@@ -214,14 +174,6 @@ def test_there_is_no_second_derivative():
 
 
 # --- batches
-
-
-def test_one_mesh_many_views_and_many_meshes_one_view():
-    vertices, faces = nmr.icosphere(1)
-    views = nmr.LookAt.from_angles(3.0, 0.0, [0.0, 120.0])
-    assert nmr.render_silhouette(0.5 * vertices, faces, views, image_size=8).shape == (2, 8, 8)
-    one = nmr.LookAt([0.0, 0.0, -3.0])
-    assert nmr.render_silhouette(vertices.expand(4, -1, -1), faces, one, image_size=8).shape == (4, 8, 8)
 
 
 def test_a_batch_of_three_is_three_cameras():
@@ -266,22 +218,6 @@ def test_packed_is_one_by_one(name, one_camera):
     torch.testing.assert_close(eye.grad, eye_sum, rtol=1e-5, atol=1e-5)
 
 
-def test_empty_batches():
-    camera = nmr.LookAt([0.0, 0.0, -2.0])
-    assert camera.transform(torch.zeros(0, 4, 3)).shape == (0, 4, 3)
-    assert camera.transform(torch.zeros(2, 0, 3)).shape == (2, 0, 3)
-    assert camera.transform(torch.zeros(0, 3), torch.zeros(1, 2, dtype=torch.int64)).shape == (0, 3)
-
-
-def test_compile():
-    eye = torch.tensor([[0.3, 1.0, -3.0], [2.0, 0.5, 1.0]], requires_grad=True)
-    points = torch.rand(1, 5, 3)
-    camera = nmr.LookAt(eye, half_fov_deg=torch.tensor(20.0))
-    compiled = torch.compile(lambda x: camera.transform(x).square().sum(), fullgraph=True, backend="aot_eager")
-    wanted = torch.autograd.grad(camera.transform(points).square().sum(), eye)[0]
-    torch.testing.assert_close(torch.autograd.grad(compiled(points), eye)[0], wanted)
-
-
 def test_fields_of_view_and_scales_under_vmap():
     points, values = torch.rand(1, 5, 3), torch.tensor([20.0, 30.0])
     for make in (
@@ -292,19 +228,7 @@ def test_fields_of_view_and_scales_under_vmap():
         assert torch.equal(many, torch.stack([make(x).transform(points) for x in values]))
 
 
-def test_whole_numbers_are_a_camera_too():
-    numbers = torch.tensor([[[2, 0, 0, 0], [0, -2, 0, 0], [0, 0, 2, 3]]]), torch.tensor([[[1, 0, 0], [0, -1, 0]]])
-    camera = nmr.cameras.Projection(*numbers)
-    assert camera.matrix.dtype == camera.intrinsics.dtype == torch.float64
-
-
 # --- vertices and cameras without an image
-
-
-def test_eye_on_the_up_axis_is_degenerate_but_finite():
-    with pytest.warns(UserWarning, match="looks along its up vector"):
-        camera = nmr.LookAt([0.0, 2.0, 0.0])
-    assert camera.transform(torch.rand(1, 4, 3)).isfinite().all()
 
 
 def test_an_eye_at_the_place_that_it_looks_at_warns():
@@ -392,13 +316,6 @@ def test_vertices_without_an_image(dtype):
         assert torch.equal(a, b)
 
 
-def test_upstream_nan_is_passed_on():
-    vertices = torch.rand(1, 3, 3, requires_grad=True)
-    out = nmr.LookAt([0.0, 0.0, -2.0]).transform(vertices)
-    out.backward(torch.tensor([[[1.0, 1.0, 1.0], [math.nan, 0.0, 0.0], [1.0, 1.0, 1.0]]]))
-    assert vertices.grad.isnan().any(-1).tolist() == [[False, True, False]]
-
-
 def test_the_optical_axis_has_a_gradient():
     """Upstream takes the root of r^2, whose derivative is not finite on the axis (defect 14, fixed)."""
     camera = nmr.Pinhole(CALIBRATION, torch.eye(3), [0.0, 0.0, 2.0], [0.1, 0.2, 0.1, 0.2, 0.3], orig_size=256)
@@ -406,24 +323,7 @@ def test_the_optical_axis_has_a_gradient():
     assert torch.autograd.gradcheck(camera.transform, vertices)
 
 
-NASTY = [
-    0.0,
-    -0.0,
-    1.0,
-    -1.0,
-    1e-45,
-    1e-30,
-    1e-7,
-    1e7,
-    1e16,
-    1e30,
-    -1e30,
-    3.4e38,
-    -3.4e38,
-    math.inf,
-    -math.inf,
-    math.nan,
-]
+NASTY = [0.0, -0.0, 1.0, -1.0, 1e-45, 1e-30, 1e-7, 1e7, 1e16, 1e30, -1e30, 3.4e38, math.inf, -math.inf, math.nan]
 nasty = st.one_of(st.sampled_from(NASTY), st.floats(-2, 2, width=32), st.floats(width=32))
 
 
@@ -464,16 +364,6 @@ def test_never_nan(dtype, vertices, pose, calibration, distortion, upstream):
 # --- cameras of one's own, errors
 
 
-def test_any_object_with_transform_is_a_camera():
-    class Shift:
-        def transform(self, vertices):
-            return vertices + torch.tensor([0.0, 0.0, 2.0])
-
-    vertices, faces = nmr.icosphere(1)
-    assert isinstance(Shift(), nmr.Camera) and not isinstance(object(), nmr.Camera)
-    assert nmr.render_silhouette(0.5 * vertices, faces, Shift(), image_size=8).any()
-
-
 def test_a_camera_of_ones_own_can_give_a_projection():
     class Affine(nmr.cameras.ProjectingCamera):
         def projection(self, dtype=torch.float64):
@@ -481,11 +371,12 @@ def test_a_camera_of_ones_own_can_give_a_projection():
 
     points = torch.rand(2, 3, 3)
     assert torch.equal(Affine().transform(points), points)
+    whole = Projection(torch.eye(3, 4).long()[None], torch.eye(2, 3).long()[None])
+    assert whole.matrix.dtype == whole.intrinsics.dtype == torch.float64
     with pytest.raises(NotImplementedError):
         nmr.cameras.ProjectingCamera().transform(points)
 
 
-POINTS, STARTS = torch.rand(7, 3), torch.tensor([[0, 0], [3, 0], [7, 0]])
 EYE, K = [0.0, 0.0, -2.0], torch.eye(3)
 
 
@@ -502,29 +393,14 @@ def test_tensors_in_lists_keep_their_gradient():
     points_from_angles([distance, 1.0], 0.0, 0.0).sum().backward()
     assert distance.grad == -1
     t = torch.tensor(2.0, requires_grad=True)
-    nmr.Pinhole(K, K, [0.0, 0.0, t], orig_size=2).transform(POINTS)[..., 2].sum().backward()
-    assert t.grad == len(POINTS)
+    nmr.Pinhole(K, K, [0.0, 0.0, t], orig_size=2).transform(torch.rand(7, 3))[..., 2].sum().backward()
+    assert t.grad == 7
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda t: nmr.LookAt(t, half_fov_deg=20.0),
-        lambda t: nmr.Orthographic([0.0, t[1], -2.0], scale=0.5),
-        lambda t: nmr.Pinhole(K, K, t, orig_size=(2, 3)),
-    ],
-)
-def test_cameras_are_made_in_a_compiled_graph(make):
-    points, t = torch.rand(5, 3), torch.tensor([0.1, 0.2, -2.0], requires_grad=True)
-
-    def transform(points, t):
-        return make(t).transform(points)
-
-    compiled = torch.compile(transform, fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(points, t), transform(points, t))
-
-
-def test_no_pose_is_an_empty_batch():
+def test_empty_batches():
+    camera = nmr.LookAt([0.0, 0.0, -2.0])
+    assert camera.transform(torch.zeros(0, 4, 3)).shape == (0, 4, 3)
+    assert camera.transform(torch.zeros(0, 3), torch.zeros(1, 2, dtype=torch.int64)).shape == (0, 3)
     points = torch.rand(4, 3, requires_grad=True)
     for camera in (
         nmr.LookAt(torch.rand(0, 3)),
@@ -536,75 +412,3 @@ def test_no_pose_is_an_empty_batch():
         assert out.shape == (0, 4, 3)
         (grad,) = torch.autograd.grad(out.sum(), points)
         assert not grad.any()
-
-
-@pytest.mark.parametrize("size", [(480, 640), [480, 640], torch.tensor([480, 640]), np.array([480.0, 640.0])])
-def test_the_size_of_an_image_may_come_in_any_form(size):
-    camera = nmr.Pinhole(K, K, EYE, orig_size=size)
-    assert camera.orig_size == (480.0, 640.0)
-
-
-@pytest.mark.parametrize(
-    "error, make, words",
-    [
-        (ValueError, lambda: nmr.LookAt([0.0, 1.0]), r"eye must have shape \[3\] or \[B, 3\], got \[2\]"),
-        (ValueError, lambda: nmr.Look(EYE, torch.rand(2, 2)), r"direction must have shape \[3\] or \[B, 3\], got"),
-        (ValueError, lambda: nmr.LookAt(EYE, half_fov_deg=90.0), "must lie between 0 and 90 degrees, got 90.0"),
-        (ValueError, lambda: nmr.LookAt(EYE, half_fov_deg=torch.tensor([1.0, math.nan])), "between 0 and 90"),
-        (ValueError, lambda: nmr.Look(EYE, half_fov_deg=0), "between 0 and 90"),
-        (ValueError, lambda: nmr.LookAt(EYE, half_fov_deg=torch.ones(2, 1)), r"must have shape \[\] or \[B\], got"),
-        (ValueError, lambda: nmr.Orthographic(EYE, scale=-1.0), "scale must lie between 0 and infinity, got -1.0"),
-        (
-            ValueError,
-            lambda: nmr.LookAt.from_angles([1.0, 2.0], 0.0, [0.0, 1.0, 2.0]),
-            r"one length, got shapes \[2\], \[\], \[3\]",
-        ),
-        (
-            ValueError,
-            lambda: nmr.LookAt(torch.rand(2, 3), torch.rand(3, 3)),
-            r"one batch size \(or 1\), got eye \[2, 3\], at \[3, 3\]",
-        ),
-        (
-            ValueError,
-            lambda: nmr.LookAt(torch.rand(2, 3), half_fov_deg=[20.0, 30.0, 40.0]),
-            r"got eye \[2, 3\], half_fov_deg \[3\]",
-        ),
-        (ValueError, lambda: nmr.LookAt(torch.rand(2, 3)).transform(torch.rand(3, 4, 3)), "3 meshes and 2 poses"),
-        (ValueError, lambda: nmr.LookAt(torch.rand(3, 3)).transform(POINTS, STARTS), "one pose each, or one for all"),
-        (TypeError, lambda: nmr.LookAt(EYE).transform(torch.rand(1, 4, 3).half()), "must be float32 or float64"),
-        (ValueError, lambda: nmr.LookAt(EYE).transform(POINTS[None], STARTS), r"must be packed \[N, 3\], got"),
-        (ValueError, lambda: nmr.LookAt(EYE).transform(POINTS, STARTS.int()), r"int64 tensor \[B \+ 1, 2\], got int32"),
-        (ValueError, lambda: nmr.LookAt(EYE).transform(POINTS[1:], STARTS), r"must ascend from \(0, 0\) to \(6, 0\)"),
-        (ValueError, lambda: nmr.Pinhole(K[:2], K, EYE, orig_size=2), r"K must have shape \[3, 3\] or \[B, 3, 3\]"),
-        (ValueError, lambda: nmr.Pinhole(K, K[0], EYE, orig_size=2), r"R must have shape \[3, 3\] or \[B, 3, 3\]"),
-        (ValueError, lambda: nmr.Pinhole(K, K, [1.0], orig_size=2), r"t must have shape \[3\] or \[B, 3\], got \[1\]"),
-        (ValueError, lambda: nmr.Pinhole(K, K, EYE, [0.0] * 4, orig_size=2), r"dist_coeffs must have shape \[5\]"),
-        (ValueError, lambda: nmr.Pinhole(K, K, EYE, orig_size=(0, 5)), r"positive numbers \(height, width\)"),
-        (ValueError, lambda: nmr.Pinhole(K.expand(2, 3, 3), K, torch.rand(3, 3), orig_size=2), r"K \[2, 3, 3\], t"),
-        (TypeError, lambda: nmr.LookAt("front"), r"eye must be numbers of shape \[3\] or \[B, 3\], got str: "),
-        (TypeError, lambda: nmr.LookAt(None), "eye must be numbers .* got NoneType"),
-        (TypeError, lambda: nmr.LookAt([[0.0, 0.0, 1.0], [0.0, 1.0]]), "eye must be numbers .* got list: "),
-        (TypeError, lambda: nmr.LookAt(torch.zeros(3, dtype=torch.cfloat)), "of real numbers, got complex64"),
-        (
-            TypeError,
-            lambda: nmr.LookAt(EYE, half_fov_deg="wide"),
-            r"half_fov_deg must be numbers of shape \[\] or \[B\]",
-        ),
-        (TypeError, lambda: nmr.Orthographic(EYE, scale=None), "scale must be numbers .* got NoneType"),
-        (
-            TypeError,
-            lambda: nmr.LookAt.from_angles(2.0, "up", 0.0),
-            r"elevation_deg must be a number or \[B\], got str",
-        ),
-        (TypeError, lambda: nmr.Pinhole(None, K, EYE, orig_size=2), "K must be numbers .* got NoneType"),
-        (TypeError, lambda: nmr.Pinhole(K, K, "t", orig_size=2), "t must be numbers .* got str"),
-        (ValueError, lambda: nmr.Pinhole(K, K, EYE, orig_size="large"), "orig_size must be positive .* got large"),
-        (ValueError, lambda: nmr.Pinhole(K, K, EYE, orig_size=(2, 3, 4)), r"orig_size .* got \(2, 3, 4\)"),
-        (ValueError, lambda: nmr.Pinhole(K, K, EYE, orig_size=None), "orig_size must be positive .* got None"),
-        (ValueError, lambda: Projection(K, K), r"matrix must be a tensor of shape \[B, 3, 4\], got float32 \[3, 3\]"),
-        (ValueError, lambda: Projection(torch.rand(2, 3, 4), torch.rand(3, 2, 3)), r"intrinsics \[3, 2, 3\]"),
-    ],
-)
-def test_errors(error, make, words):
-    with pytest.raises(error, match=words):
-        make()

@@ -153,45 +153,6 @@ def test_scenes_in_front_of_the_plane_keep_their_bits():
         assert torch.equal(a, b)
 
 
-def _gradients(meshes, camera):
-    """Images and gradients of the vertices of each mesh."""
-    vertices, faces = meshes
-    leaves = [v.clone().requires_grad_() for v in vertices]
-    given = torch.stack(leaves) if isinstance(faces, torch.Tensor) else leaves
-    images = nmr.render(given, faces, camera, outputs=("rgb", "alpha", "depth", "normals"), image_size=SIZE)
-    loss = sum(
-        (image * torch.linspace(-1, 1, image[0].numel()).view(image.shape[1:])).flatten(1).sum(1).sum()
-        for image in images
-    )
-    return list(images), torch.autograd.grad(loss, leaves)
-
-
-@pytest.mark.parametrize("shared", [True, False])
-def test_a_batch_draws_each_mesh_as_if_alone(shared):
-    vertices, faces = tilted(torch.float32)
-    ahead = vertices + torch.tensor([0.0, 0.0, 4.0])  # crosses nothing
-    behind = vertices - torch.tensor([0.0, 0.0, 20.0])
-    meshes = [vertices, ahead, behind, 0.9 * vertices]
-    all_faces = faces if shared else [faces, faces[:2], faces, faces.flip(0)]
-    images, grads = _gradients((meshes, all_faces), CAMERA)
-    assert images[1].flatten(1).sum(1).gt(0).tolist() == [True, True, False, True]
-    for b, mesh in enumerate(meshes):
-        alone, grad = _gradients(([mesh], [faces if shared else all_faces[b]]), CAMERA)
-        for image, single in zip(images, alone, strict=True):
-            assert torch.equal(image[b : b + 1], single)
-        assert torch.equal(grads[b], grad[0])
-
-
-def test_one_mesh_and_many_poses():
-    vertices, faces = floor(1)
-    eyes = torch.tensor([[0.0, 0.0, 0.0], [0.0, 3.0, -30.0], [1.0, 0.5, 2.0]])
-    at = eyes + torch.tensor([0.0, -0.3, 1.0])
-    together = nmr.render_depth(vertices, faces, nmr.LookAt(eyes, at), image_size=SIZE)
-    for b in range(3):
-        alone = nmr.render_depth(vertices, faces, nmr.LookAt(eyes[b], at[b]), image_size=SIZE)
-        assert torch.equal(together[b : b + 1], alone)
-
-
 def test_a_camera_of_ones_own():
     class Shift:  # takes batches only
         def transform(self, vertices):
@@ -205,15 +166,6 @@ def test_a_camera_of_ones_own():
         results.append((alpha, depth, *torch.autograd.grad((alpha * depth).sum(), vertices)))
     for a, b in zip(*results, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(b.detach().abs().max()))
-
-
-def test_an_orthographic_camera():
-    vertices, faces = tilted()
-    camera = nmr.Orthographic([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], scale=0.4)
-    fragments = nmr.render_fragments(vertices, faces, camera, image_size=SIZE)
-    z = fragments.interpolate(vertices)[fragments.covered][:, 2]
-    assert len(z) > 100 and z.min() >= 0.1 - 1e-9
-    torch.testing.assert_close(z, fragments.depth[fragments.covered])
 
 
 def test_a_corner_in_the_plane_of_the_eye():
@@ -231,73 +183,9 @@ def test_a_corner_in_the_plane_of_the_eye():
     assert torch.autograd.gradcheck(depth, vertices.requires_grad_(), eps=1e-7, atol=1e-4, rtol=1e-4)
 
 
-def test_corners_that_are_not_finite_draw_nothing_and_spoil_nothing():
-    vertices, faces = tilted(torch.float32)
-    for bad in (float("nan"), float("inf"), -float("inf"), 1e38):
-        for camera in (CAMERA, None):
-            points = vertices.clone()
-            points[1] = bad
-            points.requires_grad_()
-            alpha, depth = nmr.render(points, faces, camera, outputs=("alpha", "depth"), image_size=16)
-            fragments = nmr.render_fragments(points, faces, camera, image_size=16)
-            (alpha.sum() + depth.sum() + fragments.weights.square().sum()).backward()
-            assert alpha.isfinite().all() and depth.isfinite().all() and points.grad.isfinite().all()
-            assert fragments.face_index.unique().tolist() == [-1, 1, 2]
-
-
 def test_near_zero():
     vertices, faces = floor(1)
     alpha = nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=0.0)
     assert torch.equal(alpha, nmr.render_silhouette(*floor(150), CAMERA, image_size=SIZE, near=0.0))
     tiny = [nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=near) for near in (1e-6, 1e-7, 1e-12)]
     assert torch.equal(tiny[0], tiny[1]) and torch.equal(tiny[0], tiny[2]) and (tiny[0] >= alpha).all()
-
-
-def test_a_far_plane_at_any_distance_leaves_near_alone():
-    vertices, faces = floor(1)
-    drawn = [nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=0.1, far=far) for far in (1e2, 1e6)]
-    assert drawn[0].any() and torch.equal(*drawn)
-
-
-def test_compile_and_vmap_leave_room_for_every_cut():
-    vertices, faces = tilted(torch.float32)
-
-    def loss(vertices):
-        outputs = nmr.render(vertices, faces, CAMERA, outputs=("rgb", "alpha", "depth"), image_size=16)
-        return sum(image.square().sum() for image in outputs)
-
-    eager, compiled = (vertices.clone().requires_grad_() for _ in range(2))
-    loss(eager).backward()
-    torch.compile(loss, fullgraph=True, backend="aot_eager")(compiled).backward()
-    torch.testing.assert_close(compiled.grad, eager.grad, rtol=1e-5, atol=1e-5 * float(eager.grad.abs().max()))
-    many = torch.stack([vertices, vertices + torch.tensor([0.0, 0.0, 4.0])])
-    grads = torch.func.vmap(torch.func.grad(loss))(many)
-    torch.testing.assert_close(grads[0], eager.grad, rtol=1e-5, atol=1e-5 * float(eager.grad.abs().max()))
-    torch.testing.assert_close(torch.func.vmap(loss)(many)[0], loss(vertices))
-
-
-def test_results_do_not_depend_on_threads():
-    threads = torch.get_num_threads()
-    results = []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            results.append(_gradients(([tilted(torch.float32)[0]] * 2, tilted()[1]), CAMERA))
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for a, b in zip(*(x[0] for x in results), strict=True))
-    assert all(torch.equal(a, b) for a, b in zip(*(x[1] for x in results), strict=True))
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_opcheck(packed):
-    vertices, faces = tilted(torch.float32)
-    seen = CAMERA.transform(vertices)
-    starts = torch.tensor([[0, 0], [7, 3]]) if packed else None
-    arguments = (seen[0] if packed else seen, faces, starts, 0.1)
-    torch.library.opcheck(nmr.ops.clip_count, arguments)
-    room = nmr.ops.clip_count(*arguments)
-    assert room.tolist() == [[4, 4]]
-    torch.library.opcheck(nmr.ops.clip_faces, (*arguments, torch.tensor([[0, 0], [4, 4]]), 4, 4))
-    with pytest.raises(ValueError, match="too little room"):
-        nmr.ops.clip_faces(*arguments, torch.tensor([[0, 0], [4, 3]]), 4, 3)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from scenes import different_soups, for_threads, pack, random_soup
+from scenes import random_soup
 from vectors import gradient_tolerance, load_vector, vector_names
 
 import nmr
-from nmr import _C, reference
+from nmr import reference
 
 EPS = 1e-3
 
@@ -79,60 +79,6 @@ def test_gradient_in_the_image_is_the_mean_s(anti_aliasing):
     assert torch.autograd.gradcheck(resolve, image)
 
 
-def test_an_image_of_one_colour_has_no_edges():
-    vertices, faces = random_soup(0)
-    face_index = face_index_of(vertices, faces, 24)
-    image = torch.rand(3, dtype=torch.float64).expand(*face_index.shape, 3).contiguous()
-    _, grad_image, grad, _ = resolve_with_gradient(image, vertices, faces, None, face_index)
-    assert grad_image.any() and not grad.any()
-
-
-def test_channels_act_together():
-    """A second channel that gains twice as much, where the first one loses, reverses the pull."""
-    vertices = torch.tensor([[[-0.5, -0.5, 1.0], [0.5, -0.5, 1.0], [0.0, 0.6, 1.0]]], dtype=torch.float64)
-    faces = torch.tensor([[0, 1, 2]])
-    face_index = face_index_of(vertices, faces, 16)
-    covered = (face_index >= 0).double()[..., None]
-
-    def spread(image, weights):
-        """How far the loss sum(weights . image) wants the two lower corners apart (> 0: together)."""
-        leaf = vertices.clone().requires_grad_()
-        (
-            nmr.ops.resolve(image, None, leaf, faces, None, face_index, False, EPS) * torch.tensor(weights)
-        ).sum().backward()
-        return leaf.grad[0, 1, 0] - leaf.grad[0, 0, 0]
-
-    two = covered.expand(-1, -1, -1, 2).contiguous()
-    assert spread(covered, [1.0]) > 0 > spread(covered, [-1.0])
-    assert spread(two, [1.0, -2.0]) < 0 < spread(two, [-1.0, 2.0])
-    torch.testing.assert_close(spread(two, [1.0, -2.0]), spread(covered, [-1.0]))
-
-
-@pytest.mark.parametrize("batch, raster_size", [(5, 40), (2, 100)])
-def test_same_bits_for_any_number_of_threads(batch, raster_size):
-    """Also of fewer images than threads: then the threads share the lines and faces of each."""
-    vertices, faces = random_soup(2, batch, 100, torch.float32)
-    face_index = face_index_of(vertices, faces, raster_size)
-    assert len(face_index[0].unique()) > 64  # several chunks of faces
-    image = random_image(face_index, 3, torch.float32)
-    results = for_threads((1, 2, 5), lambda: resolve_with_gradient(image, vertices, faces, None, face_index, True))
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
-def test_packed_equals_one_by_one():
-    meshes = different_soups()
-    vertices, faces, starts = pack(meshes)
-    face_index = face_index_of(vertices, faces, 30, starts=starts)
-    image = random_image(face_index, 3, torch.float32)
-    resolved, grad_image, grad, _ = resolve_with_gradient(image, vertices, faces, starts, face_index)
-    for b, (v, f) in enumerate(meshes):
-        part = slice(b, b + 1)
-        single = resolve_with_gradient(image[part], v[None], f, None, face_index[part])
-        expected = resolved[part], grad_image[part], grad[None, starts[b, 0] : starts[b + 1, 0]]
-        assert all(torch.equal(a, b) for a, b in zip(single, expected, strict=False))
-
-
 def test_not_a_number_in_a_pixel_gives_none_in_a_vertex():
     vertices, faces = random_soup(0, dtype=torch.float32)
     face_index = face_index_of(vertices, faces, 24)
@@ -164,139 +110,3 @@ def test_background_is_the_colour_of_pixels_without_a_face(threads, per_image):
         resolved.backward(upstream)
         results.append([resolved.detach(), *(leaf.grad for leaf in leaves)])
     torch.testing.assert_close(*results)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_an_upstream_gradient_that_is_not_finite_reaches_every_visible_face_of_its_image(value):
-    vertices, faces = random_soup(0)
-    face_index = face_index_of(vertices, faces, 20)
-    leaf = vertices.clone().requires_grad_()
-    resolved = nmr.ops.resolve(random_image(face_index, 3), None, leaf, faces, None, face_index, True, EPS)
-    upstream = torch.zeros_like(resolved)
-    upstream[0, 3, 4, 1] = value
-    resolved.backward(upstream)
-    seen = torch.unique(face_index[0][face_index[0] >= 0] % len(faces))
-    corners = torch.unique(faces[seen.long()])
-    assert leaf.grad[0, corners, :2].isnan().all() and not leaf.grad[1].any()
-
-
-def test_a_step_with_nan_does_not_change_later_steps():
-    vertices, faces = nmr.icosphere(2)
-    camera = nmr.LookAt([0.0, 0.5, -3.0])
-
-    def step(bad):
-        leaf = (0.5 * vertices).requires_grad_()
-        outputs = ("rgb", "alpha") if bad else ("rgb",)
-        images = nmr.render(
-            leaf, faces, camera, outputs=outputs, colors=nmr.VertexColors((vertices + 1) / 2), image_size=64
-        )
-        loss = sum(image[:, 28:32].square().sum() for image in images)
-        (loss * (float("nan") if bad else 1.0)).backward()
-        return leaf.grad
-
-    healthy = step(False)
-    assert step(True).isnan().any()
-    assert torch.equal(step(False), healthy)
-
-
-@pytest.mark.parametrize("batch, num_faces", [(0, 5), (2, 0)])
-def test_empty_batches_and_meshes(batch, num_faces):
-    vertices, faces = torch.zeros(batch, 15, 3), torch.zeros(num_faces, 3, dtype=torch.long)
-    face_index = face_index_of(vertices, faces, 8)
-    resolved, _, grad, _ = resolve_with_gradient(
-        random_image(face_index, 3, torch.float32), vertices, faces, None, face_index
-    )
-    assert resolved.shape == (batch, 8, 8, 3) and grad.shape == vertices.shape and not grad.any()
-
-
-@pytest.mark.parametrize("dtype, packed", [(torch.float32, False), (torch.float64, True)])
-def test_opcheck(dtype, packed):
-    vertices, faces = random_soup(0, dtype=dtype)
-    starts = None
-    if packed:
-        vertices, faces, starts = pack([(v, faces) for v in vertices])
-    face_index = face_index_of(vertices, faces, 12, starts=starts)
-    image = random_image(face_index, 3, dtype)
-    leaf = image.clone().requires_grad_()
-    mesh, upstream = (vertices.clone().requires_grad_(), faces, starts, face_index), image[:, :6, :6].contiguous()
-    for behind in (
-        None,
-        torch.rand(1, 3, dtype=dtype),
-        torch.rand(len(face_index), 3, dtype=dtype, requires_grad=True),
-    ):
-        torch.library.opcheck(nmr.ops.resolve, (leaf, behind, *mesh, True, EPS))
-        behind = None if behind is None else behind.detach()
-        torch.library.opcheck(nmr.ops.resolve_backward, (upstream, behind, face_index, True, True, behind is not None))
-        torch.library.opcheck(nmr.ops.edges_backward, (vertices, *mesh[1:], image, behind, upstream, True, EPS))
-
-
-def test_second_derivatives_are_refused():
-    vertices, faces = random_soup(0)
-    face_index = face_index_of(vertices, faces, 12)
-    leaf, image = vertices.requires_grad_(), random_image(face_index, 3).requires_grad_()
-    loss = nmr.ops.resolve(image, None, leaf, faces, None, face_index, False, EPS).square().sum()
-    for grad in torch.autograd.grad(loss, (image, leaf), create_graph=True):
-        with pytest.raises(RuntimeError, match="render has no second derivative"):
-            grad.square().sum().backward(retain_graph=True)
-
-
-CALLS = {
-    "resolve": lambda a: _C.resolve_forward(a["image"], a["background"], a["face_index"], a["resolved"], True, 1),
-    "resolve_backward": lambda a: _C.resolve_backward(
-        a["resolved"], a["background"], a["face_index"], a["image"], a["grad_background"], True, 1
-    ),
-    "edges": lambda a: _C.edges_backward(
-        a["vertices"],
-        a["faces"],
-        None,
-        a["face_index"],
-        a["image"],
-        a["background"],
-        a["resolved"],
-        a["grad"],
-        True,
-        EPS,
-        1,
-    ),
-}
-ALL = tuple(CALLS)
-
-
-@pytest.mark.parametrize(
-    "calls, change, words",
-    [
-        (
-            ALL[:2],
-            dict(resolved=np.zeros((2, 4, 4))),
-            r"resolved image must have shape \[B, h, w, C\], got \[2, 4, 4\]",
-        ),
-        (ALL[:2], dict(resolved=np.zeros((2, 4, 5, 3))), r"face_index must have shape \[2, 8, 10\]"),
-        (ALL[:2], dict(resolved=np.zeros((2, 4, 4, 0))), "must have pixels and channels"),
-        (ALL, dict(image=np.zeros((2, 8, 7, 3))), r"image must have shape \[2, 8, 8, 3\], got \[2, 8, 7, 3\]"),
-        (ALL[2:], dict(image=np.zeros((2, 8, 8))), r"image must have shape \[B, H, W, C\], got \[2, 8, 8\]"),
-        (
-            ALL[2:],
-            dict(face_index=np.full((2, 8, 8), 8, np.int32)),
-            "the face index map does not belong to these faces",
-        ),
-        (ALL[2:], dict(resolved=np.zeros((2, 4, 4, 2))), r"grad_resolved must have shape \[2, 4, 4, 3\]"),
-        (ALL, dict(background=np.zeros((3, 3))), r"background must have shape \[1 or 2, 3\], got \[3, 3\]"),
-        (ALL[1:2], dict(grad_background=np.zeros((1, 3))), r"grad_background must have shape \[2, 3\]"),
-        (ALL[2:], dict(grad=np.zeros((2, 12, 2))), r"grad_vertices must have shape \[2, 12, 3\]"),
-    ],
-)
-def test_no_call_reads_or_writes_outside_an_array(calls, change, words):
-    arguments = dict(
-        vertices=random_soup(0, num_faces=4)[0].numpy(),
-        faces=np.arange(12).reshape(4, 3),
-        face_index=np.zeros((2, 8, 8), np.int32),
-        image=np.zeros((2, 8, 8, 3)),
-        background=np.zeros((1, 3)),
-        grad_background=np.zeros((2, 3)),
-        resolved=np.zeros((2, 4, 4, 3)),
-        grad=np.zeros((2, 12, 3)),
-    )
-    for call in calls:
-        CALLS[call](arguments)
-        with pytest.raises(ValueError, match=words):
-            CALLS[call]({**arguments, **change})

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from scenes import random_soup
 
 import nmr
 from nmr import reference
@@ -23,19 +24,10 @@ def slow_layers(vertices, faces, size, layers, fill_back):
     return face_index[..., :layers].flip(0), depth[..., :layers].flip(0)
 
 
-def soup(seed, dtype=torch.float64, num_faces=12):
-    """Random triangles in renderer space, some of them partly off the screen."""
-    g = torch.Generator().manual_seed(seed)
-    centre = torch.rand(num_faces, 1, 3, generator=g) * 2 - 1
-    corners = centre + 0.5 * torch.randn(num_faces, 3, 3, generator=g)
-    corners[..., 2] = 1 + torch.rand(num_faces, 3, generator=g)
-    return corners.view(1, -1, 3).to(dtype), torch.arange(num_faces * 3).view(-1, 3)
-
-
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("fill_back", [False, True])
 def test_equals_the_slow_definition(seed, fill_back):
-    vertices, faces = soup(seed)
+    vertices, faces = random_soup(seed, 1)
     fragments = nmr.render_fragments(vertices, faces, image_size=20, fill_back=fill_back, faces_per_pixel=5, clip=False)
     face_index, depth = slow_layers(vertices[0], faces, 20, 5, fill_back)
     assert torch.equal(fragments.sided_face_index[0].long(), face_index) and (face_index[..., 1] >= 0).any()
@@ -46,7 +38,7 @@ def test_equals_the_slow_definition(seed, fill_back):
 @pytest.mark.parametrize("image_size", [33, (20, 41)])
 def test_the_first_layer_is_what_is_seen(dtype, image_size):
     for seed in range(4):
-        vertices, faces = soup(seed, dtype)
+        vertices, faces = random_soup(seed, 1, dtype=dtype)
         plain = nmr.render_fragments(vertices, faces, image_size=image_size)
         layers = nmr.render_fragments(vertices, faces, image_size=image_size, faces_per_pixel=3)
         first = layers.layer(0)
@@ -88,7 +80,7 @@ def test_a_sphere_has_two_surfaces():
 
 
 def test_gradients_are_the_derivative():
-    vertices, faces = soup(1)
+    vertices, faces = random_soup(1, 1)
     faces = faces[:8]
     values = torch.rand(vertices.shape[1], 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
@@ -97,60 +89,3 @@ def test_gradients_are_the_derivative():
         return layers.weights, layers.depth, layers.interpolate(values)
 
     assert torch.autograd.gradcheck(draw, vertices.clone().requires_grad_(), eps=1e-7, atol=1e-5, rtol=1e-5)
-
-
-def test_lists_batches_and_clipped_faces():
-    meshes = [soup(2, torch.float32), soup(3, torch.float32)]
-    vertices = [v[0] - torch.tensor([0.0, 0.0, 1.5]) for v, _ in meshes]
-    faces = [meshes[0][1], meshes[1][1][:7]]
-    camera = nmr.Look([0.0, 0.0, 0.0], [0.0, 0.1, 1.0], half_fov_deg=40.0)
-    together = nmr.render_fragments(vertices, faces, camera, image_size=24, faces_per_pixel=4)
-    assert together.mesh is not together._drawn  # some are cut
-    for b in range(2):
-        alone = nmr.render_fragments(vertices[b], faces[b], camera, image_size=24, faces_per_pixel=4)
-        nearest = nmr.render_fragments(vertices[b], faces[b], camera, image_size=24)
-        for name in ("sided_face_index", "weights", "depth", "face_index"):
-            assert torch.equal(getattr(together, name)[b], getattr(alone, name)[0])
-            assert torch.equal(getattr(together.layer(0), name)[b], getattr(nearest, name)[0])
-        assert torch.equal(together.normals()[b], alone.normals()[0])
-
-
-def test_results_do_not_depend_on_threads():
-    vertices, faces = soup(0, torch.float32)
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        one = nmr.render_fragments(vertices, faces, image_size=100, faces_per_pixel=3).sided_face_index
-        torch.set_num_threads(3)
-        assert torch.equal(
-            one, nmr.render_fragments(vertices, faces, image_size=100, faces_per_pixel=3).sided_face_index
-        )
-    finally:
-        torch.set_num_threads(threads)
-
-
-def test_errors():
-    vertices, faces = soup(0)
-    for wrong in (0, 1025):
-        with pytest.raises(ValueError, match="faces_per_pixel"):
-            nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=wrong)
-    with pytest.raises(TypeError, match="faces_per_pixel"):
-        nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=2.0)
-    layers = nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=2)
-    for fragments in (layers, layers.layer(1)):
-        with pytest.raises(ValueError, match="layer\\(0\\)"):
-            fragments.resolve(torch.zeros(1, 8, 8, 3, dtype=torch.float64))
-    with pytest.raises(IndexError, match="faces_per_pixel"):
-        layers.layer(2)
-    with pytest.raises(IndexError, match="faces_per_pixel"):
-        layers.layer(0).layer(0)
-    image, uv, cubes = torch.rand(4, 4, 3), torch.rand(len(vertices), 2), torch.rand(len(faces), 2, 2, 2, 3)
-    for use in (nmr.UVTexture(image, uv).sample, nmr.TextureCubes(cubes).sample, nmr.Lights().shade):
-        with pytest.raises(ValueError, match=r"layer\(k\)"):
-            use(layers)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_opcheck(dtype):
-    vertices, faces = soup(0, dtype)
-    torch.library.opcheck(nmr.ops.rasterize_layers, (vertices, faces, None, 8, 12, 3, True, NEAR, FAR))

@@ -1,11 +1,8 @@
 """render_silhouette(gradient="local"): against the slow definition, by hand, its reach, what descent does with it."""
 
-import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scenes import different_soups, for_threads, pack, random_soup
+from scenes import random_soup
 
 import nmr
 from nmr import reference
@@ -57,14 +54,6 @@ def test_rectangles_equal_the_slow_definition(size, anti_aliasing):
         expected = reference.local_gradient(vertices[b], faces, index[b], upstream[b], anti_aliasing)
         torch.testing.assert_close(grad[b], expected, rtol=1e-9, atol=1e-9)
     assert grad.any()
-
-
-def test_float32_is_close_to_float64():
-    vertices, faces = random_soup(1, dtype=torch.float32)
-    upstream = noise(2, 12, 12)
-    single, double = gradient_of(vertices, faces, upstream.float()), gradient_of(vertices.double(), faces, upstream)
-    assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), double, rtol=1e-4, atol=1e-4)
 
 
 def test_the_image_is_the_same():
@@ -155,41 +144,6 @@ def test_one_pixel_is_its_reach():
     assert far[0, 1:3, 0].max() < 0
 
 
-def test_descent_moves_a_square_onto_another():
-    vertices, faces = square(-0.5, -0.4, 0.3, 0.4)
-    target = nmr.render_silhouette(vertices + vertices.new_tensor([0.2, 0.12, 0.0]), faces, image_size=32)
-    offset = torch.zeros(1, 1, 3, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.SGD([offset], lr=0.01)
-    losses = []
-    for _ in range(40):
-        optimizer.zero_grad()
-        alpha = nmr.render_silhouette(vertices + offset, faces, image_size=32, gradient="local")
-        loss = nmr.losses.soft_iou_loss(alpha, target)
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[0] > 0.5 and losses[-1] < 0.1
-    # It comes to rest less than a pixel of the raster away.
-    torch.testing.assert_close(offset.detach().flatten(), vertices.new_tensor([0.2, 0.12, 0.0]), rtol=0, atol=2 / 64)
-
-
-def test_descent_through_a_camera_deforms_a_sphere():
-    vertices, faces = nmr.icosphere(2)
-    camera = nmr.LookAt.from_angles(2.732, 20.0, [0.0, 60.0, 120.0], half_fov_deg=20.0)
-    target = nmr.render_silhouette(vertices * torch.tensor([0.6, 0.25, 0.4]), faces, camera, image_size=48)
-    shape = (0.4 * vertices).requires_grad_()
-    optimizer = torch.optim.Adam([shape], lr=0.01)
-    losses = []
-    for _ in range(60):
-        optimizer.zero_grad()
-        alpha = nmr.render_silhouette(shape, faces, camera, image_size=48, gradient="local")
-        loss = nmr.losses.soft_iou_loss(alpha, target)
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[0] > 0.3 and losses[-1] < 0.6 * losses[0]
-
-
 def test_reversed_faces_and_their_order_change_nothing():
     vertices, faces = nmr.icosphere(2)
     vertices = (0.5 * vertices + torch.tensor([0.1, 0.0, 2.0])).double()[None]
@@ -199,78 +153,6 @@ def test_reversed_faces_and_their_order_change_nothing():
     for other in (faces.flip(1), faces[order], faces.roll(1, 1)):
         torch.testing.assert_close(gradient_of(vertices, other, upstream), grad, rtol=1e-9, atol=1e-9)
     assert grad.any()
-
-
-def test_same_bits_for_any_number_of_threads_and_in_company():
-    vertices, faces = random_soup(3, batch=5, dtype=torch.float32)
-    upstream = noise(5, 24, 24, dtype=torch.float32)
-    results = for_threads((1, 2, 5), lambda: gradient_of(vertices, faces, upstream))
-    assert all(torch.equal(grad, results[0]) for grad in results[1:]) and results[0].any()
-    for b in range(5):
-        assert torch.equal(gradient_of(vertices[b : b + 1], faces, upstream[b : b + 1])[0], results[0][b])
-
-
-def test_a_list_equals_its_meshes_one_by_one():
-    meshes = different_soups()
-    upstream = noise(len(meshes), 16, 16, dtype=torch.float32)
-    vertices = [v.clone().requires_grad_() for v, _ in meshes]
-    nmr.render_silhouette(vertices, [f for _, f in meshes], image_size=16, gradient="local").backward(upstream)
-    for (v, f), own, leaf in zip(meshes, upstream, vertices, strict=True):
-        assert torch.equal(gradient_of(v[None], f, own[None])[0], leaf.grad)
-    assert vertices[0].grad.any() and vertices[3].grad.any()
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_opcheck(dtype):
-    vertices, faces = random_soup(0, dtype=dtype)
-    settings = 12, 12, True, True, 0.1, 100.0, 1e-4
-    torch.library.opcheck(nmr.ops.silhouette, (vertices.clone().requires_grad_(), faces, None, *settings, True))
-    _, face_index = nmr.ops.silhouette(vertices, faces, None, *settings, True)
-    upstream = noise(2, 12, 12, dtype=dtype)
-    torch.library.opcheck(nmr.ops.local_gradient, (vertices, faces, None, face_index, upstream, True, 1e-4))
-    packed = pack(different_soups(dtype))
-    _, face_index = nmr.ops.silhouette(*packed, *settings, True)
-    torch.library.opcheck(nmr.ops.silhouette, (packed[0].requires_grad_(), *packed[1:], *settings, True))
-    upstream = noise(4, 12, 12, dtype=dtype)
-    torch.library.opcheck(nmr.ops.local_gradient, (packed[0].detach(), *packed[1:], face_index, upstream, True, 1e-4))
-
-
-def test_compile_fullgraph():
-    vertices, faces = random_soup(0, dtype=torch.float32)
-
-    def loss(v):
-        return nmr.render_silhouette(v, faces, image_size=16, gradient="local").square().mean()
-
-    eager, compiled = vertices.clone().requires_grad_(), vertices.clone().requires_grad_()
-    loss(eager).backward()
-    torch.compile(loss, fullgraph=True, backend="aot_eager")(compiled).backward()
-    torch.testing.assert_close(compiled.grad, eager.grad, rtol=1e-5, atol=1e-7)
-    assert eager.grad.any()
-
-
-def test_second_derivative_is_refused():
-    vertices, faces = random_soup(0)
-    vertices.requires_grad_()
-    loss = nmr.render_silhouette(vertices, faces, image_size=12, gradient="local").square().sum()
-    (grad,) = torch.autograd.grad(loss, vertices, create_graph=True)
-    with pytest.raises(RuntimeError, match="render_silhouette has no second derivative"):
-        grad.square().sum().backward()
-
-
-@settings(max_examples=80, deadline=None)
-@given(
-    st.lists(
-        st.floats(width=32) | st.floats(-2, 2, width=32) | st.sampled_from([0.0, 1e-30, 3e38]), min_size=18, max_size=18
-    ),
-    st.lists(st.lists(st.integers(0, 5), min_size=3, max_size=3), max_size=5),
-    st.integers(1, 9),
-    st.booleans(),
-)
-def test_no_mesh_gives_a_nan(numbers, faces, size, anti_aliasing):
-    vertices = torch.from_numpy(np.array(numbers, np.float32)).view(1, 6, 3)
-    faces = torch.tensor(faces, dtype=torch.long).view(-1, 3)
-    grad = gradient_of(vertices, faces, noise(size, size, dtype=torch.float32), anti_aliasing=anti_aliasing)
-    assert grad.isfinite().all()
 
 
 def test_a_gradient_that_is_not_a_number_is_passed_on():
@@ -293,9 +175,3 @@ def test_together_with_other_images():
     with pytest.raises(ValueError, match="gradient 'local' is that of silhouettes"):
         colors = nmr.VertexColors(torch.rand(len(vertices), 3))
         nmr.render(vertices, faces, colors=colors, image_size=16, gradient="local")
-
-
-@pytest.mark.parametrize("gradient", ["soft", None, torch.zeros(2)])
-def test_an_unknown_gradient(gradient):
-    with pytest.raises(ValueError, match="gradient must be 'nmr' or 'local', got "):
-        nmr.render_silhouette(*square(*BLOCK), gradient=gradient)

@@ -39,22 +39,6 @@ def test_equals_the_slow_definition(image_size, sigma, fill_back):
     assert (single_grad - grad).norm() < 1e-3 * grad.norm()
 
 
-def test_vmap_gives_the_same_bits():
-    sphere, faces = nmr.icosphere(1)
-    many = torch.stack([0.5 * sphere, 0.4 * sphere + 0.1])
-    camera = nmr.LookAt([0.0, 0.0, -3.0])
-
-    def draw(vertices):
-        return nmr.render_soft_silhouette(vertices, faces, camera, sigma=1e-3, image_size=32)[0]
-
-    def loss(vertices):
-        return draw(vertices).square().sum()
-
-    assert torch.equal(torch.func.vmap(draw)(many), torch.stack([draw(mesh) for mesh in many]))
-    wanted = torch.stack([torch.func.grad(loss)(mesh) for mesh in many])
-    assert torch.equal(torch.func.vmap(torch.func.grad(loss))(many), wanted)
-
-
 def test_a_face_of_one_vertex_is_none():
     vertices, faces = soup(2)
     more = torch.cat([faces, torch.zeros(5, 3, dtype=torch.int64)])
@@ -102,57 +86,8 @@ def test_with_a_small_sigma_it_is_the_silhouette():
     torch.testing.assert_close(averaged, fine.view(2, 32, 2, 32, 2).mean((2, 4)), rtol=0, atol=1e-6)
 
 
-def test_lists_threads_and_faces_out_of_range():
-    meshes = [soup(2, torch.float32), soup(3, torch.float32, 7)]
-    vertices = [v.clone().requires_grad_() for v, _ in meshes]
-    threads, results = torch.get_num_threads(), []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            alpha = nmr.render_soft_silhouette(vertices, [f for _, f in meshes], image_size=50, sigma=1e-3)
-            results.append([alpha, *torch.autograd.grad(alpha.square().sum(), vertices)])
-    finally:
-        torch.set_num_threads(threads)
-    for b, (_, faces) in enumerate(meshes):
-        alpha = nmr.render_soft_silhouette(vertices[b], faces, image_size=50, sigma=1e-3)
-        (grad,) = torch.autograd.grad(alpha.square().sum(), vertices[b])
-        for result in results:
-            assert torch.equal(result[0][b], alpha[0]) and torch.equal(result[1 + b], grad)
-    for shift in (-3.0, 200.0):
-        away = vertices[0].detach() + torch.tensor([0.0, 0.0, shift])
-        assert not nmr.render_soft_silhouette(away, meshes[0][1], image_size=16, clip=False).any()
-
-
-def test_no_mesh_gives_a_nan():
-    vertices, faces = soup(4, torch.float32)
-    for bad in (float("nan"), float("inf"), 1e30, 3e8, 0.0):
-        points = vertices.clone()
-        points[1:5] = bad
-        points[:, 2] = 1.5
-        points.requires_grad_()
-        alpha = nmr.render_soft_silhouette(points, faces, image_size=16, sigma=1e-2)
-        (grad,) = torch.autograd.grad(alpha.sum(), points)
-        assert alpha.isfinite().all() and grad.isfinite().all() and alpha.max() > 0.5
-
-
-def test_errors():
-    vertices, faces = soup(0)
-    for options in ({"sigma": 0.0}, {"sigma": float("inf")}, {"dist_eps": 0.0}, {"dist_eps": 0.5}):
-        with pytest.raises(ValueError, match=next(iter(options))):
-            nmr.render_soft_silhouette(vertices, faces, image_size=8, **options)
-    leaf = vertices.requires_grad_()
-    alpha = nmr.render_soft_silhouette(leaf, faces, image_size=8, sigma=0.1)
-    (grad,) = torch.autograd.grad(alpha.square().sum(), leaf, create_graph=True)
-    with pytest.raises(RuntimeError, match="render_soft_silhouette has no second derivative"):
-        grad.sum().backward()
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_opcheck(dtype):
-    vertices, faces = soup(0, dtype)
-    settings = True, 0.1, 100.0, 0.01, 0.09
-    leaf = vertices[None].requires_grad_()
-    torch.library.opcheck(nmr.ops.soft_silhouette, (leaf, faces, None, 8, 12, *settings))
-    clear = nmr.ops.soft_silhouette(vertices[None], faces, None, 8, 12, *settings).detach()
-    arguments = (vertices[None].detach(), faces, None, clear, torch.rand_like(clear), *settings)
-    torch.library.opcheck(nmr.ops.soft_silhouette_backward, arguments)
+@pytest.mark.parametrize("shift", [-3.0, 200.0])
+def test_faces_out_of_range_draw_nothing(shift):
+    vertices, faces = soup(2)
+    away = vertices + torch.tensor([0.0, 0.0, shift])
+    assert not nmr.render_soft_silhouette(away, faces, image_size=16, clip=False).any()

@@ -53,28 +53,12 @@ def test_silhouette_bit_for_bit_and_gradient(name):
 @pytest.mark.parametrize("name", [n for n in SILHOUETTES if "face_index_map" in load_vector(n)])
 def test_index_map(name):
     v = load_vector(name)
-    num_faces, raster_size = len(v["faces"]), v["face_index_map"].shape[1]
-    expected = v["face_index_map"][:, ::-1]
-    face_index = nmr.ops.rasterize(
-        torch.from_numpy(v["vertices"]),
-        torch.from_numpy(v["faces"]).long(),
-        None,
-        raster_size,
-        raster_size,
-        bool(v["fill_back"]),
-        float(v["near"]),
-        float(v["far"]),
-    )
-    assert np.array_equal(face_index.numpy(), expected)
-    public = nmr.render_face_index(
-        torch.from_numpy(v["vertices"]),
-        torch.from_numpy(v["faces"]),
-        image_size=raster_size,
-        fill_back=bool(v["fill_back"]),
-        near=float(v["near"]),
-        far=float(v["far"]),
-        clip=False,
-    )
+    num_faces, expected = len(v["faces"]), v["face_index_map"][:, ::-1]
+    mesh, size = (torch.from_numpy(v["vertices"]), torch.from_numpy(v["faces"]).long()), expected.shape[1]
+    how = {"fill_back": bool(v["fill_back"]), "near": float(v["near"]), "far": float(v["far"])}
+    fragments = nmr.render_fragments(*mesh, image_size=size, clip=False, **how)
+    assert np.array_equal(fragments.sided_face_index.numpy(), expected)
+    public = nmr.render_face_index(*mesh, image_size=size, clip=False, **how)
     assert np.array_equal(public.numpy(), np.where(expected >= num_faces, expected - num_faces, expected))
 
 

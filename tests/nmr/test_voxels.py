@@ -134,62 +134,6 @@ def test_kato19_is_its_slow_definition_elsewhere(seed):
         assert np.array_equal(kato19(vertices, faces, size), fill(surface))
 
 
-@settings(max_examples=100, deadline=None)
-@given(corners, triples, sizes)
-def test_kato19_contains_kato18(corners, faces, size):
-    corners = corners // 8 * 8  # so that float32 cannot round a ray of kato18 over a face's edge
-    vertices = torch.from_numpy(corners).clamp(0, 64 * size) / (64.0 * size)
-    thick, thin = (nmr.voxelize(vertices, torch.from_numpy(faces), size, definition=d) for d in ("kato19", "kato18"))
-    assert (thick | ~thin).all()
-
-
-@settings(max_examples=100, deadline=None)
-@given(
-    hnp.arrays(np.float32, (6, 3), elements=st.floats(-0.5, 1.5, width=32)),
-    triples,
-    st.integers(1, 9),
-    st.integers(0, 2**32 - 1),
-)
-def test_kato19_holds_every_point_of_every_face(vertices, faces, size, seed):
-    weights = np.random.default_rng(seed).dirichlet((0.5, 0.5, 0.5), (len(faces), 200))
-    corners = (vertices * np.float32(size)).astype(np.float64)[faces]
-    points = np.einsum("fnk,fkc->fnc", weights, corners).reshape(-1, 3)
-    clear = (np.abs(points - points.round()) > 1e-6).all(1)  # of the rounding of the points themselves
-    cells = np.floor(points[clear]).astype(int)
-    cells = cells[((cells >= 0) & (cells < size)).all(1)]
-    assert kato19(vertices, faces, size)[tuple(cells.T)].all()
-
-
-@settings(max_examples=100, deadline=None)
-@given(
-    hnp.arrays(np.float32, (6, 3), elements=st.floats(-0.5, 1.5, width=32)), triples, st.integers(1, 9), st.randoms()
-)
-def test_kato19_knows_no_order_and_no_winding(vertices, faces, size, random):
-    shuffled = [random.sample(list(face), 3) for face in random.sample(list(faces), len(faces))]
-    shuffled = np.array(shuffled, np.int64).reshape(-1, 3)
-    assert np.array_equal(kato19(vertices, shuffled, size), kato19(vertices, faces, size))
-
-
-@settings(max_examples=60, deadline=None)
-@given(corners, triples, sizes, st.permutations(range(3)), st.integers(0, 2))
-def test_kato19_knows_no_axis(corners, faces, size, order, mirrored):
-    grid = kato19(corners / (64.0 * size), faces, size)
-    assert np.array_equal(kato19(corners[:, order] / (64.0 * size), faces, size), grid.transpose(order))
-    corners = corners.copy()
-    corners[:, mirrored] = 64 * size - corners[:, mirrored]
-    assert np.array_equal(kato19(corners / (64.0 * size), faces, size), np.flip(grid, mirrored))
-
-
-def test_kato19_of_a_face_between_cells_is_on_both_sides():
-    square = torch.tensor([[0.25, 0.25, 0.5], [0.75, 0.25, 0.5], [0.75, 0.75, 0.5], [0.25, 0.75, 0.5]])
-    grid = nmr.voxelize(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), 8, definition="kato19")[0]
-    expected = torch.zeros(8, 8, 8, dtype=torch.bool)
-    expected[1:7, 1:7, 3:5] = True  # [2, 6] touches the cells 1 to 6
-    assert torch.equal(grid, expected)
-    thin = nmr.voxelize(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), 8)[0]
-    assert thin.sum() < grid.sum() and (grid | ~thin).all()
-
-
 def test_a_box_that_fills_the_grid_is_open_in_kato18():
     corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -233,13 +177,6 @@ def test_kato19_of_a_face_far_larger_than_the_grid():
     assert 256 * 250 > grid.sum(0).bool().sum() > 128 * 250
 
 
-def test_opcheck():
-    vertices, faces = nmr.icosphere(1)
-    batch = torch.stack([0.3 * vertices + 0.5, 0.4 * vertices + 0.5])
-    for arguments in ((batch, faces, 6, False), (batch, faces, 6, True)):
-        torch.library.opcheck(nmr.ops.voxels, arguments)
-
-
 # --- bad input
 
 
@@ -260,20 +197,3 @@ def test_any_mesh_is_voxelized(vertices, faces, size, normalize, definition):
     assert voxels.dtype == torch.bool and voxels.shape == (len(vertices), size, size, size)
     if len(faces) == 0:
         assert not voxels.any()
-
-
-@pytest.mark.parametrize(
-    "change, error, words",
-    [
-        (dict(size=0), ValueError, "size must lie in 1"),
-        (dict(size=2.5), TypeError, "size must be an integer"),
-        (dict(vertices=torch.zeros(3)), ValueError, "vertices must have shape"),
-        (dict(faces=torch.full((1, 3), 7)), ValueError, "vertex 7"),
-        (dict(definition="kato20"), ValueError, "definition must be 'kato18' or 'kato19', got 'kato20'"),
-        (dict(definition=None), ValueError, "got None"),
-    ],
-)
-def test_errors(change, error, words):
-    good = dict(vertices=torch.zeros(4, 3), faces=torch.zeros(1, 3, dtype=torch.long))
-    with pytest.raises(error, match=words):
-        nmr.voxelize(**{**good, **change})

@@ -52,36 +52,6 @@ def test_points_from_angles():
     assert nr.get_points_from_angles(*(x.numpy() for x in angles)).shape == (5, 3)
 
 
-def test_an_eye_above_the_target_is_degenerate_as_published():
-    v = load_vector("cameras_degenerate")
-    out = nr.look_at(torch.from_numpy(v["vertices"]), torch.from_numpy(v["eye"]))
-    torch.testing.assert_close(out, torch.from_numpy(v["look_at_out"]), rtol=1e-5, atol=1e-5)
-    assert not nr.look(torch.rand(1, 5, 3), [0, 0, -3])[..., :2].any()
-
-
-@pytest.mark.parametrize("convert", [list, tuple, np.array, torch.tensor])
-@pytest.mark.parametrize("batch", [False, True])
-def test_points_in_any_container(convert, batch):
-    eye, at, up = [1.0, 2, -3], [0.1, 0, 0], [0, 1.0, 0.2]
-    vertices = torch.rand(4, 6, 3)
-    expected = nr.look_at(vertices, torch.tensor(eye), torch.tensor(at), torch.tensor(up))
-    given = (convert([x] * 4 if batch else x) for x in (eye, at, up))
-    torch.testing.assert_close(nr.look_at(vertices, *given), expected)
-    expected = nr.look(vertices, torch.tensor(eye), torch.tensor(at), torch.tensor(up))
-    given = (convert([x] * 4 if batch else x) for x in (eye, at, up))
-    torch.testing.assert_close(nr.look(vertices, *given), expected)
-
-
-def test_one_mesh_and_many_cameras():
-    vertices = torch.rand(1, 6, 3)
-    eyes = nr.get_points_from_angles(torch.full((3,), 2.0), torch.zeros(3), torch.tensor([0.0, 10, 20]))
-    views = nr.perspective(nr.look_at(vertices, eyes))
-    assert views.shape == (3, 6, 3)
-    for b in range(3):
-        torch.testing.assert_close(views[b : b + 1], nr.perspective(nr.look_at(vertices, eyes[b])))
-    assert nr.perspective(vertices, torch.tensor([15.0, 30.0])).shape == (2, 6, 3)
-
-
 def test_projection_takes_matrices_of_every_shape():
     vertices = torch.rand(2, 6, 3) + torch.tensor([0.0, 0, 2])
     K, R, t = np.diag([200.0, 220, 1]), np.eye(3), np.array([0.1, 0.2, 0.3])
@@ -95,63 +65,3 @@ def test_projection_takes_matrices_of_every_shape():
         torch.testing.assert_close(nr.projection(vertices, K[None], R[None], given, [[0] * 5], 256), expected)
     sizes = torch.tensor([256.0, 512.0])
     torch.testing.assert_close(nr.projection(vertices, K, R, t, [0] * 5, sizes)[0], expected[0])
-
-
-@pytest.mark.parametrize("dtype", [torch.float64])
-def test_gradients_are_derivatives(dtype):
-    def make(*shape):
-        return torch.rand(*shape, dtype=dtype, requires_grad=True)
-
-    vertices = (torch.rand(2, 3, 3, dtype=dtype) + torch.tensor([0, 0, 2.0])).requires_grad_()
-    assert torch.autograd.gradcheck(nr.look_at, (vertices, make(2, 3), make(3), make(2, 3)))
-    assert torch.autograd.gradcheck(nr.look, (vertices, make(3), make(2, 3), make(3)))
-    assert torch.autograd.gradcheck(lambda v, a: nr.perspective(v, 20 + a), (vertices, make(2)))
-    arguments = (vertices, make(2, 3, 3), make(3, 3), make(2, 1, 3), (make(5) * 0.1).detach().requires_grad_())
-    assert torch.autograd.gradcheck(lambda *a: nr.projection(*a, 8.0), arguments)
-
-
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda v: nr.look_at(v[0], [0, 0, 1]), ValueError, r"use vertices\[None\]"),
-        (lambda v: nr.look_at(v, [0, 0]), ValueError, r"must have shape \[3\] or \[B, 3\]"),
-        (lambda v: nr.look(v, [0, 0, 1], torch.rand(3, 3)), ValueError, "one batch size"),
-        (lambda v: nr.look(v, [0, 0, 1], up=[1, 0]), ValueError, "up must have shape"),
-        (lambda v: nr.perspective(v, 90), ValueError, "half_fov_deg"),
-        (lambda v: nr.perspective(v, torch.rand(2, 2)), ValueError, "half_fov_deg"),
-        (lambda v: nr.projection(v, torch.eye(4), torch.eye(3), [0] * 3, None, 8), ValueError, "K must have shape"),
-        (lambda v: nr.projection(v, torch.eye(3), torch.eye(3), [0] * 4, None, 8), ValueError, "t must have shape"),
-        (
-            lambda v: nr.projection(v, torch.eye(3), torch.eye(3), [0] * 3, [0] * 4, 8),
-            ValueError,
-            r"dist_coeffs must have shape \[5\]",
-        ),
-        (
-            lambda v: nr.projection(v, torch.eye(3).expand(3, 3, 3), torch.eye(3), [0] * 3, None, 8),
-            ValueError,
-            "one batch size",
-        ),
-        (
-            lambda v: nr.get_points_from_angles([1.0, 2], [1.0, 2, 3], 0.0),
-            ValueError,
-            "single numbers or have one length",
-        ),
-    ],
-)
-def test_errors(call, error, message):
-    with pytest.raises(error, match=message):
-        call(torch.rand(2, 6, 3))
-
-
-def test_gradients_reach_tensors_inside_lists():
-    x = torch.tensor(0.3, requires_grad=True)
-    vertices = torch.rand(1, 4, 3)
-    K = [[x, 0.0, 32.0], [0.0, 30.0, 32.0], [0.0, 0.0, 1.0]]
-    pose = torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]])
-    for made in (
-        nr.projection(vertices, K, *pose, None, 64),
-        nr.look(vertices, [x, 0.0, -3.0], [0.0, 0.0, 1.0]),
-        nr.get_points_from_angles(2.7, [x, 2.0], [1.0, 2.0]),
-    ):
-        (grad,) = torch.autograd.grad(made.sum(), x)
-        assert grad != 0

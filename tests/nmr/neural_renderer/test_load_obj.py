@@ -8,6 +8,7 @@ from memory_checks import at_most
 from vectors import load_vector, vector_names
 
 import nmr.neural_renderer as nr
+from nmr.neural_renderer._images import read_image
 from nmr.neural_renderer.load_obj import bake_textures, load_mtl, load_textures, texture_wrapping_dict
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -29,12 +30,6 @@ def test_vertices_and_faces(tmp_path):
     np.testing.assert_allclose(vertices.numpy(), v["vertices_normalized"], atol=1e-6)
 
 
-def test_numbers_from_the_end_and_files_of_other_programs(tmp_path):
-    text = TRIANGLE.replace(" ", "\t", 1).replace("\t", " ") + "g x\nvn 0 0 1\nf -3//1 -2//1 -1//1\nv 9 9 9 1.0\n"
-    vertices, faces = nr.load_obj(tmp_path / write(tmp_path, a_obj=text.replace("\n", "\r\n")), False)
-    assert faces.tolist() == [[0, 1, 2]] and vertices.shape == (4, 3)
-
-
 @pytest.mark.parametrize("name", vector_names("texload_*"))
 def test_bake_textures(name):
     v = load_vector(name)
@@ -53,6 +48,46 @@ def test_bake_images_of_one_row_or_column(shape, bilinear):
     expected = image[-1, 0], image[-1, -1], image[0, -1]
     for k, color in enumerate(expected):
         np.testing.assert_allclose(baked[(0, *(2 * (np.arange(3) == k)))], color, atol=1e-6)
+
+
+LINES = {
+    "numbers from the end, CRLF": "g x\r\nvn 0 0 1\r\nf -3//1 -2//1 -1//1\r\n",
+    "tabs": "f\t1 \t 2\t3\n\t\n",
+    "faces of one and two corners": "f 1 2\nf 1\nf 1 2 3 # f 1 2 2\n",
+    "texture coordinates that nobody reads": "vt a b\nvt\nf 1/7 2/8 3/9\n",
+}
+
+
+@pytest.mark.parametrize("lines", LINES.values(), ids=LINES)
+def test_lines_that_the_published_function_accepts(tmp_path, lines):
+    vertices, faces = nr.load_obj(write(tmp_path, a_obj=f"{TRIANGLE}{lines}v 9 9 9 1.0\n"), False)
+    assert faces.tolist() == [[0, 1, 2]] and vertices.shape == (4, 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "has no vertices"),
+        (TRIANGLE, "has no faces"),
+        (TRIANGLE + "f 1 2 4\n", "refers to vertex 4, but there are 3"),
+        (TRIANGLE + "f 1 2 0\n", "line 4: 'f 1 2 0' cannot be read: there is no element 0"),
+        (TRIANGLE + "f 1 2 -4\n", "there is no element -4"),
+        (TRIANGLE + "f\n", "a face needs corners"),
+        (TRIANGLE + "f a b c\n", "line 4.*cannot be read"),
+        (TRIANGLE + "f 1 1 " + "9" * 400 + "\n", "cannot be read"),
+        (TRIANGLE + "f 1/1 2/2 3/3\n", "refers to texture coordinate 3, but there are 0"),
+        (TRIANGLE + "vt\nf 1 2 3\n", "line 4.*2 numbers are needed"),
+        (TRIANGLE + "f 1 2 3\n", "names no .mtl file"),
+        ("v 1 2\n", "line 1.*3 numbers are needed"),
+        ("v 0 0 nan\n", "3 numbers are needed, finite in float32"),
+        ("v 0 0 1e39\n", "finite in float32"),
+        ("v 1 1 1\n" * 3 + "f 1 2 3\n", "finite in float32"),
+        ("v -3e38 0 0\nv 3e38 0 0\nv 0 1 0\nf 1 2 3\n", "finite in float32"),
+    ],
+)
+def test_errors_of_files(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        nr.load_obj(write(tmp_path, a_obj=text), load_texture=True)
 
 
 def materials(tmp_path):
@@ -78,82 +113,32 @@ def test_textures_of_materials(tmp_path):
     assert torch.all(textures[3] == torch.tensor([0, 0, 1.0]))
 
 
-def test_options_before_the_image_name_are_skipped(tmp_path):
-    image_module = pytest.importorskip("PIL.Image")
-    image_module.new("L", (2, 2), 51).save(tmp_path / "grey.png")
-    image_module.fromarray(np.full((2, 2), 13107, dtype=np.uint16)).save(tmp_path / "deep.png")
-    image_module.new("RGBA", (2, 2), (51, 51, 51, 0)).save(tmp_path / "clear.png")
-    for name in ("grey", "deep", "clear"):
-        obj = "mtllib a.mtl\n" + TRIANGLE + "vt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
-        path = write(tmp_path, a_obj=obj, a_mtl=f"newmtl m\nmap_Kd -s 1 1 1 {name}.png\n")
-        _, _, textures = nr.load_obj(path, load_texture=True)
-        torch.testing.assert_close(textures, torch.full_like(textures, 0.2))
-
-
-def test_material_file_beside_the_obj_is_found_from_elsewhere(tmp_path, monkeypatch):
-    write(tmp_path, a_obj="mtllib a.mtl\n" + TRIANGLE + "f 1 2 3\n", a_mtl="newmtl x\nKd 1 1 1\n")
-    monkeypatch.chdir(tmp_path.parent)
-    assert len(nr.load_obj(f"{tmp_path.name}/a.obj", load_texture=True)) == 3
-    assert load_mtl(tmp_path / "a.mtl")[0]["x"].tolist() == [1, 1, 1]
-
-
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("library", "used", "made", "image", "mode"),
     [
-        ("f 1 2 3\n", "there is no element|refers to vertex|no vertices"),
-        (TRIANGLE, r"has no faces"),
-        ("", "has no vertices"),
-        (TRIANGLE + "f 1 2 4\n", "refers to vertex 4, but there are 3"),
-        (TRIANGLE + "f 1 2 0\n", "line 4: 'f 1 2 0' cannot be read: there is no element 0"),
-        (TRIANGLE + "f 1 2 -4\n", "there is no element -4"),
-        (TRIANGLE + "f\n", "a face needs corners"),
-        (TRIANGLE + "f 1 2\n", "has no faces"),
-        (TRIANGLE + "f a b c\n", "line 4.*cannot be read"),
-        ("v 1 2\n", "line 1.*3 numbers are needed"),
-        (TRIANGLE + "vt 0 0\nf 1/1 2/2 3/1\n", "refers to texture coordinate 2, but there are 1"),
-        (TRIANGLE + "f 1/1 2/2 3/3\n", "refers to texture coordinate 3, but there are 0"),
-        (TRIANGLE + "vt\nf 1 2 3\n", "line 4.*2 numbers are needed"),
+        ("a.mtl # materials", "red # the roof", "red", "wood.png # oak", "RGB"),
+        ("a.mtl", "red", "red # the roof", "wood #1.png", "L"),
+        ("none.mtl a.mtl", "red roof", "red", "-s 1 1 1 wood.png", "RGBA"),
     ],
 )
-def test_errors_of_files(tmp_path, text, message):
-    with pytest.raises(ValueError, match=message):
-        nr.load_obj(write(tmp_path, a_obj=text), load_texture=True)
-
-
-@pytest.mark.parametrize("line", ["f 1 2", "f 1", "vt 0.5", "vt", "vt a b", "f 1/1 2/2 3/3", "f 1 2 3 # f 1 2 2", "\t"])
-def test_lines_that_the_published_function_accepts(tmp_path, line):
-    """Faces of one or two corners add nothing; texture coordinates are not read without ``load_texture``."""
-    faces = nr.load_obj(write(tmp_path, a_obj=f"{TRIANGLE}f 3 2 1\n{line}\n"))[1]
-    assert faces.tolist() == [[2, 1, 0]] + ([[0, 1, 2]] if line.count("3") else [])
-
-
-@pytest.mark.parametrize("blank", ["\t", " \t ", "\t\t"])
-def test_tabs_between_words(tmp_path, blank):
-    obj = "\tmtllib a.mtl\nv 0 0 1\nv 1 0 0\nv 0 1 0\nv 0 2 0\nusemtl red\nf 1 2 4\n".replace(" ", blank)
-    path = write(tmp_path, a_obj=obj, a_mtl="newmtl red\n Kd 1 0 0\n".replace(" ", blank))
-    vertices, faces, textures = nr.load_obj(path, normalization=False, load_texture=True)
-    assert vertices.tolist() == [[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 2, 0]] and faces.tolist() == [[0, 1, 3]]
-    assert torch.all(textures == torch.tensor([1.0, 0, 0]))
-
-
-@pytest.mark.parametrize("used", ["red # the roof", "red roof", "red\t#", "red"])
-@pytest.mark.parametrize("made", ["red # the roof", "red"])
-def test_comments_after_names(tmp_path, used, made):
-    """Without a material of the whole name, the first word is the name, as published."""
-    obj = f"mtllib a.mtl # materials\n{TRIANGLE}usemtl {used}\nf 1 2 3\n"
-    path = write(tmp_path, a_obj=obj, a_mtl=f"newmtl blue\nKd 0 0 1\nnewmtl {made}\nKd 1 0 0 # red\n")
-    assert torch.all(nr.load_obj(path, load_texture=True)[2] == torch.tensor([1.0, 0, 0]))
-
-
-@pytest.mark.parametrize("line", ["wood.png # oak", "wood #1.png", "-s 1 1 1 wood.png\t# oak"])
-def test_names_of_images(tmp_path, line):
+def test_names_options_and_comments(tmp_path, monkeypatch, library, used, made, image, mode):
+    """Without a material of the whole name, the first word is the name, as published. Alpha is dropped."""
     image_module = pytest.importorskip("PIL.Image")
-    name = "wood #1.png" if "#1" in line else "wood.png"
-    image_module.new("RGB", (2, 2), (51, 51, 51)).save(tmp_path / name)
-    obj = f"mtllib a.mtl\n{TRIANGLE}vt 0.5\nusemtl m\nf 1/1 2/1 3/1\n"
-    path = write(tmp_path, a_obj=obj, a_mtl=f"newmtl m\nmap_Kd {line}\n")
-    textures = nr.load_obj(path, load_texture=True)[2]
+    color = {"RGB": (51, 51, 51), "RGBA": (51, 51, 51, 0), "L": 51}[mode]
+    image_module.new(mode, (2, 2), color).save(tmp_path / ("wood #1.png" if "#1" in image else "wood.png"))
+    obj = f"mtllib {library}\n{TRIANGLE}vt 0.5\nusemtl {used}\nf 1/1 2/1 3/1\n"
+    mtl = f"newmtl blue\nKd 0 0 1\n\nnewmtl {made}\nKd 1 0 0 # red\nmap_Kd {image}\n"
+    write(tmp_path, a_obj=obj, a_mtl=mtl)
+    (tmp_path / "none.mtl").write_text("# nothing")
+    monkeypatch.chdir(tmp_path.parent)
+    textures = nr.load_obj(f"{tmp_path.name}/a.obj", load_texture=True)[2]
     torch.testing.assert_close(textures, torch.full_like(textures, 0.2))
+
+
+def test_images_of_16_bits(tmp_path):
+    image_module = pytest.importorskip("PIL.Image")
+    image_module.fromarray(np.full((2, 2), 13107, dtype=np.uint16)).save(tmp_path / "deep.png")
+    np.testing.assert_allclose(read_image(str(tmp_path / "deep.png")), np.full((2, 2, 3), 0.2), atol=1e-6)
 
 
 def test_textures_of_another_material_file(tmp_path):
@@ -163,29 +148,9 @@ def test_textures_of_another_material_file(tmp_path):
     (tmp_path / "b.mtl").write_text("newmtl red\nKd 0 1 0\n")
     assert torch.all(load_textures(path, tmp_path / "b.mtl", 2, use_bilinear=False)[1] == torch.tensor([0, 1.0, 0]))
     assert texture_wrapping_dict == {"REPEAT": 0, "MIRRORED_REPEAT": 1, "CLAMP_TO_EDGE": 2, "CLAMP_TO_BORDER": 3}
-    with pytest.raises(ValueError, match="texture_wrapping must be one of REPEAT"):
-        load_textures(path, tmp_path / "a.mtl", 2, "WRAP")
-
-
-def test_millions_of_corners_take_little_memory(tmp_path):
-    """Some 30 times the size of the file."""
-    write(tmp_path, a_obj=f"{TRIANGLE}f {'1 ' * 200_000}\n")
-    with at_most(30 * 400_000):
-        faces = nr.load_obj(tmp_path / "a.obj")[1]
-    assert faces.shape == (199_998, 3)
-
-
-def test_errors(tmp_path, monkeypatch):
-    path = write(tmp_path, a_obj=TRIANGLE + "f 1 2 3\n")
-    with pytest.raises(ValueError, match="names no"):
-        nr.load_obj(path, load_texture=True)
-    with pytest.raises(ValueError, match="texture_wrapping must be one of REPEAT"):
-        nr.load_obj(path, texture_wrapping="WRAP")
-    with pytest.raises(FileNotFoundError):
-        nr.load_obj(tmp_path / "b.obj")
-    (tmp_path / "a.mtl").write_text("newmtl x\nKd 1 1\n")
-    with pytest.raises(ValueError, match=r"a.mtl, line 2.*3 numbers are needed"):
-        load_mtl(tmp_path / "a.mtl")
+    (tmp_path / "b.mtl").write_text("newmtl x\nKd 1 1\n")
+    with pytest.raises(ValueError, match=r"b.mtl, line 2.*3 numbers are needed"):
+        load_mtl(tmp_path / "b.mtl")
 
 
 def test_images_without_pillow(tmp_path, monkeypatch):
@@ -203,23 +168,6 @@ def test_images_without_pillow(tmp_path, monkeypatch):
         nr.load_obj(path, load_texture=True)
     with pytest.raises(ImportError, match=r"pip install pillow"):
         nr.save_obj(tmp_path / "b.obj", torch.rand(3, 3), torch.tensor([[0, 1, 2]]), torch.rand(1, 2, 2, 2, 3))
-
-
-HOSTILE = {
-    "nan": ("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "3 numbers are needed, finite in float32"),
-    "beyond float32": ("v 0 0 1e39\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite in float32"),
-    "one point": ("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "finite in float32"),
-    "too wide": ("v -3e38 0 0\nv 3e38 0 0\nv 0 1 0\nf 1 2 3\n", "finite in float32"),
-    "a number beyond any": ("v 0 0 0\nf 1 1 " + "9" * 400 + "\n", "cannot be read"),
-}
-
-
-@pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_files(tmp_path, name):
-    text, message = HOSTILE[name]
-    write(tmp_path, **{"a_obj": text})
-    with pytest.raises(ValueError, match=message):
-        nr.load_obj(tmp_path / "a.obj")
 
 
 def test_hostile_materials_and_images(tmp_path, monkeypatch):
@@ -245,11 +193,14 @@ def test_hostile_materials_and_images(tmp_path, monkeypatch):
     refused(r"a\.obj has \d+ bytes; at most 20 are read")
 
 
-def test_long_names_of_materials_take_no_memory_per_face(tmp_path):
+def test_long_lines_and_names_take_little_memory(tmp_path):
+    """Some 30 times the size of the file, and nothing per face."""
+    write(tmp_path, a_obj=f"{TRIANGLE}f {'1 ' * 50_000}\n")
+    with at_most(30 * 100_000):
+        assert nr.load_obj(tmp_path / "a.obj")[1].shape == (49_998, 3)
     name = "m" * 200_000
-    faces = "f 1 2 3\n" * 2000
-    write(tmp_path, **{"a_obj": f"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl {name}\n{faces}"})
-    write(tmp_path, **{"a_mtl": f"newmtl {name}\nKd 1 0 0\n"})
+    write(tmp_path, a_obj=f"mtllib a.mtl\n{TRIANGLE}usemtl {name}\n" + "f 1 2 3\n" * 2000)
+    write(tmp_path, a_mtl=f"newmtl {name}\nKd 1 0 0\n")
     with at_most(2**26):
         textures = nr.load_obj(tmp_path / "a.obj", load_texture=True, texture_size=2)[2]
     assert textures.shape == (2000, 2, 2, 2, 3) and (textures[..., 0] == 1).all()

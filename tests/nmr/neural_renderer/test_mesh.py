@@ -33,8 +33,3 @@ def test_batches_share_memory_and_gradients():
     assert vertices.shape == (3, 12, 3) and faces.shape == (3, 20, 3) and textures.shape == (3, 20, 2, 2, 2, 3)
     textures.sum().backward()
     assert torch.all(mesh.textures.grad > 0)
-
-
-def test_errors():
-    with pytest.raises(TypeError, match=r"Mesh.fromobj\(filename\) reads a file"):
-        nr.Mesh("a.obj", 4)

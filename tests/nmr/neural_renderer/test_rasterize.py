@@ -7,7 +7,8 @@ from vectors import gradient_tolerance, load_vector, vector_names
 
 import nmr.neural_renderer as nr
 
-SILHOUETTES, DEPTHS, COLORS = (vector_names(pattern) for pattern in ("sil_*", "depth_*", "rgb_*"))
+DEPTHS, COLORS = (vector_names(pattern) for pattern in ("depth_*", "rgb_*"))
+assert len(DEPTHS) >= 22 and len(COLORS) >= 12
 
 
 def settings_of(v):
@@ -42,23 +43,13 @@ def assert_gradient(gradient, expected, tolerance):
         assert np.linalg.norm(gradient.numpy() - expected) <= tolerance * scale
 
 
-@pytest.mark.parametrize("name", SILHOUETTES)
-def test_silhouettes_bit_for_bit(name):
-    v = load_vector(name)
-    vertices = torch.from_numpy(v["vertices"]).requires_grad_()
-    alpha = nr.rasterize_silhouettes(corners_of(v, vertices), **settings_of(v))
-    alpha.backward(torch.from_numpy(v["grad_alpha"]))
-    assert np.array_equal(alpha.detach().numpy(), v["alpha"])
-    assert_gradient(vertices.grad, v["grad_vertices"], gradient_tolerance(name))
-
-
 @pytest.mark.parametrize("name", DEPTHS)
 def test_depth(name):
     v = load_vector(name)
     vertices = torch.from_numpy(v["vertices"]).requires_grad_()
     depth = nr.rasterize_depth(corners_of(v, vertices), **settings_of(v))
     depth.backward(torch.from_numpy(v["grad_depth"]))
-    assert_image(depth, v, "depth")
+    assert np.array_equal(depth.detach().numpy(), v["depth"])  # fragile pixels included
     assert_gradient(vertices.grad, v["grad_vertices"], gradient_tolerance(name))
 
 
@@ -77,7 +68,7 @@ def test_colors(name):
     for output in outputs:
         assert_image(images[output], v, output)
     assert_gradient(vertices.grad, v["grad_vertices"], gradient_tolerance(name))
-    assert_gradient(textures.grad, v["grad_textures"], 1e-4)
+    assert np.abs(textures.grad.numpy() - v["grad_textures"]).max() <= max(5 * v["grad_textures_fma_maxdiff"], 1e-5)
 
 
 def scene(batch=2, ts=2, dtype=torch.float32):
@@ -106,37 +97,6 @@ def test_outputs_that_are_not_wanted_are_none():
             assert (one is None) if not flag else torch.equal(one, all_of_them)
 
 
-def test_defaults():
-    corners, textures = scene(1)
-    images = nr.rasterize_rgbad(corners, textures)
-    assert images["rgb"].shape == (1, 3, 256, 256) and images["depth"].max() == 100
-    assert torch.equal(nr.rasterize_silhouettes(corners), images["alpha"])
-    assert torch.equal(nr.rasterize_depth(corners), images["depth"])
-    assert torch.equal(nr.rasterize(corners, textures), images["rgb"])
-    background = images["alpha"] == 0
-    assert background.any() and not images["rgb"].permute(0, 2, 3, 1)[background].any()
-
-
-@pytest.mark.parametrize("convert", [list, tuple, np.array, torch.tensor, lambda x: list(torch.tensor(x))])
-def test_backgrounds(convert):
-    corners, textures = scene()
-    alpha = nr.rasterize_silhouettes(corners, 8)
-    for color in ([0.2, 0.4, 0.6], [[0.2, 0.4, 0.6]] * 2, [[0.2, 0.4, 0.6], [0.1, 0.3, 0.5]]):
-        rgb = nr.rasterize(corners, textures, 8, background_color=convert(color)).permute(0, 2, 3, 1)
-        for b in range(2):
-            expected = torch.tensor(color[b] if isinstance(color[0], list) else color)
-            background = rgb[b][alpha[b] == 0]
-            assert len(background) and torch.equal(background, expected.expand_as(background))
-
-
-def test_gradient_of_the_background():
-    corners, textures = scene()
-    color = torch.rand(2, 3, requires_grad=True)
-    nr.rasterize(corners, textures, 8, background_color=color).sum().backward()
-    uncovered = (1 - nr.rasterize_silhouettes(corners, 8)).sum((1, 2))
-    torch.testing.assert_close(color.grad, uncovered[:, None].expand(2, 3))
-
-
 def test_module_returns_rasters_from_the_bottom_up():
     corners, textures = scene()
     images = nr.rasterize_rgbad(corners, textures, 8, False)
@@ -154,28 +114,3 @@ def test_one_texture_for_all_images_and_other_channels():
     five = torch.cat([textures, textures[..., :2]], dim=-1)
     images = nr.rasterize(corners, five, 8, background_color=[0] * 5)
     assert torch.equal(images[:, :3], nr.rasterize(corners, textures, 8)) and images.shape[1] == 5
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        (dict(faces=torch.rand(2, 9, 3)), ValueError, "faces must be corners"),
-        (dict(faces=torch.ones(2, 9, 3, 3, dtype=torch.int64)), TypeError, "faces.float()"),
-        (dict(textures=None), ValueError, "RGB images need textures"),
-        (dict(textures=torch.rand(3, 9, 2, 2, 2, 3)), ValueError, "textures must have the batch size"),
-        (dict(textures=torch.rand(2, 8, 2, 2, 2, 3)), ValueError, "number of faces"),
-        (dict(textures=torch.rand(2, 9, 2, 2, 3)), ValueError, r"textures must have shape"),
-        (dict(image_size=0), ValueError, "image_size must lie in"),
-        (dict(image_size=(8, 9, 3)), ValueError, "image_size must be an integer"),
-        (dict(image_size=8.5), TypeError, "image_size must be an integer"),
-        (dict(near=2, far=1), ValueError, "near < far"),
-        (dict(eps=0), ValueError, "eps must be positive"),
-        (dict(background_color=(0, 0)), ValueError, "background must be a number"),
-        (dict(background_color=torch.rand(3, 3)), ValueError, r"or \[2, 3\], got"),
-        (dict(background_color="black"), TypeError, "background_color must be numbers"),
-    ],
-)
-def test_errors(change, error, message):
-    corners, textures = scene()
-    with pytest.raises(error, match=message):
-        nr.rasterize(**(dict(faces=corners, textures=textures, image_size=8) | change))

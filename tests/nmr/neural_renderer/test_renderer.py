@@ -93,24 +93,16 @@ def test_arguments_and_defaults_of_the_published_interface():
     assert nr.__version__ == "1.1.3"
 
 
-def test_modules_of_the_published_package():
-    from nmr.neural_renderer.get_points_from_angles import get_points_from_angles
-    from nmr.neural_renderer.lighting import lighting
-    from nmr.neural_renderer.load_obj import load_mtl, load_obj
-    from nmr.neural_renderer.look import look
-    from nmr.neural_renderer.look_at import look_at
-    from nmr.neural_renderer.mesh import Mesh
-    from nmr.neural_renderer.perspective import perspective
-    from nmr.neural_renderer.projection import projection
-    from nmr.neural_renderer.rasterize import DEFAULT_BACKGROUND_COLOR, Rasterize, rasterize_depth
-    from nmr.neural_renderer.renderer import Renderer
-    from nmr.neural_renderer.save_obj import create_texture_image, save_obj
-    from nmr.neural_renderer.vertices_to_faces import vertices_to_faces
-
-    names = (get_points_from_angles, lighting, load_obj, look, look_at, Mesh, perspective, projection, Rasterize)
-    for one in (*names, rasterize_depth, Renderer, save_obj, vertices_to_faces):
-        assert getattr(nr, one.__name__) is one
-    assert callable(load_mtl) and callable(create_texture_image) and DEFAULT_BACKGROUND_COLOR == (0, 0, 0)
+def test_faces_that_cross_the_plane_of_the_eye_are_not_clipped():
+    """As published: x and y of a vertex behind the eye are divided by a negative depth."""
+    vertices = torch.tensor([[[-1.0, -0.5, 0.5], [1, -0.5, 0.5], [0.3, -0.5, -4]]])
+    renderer = nr.Renderer(camera_mode="look", image_size=16)
+    renderer.eye = [0, 0, -1]
+    _, depth, alpha = renderer(vertices, torch.tensor([[[0, 1, 2]]]), torch.ones(1, 1, 2, 2, 2, 3))
+    how = dict(outputs=("alpha", "depth"), image_size=16)
+    mesh = vertices, torch.tensor([[0, 1, 2]]), nmr.Look(renderer.eye)
+    plain, cut = (nmr.render(*mesh, clip=clip, **how) for clip in (False, True))
+    assert torch.equal(alpha, plain.alpha) and torch.equal(depth, plain.depth) and not torch.equal(alpha, cut.alpha)
 
 
 def test_defaults_of_attributes():
@@ -130,18 +122,6 @@ def test_calibrated_cameras_are_stored_as_published():
     assert torch.equal(nr.Renderer(K=K, R=R, t=t).dist_coeffs, torch.zeros(1, 5))
     leaf = torch.zeros(1, 3, requires_grad=True)
     assert nr.Renderer(K=K, R=R, t=leaf).t is leaf
-
-
-def test_calibrated_cameras_need_no_viewing_angle():
-    vertices, faces = sphere()
-    K = torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-    camera = dict(K=K, R=torch.eye(3), t=torch.tensor([0, 0, 4.0]), orig_size=1, image_size=16)
-    renderer = nr.Renderer(camera_mode="projection", viewing_angle=0, **camera)
-    expected = nr.Renderer(**camera).render_silhouettes(vertices, faces)
-    assert expected.any() and torch.equal(renderer.render_silhouettes(vertices, faces), expected)
-    renderer.camera_mode = "look_at"
-    with pytest.raises(ValueError, match=r"camera_mode='look_at' needs an eye; set renderer\.eye"):
-        renderer.render_silhouettes(vertices, faces)
 
 
 @pytest.mark.parametrize("perspective", [True, False])
@@ -231,29 +211,6 @@ def test_eyes_and_colours_in_any_container(convert, batch):
     torch.testing.assert_close(images(), out)
 
 
-@pytest.mark.parametrize("dtype", [torch.int16, torch.int32, torch.int64, torch.float32])
-def test_faces_of_any_type(dtype):
-    vertices, faces = sphere()
-    renderer = nr.Renderer(camera_mode="look_at", image_size=16)
-    expected = renderer.render_silhouettes(vertices, faces)
-    assert torch.equal(renderer.render_silhouettes(vertices, faces.to(dtype)), expected)
-    assert torch.equal(renderer.render_silhouettes(vertices, faces[:1].to(dtype)), expected)
-    assert torch.equal(renderer.render_silhouettes(vertices, faces[0].to(dtype)), expected)
-
-
-def test_one_mesh_seen_by_many_cameras():
-    vertices, faces = sphere(1)
-    textures = torch.rand(1, 80, 2, 2, 2, 3)
-    renderer = nr.Renderer(camera_mode="look_at", image_size=16)
-    eyes = nr.get_points_from_angles(torch.full((3,), 3.0), torch.zeros(3), torch.tensor([0.0, 100, 200]))
-    renderer.eye = eyes
-    rgb, depth, alpha = renderer(vertices, faces, textures)
-    for b in range(3):
-        renderer.eye = eyes[b]
-        for one, image in zip(renderer(vertices, faces, textures), (rgb, depth, alpha), strict=True):
-            torch.testing.assert_close(one[0], image[b])
-
-
 def test_different_faces_of_one_set_of_vertices():
     vertices, faces = sphere(2)
     faces = torch.stack([faces[0], faces[1].roll(7, 0)])
@@ -269,27 +226,6 @@ def test_silhouettes_and_depth_have_their_own_range_as_published():
     assert renderer.render_silhouettes(vertices, faces).any() and renderer.render_depth(vertices, faces).max() == 100
     _, depth, alpha = renderer(vertices, faces, torch.rand(2, 80, 2, 2, 2, 3))
     assert not alpha.any() and torch.all(depth == 1.5)
-
-
-def test_faces_that_cross_the_plane_of_the_eye_are_not_clipped():
-    """As published: x and y of a vertex behind the eye are divided by a negative depth."""
-    vertices = torch.tensor([[[-1.0, -0.5, 0.5], [1, -0.5, 0.5], [0.3, -0.5, -4]]])
-    faces, options = torch.tensor([[[0, 1, 2]]]), dict(image_size=16)
-    renderer = nr.Renderer(camera_mode="look", image_size=16)
-    renderer.eye = [0, 0, -1]
-    _, depth, alpha = renderer(vertices, faces, torch.ones(1, 1, 2, 2, 2, 3))
-    on_screen = nr.perspective(nr.look(vertices, renderer.eye, [0, 0, 1]))
-    by_hand = nr.rasterize_silhouettes(
-        nr.vertices_to_faces(on_screen, torch.cat([faces, faces.flip(-1)], 1)), **options
-    )
-    for clip in (True, False):
-        wanted = nmr.render_silhouette(vertices, faces[0], nmr.Look(renderer.eye), clip=clip, **options)
-        assert wanted.any()
-        for silhouette in (renderer.render_silhouettes(vertices, faces), alpha, by_hand):
-            assert torch.equal(silhouette, wanted) != clip
-        wanted = nmr.render_depth(vertices, faces[0], nmr.Look(renderer.eye), clip=clip, **options)
-        for image in (renderer.render_depth(vertices, faces), depth):
-            assert torch.equal(image, wanted) != clip
 
 
 def test_light_without_direction_leaves_flat_colours():
@@ -311,62 +247,3 @@ def test_renderers_can_be_copied_and_nested():
     assert [name for name, _ in model.named_parameters()] == ["renderer.eye"]
     model.renderer.eye = nr.get_points_from_angles(2.7, 0, 90)
     assert not list(model.parameters()) and model.renderer.render_silhouettes(*sphere()).any()
-
-
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda r, v, f: r.render_silhouettes(v[0], f), ValueError, r"use vertices\[None\]"),
-        (lambda r, v, f: r.render_silhouettes(v.numpy(), f), TypeError, "vertices must be a float tensor"),
-        (lambda r, v, f: r.render_silhouettes(v.half(), f), TypeError, "vertices.float()"),
-        (lambda r, v, f: r.render_silhouettes(v, f.tolist()), TypeError, "faces must be an integer tensor"),
-        (lambda r, v, f: r.render_silhouettes(v, f + 1), ValueError, "faces"),
-        (lambda r, v, f: r.render_rgb(v, f + 1, torch.rand(2, 80, 2, 2, 2, 3)), ValueError, "faces"),
-        (lambda r, v, f: r.render_silhouettes(v[:1].expand(3, -1, -1), f), ValueError, "batch size"),
-        (lambda r, v, f: r.render_rgb(v, f, torch.rand(2, 79, 2, 2, 2, 3)), ValueError, "number of faces"),
-        (lambda r, v, f: r.render_rgb(v, f, None), ValueError, "RGB images need textures"),
-        (lambda r, v, f: r(v, f), ValueError, "RGB images need textures"),
-        (
-            lambda r, v, f: nr.Renderer(K=torch.eye(3), t=[0, 0, 1]).render_depth(v, f),
-            ValueError,
-            "K, R and t; missing: R;",
-        ),
-        (lambda r, v, f: nr.Renderer(K=torch.eye(3)).render_depth(v, f), ValueError, "missing: R, t;"),
-        (lambda r, v, f: nr.Renderer(camera_mode="orthographic"), ValueError, "camera_mode must be"),
-    ],
-)
-def test_errors(call, error, message):
-    with pytest.raises(error, match=message):
-        call(nr.Renderer(camera_mode="look_at", image_size=16), *sphere())
-
-
-def test_a_mesh_without_faces():
-    vertices, faces = sphere()
-    renderer = nr.Renderer(camera_mode="look_at", image_size=16, background_color=[0.1, 0.2, 0.3])
-    rgb, depth, alpha = renderer(vertices, faces[:, :0], torch.rand(2, 0, 2, 2, 2, 3))
-    assert torch.equal(rgb[1, :, 3, 4], torch.tensor([0.1, 0.2, 0.3])) and torch.all(depth == 100) and not alpha.any()
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_cuda_tensors_are_staged_through_the_host():
-    vertices, faces = sphere()
-    textures = torch.rand(2, 80, 2, 2, 2, 3)
-    leaf = vertices.cuda().requires_grad_()
-    renderer = nr.Renderer(camera_mode="look", image_size=16).cuda()
-    images = renderer(leaf, faces.cuda(), textures.cuda())
-    sum(image.sum() for image in images).backward()
-    assert leaf.grad.is_cuda and leaf.grad.any()
-    for image, expected in zip(images, renderer(vertices, faces, textures), strict=True):
-        assert image.is_cuda
-        torch.testing.assert_close(image.cpu(), expected)
-
-
-def test_cameras_and_light_of_different_batches():
-    vertices, faces = sphere()
-    renderer = nr.Renderer(camera_mode="look_at", image_size=16)
-    renderer.eye = torch.rand(3, 3)
-    with pytest.raises(ValueError, match="one batch size"):
-        renderer.render_silhouettes(vertices, faces)
-    renderer.light_direction = torch.rand(2, 3)
-    with pytest.raises(ValueError, match="light for 2 images, but 3 are drawn"):
-        renderer(vertices[:1], faces[:1], torch.rand(1, 80, 2, 2, 2, 3))

@@ -56,20 +56,3 @@ def test_textures_come_back(tmp_path, texture_size):
     for k in range(3):
         index = tuple(3 * (torch.arange(3) == k))
         torch.testing.assert_close(loaded[(slice(None), *index)], corner_colors[:, k], rtol=0, atol=0.03)
-
-
-def test_errors(tmp_path):
-    vertices, faces = nmr.icosphere(0)
-    with pytest.raises(ValueError, match=r"must end in .obj"):
-        nr.save_obj(tmp_path / "a.ply", vertices, faces)
-    with pytest.raises(ValueError, match=r"vertices must be those of one mesh.*take \[0\]"):
-        nr.save_obj(tmp_path / "a.obj", vertices[None], faces)
-    with pytest.raises(ValueError, match="faces must be those of one mesh"):
-        nr.save_obj(tmp_path / "a.obj", vertices, faces[None])
-    with pytest.raises(ValueError, match="textures must be those of one mesh"):
-        nr.save_obj(tmp_path / "a.obj", vertices, faces, torch.rand(1, len(faces), 2, 2, 2, 3))
-    with pytest.raises(ValueError, match="one per face, 20"):
-        nr.save_obj(tmp_path / "a.obj", vertices, faces, torch.rand(3, 2, 2, 2, 3))
-    with pytest.raises(ValueError, match="texture_size_out must be at least 2"):
-        create_texture_image(torch.rand(3, 2, 2, 2, 3), 1)
-    assert not os.listdir(tmp_path)

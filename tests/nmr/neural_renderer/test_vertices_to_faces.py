@@ -16,21 +16,3 @@ def test_corners(kind):
     assert torch.equal(nr.vertices_to_faces(vertices, given[0]), vertices[:, faces[0]])
     corners.sum().backward()
     assert torch.equal(vertices.grad[..., 0].sum(1), torch.tensor([15.0, 15.0]))
-
-
-@pytest.mark.parametrize(
-    ("vertices", "faces", "error", "message"),
-    [
-        (torch.rand(7, 3), torch.zeros(1, 5, 3), ValueError, r"use vertices\[None\]"),
-        (torch.rand(2, 7, 2), torch.zeros(2, 5, 3), ValueError, r"vertices must have shape"),
-        (torch.rand(2, 7, 3), torch.zeros(3, 5, 3), ValueError, "batch size of the vertices, 2"),
-        (torch.rand(2, 7, 3), torch.zeros(2, 5, 4), ValueError, "faces must have shape"),
-        (torch.rand(2, 7, 3), torch.rand(2, 5, 3), ValueError, "with fractions"),
-        (torch.rand(2, 7, 3), [[0, 1, 2]], TypeError, "use torch.as_tensor"),
-        (torch.rand(2, 7, 3), torch.full((2, 5, 3), 7), ValueError, r"vertices 0..6, got 7..7"),
-        (torch.rand(2, 7, 3), torch.full((2, 5, 3), -1), ValueError, r"got -1..-1"),
-    ],
-)
-def test_errors(vertices, faces, error, message):
-    with pytest.raises(error, match=message):
-        nr.vertices_to_faces(vertices, faces)
