@@ -20,17 +20,16 @@ WITHOUT_COLOR = 0.3  # share of the images that it leaves without colours
 def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *, inverted: bool = True) -> Batch:
     """The batch with the named changes, each drawn for every sample on its own, in the order of the names.
 
-    "flip": image, mask and, where it is known, pose mirrored left-right with probability 1/2 (Kato and Harada 2019).
-    "flip-image": the colours of the input image alone, while every mask stays with its pose (published code of both
-    papers on Pascal3D+; it works because the mesh is symmetric). "channels": a random permutation of the three colours.
+    "flip": image, mask and pose (if known) mirrored left-right with probability 1/2 (Kato and Harada 2019).
+    "flip-image": the colours alone (published code of both papers on Pascal3D+, whose meshes are symmetric).
+    "channels": a random permutation of the three colours.
     "colors": a random permutation, each colour times a random factor of 0.7 .. 1.3, and 30 % of the images without
-    colours (0), so that an object is not known by its tint. It is 255 - colour that is changed, so that a white
-    background stays white; `inverted` says that images are stored so. It is not for encoders that ignore the mask.
+    colours (0). It changes 255 - colour, so that a white background stays white; `inverted` says that images are stored
+    so. It is not for encoders that ignore the mask.
     "crop": the colours cut anew from the original image, each side of the padded box moved by up to 15 % of the box,
-    uniformly (Pascal3D+, both papers); it comes first, and masks stay as they are. Where processes share a step, each
-    view is changed as in one process.
+    uniformly (Pascal3D+, both papers). It must come first.
 
-    Raises ValueError for an unknown name, for "crop" where the data set has no original images, or not first.
+    Raises ValueError for an unknown name, and for "crop" if it is not first or there are no original images.
     """
     rng = np.random.default_rng([seed, step, 1])
     views = batch.step_views
@@ -41,14 +40,10 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *
         images, colors = batch.images, batch.images[:, :3]
         if name == "crop":
             if position > 0:
-                raise ValueError(
-                    f"crop must be the first augmentation, for it makes new images; got {', '.join(names)}"
-                )
+                raise ValueError(f"crop must be the first augmentation, got {', '.join(names)}")
             if batch.crops is None:
-                raise ValueError(
-                    "the augmentation crop needs the original images and boxes, which only the layout pascal3d has, "
-                    "and not in shards; leave it out"
-                )
+                where = "only the layout pascal3d has, and not in shards"
+                raise ValueError(f"the augmentation crop needs the original images, which {where}; leave it out")
             colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))[rows.numpy()]))
         elif name in ("channels", "colors"):
             order = torch.from_numpy(np.argsort(rng.random((count, 3)), axis=1))[rows]

@@ -14,10 +14,10 @@ from learn3d.data.poses import Poses
 
 @dataclass(frozen=True, eq=False)
 class StepViews:
-    """Poses and classes of all B views of a training step. Where processes share the step, each knows all of them."""
+    """Poses and classes of all B views of a training step. If processes share the step, each knows all of them."""
 
     rows: torch.Tensor  # int64 [b]: which of the B views are in this process's batch
-    poses: Poses | None  # where the B cameras stood; None where it is not known
+    poses: Poses | None  # of the B cameras; None if unknown
     view_ids: torch.Tensor  # int64 [B]
     class_ids: torch.Tensor  # int64 [B]
 
@@ -31,20 +31,20 @@ class Batch:
 
     images: torch.Tensor  # uint8 [B, 4, S, S]: R, G, B and the mask, in the form that the encoder takes
     masks: torch.Tensor  # float32 [B, 64, 64] in [0, 1]: silhouettes to be matched, row 0 = top
-    poses: Poses | None  # where the B cameras stood; None where it is not known
-    view_ids: torch.Tensor  # int64 [B] in 0 .. K-1: the pose class of each view
+    poses: Poses | None  # of the B cameras; None if unknown
+    view_ids: torch.Tensor  # int64 [B] in 0 .. K-1: the view class of each view
     object_ids: torch.Tensor  # int64 [B]: which object of the split each view shows
-    class_ids: torch.Tensor  # int64 [B]: which category each object belongs to (0 where there is one only)
-    voxels: torch.Tensor | None  # bool [B, 32, 32, 32] ground truth in the data set's axes, None where there is none
+    class_ids: torch.Tensor  # int64 [B]: which category each object belongs to (0 if there is one only)
+    voxels: torch.Tensor | None  # bool [B, 32, 32, 32] ground truth in the data set's axes; None if there is none
     crops: Crops | None = None  # the original images, which the augmentation "crop" cuts colours from; None: unknown
-    part_of: StepViews | None = None  # all views of the step, where other processes have the rest of them
+    part_of: StepViews | None = None  # all views of the step, if other processes have the rest
 
     def __len__(self) -> int:
         return len(self.images)
 
     @property
     def cameras(self) -> nmr.cameras.Camera:
-        """The B cameras that saw the images, where their poses are known."""
+        """The B cameras that saw the images; their poses must be known."""
         return self.poses.cameras()
 
     @property
@@ -55,6 +55,6 @@ class Batch:
         return StepViews(torch.arange(len(self)), self.poses, self.view_ids, self.class_ids)
 
     def with_poses(self, poses: Poses) -> Batch:
-        """The same batch, where `poses` are those of all views of the step."""
+        """The same batch with `poses` for all views of the step."""
         part = None if self.part_of is None else dataclasses.replace(self.part_of, poses=poses)
         return dataclasses.replace(self, poses=poses if part is None else poses[part.rows], part_of=part)

@@ -1,24 +1,21 @@
-"""Everything that is wrong with a folder of data, found at once: what `learn3d check-dataset` prints.
+"""Everything that is wrong with a folder of data, found at once: the report of `learn3d check-dataset`.
 
-A reader takes part with three functions beside `load`: `contents(folder)`, the categories and their splits;
-`count(folder, category, split)`, how many objects a split should have; `problems(folder, category, split)`, what is
-wrong with them. An error is what `load` would raise, a warning is what it would read in spite of being odd.
+It is the walk of the readers' `load`, with findings that go on: an error is something that `load` would raise, a
+warning an oddity that it would read.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from learn3d.data import shards
 from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS
-from learn3d.data.layouts import LAYOUTS, layouts_in
+from learn3d.data.layouts import LAYOUTS, Layout, layouts_in
 from learn3d.data.readers import READERS
-from learn3d.files.findings import Problem
+from learn3d.files.findings import Findings, Problem
 
 
 @dataclass(frozen=True)
@@ -27,18 +24,12 @@ class SplitReport:
 
     category: str
     split: str
-    objects: int  # how many it should have; 0 where that cannot be read
+    objects: int  # that the files list
     problems: tuple[Problem, ...]
 
-    @property
-    def errors(self) -> int:
-        """How many of the problems are errors."""
-        return sum(problem.severity == "error" for problem in self.problems)
-
-    @property
-    def warnings(self) -> int:
-        """How many of the problems are warnings."""
-        return len(self.problems) - self.errors
+    def count(self, severity: str) -> int:
+        """Number of the problems that are an "error" or a "warning"."""
+        return sum(problem.severity == severity for problem in self.problems)
 
 
 @dataclass(frozen=True)
@@ -49,36 +40,20 @@ class Report:
     folder: str
     splits: tuple[SplitReport, ...]
 
-    @property
-    def errors(self) -> int:
-        """How many problems are errors."""
-        return sum(split.errors for split in self.splits)
-
-    @property
-    def warnings(self) -> int:
-        """How many problems are warnings."""
-        return sum(split.warnings for split in self.splits)
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values: {layout, folder, errors, warnings, splits: [{category, split, objects, problems: [..]}]}."""
-        return {"errors": self.errors, "warnings": self.warnings, **dataclasses.asdict(self)}
+    def count(self, severity: str) -> int:
+        """Number of problems that are an "error" or a "warning"."""
+        return sum(split.count(severity) for split in self.splits)
 
     def table(self) -> str:
         """A line per category and split: objects, errors, warnings."""
         rows = [("category", "split", "objects", "errors", "warnings")]
-        rows += [(s.category, s.split, str(s.objects), str(s.errors), str(s.warnings)) for s in self.splits]
-        widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-        return "\n".join(
-            "  ".join(
-                cell.ljust(width) if column < 2 else cell.rjust(width)
-                for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-            ).rstrip()
-            for row in rows
-        )
+        rows += [(s.category, s.split, s.objects, s.count("error"), s.count("warning")) for s in self.splits]
+        width = max(len(row[0]) for row in rows)
+        return "\n".join(f"{row[0]:{width}}  {row[1]:5}  {row[2]:>7}  {row[3]:>6}  {row[4]:>8}" for row in rows)
 
 
 def check_folder(
-    layout: str,
+    layout: Layout,
     folder: Path | str,
     categories: Sequence[str] = (),
     splits: Sequence[str] = (),
@@ -95,43 +70,33 @@ def check_folder(
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder}")
-    found = _contents(layout, folder)
+    found, others = shards.contents(folder), {}
+    try:
+        others = READERS[layout].contents(folder)
+    except (ValueError, OSError):  # there are only shards, or reading a category will tell
+        if not categories and not found:
+            raise
+    for category, there in others.items():
+        found[category] = tuple(split for split in SPLITS if split in (*there, *found.get(category, ())))
     if not found and not categories:
         others = layouts_in(folder, layout)
-        what = f"; it is a data set of the layout {others[0]!r}: add --layout {others[0]}" if others else ""
-        raise FileNotFoundError(f"{folder} holds nothing of the layout {layout!r}{what or '; see docs/data-sets.md'}")
+        hint = f"it is a data set of the layout {others[0]!r}: add --layout {others[0]}" if others else "see"
+        raise FileNotFoundError(f"{folder} holds nothing of the layout {layout!r}; {hint} (docs/data-sets.md)")
     reports = []
     for category in categories or found:
-        there = found.get(category) or found.get(synset_of(category)) or ("train", "val", "test")
-        for split in splits or there:
-            reports.append(_check_split(layout, folder, category, split, progress))
+        there = found.get(category) or found.get(synset_of(category)) or SPLITS
+        reports += [_check_split(layout, folder, category, split, progress) for split in splits or there]
     return Report(layout, str(folder), tuple(reports))
 
 
-def _contents(layout: str, folder: Path) -> dict[str, tuple[str, ...]]:
-    """The categories of a folder and their splits, those in shards included."""
-    found = shards.contents(folder)
-    try:
-        others = READERS[layout].contents(folder)
-    except (ValueError, OSError):
-        if not found:
-            raise
-        others = {}  # there are only shards
-    for category, splits in others.items():
-        found[category] = tuple(split for split in SPLITS if split in (*splits, *found.get(category, ())))
-    return found
-
-
 def _check_split(layout: str, folder: Path, category: str, split: str, progress: bool) -> SplitReport:
-    stored = shards.holds(folder, category, split)
-    reader = shards if stored else READERS[layout]
-    options = {"layout": layout} if stored else {}
-    problems = tuple(reader.problems(folder, category, split, progress=progress, **options))
-    return SplitReport(category, split, _count(reader, folder, category, split), problems)
-
-
-def _count(reader: Any, folder: Path, category: str, split: str) -> int:
+    load, options = READERS[layout].load, {"progress": progress} if "progress" in LAYOUTS[layout].options else {}
+    if shards.holds(folder, category, split):
+        load, options = shards.load, {"layout": layout}
+    findings = Findings()
     try:
-        return reader.count(folder, category, split)
-    except (ValueError, FileNotFoundError):
-        return 0  # the problems say why
+        load(folder, category, split, findings=findings, **options)
+    except (ValueError, OSError) as error:  # which ends the walk
+        path, message = getattr(error, "path", folder), getattr(error, "message", str(error))
+        findings.problems.append(Problem(str(path), message))
+    return SplitReport(category, split, findings.objects, tuple(dict.fromkeys(findings.problems)))

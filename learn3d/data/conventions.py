@@ -35,22 +35,18 @@ class VoxelConvention:
     """Axes and normalisation of a data set's ground-truth grids."""
 
     name: str
-    swap: tuple[int, int] | None  # grid axes to exchange (of batch, 1, 2, 3) ...
+    swap: tuple[int, int]  # grid axes to exchange (of batch, 1, 2, 3) ...
     flip: tuple[int, ...]  # ... and then to reverse
-    box: float = 1.0  # side of the cube of the object frame, centred at the origin, that the grid spans
+    cube_side: float = 1.0  # of the cube of the object frame, centred at the origin, that the grid spans
     kato18_scale: float = 1.0  # shrinking before the kato18 voxeliser, whose rays sit on the grid's corner lines
 
     def to_axes(self, grid: Tensor) -> Tensor:
         """Grids [B, s, s, s] with axes (x, y, z) of the object frame, in the axes of the stored voxels."""
-        if self.swap is not None:
-            grid = grid.transpose(*self.swap)
-        return grid.flip(self.flip) if self.flip else grid
+        return grid.transpose(*self.swap).flip(self.flip)
 
     def to_object(self, grid: Tensor) -> Tensor:
         """The inverse of `to_axes`: stored voxels [B, s, s, s] in the axes (x, y, z) of the object frame."""
-        if self.flip:
-            grid = grid.flip(self.flip)
-        return grid.transpose(*self.swap) if self.swap is not None else grid
+        return grid.flip(self.flip).transpose(*self.swap)
 
     def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
         """Occupancy bool [B, 32, 32, 32] of meshes in the object frame, comparable with the stored voxels.
@@ -68,7 +64,7 @@ class VoxelConvention:
 
     def _to_unit(self, vertices: Tensor, definition: Definition) -> Tensor:
         """Object frame to the unit cube that the grid spans."""
-        return vertices * ((self.kato18_scale if definition == "kato18" else 1.0) / self.box) + 0.5
+        return vertices * ((self.kato18_scale if definition == "kato18" else 1.0) / self.cube_side) + 0.5
 
 
 #: Where a grid's corner lines lie inside the box: `VoxelConvention.kato18_scale` of most data sets.
@@ -77,13 +73,25 @@ INNER = (VOXEL_SIZE - 1) / VOXEL_SIZE
 KATO = VoxelConvention("kato", swap=(1, 2), flip=(3,), kato18_scale=INNER)
 
 
+@dataclass(frozen=True)
+class LayoutProperties:
+    """Facts about all data sets of a layout."""
+
+    voxels: bool  # there are true shapes, with which voxel IoU can be measured
+    convention: VoxelConvention  # axes of the true shapes
+    inverted: bool  # colours are stored as 255 - colour over black, see `ViewDataset.inverted`
+    validation: bool = True  # there is a split "val"; without one, networks are validated on "test"
+    angles: bool = True  # cameras have azimuth and elevation, whose cells can serve as view classes
+    stretched: bool = False  # images are the object's box of a photograph, stretched to a square over its background
+    options: tuple[str, ...] = ()  # of `load_dataset`, beside view_bins, that the reader knows
+
+
 def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:
     """Matrix [3, 3] that takes right-handed mesh coordinates to the object frame: object = matrix @ mesh.
 
     `up` is the mesh axis that points up, `front` the one that faces the camera of view 0 ("x", "-x", "y" ...). A viewer
-    in front of the mesh looks along -front and has (-front) x up = up x front on the right, so the rows are
-    [up x front, up, -front]. The determinant is -1: mesh files are right-handed, the renderer's frame is left-handed.
-    The default, (x, y, z) -> (-z, y, -x), is what Kato's rendering of ShapeNet amounts to.
+    in front of the mesh has (-front) x up = up x front on the right, so the rows are [up x front, up, -front] and the
+    determinant is -1. The default, (x, y, z) -> (-z, y, -x), is that of Kato's rendering of ShapeNet.
     """
     axes = {s + a: np.float64(-1 if s else 1) * row for s in ("", "-") for a, row in zip("xyz", np.eye(3), strict=True)}
     if up not in axes or front not in axes:
@@ -97,8 +105,3 @@ def view_poses(view_ids: torch.Tensor) -> LookAtPoses:
     """Poses of Kato's views, one per entry of `view_ids` (int64 [B] in 0 .. 23)."""
     azimuth_deg = AZIMUTH_STEP_DEG * torch.as_tensor(view_ids).to(torch.float32)
     return LookAtPoses(azimuth_deg, ELEVATION_DEG, DISTANCE, HALF_FOV_DEG)
-
-
-def view_cameras(view_ids: torch.Tensor) -> nmr.LookAt:
-    """Cameras of Kato's views, one per entry of `view_ids` (int64 [B] in 0 .. 23)."""
-    return view_poses(view_ids).cameras()

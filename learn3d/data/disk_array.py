@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import threading
 import zlib
 from collections.abc import Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from learn3d.files.reading import open_file
 
 MOST_BYTES = 2**45  # of a file
 WANTED = "a shard of a data set"
+_reader = ThreadPoolExecutor(1, "read ahead")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,26 +38,18 @@ class DiskArray:
     _ahead: dict[bytes, Future] = field(default_factory=dict)  # rows that `prepare` reads, by their numbers
 
     @classmethod
-    def of_file(
-        cls, path: Path, position: int, checksums: np.ndarray, row_shape: tuple[int, ...], dtype: np.dtype
-    ) -> DiskArray:
-        """The rows from a position of one file on, as many as there are checksums."""
-        count = len(checksums)
-        return cls(((path, position),), np.array([0, count]), checksums, row_shape, dtype, np.arange(count))
-
-    @classmethod
     def join(cls, parts: Sequence[DiskArray]) -> DiskArray:
         """The rows of several arrays, one after the other. Raises ValueError if their rows differ in shape or type."""
         if len({(part.row_shape, part.dtype) for part in parts}) != 1:
             raise ValueError("the arrays have rows of different shapes or types")
-        begins = np.cumsum([0] + [part.starts[-1] for part in parts])
-        ends = [part.starts[1:] + begin for part, begin in zip(parts, begins, strict=False)]
+        begins = np.cumsum([0] + [part.starts[-1] for part in parts])[:-1]
+        ends = [part.starts[1:] + begin for part, begin in zip(parts, begins, strict=True)]
         return dataclasses.replace(
             parts[0],
             files=tuple(file for part in parts for file in part.files),
             starts=np.concatenate([[0], *ends]),
             checksums=np.concatenate([part.checksums for part in parts]),
-            rows=np.concatenate([part.rows + begin for part, begin in zip(parts, begins, strict=False)]),
+            rows=np.concatenate([part.rows + begin for part, begin in zip(parts, begins, strict=True)]),
             _ahead={},
         )
 
@@ -69,11 +61,6 @@ class DiskArray:
         """(M, ...)."""
         return (len(self), *self.row_shape)
 
-    @property
-    def ndim(self) -> int:
-        """Number of dimensions."""
-        return 1 + len(self.row_shape)
-
     def select(self, samples: np.ndarray) -> DiskArray:
         """The array of these rows, int64 [B]; nothing is read."""
         return dataclasses.replace(self, rows=self.rows[samples], _ahead={})
@@ -84,30 +71,20 @@ class DiskArray:
 
     def prepare(self, samples: np.ndarray) -> None:
         """Begin to read rows that will be asked for next, in a thread. The rows of an earlier call are forgotten."""
-        future = Future()
-
-        def read() -> None:
-            try:
-                future.set_result(self._read(samples))
-            except Exception as error:  # raised where the rows are asked for
-                future.set_exception(error)
-
         self._ahead.clear()
-        self._ahead[np.asarray(samples, np.int64).tobytes()] = future
-        threading.Thread(target=read, daemon=True).start()
+        self._ahead[samples.tobytes()] = _reader.submit(self._read, samples)
 
     def __getitem__(self, samples: np.ndarray) -> np.ndarray:
-        samples = np.asarray(samples)
-        if samples.ndim != 1 or samples.dtype.kind not in "iu":
+        if not isinstance(samples, np.ndarray) or samples.ndim != 1 or samples.dtype.kind not in "iu":
             raise TypeError(f"rows of an array on disk are read by their numbers, int64 [B], got {samples!r}")
-        future = self._ahead.pop(np.asarray(samples, np.int64).tobytes(), None)
+        future = self._ahead.pop(samples.tobytes(), None)
         return self._read(samples) if future is None else future.result()
 
     def _read(self, samples: np.ndarray) -> np.ndarray:
         rows = self.rows[samples]
         result = np.empty((len(rows), *self.row_shape), self.dtype)
-        size = math.prod(self.row_shape) * self.dtype.itemsize
         content = result.reshape(len(rows), math.prod(self.row_shape)).view(np.uint8)
+        size = content.shape[1]
         file_of = np.searchsorted(self.starts, rows, side="right") - 1
         for number, samples_of_file in itertools.groupby(np.argsort(rows), key=file_of.__getitem__):
             path, position = self.files[number]
@@ -117,17 +94,13 @@ class DiskArray:
                         file.seek(position + int(rows[k] - self.starts[number]) * size)
                         if file.readinto(content[k]) != size:
                             raise OSError("it ends early")
-                        self._check_row(int(rows[k]), content[k], result[k])
+                        if zlib.crc32(content[k]) != self.checksums[rows[k]]:
+                            raise ValueError("its content is not as it was written: another CRC-32")
+                        if self.dtype == np.bool_ and content[k].max() > 1:  # such bools compute wrongly
+                            raise ValueError("its bools have values other than 0 and 1")
+                        if self.dtype.kind == "f" and not np.isfinite(result[k]).all():
+                            raise ValueError("it has numbers that are not finite")
             except (OSError, ValueError) as error:
                 text = error.message if isinstance(error, DamagedFile) else str(error)
                 raise DamagedFile(path, f"cannot be used any more ({text}); make or copy it again") from error
         return result
-
-    def _check_row(self, row: int, content: np.ndarray, values: np.ndarray) -> None:
-        """Raise a ValueError for a row that was not written so, or whose values cannot be."""
-        if zlib.crc32(content) != self.checksums[row]:
-            raise ValueError("its content is not as it was written: another CRC-32")
-        if self.dtype == np.bool_ and content.max(initial=0) > 1:  # such bools compute wrongly
-            raise ValueError("its bools have values other than 0 and 1")
-        if self.dtype.kind == "f" and not np.isfinite(values).all():
-            raise ValueError("it has numbers that are not finite")

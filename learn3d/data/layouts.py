@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import functools
+import contextlib
 import shlex
 from pathlib import Path
 from typing import Literal
 
 from learn3d.data import shards
-from learn3d.data.conventions import IMAGE_SIZE
+from learn3d.data.conventions import IMAGE_SIZE, LayoutProperties
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.readers import READERS
-from learn3d.data.readers.properties import LayoutProperties
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.findings import DamagedFile, MissingFile
 
@@ -21,15 +20,13 @@ LAYOUTS: dict[str, LayoutProperties] = {name: reader.PROPERTIES for name, reader
 
 def check_options(layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str | None = None) -> None:
     """Raise a ValueError for an unknown layout and for an option of `load_dataset` that does not go with it."""
-    if not isinstance(layout, str) or layout not in LAYOUTS:
+    if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
-    properties = LAYOUTS[layout]
-    if "image_size" not in properties.options and image_size != IMAGE_SIZE:
-        size = f"{IMAGE_SIZE}x{IMAGE_SIZE}"
-        raise ValueError(f"images of the layout {layout!r} have {size} pixels, but {image_size} are wanted")
+    if "image_size" not in LAYOUTS[layout].options and image_size != IMAGE_SIZE:
+        raise ValueError(f"images of the layout {layout!r} have 64x64 pixels, but {image_size} are wanted")
     if view_bins is not None:
         AngleBins.parse(view_bins)
-        if not properties.angles:
+        if not LAYOUTS[layout].angles:
             raise ValueError(
                 f"view_bins {view_bins!r}: cells of azimuth and elevation need cameras that look at the object, those "
                 f"of the layout {layout!r} are rotations; choose a preset that is made for it"
@@ -37,17 +34,12 @@ def check_options(layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str |
 
 
 def require_folder(folder: Path | str) -> None:
-    """Raise FileNotFoundError where the folder of a data set is not there, saying where it was looked for.
-
-    Runs remember the path that they were given, which from another working directory is another place.
-    """
+    """Raise FileNotFoundError if the folder of a data set is not there, with the place that a relative path means."""
     folder = Path(folder)
     if not folder.is_dir():
         where = "" if folder.is_absolute() else f" (here that is {folder.absolute()})"
-        raise MissingFile(
-            folder,
-            f"there is no such folder{where}; say where the data set is with --data, or make it (learn3d make-dataset)",
-        )
+        said = "say where the data set is with --data, or make it (learn3d make-dataset)"
+        raise MissingFile(folder, f"there is no such folder{where}; {said}")
 
 
 def load_dataset(
@@ -66,10 +58,10 @@ def load_dataset(
     Categories that the folder has in shards (`data.shards`) are read from these, and their images stay on disk.
 
     image_size: side of the network's images in pixels, for layouts that keep larger ones; Kato's renderings are 64x64.
-    view_bins: pose classes from cells of azimuth and elevation, see `AngleBins.parse`; None: the layout's own.
-    views_per_object: use only so many views of every object (kar, r2n2: the first; other layouts, and shards: drawn at
-    random, the same in every run); None: what the layout's published protocol uses.
-    progress: show a bar where many files are read.
+    view_bins: view classes from cells of azimuth and elevation, see `AngleBins.parse`; None: the layout's own.
+    views_per_object: use only so many views of every object (kar: the first; else drawn at random, the same in every
+    run); None: as in the layout's published protocol.
+    progress: show a bar if many files are read.
 
     Raises ValueError for an unknown layout, an option that the layout does not have, and damaged files (named);
     FileNotFoundError for missing ones.
@@ -81,37 +73,32 @@ def load_dataset(
         raise ValueError(f"category must be one name, or different names joined by commas, got {category!r}")
     given = {"image_size": image_size, "views_per_object": views_per_object, "progress": progress}
     options = {name: given[name] for name in LAYOUTS[layout].options}
-    load = functools.partial(READERS[layout].load, folder, split=split, **options)
-    in_shards = functools.partial(shards.load, folder, split=split, layout=layout)
-    if "image_size" in options:
-        in_shards = functools.partial(in_shards, image_size=image_size)
-    stored = {name: shards.holds(folder, name, split) for name in names}
+    stored = [shards.holds(folder, name, split) for name in names]
+    parts = []
     try:
-        dataset = concatenate([(in_shards if stored[name] else load)(name) for name in names])
-    except (DamagedFile, FileNotFoundError) as error:
+        for name, is_stored in zip(names, stored, strict=True):
+            if is_stored:
+                parts.append(shards.load(folder, name, split, layout=layout, image_size=options.get("image_size")))
+            else:
+                parts.append(READERS[layout].load(folder, name, split, **options))
+        dataset = concatenate(parts)
+    except (DamagedFile, MissingFile) as error:
         if others := layouts_in(Path(folder), layout):
             hint = f"this is a data set of the layout {others[0]!r}, not {layout!r}; give another folder, or train "
             hint += f"with a preset for it, or with --layout {others[0]}"
             raise MissingFile(Path(folder), hint) from None
-        if not isinstance(error, (DamagedFile, MissingFile)):
-            raise
         check = f"learn3d check-dataset {shlex.quote(str(folder))} --layout {layout}"
-        raise type(error)(
-            error.path, f"{error.message}. All that is wrong with the data set is listed by: {check}"
-        ) from error
-    if views_per_object is not None and (any(stored.values()) or "views_per_object" not in LAYOUTS[layout].options):
+        message = f"{error.message}. All that is wrong with the data set is listed by: {check}"
+        raise type(error)(error.path, message) from error
+    if views_per_object is not None and (any(stored) or "views_per_object" not in options):
         dataset = dataset.with_few_views(views_per_object)
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
 
 
 def layouts_in(folder: Path, asked: str) -> list[str]:
-    """The layouts of which the folder holds something, where it holds nothing of the one that was asked for."""
-    found = [layout for layout in LAYOUTS if _holds(folder, layout)]
+    """The layouts of which the folder holds something, if it holds nothing of the one that was asked for."""
+    found = []
+    for layout, reader in READERS.items():
+        with contextlib.suppress(ValueError, OSError):  # the file that lists them is damaged, or another layout's
+            found += [layout] * bool(reader.contents(folder))
     return [] if asked in found else found
-
-
-def _holds(folder: Path, layout: str) -> bool:
-    try:
-        return bool(READERS[layout].contents(folder))
-    except (ValueError, OSError):  # the file that lists them is damaged, or another layout's
-        return False

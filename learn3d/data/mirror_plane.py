@@ -24,14 +24,12 @@ _CLEAR = 0.1  # how much smaller than the median over all planes the difference 
 def find_mirror_plane(dataset: ViewDataset) -> float | None:
     """Azimuth in degrees, 0 .. 172.5, of a camera that looks along the mirror plane; None: there is none to be seen.
 
-    For each plane p the squared difference of mean masks of sectors v and 2 p - v is summed over pixels and sectors.
-    What the difference of two means of so many masks has by chance is subtracted. A plane is found where the smallest
-    of the 24 sums is below a tenth of their median. (Bodies of revolution look the same at every plane; any will do.)
-    Cameras that stand at n < 24 azimuths, at equal distances, show n planes, at least 6. A sector is compared if it and
-    its mirror image have four images; where that leaves too few sectors or planes, nothing is found: of random azimuths
-    some 150 images are needed.
+    For each plane p the squared differences of the mean masks of sectors v and 2 p - v are summed over pixels and
+    sectors, less those expected by chance. A plane is found if the smallest of the 24 sums is below a tenth of their
+    median. A sector is compared if it and its mirror image have four images: random azimuths need some 150 images.
+    Cameras at n < 24 equally spaced azimuths show n planes, at least 6.
 
-    Raises ValueError where poses are not known, or not given by azimuth and elevation.
+    Raises ValueError if poses are unknown, or not given by azimuth and elevation.
     """
     if not isinstance(dataset.poses, LookAtPoses):
         raise ValueError(
@@ -46,7 +44,8 @@ def find_mirror_plane(dataset: ViewDataset) -> float | None:
         if len(samples) < _ENOUGH:
             continue
         some = np.linspace(0, len(samples) - 1, min(len(samples), _MOST)).round().astype(int)
-        seen = dataset.mask_pixels(samples[some]) / np.float32(255)
+        stored = dataset.images if dataset.masks is None else dataset.masks
+        seen = stored[samples[some]].reshape(len(some), -1, MASK_SIZE, MASK_SIZE)[:, -1] / np.float32(255)
         means[sector], known[sector] = seen.mean(axis=0), True
         noise[sector] = seen.var(axis=0).sum() / (len(seen) - 1)
     differences = np.full(_SECTORS, np.inf)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -32,13 +34,13 @@ class LookAtPoses:
     num_features: ClassVar[int] = 3
 
     def __post_init__(self) -> None:
-        for name in ("azimuth_deg", "elevation_deg", "distance", "half_fov_deg"):
-            value = getattr(self, name)
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, name, torch.from_numpy(np.ascontiguousarray(value, np.float32)))
-            value = getattr(self, name)
-            if isinstance(value, Tensor) and value.shape != (len(self.azimuth_deg),):
-                raise ValueError(f"{name} must be [{len(self.azimuth_deg)}] or one number, got {list(value.shape)}")
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, (np.ndarray, Tensor)):
+                value = torch.as_tensor(value, dtype=torch.float32)
+                object.__setattr__(self, field.name, value)
+                if value.shape != (len(self),):
+                    raise ValueError(f"{field.name} must be [{len(self)}] or one number, got {list(value.shape)}")
 
     def __len__(self) -> int:
         return len(self.azimuth_deg)
@@ -61,17 +63,12 @@ class LookAtPoses:
         )
 
     def features(self) -> Tensor:
-        """What tells a discriminator the view: the eye's position, float32 [M, 3]."""
+        """The description of each view for a discriminator: the eye's position, float32 [M, 3]."""
         return nmr.cameras.points_from_angles(self.distance, self.elevation_deg, self.azimuth_deg).to(torch.float32)
 
     def mirrored(self, chosen: Tensor) -> LookAtPoses:
-        """The same poses, where `chosen` (bool [M]) seen in a mirror: image flipped left-right, azimuth negated."""
+        """The same poses, those with `chosen` (bool [M]) in a mirror: image flipped left-right, azimuth negated."""
         return replace(self, azimuth_deg=torch.where(chosen, -self.azimuth_deg, self.azimuth_deg))
-
-    @property
-    def elevations_deg(self) -> Tensor:
-        """The elevation of every sample, float32 [M]."""
-        return torch.as_tensor(self.elevation_deg, dtype=torch.float32).expand(len(self))
 
     def _values(self) -> tuple[Tensor | float, ...]:
         return self.azimuth_deg, self.elevation_deg, self.distance, self.half_fov_deg
@@ -89,9 +86,7 @@ class RotationPoses:
     num_features: ClassVar[int] = 9
 
     def __post_init__(self) -> None:
-        if isinstance(self.rotation, np.ndarray):
-            rotation = torch.from_numpy(np.ascontiguousarray(self.rotation, np.float32))
-            object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "rotation", torch.as_tensor(self.rotation, dtype=torch.float32))
         if self.rotation.ndim != 3 or self.rotation.shape[1:] != (3, 3):
             raise ValueError(f"rotation must be [M, 3, 3], got {list(self.rotation.shape)}")
 
@@ -99,6 +94,7 @@ class RotationPoses:
         return len(self.rotation)
 
     def __getitem__(self, indices: Tensor) -> RotationPoses:
+        """The poses of the samples `indices`, int64 [B]."""
         return RotationPoses(self.rotation[indices], self.depth_offset)
 
     def in_range(self) -> Tensor:
@@ -112,19 +108,35 @@ class RotationPoses:
         return nmr.cameras.Projection(torch.cat([self.rotation, offset], dim=2), intrinsics, perspective=False)
 
     def features(self) -> Tensor:
-        """What tells a discriminator the view: the nine entries of the rotation, float32 [M, 9]."""
+        """The description of each view for a discriminator: the nine entries of the rotation, float32 [M, 9]."""
         return self.rotation.reshape(len(self), 9)
 
     def mirrored(self, chosen: Tensor) -> RotationPoses:
-        """The same poses, where `chosen` (bool [M]) for the image flipped left-right of an object with x' -> -x'.
+        """The same poses, those with `chosen` (bool [M]) for the image flipped left-right of an object with x' -> -x'.
 
         For an object that is symmetric about z = 0 the flipped image is seen under D R D', D = diag(-1, 1, 1),
         D' = diag(1, 1, -1).
         """
         image, body = torch.tensor([-1.0, 1.0, 1.0]), torch.tensor([1.0, 1.0, -1.0])
-        return replace(
-            self, rotation=torch.where(chosen[:, None, None], image[:, None] * self.rotation * body, self.rotation)
-        )
+        mirrored = image[:, None] * self.rotation * body
+        return replace(self, rotation=torch.where(chosen[:, None, None], mirrored, self.rotation))
 
 
 Poses = LookAtPoses | RotationPoses
+
+
+def join_poses(poses: Sequence[Poses | None]) -> Poses | None:
+    """The poses of several sets, one after the other. Raises ValueError for cameras of different kinds."""
+    kind = type(poses[0])
+    if any(type(p) is not kind for p in poses):
+        raise ValueError("the categories have cameras of different kinds")
+    if poses[0] is None:
+        return None
+    joined = {}
+    for field in dataclasses.fields(kind):
+        values = [getattr(p, field.name) for p in poses]
+        if any(isinstance(v, Tensor) for v in values) or len(set(values)) > 1:  # else one number for all
+            parts = [torch.as_tensor(v, dtype=torch.float32) for v in values]
+            values = [torch.cat([v if v.ndim else v.expand(len(p)) for v, p in zip(parts, poses, strict=True)])]
+        joined[field.name] = values[0]
+    return kind(**joined)

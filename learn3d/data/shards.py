@@ -23,10 +23,10 @@ import dataclasses
 import itertools
 import json
 import math
+import os
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, BinaryIO, Literal
 
 import numpy as np
 from pydantic import Field
@@ -34,13 +34,12 @@ from safetensors.numpy import save_file
 from torch import Tensor
 
 from learn3d.data.categories import synset_of
-from learn3d.data.conventions import VOXEL_SIZE
-from learn3d.data.dataset import MASK_SIZE, SPLITS, ViewDataset
+from learn3d.data.dataset import SPLITS, ViewDataset, join_datasets
 from learn3d.data.disk_array import MOST_BYTES, WANTED, DiskArray
 from learn3d.data.poses import LookAtPoses, Poses, RotationPoses
 from learn3d.data.readers import READERS
 from learn3d.files import limits
-from learn3d.files.findings import DamagedFile, MissingFile, Problem
+from learn3d.files.findings import STRICT, DamagedFile, Findings
 from learn3d.files.reading import open_file, parse_json, read_bytes
 from learn3d.files.writing import replacing, write_json
 from learn3d.settings import checked
@@ -50,9 +49,14 @@ SHARD_BYTES = 2**28  # of images in a shard, about
 _FILES = 5 * "[0-9]" + "*.safetensors"
 _REPORTS = 5 * "[0-9]" + "*.report.json"  # lists of meshes, which `make_data.sharded` writes
 _ARRAYS = ("images", "masks", "voxels", "points")  # the first two have a row for each view, the others for each object
-_DTYPES = {"U8": np.uint8, "BOOL": np.bool_, "I32": np.int32, "U32": np.uint32, "F32": np.float32}
+_DTYPES = {  # of tensors, by name; all others are float32
+    **dict.fromkeys(("images", "masks"), ("U8", np.uint8)),
+    **dict.fromkeys(("object_ids", "view_ids"), ("I32", np.int32)),
+    "voxels": ("BOOL", np.bool_),
+    "checksums": ("U32", np.uint32),
+}
 _POSES = {kind.__name__: kind for kind in (LookAtPoses, RotationPoses)}
-_MAKE_AGAIN = "make or convert the data set again"
+_MAKE_AGAIN = "make or copy it again"
 _ROWS_AT_ONCE = 256  # that are read to be checked
 
 Text = Annotated[str, Field(max_length=1000)]
@@ -68,21 +72,6 @@ class SetFile:
     view_names: Annotated[list[Text], Field(max_length=limits.VIEW_CLASSES)]
     poses: Literal[(None, *_POSES)]  # kind of the poses; None if they are unknown
     constants: dict[Text, Annotated[float, Field(allow_inf_nan=False)]]  # fields of the poses that all views share
-
-    @property
-    def pose_fields(self) -> list[str]:
-        """Names of the fields of the poses."""
-        return [] if self.poses is None else [field.name for field in dataclasses.fields(_POSES[self.poses])]
-
-
-@dataclasses.dataclass(frozen=True)
-class Shard:
-    """A shard whose names and tables have been read; its arrays are on disk."""
-
-    path: Path
-    objects: list[str]
-    tables: dict[str, np.ndarray]
-    arrays: dict[str, DiskArray]
 
 
 def split_folder(folder: Path | str, category: str, split: str) -> Path:
@@ -103,7 +92,12 @@ def shard_path(folder: Path, number: int) -> Path:
     return folder / f"{number:05d}.safetensors"
 
 
-# ------------------------------------------------------------------------------------------------------------- writing
+def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
+    """The categories of a folder that are kept in shards, and the splits of each."""
+    found = {}
+    for path in sorted(Path(folder).glob(f"*/*/{SET_FILE}")):
+        found.setdefault(path.parents[1].name, set()).add(path.parent.name)
+    return {category: tuple(s for s in SPLITS if s in splits) for category, splits in found.items()}
 
 
 def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
@@ -156,8 +150,122 @@ def remove(folder: Path) -> None:
         path.unlink()
 
 
+def load(
+    folder: Path | str,
+    category: str,
+    split: str,
+    *,
+    layout: str,
+    image_size: int | None = None,
+    findings: Findings = STRICT,
+) -> ViewDataset | None:
+    """The split, with its arrays on disk: only names and tables are read, about 60 bytes for each view.
+
+    Raises MissingFile and DamagedFile for shards that are missing, damaged, or of another layout or image size. If the
+    findings are not strict, all arrays are read, too, and the result is None.
+    """
+    where = split_folder(folder, category, split)
+    content = read_bytes(where / SET_FILE, limits.JSON_BYTES, "the description of shards as JSON")
+    try:
+        facts = SetFile(**parse_json(content))
+    except (ValueError, TypeError) as error:
+        raise DamagedFile(where / SET_FILE, f"is no description of shards ({error}); {_MAKE_AGAIN}") from None
+    if facts.layout != layout or image_size not in (None, facts.image_size):
+        found, wanted = (
+            f"images of {facts.image_size} pixels in the layout {facts.layout!r}",
+            image_size or facts.image_size,
+        )
+        hint = "give another --layout, or convert it with another --image-size"
+        raise DamagedFile(where, f"has {found}, but {layout!r} is wanted with {wanted}; {hint}")
+    paths = sorted(where.glob(_FILES))
+    if len(paths) != facts.shards:
+        missing = next(path for n in itertools.count() if (path := shard_path(where, n)) not in paths)
+        findings.take(DamagedFile(missing, f"one of {facts.shards} shards, of which {len(paths)} are there"))
+    read = (findings.attempt(_read_shard, path, facts, category, split) for path in paths)
+    parts = [part for part in read if part is not None]
+    try:
+        dataset = join_datasets(parts) if parts else None
+    except ValueError as error:
+        raise DamagedFile(where, f"has shards that differ ({error}); {_MAKE_AGAIN}") from error
+    if findings.strict or dataset is None:
+        return dataset
+    findings.objects = dataset.num_objects
+    for array in (a for part in parts for name in _ARRAYS if (a := getattr(part, name)) is not None):
+        findings.attempt(_read_rows, array)
+    if warning := dataset.check_masks():
+        findings.warn(where, warning)
+    return None
+
+
+def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDataset:
+    """The names and tables of a shard, if it agrees with the facts; its arrays stay on disk."""
+    with open_file(path, MOST_BYTES, WANTED) as file:
+        try:
+            names, tables, arrays = _read_tables(path, file)
+            poses = None
+            if kind := _POSES.get(facts.poses):
+                poses = kind(**{f.name: (tables | facts.constants)[f.name] for f in dataclasses.fields(kind)})
+                if not (sound := poses.in_range()).all():
+                    raise ValueError(f"the pose of view {int(sound.int().argmin())} is out of range")
+            if not ((tables["sides"] >= 0) & (tables["sides"] <= 1)).all():
+                raise ValueError("sides must lie in 0 .. 1")
+            dataset = ViewDataset(
+                category=category,
+                split=split,
+                poses=poses,
+                view_names=tuple(facts.view_names),
+                object_names=tuple(names),
+                convention=READERS[facts.layout].PROPERTIES.convention,
+                inverted=READERS[facts.layout].PROPERTIES.inverted,
+                **{name: tables[name] for name in ("view_ids", "object_ids", "sides")},
+                **{"voxels": None} | arrays,
+            )
+            if dataset.image_size != facts.image_size:
+                raise ValueError(f"its images have {dataset.image_size} pixels, not {facts.image_size}")
+            return dataset
+        except (ValueError, TypeError, LookupError, AttributeError, OSError) as error:
+            text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            raise DamagedFile(path, f"cannot be read as {WANTED} ({text}); {_MAKE_AGAIN}") from error
+
+
+def _read_tables(path: Path, file: BinaryIO) -> tuple[list[str], dict[str, np.ndarray], dict[str, DiskArray]]:
+    """The names of objects, the tables, and the arrays of a shard."""
+    size, end = int.from_bytes(file.read(8), "little"), os.fstat(file.fileno()).st_size
+    header = parse_json(file.read(min(size, limits.JSON_BYTES)))
+    metadata = parse_json(header.pop("__metadata__")["shard"])
+    tables, positions = {}, {}
+    for name, info in header.items():
+        code, dtype = _DTYPES.get(name.partition(".")[2] or name, ("F32", np.float32))
+        begin, stop = (8 + size + offset for offset in info["data_offsets"])
+        shape, count = info["shape"], math.prod(info["shape"])
+        if info["dtype"] != code or not all(type(n) is int and n >= 0 for n in (*shape, *info["data_offsets"])):
+            raise ValueError(f"{name} is {info}; expected {code}")
+        if stop > end or stop - begin != count * np.dtype(dtype).itemsize:
+            raise ValueError(f"{name} is not as long as it should be; the file has {end} bytes")
+        if name in _ARRAYS:
+            positions[name] = begin, tuple(shape), np.dtype(dtype)
+        else:
+            file.seek(begin)
+            tables[name] = np.fromfile(file, dtype, count).reshape(shape)
+    if _crc(metadata["objects"], tables) != metadata["crc"]:
+        raise ValueError("its content is not as it was written: another CRC-32")
+    arrays = {}
+    for name, (begin, (count, *row_shape), dtype) in positions.items():
+        checksums = tables.pop(f"{name}.checksums")
+        if checksums.shape != (count,):
+            raise ValueError(f"{name} has {count} rows, but {checksums.shape} checksums")
+        ends = np.array([0, count])
+        arrays[name] = DiskArray(((path, begin),), ends, checksums, tuple(row_shape), dtype, np.arange(count))
+    return metadata["objects"], tables, arrays
+
+
 def _fields(poses: Poses | None) -> dict[str, Tensor | float]:
     return {} if poses is None else {field.name: getattr(poses, field.name) for field in dataclasses.fields(poses)}
+
+
+def _read_rows(array: DiskArray) -> None:
+    for start in range(0, len(array), _ROWS_AT_ONCE):
+        array[np.arange(start, min(start + _ROWS_AT_ONCE, len(array)))]
 
 
 def _crc(objects: list[str] | tuple[str, ...], tables: dict[str, np.ndarray]) -> int:
@@ -166,184 +274,3 @@ def _crc(objects: list[str] | tuple[str, ...], tables: dict[str, np.ndarray]) ->
     for name in sorted(tables):
         crc = zlib.crc32(np.ascontiguousarray(tables[name]), crc)
     return crc
-
-
-# ------------------------------------------------------------------------------------------------------------- reading
-
-
-def read_set(folder: Path) -> SetFile:
-    """`set.json` of a split's folder. Raises MissingFile and DamagedFile."""
-    content = read_bytes(folder / SET_FILE, limits.JSON_BYTES, "the description of shards as JSON")
-    try:
-        return SetFile(**parse_json(content))
-    except (ValueError, TypeError) as error:
-        raise DamagedFile(folder / SET_FILE, f"is no description of shards ({error}); {_MAKE_AGAIN}") from None
-
-
-def read_shard(path: Path, facts: SetFile) -> Shard:
-    """The names and tables of a shard, if it agrees with the facts about the set. Raises MissingFile, DamagedFile."""
-    with open_file(path, MOST_BYTES, WANTED) as file:
-        try:
-            size = int.from_bytes(file.read(8), "little")
-            if size > limits.JSON_BYTES:
-                raise ValueError(f"its header would have {size} bytes")
-            header = parse_json(file.read(size))
-            metadata, end = parse_json(header.pop("__metadata__")["shard"]), file.seek(0, 2)
-            objects, tables, positions = metadata["objects"], {}, {}
-            wanted = _wanted_tensors(facts, header, len(objects))
-            if missing := wanted.keys() - header.keys():
-                raise ValueError(f"it has no {min(missing)}")
-            for name, info in header.items():
-                code, shape = wanted[name]
-                begin, stop = (8 + size + offset for offset in info["data_offsets"])
-                if (info["dtype"], info["shape"]) != (code, shape):
-                    raise ValueError(f"{name} is {info['dtype']} {info['shape']}; expected {code} {shape}")
-                dtype = np.dtype(_DTYPES[code])
-                if not 8 + size <= begin <= stop <= end or stop - begin != math.prod(shape) * dtype.itemsize:
-                    raise ValueError(f"{name} is not as long as it should be; the file has {end} bytes")
-                if name in _ARRAYS:
-                    positions[name] = begin
-                else:
-                    file.seek(begin)
-                    tables[name] = np.fromfile(file, dtype, math.prod(shape)).reshape(shape)
-            if _crc(objects, tables) != metadata["crc"]:
-                raise ValueError("its content is not as it was written: another CRC-32")
-            _check_values(facts, tables, len(objects))
-        except (ValueError, TypeError, LookupError, AttributeError, OSError) as error:
-            text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            raise DamagedFile(path, f"cannot be read as {WANTED} ({text}); {_MAKE_AGAIN}") from error
-    arrays = {}
-    for name, position in positions.items():
-        code, (_, *row_shape) = wanted[name]
-        checksums = tables.pop(f"{name}.checksums")
-        arrays[name] = DiskArray.of_file(path, position, checksums, tuple(row_shape), np.dtype(_DTYPES[code]))
-    return Shard(path, objects, tables, arrays)
-
-
-def _wanted_tensors(facts: SetFile, header: dict[str, Any], objects: int) -> dict[str, tuple[str, list[int]]]:
-    """Type and shape of all tensors that a shard must have, given those in its header."""
-    views, size = header["images"]["shape"][0], facts.image_size
-    points = header["points"]["shape"][1] if "points" in header else 0
-    arrays = {
-        "images": ("U8", [views, 4, size, size]),
-        "masks": ("U8", [views, MASK_SIZE, MASK_SIZE]),
-        "voxels": ("BOOL", [objects, VOXEL_SIZE, VOXEL_SIZE, VOXEL_SIZE]),
-        "points": ("F32", [objects, points, 3]),
-    }
-    arrays = {name: wanted for name, wanted in arrays.items() if name in header}
-    tables = {"object_ids": ("I32", [views]), "view_ids": ("I32", [views]), "sides": ("F32", [views])}
-    for name in facts.pose_fields:
-        if name not in facts.constants:
-            tables[name] = ("F32", [views, 3, 3] if name == "rotation" else [views])
-    checksums = {f"{name}.checksums": ("U32", shape[:1]) for name, (_, shape) in arrays.items()}
-    return tables | checksums | arrays
-
-
-def _check_values(facts: SetFile, tables: dict[str, np.ndarray], objects: int) -> None:
-    """Raise a ValueError for values of the tables that are out of range."""
-    ends = {"object_ids": objects - 1, "view_ids": len(facts.view_names) - 1, "sides": 1}
-    for name, end in ends.items():
-        if not ((tables[name] >= 0) & (tables[name] <= end)).all():
-            raise ValueError(f"{name} must lie in 0 .. {end}")
-    poses = _poses(facts, tables)
-    if poses is not None and not poses.in_range().all():
-        raise ValueError(f"the pose of view {int(poses.in_range().int().argmin())} is out of range")
-
-
-def _poses(facts: SetFile, tables: dict[str, np.ndarray]) -> Poses | None:
-    values = {name: tables.get(name, facts.constants.get(name)) for name in facts.pose_fields}
-    return None if facts.poses is None else _POSES[facts.poses](**values)
-
-
-def load(folder: Path | str, category: str, split: str, *, layout: str, image_size: int | None = None) -> ViewDataset:
-    """The split, with its arrays on disk. Shards that are missing or damaged are left out: see `ViewDataset.notes`.
-
-    Only names and tables are read, about 60 bytes for each view; images are compared with their checksums when a batch
-    needs them. Raises DamagedFile if no shard can be read, ValueError for another layout or image size.
-    """
-    where = split_folder(folder, category, split)
-    facts = read_set(where)
-    if facts.layout != layout:
-        raise ValueError(f"{where} is a data set of the layout {facts.layout!r}, not {layout!r}")
-    if image_size not in (None, facts.image_size):
-        raise ValueError(
-            f"{where} has images of {facts.image_size} pixels, but {image_size} are wanted; convert the data set "
-            f"again with --image-size {image_size}"
-        )
-    there = set(where.glob(_FILES))
-    first_missing = next(path for n in itertools.count() if (path := shard_path(where, n)) not in there)
-    shards, notes = [], []
-    if missing := max(0, facts.shards - len(there)):
-        notes.append(f"left out {missing} of {facts.shards} shards, which are missing: {first_missing} ...")
-    for path in sorted(there):
-        try:
-            shard = read_shard(path, facts)
-            if shards and _row_shapes(shard) != _row_shapes(shards[0]):
-                raise DamagedFile(path, f"does not go with {shards[0].path}: it has other arrays; {_MAKE_AGAIN}")
-            shards.append(shard)
-        except (DamagedFile, MissingFile) as error:
-            notes.append(f"left out one of {facts.shards} shards: {error}")
-    if not shards:
-        raise DamagedFile(where, f"none of its {facts.shards} shards can be read; the first: {notes[0]}")
-    tables = {name: np.concatenate([shard.tables[name] for shard in shards]) for name in shards[0].tables}
-    starts = np.cumsum([0] + [len(shard.objects) for shard in shards])[:-1]
-    views = [len(shard.tables["object_ids"]) for shard in shards]
-    arrays = {name: DiskArray.join([shard.arrays[name] for shard in shards]) for name in shards[0].arrays}
-    properties = READERS[layout].PROPERTIES
-    return ViewDataset(
-        category=category,
-        split=split,
-        poses=_poses(facts, tables),
-        view_ids=tables["view_ids"],
-        view_names=tuple(facts.view_names),
-        object_ids=tables["object_ids"] + np.repeat(starts, views).astype(np.int32),
-        object_names=tuple(name for shard in shards for name in shard.objects),
-        convention=properties.convention,
-        inverted=properties.inverted,
-        sides=tables["sides"],
-        notes=tuple(notes),
-        **({"voxels": None} | arrays),
-    )
-
-
-def _row_shapes(shard: Shard) -> dict[str, tuple[int, ...]]:
-    return {name: array.row_shape for name, array in shard.arrays.items()}
-
-
-# ------------------------------------------------------------------------------------------------------------ checking
-
-
-def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
-    """The categories of a folder that are kept in shards, and the splits of each."""
-    found = {}
-    for path in sorted(Path(folder).glob(f"*/*/{SET_FILE}")):
-        found.setdefault(path.parents[1].name, set()).add(path.parent.name)
-    return {category: tuple(s for s in SPLITS if s in splits) for category, splits in found.items()}
-
-
-def count(folder: Path | str, category: str, split: str) -> int:
-    """How many objects a split holds in its sound shards."""
-    where = split_folder(folder, category, split)
-    return load(folder, category, split, layout=read_set(where).layout).num_objects
-
-
-def problems(
-    folder: Path | str, category: str, split: str, *, layout: str, progress: bool = False
-) -> Iterator[Problem]:
-    """Everything that is wrong with the files of a split, which are read as a whole. `load` leaves such shards out."""
-    where = str(split_folder(folder, category, split))
-    try:
-        dataset = load(folder, category, split, layout=layout)
-    except ValueError as error:
-        yield Problem(str(getattr(error, "path", where)), getattr(error, "message", str(error)))
-        return
-    yield from (Problem(where, note) for note in dataset.notes)
-    for array in (dataset.images, dataset.masks, dataset.voxels, dataset.points):
-        for start, end in [] if array is None else itertools.pairwise(array.starts.tolist()):
-            try:
-                for rows in range(start, end, _ROWS_AT_ONCE):
-                    array[np.arange(rows, min(rows + _ROWS_AT_ONCE, end))]
-            except DamagedFile as error:
-                yield Problem(str(error.path), error.message)
-    if warning := dataset.check_masks():
-        yield Problem(where, warning, "warning")

@@ -1,7 +1,8 @@
-"""From continuous viewpoints to the K pose classes that the discriminator tells apart."""
+"""From continuous viewpoints to the K view classes that the discriminator tells apart."""
 
 from __future__ import annotations
 
+import re
 from typing import Annotated
 
 import numpy as np
@@ -30,9 +31,8 @@ class AngleBins:
     def __post_init__(self) -> None:
         span = self.elevation_high_deg - self.elevation_low_deg
         if span <= 0:
-            raise ValueError(
-                f"elevations must go from low to high, got {self.elevation_low_deg} .. {self.elevation_high_deg}"
-            )
+            limits_deg = f"{self.elevation_low_deg} .. {self.elevation_high_deg}"
+            raise ValueError(f"elevations must go from low to high, got {limits_deg}")
         cells = 360 / self.azimuth_width_deg * (span / self.elevation_width_deg)
         if cells > limits.VIEW_CLASSES:
             raise ValueError(f"there would be {cells:.0f} bins; at most {limits.VIEW_CLASSES} are possible")
@@ -40,15 +40,11 @@ class AngleBins:
     @classmethod
     def parse(cls, text: str) -> AngleBins:
         """From "15x20" (azimuth x elevation widths in degrees), or "15x20:-20:40" with the range of elevations."""
-        try:
-            widths, *limits = text.split(":")
-            azimuth, elevation = (float(width) for width in widths.split("x"))
-            low, high = (float(limit) for limit in limits) if limits else (-20.0, 40.0)
-        except ValueError:
-            raise ValueError(
-                f"view bins are written as AZIMUTHxELEVATION in degrees, such as 15x20 or 15x20:-20:40, got {text!r}"
-            ) from None
-        return cls(azimuth, elevation, low, high)
+        number = r"(-?\d+(?:\.\d+)?)"
+        if not (match := re.fullmatch(f"{number}x{number}(?::{number}:{number})?", text)):
+            wanted = "AZIMUTHxELEVATION in degrees, such as 15x20 or 15x20:-20:40"
+            raise ValueError(f"view bins are written as {wanted}, got {text!r}")
+        return cls(*(float(value) for value in match.groups() if value is not None))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -68,7 +64,9 @@ class AngleBins:
         azimuth = poses.azimuth_deg.double()
         turn = torch.where(azimuth == 180, azimuth, wrap_deg(azimuth)) + 180  # the upper end belongs to the last cell
         a = (turn / self.azimuth_width_deg).floor().long().clamp(0, azimuths - 1)
-        e = (poses.elevations_deg.double() - self.elevation_low_deg) / self.elevation_width_deg
+        e = (
+            torch.as_tensor(poses.elevation_deg, dtype=torch.float32).double() - self.elevation_low_deg
+        ) / self.elevation_width_deg
         return a * elevations + e.floor().long().clamp(0, elevations - 1)
 
     def names(self) -> list[str]:
@@ -77,3 +75,19 @@ class AngleBins:
         middle_a = [-180 + (k + 0.5) * self.azimuth_width_deg for k in range(azimuths)]
         middle_e = [self.elevation_low_deg + (k + 0.5) * self.elevation_width_deg for k in range(elevations)]
         return [f"azimuth {a:g}°, elevation {e:g}°" for a in middle_a for e in middle_e]
+
+
+def training_classes(
+    cells: np.ndarray, directions: np.ndarray, training_cells: np.ndarray, training_directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Class int64 [M] in 0 .. K-1 of each view, and the K cells int64 [K] that have training views.
+
+    A view in another cell gets the class of the training view with the nearest direction. cells int64 [M] and
+    directions float [M, D] of the views, whose product is largest for the nearest; likewise of the T training views.
+    """
+    kept = np.unique(training_cells)
+    unseen = ~np.isin(cells, kept)
+    nearest = (directions[unseen] @ training_directions.T).argmax(axis=1)
+    cells = cells.copy()
+    cells[unseen] = training_cells[nearest]
+    return np.searchsorted(kept, cells), kept

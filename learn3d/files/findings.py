@@ -1,7 +1,7 @@
 """Faults of the files of a data set: errors that name the file, and a list of them.
 
-A reader parses an object in steps, each through `Findings.attempt`. With strict findings (`load`) the first step that
-fails raises; otherwise (`problems`) it is noted and the next one follows, so that both see exactly the same.
+A reader parses an object in steps, each through `Findings.attempt`. With strict findings the first step that fails
+raises; otherwise it is noted and the next one follows. So loading a data set and checking it are the same walk.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ class Findings:
 
     strict: bool = False  # raise the first error, drop warnings
     problems: list[Problem] = field(default_factory=list)
+    objects: int = 0  # number of objects that the files list
 
     def attempt(self, function: Callable[..., R], *arguments: Any) -> R | None:
         """The result of function(*arguments), or None with a note of why there is none."""
@@ -69,3 +70,6 @@ class Findings:
         """Note something that is odd, but can be read."""
         if not self.strict:
             self.problems.append(Problem(str(path), message, "warning"))
+
+
+STRICT = Findings(strict=True)

@@ -1,6 +1,6 @@
-"""Bounds on what is read from files that somebody else may have made, where they are cheap to check and clear.
+"""Bounds of files that somebody else may have made.
 
-Memory, time and crashes of the libraries that decode are the business of `worker`. Real data stay far below all of
+Memory, time and crashes of the libraries that decode are left to `sandbox`. Real data stay far below all of
 these (the comments say by how much), so none can be changed from outside.
 """
 
@@ -15,7 +15,6 @@ JSON_BYTES = 16 * MIB  # splits.json: 2 MB; test.json of a run on 10,000 objects
 METRICS_BYTES = 256 * MIB  # metrics.jsonl: a million lines
 CURVES = 100  # numbers that they log, each a panel of a figure; ours log 20
 CURVE_NAME = 60  # characters
-OBJECTS = 1_000_000  # photographs in a table
 NAME_LENGTH = 200  # characters of an object's id, which becomes part of a file name
 
 # Arrays and archives
@@ -29,22 +28,12 @@ VOLUME_BYTES = 4 * MIB  # a voxel file (.mat, .binvox) of 32^3 cells: 0.3 as flo
 IMAGE_FILE_BYTES = 256 * MIB
 IMAGE_SIDE = 10_000  # pixels; photographs are padded to squares: 400 MB
 IMAGE_PIXELS = 64_000_000  # a photograph; decoding, masking and framing take some 40 bytes for each
-SQUARE_SIDE = 16_000  # pixels of the square around an object of which the object takes 65 %
 RENDER_SIDE = 2048  # pixels, renderings of a data set; published ones have up to 224
 
 # Meshes
 MESH_FILE_BYTES = 256 * MIB  # and of each file that it refers to; the largest of ShapeNet has some 100
-MESH_FACES = 20_000_000  # `max_faces` of make_dataset, 1,000,000, is the one that counts
-POLYGON_CORNERS = 2000  # of one polygon of a text format: cutting ears takes the square of it, or its cube
 
-# Debian packages
-PACKAGE_BYTES = 16 * GIB  # all files of a package; FlightGear's have 0.4
-PACKAGE_MEMBERS = 1_000_000
-PACKAGE_WANTED_BYTES = 2 * GIB  # its catalogues, or models, held at a time; FlightGear's have less than 0.4
-CATALOGUE_MEMBER_BYTES = 64 * MIB  # one file inside a catalogue; the largest wanted today is a 9 MB model
-
-# Checkpoints and weights
-CHECKPOINT_BYTES = 16 * GIB  # one with optimizer states: 0.7
+# Weights
 WEIGHTS_BYTES = GIB  # pretrained weights: ResNet-18 has 45 MB
 
 # Options: what a configuration may ask for

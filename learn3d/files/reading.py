@@ -22,7 +22,7 @@ def open_file(path: Path | str, most: int, wanted: str) -> BinaryIO:
     """
     path = Path(path)
     try:
-        file = open(path, "rb", opener=_open_at_once)
+        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     except (FileNotFoundError, NotADirectoryError):
         raise MissingFile(path, f"is missing; expected {wanted}") from None
     except (OSError, ValueError) as error:
@@ -31,14 +31,10 @@ def open_file(path: Path | str, most: int, wanted: str) -> BinaryIO:
     if stat.S_ISREG(status.st_mode) and status.st_size <= most:
         return file
     file.close()
+    fault = f"has {status.st_size} bytes, and at most {most} are read"
     if not stat.S_ISREG(status.st_mode):
-        raise DamagedFile(path, f"cannot be read: it is no plain file; expected {wanted}")
-    size = f"{status.st_size} bytes, and at most {most} are read"
-    raise DamagedFile(path, f"has {size}; expected {wanted}. Is it that file?")
-
-
-def _open_at_once(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK)
+        fault = "cannot be read: it is no plain file"
+    raise DamagedFile(path, f"{fault}; expected {wanted}")
 
 
 def check_file(path: Path | str, most: int, wanted: str) -> int:
@@ -50,10 +46,7 @@ def check_file(path: Path | str, most: int, wanted: str) -> int:
 def read_bytes(path: Path | str, most: int, wanted: str) -> bytes:
     """A whole file of at most `most` bytes."""
     with open_file(path, most, wanted) as file:
-        try:
-            return file.read(os.fstat(file.fileno()).st_size)
-        except OSError as error:
-            raise DamagedFile(Path(path), f"cannot be read ({error}); expected {wanted}. {FETCH_AGAIN}") from error
+        return file.read(os.fstat(file.fileno()).st_size)
 
 
 def read_text(path: Path | str, most: int, wanted: str, *, encoding: str = "utf-8", errors: str = "strict") -> str:
@@ -66,26 +59,15 @@ def read_text(path: Path | str, most: int, wanted: str, *, encoding: str = "utf-
 
 
 def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
-    """The value of a JSON text; a ValueError says what is wrong with it, the caller in which file.
+    """The value of a JSON text. Raises ValueError, also for NaN and infinities unless `finite` is False."""
 
-    finite: refuse NaN and Infinity, which JSON does not have, and numbers that a float cannot hold. Whole numbers have
-    at most 300 digits in any case.
-    """
+    def number(word: str) -> float:
+        if not math.isfinite(value := float(word)):
+            raise ValueError(f"{word[:30]} is no number of JSON that a float holds")
+        return value
+
     try:
-        text = text.decode("utf-8") if isinstance(text, bytes) else text
-        kinds = {"parse_constant": _finite, "parse_float": _finite} if finite else {}
-        return json.loads(text, parse_int=_whole, **kinds)
+        kinds = {"parse_constant": number, "parse_float": number} if finite else {}
+        return json.loads(text, **kinds)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
-
-
-def _whole(digits: str) -> int:
-    if len(digits) > 300:  # beyond 308 digits no float holds it
-        raise ValueError(f"a whole number has {len(digits)} digits")
-    return int(digits)
-
-
-def _finite(word: str) -> float:
-    if not math.isfinite(value := float(word)):
-        raise ValueError(f"{word[:30]} is no number of JSON that a float holds")
-    return value

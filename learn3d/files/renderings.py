@@ -47,8 +47,13 @@ def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
     return *shrink(color, mask, size), int(mask.max())
 
 
-def read_exactly(path: Path, size: int) -> np.ndarray:
-    """An image of exactly this size, colours over white, uint8 [size, size, 3]."""
+def read_with_mask(path: Path, mask_path: Path, size: int) -> View:
+    """A rendering and its mask, both of exactly this size; colours inverted over black, as Kato stores them."""
+    color, mask = (_read_exactly(each, size) for each in (path, mask_path))
+    return np.dstack([255 - color, mask[..., 0]]).transpose(2, 0, 1), mask[..., 0], int(mask.max())
+
+
+def _read_exactly(path: Path, size: int) -> np.ndarray:
     image = open_image(path, RENDERINGS, limits.RENDER_SIDE)
     if image.size != (size, size) or image.mode.startswith("I"):
         found = f"{image.width}x{image.height} pixels of the format {image.mode}"
@@ -93,12 +98,12 @@ def shrink(color: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, 
 def _shrink(planes: np.ndarray, size: int) -> np.ndarray:
     if planes.shape[-1] == size:
         return planes.astype(np.uint8)
-    weights = _area_weights(planes.shape[-1], size)
+    weights = area_weights(planes.shape[-1], size)
     return np.rint(weights @ planes @ weights.T).astype(np.uint8)
 
 
 @functools.cache
-def _area_weights(source: int, size: int) -> np.ndarray:
+def area_weights(source: int, size: int) -> np.ndarray:
     """Share of each of `source` pixels in each of `size` larger ones, float32 [size, source]; rows sum to 1."""
     edges = np.arange(size + 1) * (source / size)
     pixels = np.arange(source)
@@ -122,9 +127,3 @@ def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
         if not sound:
             raise DamagedFile(path, f"row {k} is {' '.join(line)!r}; expected {wanted}, all finite")
     return table
-
-
-def check_folder(path: Path, wanted: str) -> None:
-    """Raise MissingFile if there is no such folder."""
-    if not path.is_dir():
-        raise MissingFile(path, f"is missing; expected {wanted}")

@@ -36,7 +36,7 @@ MEMORY = 256 * 2**20  # bytes that a call may add to its worker; arrays made by 
 SECONDS = 5.0  # processor time of a call
 _PATIENCE = 600.0  # seconds that a worker may be silent, as disks can be slow
 _GROWTH = 256 * 2**20  # bytes that a worker may keep after a call; beyond, it is replaced
-_LARGE = 2**20  # bytes above which an array returns as shared memory, not in the pickle
+_LARGE = 2**20  # bytes above which `empty` takes shared memory
 _LINUX = sys.platform == "linux"
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -74,16 +74,16 @@ def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
     groups, tasks, most = iter(groups), deque(), cores()
     try:
         while True:
-            busy = [task for task in tasks if task.results is None]
+            busy = {task.worker.connection: task for task in tasks if task.results is None}
             if len(busy) < most and len(tasks) < 2 * most and (calls := next(groups, None)) is not None:
                 tasks.append(_Task(list(calls)))
             elif tasks and tasks[0].results is not None:
                 yield tasks.popleft().results
             elif busy:
-                first = min(task.deadline for task in busy)
-                ready = wait([task.worker.connection for task in busy], max(0.0, first - time.monotonic()))
-                for task in busy:
-                    if task.worker.connection in ready or time.monotonic() > task.deadline:
+                for connection in wait(busy, 1.0):
+                    busy[connection].receive()
+                for task in busy.values():
+                    if task.results is None and time.monotonic() > task.deadline:
                         task.receive()
             else:
                 return
@@ -115,14 +115,12 @@ class _Task:
         try:
             if not self.worker.connection.poll():
                 raise TimeoutError
-            results, grown = self.worker.receive()
+            self.results, grown = self.worker.receive()
+            self.worker.end() if grown else _idle.append(self.worker)
         except (EOFError, OSError, pickle.UnpicklingError):
             status = self.worker.end()
             single = len(self.calls) == 1
             self.results = [self._fault(status)] if single else [next(read_all([[call]]))[0] for call in self.calls]
-            return
-        self.results = results
-        self.worker.end() if grown else _idle.append(self.worker)
 
     def _fault(self, status: int) -> DamagedFile:
         call, fault = self.calls[0], f"the process that read it crashed (status {status})"
@@ -147,19 +145,16 @@ class _Worker:
         _workers.add(self)
 
     def receive(self) -> tuple[list[Any], bool]:
-        """The results of its calls, and whether the process has grown too large to be kept.
-
-        Raises EOFError or OSError if it has died.
-        """
+        """The results of its calls, and whether the process has grown too large to be kept."""
         data, sizes, grown = self.connection.recv()
         buffers = []
         for size in sizes:
             with open(recv_handle(self.connection), "r+b") as file:
-                buffers.append(memoryview(mmap.mmap(file.fileno(), 0))[:size])
+                buffers.append(memoryview(mmap.mmap(file.fileno(), size)))
         return pickle.loads(data, buffers=buffers), grown
 
     def end(self) -> int:
-        """Kill the process, which keeps nothing that would have to be saved. Returns its exit status."""
+        """Kill the process, which has nothing to save. Returns its exit status."""
         _workers.discard(self)
         self.process.kill()
         self.connection.close()
@@ -215,11 +210,18 @@ def _serve(end: int) -> None:
         while True:
             folder, calls = connection.recv()
             os.chdir(folder)
-            results = [_attempt(call) for call in calls]
+            results, sent = [_attempt(call) for call in calls], []
             _limit(math.inf, math.inf)
-            data, buffers = _pickled(results)
-            connection.send((data, [size for _, size in buffers], _memory() - start > _GROWTH))
-            for file, _ in buffers:
+
+            def in_band(buffer: pickle.PickleBuffer, sent: list[tuple[int, int]] = sent) -> bool:
+                content = np.frombuffer(buffer.raw(), np.uint8)
+                if shared := content.ctypes.data in _shared:
+                    sent.append((_shared[content.ctypes.data], content.nbytes))
+                return not shared
+
+            data = pickle.dumps(results, 5, buffer_callback=in_band)
+            connection.send((data, [size for _, size in sent], _memory() - start > _GROWTH))
+            for file, _ in sent:
                 send_handle(connection, file, None)
             for file in _shared.values():
                 os.close(file)
@@ -245,8 +247,6 @@ def _attempt(call: Call) -> Any:
 
 def reason(error: Exception) -> str:
     """The first line of an error's text, with its kind if that says more than "ValueError"."""
-    if isinstance(error, (NameError, AttributeError, TypeError, AssertionError)):  # a slip of a library
-        return f"its content misleads the library that reads it: {type(error).__name__}"
     text = (str(error).strip().splitlines() or [""])[0][:300]
     return text if text and type(error) is ValueError else f"{type(error).__name__}: {text}"
 
@@ -268,21 +268,3 @@ def _memory() -> int:
         return 0
     with open("/proc/self/statm", "rb", buffering=0) as file:
         return int(file.read().split()[5]) * mmap.PAGESIZE
-
-
-def _pickled(results: list[Any]) -> tuple[bytes, list[tuple[int, int]]]:
-    """Results pickled without their large arrays, and file and size of the shared memory of each of these."""
-    buffers = []
-
-    def in_band(buffer: pickle.PickleBuffer) -> bool:
-        content = np.frombuffer(buffer.raw(), np.uint8)
-        if content.nbytes < _LARGE or not _LINUX:
-            return True
-        if content.ctypes.data not in _shared:
-            copy = empty((content.nbytes,), np.uint8)
-            copy[:] = content
-            content = copy
-        buffers.append((_shared[content.ctypes.data], content.nbytes))
-        return False
-
-    return pickle.dumps(results, 5, buffer_callback=in_band), buffers

@@ -16,14 +16,11 @@ def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
     """The array `name` of numbers [size, size, size] of a MATLAB file (version 5 to 7) as bool: True if not 0."""
     import scipy.io  # here, as it takes longer to import than all else in a worker
 
-    wanted = f"a MATLAB file (version 5 to 7) with the array {name!r} [{size}, {size}, {size}]"
+    wanted = f"a MATLAB file (version 5 to 7) with the array {name!r} of numbers [{size}, {size}, {size}]"
     with open_file(path, limits.VOLUME_BYTES, wanted) as file:
-        array = scipy.io.loadmat(file, variable_names=[name]).get(name)
-    if not isinstance(array, np.ndarray):
-        raise DamagedFile(path, f"has no such array; expected {wanted}")
-    kind = "numbers" if array.dtype.kind in "biuf" else "no numbers"
-    if kind == "no numbers" or array.shape != (size,) * 3:
-        raise DamagedFile(path, f"has {kind} {list(array.shape)}; expected {wanted}")
+        array = np.asarray(scipy.io.loadmat(file, variable_names=[name]).get(name))
+    if array.dtype.kind not in "biuf" or array.shape != (size,) * 3:
+        raise DamagedFile(path, f"has {array.dtype} {list(array.shape)} there; expected {wanted}")
     return array != 0
 
 
@@ -37,25 +34,20 @@ class Binvox(NamedTuple):
 
 def read_binvox(path: Path, size: int) -> Binvox:
     """A grid of size^3 cells: a text header, then runs of (value, count) bytes with y fastest, then z, then x."""
-    wanted = "a binvox file: '#binvox 1', the lines dim, translate, scale and data, then pairs of bytes"
-    content = read_bytes(path, limits.VOLUME_BYTES, wanted)
-    head, found, runs = content.partition(b"\ndata\n")
-    header = {line.split()[0]: line.split()[1:] for line in head.split(b"\n") if line.strip()}
+    wanted = f"a binvox file of {size}x{size}x{size} cells: the lines dim, translate, scale, data, then pairs of bytes"
+    head, _, runs = read_bytes(path, limits.VOLUME_BYTES, wanted).partition(b"\ndata\n")
+    header = {words[0]: words[1:] for line in head.split(b"\n") if (words := line.split())}
     try:
-        dim = [int(word) for word in header[b"dim"]]
-        translate = np.array([float(word) for word in header[b"translate"]])
-        (scale,) = (float(word) for word in header[b"scale"])
+        translate, (scale,) = np.array(header[b"translate"], np.float64), np.array(header[b"scale"], np.float64)
+        if header[b"dim"] != [b"%d" % size] * 3 or translate.shape != (3,):
+            raise ValueError
     except (KeyError, ValueError):
-        found = b""
-    if not found or not content.startswith(b"#binvox"):
-        raise DamagedFile(path, f"has no such header; expected {wanted}. {FETCH_AGAIN}")
-    if dim != [size] * 3:
-        raise DamagedFile(path, f"holds {'x'.join(map(str, dim))} cells; expected {size}x{size}x{size}")
+        raise DamagedFile(path, f"has another header; expected {wanted}") from None
     low, high = limits.DISTANCE
-    if translate.shape != (3,) or not (np.abs(translate) <= high).all() or not low <= scale <= high:
+    if not (np.abs(translate) <= high).all() or not low <= scale <= high:
         raise DamagedFile(path, f"has translate {translate} and scale {scale}; expected {low:g} .. {high:g}")
     pairs = np.frombuffer(runs[: len(runs) // 2 * 2], np.uint8).reshape(-1, 2)
     if (total := int(pairs[:, 1].sum(dtype=np.int64))) != size**3:
         raise DamagedFile(path, f"its runs fill {total} cells; expected {size**3}. {FETCH_AGAIN}")
     grid = np.repeat(pairs[:, 0] != 0, pairs[:, 1]).reshape(size, size, size)  # axes x, z, y
-    return Binvox(np.ascontiguousarray(grid.transpose(0, 2, 1)), translate, scale)
+    return Binvox(np.ascontiguousarray(grid.transpose(0, 2, 1)), translate, float(scale))

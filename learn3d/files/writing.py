@@ -14,49 +14,54 @@ from typing import Any
 
 @contextlib.contextmanager
 def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
-    """Gives a temporary path in the folder of `path`; what was written there takes the name `path` when the block ends.
+    """Gives a temporary path in the folder of `path`; the file written there takes the name `path` at the end.
 
     After an exception nothing is left of it; a killed process leaves the temporary file (`remove_partials`). With
-    `sync` the content is on the disk before it takes the name, and the name before the block ends, so that not even a
-    power cut leaves half a file or brings the old one back. Raises OSError where `path` is there and no plain file: a
-    folder, or a device such as /dev/null, which must not be replaced.
+    `sync` not even a power cut leaves half a file. Raises OSError if `path` is a folder, a pipe or a device.
     """
     path = Path(path)
-    if path.exists() and not path.is_file():
+    if not _may_replace(path):
         raise OSError(f"{path} is no plain file and is not replaced; give another name")
     temporary = path.with_name(f".{path.name}.partial")
     temporary.unlink(missing_ok=True)  # a killed process may have left it as a second name of a file
     try:
         yield temporary
         if sync:
-            with open(temporary, "rb+") as file:
-                os.fsync(file.fileno())
+            _sync(temporary)
         os.replace(temporary, path)
-        if sync and os.name == "posix":  # Windows cannot open folders
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+        if sync:
+            _sync(path.parent)
     except OSError as error:
-        if error.errno is not None and error.filename is None:  # a full disk does not say which file it had no room for
+        if error.errno is not None and error.filename is None:  # a full disk does not name the file
             error.filename = str(path)
         raise
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def check_target(path: Path, option: str, *, folder: bool = False) -> None:
-    """Raise OSError where `path` cannot be written. For the beginning of long work; nothing is left of the attempt.
+def _may_replace(path: Path) -> bool:
+    # /dev/stdout is a link into /proc; it must stay one even if the output goes to a plain file.
+    into_proc = path.is_symlink() and path.readlink().is_relative_to("/proc")
+    return not into_proc and (path.is_file() or not path.exists())
 
-    With `folder` it is a folder for files, which need not be there yet. `option` is how the command calls the path.
+
+def _sync(path: Path) -> None:
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
+
+
+def check_target(path: Path, option: str, *, folder: bool = False) -> None:
+    """Raise OSError if `path` cannot be written. For the beginning of long work; nothing is left of the attempt.
+
+    With `folder` it is a folder for files, which need not be there yet. `option` is the command's name of the path.
     """
     path = Path(path)
-    there = next(p for p in (path, *path.parents) if os.path.lexists(p)) if folder else path.parent
+    there = next(p for p in (path, *path.parents) if p.exists()) if folder else path.parent
     try:
-        if not there.is_dir():
-            raise OSError(f"{there} is a file" if there.is_file() else f"there is no folder {there}")
-        if not folder and path.exists() and not path.is_file():
+        if not folder and not _may_replace(path):
             raise OSError("it is no plain file, and is not replaced")
         with tempfile.TemporaryFile(dir=there):
             pass
@@ -72,9 +77,9 @@ def remove_partials(*folders: Path) -> None:
 
 
 def give_second_name(path: Path, name: Path) -> None:
-    """Let a file be found under another name as well, by a hard link, or as a copy where the file system has none.
+    """Let a file be found under another name as well, in place of a file of that name.
 
-    A file of that name is replaced.
+    It is a hard link, or a copy if the file system has none.
     """
     with replacing(name, sync=True) as temporary:
         try:

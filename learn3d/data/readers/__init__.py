@@ -2,7 +2,8 @@
 
 from learn3d.data.readers import dvr, kar, kato, pascal3d, photos, r2n2
 
-#: By the name of the layout. Each module has its `PROPERTIES` and four functions: `load` (the data set of a category
-#: and split), `problems` (what is wrong with its files), `contents` (categories and splits of a folder) and `count`
-#: (the objects of a split).
+#: By the name of the layout. Each module has its `PROPERTIES` and two functions. `load(folder, category, split, *,
+#: findings, ...)` reads and checks a category (name or synset id) and split, with the keywords of `PROPERTIES.options`.
+#: It raises MissingFile or DamagedFile for the first fault; if the findings are not strict, it notes all faults and
+#: returns None. `contents(folder)` says which categories there are, with their splits.
 READERS = {"kato": kato, "dvr": dvr, "kar": kar, "r2n2": r2n2, "pascal3d": pascal3d, "photos": photos}

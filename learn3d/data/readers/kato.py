@@ -11,26 +11,28 @@ The oddities that this module hides (Kato et al. 2018):
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from learn3d.data.categories import SYNSETS, synset_of
-from learn3d.data.conventions import AZIMUTH_STEP_DEG, IMAGE_SIZE, KATO, NUM_VIEWS, VOXEL_SIZE, view_poses
+from learn3d.data.conventions import (
+    AZIMUTH_STEP_DEG,
+    IMAGE_SIZE,
+    KATO,
+    NUM_VIEWS,
+    VOXEL_SIZE,
+    LayoutProperties,
+    view_poses,
+)
 from learn3d.data.dataset import SPLITS, ViewDataset
-from learn3d.data.readers.properties import LayoutProperties
-from learn3d.data.readers.renderings import check_split
 from learn3d.files import npz
-from learn3d.files.findings import DamagedFile, Findings, MissingFile, Problem
+from learn3d.files.findings import STRICT, DamagedFile, Findings, MissingFile
 from learn3d.files.sandbox import Call, read_all
 
 PROPERTIES = LayoutProperties(voxels=True, convention=KATO, inverted=True)
-VIEW_NAMES = tuple(f"azimuth {AZIMUTH_STEP_DEG * view:g}°" for view in range(NUM_VIEWS))
 
 _KEY = "arr_0"
 _ARRAYS = {  # dtype and shape of one object
@@ -45,19 +47,27 @@ def split_paths(folder: Path | str, category: str, split: str) -> tuple[Path, Pa
     return Path(folder) / f"{stem}_images.npz", Path(folder) / f"{stem}_voxels.npz"
 
 
-def load(folder: Path | str, category: str, split: str) -> ViewDataset:
-    """Read and check one category (name or synset id) and split ("train", "val" or "test") of a folder.
-
-    Sample `object * 24 + view` is one view of one object; the pose classes are the 24 views.
-    Raises FileNotFoundError where a file is missing (the message lists what the folder holds) and ValueError where
-    a file is no such npz, or its array has another shape or dtype, or the two files disagree on the object count.
-    """
-    check_split(split)
-    images, voxels = _read(folder, category, split, Findings(strict=True))
+def load(folder: Path | str, category: str, split: str, *, findings: Findings = STRICT) -> ViewDataset | None:
+    """Read a split. Sample `object * 24 + view` is one view of one object; the view classes are the 24 views."""
+    paths = split_paths(folder, category, split)
+    images = findings.attempt(_read, paths[0], "images", category, split, None)
+    # Grids are mostly zeros, and no expansion would be suspect: they are as many as the images.
+    voxels = findings.attempt(_read, paths[1], "voxels", category, split, None if images is None else len(images))
+    if images is None or voxels is None:
+        return None
+    if not findings.strict:
+        for index, view in np.argwhere(images[:, :, 3].max((2, 3), initial=0) < 128):
+            findings.warn(paths[0], f"the mask of object {index}, view {view}, is empty")
+        for index in np.flatnonzero(~voxels.any((1, 2, 3))):
+            findings.warn(paths[1], f"the grid of object {index} is empty")
+    if len(images) != len(voxels) or not len(images):
+        counts = f"{len(images)} objects and {paths[1].name} {len(voxels)}"
+        raise DamagedFile(paths[0], f"holds {counts}; expected as many, and at least one: fetch or make both again")
+    findings.objects = len(images)
     return from_arrays(images, voxels, category, split)
 
 
-def from_arrays(images: np.ndarray, voxels: np.ndarray, category: str, split: str) -> ViewDataset:
+def from_arrays(images: np.ndarray, voxels: np.ndarray | None, category: str, split: str) -> ViewDataset:
     """The data set of images uint8 [N, 24, 4, 64, 64] and voxels bool [N, 32, 32, 32], as the files hold them."""
     count = len(images)
     view_ids = np.tile(np.arange(NUM_VIEWS), count)
@@ -67,26 +77,12 @@ def from_arrays(images: np.ndarray, voxels: np.ndarray, category: str, split: st
         images=images.reshape(count * NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE),
         poses=view_poses(torch.from_numpy(view_ids)),
         view_ids=view_ids,
-        view_names=VIEW_NAMES,
+        view_names=tuple(f"azimuth {AZIMUTH_STEP_DEG * view:g}°" for view in range(NUM_VIEWS)),
         object_ids=np.repeat(np.arange(count), NUM_VIEWS),
         object_names=tuple(f"{i:04d}" for i in range(count)),
         voxels=voxels,
         convention=KATO,
     )
-
-
-def problems(folder: Path | str, category: str, split: str, *, progress: bool = False) -> Iterator[Problem]:
-    """Everything that is wrong with the two files of one category and split."""
-    findings = Findings()
-    arrays = _read(folder, category, split, findings)
-    yield from findings.problems
-    for path, kind, array in zip(split_paths(folder, category, split), _ARRAYS, arrays, strict=True):
-        if array is None:
-            continue
-        empty = array[:, :, 3].max((2, 3)) < 128 if kind == "images" else ~array.any((1, 2, 3))
-        for index in np.argwhere(empty).tolist():
-            what = "the mask of object {}, view {}," if kind == "images" else "the grid of object {}"
-            yield Problem(str(path), f"{what.format(*index)} is empty", "warning")
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -100,92 +96,21 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     return {prefix: tuple(s for s in SPLITS if s in splits) for prefix, splits in sorted(found.items())}
 
 
-def count(folder: Path | str, category: str, split: str) -> int:
-    """How many objects a split holds, from the header of its voxels (or images) file alone; 0 where it has none."""
-    heads = _headers(split_paths(folder, category, split))
-    with contextlib.suppress(StopIteration, IndexError):
-        return next(head.shape[0] for head in reversed(heads) if isinstance(head, npz.Header))
-    return 0
-
-
-def _read(folder: Path | str, category: str, split: str, findings: Findings) -> list[np.ndarray | None]:
-    """Images [N, 24, 4, 64, 64] and voxels [N, 32, 32, 32], read at the same time; None for what findings tell of."""
-    paths = split_paths(folder, category, split)
-    for path in paths:
-        findings.attempt(_check_there, path, category, split)
-    heads = [
-        findings.attempt(_checked, path, kind, head) if path.is_file() else None
-        for path, kind, head in zip(paths, _ARRAYS, _headers(paths), strict=True)
-    ]
-    counts = [head.shape[0] for head in heads if head is not None]
-    if len(counts) == 2:
-        findings.attempt(_check_counts, paths, *counts)
-    calls = []
-    for path, (kind, (dtype, shape)), head in zip(paths, _ARRAYS.items(), heads, strict=True):
-        # Grids are mostly zeros, and no expansion would be suspect: they are as many as the images.
-        most = counts[0] * math.prod(shape) * dtype.itemsize if kind == "voxels" and len(counts) == 2 else None
-        calls += [[Call(npz.read, path, (_KEY, most), _wanted(kind))]] if head is not None else []
-    arrays = iter(findings.take(array) for (array,) in read_all(calls))
-    return [None if head is None else next(arrays) for head in heads]
-
-
-def _headers(paths: tuple[Path, Path]) -> list[Any]:
-    """The header of the array of each file, or what is wrong with it."""
-    calls = [[Call(npz.header, path, (_KEY,), _wanted(kind))] for path, kind in zip(paths, _ARRAYS, strict=True)]
-    return [head for (head,) in read_all(calls)]
-
-
-def _wanted(kind: str) -> str:
-    dtype, shape = _ARRAYS[kind]
-    text = f"{dtype} [N, {', '.join(map(str, shape))}] under the key '{_KEY}'"
-    return f"an npz file with {text} and no pickled objects"
-
-
-def _checked(path: Path, kind: str, head: Any) -> npz.Header:
-    if not isinstance(head, npz.Header):
-        raise head
-    if (head.dtype, head.shape[1:]) != _ARRAYS[kind] or not head.shape:
-        raise DamagedFile(path, f"the {kind} file must be {_wanted(kind)}, got {head}")
-    return head
-
-
-def _check_there(path: Path, category: str, split: str) -> None:
+def _read(path: Path, kind: str, category: str, split: str, count: int | None) -> np.ndarray:
+    """The array of one file, of `count` objects at most if that is known."""
     if not path.is_file():
-        raise MissingFile(path, _what_is_there(category, split, path))
-
-
-def _check_counts(paths: tuple[Path, Path], images: int, voxels: int) -> None:
-    if images != voxels:
-        raise DamagedFile(
-            paths[0],
-            f"holds {images} objects but {paths[1].name} holds {voxels}; "
-            "the two files must come from the same data set: fetch or make both again",
+        names = {synset: name for name, synset in SYNSETS.items()}
+        there = [f"{names.get(prefix, prefix)} {s}" for prefix, splits in contents(path.parent).items() for s in splits]
+        raise MissingFile(
+            path,
+            f"is missing ({category}, {split}): a split is two files, *_images.npz and *_voxels.npz. The folder holds: "
+            f"{', '.join(there) or 'none'}. Choose one of these, or make it (learn3d make-dataset)",
         )
-    if images == 0:
-        raise DamagedFile(paths[0], "holds no object; make the data set with more meshes or another split")
-
-
-def _what_is_there(category: str, split: str, missing: Path) -> str:
-    """Message for a missing file: what was wanted, what the folder holds, what to do."""
-    folder = missing.parent
-    wanted = f"is missing ({category}, {split})"
-    if not folder.is_dir():
-        return f"{wanted}: there is no such folder; give the one with the npz files, or make it (learn3d make-dataset)"
-    pair = split_paths(folder, category, split)
-    for other, kind, lacking in zip(pair, _ARRAYS, reversed(_ARRAYS), strict=True):
-        if other.is_file():
-            return (
-                f"{wanted}: the {kind} are there ({other.name}), but a split needs the {lacking}, too. Fetch or copy "
-                "that file from where the other came from, or make both again (learn3d make-dataset --overwrite)"
-            )
-    names = {synset: name for name, synset in SYNSETS.items()}
-    found = []
-    for prefix, splits in contents(folder).items():
-        whole = [s for s in splits if all(path.is_file() for path in split_paths(folder, prefix, s))]
-        found += [f"{names.get(prefix, prefix)} {s}" for s in whole]
-    if found:
-        return f"{wanted}; the folder holds: {', '.join(found)}. Choose one of these, or make it (learn3d make-dataset)"
-    return (
-        f"{wanted}; the folder holds no '*_images.npz' with its '*_voxels.npz' at all. Give another folder, or make "
-        "one (learn3d make-dataset)"
-    )
+    dtype, shape = _ARRAYS[kind]
+    wanted = f"an npz file with {dtype} [N, {', '.join(map(str, shape))}] under the key '{_KEY}' and no pickled objects"
+    most = None if count is None else count * math.prod(shape) * dtype.itemsize
+    ((array,),) = read_all([[Call(npz.read, path, (_KEY, most), wanted)]])
+    array = STRICT.take(array)
+    if (array.dtype, array.shape[1:]) != (dtype, shape) or not array.shape:
+        raise DamagedFile(path, f"the {kind} file must be {wanted}, got {array.dtype} {list(array.shape)}")
+    return array

@@ -14,7 +14,7 @@ from shapenet_files import CHAIR, write_dvr, write_kar, write_r2n2
 from learn3d.data.layouts import LAYOUTS, Layout, check_options, load_dataset
 from learn3d.data.readers import READERS
 
-LISTS = {"train": ["b1"], "val": ["c2"], "test": ["a0"]}
+TABLE = "04379243"
 
 
 @pytest.fixture(scope="module")
@@ -23,57 +23,46 @@ def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("layouts")
     rng = np.random.default_rng(0)
     (root / "kato").mkdir()
-    for prefix in (CHAIR, "04379243"):
+    for prefix in (CHAIR, TABLE):
         np.savez(root / "kato" / f"{prefix}_test_images.npz", rng.integers(0, 256, (2, 24, 4, 64, 64), np.uint8))
         np.savez(root / "kato" / f"{prefix}_test_voxels.npz", rng.random((2, 32, 32, 32)) < 0.5)
     write_dvr(root / "dvr", {"test": ["a0"]})
-    write_kar(root / "kar", LISTS, 64)
+    write_kar(root / "kar", {"train": ["b1"], "val": ["c2"], "test": ["a0"]}, 64)
     write_r2n2(root / "r2n2", ["a0", "b1"], 64)
     for path in (p for layout in ("dvr", "kar", "r2n2") for p in list((root / layout).rglob(CHAIR))):
-        shutil.copytree(path, path.with_name("04379243"))
+        shutil.copytree(path, path.with_name(TABLE))
     lists = json.loads((root / "kar" / "splits.json").read_text())
-    (root / "kar" / "splits.json").write_text(json.dumps(lists | {"04379243": lists[CHAIR]}))
+    (root / "kar" / "splits.json").write_text(json.dumps(lists | {TABLE: lists[CHAIR]}))
     return root
 
 
 @pytest.mark.parametrize(
     ("layout", "views", "classes"), [("kato", 48, 24), ("dvr", 24, 24), ("kar", 20, 72), ("r2n2", 24, 24)]
 )
-def test_one_category_or_several(folders, layout, views, classes):
+def test_one_category_or_several(folders, layout, views, classes) -> None:
     one = load_dataset(layout, folders / layout, "chair", "test")
     assert (len(one), one.num_views, one.num_classes) == (views, classes, 1)
-    both = load_dataset(layout, folders / layout, "chair, table", "test")
-    assert (len(both), both.num_views, both.num_classes) == (2 * views, classes, 2)
+    both = load_dataset(layout, folders / layout, "chair, table", "test", view_bins="90x90:-90:90")
+    assert (len(both), both.num_views, both.num_classes) == (2 * views, 8, 2)
+    assert both.view_names[0] == "azimuth -135°, elevation -45°"
     assert both.class_names == ("chair", "table") and both.category == "chair,table"
     assert both.class_ids.tolist() == [0] * one.num_objects + [1] * one.num_objects
+    few = load_dataset(layout, folders / layout, "chair", "test", views_per_object=2)
+    assert len(few) == 2 * one.num_objects
 
 
-@pytest.mark.parametrize("layout", ["kato", "dvr", "kar", "r2n2"])
-def test_view_bins_are_a_choice_for_any_layout_with_angles(folders, layout):
-    dataset = load_dataset(layout, folders / layout, "chair", "test", view_bins="90x90:-90:90")
-    assert dataset.num_views == 8 and dataset.view_names[0] == "azimuth -135°, elevation -45°"
-
-
-def test_a_folder_that_is_not_there_is_named_with_where_it_was_looked_for(tmp_path, monkeypatch):
+def test_a_folder_that_is_not_there_or_of_another_layout_is_named(folders, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for layout in LAYOUTS:
-        with pytest.raises(FileNotFoundError) as error:
-            load_dataset(layout, "data", "chair", "train")
-        assert f"data: there is no such folder (here that is {tmp_path / 'data'})" in str(error.value)
-        assert "say where the data set is with --data" in str(error.value)
-    with pytest.raises(FileNotFoundError, match="nowhere: there is no such folder; say"):
-        load_dataset("kato", tmp_path / "nowhere", "chair", "train")
+    for folder, message in (
+        ("data", rf"data: there is no such folder \(here that is {tmp_path / 'data'}\); say where the data set is"),
+        (tmp_path / "nowhere", "nowhere: there is no such folder; say"),
+        (folders / "kar", "kar: this is a data set of the layout 'kar', not 'dvr'; .*--layout"),
+    ):
+        with pytest.raises(FileNotFoundError, match=message):
+            load_dataset("dvr", folder, "chair", "test")
 
 
-def test_options_reach_the_reader(folders):
-    assert len(load_dataset("kar", folders / "kar", "chair", "train")) == 1
-    assert len(load_dataset("kar", folders / "kar", "chair", "train", views_per_object=4)) == 4
-    assert len(load_dataset("r2n2", folders / "r2n2", "chair", "train", views_per_object=4)) == 4
-    small = load_dataset("kar", folders / "kar", "chair", "test", image_size=32)
-    assert small.image_size == 32 and small.masks.shape == (20, 64, 64)
-
-
-def test_progress_is_off_unless_asked_for(folders, capsys):
+def test_progress_is_off_unless_asked_for(folders, capsys) -> None:
     load_dataset("dvr", folders / "dvr", "chair", "test")
     assert capsys.readouterr().err == ""
     load_dataset("dvr", folders / "dvr", "chair", "test", progress=True)
@@ -81,22 +70,17 @@ def test_progress_is_off_unless_asked_for(folders, capsys):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_options_that_a_layout_does_not_have_are_refused(layout):
-    if "image_size" in LAYOUTS[layout].options:
+def test_options_of_a_layout(layout) -> None:
+    known = set(inspect.signature(READERS[layout].load).parameters) & {"image_size", "views_per_object", "progress"}
+    assert known == set(LAYOUTS[layout].options)
+    if "image_size" in known:
         check_options(layout, image_size=224)
     else:
         with pytest.raises(ValueError, match=f"images of the layout '{layout}' have 64x64 pixels, but 224 are wanted"):
-            load_dataset(layout, "nowhere", "chair", "test", image_size=224)
+            check_options(layout, image_size=224)
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_table_says_what_each_reader_takes(layout):
-    reader = READERS[layout]
-    known = set(inspect.signature(reader.load).parameters) & {"image_size", "views_per_object", "progress"}
-    assert known == set(LAYOUTS[layout].options)
-
-
-def test_unknown_names(folders):
+def test_unknown_names(folders) -> None:
     assert tuple(LAYOUTS) == get_args(Layout) == tuple(READERS)
     with pytest.raises(ValueError, match=r"layout must be one of kato, .* got 'lsm'"):
         load_dataset("lsm", folders, "chair", "test")

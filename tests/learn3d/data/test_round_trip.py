@@ -1,4 +1,4 @@
-"""Meshes -> files of a layout -> the layout's reader: masks, cameras and voxels are those of the meshes."""
+"""Meshes -> files of a layout -> its reader, also in shards: masks, cameras and voxels are those of the meshes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ import trimesh
 from lopsided_meshes import write_meshes
 
 import nmr
+from learn3d.data import shards
 from learn3d.data.conventions import mesh_to_object
+from learn3d.data.disk_array import DiskArray
 from learn3d.data.layouts import LAYOUTS, load_dataset
+from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.make_data.render import DatasetConfig, make_dataset
 
 SETTINGS = {
@@ -64,6 +67,8 @@ def test_masks_cameras_and_voxels(made):
     for split in ("train", "val" if made.layout == "pascal3d" else "test"):
         dataset = load_dataset(made.layout, made.folder, "chair", split)
         assert dataset.inverted == LAYOUTS[made.layout].inverted
+        assert (dataset.voxels is not None) == LAYOUTS[made.layout].voxels
+        assert (dataset.points is not None) == (made.layout == "dvr")
         expected = {"kato": 24, "dvr": 24, "kar": 20, "r2n2": 24, "pascal3d": 4, "photos": 4}[made.layout]
         if made.layout == "kar" and split == "train":
             expected = 1  # the published protocol
@@ -100,7 +105,27 @@ def test_masks_cameras_and_voxels(made):
             assert (background == (0 if dataset.inverted else 255)).float().mean() > 0.98
 
 
-def test_every_layout_has_voxels_or_points_or_says_that_it_has_none(made):
-    dataset = load_dataset(made.layout, made.folder, "chair", "train")
-    assert (dataset.voxels is not None) == LAYOUTS[made.layout].voxels
-    assert (dataset.points is not None) == (made.layout == "dvr")
+def test_shards_keep_batches(made, tmp_path, command, monkeypatch):
+    monkeypatch.setattr(shards, "SHARD_BYTES", 1)  # one object in each
+    words = ("--data", made.folder, "--layout", made.layout, "--output", tmp_path)
+    status, out, said = command("convert-dataset", *words)
+    assert status == 0 and "train: " in out, said
+    before = load_dataset(made.layout, made.folder, "chair", "train")
+    before = before.select(np.argsort(before.object_ids, kind="stable"))  # as they come in shards of one object
+    after = load_dataset(made.layout, tmp_path, "chair", "train")
+    assert isinstance(after.images, DiskArray) and after.info() == before.info()
+    for name in ("view_names", "object_names", "convention", "image_size"):
+        assert getattr(after, name) == getattr(before, name), name
+    order = torch.randperm(len(before))
+    one, other = before.batch(order), after.batch(order)
+    for name in ("images", "masks", "view_ids", "object_ids", "class_ids", "voxels"):
+        a, b = getattr(one, name), getattr(other, name)
+        assert (a is None and b is None) or torch.equal(a, b), name
+    assert torch.equal(one.poses.features(), other.poses.features())
+    assert after.object_share() == pytest.approx(before.object_share())
+    assert after.check_masks() == before.check_masks()
+    if LAYOUTS[made.layout].angles:
+        assert find_mirror_plane(after) == find_mirror_plane(before)
+    else:
+        val, test = (load_dataset(made.layout, tmp_path, "chair", split) for split in ("val", "test"))
+        assert val.digest() == test.digest()

@@ -61,7 +61,7 @@ def test_json():
         "[NaN]": "NaN is no number of JSON",
         "[-Infinity]": "-Infinity is no number of JSON",
         "1e999": "1e999 is no number of JSON",
-        "9" * 5000: "a whole number has 5000 digits",
+        "9" * 5000: "digits",
         "{": "Expecting",
     }
     for text, message in cases.items():

@@ -7,7 +7,6 @@ import resource
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -31,10 +30,8 @@ def path(tmp_path: Path) -> Path:
     ("function", "said"),
     [
         (strange.crash, "crashed"),
-        (strange.leave, "crashed"),
         (strange.eat, "memory"),
         (strange.fail, "a strange word"),
-        (strange.slip, "misleads the library that reads it: UnboundLocalError"),
         (strange.spin, "processor time"),
     ],
 )
@@ -67,10 +64,6 @@ def test_worker_is_kept_until_it_has_grown(path: Path) -> None:
     assert read(strange.keep, path, 10) == first
     assert read(strange.keep, path, 300) == first
     assert read(strange.keep, path, 10) != first
-
-
-def test_what_libraries_print_does_not_disturb(path: Path) -> None:
-    assert read(strange.chatter, path) == "done"
 
 
 def test_workers_are_light(path: Path) -> None:
@@ -113,24 +106,6 @@ def test_only_a_few_are_read_ahead(path: Path) -> None:
     assert len(asked) < 4 * cores() + 2
     reading.close()
     assert read(strange.size, path) == 5
-
-
-def test_threads_may_read_at_the_same_time(path: Path) -> None:
-    found = []
-    threads = [threading.Thread(target=lambda: found.append(read(strange.size, path))) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert found == [5] * 8
-
-
-def test_cores_are_shared_with_the_processes_beside(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("PYTEST_XDIST_WORKER_COUNT", raising=False)
-    monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
-    alone = cores()
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    assert cores() == max(1, alone // 2)
 
 
 def test_relative_paths_begin_at_the_folder_of_the_moment(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,321 @@
+"""ShapeNet's renderings as DVR, Kar et al. and 3D-R2N2 packed them, written to their descriptions."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+import torch
+from PIL import Image
+from reader_checks import cut_short, expect, problems, silhouette_iou
+from shapenet_files import (
+    CHAIR,
+    COLOR,
+    binvox_bytes,
+    box_mesh,
+    save,
+    shapes,
+    swap_frames,
+    write_dvr,
+    write_kar,
+    write_r2n2,
+)
+
+from learn3d.data.conventions import KATO, view_poses
+from learn3d.data.readers import READERS, dvr, kar, r2n2
+from learn3d.data.readers.kar import KAR
+from learn3d.data.readers.r2n2 import R2N2
+from learn3d.data.readers.renderings import check_poses
+from learn3d.files.findings import DamagedFile
+from nmr.metrics import voxel_iou
+
+LISTS = {"train": ["b1"], "val": ["c2"], "test": ["a0"]}
+ASIDE = np.eye(4)[[0]].T @ np.eye(4)[[3]]
+OBJECT = {"dvr": "a0", "kar": "a0", "r2n2": "b1"}  # of the split "test"
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory):
+    root = tmp_path_factory.mktemp("renderings")
+    write_dvr(root / "dvr", LISTS)
+    write_kar(root / "kar", LISTS, 80)  # the real renders have 224 pixels
+    write_r2n2(root / "r2n2", ["a0", "b1"], 72)  # and these 137
+    return root
+
+
+@pytest.fixture
+def copy(originals, tmp_path):
+    return lambda layout: shutil.copytree(originals / layout, tmp_path / layout)
+
+
+def views(folder: Path, name: str = "") -> Path:
+    """The folder of the images of an object."""
+    parents = {"dvr": "", "kar": "renders", "r2n2": "ShapeNetRendering"}
+    root = folder / parents[folder.name] / CHAIR / (name or OBJECT[folder.name])
+    return root / "rendering" if folder.name == "r2n2" else root
+
+
+def grid(folder: Path) -> Path:
+    """The voxels of an object."""
+    if folder.name == "r2n2":
+        return folder / "ShapeNetVox32" / CHAIR / OBJECT["r2n2"] / "model.binvox"
+    return folder / "voxels" / "modelVoxels32" / CHAIR / f"{OBJECT['kar']}.mat"
+
+
+def mesh(number: int) -> tuple[np.ndarray, np.ndarray]:
+    """An object of `shapes` in the object frame."""
+    vertices, faces = box_mesh(shapes(3)[number])
+    return swap_frames(vertices), faces
+
+
+@pytest.mark.parametrize(("layout", "number", "count", "half_fov"), [("kar", 0, 20, 14.9314), ("r2n2", 1, 24, 24.5672)])
+def test_renders_voxels_and_cameras_agree_with_the_object(originals, layout, number, count, half_fov) -> None:
+    dataset = READERS[layout].load(originals / layout, "chair", "test")
+    assert (len(dataset), dataset.object_names) == (count, (OBJECT[layout],))
+    assert dataset.poses.half_fov_deg == pytest.approx(half_fov, abs=1e-4)
+    assert silhouette_iou(dataset, *mesh(number)).min() > 0.92
+    vertices, faces = map(torch.from_numpy, mesh(number))
+    truth = torch.from_numpy(dataset.voxels)
+    iou = {c.name: float(voxel_iou(c.voxelize(vertices, faces), truth)) for c in (KATO, KAR, R2N2)}
+    assert iou.pop(layout) > 0.75 and max(iou.values()) < 0.4
+    colors, mask = dataset.images[:, :3].transpose(0, 2, 3, 1), dataset.images[:, 3]
+    assert (colors[mask == 255] == COLOR).all() and (colors[mask == 0] == 255).all() and not dataset.inverted
+
+
+def test_distances_of_r2n2_are_in_sides_of_the_grid(tmp_path) -> None:
+    write_r2n2(tmp_path, ["a0", "b1"], 72, scale=0.8)
+    assert silhouette_iou(r2n2.load(tmp_path, "chair", "test"), *mesh(1)).min() > 0.92
+
+
+def test_images_and_cameras_of_dvr_are_those_of_katos_files(originals) -> None:
+    dataset = dvr.load(originals / "dvr", "chair", "train")
+    assert (len(dataset), dataset.object_names, dataset.voxels, dataset.inverted) == (24, ("b1",), None, True)
+    inside = dataset.images[:, 3] == 255
+    colors = dataset.images[:, :3].transpose(0, 2, 3, 1)
+    np.testing.assert_array_equal(np.unique(colors[inside], axis=0), [[255 - c for c in COLOR]])
+    assert not colors[~inside].any()
+    assert torch.equal(dataset.poses.features(), view_poses(torch.arange(24)).features())
+    assert silhouette_iou(dataset, *mesh(1)).min() > 0.94
+
+
+@pytest.mark.parametrize("determinant", [1, -1])
+def test_any_world_of_cameras_and_points_is_brought_into_the_object_frame(tmp_path, determinant) -> None:
+    world, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    write_dvr(tmp_path, {"test": ["a", "b"]}, world=world * np.sign(np.linalg.det(world)) * determinant)
+    np.savez(tmp_path / CHAIR / "b" / "pointcloud.npz", points=np.zeros((400, 3)))
+    points = dvr.load(tmp_path, CHAIR, "test").points
+    assert points.shape == (2, 400, 3) and points.dtype == np.float32  # as many as every object has
+    low, high = swap_frames(shapes(1)[0]).min(1), swap_frames(shapes(1)[0]).max(1)
+    outside = np.maximum(np.maximum(low[:, None] - points[0], points[0] - high[:, None]), 0)
+    assert np.linalg.norm(outside, axis=2).min(0).max() < 2e-3  # float16
+    assert not (np.abs(points[0, :, 0]) < 0.29).all()  # z of the mesh spans 0.6, its x spans 1
+
+
+def test_kar_has_the_protocol_of_the_published_code(copy) -> None:
+    folder = copy("kar")
+    train = kar.load(folder, "chair", "train")
+    with pytest.raises(ValueError, match=r"views_per_object must lie in 1 \.\. 20, got 21"):
+        kar.load(folder, "chair", "train", views_per_object=21)
+    everything = kar.load(folder, "chair", "train", views_per_object=20)
+    assert (len(train), len(kar.load(folder, "chair", "val"))) == (1, 20)  # render 0 alone, or all
+    np.testing.assert_array_equal(train.images[0], everything.images[0])
+    table = np.loadtxt(views(folder, "b1") / "view.txt")
+    np.testing.assert_array_equal(everything.view_ids, (table[:, 0] + 180) // 15 * 3 + (table[:, 1] + 20) // 20)
+    lists = json.loads((folder / "splits.json").read_text())
+    lists[CHAIR]["test"] = [*sorted(kar.BROKEN), "a0"]
+    (folder / "splits.json").write_text(json.dumps(lists))
+    assert len(kar.BROKEN) == 3 and kar.load(folder, "chair", "test").object_names == ("a0",)
+
+
+def test_objects_may_have_fewer_renders(copy) -> None:
+    folder = copy("kar")
+    for k in range(12, 20):
+        (views(folder) / f"render_{k}.png").unlink()
+    table = views(folder) / "view.txt"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:12]))
+    assert len(kar.load(folder, "chair", "test")) == 12
+    assert not problems("kar", folder, "test")
+
+
+@pytest.mark.parametrize(("layout", "size"), [("kar", 80), ("r2n2", 72)])
+def test_large_images_keep_their_size_and_masks_have_64_pixels(originals, layout, size) -> None:
+    load, folder = READERS[layout].load, originals / layout
+    dataset = load(folder, "chair", "test", image_size=size)
+    assert dataset.image_size == size and set(np.unique(dataset.images[:, 3])) == {0, 255}
+    small = load(folder, "chair", "test").images[:, 3]
+    np.testing.assert_array_equal(dataset.masks, small)
+    assert len(np.unique(small)) > 2  # borders are averaged
+    with pytest.raises(ValueError, match=r"expected a square image of at least 137x137"):
+        load(folder, "chair", "test", image_size=137)
+
+
+def test_contents_and_splits(originals, tmp_path) -> None:
+    for layout, splits in {"dvr": tuple(LISTS), "kar": tuple(LISTS), "r2n2": ("train", "test")}.items():
+        assert READERS[layout].contents(originals / layout) == {CHAIR: splits}
+        assert [problems(layout, originals / layout, split) for split in splits] == [()] * len(splits)
+    write_r2n2(tmp_path, list("gfedcba"), 64)
+    names = {split: r2n2.load(tmp_path, CHAIR, split).object_names for split in ("train", "test")}
+    assert names == {"train": tuple("abcde"), "test": tuple("fg")}  # the first four fifths of the sorted ids
+    with pytest.raises(ValueError, match="split must be one of train, test; got 'val'"):
+        r2n2.load(tmp_path, CHAIR, "val")
+
+
+def rewrite_row(k: int, text: str):
+    def change(folder: Path) -> None:
+        path = views(folder) / ("view.txt" if folder.name == "kar" else "rendering_metadata.txt")
+        rows = path.read_text().splitlines()
+        rows[k : k + 1] = [text] if text else []
+        path.write_text("\n".join(rows))
+
+    return change
+
+
+def change_cameras(change):
+    def apply(folder: Path) -> None:
+        path = views(folder) / "cameras.npz"
+        with np.load(path) as file:
+            arrays = dict(file)
+        change(arrays)
+        np.savez(path, **arrays)
+
+    return apply
+
+
+def change_matrix(k: int, change):
+    return change_cameras(lambda a: a.update({f"world_mat_{k}": change(a[f"world_mat_{k}"].copy())}))
+
+
+def reverse_views(arrays) -> None:
+    arrays.update(
+        {f"world_mat_{k}": matrix for k, matrix in enumerate([arrays[f"world_mat_{-k % 24}"] for k in range(24)])}
+    )
+
+
+def turned(axis: int, angle: float):
+    """A camera turned about one of its axes, at its place."""
+
+    def turn(matrix: np.ndarray) -> np.ndarray:
+        a, b = [i for i in range(3) if i != axis]
+        c, s = np.cos(angle), np.sin(angle)
+        rotation = np.eye(3)
+        rotation[[a, a, b, b], [a, b, a, b]] = [c, -s, s, c]
+        matrix[:3] = rotation @ matrix[:3]
+        return matrix
+
+    return turn
+
+
+def save_points(**arrays: np.ndarray):
+    return lambda folder: np.savez(views(folder) / "pointcloud.npz", **arrays)
+
+
+FAULTS = {
+    ("dvr", "image/0003.png: is missing"): lambda f: (views(f) / "image" / "0003.png").unlink(),
+    ("dvr", "mask/0023.png: is missing"): lambda f: (views(f) / "mask" / "0023.png").unlink(),
+    ("dvr", "mask/0001.png: is 32x32 pixels"): lambda f: save(
+        views(f) / "mask" / "0001.png", np.full((32, 32), 255, np.uint8)
+    ),
+    ("dvr", "cameras.npz: cannot be read"): lambda f: cut_short(views(f) / "cameras.npz"),
+    ("dvr", "has no world_mat_7 of 4x4 numbers"): change_cameras(lambda a: a.pop("world_mat_7")),
+    ("dvr", "no rotation, or not finite"): change_matrix(2, lambda m: m * np.nan),
+    ("dvr", "part of a matrix is no rotation"): change_matrix(4, lambda m: m * 1.1),
+    ("dvr", "the camera of view 5 stands or looks elsewhere than Kato's"): change_matrix(5, lambda m: m + 0.3 * ASIDE),
+    ("dvr", "the camera of view 6 stands or looks elsewhere than Kato's"): change_matrix(6, turned(1, 0.1)),
+    ("dvr", "the camera of view 9 stands or looks elsewhere than Kato's"): change_matrix(9, turned(2, 0.1)),
+    ("dvr", "or is rolled or mirrored"): change_cameras(reverse_views),
+    ("dvr", "pointcloud.npz: is missing"): lambda f: (views(f) / "pointcloud.npz").unlink(),
+    ("dvr", "pointcloud.npz: has the shape [5, 4]"): save_points(points=np.zeros((5, 4))),
+    ("dvr", "pointcloud.npz: has coordinates up to nan"): save_points(points=np.full((5, 3), np.nan)),
+    ("kar", "render_19.png: is missing"): lambda f: (views(f) / "render_19.png").unlink(),
+    ("kar", "depth_5.png: cannot be decoded"): lambda f: cut_short(views(f) / "depth_5.png"),
+    ("kar", "view.txt: is missing"): lambda f: (views(f) / "view.txt").unlink(),
+    ("kar", "view.txt: row 4 is '1 nan 0 2'"): rewrite_row(4, "1 nan 0 2"),
+    ("kar", "view.txt: row 4 has azimuth 1, elevation 95 and distance 2"): rewrite_row(4, "1 95 0 2"),
+    ("kar", "a0.mat: is missing"): lambda f: grid(f).unlink(),
+    ("kar", "a0.mat: has float64 [16, 16, 16]"): lambda f: scipy.io.savemat(grid(f), {"Volume": np.ones((16,) * 3)}),
+    ("r2n2", "rendering/23.png: is missing"): lambda f: (views(f) / "23.png").unlink(),
+    ("r2n2", "02.png: has the channels RGB"): lambda f: save(views(f) / "02.png", np.zeros((72, 72, 3), np.uint8)),
+    ("r2n2", "rendering_metadata.txt: has 23 rows, 24 are needed"): rewrite_row(0, ""),
+    ("r2n2", "row 1 has azimuth -10, elevation 27 and distance -1.75"): rewrite_row(1, "10 27 0 -1 25"),
+    ("r2n2", "model.binvox: its runs fill"): lambda f: cut_short(grid(f)),
+    ("r2n2", "rendering: is missing; expected the folder of an object"): lambda f: shutil.rmtree(views(f)),
+}
+
+
+@pytest.mark.parametrize(("layout", "message"), FAULTS)
+def test_faults_of_an_object_are_named_by_load_and_by_the_check(copy, layout, message) -> None:
+    FAULTS[layout, message](folder := copy(layout))
+    expect(layout, folder, "test", message)
+
+
+@pytest.mark.parametrize("pose", [(1e30, 5, 2), (1, 5, 0), (1, np.nan, 2)])
+def test_poses_that_cannot_be_are_refused(pose) -> None:
+    with pytest.raises(DamagedFile, match=r"row 1 has azimuth .*; expected a table"):
+        check_poses(Path("view.txt"), np.array([(0.0, 0.0, 2.0), pose]), "a table")
+
+
+def test_oddities_of_an_object_are_warnings(copy) -> None:
+    folder = copy("dvr")
+    save(views(folder) / "mask" / "0004.png", np.ones((64, 64), np.uint8))
+    expect("dvr", folder, "test", "its mask is empty: the brightest of its values 0 .. 255 is 1", "warning")
+    folder = copy("kar")
+    scipy.io.savemat(grid(folder), {"Volume": np.zeros((32, 32, 32), np.uint8)})
+    expect("kar", folder, "test", "a0.mat: the grid is empty", "warning")
+    folder = copy("r2n2")
+    grid(folder).write_bytes(binvox_bytes(np.zeros((32, 32, 32), bool)))
+    pixels = np.array(Image.open(views(folder) / "07.png"))
+    pixels[..., 3] = 0
+    save(views(folder) / "07.png", pixels)
+    assert [p.severity for p in problems("r2n2", folder, "test")] == ["warning"] * 2
+
+
+LIST_FAULTS = {
+    "splits.json: cannot be read as JSON": "{",
+    "splits.json: has another structure": '{"03001627": {"test": "a0"}}',
+    "has another structure; expected": '["03001627"]',
+    "has no entry 03001627 (chair); it has: 02691156": '{"02691156": {"test": ["a0"]}}',
+    "names the object '../../../etc'; expected the plain name": '{"03001627": {"test": ["../../../etc"]}}',
+    "names the object '..'; expected the plain name": '{"03001627": {"test": [".."]}}',
+    "names the object '/etc'; expected the plain name": '{"03001627": {"test": ["/etc"]}}',
+    "names no object for test": '{"03001627": {"test": []}}',
+}
+
+
+@pytest.mark.parametrize("message", LIST_FAULTS)
+def test_faults_of_the_lists_of_kar(copy, message) -> None:
+    (folder := copy("kar")).joinpath("splits.json").write_text(LIST_FAULTS[message])
+    expect("kar", folder, "test", message)
+
+
+def test_lists_that_are_absent_or_overlap(copy) -> None:
+    folder = copy("dvr")
+    path = folder / CHAIR / "softras_test.lst"
+    path.write_text("a0\na0\n")
+    expect("dvr", folder, "test", "test lists a0 more than once", "warning")
+    path.write_text("b1\n")
+    expect("dvr", folder, "test", "test shares 1 objects with train, such as b1", "warning")
+    path.unlink()
+    expect("dvr", folder, "test", "is missing; expected a list of ids. Splits here: train, val")
+    folder = copy("r2n2")
+    shutil.rmtree(views(folder, "a0").parent)
+    expect("r2n2", folder, "train", "holds 1 objects, which leaves none for train; expected at least 2")
+    shutil.rmtree(folder / "ShapeNetRendering" / CHAIR)
+    (folder / "ShapeNetRendering" / "02691156").mkdir()
+    expect("r2n2", folder, "train", "there is no folder of 'chair'; those here are: 02691156")
+
+
+def test_everything_wrong_is_found_in_one_walk(copy) -> None:
+    folder = copy("kar")
+    root = views(folder)
+    cut_short(root / "render_3.png")
+    (root / "render_4.png").unlink()
+    (root / "view.txt").write_text("nan nan nan nan\n" * 20)
+    lists = {"name": "chair", **LISTS, "test": ["a0", "gone"], "val": ["c2", "b1"]}
+    (folder / "splits.json").write_text(json.dumps({CHAIR: lists}))
+    found = problems("kar", folder, "test")
+    assert [Path(p.path).name for p in found] == ["gone", "view.txt", "render_3.png", "render_4.png"]
+    assert [p.message for p in problems("kar", folder, "train")] == ["train shares 1 objects with val, such as b1"]
