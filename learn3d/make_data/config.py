@@ -1,9 +1,9 @@
-"""What to make a data set from, and how."""
+"""Settings of a data set to be made."""
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Annotated, Literal
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -14,8 +14,8 @@ from learn3d.make_data.writers import WRITERS
 from learn3d.settings import Count, FilePath, Rare, Weight, checked
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-HOW = ("shards", "jobs", "cluster")  # options on which no file depends
 Amount = Annotated[int, Field(ge=0)]
+NOT_SETTINGS = {"output", "overwrite", "shards", "jobs", "cluster"}  # options on which no file depends
 
 
 @checked
@@ -47,10 +47,6 @@ class DatasetConfig:
     """Axis of the mesh files that points up."""
     front: Axis | None = None
     """Axis of the mesh files that faces the camera of view 0 (default: x, or y if x is up; z for procedural shapes)."""
-    color: Rare[Literal["random", "mesh"]] = "random"
-    """Colour every object in one random light colour, or as its file says if it names colours."""
-    max_faces: Rare[Count] = 1_000_000
-    """Skip meshes with more faces."""
     seed: Rare[Amount] = 0
     """Seed of the splits, scales, colours, views and procedural shapes."""
     overwrite: bool = False
@@ -77,21 +73,31 @@ class DatasetConfig:
             raise ValueError("--jobs and --cluster are for shards: add --shards")
         synset_of(self.category)
         conventions.mesh_to_object(self.up, self.facing)
+        writer = WRITERS[self.layout]
+        defaults = {"views": writer.default_views, "test": writer.default_test, "val": writer.default_val}
+        for name, value in defaults.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
+            if value == 0 and getattr(self, name) != 0:
+                raise ValueError(f"the layout {self.layout} has no {name} split; leave {name} at 0")
+        if writer.fixed_views and self.views != writer.default_views:
+            raise ValueError(f"the layout {self.layout} has {writer.default_views} views per object, not {self.views}")
+        if writer.fixed_splits and (self.test != writer.default_test or self.augment):
+            raise ValueError(
+                f"the layout {self.layout} has no list of splits: the first 80 % of the sorted ids are for training; "
+                "leave test at 0.2 and augment at 0, or choose another layout"
+            )
 
     @property
     def facing(self) -> str:
         """The axis that faces the camera of view 0."""
         return self.front or ("z" if self.procedural else "y" if self.up.endswith("x") else "x")
 
-    def complete(self) -> DatasetConfig:
-        """Fill in the layout's own numbers of views, test and val; ValueError if the settings do not go with it."""
-        writer = WRITERS[self.layout]
-        defaults = {"views": writer.default_views, "test": writer.default_test, "val": writer.default_val}
-        config = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
-        if writer.fixed_views and config.views != writer.default_views:
-            raise ValueError(f"the layout {self.layout} has {writer.default_views} views per object, not {self.views}")
-        for split in ("test", "val"):
-            if defaults[split] == 0 and getattr(config, split) != 0:
-                raise ValueError(f"the layout {self.layout} has no {split} split; leave {split} at 0")
-        writer.check(config.output, config.test, config.augment)
-        return config
+    def copies(self, split: str) -> int:
+        """Objects that are made of each mesh of a split."""
+        return 1 + self.augment if split == "train" else 1
+
+    def plain(self) -> dict[str, Any]:
+        """The settings that the files depend on, as plain values."""
+        settings = {name: value for name, value in asdict(self).items() if name not in NOT_SETTINGS}
+        return settings | {"source": self.source and self.source.name}

@@ -1,28 +1,14 @@
-"""The folder of a data set: is there room, and new files that replace the old ones all together."""
+"""New files that replace the old ones all together."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from learn3d.files.writing import check_target
 from learn3d.terminal import stop_on_signal
-
-
-def check_room(folder: Path, needed: int, what: str) -> None:
-    """Make the folder; raise OSError if it is not writable or its disk has less than `needed` bytes free."""
-    check_target(folder, "--output", folder=True)
-    folder.mkdir(parents=True, exist_ok=True)
-    free = shutil.disk_usage(folder).free
-    if free < needed:
-        raise OSError(
-            f"{what} may need {needed / 2**20:.0f} MiB but the disk of {folder} has {free / 2**20:.0f} MiB free; "
-            "free some, give another folder, or use fewer meshes or augmented copies"
-        )
 
 
 @contextlib.contextmanager

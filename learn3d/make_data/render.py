@@ -5,24 +5,28 @@ Here meshes are split, scaled, coloured and rendered; `writers` has the cameras 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from learn3d.data import conventions
+from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS
+from learn3d.files.writing import write_json
 from learn3d.make_data import meshes
 from learn3d.make_data.config import DatasetConfig
-from learn3d.make_data.folders import check_room, publishing
-from learn3d.make_data.report import DatasetReport, report_files, write_report
+from learn3d.make_data.folders import publishing
 from learn3d.make_data.writers import WRITERS, RenderedObject, Writer
-from learn3d.pictures.contact_sheet import ROWS, make_row
+from learn3d.make_data.writers.writer import write_png
+from learn3d.pictures.contact_sheet import LEGEND, ROWS, draw_sheet, make_row
 from learn3d.pictures.studio import KEY_LIGHT, photograph, studio_lights
 
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
+MOST_LISTED = 100  # skipped meshes in the text of a report; the card lists all
 
 
 @dataclass(frozen=True)
@@ -31,125 +35,151 @@ class Item:
 
     number: int  # in the whole data set
     name: str  # of its object
-    source: meshes.MeshSource
+    split: str
+    file: str
+    read: meshes.Source
 
 
-@dataclass
-class Part:
-    """The result of rendering some meshes of one split."""
+@dataclass(frozen=True)
+class DatasetReport:
+    """The outcome of `make_dataset`."""
 
-    objects: list[str] = field(default_factory=list)  # names, augmented copies included
-    used: list[dict] = field(default_factory=list)  # per mesh: object, name, split, vertices, faces, watertight
-    skipped: list[dict] = field(default_factory=list)  # per mesh: name, split, reason
-    rows: dict[str, list[np.ndarray]] = field(default_factory=dict)  # of the contact sheet, by object
+    config: DatasetConfig
+    meshes: Sequence[dict]  # of each: name, split, and objects (their names, scaled copies included) or reason
+
+    def __post_init__(self) -> None:
+        if "train" not in self.objects:
+            reasons = "; ".join(f"{mesh['name']}: {mesh['reason']}" for mesh in self.skipped[:3])
+            raise ValueError(f"no mesh to train on can be used; the first reasons: {reasons}")
+
+    @property
+    def skipped(self) -> list[dict]:
+        """The meshes that could not be used, each with the reason."""
+        return [mesh for mesh in self.meshes if "reason" in mesh]
+
+    @property
+    def objects(self) -> dict[str, list[str]]:
+        """The names of the objects of each split that is not empty."""
+        found = {split: [] for split in SPLITS}
+        for mesh in self.meshes:
+            found[mesh["split"]] += mesh.get("objects", [])
+        return {split: names for split, names in found.items() if names}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """The number of objects of each split that is not empty."""
+        return {split: len(names) for split, names in self.objects.items()}
+
+    def text(self) -> str:
+        """The report for people."""
+        config, skipped, counts = self.config, self.skipped, self.counts
+        lines = [f"{config.category}: {len(self.meshes) - len(skipped)} meshes used, {len(skipped)} skipped"]
+        lines.append("objects: " + ", ".join(f"{split} {count}" for split, count in counts.items()))
+        lines += [f"skipped {mesh['name']} ({mesh['split']}): {mesh['reason']}" for mesh in skipped[:MOST_LISTED]]
+        lines.append(f"contact sheet {config.output / report_files(config.category)[1]}: {LEGEND}")
+        return "\n".join(lines)
+
+    def write(self, folder: Path, rows: Mapping[str, Sequence[list[np.ndarray]]]) -> None:
+        """Write the card, with all that is needed to make the data set again, and the contact sheet of these rows."""
+        used = [mesh for mesh in self.meshes if "objects" in mesh]
+        splits = {split: [mesh["name"] for mesh in used if mesh["split"] == split] for split in self.counts}
+        card, sheet = (folder / name for name in report_files(self.config.category))
+        write_json(card, {"settings": self.config.plain(), "splits": splits, "skipped": self.skipped})
+        write_png(sheet, draw_sheet(rows, self.config.views))
+
+
+def report_files(category: str) -> tuple[str, str]:
+    """Names of the card and the contact sheet, which lie beside the data of every layout."""
+    return f"{synset_of(category)}_card.json", f"{synset_of(category)}_contact.png"
 
 
 def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
-    """Make the data set that `config` describes and return what was done; meshes that cannot be used are skipped.
+    """Make the data set that `config` describes and return a report; meshes that cannot be used are skipped.
 
     Writes the files of the layout (see its class in `learn3d.make_data.writers`) for every split that is not empty,
-    `{synset}_card.json` (settings, splits), `{synset}_report.json`, `{synset}_report.txt` and `{synset}_contact.png`
-    (see `contact_sheet.LEGEND`). Files appear under their names only when all of them are complete.
+    `{synset}_card.json` (settings, splits, skipped meshes) and `{synset}_contact.png` (see `contact_sheet.LEGEND`).
+    Files appear under their names only when all of them are complete.
 
-    Raises ValueError (settings that do not fit, no usable mesh), FileNotFoundError (no such source), FileExistsError
-    (files of the category are there and `overwrite` is off), OSError (folder not writable, disk too full).
+    Raises ValueError (no usable mesh), FileNotFoundError (no such source), FileExistsError (files of the category are
+    there and `overwrite` is off), OSError (folder not writable, disk full).
     """
-    config = config.complete()
-    splits, ignored = split_items(config)
+    items = [item for of_split in split_items(config).values() for item in of_split]
     writer_class = WRITERS[config.layout]
     paths = [*writer_class.paths(config.category), *report_files(config.category)]
     there = [path for path in paths if (config.output / path).exists()]
     if there and not config.overwrite:
         raise FileExistsError(
-            f"{config.output} already holds {there[0]} and {len(there) - 1} more file(s) or folder(s) of "
-            f"{config.category}; give another folder, or --overwrite to replace them"
+            f"{config.output} already holds {there[0]}; give another folder, or --overwrite to replace all files of "
+            f"{config.category}"
         )
-    count = sum(len(items) * copies_of(config, split) for split, items in splits.items())
-    view_bytes = 4 * writer_class.image_size**2 + writer_class.extra_bytes_per_view
-    needed = count * (config.views * view_bytes + 32**3) // 2 + 2**24  # renderings shrink to a tenth
-    check_room(config.output, needed, f"{count} objects")
-    total = sum(map(len, splits.values()))
-    with (
-        publishing(config.output, [*paths, *writer_class.shared]) as folder,
-        tqdm(total=total, desc=config.category, unit="mesh", disable=not progress, dynamic_ncols=True) as bar,
-    ):
+    config.output.mkdir(parents=True, exist_ok=True)
+    made, rows = [], {split: [] for split in SPLITS}
+    with publishing(config.output, [*paths, *writer_class.shared]) as folder:
         writer = writer_class(folder, config.category)
-        parts = {split: render_meshes(config, writer, split, items, bar.update) for split, items in splits.items()}
-        check_train(parts["train"].objects, parts["train"].skipped)
-        objects = writer.finish(config.output, {split: part.objects for split, part in parts.items() if part.objects})
-        split_of = {name: split for split, names in objects.items() for name in names}
-        used = [mesh | {"split": split_of[mesh["object"]]} for part in parts.values() for mesh in part.used]
-        skipped = [mesh for part in parts.values() for mesh in part.skipped]
-        rows = {name: row for part in parts.values() for name, row in part.rows.items()}
-        sheet = {split: [rows[name] for name in names if name in rows] for split, names in objects.items()}
-        files = [path for path in (*writer.paths(config.category), *writer.shared) if (folder / path).exists()]
-        counts = {split: len(names) for split, names in objects.items() if names}
-        return write_report(config, folder, files, counts, used, skipped, ignored, sheet)
+        bar = tqdm(items, desc=config.category, unit="mesh", disable=not progress, dynamic_ncols=True)
+        for mesh, objects in render_meshes(config, writer, bar):
+            made.append(mesh)
+            for item in objects:
+                writer.write(item)
+            if objects and len(rows[mesh["split"]]) < ROWS:
+                rows[mesh["split"]].append(contact_row(writer, objects[0]))
+        report = DatasetReport(config, writer.split(made))
+        writer.finish(config.output, report.objects)
+        report.write(folder, rows)
+    return report
 
 
 def render_meshes(
-    config: DatasetConfig,
-    writer: Writer,
-    split: str,
-    items: Sequence[Item],
-    after_each: Callable[[], object] = lambda: None,
-) -> Part:
-    """Render some meshes of a split and hand their objects to the writer; a mesh that cannot be used is listed."""
-    part, copies = Part(), copies_of(config, split)
-    writer.start(split, len(items) * copies)
+    config: DatasetConfig, writer: Writer, items: Iterable[Item]
+) -> Iterator[tuple[dict, list[RenderedObject]]]:
+    """Render meshes: of each its entry in `DatasetReport.meshes`, and its objects, none if it cannot be used."""
     for item in items:
-        names = [item.name, *(f"{item.name}-{copy}" for copy in range(1, copies))]
+        mesh, objects = {"name": item.file, "split": item.split}, []
         try:
-            mesh = meshes.checked(item.source.read(), config.max_faces)
-            objects = [render(config, writer, mesh, item.number, k, name, split) for k, name in enumerate(names)]
+            raw = meshes.checked(item.read())
+            objects = [_render(config, writer, raw, item, copy) for copy in range(config.copies(item.split))]
+            mesh["objects"] = [made.name for made in objects]
         except ValueError as error:  # it cannot be read, rendered or seen: the others go on
-            part.skipped.append({"name": item.source.name, "split": split, "reason": str(error)})
-        else:
-            for made in objects:
-                writer.write(made)
-            size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-            watertight = meshes.is_watertight(mesh.vertices, mesh.faces)
-            entry = {"object": item.name, "name": item.source.name, "split": split, **size, "watertight": watertight}
-            part.used.append(entry)
-            part.objects += names
-            if len(part.rows) < ROWS:
-                grid = writer.convention.to_object(torch.from_numpy(objects[0].voxels)[None])[0].numpy()
-                part.rows[item.name] = make_row(objects[0].rgb, objects[0].alpha, grid)
-        after_each()
-    return part
+            mesh["reason"] = str(error)
+        yield mesh, objects
 
 
-def render(
-    config: DatasetConfig, writer: Writer, mesh: meshes.RawMesh, number: int, copy: int, name: str, split: str
-) -> RenderedObject:
-    """Render copy `copy` of mesh `number`: scaled (but for copy 0), coloured, placed.
+def contact_row(writer: Writer, item: RenderedObject) -> list[np.ndarray]:
+    """The row of an object in the contact sheet."""
+    grid = writer.convention.to_object(torch.from_numpy(item.voxels)[None])[0].numpy()
+    return make_row(item.rgb, item.alpha, grid)
+
+
+def _render(config: DatasetConfig, writer: Writer, mesh: meshes.RawMesh, item: Item, copy: int) -> RenderedObject:
+    """Render copy `copy` of a mesh: scaled (but for copy 0), coloured, placed.
 
     Depends on the settings, the mesh and the two numbers alone. Raises ValueError if no view shows any of it.
     """
-    rng = np.random.default_rng([config.seed, 1, number, copy])
+    rng = np.random.default_rng([config.seed, 1, item.number, copy])
     scale = rng.uniform(*SCALE_RANGE, size=3)
     color = np.clip(rng.uniform(0.55, 0.9) + rng.uniform(-0.2, 0.2, size=3), 0.35, 1.0).astype(np.float32)  # light grey
-    if config.color == "mesh" and mesh.face_colors is not None:
-        color = np.where(np.isnan(mesh.face_colors), color, mesh.face_colors)
     vertices = mesh.vertices @ conventions.mesh_to_object(config.up, config.facing).T
     placed = writer.place(meshes.fit_to_box(meshes.fit_to_box(vertices) * (scale if copy else 1.0)))
-    rng = np.random.default_rng([config.seed, 2, number, copy])
+    rng = np.random.default_rng([config.seed, 2, item.number, copy])
     poses = writer.views(placed, config.views, rng)
-    vertices = torch.as_tensor(np.ascontiguousarray(placed, dtype=np.float32))
-    faces = torch.as_tensor(np.ascontiguousarray(mesh.faces, dtype=np.int64))
+    vertices, faces = torch.as_tensor(placed, dtype=torch.float32).contiguous(), torch.from_numpy(mesh.faces)
     lights = studio_lights(tuple((writer.turn @ KEY_LIGHT).tolist()))
     rgb, alpha = photograph(vertices, faces, color, poses.cameras(), image_size=writer.image_size, lights=lights)
     if not alpha.any():
         raise ValueError("no view shows any of it (all faces have no area, or are smaller than a pixel)")
-    return RenderedObject(name, split, vertices, faces, poses, rgb, alpha, writer.voxelize(vertices, faces), rng)
+    name, voxels = f"{item.name}-{copy}" if copy else item.name, writer.voxelize(vertices, faces)
+    return RenderedObject(name, item.split, vertices, faces, poses, rgb, alpha, voxels, rng)
 
 
-def split_items(config: DatasetConfig) -> tuple[dict[str, list[Item]], dict[str, int]]:
-    """The meshes of the splits train, val and test, and the number of other files beside them per extension."""
-    sources, ignored = meshes.list_sources(config)
-    names = meshes.object_names(sources)
+def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
+    """The meshes of the splits train, val and test."""
+    if config.procedural:
+        sources = meshes.procedural_sources(config.category, config.procedural, config.seed)
+    else:
+        sources = meshes.list_sources(config.source)
     numbers = split_objects(len(sources), config.test, config.val, config.seed)
-    return {s: [Item(i, names[i], sources[i]) for i in numbers[s].tolist()] for s in SPLITS}, ignored
+    named = list(zip(meshes.object_names(sources), sources.items(), strict=True))
+    return {s: [Item(i, named[i][0], s, *named[i][1]) for i in numbers[s].tolist()] for s in SPLITS}
 
 
 def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, np.ndarray]:
@@ -157,32 +187,14 @@ def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, n
 
     `test` and `val` are counts, or shares (below 1) that give at least 4 objects, or an equal part if there are few.
     With test = 0.2 and val = 0, test is `default_rng(seed).permutation(count)[:max(4, round(0.2 * count))]`.
-    Raises ValueError for a negative or fractional count, and if none would be left to train on.
+    Raises ValueError if none would be left to train on.
     """
-    sizes = {}
-    equal = count // (1 + (test > 0) + (val > 0))
-    for name, amount in (("test", test), ("val", val)):
-        if not amount >= 0 or (amount >= 1 and amount != int(amount)):
-            raise ValueError(f"{name} must be a share in 0 .. 1 or a whole number of meshes, got {amount}")
-        least = min(4, equal) if amount > 0 else 0
-        sizes[name] = int(amount) if amount >= 1 else max(least, round(amount * count))
-    if sum(sizes.values()) >= count:
+    least = min(4, count // (1 + (test > 0) + (val > 0)))
+    sizes = [int(part) if part >= 1 else max(least * (part > 0), round(part * count)) for part in (test, val)]
+    if sum(sizes) >= count:
         raise ValueError(
-            f"test ({sizes['test']}) and val ({sizes['val']}) leave none of the {count} meshes to train on; "
-            "give more meshes, or a smaller test or val"
+            f"test ({sizes[0]}) and val ({sizes[1]}) leave none of the {count} meshes to train on; give more meshes, "
+            "or a smaller test or val"
         )
     order = np.random.default_rng(seed).permutation(count)
-    bounds = np.cumsum([sizes["test"], sizes["val"]])
-    return dict(zip(("test", "val", "train"), np.split(order, bounds), strict=True))
-
-
-def copies_of(config: DatasetConfig, split: str) -> int:
-    """Objects that are made of each mesh of a split."""
-    return 1 + config.augment if split == "train" else 1
-
-
-def check_train(objects: Sequence[str], skipped: Sequence[dict]) -> None:
-    """Raise ValueError if there is no object to train on."""
-    if not objects:
-        reasons = "; ".join(f"{mesh['name']}: {mesh['reason']}" for mesh in skipped[:3])
-        raise ValueError(f"none of the {len(skipped)} meshes to train on can be used; the first reasons: {reasons}")
+    return dict(zip(("test", "val", "train"), np.split(order, np.cumsum(sizes)), strict=True))

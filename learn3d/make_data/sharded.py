@@ -1,7 +1,7 @@
 """Data sets of any size: meshes -> shards (`learn3d.data.shards`), each made by a process of its own.
 
-A shard depends on the settings and its meshes alone. So it does not matter which process or machine makes it, and what
-a killed call has made is kept by the next one.
+A shard depends on the settings and its meshes alone. So it does not matter which process or machine makes it, and the
+shards that a killed call has made are kept by the next one.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from learn3d.data.categories import synset_of
@@ -21,16 +22,14 @@ from learn3d.distributed.tasks import Task, run_tasks
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.files.writing import write_json
 from learn3d.make_data.config import DatasetConfig
-from learn3d.make_data.folders import check_room, publishing
-from learn3d.make_data.render import Item, Part, check_train, copies_of, render_meshes, split_items
-from learn3d.make_data.report import DatasetReport, report_files, settings_of, write_report
-from learn3d.make_data.writers import KatoWriter
+from learn3d.make_data.folders import publishing
+from learn3d.make_data.render import DatasetReport, Item, contact_row, render_meshes, report_files, split_items
+from learn3d.make_data.writers import KatoWriter, RenderedObject
 from learn3d.pictures.contact_sheet import ROWS
 from learn3d.terminal import INTERRUPTED, note, say, stop_on_signal
 
 OBJECTS_PER_SHARD = 512  # 201 MB of images
-SETTINGS = "settings.json"
-PART_BYTES = 2**28  # of the list of a shard's meshes
+LIST = ".report.json"  # suffix of the list of a shard's meshes
 
 
 def make_shards(config: DatasetConfig) -> int:
@@ -43,117 +42,85 @@ def make_shards(config: DatasetConfig) -> int:
     Raises ValueError (no usable mesh, settings that do not fit, shards of other settings in the folder), OSError (the
     folder cannot be written, no such cluster).
     """
-    config = config.complete()
-    folder = config.output / synset_of(config.category)
-    splits, ignored = split_items(config)
+    folder, splits = config.output / synset_of(config.category), split_items(config)
     _prepare(config, folder, splits)
     threads = max(1, torch.get_num_threads() // config.jobs)
-    tasks, counts = [], {}
+    tasks = {}
     for split, items in splits.items():
-        step = max(1, OBJECTS_PER_SHARD // copies_of(config, split))  # meshes of a shard
-        starts = range(0, len(items), step)
-        counts[split] = len(starts)
-        for number, start in enumerate(starts):
-            if not shard_path(folder / split, number).is_file():
-                given = (config, folder / split, split, number, items[start : start + step], threads)
-                tasks.append(Task(f"{split} {number}", make_shard, given, folder / f"{split}-{number:05d}.log"))
-    note(f"{config.category}: {sum(counts.values())} shards, {len(tasks)} to be made; logs: {folder / '*.log'}")
-    failed = run_tasks(tasks, jobs=config.jobs, cluster=config.cluster)
+        step = max(1, OBJECTS_PER_SHARD // config.copies(split))  # meshes of a shard
+        for number, start in enumerate(range(0, len(items), step)):
+            path = shard_path(folder / split, number)
+            given = (config, path, number, items[start : start + step], threads)
+            tasks[path] = Task(f"{split} {number}", make_shard, given, folder / f"{split}-{number:05d}.log")
+    missing = [task for path, task in tasks.items() if not path.is_file()]
+    note(f"{config.category}: {len(tasks)} shards, {len(missing)} to be made; logs: {folder / '*.log'}")
+    failed = run_tasks(missing, jobs=config.jobs, cluster=config.cluster)
     for name, tail in failed.items():
         note(f"\nFAILED {name}; the end of the log:\n{tail}")
-    missing = [
-        f"{s} {k}" for s, count in counts.items() for k in range(count) if not shard_path(folder / s, k).is_file()
-    ]
-    if missing:
-        note(f"{len(missing)} shards are missing ({', '.join(missing[:5])} ...); the same command makes them")
+    if count := sum(not path.is_file() for path in tasks):
+        note(f"{count} shards are missing; the same command makes them")
         return 1 if failed else INTERRUPTED
-    say(_finish(config, folder, splits, counts, ignored).text())
+    say(_finish(config, folder, splits, list(tasks)).text())
     return 0
 
 
-def make_shard(
-    config: DatasetConfig, folder: Path, split: str, number: int, items: Sequence[Item], threads: int
-) -> bool:
-    """Make one shard; returns False if a signal stopped it."""
-
-    def check_stop() -> None:
-        if stop.name:
-            raise KeyboardInterrupt
-
+def make_shard(config: DatasetConfig, path: Path, number: int, items: Sequence[Item], threads: int) -> bool:
+    """Make one shard and the list of its meshes; returns False if a signal stopped it."""
     torch.set_num_threads(threads)
-    folder.mkdir(parents=True, exist_ok=True)
-    writer = KatoWriter(folder, config.category)
+    made, objects = [], []
     with stop_on_signal() as stop:
-        try:
-            part = render_meshes(config, writer, split, items, check_stop)
-        except KeyboardInterrupt:
-            return False
-        dataset = kato.from_arrays(*writer.arrays(), config.category, split)
-        plain = {"objects": part.objects, "used": part.used, "skipped": part.skipped}
-        write_json(_part_file(folder, number), plain, sync=True)
-        write_shard(folder, number, dataclasses.replace(dataset, object_names=tuple(part.objects)))
-    print(f"{split} {number}: {len(part.objects)} objects, {len(part.skipped)} meshes skipped", flush=True)
+        for mesh, of_mesh in render_meshes(config, KatoWriter(path.parent, config.category), items):
+            if stop.name:
+                return False
+            made.append(mesh)
+            objects += of_mesh
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path.with_suffix(LIST), made, sync=True)
+        write_shard(path.parent, number, _dataset(objects, config.category, items[0].split))
+    print(f"{path.parent.name} {number}: {len(objects)} objects", flush=True)
     return True
 
 
-def _part_file(folder: Path, number: int) -> Path:
-    """The list of a shard's meshes."""
-    return folder / f"{number:05d}.report.json"
+def _dataset(objects: Sequence[RenderedObject], category: str, split: str) -> ViewDataset:
+    images, voxels = np.zeros((0, 24, 4, 64, 64), np.uint8), np.zeros((0, 32, 32, 32), bool)
+    if objects:
+        images, voxels = np.stack([KatoWriter.images(o) for o in objects]), np.stack([o.voxels for o in objects])
+    dataset = kato.from_arrays(images, voxels, category, split)
+    return dataclasses.replace(dataset, object_names=tuple(o.name for o in objects))
 
 
 def _prepare(config: DatasetConfig, folder: Path, splits: dict[str, list[Item]]) -> None:
     """Make the category's folder, and write the settings of its shards or compare them with those there."""
-    check_room(folder, 2**24, "a data set")
-    path = folder / SETTINGS
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "settings.json"
     if config.overwrite:
         for split in SPLITS:
             remove(folder / split)
         path.unlink(missing_ok=True)
     names = sorted((item.number, item.name) for items in splits.values() for item in items)
     crc = zlib.crc32("\n".join(name for _, name in names).encode())
-    settings = settings_of(config) | {"list of meshes": f"{len(names)}, CRC-32 {crc:08x}"}
-    if path.is_file():
-        before = parse_json(read_bytes(path, 2**20, "the settings of shards"))
-        if different := sorted(k for k in {*settings, *before} if settings.get(k) != before.get(k)):
-            raise ValueError(
-                f"{folder} has shards that were made with another {', '.join(different)}; ask for the same, give "
-                "another folder, or --overwrite to replace them"
-            )
+    settings = config.plain() | {"list of meshes": f"{len(names)}, CRC-32 {crc:08x}"}
+    before = parse_json(read_bytes(path, 2**20, "the settings of shards")) if path.is_file() else settings
+    if different := sorted(k for k in {*settings, *before} if settings.get(k) != before.get(k)):
+        raise ValueError(
+            f"{folder} has shards that were made with another {', '.join(different)}; ask for the same, give another "
+            "folder, or --overwrite to replace them"
+        )
     write_json(path, settings)
 
 
 def _finish(
-    config: DatasetConfig, folder: Path, splits: dict[str, list[Item]], counts: dict[str, int], ignored: dict[str, int]
+    config: DatasetConfig, folder: Path, splits: dict[str, list[Item]], shards: Sequence[Path]
 ) -> DatasetReport:
     """Declare the splits complete, and write the report."""
-    parts = {split: _joined(folder / split, count) for split, count in counts.items()}
-    check_train(parts["train"].objects, parts["train"].skipped)
+    lists = [parse_json(read_bytes(path.with_suffix(LIST), 2**28, "the list of a shard's meshes")) for path in shards]
+    report = DatasetReport(config, [mesh for found in lists for mesh in found])
+    rows, writer = {}, KatoWriter(folder, config.category)
+    for split in report.counts:
+        count = sum(path.parent.name == split for path in shards)
+        finish_set(folder / split, config.layout, count, _dataset([], config.category, split))
+        shown = [objects[0] for _, objects in render_meshes(config, writer, splits[split][:ROWS]) if objects]
+        rows[split] = [contact_row(writer, item) for item in shown]
     with publishing(config.output, report_files(config.category)) as temporary:
-        sheet = {}
-        for split, part in parts.items():
-            if part.objects:
-                finish_set(folder / split, config.layout, counts[split], _empty(config, split))
-                shown = render_meshes(config, KatoWriter(temporary, config.category), split, splits[split][:ROWS])
-                sheet[split] = list(shown.rows.values())
-        used = [mesh for part in parts.values() for mesh in part.used]
-        skipped = [mesh for part in parts.values() for mesh in part.skipped]
-        objects = {split: len(part.objects) for split, part in parts.items() if part.objects}
-        return write_report(config, temporary, [folder.name], objects, used, skipped, ignored, sheet)
-
-
-def _joined(folder: Path, count: int) -> Part:
-    """The lists of meshes of all shards of a split."""
-    part = Part()
-    for number in range(count):
-        found = parse_json(read_bytes(_part_file(folder, number), PART_BYTES, "the list of a shard's meshes"))
-        part.objects += found["objects"]
-        part.used += found["used"]
-        part.skipped += found["skipped"]
-    return part
-
-
-def _empty(config: DatasetConfig, split: str) -> ViewDataset:
-    """A data set without objects, which has all that the shards have in common."""
-    writer = KatoWriter(Path(), config.category)
-    writer.start(split, 0)
-    return kato.from_arrays(*writer.arrays(), config.category, split)
+        report.write(temporary, rows)
+    return report

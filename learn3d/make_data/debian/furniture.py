@@ -8,20 +8,17 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-import zlib
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
-from tqdm import tqdm
 
-from learn3d.files import limits
-from learn3d.make_data.debian.mesh_text import read_obj
-from learn3d.make_data.debian.packages import Candidate, Package, read_package
+from learn3d.make_data.debian.mesh_text import Part, read_obj
+from learn3d.make_data.debian.packages import Candidate
 
 FURNITURE_PACKAGES = ("sweethome3d-furniture", "sweethome3d-furniture-nonfree")  # the second is optional
-CATALOGUE = "PluginFurnitureCatalog.properties"
 
 # The first rule whose words occur in the English name of the catalogue gives the category; None leaves the piece out.
 # Each pattern is searched in "name" as written in the catalogue, lower case.
@@ -44,109 +41,63 @@ FURNITURE_SECTIONS_LEFT_OUT = ("Characters", "Doors and windows", "Staircases", 
 
 
 def furniture_category(name: str, section: str = "") -> str | None:
-    """Category of a catalogue entry from its English name and the section it is listed in; None if it has none.
-
-    Names of over 200 characters have none: some patterns take the square of the length.
-    """
-    if section in FURNITURE_SECTIONS_LEFT_OUT or len(name) > limits.NAME_LENGTH:
+    """Category of a catalogue entry from its English name and the section it is listed in; None if it has none."""
+    if section in FURNITURE_SECTIONS_LEFT_OUT:
         return None
-    for pattern, category in FURNITURE_RULES:
-        if re.search(pattern, name.lower()):
-            return category
-    return None
+    return next((category for pattern, category in FURNITURE_RULES if re.search(pattern, name.lower())), None)
 
 
 def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
     """The general properties and the entries (`key#N`, in the order of N) of a Sweet Home 3D furniture catalogue."""
-    general: dict[str, str] = {}
-    entries: dict[int, dict[str, str]] = {}
-    for line in text.splitlines():
-        match = re.match(r"\s*(\w+)(?:#(\d+))?\s*=\s*(.*)", line)
-        if match:
-            key, number, value = match.groups()
-            if len(number or "") > 9:
-                continue
-            value = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value).strip()
-            value = value.encode("utf-8", "replace").decode()  # half of a pair of surrogates is no character
-            (general if number is None else entries.setdefault(int(number), {}))[key] = value
+    entries: defaultdict[int, dict[str, str]] = defaultdict(dict)  # the general ones under 0
+    for key, number, value in re.findall(r"^\s*(\w+)(?:#(\d+))?\s*=[^\S\n]*(.*)$", text, re.MULTILINE):
+        value = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value).strip()
+        entries[int(number or 0)][key] = value
+    general = entries.pop(0, {})
     return general, [entries[number] for number in sorted(entries)]
 
 
-def place_furniture(vertices: np.ndarray, entry: dict[str, str]) -> np.ndarray:
+def place_furniture(vertices: np.ndarray, entry: Mapping[str, str]) -> np.ndarray:
     """Vertices [V, 3] turned by the entry's modelRotation (nine numbers by rows, p' = R p) and stretched to its box.
 
     The box is width x height x depth along x, y, z, as Sweet Home 3D draws it: y up, the front towards +z.
-    Raises ValueError for a modelRotation that is not a rotation.
     """
     if "modelRotation" in entry:
-        numbers = np.array(entry["modelRotation"].split(), dtype=np.float64)
-        rotation = numbers.reshape(3, 3) if numbers.size == 9 else np.zeros((3, 3))
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-            raise ValueError(f"modelRotation is not a rotation: {entry['modelRotation']}")
-        vertices = vertices @ rotation.T
-    if len(vertices) and all(key in entry for key in ("width", "height", "depth")):
+        vertices = vertices @ np.array(entry["modelRotation"].split(), dtype=np.float64).reshape(3, 3).T
+    if all(key in entry for key in ("width", "height", "depth")):
         extents = np.ptp(vertices, axis=0)
-        size = np.array([float(entry[key]) for key in ("width", "height", "depth")])
-        if (extents > 0).all() and (size > 0).all():
-            vertices = vertices * (size / extents)
+        if (extents > 0).all():
+            vertices = vertices * ([float(entry[key]) for key in ("width", "height", "depth")] / extents)
     return vertices
 
 
-def furniture_models(
-    package: Package, categories: tuple[str, ...], licences: Path, progress: bool
-) -> Iterator[Candidate | None]:
-    """Models of every catalogue of a package, by catalogue and entry number; None for an entry of no wanted category.
-
-    The package's copyright file goes to the folder `licences`.
-    Raises ValueError for a catalogue that is damaged.
-    """
-    for path, content in sorted(read_package(package, (".sh3f",), licences)):
+def furniture_models(files: Mapping[str, bytes]) -> Iterator[Candidate]:
+    """The pieces of furniture of every catalogue of a package, by catalogue and entry number."""
+    for path, content in sorted(files.items()):
         catalogue = PurePosixPath(path).name
-        try:
-            archive = zipfile.ZipFile(io.BytesIO(content))
-        except (zipfile.BadZipFile, NotImplementedError, ValueError, EOFError, OSError) as error:
-            raise ValueError(f"{catalogue} is refused as a zip archive: {error}; get its package again") from error
-        with archive:
-            general, entries = read_catalogue(_member(archive, CATALOGUE))
-            for entry in tqdm(entries, desc=catalogue, unit="model", disable=not progress, leave=False):
-                model = PurePosixPath(entry.get("model", "").removeprefix("/"))
-                category = furniture_category(entry.get("name", ""), entry.get("category", ""))
-                if category not in categories or model.stem in MISFITS:
-                    yield None
-                    continue
-                try:
-                    text = _member(archive, str(model))
-                except ValueError as error:
-                    text = error  # is raised when the model is read: other models go on
+        if not catalogue.endswith(".sh3f"):
+            continue
+        archive = zipfile.ZipFile(io.BytesIO(content))
+        general, entries = read_catalogue(archive.read("PluginFurnitureCatalog.properties").decode("latin-1"))
+        for entry in entries:
+            model = PurePosixPath(entry.get("model", "").removeprefix("/"))
+            category = furniture_category(entry.get("name", ""), entry.get("category", ""))
+            if category is not None and model.stem not in MISFITS:
                 yield Candidate(
                     category=category,
                     title=entry["name"],
                     author=entry.get("creator", ""),
                     licence=" ".join(entry.get("license", general.get("license", "see the package")).split()),
-                    package=package,
                     source=f"{catalogue}!/{model}",
                     stem=f"{PurePosixPath(catalogue).stem}-{model.stem}",
-                    read=partial(_read_furniture, text, model.suffix, entry),
+                    read=partial(_read_furniture, archive, str(model), entry),
                 )
 
 
-def _read_furniture(text: str | ValueError, suffix: str, entry: dict[str, str]) -> tuple[np.ndarray, np.ndarray]:
-    if isinstance(text, ValueError):
-        raise text
-    if suffix.lower() != ".obj":
-        raise ValueError(f"only OBJ models are read, this is {suffix or 'nothing'}")
-    vertices, faces = read_obj(text)
-    return place_furniture(vertices, entry), faces
-
-
-def _member(archive: zipfile.ZipFile, path: str) -> str:
-    """A text in a catalogue; ValueError if it is missing, damaged or over 64 MiB."""
-    try:
-        info = archive.getinfo(path)
-        if info.file_size > limits.CATALOGUE_MEMBER_BYTES:
-            raise ValueError(f"{info.file_size} bytes; at most {limits.CATALOGUE_MEMBER_BYTES} are read")
-        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError(f"compressed with method {info.compress_type}; only deflate is read")
-        return archive.read(info).decode("latin-1")
-    except (KeyError, ValueError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error, EOFError) as error:
-        raise ValueError(f"{path} cannot be read from the catalogue ({error})") from error
+def _read_furniture(archive: zipfile.ZipFile, model: str, entry: Mapping[str, str]) -> Part:
+    if not model.lower().endswith(".obj"):
+        raise ValueError("only OBJ models are read")
+    if model not in archive.namelist():
+        raise ValueError("its catalogue does not hold it")
+    vertices, faces = read_obj(archive.read(model).decode("latin-1"))
+    return Part(place_furniture(vertices, entry), faces)

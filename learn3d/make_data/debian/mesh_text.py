@@ -7,107 +7,83 @@ fan of every polygon, which covers the gaps of concave ones (the backs of some c
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from learn3d.files import limits
 
+class Part(NamedTuple):
+    """One object of an AC3D file, in the frame of the file."""
 
-@dataclass(frozen=True)
-class Part:
-    """One named object of an AC3D file, in the frame of the file."""
-
-    name: str
     vertices: np.ndarray  # float64 [V, 3]
     faces: np.ndarray  # int64 [F, 3]
 
 
-def read_obj(text: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices float64 [V, 3] and triangles int64 [F, 3] of a Wavefront OBJ text; ValueError if it is malformed."""
+def read_obj(text: str) -> Part:
+    """Vertices and triangles of a Wavefront OBJ text; ValueError if it is malformed."""
     rows, polygons = [], []
-    for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
+    for line in text.splitlines():
         fields = line.split() or [""]
         if fields[0] == "v":
             rows.append(fields[1:4])
         elif fields[0] == "f" and len(fields) > 3:
             indices = [int(field.split("/", 1)[0]) for field in fields[1:]]
             polygons.append([i - 1 if i > 0 else len(rows) + i for i in indices])
-    try:
-        vertices = np.array(rows, dtype=np.float64).reshape(-1, 3)
-    except ValueError as error:
-        raise ValueError(f"an OBJ vertex needs three numbers ({error})") from error
-    return vertices, triangulate(polygons, vertices)
+    vertices = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return Part(vertices, triangulate(polygons, vertices))
 
 
-def read_ac3d(text: str, skip: Callable[[str], bool] = lambda name: False) -> list[Part]:
+def read_ac3d(text: str, skip: Callable[[str], object]) -> list[Part]:
     """Objects of an AC3D text with at least one polygon, placed by the `loc` and `rot` of their ancestors.
 
     An object whose name `skip` accepts is left out with its children; so are lines (surface types 1 and 2).
     Convention of FlightGear's models: nose towards -x, y up, left wing towards +z.
     Raises ValueError if the text is not AC3D or ends too early.
     """
-    lines = iter(text.splitlines())
+    lines = (line for line in map(str.strip, text.splitlines()) if line)  # some exporters scatter blank ones
     if not next(lines, "").startswith("AC3D"):
         raise ValueError("an AC3D file starts with AC3D")
-    parts: list[Part] = []
     try:
-        _read_objects(lines, 1, np.eye(3), np.zeros(3), skip, parts)
-    except (StopIteration, IndexError, RecursionError) as error:
-        raise ValueError("the AC3D file ends in the middle of an object, or its objects are nested too deep") from error
-    return parts
+        return list(_read_objects(lines, 1, np.eye(3), np.zeros(3), skip))
+    except (RuntimeError, IndexError) as error:  # a generator turns StopIteration into a RuntimeError
+        raise ValueError("the AC3D file ends in the middle of an object") from error
 
 
 def _read_objects(
-    lines: Iterator[str],
-    count: int,
-    rotation: np.ndarray,
-    translation: np.ndarray,
-    skip: Callable[[str], bool],
-    parts: list[Part],
-) -> None:
-    """Add `count` objects and their children to `parts`; rotation [3, 3] (of row vectors) is that of their parent."""
-    while count > 0 and (line := next(lines, None)) is not None:
-        if not line.startswith("OBJECT"):
-            continue
-        count -= 1
+    lines: Iterator[str], count: int, rotation: np.ndarray, translation: np.ndarray, skip: Callable[[str], object]
+) -> Iterator[Part]:
+    """The next `count` objects with their children; rotation [3, 3] (of row vectors) is that of their parent."""
+    for _ in range(count):
+        if not any(line.startswith("OBJECT") for line in lines):
+            return
         name, vertices, polygons, kind, key = "", np.zeros((0, 3)), [], -1, ""
         turn, shift = np.eye(3), np.zeros(3)
         while key != "kids":
-            key, _, value = _next(lines).partition(" ")
+            key, _, value = next(lines).partition(" ")
             if key == "name":
-                name = value.strip().strip('"')
+                name = value.strip('"')
             elif key == "data":
-                size = int(value)
-                while size > 0:  # free text of `size` characters, which may look like anything
-                    size -= len(next(lines)) + 1
+                next(lines)  # free text, which may look like anything
             elif key == "loc":
-                shift = np.array(value.split()[:3], dtype=np.float64)
+                shift = np.array(value.split(), dtype=np.float64)
             elif key == "rot":
-                turn = np.array(value.split()[:9], dtype=np.float64).reshape(3, 3)
+                turn = np.array(value.split(), dtype=np.float64).reshape(3, 3)
             elif key == "numvert":
-                rows = [_next(lines).split()[:3] for _ in range(int(value))]
+                rows = [next(lines).split()[:3] for _ in range(int(value))]
                 vertices = np.array(rows, dtype=np.float64).reshape(-1, 3)
             elif key == "SURF":
                 kind = int(value, 16) & 0xF
             elif key == "refs":
-                polygon = [int(_next(lines).split()[0]) for _ in range(int(value))]
+                polygon = [int(next(lines).split()[0]) for _ in range(int(value))]
                 if kind == 0 and len(polygon) > 2:
                     polygons.append(polygon)
         turn, shift = turn @ rotation, shift @ rotation + translation
-        kept = [] if skip(name) else parts
-        if polygons:
+        children = list(_read_objects(lines, int(value), turn, shift, skip))
+        if not skip(name):
             placed = vertices @ turn + shift
-            kept.append(Part(name, placed, triangulate(polygons, placed)))
-        _read_objects(lines, int(value), turn, shift, skip, kept)
-
-
-def _next(lines: Iterator[str]) -> str:
-    """The next line that is not blank (some exporters scatter blank ones); StopIteration at the end."""
-    while not (line := next(lines).strip()):
-        pass
-    return line
+            yield from [Part(placed, triangulate(polygons, placed))] if polygons else []
+            yield from children
 
 
 def triangulate(polygons: Sequence[Sequence[int]], vertices: np.ndarray) -> np.ndarray:
@@ -117,12 +93,9 @@ def triangulate(polygons: Sequence[Sequence[int]], vertices: np.ndarray) -> np.n
     """
     by_size: dict[int, list[Sequence[int]]] = {}
     for polygon in polygons:
-        if min(polygon) < 0 or max(polygon) >= len(vertices):  # of any size: before they become an array
-            worst = max(polygon, key=abs)
-            raise ValueError(f"a polygon names vertex {str(worst)[:20]}, but there are {len(vertices)} vertices")
+        if min(polygon) < 0 or max(polygon) >= len(vertices):
+            raise ValueError(f"a polygon {polygon} names a vertex that is not there")
         by_size.setdefault(len(polygon), []).append(polygon)
-    if (most := max(by_size, default=0)) > limits.POLYGON_CORNERS:
-        raise ValueError(f"a polygon has {most} corners; at most {limits.POLYGON_CORNERS} are read")
     triangles = [np.empty((0, 3), dtype=np.int64)]
     for size in sorted(by_size):
         corners = np.array(by_size[size], dtype=np.int64)  # [P, size]

@@ -1,8 +1,8 @@
 """Real meshes from Debian packages: chairs, tables, cabinets, sofas, lamps (Sweet Home 3D) and airplanes (FlightGear).
 
 `fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply, welded, y up, facing +z, box centred at the origin, longest side
-1, with OUTPUT/index.csv (what each mesh is and under which licence), OUTPUT/dropped.csv (what was left out and why)
-and OUTPUT/licences (the packages' copyright files). The same packages give the same bytes.
+1, with OUTPUT/index.csv (the source and licence of each mesh) and OUTPUT/licences (the packages' copyright files). The
+same packages give the same bytes.
 """
 
 from __future__ import annotations
@@ -10,196 +10,152 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from urllib.parse import unquote
 
 import numpy as np
 import trimesh
-from pydantic import Field
+from tqdm import tqdm
 
-from learn3d.files import limits, sandbox
-from learn3d.files.findings import DamagedFile, MissingFile
-from learn3d.files.writing import write_bytes
-from learn3d.make_data.debian import packages
+from learn3d import settings
 from learn3d.make_data.debian.aircraft import AIRCRAFT_PACKAGE, aircraft_models
 from learn3d.make_data.debian.furniture import FURNITURE_PACKAGES, furniture_models
-from learn3d.make_data.debian.mesh_cleaning import clean_mesh, overlap, surface_grid
+from learn3d.make_data.debian.packages import Candidate, get_package, read_package
 from learn3d.make_data.folders import publishing
-from learn3d.settings import FilePath, checked, split_names
+from learn3d.make_data.meshes import RawMesh, checked, fit_to_box
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
+PACKAGES = {name: furniture_models for name in FURNITURE_PACKAGES} | {AIRCRAFT_PACKAGE: aircraft_models}
 GRID = 24  # cells per side when surfaces are compared
-Overlap = Annotated[float, Field(gt=0, le=1)]
+SAMPLES = 2_000_000  # points of surfaces in memory at a time
+DUPLICATE_IOU = 0.85  # two surfaces that overlap more are one model
 INDEX = ("category", "file", "title", "author", "licence", "package", "version", "source")
 INDEX += ("vertices", "faces", "watertight")  # columns of index.csv; watertight: each edge belongs to exactly two faces
-DROPPED = ("category", "title", "package", "source", "reason")  # columns of dropped.csv
 
 
-@checked
+@settings.checked
 class FetchConfig:
-    """Categories, packages and duplicates of `fetch_debian_models`."""
+    """Options of `fetch_debian_models`."""
 
-    output: FilePath
-    """Folder to write."""
-    category: str = ",".join(CATEGORIES)
-    """Categories, separated by commas."""
-    packages_dir: FilePath | None = None
-    """Folder with the .deb files (default: apt-get downloads them)."""
-    overwrite: bool = False
-    """Replace an earlier output."""
-    duplicate_iou: Overlap = 0.85
-    """Two surfaces whose overlap is greater are one model; 1 keeps all."""
-    stretched_iou: Overlap = 0.85
-    """Two surfaces whose overlap is greater when both boxes are stretched to cubes are one model; 1 keeps stretched
-    copies."""
-
-    def __post_init__(self) -> None:
-        if not self.categories or set(self.categories) - set(CATEGORIES):
-            raise ValueError(f"category must be some of {','.join(CATEGORIES)}; got {self.category!r}")
-
-    @property
-    def categories(self) -> tuple[str, ...]:
-        return split_names(self.category)
+    output: settings.FilePath
+    """Folder to write; it must not be there yet."""
+    packages_dir: settings.FilePath | None = None
+    """Folder that keeps the .deb files; those that it lacks are downloaded (default: none is kept)."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Report:
     """The outcome of `fetch_debian_models`."""
 
-    output: Path
-    models: list[dict]  # rows of index.csv, a mesh each
-    dropped: list[dict]  # rows of dropped.csv: models of wanted categories that were not written
-    ignored: int  # models of other categories
-    notes: list[str]  # optional packages that were not there
+    models: list[dict] = field(default_factory=list)  # rows of index.csv, a mesh each
+    dropped: dict[str, str] = field(default_factory=dict)  # the reason why a model was left out, by its source
+    notes: list[str] = field(default_factory=list)  # optional packages that were not there
 
     def summary(self) -> str:
-        """A few lines for a person: counts per category, reasons of what was dropped, notes."""
-        kept = Counter(model["category"] for model in self.models)
-        closed = Counter(model["category"] for model in self.models if model["watertight"])
-        lines = [f"{category:9s}{kept[category]:5d} meshes, {closed[category]} watertight" for category in kept]
-        reasons = Counter(re.sub(r" \(.*| of .*", "", drop["reason"]) for drop in self.dropped)
-        lines += [f"{count} dropped: {reason}" for reason, count in reasons.most_common()]
-        lines.append(f"{self.ignored} models of other categories or parts")
-        return "\n".join([*lines, *self.notes, f"written to {self.output}"])
+        """A few lines for a person: counts per category, reasons of those left out, notes."""
+        lines = [f"{name:9s}{n:5d} meshes" for name, n in Counter(row["category"] for row in self.models).items()]
+        reasons = Counter(reason.split(" of ")[0] for reason in self.dropped.values())
+        return "\n".join([*lines, *(f"{n} left out: {reason}" for reason, n in reasons.most_common()), *self.notes])
 
 
 def fetch_debian_models(config: FetchConfig, progress: bool = True) -> Report:
-    """Write the meshes that `config` names into its output folder; the folder appears at once or not at all.
+    """Write the meshes into the output folder, which appears at once or not at all.
 
-    Raises ValueError (a sentence that says what to do) for an output that is there already, a package that cannot be
-    had, and archives that are damaged. A model that cannot be read is reported, not raised.
+    Raises ValueError (a sentence that says what to do) for an output that is there already, and for a package that is
+    missing or damaged. A model that cannot be read is reported, not raised.
     """
-    output = config.output.resolve()
+    output, report = config.output.resolve(), Report()
     if output.exists():
-        if not config.overwrite:
-            raise ValueError(f"{config.output} is there already; remove it, or replace it with --overwrite")
-        if not _is_ours(output / "index.csv"):
-            raise ValueError(f"{config.output} was not written by this tool (no such index.csv); choose another folder")
+        raise ValueError(f"{config.output} is there already; remove it, or give another folder")
     output.parent.mkdir(parents=True, exist_ok=True)
     with publishing(output.parent, [output.name]) as scratch:
-        report = _write_models(config, scratch / output.name, scratch, progress)
+        folder, kept = scratch / output.name, {category: {} for category in CATEGORIES}
+        (folder / "licences").mkdir(parents=True)
+        for name, find_models in PACKAGES.items():
+            try:
+                package = get_package(name, config.packages_dir or scratch)
+            except ValueError as missing:
+                if not name.endswith("-nonfree"):
+                    raise
+                report.notes.append(f"done without {name}: {missing}")
+                continue
+            files = read_package(package, (".sh3f", ".ac", ".xml", notice := f"/doc/{name}/copyright"))
+            for path in [path for path in files if path.endswith(notice)]:
+                (folder / "licences" / f"{name}.copyright").write_bytes(files[path])
+            about = {"package": name, "version": unquote(package.stem.split("_")[1])}
+            for model in tqdm(find_models(files), desc=name, unit="model", disable=not progress, leave=False):
+                try:
+                    report.models.append(about | _write_model(model, folder, kept[model.category]))
+                except ValueError as reason:
+                    report.dropped[model.source] = str(reason)
+        report.models.sort(key=lambda row: (CATEGORIES.index(row["category"]), row["file"]))
+        with (folder / "index.csv").open("w", newline="", encoding="utf-8") as file:
+            rows = [[row[column] for column in INDEX] for row in report.models]
+            csv.writer(file, lineterminator="\n").writerows([INDEX, *rows])
     return report
 
 
-def _write_models(config: FetchConfig, folder: Path, downloads: Path, progress: bool) -> Report:
-    """Write meshes, tables and copyright files into `folder`, which is made."""
-    folder.mkdir()
-    notes, dropped, ignored, kept = [], [], 0, _Kept(config, folder)
-    for package, read in _packages(config, downloads, notes):
-        for candidate in read(package, licences=folder / "licences", progress=progress):
-            if candidate is None:
-                ignored += 1
-                continue
-            try:
-                kept.add(candidate)
-            except ValueError as reason:
-                names = candidate.category, candidate.title, package.name, candidate.source
-                dropped.append(dict(zip(DROPPED, (*names, str(reason)), strict=True)))
-    kept.rows.sort(key=lambda row: (CATEGORIES.index(row["category"]), row["file"]))
-    dropped.sort(key=lambda row: (CATEGORIES.index(row["category"]), row["package"], row["source"]))
-    for name, columns, rows in (("index.csv", INDEX, kept.rows), ("dropped.csv", DROPPED, dropped)):
-        with (folder / name).open("w", newline="", encoding="utf-8") as file:
-            table = csv.DictWriter(file, columns, lineterminator="\n")
-            table.writeheader()
-            table.writerows(rows)
-    return Report(config.output, kept.rows, dropped, ignored, notes)
+def _write_model(model: Candidate, folder: Path, kept: dict[str, list[np.ndarray]]) -> dict:
+    """Write a mesh, and return its row of index.csv. kept: surfaces in proportion and stretched to cubes, by name.
+
+    Raises ValueError if it cannot be read, or is nearly one of those kept.
+    """
+    mesh = clean_mesh(*model.read())
+    surface = [surface_grid(mesh.vertices, mesh.faces, GRID, per_axis=cube) for cube in (False, True)]
+    for name, others in kept.items():
+        for kind, mine, other in zip(("", "stretched "), surface, others, strict=True):
+            iou = np.count_nonzero(mine & other) / np.count_nonzero(mine | other)
+            if iou > DUPLICATE_IOU:
+                raise ValueError(f"{kind}near-duplicate of {name} (surface IoU {iou:.3f})")
+    stem = f"{model.category}/" + (re.sub(r"[^a-z0-9]+", "-", model.stem.lower()).strip("-") or "model")
+    name, number = stem, 1
+    while name in kept:
+        number += 1
+        name = f"{stem}-{number}"
+    kept[name] = surface
+    (folder / model.category).mkdir(exist_ok=True)
+    (folder / f"{name}.ply").write_bytes(mesh.export(file_type="ply"))
+    size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "watertight": mesh.is_watertight}
+    return model._asdict() | {"file": f"{name}.ply"} | size
 
 
-def _packages(
-    config: FetchConfig, downloads: Path, notes: list[str]
-) -> list[tuple[packages.Package, Callable[..., Iterator[packages.Candidate | None]]]]:
-    """The packages with models of the wanted categories and their readers; adds to `notes` those that are missing."""
-    readers = {}
-    if set(config.categories) - {"airplane"}:
-        readers = dict.fromkeys(FURNITURE_PACKAGES, partial(furniture_models, categories=config.categories))
-    if "airplane" in config.categories:
-        readers[AIRCRAFT_PACKAGE] = aircraft_models
-    found = []
-    for name, read in readers.items():
-        try:
-            if config.packages_dir is None:
-                found.append((packages.download_package(name, downloads), read))
-            else:
-                found.append((packages.find_package(name, config.packages_dir), read))
-        except packages.PackageMissing as missing:
-            if name != FURNITURE_PACKAGES[1]:
-                raise
-            notes.append(f"done without {name}: {missing}")
-    return found
+def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
+    """The welded mesh with its box centred at the origin and its longest side 1.
+
+    Vertices closer than about 1e-5 of the longest side become one; faces without area, repeated faces (in whatever
+    winding) and unused vertices go. Raises ValueError if nothing solid is left or a coordinate is not finite.
+    """
+    raw = checked(RawMesh(vertices, faces))
+    mesh = trimesh.Trimesh(fit_to_box(raw.vertices), raw.faces, process=False)
+    mesh.merge_vertices(digits_vertex=5)
+    mesh.update_faces((mesh.area_faces > 1e-12) & mesh.unique_faces())
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) == 0:
+        raise ValueError("no face has an area")
+    if mesh.extents.min() < 1e-3 * mesh.extents.max():
+        raise ValueError("it is flat")
+    mesh.vertices = fit_to_box(mesh.vertices)
+    return mesh
 
 
-class _Kept:
-    """The models that were written, each with its surface in two grids to compare the next ones with."""
+def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: bool = False) -> np.ndarray:
+    """Cells bool [size, size, size] that the surface passes through, by samples at most a third of a cell apart.
 
-    def __init__(self, config: FetchConfig, folder: Path) -> None:
-        self.rows: list[dict] = []  # of index.csv
-        self._config, self._folder = config, folder
-        self._grids: dict[str, dict[str, list[np.ndarray]]] = {name: {} for name in CATEGORIES}
-
-    def add(self, candidate: packages.Candidate) -> None:
-        """Write the candidate's mesh; raise ValueError with the reason if it is left out."""
-        package, known = candidate.package, self._grids[candidate.category]
-        try:
-            mesh, grids = sandbox.read(_prepare, package.path, candidate.read, memory=2 * limits.GIB, seconds=60.0)
-        except (DamagedFile, MissingFile) as error:
-            raise ValueError(f"unreadable ({error.message})") from error
-        for name, others in known.items():
-            iou, stretched = (overlap(mine, other) for mine, other in zip(grids, others, strict=True))
-            if iou > self._config.duplicate_iou:
-                raise ValueError(f"near-duplicate of {name} (surface IoU {iou:.3f})")
-            if stretched > self._config.stretched_iou:
-                raise ValueError(f"stretched near-duplicate of {name} (surface IoU {stretched:.3f} as cubes)")
-        stem = re.sub(r"[^a-z0-9]+", "-", candidate.stem.lower()).strip("-") or "model"
-        name, number = f"{candidate.category}/{stem}", 1
-        while name in known:
-            number += 1
-            name = f"{candidate.category}/{stem}-{number}"
-        known[name] = grids
-        file = self._folder / f"{name}.ply"
-        file.parent.mkdir(exist_ok=True)
-        write_bytes(file, mesh.export(file_type="ply"))
-        said = candidate.title, candidate.author, candidate.licence, package.name, package.version, candidate.source
-        size = len(mesh.vertices), len(mesh.faces), mesh.is_watertight
-        self.rows.append(dict(zip(INDEX, (candidate.category, f"{name}.ply", *said, *size), strict=True)))
-
-
-def _prepare(
-    package: Path, read: Callable[[], tuple[np.ndarray, np.ndarray]]
-) -> tuple[trimesh.Trimesh, list[np.ndarray]]:
-    """In a worker: clean a model of the package; its surface in two grids, in proportion and stretched to a cube."""
-    try:
-        mesh = clean_mesh(*read())
-    except ValueError as error:
-        raise DamagedFile(package, str(error)) from error
-    return mesh, [surface_grid(mesh.vertices, mesh.faces, GRID, per_axis=cube) for cube in (False, True)]
-
-
-def _is_ours(index: Path) -> bool:
-    """Whether a table begins as index.csv does."""
-    if not index.is_file():
-        return False
-    with index.open(encoding="utf-8", errors="replace") as file:
-        return file.readline(1000).strip() == ",".join(INDEX)
+    The box is centred in the grid and its longest side fills it; with `per_axis` each side fills it.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    scale = high - low if per_axis else (high - low).max()
+    corners = (((vertices - (low + high) / 2) / scale + 0.5) * size)[faces]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    steps = np.maximum(np.ceil(3 * edges).astype(np.int64), 1)
+    grid = np.zeros((size, size, size), dtype=bool)
+    for count in np.unique(steps):
+        i, j = np.divmod(np.arange((count + 1) ** 2), count + 1)
+        i, j = i[i + j <= count], j[i + j <= count]
+        weights = np.stack([i, j, count - i - j], axis=1) / count
+        chosen = corners[steps == count]
+        for part in np.array_split(chosen, 1 + len(chosen) * len(weights) // SAMPLES):
+            cells = np.clip(np.floor((weights @ part).reshape(-1, 3)).astype(np.int64), 0, size - 1)
+            grid[tuple(cells.T)] = True
+    return grid

@@ -225,7 +225,6 @@ def light_plane(draw: Draw) -> Part:
 
 
 def _floats(draw: Draw, radius: float, tall: float) -> Part:
-    """A pair of floats on struts."""
     x, y = 2.2 * radius, -tall - draw(0.08, 0.11)
     hull = fuselage(0.035, nose=0.25, nose_power=1.8, tail_start=0.5, upsweep=0.9, length=draw(0.65, 0.8))
     part = hull.moved(x, y, 0.12)

@@ -207,6 +207,5 @@ def gear(belly: float, drop: float, main_x: float, main_z: float, other_z: float
 
 
 def _wheel(radius: float) -> Part:
-    """A wheel about the x axis."""
     t = 0.35 * radius
     return revolve([(0.7 * radius, -t), (radius, -0.6 * t), (radius, 0.6 * t), (0.7 * radius, t)], 12).rotated("z", 90)

@@ -65,11 +65,17 @@ def car(draw: Draw, kind: str) -> Part:
     """A car of one of the kinds of `_MEASURES`."""
     measures = [draw(*limits) for limits in zip(*_MEASURES[kind], strict=True)]
     body = Body(*measures, has_bed=kind == "pickup")
-    part = _hull(body) + _wheels(draw, body) + _mirrors(draw, body)
+    part = _hull(body) + _wheels(draw, body)
+    half, y, z = body.width / 2, body.shoulder + 0.07, (0.5 - body.bonnet) * body.length - 0.2
+    mirror = box((draw(0.14, 0.22), draw(0.09, 0.16), 0.08), (half + 0.07, y, z), 0.03)
+    part += (mirror + bar((0.85 * half, y - 0.09, z), (half + 0.04, y - 0.01, z), 0.05)).both_sides()
     if kind in ("hatchback", "wagon", "suv", "van") and draw.maybe(0.4):
         part += _roof_box(draw, body)
-    if kind == "coupe" and draw.maybe(0.5):
-        part += _spoiler(draw, body)
+    if kind == "coupe" and draw.maybe(0.5):  # a spoiler on two stays
+        half, z, high = 0.42 * body.width, draw(0.15, 0.4) - body.length / 2, draw(0.1, 0.3)
+        y = body.shoulder + high
+        stay = box((0.05, high + 0.3, 0.14), (0.7 * half, y - high / 2 - 0.13, z - 0.13))
+        part += wing([(-half, y, z, 0.3, 0.12), (half, y, z, 0.3, 0.12)]) + stay.both_sides()
     return part
 
 
@@ -137,29 +143,13 @@ def _wheels(draw: Draw, body: Body) -> Part:
     return join(pair.moved(z=body.length / 2 - s) for s in body.axles)
 
 
-def _mirrors(draw: Draw, body: Body) -> Part:
-    """Wing mirrors at the foot of the windscreen."""
-    half, y, z = body.width / 2, body.shoulder + 0.07, (0.5 - body.bonnet) * body.length - 0.2
-    mirror = box((draw(0.14, 0.22), draw(0.09, 0.16), 0.08), (half + 0.07, y, z), 0.03)
-    return (mirror + bar((0.85 * half, y - 0.09, z), (half + 0.04, y - 0.01, z), 0.05)).both_sides()
-
-
 def _roof_box(draw: Draw, body: Body) -> Part:
-    """Two bars across the roof that carry a box."""
     start, end = body.bonnet + body.screen, body.roof
     z, long = (0.5 - (start + end) / 2) * body.length, 0.8 * (end - start) * body.length
     half = 0.35 * body.width - 0.5 * body.lean * (body.height - body.shoulder)
     bars = join(box((2 * half, 0.12, 0.06), (0, body.height + 0.01, z + s * 0.3 * long)) for s in (-1, 1))
     outline = rectangle(draw(1.0, 1.8) * half, long, 0.2, 3)
     return bars + slab(outline, draw(0.18, 0.35), 0.1).moved(y=body.height + 0.05, z=z)
-
-
-def _spoiler(draw: Draw, body: Body) -> Part:
-    """A wing on two stays over the tail."""
-    half, z, high = 0.42 * body.width, draw(0.15, 0.4) - body.length / 2, draw(0.1, 0.3)
-    y = body.shoulder + high
-    stay = box((0.05, high + 0.3, 0.14), (0.7 * half, y - high / 2 - 0.13, z - 0.13))
-    return wing([(-half, y, z, 0.3, 0.12), (half, y, z, 0.3, 0.12)]) + stay.both_sides()
 
 
 _WEIGHTS = {"sedan": 2.5, "hatchback": 2, "wagon": 1.2, "coupe": 1.8, "suv": 1.8, "van": 1.6, "pickup": 1.6}

@@ -33,7 +33,6 @@ def _shade(draw: Draw, radius: float, height: float) -> Part:
 
 
 def _foot(draw: Draw, size: float) -> Part:
-    """A round or square plate on the floor."""
     return slab(draw.pick((ellipse(size, size), rectangle(size, size))), draw(0.02, 0.05))
 
 

@@ -1,7 +1,8 @@
 """Closed parts of procedural shapes: boxes, slabs, posts, tubes, revolved profiles, sheets, wings.
 
 All of them are lofts. A loft is watertight whatever its rings are, so a shape made of lofts is a union of closed
-components. Axes: x right, y up, z forward.
+components. Axes: x right, y up, z forward. Outlines are closed curves [N, 2], counter-clockwise, star-shaped about
+their mean.
 """
 
 from __future__ import annotations
@@ -80,9 +81,6 @@ def loft(rings: np.ndarray | Sequence[np.ndarray], ends: str = "fan") -> Part:
     return Part((Loft(np.asarray(rings), ends),))
 
 
-# --- outlines: closed curves [N, 2], counter-clockwise, star-shaped about their mean --------------------------------
-
-
 def ellipse(width: float, depth: float, count: int = 20, exponent: float = 2.0) -> np.ndarray:
     """A (super)ellipse outline [count, 2]; exponent 2 is an ellipse, larger ones approach a rectangle."""
     angle = np.arange(count) * (2.0 * np.pi / count)
@@ -112,9 +110,6 @@ def inset(outline: np.ndarray, distance: float) -> np.ndarray:
     normal = np.stack([edge[:, 1], -edge[:, 0]], 1) / np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-12)
     mitre = normal + np.roll(normal, 1, 0)
     return outline - mitre * (2.0 * distance / np.maximum((mitre**2).sum(1, keepdims=True), 0.5))
-
-
-# --- parts -----------------------------------------------------------------------------------------------------------
 
 
 def _prism(outline: np.ndarray, rims: Sequence[tuple[float, float]], axes: tuple[int, int, int]) -> Part:
@@ -266,9 +261,6 @@ def wing(sections: list[Sequence[float]], points: int = 7, upright: bool = False
         x, y = np.full(2 * points, span), rise + thickness * chord * ratio
         rings.append(np.stack([y, x, z - chordwise * chord] if upright else [x, y, z - chordwise * chord], 1))
     return loft(np.stack(rings), "strip")
-
-
-# --- from parts to a mesh -------------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=1024)

@@ -68,7 +68,6 @@ def legs(
 
 
 def _hairpin_legs(half_x: float, half_z: float, height: float, splay: float) -> Part:
-    """Four V-shaped legs of bent wire under a plate."""
     foot, level = (half_x + splay, 0.006, half_z + splay), height + 0.01
     leg = bar(foot, (half_x - 0.1, level, half_z), 0.013) + bar(foot, (half_x, level, half_z - 0.1), 0.013)
     plate = between((-half_x - 0.01, height - 0.012, -half_z), (half_x + 0.01, height + 0.005, half_z))

@@ -1,13 +1,10 @@
-"""Writers of data sets: one file per layout, all with the interface of `learn3d.make_data.writers.writer`."""
+"""Writers of data sets: all with the interface of `learn3d.make_data.writers.writer`."""
 
 from __future__ import annotations
 
-from learn3d.make_data.writers.dvr import DvrWriter
-from learn3d.make_data.writers.kar import KarWriter
-from learn3d.make_data.writers.kato import KatoWriter
-from learn3d.make_data.writers.pascal3d import Pascal3dWriter
-from learn3d.make_data.writers.photos import PhotosWriter
-from learn3d.make_data.writers.r2n2 import R2n2Writer
+from learn3d.make_data.writers.kato import DvrWriter, KatoWriter
+from learn3d.make_data.writers.photographs import Pascal3dWriter, PhotosWriter
+from learn3d.make_data.writers.shapenet import KarWriter, R2n2Writer
 from learn3d.make_data.writers.writer import RenderedObject, Writer
 
 __all__ = ["WRITERS", "KatoWriter", "RenderedObject", "Writer"]

@@ -1,4 +1,4 @@
-"""The interface of the writers of all layouts, and what several of them use: cameras, colours, PNG files."""
+"""The interface of the writers of all layouts, and their common parts: cameras, colours, PNG files."""
 
 from __future__ import annotations
 
@@ -35,11 +35,6 @@ class RenderedObject:
     voxels: np.ndarray  # bool [32, 32, 32], as `Writer.voxelize` returned them
     rng: np.random.Generator  # for other random content of the files: backgrounds, surface points
 
-    def over(self, backgrounds: np.ndarray) -> np.ndarray:
-        """Composite the images over backgrounds instead of white; both are uint8 [n, S, S, 3]."""
-        clear = 1 - self.alpha[..., None] / np.float32(255)
-        return np.rint(self.rgb + (backgrounds.astype(np.float32) - 255) * clear).clip(0, 255).astype(np.uint8)
-
     def rgba(self) -> np.ndarray:
         """The images with straight alpha, uint8 [n, S, S, 4]; colours are 0 where alpha is 0."""
         share = self.alpha[..., None] / np.float32(255)
@@ -55,13 +50,11 @@ class RenderedObject:
 
 
 class Writer(ABC):
-    """One category in one layout, written object by object below `folder`, which is empty and temporary.
+    """One category in one layout, written object by object below `folder`, which is temporary.
 
-    For the objects of each split (train, val, test) `start` is called once and `write` for each; then `finish` once.
-    After that the files and folders of `paths(category)` and `shared` are moved to their final place. The class
-    docstring of a layout describes its files, and becomes part of the data set's card.
-
-    Without other values a layout has the images, cameras and voxel axes of Kato's.
+    The readers in `learn3d.data.readers` describe the files. `write` is called for the objects of train, val and test,
+    then `finish`; after that the files and folders `paths(category)` and `shared` are moved to their final place. A
+    layout that says nothing else has the images, cameras and voxel axes of Kato's.
     """
 
     image_size: ClassVar[int] = conventions.IMAGE_SIZE
@@ -69,25 +62,19 @@ class Writer(ABC):
     fixed_views: ClassVar[bool] = False  # True if no other number of views is allowed
     default_test: ClassVar[float] = 0.2  # share of the test split; 0 if the layout has no such split
     default_val: ClassVar[float] = 0.1
-    extra_bytes_per_view: ClassVar[int] = 0  # bytes per view beside colours and mask, to estimate the disk space
+    fixed_splits: ClassVar[bool] = False  # True if the order of the objects decides about their splits
     convention: ClassVar[conventions.VoxelConvention] = conventions.KATO
     shared: ClassVar[tuple[str, ...]] = ()  # files with entries for all categories of the folder
     turn: ClassVar[np.ndarray] = np.eye(3)  # from the frame of `mesh_to_object` to the layout's object frame
-    diagonal: ClassVar[float | None] = None  # of the object's bounding box; None: its longest side is 1
+    diagonal: ClassVar[float | None] = None  # length of the object's bounding box; None: its longest side is 1
 
     def __init__(self, folder: Path, category: str) -> None:
-        self.folder = folder
-        self.category = category
+        self.folder, self.category = folder, category
 
-    @classmethod
+    @staticmethod
     @abstractmethod
-    def paths(cls, category: str) -> tuple[str, ...]:
+    def paths(category: str) -> tuple[str, ...]:
         """Files and folders, relative to the data set's folder, that belong to the category alone."""
-
-    @classmethod
-    def check(cls, output: Path, test: float, augment: int) -> None:
-        """Raise ValueError if the settings, or files in the folder `output`, do not go with the layout."""
-        return None
 
     def place(self, vertices: np.ndarray) -> np.ndarray:
         """Vertices [V, 3] (box centred, longest side 1, frame of `mesh_to_object`) in the layout's object frame."""
@@ -102,20 +89,17 @@ class Writer(ABC):
         """Occupancy bool [32, 32, 32] of the placed mesh in the axes of the layout."""
         return self.convention.voxelize(vertices, faces)[0].numpy()
 
-    def start(self, split: str, most: int) -> None:
-        """Prepare for at most `most` objects of a split."""
-        return None
-
     @abstractmethod
     def write(self, item: RenderedObject) -> None:
         """Write, or keep, one object."""
 
-    def finish(self, output: Path, objects: dict[str, list[str]]) -> dict[str, list[str]]:
-        """Complete the files; `objects` are the names written per split, `output` is the final folder.
+    def split(self, meshes: list[dict]) -> list[dict]:
+        """The entries of `DatasetReport.meshes`, with the splits that readers of the layout will see."""
+        return meshes
 
-        Returns the names per split as readers of the layout will see them.
-        """
-        return objects
+    def finish(self, output: Path, objects: dict[str, list[str]]) -> None:
+        """Complete the files. `objects` are the names of each split; `output` is the final folder."""
+        return None
 
 
 def uniform(rng: np.random.Generator, limits: tuple[float, float], count: int) -> np.ndarray:
@@ -139,18 +123,3 @@ def write_png(path: Path, image: np.ndarray) -> None:
     """Write uint8 [H, W] (grey), [H, W, 3] or [H, W, 4], with the folders on the way."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(image).save(path, compress_level=4)
-
-
-def photo_background(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw an out-of-focus background: colours that change slowly, blotches and noise. uint8 [H, W, 3]."""
-    corners = rng.uniform(40, 230, (2, 2, 3))
-    blotches = rng.normal(0, 25, (8, 8, 1))
-    grain = rng.normal(0, 4, (height, width, 1))
-    smooth = _enlarge(corners, height, width) + _enlarge(np.repeat(blotches, 3, axis=2), height, width)
-    return (smooth + grain).clip(0, 255).astype(np.uint8)
-
-
-def _enlarge(small: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Bilinear: [h, w, 3] -> float32 [H, W, 3]."""
-    channels = [Image.fromarray(small[..., c].astype(np.float32)) for c in range(3)]
-    return np.stack([np.asarray(c.resize((width, height), Image.Resampling.BILINEAR)) for c in channels], axis=-1)

@@ -23,10 +23,8 @@ from scipy.spatial.transform import Rotation
 import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.poses import Poses
-from learn3d.data.readers.kar import KAR
-from learn3d.data.readers.pascal3d import PASCAL3D
 from learn3d.make_data.writers import WRITERS, RenderedObject
-from learn3d.make_data.writers.r2n2 import binvox_bytes
+from learn3d.make_data.writers.photographs import over
 
 SYNSET = "03001627"
 
@@ -99,16 +97,14 @@ def views(layout: str, radius: float, count: int, seed: int) -> Poses:
 def test_dvr(tmp_path, folder):
     make(tmp_path, folder, "dvr", test=1)
     root = tmp_path / SYNSET
-    train, test = ((root / f"softras_{split}.lst").read_text().split() for split in ("train", "test"))
-    assert len(train) == 4 and len(test) == 1 and not (root / "softras_val.lst").exists()
-    name = test[0]
+    train, (name,) = ((root / f"softras_{split}.lst").read_text().split() for split in ("train", "test"))
+    assert len(train) == 4 and not (root / "softras_val.lst").exists()
     vertices, faces = true_mesh(folder, name)
     cameras = np.load(root / name / "cameras.npz")
     to_pixels = np.array([[32, 0, 32], [0, 32, 32], [0, 0, 1.0]])
-    for k in range(24):
+    for k in (0, 5, 23):
         world, camera = cameras[f"world_mat_{k}"], cameras[f"camera_mat_{k}"]
         assert np.linalg.det(world[:3, :3]) == pytest.approx(1) and world.shape == (4, 4)
-        assert camera[0, 0] * 32 == pytest.approx(1.8660254 * 64)
         opencv = nmr.cameras.from_opencv(
             to_pixels @ camera[:3, :3], world[:3, :3], world[:3, 3], height=64, width=64, pixel_center=0.5
         )
@@ -118,57 +114,42 @@ def test_dvr(tmp_path, folder):
         assert image.shape == (64, 64, 3) and (image[mask == 0] == 255).all() and (image[mask == 255] < 255).any()
     # file k is at azimuth 15 k of Kato's Blender scene: from the front, x, at 0, and seen from -z at 90 degrees
     eye = -cameras["world_mat_6"][:3, :3].T @ cameras["world_mat_6"][:3, 3]
-    cos, sin = np.cos(np.deg2rad(30)), np.sin(np.deg2rad(30))
-    np.testing.assert_allclose(eye, 2.732 * np.array([0, sin, cos]), atol=1e-5)
+    np.testing.assert_allclose(eye, 2.732 * np.array([0, 0.5, np.sqrt(0.75)]), atol=1e-5)
     cloud = np.load(root / name / "pointcloud.npz")
     mesh = trimesh.Trimesh(vertices.numpy(), faces.numpy())
     _, distance, _ = trimesh.proximity.closest_point_naive(mesh, cloud["points"][:200])
     assert cloud["points"].shape == cloud["normals"].shape == (10_000, 3) and distance.max() < 1e-5
-    assert np.abs(np.linalg.norm(cloud["normals"], axis=1) - 1).max() < 1e-4
 
 
 def test_kar(tmp_path, folder):
     make(tmp_path, folder, "kar", test=1, val=1, views=3)
     splits = json.loads((tmp_path / "splits.json").read_text())[SYNSET]
     assert splits["name"] == "chair" and [len(splits[s]) for s in ("train", "val", "test")] == [3, 1, 1]
-    elevations = []
-    for name in splits["test"] + splits["val"]:
-        vertices, faces = true_mesh(folder, name)
-        volume = loadmat(tmp_path / "voxels" / "modelVoxels32" / SYNSET / f"{name}.mat")["Volume"] > 0
-        wanted = KAR.voxelize(in_object_frame(vertices), faces)[0].numpy()
-        np.testing.assert_array_equal(volume, wanted)
-        x, y, z = in_object_frame(vertices).T
-        assert_oriented(volume, torch.stack([-z, y, x], dim=1), faces, span=1)
-        root = tmp_path / "renders" / SYNSET / name
-        rows = [[float(word) for word in line.split()] for line in (root / "view.txt").read_text().splitlines()]
-        assert len(rows) == 3 and all(
-            len(row) == 4 and row[2] == 0 and -180 <= row[0] < 180 and -20 <= row[1] < 40 for row in rows
-        )
-        elevations += [row[1] for row in rows]
-        for i, (azimuth, elevation, _, distance) in enumerate(rows):
-            camera = nmr.LookAt.from_angles([distance], [elevation], [azimuth], half_fov_deg=14.9314)
-            rgba = read_image(root / f"render_{i}.png")
-            assert rgba.shape == (224, 224, 4)
-            assert_same_mask(rgba[..., 3], silhouette(in_object_frame(vertices), faces, camera, 224))
-            assert (rgba[rgba[..., 3] == 0] == 0).all() and rgba[rgba[..., 3] > 0][:, :3].min() > 20
-            border = np.concatenate([rgba[[0, -1], :, 3], rgba[:, [0, -1], 3].T])
-            assert (border == 0).all()  # the whole object is seen
-            depth = np.asarray(Image.open(root / f"depth_{i}.png"))
-            hard = silhouette(in_object_frame(vertices), faces, camera, 224, anti_aliasing=False)
-            assert depth.dtype == np.uint8 and depth.shape == (224, 224) and depth.max() == 255
-            assert_same_mask(255.0 * (depth < 250), hard)
-            true_depth = nmr.render_depth(
-                in_object_frame(vertices), faces, camera, image_size=224, anti_aliasing=False
-            )[0].numpy()
-            seen = (depth < 250) & (hard > 0)
-            np.testing.assert_allclose(depth[seen] / 240 * 1.8 + distance - 0.9, true_depth[seen], atol=0.005)
-            matrices = loadmat(root / f"camera_{i}.mat")
-            rotation, offset = matrices["extrinsic"][:, :3], matrices["extrinsic"][:, 3]
-            opencv = nmr.cameras.from_opencv(matrices["K"], rotation, offset, height=224, width=224, pixel_center=0.5)
-            assert_same_mask(rgba[..., 3], silhouette(vertices, faces, opencv, 224))
-            quaternion = Rotation.from_quat(np.roll(matrices["quat"].reshape(4), -1))
-            np.testing.assert_allclose(quaternion.as_matrix(), rotation, atol=1e-6)
-    assert np.ptp(elevations) > 5
+    (name,) = splits["test"]
+    mesh, faces = true_mesh(folder, name)
+    vertices, root = in_object_frame(mesh), tmp_path / "renders" / SYNSET / name
+    volume = loadmat(tmp_path / "voxels" / "modelVoxels32" / SYNSET / f"{name}.mat")["Volume"] > 0
+    assert_oriented(volume, vertices[:, [2, 1, 0]] * torch.tensor([-1, 1, 1]), faces, span=1)
+    rows = np.loadtxt(root / "view.txt")
+    assert rows.shape == (3, 4)
+    for i, (azimuth, elevation, _, distance) in enumerate(rows):
+        camera = nmr.LookAt.from_angles([distance], [elevation], [azimuth], half_fov_deg=14.9314)
+        rgba = read_image(root / f"render_{i}.png")
+        assert_same_mask(rgba[..., 3], silhouette(vertices, faces, camera, 224))
+        assert (rgba[rgba[..., 3] == 0] == 0).all() and rgba[rgba[..., 3] > 0][:, :3].min() > 20
+        assert not rgba[[0, -1], :, 3].any() and not rgba[:, [0, -1], 3].any()  # the whole object is seen
+        depth = np.asarray(Image.open(root / f"depth_{i}.png"))
+        hard = silhouette(vertices, faces, camera, 224, anti_aliasing=False)
+        assert_same_mask(255.0 * (depth < 250), hard)
+        true_depth = nmr.render_depth(vertices, faces, camera, image_size=224, anti_aliasing=False)[0].numpy()
+        seen = (depth < 250) & (hard > 0)
+        np.testing.assert_allclose(depth[seen] / 240 * 1.8 + distance - 0.9, true_depth[seen], atol=0.005)
+        matrices = loadmat(root / f"camera_{i}.mat")
+        rotation, offset = matrices["extrinsic"][:, :3], matrices["extrinsic"][:, 3]
+        opencv = nmr.cameras.from_opencv(matrices["K"], rotation, offset, height=224, width=224, pixel_center=0.5)
+        assert_same_mask(rgba[..., 3], silhouette(mesh, faces, opencv, 224))
+        quaternion = Rotation.from_quat(np.roll(matrices["quat"].reshape(4), -1))
+        np.testing.assert_allclose(quaternion.as_matrix(), rotation, atol=1e-6)
 
 
 def read_binvox(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
@@ -184,32 +165,22 @@ def read_binvox(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
 
 def test_r2n2(tmp_path, folder):
     report = make(tmp_path, folder, "r2n2", views=3, test=None, val=None)
-    assert report.objects == {"train": 4, "test": 1}
-    names = sorted(path.name for path in (tmp_path / "ShapeNetRendering" / SYNSET).iterdir())
-    assert names == sorted(path.name for path in (tmp_path / "ShapeNetVox32" / SYNSET).iterdir())
-    card = json.loads((tmp_path / f"{SYNSET}_card.json").read_text())
-    assert card["splits"]["test"][0].removesuffix(".ply").replace(" ", "_") == names[4][6:]  # last of the sorted ids
-    for name in names[:2]:
-        vertices, faces = true_mesh(folder, name)
-        side = 1 / np.linalg.norm(np.ptp(vertices.numpy(), axis=0))  # ShapeNet's: the diagonal is 1
-        grid, translate, scale = read_binvox(tmp_path / "ShapeNetVox32" / SYNSET / name / "model.binvox")
-        assert scale == pytest.approx(side) and translate == pytest.approx([-side / 2] * 3)
-        assert_oriented(grid, vertices, faces, span=1)  # axes x, y, z of the mesh, the cube around it
-        x, y, z = in_object_frame(vertices).T
-        scaled = torch.stack([x, y, z], dim=1) * 31 / 32 + 0.5
-        wanted = nmr.voxelize(scaled, faces)[0].numpy().transpose(2, 1, 0)[::-1, :, ::-1]  # (-z, y, -x)
-        np.testing.assert_array_equal(grid, wanted)
-        root = tmp_path / "ShapeNetRendering" / SYNSET / name / "rendering"
-        rows = [[float(word) for word in line.split()] for line in (root / "rendering_metadata.txt").open()]
-        assert len(rows) == 3
-        for k, (azimuth, elevation, yaw, ratio, fov) in enumerate(rows):
-            assert 0 <= azimuth < 360 and 25 <= elevation < 30 and yaw == 0 and 0.65 <= ratio < 0.95 and fov == 25
-            a, e = np.deg2rad([azimuth, elevation])
-            eye = 1.75 * ratio * np.array([np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)])
-            rgba = read_image(root / f"{k:02d}.png")
-            assert rgba.shape == (137, 137, 4)
-            camera = opencv_camera(eye, 2.1875 * 137 / 2, 137)
-            assert_same_mask(rgba[..., 3], silhouette(vertices * side, faces, camera, 137))
+    assert report.counts == {"train": 4, "test": 1}
+    name = min(path.name for path in (tmp_path / "ShapeNetRendering" / SYNSET).iterdir())
+    vertices, faces = true_mesh(folder, name)
+    side = 1 / np.linalg.norm(np.ptp(vertices.numpy(), axis=0))  # ShapeNet's: the diagonal is 1
+    grid, translate, scale = read_binvox(tmp_path / "ShapeNetVox32" / SYNSET / name / "model.binvox")
+    assert scale == pytest.approx(side) and translate == pytest.approx([-side / 2] * 3)
+    assert_oriented(grid, vertices, faces, span=1)  # axes x, y, z of the mesh, the cube around it
+    root = tmp_path / "ShapeNetRendering" / SYNSET / name / "rendering"
+    rows = np.loadtxt(root / "rendering_metadata.txt")
+    assert rows.shape == (3, 5)
+    for k, (azimuth, elevation, yaw, ratio, fov) in enumerate(rows):
+        assert 0 <= azimuth < 360 and yaw == 0 and fov == 25
+        a, e = np.deg2rad([azimuth, elevation])
+        eye = 1.75 * ratio * np.array([np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)])
+        mask = read_image(root / f"{k:02d}.png")[..., 3]
+        assert_same_mask(mask, silhouette(vertices * side, faces, opencv_camera(eye, 2.1875 * 137 / 2, 137), 137))
 
 
 def test_colours_are_unmixed_from_white_and_mixed_with_backgrounds():
@@ -223,56 +194,33 @@ def test_colours_are_unmixed_from_white_and_mixed_with_backgrounds():
     assert np.abs(rgba[..., :3].astype(int) - color)[alpha >= 128].max() <= 2
     background = rng.integers(0, 256, rgb.shape).astype(np.uint8)
     wanted = color * share + background * (1 - share)
-    assert np.abs(item.over(background) - wanted).max() <= 1.01
-    np.testing.assert_array_equal(item.over(np.full_like(rgb, 255)), rgb)
-
-
-def test_binvox_runs_are_at_most_255_long():
-    grid = np.zeros((32, 32, 32), dtype=bool)
-    grid[3, 4, 5] = True
-    content = binvox_bytes(grid, [0.0, 0.5, -0.25], 2.0)
-    head, _, runs = content.partition(b"data\n")
-    assert head == b"#binvox 1\ndim 32 32 32\ntranslate 0 0.5 -0.25\nscale 2\n"
-    position = 3 * 1024 + 5 * 32 + 4  # y runs fastest
-    assert runs[:28] == bytes([0, 255]) * 12 + bytes([0, position - 12 * 255, 1, 1])
-    assert sum(runs[1::2]) == 32**3 and set(runs[::2]) == {0, 1}
-    empty = binvox_bytes(np.zeros((32, 32, 32), dtype=bool), [0, 0, 0], 1).partition(b"data\n")[2]
-    assert empty == bytes([0, 255]) * (32**3 // 255) + bytes([0, 32**3 % 255])
+    assert np.abs(over(item, background) - wanted).max() <= 1.01
+    np.testing.assert_array_equal(over(item, np.full_like(rgb, 255)), rgb)
 
 
 def test_pascal3d(tmp_path, folder):
     report = make(tmp_path, folder, "pascal3d", views=3, test=None, val=1)
-    assert report.objects == {"train": 4, "val": 1}
+    assert report.counts == {"train": 4, "val": 1}
     files = {name: np.load(tmp_path / f"chair_{name}.npz", allow_pickle=True) for name in ("train", "imagenet", "val")}
     assert [len(files[name]["images_ref"]) for name in files] == [6, 6, 3]
-    val = files["val"]
-    assert val["images"].dtype == object and len({image.shape for image in val["images"]}) == 3
-    assert val["images_ref"].shape == (3, 224, 224, 4) and val["images_ref"].dtype == np.uint8
-    card = json.loads((tmp_path / f"{SYNSET}_card.json").read_text())
+    val, card = files["val"], json.loads((tmp_path / f"{SYNSET}_card.json").read_text())
     vertices, faces = true_mesh(folder, card["splits"]["val"][0].replace(" ", "_"))
     vertices = vertices * (2 / torch.linalg.vector_norm(vertices.amax(0) - vertices.amin(0)))
-    assert torch.linalg.vector_norm(vertices, dim=1).max() <= 1 + 1e-6  # inside under any rotation
-    wanted = PASCAL3D.voxelize(vertices.float(), faces)[0].numpy()
-    for k in range(3):
-        np.testing.assert_array_equal(val["voxels"][k], wanted)
-        rotation = val["rotation_matrices"][k].astype(np.float64)
+    for photo, reference, rotation, (left, top, width, height) in zip(
+        *(val[key] for key in ("images", "images_ref", "rotation_matrices", "bounding_boxes")), strict=True
+    ):
+        rotation = rotation.astype(np.float64)
         assert np.linalg.det(rotation) == pytest.approx(1) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
         x, y, z = torch.from_numpy(rotation) @ vertices.T
         seen = torch.stack([-x, y, z + 2], dim=1)  # x' points left in the image, and depth moves nothing
-        mask = val["images_ref"][k, ..., 3].astype(float)
+        mask = reference[..., 3].astype(float)
         assert_same_mask(mask, silhouette(seen, faces, None, 224))
         # the box of the photograph holds what the mask of the reference holds
-        left, top, width, height = val["bounding_boxes"][k]
-        photo = val["images"][k]
-        assert photo.dtype == np.uint8 and left >= 0 and left + width <= photo.shape[1]
-        assert top >= 0 and top + height <= photo.shape[0]
         rows, columns = (np.flatnonzero((mask > 127).any(axis=axis)) for axis in (1, 0))
-        box = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
-        parts = [Image.fromarray(val["images_ref"][k, ..., :3]).crop(box)]
-        parts.append(Image.fromarray(photo).crop((left, top, left + width, top + height)))
+        parts = [Image.fromarray(reference[..., :3]).crop((columns[0], rows[0], columns[-1] + 1, rows[-1] + 1))]
+        parts.append(Image.fromarray(photo[top : top + height, left : left + width]))
         small = [np.asarray(part.resize((24, 24), Image.Resampling.BOX)).astype(float) for part in parts]
-        assert np.abs(small[0] - small[1]).mean() < 10
-        assert photo[: max(1, top)].std() > 3  # a background, not paper
+        assert np.abs(small[0] - small[1]).mean() < 10 and photo[: max(1, top)].std() > 3  # a background, not paper
     x, y, z = vertices.T
     assert_oriented(val["voxels"][0], torch.stack([-x, -z, -y], dim=1), faces, span=2)
 
@@ -283,17 +231,15 @@ def test_photos(tmp_path, folder):
         rows = list(csv.DictReader(file))
     assert len(rows) == 10 and [row["split"] for row in rows].count("test") == 2
     assert len({row["fov_deg"] for row in rows}) == 10  # each by another lens
-    assert sorted(row["file"] for row in rows) == sorted(p.name for p in (tmp_path / "chair" / "images").iterdir())
-    for row in rows[:4]:
+    for row in rows[:3]:
         vertices, faces = true_mesh(folder, row["object"])
         azimuth, elevation, distance, fov = map(float, list(row.values())[1:5])
         a, e = np.deg2rad([azimuth, elevation])  # anti-clockwise from the front, seen from above: x is front, -z right
         eye = distance * np.array([np.cos(e) * np.cos(a), np.sin(e), -np.cos(e) * np.sin(a)])
-        camera = opencv_camera(eye, 128 / np.tan(np.deg2rad(fov / 2)), 256)
         mask = read_image(tmp_path / "chair" / "masks" / row["file"])
+        camera = opencv_camera(eye, 128 / np.tan(np.deg2rad(fov / 2)), 256)
         assert_same_mask(mask, silhouette(vertices, faces, camera, 256))
-        image = read_image(tmp_path / "chair" / "images" / row["file"])
-        assert image.shape == (256, 256, 3) and image[mask == 0].std() > 5
+        assert read_image(tmp_path / "chair" / "images" / row["file"])[mask == 0].std() > 5
 
 
 def test_ranges_and_decimals():
@@ -315,19 +261,9 @@ def test_ranges_and_decimals():
     assert 12 <= photos.half_fov_deg.min() and photos.half_fov_deg.max() <= 25
 
 
-def test_the_whole_object_is_seen():
-    vertices, faces = nmr.icosphere(3)
-    for poses in (views("kar", 0.8, 30, 1), views("photos", 0.8, 30, 1)):
-        alpha = nmr.render_silhouette(0.8 * vertices, faces, poses.cameras(), image_size=64)
-        assert not alpha[:, [0, -1]].any() and not alpha[:, :, [0, -1]].any()
-        assert (alpha.mean((1, 2)) > 0.3).all()  # and not from afar
-
-
 def test_pascal3d_rotations_are_upright_but_for_the_tilt():
     in_object_frame = views("pascal3d", 0.8, 500, 2).rotation.double().numpy()
     rotations = in_object_frame @ WRITERS["pascal3d"].turn
-    np.testing.assert_allclose(np.linalg.det(rotations), 1, rtol=1e-6)
-    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (500, 1, 1)), atol=1e-6)
     up = rotations[:, :, 1]  # the object's y in the picture: right, up, away
     tilt = np.rad2deg(np.arctan2(up[:, 0], up[:, 1]))
     assert np.abs(tilt).max() <= 15 and np.ptp(tilt) > 25

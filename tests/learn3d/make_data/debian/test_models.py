@@ -1,33 +1,69 @@
-"""The whole recipe on tiny packages: placement, class rules, duplicates, what is replaced, errors."""
+"""The whole recipe on tiny packages: placement, duplicates, packages that are missing or damaged."""
 
 from __future__ import annotations
 
 import csv
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from small_packages import AIRCRAFT, AIRPLANE, ac_object, ac_text, deb, fetch
+import trimesh
+from small_packages import AIRCRAFT, AIRPLANE, CHAIR, TABLE, ac_object, ac_text, box, catalogue, deb, entry, fetch
 
-from learn3d.make_data.debian.furniture import furniture_category
+from learn3d.make_data.debian import packages
+from learn3d.make_data.debian.mesh_text import triangulate
+from learn3d.make_data.debian.models import clean_mesh, surface_grid
 
 
-def test_recipe_writes_meshes_index_and_reasons(debs: Path, tmp_path: Path):
-    trimesh = pytest.importorskip("trimesh")
+@pytest.fixture
+def debs(tmp_path: Path) -> Path:
+    """A catalogue with a chair, its copy, a stretched copy, a table, a cup; an airplane, a light and a balloon."""
+    if shutil.which("dpkg-deb") is None:
+        pytest.skip("needs dpkg-deb")
+    entries = [
+        entry("Oak chair", "chair"),
+        entry("Red chair", "copy"),
+        entry("Tall chair", "tall", width="4", height="30", depth="4"),
+        entry("Table", "table", license="CC0"),
+        entry("Cup", "cup"),
+        entry("Broken table", "broken"),
+        entry("Lost table", "lost"),
+        entry("Odd sofa", "odd", model="/m/odd.dae"),
+    ]
+    models = {"m/chair.obj": CHAIR, "m/copy.obj": CHAIR, "m/tall.obj": CHAIR, "m/table.obj": TABLE}
+    models["m/broken.obj"] = "v 0 0 0\nf 1 2 3"
+    folder, sh3f = tmp_path / "debs", {"usr/Test.sh3f": catalogue(entries, models)}
+    deb(folder, "sweethome3d-furniture", sh3f | {"usr/share/doc/sweethome3d-furniture/copyright": b"Free-Art"})
+    deb(folder, "sweethome3d-furniture-nonfree", {})
+    disc = ac_object("thing", (-5.01, -1, -1), (-5, 1, 1))
+    aircraft = {
+        "Plane/plane-main.xml": "<author>B.\n Maker</author><path> Models/plane.ac</path>",
+        "Plane/Models/plane.ac": ac_text(*AIRPLANE, disc),
+        "Plane/Models/lights/RedLight.ac": ac_text(AIRPLANE[0]),
+        "balloon/Models/balloon1.ac": ac_text(AIRPLANE[0]),
+    }
+    deb(folder, "flightgear-data-ai", {f"{AIRCRAFT}/{path}": text.encode() for path, text in aircraft.items()})
+    return folder
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_recipe_writes_meshes_index_and_licences(debs: Path, tmp_path: Path) -> None:
     report = fetch(tmp_path / "out", debs)
     rows = list(csv.DictReader((tmp_path / "out/index.csv").open(encoding="utf-8")))
     assert [row["file"] for row in rows] == ["airplane/plane.ply", "chair/test-chair.ply", "table/test-table.ply"]
     assert [row["author"] for row in rows] == ["B. Maker", "A. Maker", "A. Maker"]
     assert [row["licence"] for row in rows] == ["GPL-2+", "Free Art License 1.3", "CC0"]
-    assert {row["version"] for row in rows} == {"1:2.0-1"}
-    assert rows[1]["source"] == "Test.sh3f!/m/chair.obj"
-    reasons = {drop["title"]: drop["reason"] for drop in report.dropped}
-    assert reasons["Red chair"] == "near-duplicate of chair/test-chair (surface IoU 1.000)"
-    assert reasons["Tall chair"].startswith("stretched near-duplicate of chair/test-chair")
-    assert "vertex" in reasons["Broken table"]
-    assert ".dae" in reasons["Odd sofa"]
-    assert report.ignored == 3  # the cup, the light and the balloon
-    assert "non-free" not in report.summary() and "sweethome3d-furniture-nonfree" in report.summary()
+    assert {row["version"] for row in rows} == {"1:2.0-1"} and rows[1]["source"] == "Test.sh3f!/m/chair.obj"
+    reasons = {source.rpartition("/")[2]: reason for source, reason in report.dropped.items()}
+    assert reasons.pop("copy.obj") == "near-duplicate of chair/test-chair (surface IoU 1.000)"
+    assert reasons.pop("tall.obj").startswith("stretched near-duplicate of chair/test-chair")
+    assert reasons.keys() == {"broken.obj", "lost.obj", "odd.dae"}
+    assert "chair        1 meshes\n" in report.summary() and "\n1 left out: near-duplicate" in report.summary()
     assert (tmp_path / "out/licences/sweethome3d-furniture.copyright").read_bytes() == b"Free-Art"
     for row in rows:
         mesh = trimesh.load(tmp_path / "out" / row["file"], process=False)
@@ -35,78 +71,70 @@ def test_recipe_writes_meshes_index_and_reasons(debs: Path, tmp_path: Path):
         assert mesh.extents.max() == pytest.approx(1, abs=1e-6)
         np.testing.assert_allclose(mesh.bounds.mean(axis=0), 0, atol=1e-6)
         assert mesh.is_watertight == (row["watertight"] == "True")
+    fetch(tmp_path / "again", debs)
+    assert contents(tmp_path / "again") == contents(tmp_path / "out")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["again", "debs", "out"]
 
 
-def test_airplane_faces_front_without_its_disc(debs: Path, tmp_path: Path):
-    trimesh = pytest.importorskip("trimesh")
-    fetch(tmp_path / "out", debs, category="airplane")
+def test_airplane_faces_front_without_its_disc(debs: Path, tmp_path: Path) -> None:
+    fetch(tmp_path / "out", debs)
     mesh = trimesh.load(tmp_path / "out/airplane/plane.ply", process=False)
-    fin = mesh.vertices[mesh.vertices[:, 1].argmax()]
-    tip = mesh.vertices[mesh.vertices[:, 1].argmin()]
-    assert fin[2] < -0.3  # the fin is at the tail, so the nose points towards +z
-    assert tip[0] > 0.3  # the left wing is at +x
-    np.testing.assert_allclose(
-        mesh.extents, [0.8, 0.4, 1.0], atol=1e-6
-    )  # 0.801 in z with the disc in front of the nose
+    assert mesh.vertices[mesh.vertices[:, 1].argmax(), 2] < -0.3  # the fin is at the tail: the nose is towards +z
+    assert mesh.vertices[mesh.vertices[:, 1].argmin(), 0] > 0.3  # the left wing is at +x
+    np.testing.assert_allclose(mesh.extents, [0.8, 0.4, 1.0], atol=1e-6)  # with the disc 0.801 in z
 
 
-def test_two_runs_give_the_same_bytes(debs: Path, tmp_path: Path):
-    for name in ("a", "b"):
-        fetch(tmp_path / name, debs)
-    files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
-    assert files == sorted(path.relative_to(tmp_path / "b") for path in (tmp_path / "b").rglob("*") if path.is_file())
-    assert all((tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes() for file in files)
+def test_requests_that_are_refused_leave_nothing_behind(debs: Path, tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    with pytest.raises(ValueError, match="is there already"):
+        fetch(tmp_path / "there", debs)
+    file = next(debs.glob("flightgear*"))
+    for content in (b"", b"!<arch>\n", file.read_bytes()[:-200]):
+        file.write_bytes(content)
+        with pytest.raises(ValueError, match="cannot be read as a Debian package"):
+            fetch(tmp_path / "out", debs)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["debs", "there"]
 
 
-def test_duplicates_are_kept_when_asked_for(debs: Path, tmp_path: Path):
-    report = fetch(tmp_path / "out", debs, category="chair", duplicate_iou=1, stretched_iou=1)
-    assert [model["file"] for model in report.models] == [
-        "chair/test-chair-2.ply",
-        "chair/test-chair.ply",
-        "chair/test-copy.ply",
-    ]
+def test_packages_are_downloaded_if_they_are_not_there(
+    debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = subprocess.run
+
+    def run(command: list, **options: object) -> subprocess.CompletedProcess:
+        if command[0] != "apt-get":
+            return real(command, **options)
+        if command[-1] in missing:
+            return subprocess.CompletedProcess(command, 100, "", "E: Unable to locate package p\n")
+        shutil.copy(next(debs.glob(f"{command[-1]}_*")), options["cwd"])
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(packages.subprocess, "run", run)
+    missing = {"sweethome3d-furniture-nonfree"}
+    report = fetch(tmp_path / "out", None)
+    assert [model["title"] for model in report.models] == ["Plane plane", "Oak chair", "Table"]
+    assert "Unable to locate package p" in report.summary() and "the component non-free" in report.summary()
+    missing.add("flightgear-data-ai")
+    with pytest.raises(ValueError, match="--packages-dir"):
+        fetch(tmp_path / "other", None)
 
 
-def test_output_is_replaced_only_when_asked_and_ours(debs: Path, tmp_path: Path):
-    out = tmp_path / "out"
-    fetch(out, debs, category="chair")
-    with pytest.raises(ValueError, match="--overwrite"):
-        fetch(out, debs)
-    fetch(out, debs, category="table", overwrite=True)
-    assert sorted(path.name for path in out.iterdir()) == ["dropped.csv", "index.csv", "licences", "table"]
-    (tmp_path / "precious").mkdir()
-    (tmp_path / "precious" / "index.csv").write_text("id,name\n")
-    with pytest.raises(ValueError, match="not written by this tool"):
-        fetch(tmp_path / "precious", debs, overwrite=True)
+def test_clean_mesh_welds_and_drops() -> None:
+    corners, quads = box((0, 0, 0), (2, 1, 1))
+    vertices = np.concatenate([corners[triangulate(quads, corners)].reshape(-1, 3), [[99, 99, 99]]])
+    mesh = clean_mesh(vertices, np.concatenate([np.arange(36).reshape(-1, 3), [[0, 0, 1]], [[2, 1, 0]]]))
+    assert (mesh.vertices.shape, mesh.faces.shape, mesh.is_watertight) == ((8, 3), (12, 3), True)
+    np.testing.assert_allclose(mesh.bounds, [[-0.5, -0.25, -0.25], [0.5, 0.25, 0.25]], atol=1e-12)
+    for corner, message in (((2, 0, 0), "no face has an area"), ((0, 1, 0), "flat")):
+        with pytest.raises(ValueError, match=message):
+            clean_mesh(np.array([[0, 0, 0], [1, 0, 0], corner], float), np.array([[0, 1, 2]]))
 
 
-def test_a_failure_leaves_nothing_behind(debs: Path, tmp_path: Path):
-    deb(debs, "sweethome3d-furniture", {"usr/share/x.sh3f": b"no zip"})  # same name and version: replaces the good one
-    with pytest.raises(ValueError, match=r"x\.sh3f is refused as a zip archive"):
-        fetch(tmp_path / "out", debs)
-    assert [path.name for path in tmp_path.iterdir()] == ["debs"]
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ({"category": "chair,car"}, "category .*car"),
-        ({"category": " "}, "category must be some of"),
-        ({"duplicate_iou": 0}, "duplicate_iou must be .*0"),
-    ],
-)
-def test_bad_config(debs: Path, tmp_path: Path, more: dict, message: str):
-    with pytest.raises(ValueError, match=message):
-        fetch(tmp_path / "out", debs, **more)
-
-
-def test_long_names_and_gaps_take_no_square_of_their_length(debs: Path, tmp_path: Path):
-    """The square of a million takes hours."""
-    assert furniture_category("chair") == "chair" and furniture_category("chair " + "knife " * 10**6) is None
-    name = "prop" * 10**6
-    text = ac_text(ac_object(name, (-5, 0, -0.5), (5, 1, 0.5)), *AIRPLANE)
-    about = f"<author>B. Maker</author><path>{' ' * 10**6}x</path><path> Models/plane.ac\n</path>"
-    files = {f"./{AIRCRAFT}/Plane/Models/plane.ac": text.encode(), f"./{AIRCRAFT}/Plane/plane.xml": about.encode()}
-    deb(debs, "flightgear-data-ai", files)
-    report = fetch(tmp_path / "out", debs, category="airplane")
-    assert [(model["title"], model["author"]) for model in report.models] == [("Plane plane", "B. Maker")]
+def test_surface_grid_of_a_box() -> None:
+    corners, quads = box((0, 0, 0), (2, 1.2, 0.8))
+    faces = triangulate(quads, corners)
+    shell = np.ones((8, 8, 8), bool)
+    shell[1:-1, 1:-1, 1:-1] = False
+    np.testing.assert_array_equal(surface_grid(corners, faces, 8, per_axis=True), shell)
+    flat = surface_grid(corners, faces, 8)
+    assert [int(flat.any(axis=axes).sum()) for axes in ((1, 2), (0, 2), (0, 1))] == [8, 6, 4]

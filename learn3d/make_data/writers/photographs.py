@@ -1,0 +1,148 @@
+"""Writes renderings on backgrounds like photographs: Pascal3D+ as packed by Kato and Harada 2019, and photo folders."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+import nmr
+from learn3d.data.poses import LookAtPoses, RotationPoses
+from learn3d.data.readers.pascal3d import PASCAL3D, class_name
+from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer, distances, uniform, write_png
+
+FILES = ("train", "imagenet", "val")  # images to train on go to the first two in turn
+HEIGHTS, WIDTHS = (160, 300), (200, 400)  # of the photographs, in pixels
+SHARES = (0.5, 0.9)  # of the photograph's shorter side that the cube takes
+
+
+class Pascal3dWriter(Writer):
+    """`{class}_{train,imagenet,val}.npz`, with renderings on out-of-focus backgrounds as photographs.
+
+    All rotations are proper (determinant 1), so the object frame is right-handed. It has x to the front, y up and z to
+    the left as seen from the front, so that objects are symmetric about z = 0, as the symmetric generator wants it.
+    Half the diagonal of an object's bounding box is 1: then no rotation takes it out of [-1, 1].
+    """
+
+    image_size = 224
+    default_views = 8
+    default_test = 0.0
+    default_val = 0.2
+    convention = PASCAL3D
+    turn = WORLD_FROM_OBJECT
+    diagonal = 2.0
+
+    def __init__(self, folder: Path, category: str) -> None:
+        super().__init__(folder, category)
+        self._rows: list[dict] = []
+        self._val_rows: list[dict] = []
+
+    @staticmethod
+    def paths(category: str) -> tuple[str, ...]:
+        return tuple(f"{class_name(category)}_{name}.npz" for name in FILES)
+
+    def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> RotationPoses:
+        """Any azimuth, elevations in -10 .. 40, tilted by up to 15 degrees, as photographers hold a camera."""
+        ranges = ((-180.0, 180.0), (-10.0, 40.0), (-15.0, 15.0))
+        azimuth_deg, elevation_deg, tilt_deg = (uniform(rng, limits, count) for limits in ranges)
+        look = nmr.LookAt.from_angles(1.0, torch.from_numpy(elevation_deg), torch.from_numpy(azimuth_deg))
+        upright = look.projection(torch.float64).matrix[:, :, :3].numpy() * np.array([[1.0], [-1.0], [1.0]])
+        cos, sin = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
+        roll = np.tile(np.eye(3), (count, 1, 1))
+        roll[:, 0, 0], roll[:, 0, 1], roll[:, 1, 0], roll[:, 1, 1] = cos, -sin, sin, cos
+        return RotationPoses(roll @ upright @ self.turn.T)  # rows: the right, up and away of the image
+
+    def write(self, item: RenderedObject) -> None:
+        for rgba, rotation in zip(item.rgba(), item.poses.rotation.numpy(), strict=True):
+            row = _photograph(rgba, item.rng)
+            row |= {"rotation_matrices": rotation * np.float32([[-1], [1], [1]]), "voxels": item.voxels}
+            (self._val_rows if item.split == "val" else self._rows).append(row)
+
+    def finish(self, output: Path, objects: dict[str, list[str]]) -> None:
+        if len(self._rows) < 2:
+            raise ValueError("the layout pascal3d needs at least two pictures to train on: more meshes, or more views")
+        for path, rows in zip(
+            self.paths(self.category), (self._rows[::2], self._rows[1::2], self._val_rows), strict=True
+        ):
+            if rows:
+                images = np.empty(len(rows), dtype=object)
+                images[:] = [row.pop("images") for row in rows]
+                stacked = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+                np.savez_compressed(self.folder / path, images=images, **stacked)
+
+
+def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Put a rendering [224, 224, 4] somewhere on a photograph: its entries of images, images_ref, bounding_boxes."""
+    height, width = int(rng.integers(*HEIGHTS)), int(rng.integers(*WIDTHS))
+    side = int(rng.uniform(*SHARES) * min(height, width))
+    small = Image.fromarray(rgba).resize((side, side), Image.Resampling.BICUBIC)
+    rows, columns = (np.flatnonzero((np.asarray(small)[..., 3] > 127).any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        rows = columns = np.array([0, side - 1])  # too thin for the small image
+    size = np.array([columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1])
+    corner = rng.integers(0, np.array([width, height]) - size + 1)  # the whole object is in the photograph
+    left, top = corner[0] - columns[0], corner[1] - rows[0]
+    photo = Image.fromarray(photo_background(height, width, rng))
+    photo.paste(small, (int(left), int(top)), small)
+    cut = photo.crop((left, top, left + side, top + side)).resize(rgba.shape[:2], Image.Resampling.BICUBIC)
+    reference = np.concatenate([np.asarray(cut), rgba[..., 3:]], axis=-1)
+    box = np.array([*corner, *size], dtype=np.int64)
+    return {"images": np.asarray(photo), "images_ref": reference, "bounding_boxes": box}
+
+
+class PhotosWriter(Writer):
+    """Objects on out-of-focus backgrounds, RGB 256 x 256, with anti-aliased masks and `poses.csv`. No voxels."""
+
+    image_size = 256
+    default_views = 12
+
+    def __init__(self, folder: Path, category: str) -> None:
+        super().__init__(folder, category)
+        self._rows = [("file", "azimuth_deg", "elevation_deg", "distance", "fov_deg", "object", "split")]
+
+    @staticmethod
+    def paths(category: str) -> tuple[str, ...]:
+        return (category,)
+
+    def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
+        """Any azimuth, elevations in -10 .. 50, another lens for each image; the whole object is seen."""
+        azimuth_deg, elevation_deg = uniform(rng, (-180.0, 180.0), count), uniform(rng, (-10.0, 50.0), count)
+        half_fov_deg = uniform(rng, (12.0, 25.0), count)  # lenses of 84 .. 38 mm on a square of 36 mm
+        return LookAtPoses(azimuth_deg, elevation_deg, distances(rng, vertices, half_fov_deg), half_fov_deg)
+
+    def write(self, item: RenderedObject) -> None:
+        poses, folder = item.poses, self.folder / self.category
+        behind = np.stack([photo_background(self.image_size, self.image_size, item.rng) for _ in item.rgb])
+        images = over(item, behind)
+        numbers = np.stack([poses.azimuth_deg, poses.elevation_deg, poses.distance, 2 * poses.half_fov_deg], axis=1)
+        for k, (image, mask, row) in enumerate(zip(images, item.alpha, numbers, strict=True)):
+            file = f"{item.name}_{k:02d}.png"
+            write_png(folder / "images" / file, image)
+            write_png(folder / "masks" / file, mask)
+            self._rows.append((file, *(f"{value:.4f}" for value in row), item.name, item.split))
+
+    def finish(self, output: Path, objects: dict[str, list[str]]) -> None:
+        with open(self.folder / self.category / "poses.csv", "w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(self._rows)
+
+
+def over(item: RenderedObject, backgrounds: np.ndarray) -> np.ndarray:
+    """Composite the images of an object over backgrounds instead of white; all are uint8 [n, S, S, 3]."""
+    clear = 1 - item.alpha[..., None] / np.float32(255)
+    return np.rint(item.rgb + (backgrounds.astype(np.float32) - 255) * clear).clip(0, 255).astype(np.uint8)
+
+
+def photo_background(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw an out-of-focus background: colours that change slowly, blotches and noise. uint8 [H, W, 3]."""
+
+    def enlarge(small: np.ndarray) -> np.ndarray:
+        channels = [Image.fromarray(channel.astype(np.float32)) for channel in np.moveaxis(small, 2, 0)]
+        return np.stack([c.resize((width, height), Image.Resampling.BILINEAR) for c in channels], axis=-1)
+
+    corners = rng.uniform(40, 230, (2, 2, 3))
+    blotches = rng.normal(0, 25, (8, 8, 1))
+    grain = rng.normal(0, 4, (height, width, 1))
+    return (enlarge(corners) + enlarge(blotches) + grain).clip(0, 255).astype(np.uint8)
