@@ -1,4 +1,4 @@
-"""Methods, one file each with its own training step; `create_method` builds the one that settings belong to."""
+"""Methods, one file each with its own training step; `create_method` builds the method of given settings."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def create_method(
 ) -> Method:
     """The method of `settings`, with PyTorch's default initialisation of its networks from `seed`.
 
-    Raises ValueError where the device is absent, and where the method does not go with the data.
+    Raises ValueError if the device is absent, or if the method needs poses and the data set has none.
     """
     check_device(device)
     if type(settings) not in _METHODS:
@@ -61,6 +61,6 @@ def create_method(
             "a data set with poses, or a method that estimates them"
         )
     if device == "cuda":
-        torch.backends.cudnn.allow_tf32 = False  # torch's default for convolutions; fp32 is to mean fp32
+        torch.backends.cudnn.allow_tf32 = False  # fp32 is to mean fp32, in convolutions too
     torch.manual_seed(seed)
     return kind(settings, info, device, precision, schedule)

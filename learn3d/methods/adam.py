@@ -12,10 +12,10 @@ CHUNK = 1 << 20  # weights that are updated at once
 
 
 class SparseGradientAdam(torch.optim.Adam):
-    """Adam that leaves alone, moments included, every single weight whose gradient is exactly zero in this step.
+    """Adam without an update, of the moments too, for every single weight whose gradient is exactly zero in this step.
 
-    The published code trains with it. It is not the same as Adam: the weights of a ReLU that is off for a whole batch
-    have zero gradients in that step, and Adam would carry them on by their momentum and forget their second moment.
+    The published code trains with it. The weights of a ReLU that is off for a whole batch have zero gradients in that
+    step. Adam would carry them on by their momentum and forget their second moment.
     As in Chainer, epsilon is added before the bias correction of the second moment: lr' m / (sqrt(v) + eps), with
     lr' = lr sqrt(1 - beta_2^t) / (1 - beta_1^t), and all weights share the count t. The state is that of torch's Adam.
     """
@@ -38,7 +38,7 @@ class SparseGradientAdam(torch.optim.Adam):
         return loss
 
     def _update(self, parameter: Tensor, state: dict[str, Tensor], group: dict) -> None:
-        """In pieces, and in two pieces of memory: allocating more takes five times as long as computing."""
+        """Update in chunks that share two buffers: allocating more takes five times as long as computing."""
         (beta1, beta2), count = group["betas"], float(state["step"])
         rate = group["lr"] * math.sqrt(1 - beta2**count) / (1 - beta1**count)
         row = parameter[0].numel()

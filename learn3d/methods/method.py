@@ -1,4 +1,4 @@
-"""What the training loop, evaluation and figures expect of a method: networks, a training step, a way to shapes."""
+"""Base classes of the methods: networks, a training step, and the way from images to shapes."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from learn3d.networks import GENERATORS, MeshGenerator, Symmetry, SymmetryOption
 
 
 def plane_of(symmetry: SymmetryOption, info: DatasetInfo) -> Symmetry | None:
-    """The mirror plane of the shapes: the one that the settings name, or with "auto" the one that the data have."""
+    """The mirror plane of the shapes: that of the settings, or with "auto" that of the data."""
     return info.mirror_plane_deg if symmetry == "auto" else symmetry
 
 
 class Method(abc.ABC):
     """One method in training or in use. A subclass creates networks and optimizers and has its own training step.
 
-    Everything that decides the next steps lies in the parameters and buffers of `networks`, in `optimizers`, in
-    `ema` and in torch's global random state, so that a checkpoint of these resumes bit for bit.
+    The next steps depend only on the parameters and buffers of `networks`, on `optimizers`, `ema` and torch's global
+    random state. So a checkpoint of these resumes bit for bit.
     """
 
-    needs_poses: ClassVar[bool] = True  # whether it can be trained only where the pose of every image is known
+    needs_poses: ClassVar[bool] = True  # whether every training image must have a known pose
     networks: dict[str, nn.Module]  # each is also an attribute: networks["encoder"] is self.encoder
     optimizers: dict[str, torch.optim.Optimizer]
-    ema: EMA | None = None  # of the weights, where the run asks for it
-    group: ProcessGroup = SINGLE_PROCESS  # the processes that train it together; set by `distribute`
+    ema: EMA | None = None  # moving average of the weights, if the run asks for it
+    group: ProcessGroup = SINGLE_PROCESS  # processes that train it together; set by `distribute`
     image_size: int  # side of the images that `encode` takes; also a property of the method's settings
 
     def __init__(
@@ -63,7 +63,7 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def create_networks(self) -> dict[str, nn.Module]:
-        """The networks by name, of `settings` and `info`. Raises ValueError where these contradict each other."""
+        """The networks by name, for `settings` and `info`. Raises ValueError if these contradict each other."""
 
     @abc.abstractmethod
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
@@ -71,11 +71,11 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """The method's own part of `take_step`: losses, and `backward_and_step` for the optimizers that are to step."""
+        """The method's own part of `take_step`: compute losses, then call `backward_and_step`; returns its values."""
 
     @abc.abstractmethod
     def encode(self, images: Tensor) -> Tensor:
-        """Shape codes float32 [B, C] on the method's device, of stored images uint8 [B, 4, S, S]."""
+        """Shape codes float32 [B, C] of stored images uint8 [B, 4, S, S], on the method's device."""
 
     @abc.abstractmethod
     def decode(self, codes: Tensor) -> Meshes | Grids:
@@ -87,29 +87,28 @@ class Method(abc.ABC):
         return {}
 
     def weights_at(self, step: int) -> Mapping[str, float]:
-        """`weights` in training step `step` (from 1), where they change during a run."""
+        """`weights` in training step `step` (from 1); they may change during a run."""
         return self.weights
 
     def start_from_pretrained(self) -> None:  # noqa: B027
-        """Copy the weights of the file that the settings name, where they name one, into the encoder.
+        """Copy the pretrained weights, if the settings name a file, into the encoder; called when a run begins.
 
-        For the beginning of a run: afterwards they are in its checkpoints, and the file may be gone. Raises as
-        `learn3d.networks.resnet.load_pretrained`.
+        Raises as `learn3d.networks.resnet.load_pretrained`.
         """
 
     def check_batch(self, batch: Batch) -> None:  # noqa: B027
-        """Raise ValueError where the method cannot learn from batches like this one. Called before a run begins."""
+        """Raise ValueError if the method cannot learn from batches like this one. Called before a run begins."""
 
     def take_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Take optimisation step `step` (from 1) and return every loss that was computed, unweighted, and "total".
+        """Take optimisation step `step` (from 1); return all computed losses, unweighted, and "total".
 
-        Raises FloatingPointError when a loss is not finite, before it reaches a weight.
+        Raises FloatingPointError if a loss is not finite, before it reaches a weight.
         """
         factor = self.schedule.lr_factor(step)
         for name, optimizer in self.optimizers.items():
             for group, learning_rate in zip(optimizer.param_groups, self._learning_rates[name], strict=True):
                 group["lr"] = factor * learning_rate
-        self._clear_gradients()  # here, too, so that the forward pass has their memory
+        self._clear_gradients()  # frees their memory for the forward pass
         values = self.training_step(batch, step)
         if self.ema is not None:
             self.ema.update(step)
@@ -128,7 +127,7 @@ class Method(abc.ABC):
             optimizer.zero_grad(set_to_none=True)
 
     def distribute(self, group: ProcessGroup) -> None:
-        """Train in several processes: gradients are summed over them, batch norms see the rows of all."""
+        """Train in several processes: gradients are summed over the processes, batch norms see the rows of all."""
         self.group = group
         if group.world_size == 1:
             return
@@ -138,7 +137,7 @@ class Method(abc.ABC):
             optimizer.register_step_pre_hook(all_reduce_gradients)
 
     def ema_weights(self) -> contextlib.AbstractContextManager[None]:
-        """Within it the networks have their averaged weights, where there are any: for evaluation and pictures."""
+        """Context in which the networks have their averaged weights, if the run keeps an average."""
         return contextlib.nullcontext() if self.ema is None else self.ema.in_place()
 
     def autocast(self) -> torch.autocast:
@@ -151,7 +150,7 @@ class Method(abc.ABC):
         return any(network.training for network in self.networks.values())
 
     def set_training(self, training: bool) -> None:
-        """Batch norms and the like in training or in evaluation mode."""
+        """Put the networks into training or evaluation mode."""
         for network in self.networks.values():
             network.train(training)
 
@@ -159,8 +158,7 @@ class Method(abc.ABC):
 class MeshMethod(Method):
     """A method with an encoder of images and a generator of meshes, which learns from rendered silhouettes.
 
-    Networks and optimizers are those of its settings `encoder`, `generator`, `symmetry` and `learning_rate`, where a
-    subclass has no others.
+    By default the settings `encoder`, `generator`, `symmetry` and `learning_rate` decide networks and optimizers.
     """
 
     settings: MeshSettings
@@ -199,7 +197,7 @@ class MeshMethod(Method):
         return nmr.render_silhouette(vertices, self.faces, poses.cameras(), image_size=MASK_SIZE)
 
     def surface_losses(self, vertices: Tensor) -> dict[str, Tensor]:
-        """The losses on the surface alone, smoothness, volume and inflation, where they have a weight."""
+        """Those of the losses smoothness, volume and inflation that have a weight above 0."""
         losses = {}
         if self.weights.get("smoothness", 0.0) > 0:
             losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.edges)

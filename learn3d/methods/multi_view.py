@@ -13,7 +13,7 @@ from learn3d.methods.settings import MeshSettings
 from learn3d.networks import EncoderName, GeneratorName
 from learn3d.settings import Weight, checked
 
-CENTROID_LEARNING_RATE = 0.1  # of the centroid's layer, relative to all others
+CENTROID_LEARNING_RATE = 0.1  # learning rate of the centroid's layer, relative to all others
 
 
 @checked
@@ -52,7 +52,7 @@ class MultiView(MeshMethod):
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shapes of both views, {a, b}, in both views: the mean of four IoU losses, and lambda_s times the
-        mean smoothness of the shapes. Raises ValueError where the batch is not made of pairs.
+        mean smoothness of the shapes. Raises ValueError if the batch is not made of pairs.
         """
         pairs = check_pairs(batch)
         _, vertices = self.predict(batch.images)
@@ -66,7 +66,7 @@ class MultiView(MeshMethod):
 
 
 def check_pairs(batch: Batch) -> int:
-    """The number n of pairs in a batch [a_1 .. a_n, b_1 .. b_n], or a ValueError where it is made of something else."""
+    """The number n of pairs in a batch [a_1 .. a_n, b_1 .. b_n]. Raises ValueError for any other batch."""
     half = len(batch) // 2
     if len(batch) % 2 or not torch.equal(batch.object_ids[:half], batch.object_ids[half:]):
         raise ValueError(

@@ -1,7 +1,4 @@
-"""How weights follow from losses: gradients, optimizers, learning rates over a run, averages of the weights.
-
-A method creates its optimizers; all the rest is the same for every method and stands here.
-"""
+"""From losses to weights, the same for every method: gradients, learning rates over a run, averages of the weights."""
 
 from __future__ import annotations
 
@@ -22,12 +19,12 @@ LRSchedule = Literal["constant", "cosine", "linear", "step"]
 
 @dataclass(frozen=True)
 class TrainingSchedule:
-    """What a method must know about the run that it is trained in."""
+    """Length, learning-rate schedule and averaging of a run."""
 
-    iterations: int = 1  # steps of the whole run
-    lr_schedule: LRSchedule = "constant"  # how the learning rate changes after the warm-up
-    warmup_steps: int = 0  # steps in which it grows from nothing to its full size
-    ema_decay: float = 0.0  # of the exponential moving average of the weights a step; 0: no average
+    iterations: int = 1  # number of steps in the run
+    lr_schedule: LRSchedule = "constant"  # course of the learning rate after the warm-up
+    warmup_steps: int = 0  # steps over which the learning rate ramps up from 0
+    ema_decay: float = 0.0  # decay per step of the exponential moving average of the weights; 0: no average
 
     def __post_init__(self) -> None:
         if 0 < self.iterations <= self.warmup_steps:
@@ -55,8 +52,8 @@ CONSTANT_LR = TrainingSchedule()  # full learning rates, no average
 class EMA:
     """An exponential moving average of all weights of some networks (EMA), and of their batch norms' statistics.
 
-    After step t: average = d * average + (1 - d) * weights, where d is the `decay`, but at most (1 + t) / (10 + t), so
-    that the initial weights are soon forgotten.
+    After step t: average = d * average + (1 - d) * weights. d is the `decay`, but at most (1 + t) / (10 + t), so that
+    the initial weights are soon forgotten.
     """
 
     def __init__(self, networks: Mapping[str, nn.Module], decay: float) -> None:
@@ -66,7 +63,7 @@ class EMA:
 
     @torch.no_grad()
     def update(self, step: int) -> None:
-        """Take in the weights that step `step` (from 1) arrived at."""
+        """Take in the weights after step `step` (from 1)."""
         new = 1 - min(self.decay, (1 + step) / (10 + step))
         for name, average in self.tensors.items():
             if average.is_floating_point():
@@ -76,7 +73,7 @@ class EMA:
 
     @contextlib.contextmanager
     def in_place(self) -> Iterator[None]:
-        """Within, the networks have the averaged weights. Nothing may be trained meanwhile."""
+        """Context in which the networks have the averaged weights. Nothing may be trained in it."""
         self._swap()
         try:
             yield
@@ -101,7 +98,7 @@ DROP_EVERY = 20  # steps
 
 @torch.no_grad()
 def _drop_vanished(optimizer: torch.optim.Optimizer, *_: object) -> None:
-    """Every 20 steps, set moments to 0 that are far too small to change a weight.
+    """Every 20 steps, set moments that are far too small to change a weight to 0.
 
     The gradient of a unit that is never active is 0, so its moments decay, become denormal and stay so. Some CPUs
     are many times slower with denormal numbers: Adam took 111 ms a step of Plus instead of 15.
@@ -122,12 +119,11 @@ def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
 def backpropagate(
     losses: Mapping[str, Tensor], weights: Mapping[str, float], step: int, group: ProcessGroup = SINGLE_PROCESS
 ) -> dict[str, float]:
-    """Backpropagate the sum of the losses, each times its weight; return them, and "total".
+    """Backpropagate the sum of the losses, each times its weight; return the losses and "total".
 
-    Losses are those of this process's rows; what is returned is of the whole batch, and so is the sum of the gradients
-    over the processes. Losses may lie on the CPU and on the networks' device; there is one sum for each of the two.
-    Raises ValueError for a loss without a weight, and FloatingPointError, with no gradient computed yet, when a loss is
-    not finite.
+    Losses are means over this process's rows; returned values and the summed gradients are those of the whole batch.
+    Losses may lie on the CPU and on the networks' device; there is one sum for each of the two.
+    Raises ValueError if a loss has no weight. Raises FloatingPointError, before any gradient, if a loss is not finite.
     """
     if missing := [name for name in losses if name not in weights]:
         raise ValueError(f"the method's weights lack {', '.join(missing)}; they have {', '.join(weights) or 'none'}")

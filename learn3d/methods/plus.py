@@ -1,4 +1,4 @@
-"""Plus: the pose-invariant method, with mirror symmetry and with what masks of other objects say about novel views.
+"""Plus: the pose-invariant method with mirror symmetry and a loss at novel views, from masks of other objects.
 
 The supervision is that of Peng et al. 2020: images taken singly, each with its mask and its pose.
 """
@@ -9,10 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE
-from learn3d.device import Download
 from learn3d.losses import silhouette_energy_distance
 from learn3d.methods.optimization import adam
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
@@ -66,7 +64,7 @@ class MaskBank(nn.Module):
 
     @property
     def full(self) -> bool:
-        """Whether it has as many masks as it can hold."""
+        """Whether the bank holds as many masks as it can."""
         return bool(self.view_ids[0] >= 0)
 
     def add(self, masks: Tensor, view_ids: Tensor) -> None:
@@ -103,38 +101,31 @@ class Plus(PoseInvariant):
         return super().weights | {"novel_view": self.settings.lambda_novel_view}
 
     def encode(self, images: Tensor) -> Tensor:
-        """Shape codes; where shapes are symmetric, the mean of the codes of an image and of its mirror image."""
+        """Shape codes; if shapes are symmetric, the mean of the codes of an image and of its mirror image."""
         codes = super().encode(images)
         return codes if self.generator.mirror is None else (codes + super().encode(images.flip(3))) / 2
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """A step of `PoseInvariant`, in which every second image is flipped where shapes are symmetric, and with
-        lambda_novel_view times the loss at a novel view, once the mask bank is full.
+        """A step of `PoseInvariant` with lambda_novel_view times the loss at a novel view, once the mask bank is full.
 
-        The flipped image of a symmetric object has the same shape, so its mask and its pose stay as they are. To the
-        discriminator it is of another view, K + k for view k.
+        If shapes are symmetric, every second image is flipped. The flipped image of a symmetric object has the same
+        shape, so its mask and its pose stay as they are. To the discriminator it is of another view, K + k for view k.
         """
         flipped = self._flipped(batch)
         images = torch.where(flipped[:, None, None, None], batch.images.flip(3), batch.images)
-        codes, vertices = self.predict(images)
-        download = Download(vertices)  # a GPU computes the losses on codes while the CPU waits and renders
-        on_codes = self._losses_on_codes(codes, batch.view_ids + self.info.num_views * flipped, step)
-        vertices = download.wait()
-        silhouettes = self.render(vertices, batch.poses)
-        losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks)}
-        if self.settings.lambda_novel_view > 0:
-            losses |= self._novel_view_loss(vertices, batch)
-        losses |= self.surface_losses(vertices) | on_codes
-        trained = ["encoder", "generator"] + ["discriminator"] * ("classification" in losses)
-        return self.backward_and_step(losses, step, *trained)
+        return self._train(images, batch.view_ids + self.info.num_views * flipped, batch, step)
 
     def _flipped(self, batch: Batch) -> Tensor:
-        """Which images are flipped, bool [B]: none where shapes are free. (Batches are in random order already.)"""
+        # Batches are in random order already.
         return (batch.step_views.rows % 2 == 1) & (self.generator.mirror is not None)
 
+    def _silhouette_losses(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
+        losses = super()._silhouette_losses(vertices, batch)
+        return losses | self._novel_view_loss(vertices, batch) if self.settings.lambda_novel_view > 0 else losses
+
     def _novel_view_loss(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """All shapes of the batch are seen from one of its cameras. Their silhouettes are to be distributed as the
-        masks of this view in the mask bank, mostly of other objects: the energy distance of the two sets.
+        """All shapes of the batch are rendered at one of its cameras. The loss is the energy distance between these
+        silhouettes and the masks of this view in the mask bank, mostly of other objects.
         """
         views = batch.step_views
         masks = self.group.all_gather_rows(_reduced(batch.masks), views.rows, len(views))

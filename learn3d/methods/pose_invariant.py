@@ -19,7 +19,7 @@ from learn3d.networks import PoseDiscriminator
 from learn3d.networks.resnet import check_pretrained, load_pretrained
 from learn3d.settings import FilePath, Positive, Weight, checked
 
-INSIDE = 0.499  # of a box's side: a face exactly on the border of the grid is outside to the voxelizer kato18
+INSIDE = 0.499  # share of the cube's side: to the voxelizer kato18 a face exactly on the border is outside
 
 
 @checked
@@ -27,8 +27,8 @@ class PoseInvariantSettings(MeshSettings):
     """Networks, weights and forms of the terms of L_tot; a weight of 0 means that the term is not computed."""
 
     clamp_to_cube: bool = False
-    """Clamp vertices to the cube in which all objects of the data set lie, if it has one, in evaluation and
-    reconstruction. The voxelizers take a shape that exceeds their grid for hollow."""
+    """Clamp vertices to the cube of the data set, if it has one, in evaluation and reconstruction. The voxelizers take
+    a shape that exceeds their grid for hollow."""
     pretrained: FilePath | None = None
     """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's (default: random
     weights). The encoder gets natural colours, R, G, B, normalised as ImageNet's, however the data set stores them."""
@@ -63,7 +63,7 @@ class PoseInvariantSettings(MeshSettings):
 
     @property
     def uses_discriminator(self) -> bool:
-        """Whether the pose discriminator takes part at all (for Vanilla-AE it is not even created)."""
+        """Whether there is a pose discriminator; Vanilla-AE has none."""
         return self.lambda_classification > 0 or self.lambda_adversarial > 0
 
 
@@ -111,18 +111,22 @@ class PoseInvariant(MeshMethod):
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """In every step encoder and generator descend projection + lambda_1 smoothness + lambda_4 prior. Odd steps add
         lambda_2 classification on detached codes, which trains the discriminator and nothing else. Even steps add
-        lambda_3 confusion, which reaches the encoder through the discriminator, while the discriminator itself gets
+        lambda_3 confusion, which reaches the encoder through the discriminator. The discriminator itself then gets
         neither gradient nor step.
         """
-        codes, vertices = self.predict(batch.images)
+        return self._train(batch.images, batch.view_ids, batch, step)
+
+    def _train(self, images: Tensor, view_ids: Tensor, batch: Batch, step: int) -> dict[str, float]:
+        codes, vertices = self.predict(images)
         download = Download(vertices)  # a GPU computes the losses on codes while the CPU waits and renders
-        on_codes = self._losses_on_codes(codes, batch.view_ids, step)
+        on_codes = self._losses_on_codes(codes, view_ids, step)
         vertices = download.wait()
-        silhouettes = self.render(vertices, batch.poses)
-        losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks)}
-        losses |= self.surface_losses(vertices) | on_codes
+        losses = self._silhouette_losses(vertices, batch) | self.surface_losses(vertices) | on_codes
         trained = ["encoder", "generator"] + ["discriminator"] * ("classification" in losses)
         return self.backward_and_step(losses, step, *trained)
+
+    def _silhouette_losses(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
+        return {"projection": nmr.losses.soft_iou_loss(self.render(vertices, batch.poses), batch.masks)}
 
     def _losses_on_codes(self, codes: Tensor, view_ids: Tensor, step: int) -> dict[str, Tensor]:
         settings, losses = self.settings, {}

@@ -33,7 +33,7 @@ from learn3d.networks.voxel_gan import (
 )
 from learn3d.settings import Items, LayerChannels, Positive, Share, Step, checked
 
-BETAS = (0.5, 0.999)  # of Adam, for the two networks of the GAN
+BETAS = (0.5, 0.999)  # Adam's decays for the two networks of the GAN
 FourLayers = Annotated[tuple[LayerChannels, LayerChannels, LayerChannels, LayerChannels], Items]
 
 
@@ -56,7 +56,7 @@ class PrGANSettings(MethodSettings):
     discriminator_channels: FourLayers = DISCRIMINATOR_CHANNELS
     """Channels at 32^2, 16^2, 8^2 and 4^2; fewer on a small machine."""
     occupancy_threshold: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """A predicted voxel is full where its mean is higher. Unpublished; Kato's grids hold every cell that a shape
+    """A predicted voxel is full if its mean is higher. Unpublished; Kato's grids hold every cell that a shape
     touches, so that even true shapes reach an IoU of .35 at 0.5, but .74 at 0.1."""
     elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 30.0
     """Elevation of the K views, which stand at equal steps of azimuth."""
@@ -89,8 +89,8 @@ class PrGANSettings(MethodSettings):
 class PrGAN(Method):
     """Generator of voxels from z ~ U(-1, 1)^201, discriminator of silhouettes, inverse encoder.
 
-    The first 200 entries of z decide the shape, the last one v the view: floor((v + 1) K / 2). Which view a training
-    image was taken from is never used, only that views come from the circle, each as often as any other.
+    The first 200 entries of z decide the shape, the last one v the view: floor((v + 1) K / 2). The view of a training
+    image is never used, only that all K views are equally frequent.
     """
 
     settings: PrGANSettings
@@ -118,12 +118,12 @@ class PrGAN(Method):
 
     @functools.cached_property
     def views(self) -> ViewCircle:
-        """The K views that silhouettes are projected to."""
+        """The K views of the projected silhouettes."""
         own = self.settings
         return ViewCircle(self.info.num_views, own.elevation_deg, own.distance, own.half_fov_deg, own.perspective)
 
     def encode(self, images: Tensor) -> Tensor:
-        """Shape codes [B, 200], of the mask channel alone."""
+        """Shape codes [B, 200] from the mask channel alone."""
         masks = network_input(images, self.device, self.image_size)[:, 3]
         with self.autocast():
             return self.encoder(masks).float()[:, :SHAPE_CODE]
@@ -136,20 +136,19 @@ class PrGAN(Method):
         return 2 * torch.rand(count, SHAPE_CODE + 1) - 1
 
     def view_ids(self, z: Tensor) -> Tensor:
-        """The view that the last entry of z asks for: floor((v + 1) K / 2), int64 [B] in 0 .. K-1."""
+        """View of each z by its last entry v: floor((v + 1) K / 2), int64 [B] in 0 .. K-1."""
         return ((z[:, -1] + 1) * (self.views.count / 2)).long().clamp(0, self.views.count - 1)
 
     def generate(self, z: Tensor) -> Tensor:
-        """Silhouettes [B, 64, 64] of what z [B, 201], on the CPU, stands for. In float32: bf16 makes these layers slow
-        on CPUs."""
+        """Silhouettes [B, 64, 64] of generated shapes, for z [B, 201] on the CPU. In float32: bf16 is slow here."""
         codes = upload(z[:, :SHAPE_CODE], self.device)
         with autocast(self.device, "fp32"):
             return project(self.generator(codes), self.view_ids(z), self.views, TAU)
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """A step of the GAN before `encoder_from_step`, of the encoder from there on.
+        """A step of the GAN before `encoder_from_step`, afterwards one of the encoder.
 
-        Raises ValueError where the batch's cameras are not those of the K views.
+        Raises ValueError if the batch's cameras are not those of the K views.
         """
         check_views(batch.poses, batch.view_ids, self.views)
         views = batch.step_views
@@ -159,8 +158,8 @@ class PrGAN(Method):
         return self._gan_step(upload(batch.masks, self.device), z, step)
 
     def _gan_step(self, real: Tensor, z: Tensor, step: int) -> dict[str, float]:
-        """Discriminator (where its accuracy at the start is at most 0.8), then generator, then generator once more: on
-        the statistics of the discriminator's first layer. One z serves all three, as in the published code.
+        """Train the discriminator, if its accuracy at the start is at most 0.8, then the generator, then the generator
+        on the statistics of the discriminator's first layer. One z serves all three, as in the published code.
         """
         values = {"accuracy": self.accuracy(real, z)}
         self.set_training(True)
@@ -208,7 +207,7 @@ class PrGAN(Method):
 
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor, group: ProcessGroup = SINGLE_PROCESS) -> Tensor:
-    """Squared distance of the batch means of features [B, ...] and of their variances, summed over all features."""
+    """Squared distances of batch means and of batch variances of features [B, ...], summed over all features."""
     means, variances = [], []  # not by torch's var, which takes ten times as long over the first axis
     for features in (of_real, of_fake):
         mean = features.mean(0)
@@ -219,11 +218,9 @@ def statistics_loss(of_real: Tensor, of_fake: Tensor, group: ProcessGroup = SING
 
 
 def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
-    """Raise a ValueError unless every camera is that of its view class: angles to half a degree, the distance to
-    half a percent, half the field of view to a tenth of a degree.
+    """Raise a ValueError unless every camera is that of its view class: PrGAN draws from a table of views.
 
-    PrGAN needs a table of views to draw from. Data with continuous viewpoints have none; the means of their classes
-    would be one, but then no image would be seen from where its class says.
+    Tolerances: angles half a degree, distance half a percent, half the field of view a tenth of a degree.
     """
     wanted = (
         f"PrGAN needs images from {views.count} fixed views, view k at azimuth {-360 / views.count:g} k and elevation "
@@ -231,8 +228,8 @@ def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
     )
     if not isinstance(poses, LookAtPoses):
         raise ValueError(f"{wanted}; this data set gives rotations. Take data in Kato's layout")
-    found = [torch.as_tensor(v).expand(len(poses)) for v in (poses.elevation_deg, poses.distance, poses.half_fov_deg)]
-    found = torch.stack([poses.azimuth_deg, *found]).T
+    found = (poses.azimuth_deg, poses.elevation_deg, poses.distance, poses.half_fov_deg)
+    found = torch.stack([torch.as_tensor(values).expand(len(poses)) for values in found], dim=1)
     off = found - torch.tensor([0.0, views.elevation_deg, views.distance, views.half_fov_deg])
     off[:, 0] = wrap_deg(off[:, 0] - views.azimuth_deg(view_ids))
     wrong = (off.abs() > torch.tensor([0.5, 0.5, 0.005 * views.distance, 0.1])).any(1)

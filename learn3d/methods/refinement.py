@@ -1,4 +1,4 @@
-"""Fits a predicted shape to the image's own mask, where the camera is known: first its code, then its vertices."""
+"""Fits a predicted shape to the mask of its image, if the camera is known: first the code, then the vertices."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from learn3d.methods.method import MeshMethod
 from learn3d.methods.surfaces import Meshes
 
 CODE_STEPS = 40
-CODE_LEARNING_RATE = 0.1  # of Adam, in units of the root mean square of the codes' entries
+CODE_LEARNING_RATE = 0.1  # in units of the root mean square of the codes' entries
 VERTEX_STEPS = 40
-VERTEX_LEARNING_RATE = 0.002  # of Adam, in units of the object frame
-SMOOTHNESS = 0.001  # weight of the smoothness loss, that of the proposed method
+VERTEX_LEARNING_RATE = 0.002  # in units of the object frame
+SMOOTHNESS = 0.001  # weight of the smoothness loss, as in the proposed method
 
 
 def refine(
@@ -31,8 +31,8 @@ def refine(
 ) -> Meshes:
     """Meshes of stored images uint8 [B,4,S,S], fitted to masks float32 [B,64,64] that the B cameras of `poses` see.
 
-    Both parts minimise soft IoU loss + 0.001 smoothness: over the codes, so that shapes stay among
-    those that the generator knows, then over the vertices. Symmetric shapes stay symmetric.
+    Adam minimises soft IoU loss + 0.001 smoothness over the codes, which keeps shapes plausible, and then over the
+    vertices. Symmetric shapes stay symmetric.
     """
 
     def decode(codes: Tensor) -> Tensor:

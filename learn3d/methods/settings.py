@@ -1,4 +1,4 @@
-"""Base classes for the settings of methods. They answer what a run asks, so that it need not know any method."""
+"""Base classes for the settings of methods; a run asks them instead of knowing any method."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from learn3d.settings import Positive, checked
 
 @checked
 class MethodSettings:
-    """What a run asks of a method's settings. A subclass overrides what its method needs."""
+    """Questions of a run to its method's settings. A subclass overrides the answers that differ."""
 
     @property
     def image_size(self) -> int:
@@ -27,7 +27,7 @@ class MethodSettings:
 
     @property
     def varies_over_run(self) -> str | None:
-        """Name of the setting whose value at a step depends on the number of iterations, None if there is none."""
+        """Name of the setting whose value depends on the number of iterations, None if there is none."""
         return None
 
     def check_run(self, *, iterations: int, batch_size: int) -> None:

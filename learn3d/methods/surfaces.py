@@ -19,7 +19,7 @@ class Meshes:
 
     vertices: Tensor  # float32 [B, V, 3], object frame
     faces: Tensor  # int64 [F, 3]
-    colors: Tensor | None = None  # float32 [B, V, 3] in [0, 1]: R, G, B of each vertex; None: no colours are predicted
+    colors: Tensor | None = None  # float32 [B, V, 3] in [0, 1]: R, G, B of each vertex; None if not predicted
 
     def surfaces(self) -> list[Surface]:
         """The shapes one by one."""
@@ -32,14 +32,14 @@ class Grids:
     """Predicted volumes, on the CPU."""
 
     occupancy: Tensor  # float32 [B, s, s, s] in [0, 1]; axes (x, y, z) of the object frame over the box [-0.5, 0.5]
-    threshold: float = 0.5  # occupied above it
+    threshold: float = 0.5  # cells above it are occupied
 
     def surfaces(self) -> list[Surface]:
         """The shapes one by one as triangles, by marching cubes at the threshold."""
         return [grid_surface(grid, level=self.threshold) for grid in self.occupancy]
 
     def occupied(self, size: int) -> Tensor:
-        """Bool [B, size, size, size]: where the mean over the cell is above the threshold; s is a multiple of size."""
+        """Bool [B, size, size, size]: whether the mean over a cell is above the threshold; s is a multiple of size."""
         factor, rest = divmod(self.occupancy.shape[-1], size)
         if rest or factor < 1:
             raise ValueError(f"a grid of {self.occupancy.shape[-1]} cells cannot be pooled to {size}")

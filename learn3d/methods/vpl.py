@@ -32,7 +32,7 @@ from learn3d.networks.preact_resnet import PreactResNet18
 from learn3d.networks.resnet import check_pretrained, load_pretrained
 from learn3d.settings import Channels, FilePath, Pixels, Positive, Weight, checked
 
-MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object where alpha is at least this
+MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object if alpha is at least this
 
 
 @checked
@@ -65,8 +65,8 @@ class VPLSettings(MeshSettings):
     """alternating: odd steps train the discriminator, even ones the shapes against it. reversal: both in one step
     through a gradient reversal layer (as published)."""
     other_views: Literal["random", "reversed", "next"] = "random"
-    """The other view of each sample is that of: a random sample of the batch with another view class; the sample at the
-    same place from the batch's end (published, ShapeNet); the next sample of its category (published, Pascal3D+)."""
+    """Source of each sample's other view. random: any sample of another view class. reversed: the sample at the same
+    place from the batch's end (published, ShapeNet). next: the next of its category (published, Pascal3D+)."""
     silhouette_size: Pixels = 64
     """Side of rendered silhouettes: 64, compared with the data's masks, or image_size, with the input's own mask."""
     anti_aliasing: bool = True
@@ -92,6 +92,8 @@ class VPLSettings(MeshSettings):
         size = self.image_size
         if self.encoder == "conv" and size != ENCODERS["conv"].image_size:
             raise ValueError(f"encoder 'conv' takes images of 64 pixels, got image_size {size}")
+        if size % 32:
+            raise ValueError(f"image_size must be a multiple of 32 for encoder {self.encoder!r}, got {size}")
         if self.silhouette_size not in (MASK_SIZE, size):
             raise ValueError(
                 f"silhouette_size must be {MASK_SIZE}, the size of the data's masks, or image_size ({size}), got "
@@ -144,12 +146,9 @@ class VPL(MeshMethod):
         """In every step encoder and generator descend projection + smoothness + inflation.
 
         With a discriminator D each shape is also rendered at another view. Alternating: in odd steps D descends
-        softplus(-D(input view)) + softplus(D(other view)) on silhouettes that are constants for it; in even ones
-        encoder and generator descend lambda_D softplus(-D(other view)), while D gets neither gradient nor step. (Its
-        batch norms use the batch's statistics then, too, and leave their running means alone.) Reversal: in every step
-        D descends that loss, and encoder and generator climb it with lambda_D times its gradient.
-
-        Raises ValueError where the batch is too small to have another view.
+        softplus(-D(input view)) + softplus(D(other view)) on detached silhouettes. In even steps encoder and generator
+        descend lambda_D softplus(-D(other view)); D and its running means stay as they are. Reversal: in every step
+        D descends its loss, and encoder and generator climb it with lambda_D times its gradient.
         """
         settings = self.settings
         if settings.lambda_discriminator == 0:
@@ -181,7 +180,7 @@ class VPL(MeshMethod):
         return Download(self.predict(batch.images)[1]).wait()
 
     def render(self, vertices: Tensor, poses: Poses) -> Tensor:
-        """Silhouettes float32 [B,s,s] as the settings have them."""
+        """Silhouettes float32 [B,s,s] with the size, samples and gradient of the settings."""
         settings = self.settings
         return nmr.render_silhouette(
             vertices,
@@ -209,7 +208,7 @@ class VPL(MeshMethod):
     def _discriminate(
         self, network: Callable[..., Tensor], silhouettes: Tensor, seen_at: Tensor, views: StepViews
     ) -> Tensor:
-        """Logits for silhouettes [b,S,S] of the shapes of this process's rows, seen at the views `seen_at`."""
+        """Logits for silhouettes [b,S,S] of this process's shapes, seen at the views `seen_at`."""
         silhouettes = upload(silhouettes, self.device)
         if self.settings.discriminator == "dcgan":
             with self.autocast():
@@ -222,11 +221,11 @@ class VPL(MeshMethod):
 
 
 def other_views(batch: Batch | StepViews, choice: Literal["random", "reversed", "next"]) -> Tensor:
-    """For each sample of a batch the sample whose view serves as its other one, int64 [B]; see VPLSettings.other_views.
+    """Index of the sample whose view is the other view of each sample, int64 [B]; see VPLSettings.other_views.
 
-    "random" asks torch's global generator, and takes any sample where all have one view class. Over a data set in which
-    all views are equally frequent it draws uniformly from the other views, as the code of Peng et al. 2020 does.
-    "reversed" leaves the middle one of an odd batch its own view, "next" a sample alone in its category (as published).
+    "random" uses torch's global generator, and takes any sample if all have one view class. If all views are equally
+    frequent it draws uniformly from the other views, as the code of Peng et al. 2020 does. As published, "reversed"
+    gives the middle sample of an odd batch its own view, and "next" a sample that is alone in its category.
     """
     count = len(batch)
     if choice == "reversed":

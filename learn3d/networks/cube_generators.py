@@ -39,15 +39,15 @@ def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class CubeGenerator(MeshGenerator):
-    """What both have in common: vertices = object_scale * 1.2 * tanh(base + scale * bias), float32 [B,1352,3].
+    """Base of both: vertices = object_scale * 1.2 * tanh(base + scale * bias), float32 [B,1352,3].
 
-    `base`, learned, starts as the sphere of radius 0.5 (times object_scale); `bias` is what a subclass computes of the
-    codes. With `symmetry`, as published: z becomes |z|, each vertex the mean of itself and its mirror image, and z gets
-    the sign back that the vertex has on the cube. (The vertices are then symmetric exactly; the diagonals that divide
-    the cube's squares into faces are not, as published.)
+    `base`, learned, starts as the sphere of radius 0.5 (times object_scale); a subclass computes `bias` from the codes.
+    With `symmetry`, as published: z becomes |z|, each vertex the mean of itself and its mirror image, and z gets back
+    the sign that the vertex has on the cube. The vertices are then exactly symmetric; the diagonals that divide the
+    cube's squares into faces are not.
     """
 
-    signs: Tensor  # float32 [V,3]: (1, 1, -1) where z < 0 on the cube, else 1
+    signs: Tensor  # float32 [V,3]: (1, 1, -1) if z < 0 on the cube, else 1
 
     def __init__(self, scale: float, object_scale: float, symmetry: Symmetry | None) -> None:
         points, patches, faces = cube_surface()
@@ -61,7 +61,7 @@ class CubeGenerator(MeshGenerator):
         self.register_buffer("signs", signs, persistent=False)
 
     def bias(self, codes: Tensor) -> Tensor:
-        """What the codes [B,512] add to the base, [B,V,3]."""
+        """Change of the base by codes [B,512], [B,V,3]."""
         raise NotImplementedError
 
     def forward(self, codes: Tensor) -> Tensor:
@@ -74,7 +74,7 @@ class CubeGenerator(MeshGenerator):
 
 
 class ConvCubeGenerator(CubeGenerator):
-    """One stack of transposed convolutions per side of the cube; where sides meet, the mean of theirs (ShapeNet).
+    """One stack of transposed convolutions per side of the cube; at shared vertices the mean of the sides (ShapeNet).
 
     Each: linear to 512@2x2, three 3x3 transposed convolutions of stride 2 to 256, 128, 64 channels, batch norm and ReLU
     after each of the four; 3x3 convolution to 3@16x16.
@@ -99,7 +99,7 @@ class ConvCubeGenerator(CubeGenerator):
     def bias(self, codes: Tensor) -> Tensor:
         sides = torch.stack([side(codes) for side in self.sides], dim=1)  # [B,6,3,16,16]
         outputs = sides.float().permute(0, 1, 3, 4, 2).flatten(1, 3)
-        # A gather: its sums have a fixed order on every device, those of a scatter have not.
+        # A gather, not a scatter: its sums have a fixed order on every device.
         return (outputs[:, self.positions] * self.shares).sum(2)
 
 

@@ -1,7 +1,7 @@
 """Discriminators: of views from shape codes, and of silhouettes and their views (view prior learning).
 
-The latter answer: was a silhouette rendered from the view that the shape was predicted from? Each takes silhouettes
-float [B,S,S] and what tells the view, and returns logits: positive for "this is the input view".
+The latter tell whether a silhouette was rendered at the input view of the predicted shape. Each takes silhouettes
+float [B,S,S] and the view, and returns logits: positive for "this is the input view".
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch.nn.utils.parametrizations import spectral_norm
 from learn3d.networks.encoders import CODE_SIZE
 from learn3d.networks.layers import initialize_he, linear_layers
 
-SLOPE = 0.2  # of the leaky ReLUs
+SLOPE = 0.2  # slope of the leaky ReLUs
 BATCH_NORM_EPS = 2e-5  # published code
 
 
@@ -44,11 +44,7 @@ class OneHotViewDiscriminator(nn.Module):
         widths = [channels, 2 * channels, 4 * channels, 8 * channels]
         layers: list[nn.Module] = [nn.Conv2d(1 + num_views, channels, 4, stride=2, padding=1), nn.LeakyReLU(SLOPE)]
         for before, after in itertools.pairwise(widths):
-            layers += [
-                nn.Conv2d(before, after, 4, stride=2, padding=1),
-                nn.BatchNorm2d(after),
-                nn.LeakyReLU(SLOPE),
-            ]
+            layers += [nn.Conv2d(before, after, 4, stride=2, padding=1), nn.BatchNorm2d(after), nn.LeakyReLU(SLOPE)]
         self.layers = nn.Sequential(*layers, nn.Flatten(), nn.Linear(widths[-1] * (silhouette_size // 16) ** 2, 1))
 
     def forward(self, silhouettes: Tensor, view_ids: Tensor) -> Tensor:
@@ -88,7 +84,7 @@ class SpectralPatchDiscriminator(nn.Module):
         logits = self.last(features).squeeze(1)
         if self.num_classes is None:
             return logits
-        # One-hot vectors through the normalised layer, and not an embedding: that is what the norm is taken of.
+        # One-hot vectors, not an embedding: spectral_norm normalises the weight of a linear layer.
         classes = self.classes(F.one_hot(class_ids, self.num_classes).to(features))
         product = torch.einsum("bc,bchw->bhw", classes, features)
         return logits + product[:, ::2, ::2]

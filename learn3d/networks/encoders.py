@@ -14,7 +14,7 @@ from learn3d.networks.layers import initialize_he, linear_layers
 from learn3d.networks.resnet import ResNet18Encoder
 
 CODE_SIZE = 512
-CENTRED_SHARE = 0.8  # of the side of an image, that the object takes for the encoder conv-centred
+CENTRED_SHARE = 0.8  # share of the image's side that the object takes for the encoder conv-centred
 
 
 class ConvEncoder(nn.Module):
@@ -28,8 +28,7 @@ class ConvEncoder(nn.Module):
         self.layers = linear_layers(256 * (self.image_size // 8) ** 2, 1024, 1024, CODE_SIZE)
 
     def forward(self, images: Tensor) -> Tensor:
-        # The last ReLU after the change of layout, not before: its gradient would meet values in another layout than
-        # its own, which costs 9 ms of 270 in a step of 128 images on one core.
+        # The last ReLU comes after the change of layout; mixed layouts would cost its gradient 9 ms of a 270 ms step.
         features = self.convolutions[:-1](images).flatten(1)
         return self.layers(self.convolutions[-1](features))
 
@@ -42,12 +41,11 @@ class ReluConvEncoder(ConvEncoder):
 
 
 class LightConvEncoder(ConvEncoder):
-    """ConvEncoder with half the channels, and a 1x1 convolution to 32 channels before the linear layers: 3.9 million
-    weights, not 19, and a quarter of the multiplications; no paper's.
+    """ConvEncoder with half the channels and a 1x1 convolution to 32 channels before the linear layers; no paper's.
 
-    Its convolutions start from He's initial weights: with torch's, images hardly change the codes of the first hundred
-    steps, and all shapes may become one and stay so. A white background has the same effect, so colours that are not
-    `inverted` (stored as 1 - colour over black) are inverted first.
+    3.9 million weights, not 19. Its convolutions start from He's initial weights: with torch's, images hardly change
+    the codes of the first hundred steps, and all shapes may become one. A white background has the same effect, so
+    colours that are not `inverted` (stored as 1 - colour over black) are inverted first.
     """
 
     hidden_sizes: tuple[int, ...] = (1024, 1024)
@@ -79,8 +77,8 @@ class SmallConvEncoder(ConvEncoder):
 class CentredConvEncoder(LightConvEncoder):
     """LightConvEncoder with one hidden layer. Each image is scaled first, so that every object has the same size in it.
 
-    A picture that somebody has cut out does not show how far away the camera stood. With this encoder, training images
-    do not show it either: the size of an object is learnt from what it looks like. 1.6 million weights; no paper's.
+    A cut-out picture does not show the camera's distance. With this encoder, training images do not show it either:
+    the size of an object is learnt from its looks. 1.6 million weights; no paper's.
     """
 
     hidden_sizes = (512,)
@@ -133,9 +131,8 @@ ENCODERS: dict[str, type[nn.Module]] = {
 def create_encoder(name: EncoderName, *, inverted: bool) -> nn.Module:
     """The encoder `name` for images whose colours are stored as 255 - colour, or as they are.
 
-    resnet18 turns them into natural colours, for which its normalisation and pretrained weights are; conv-light and
-    conv-centred into inverted ones, which are 0 where a render has a white background. The others learn from scratch,
-    as published, on the colours as they are stored.
+    resnet18 turns them into natural colours, as its normalisation and pretrained weights need. conv-light and
+    conv-centred turn them into inverted ones, in which a white background is 0. The others take the stored colours.
     """
     encoder = ENCODERS[name]
     return encoder(inverted) if issubclass(encoder, (ResNet18Encoder, LightConvEncoder)) else encoder()
@@ -149,6 +146,6 @@ def network_input(images: Tensor, device: torch.device | str, size: int = 64) ->
         )
     images = upload(images, torch.device(device))
     pixels = torch.empty((len(images), size, size, 4), device=images.device)
-    for channel in range(4):  # converted and put in place in one pass; torch's own change of layout is slower
+    for channel in range(4):  # converts and copies in one pass; torch's own change of layout is slower
         pixels[..., channel].copy_(images[:, channel])
     return pixels.div_(255).permute(0, 3, 1, 2)

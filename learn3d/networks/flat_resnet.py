@@ -13,15 +13,12 @@ class FlatResNet18(nn.Module):
 
     `inverted`: the images hold 1 - colour, see `ResNet18Encoder`.
 
-    `frozen_norms`: the batch norms stay as they are (statistics, gain, offset) and the rest is trained: as published,
-    for weights of ImageNet (`load_pretrained` on `resnet`). Not for a network that is trained from scratch, where batch
-    norms at their initial values would normalise nothing.
+    `frozen_norms`: statistics, gain and offset of the batch norms stay as they are, as published for weights of
+    ImageNet. In training from scratch, frozen batch norms would normalise nothing.
     """
 
     def __init__(self, image_size: int = 224, frozen_norms: bool = False, inverted: bool = False) -> None:
         super().__init__()
-        if image_size < 32 or image_size % 32:
-            raise ValueError(f"image_size must be a multiple of 32 for FlatResNet18, got {image_size}")
         self.image_size = image_size
         self.resnet = ResNet18Encoder(inverted)
         self.code = nn.Linear(512 * (image_size // 32) ** 2, CODE_SIZE)

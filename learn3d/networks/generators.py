@@ -31,8 +31,8 @@ class SphereGenerator(MeshGenerator):
     """
 
     sphere: Tensor  # float32 [642,3]
-    source: Tensor  # int64 [642,3]: which output each coordinate is; the one after the last stands for 0
-    sign: Tensor  # float32 [642,3]: -1 where it is the opposite of the output
+    source: Tensor  # int64 [642,3]: index of the output for each coordinate; the one after the last is 0
+    sign: Tensor  # float32 [642,3]: -1 if the coordinate is the opposite of the output
 
     def __init__(self, symmetry: Symmetry | None = None) -> None:
         sphere, faces = nmr.icosphere(3)
@@ -44,7 +44,7 @@ class SphereGenerator(MeshGenerator):
         self.layers = linear_layers(CODE_SIZE, 1024, 2048, self.outputs)
 
     def _share_outputs(self) -> None:
-        middle, right = (torch.nonzero(where)[:, 0] for where in (self.sphere[:, 2] == 0, self.sphere[:, 2] > 0))
+        middle, right = (torch.nonzero(chosen)[:, 0] for chosen in (self.sphere[:, 2] == 0, self.sphere[:, 2] > 0))
         self.outputs = 2 * len(middle) + 3 * len(right)
         source, sign = torch.full(self.sphere.shape, self.outputs), torch.ones_like(self.sphere)
         source[middle, :2] = torch.arange(2 * len(middle)).reshape(-1, 2)

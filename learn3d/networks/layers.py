@@ -40,6 +40,6 @@ class _ReverseGradient(torch.autograd.Function):
 def reverse_gradient(values: Tensor, factor: float) -> Tensor:
     """The values as they are; their gradient times -factor (Ganin and Lempitsky 2015).
 
-    The networks behind it descend a loss, those in front of it climb the same loss, `factor` times as fast.
+    Networks behind it descend a loss; networks in front of it climb the same loss, `factor` times as fast.
     """
     return _ReverseGradient.apply(values, factor)

@@ -1,4 +1,4 @@
-"""What all mesh generators share: the faces of a fixed topology, and mirror symmetry about a vertical plane."""
+"""Base class of mesh generators: the faces of a fixed topology, and mirror symmetry about a vertical plane."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SymmetryOption = Symmetry | Literal["auto"] | None
 class MeshGenerator(nn.Module):
     """Shape code [B,512] -> vertices float32 [B,V,3] in the object frame (y up).
 
-    A subclass computes vertices that are symmetric about z = 0 where `symmetry` is not None, and hands them to
-    `place`, which turns them about the vertical axis until that plane is the one asked for.
+    If `symmetry` is not None, a subclass computes vertices that are symmetric about z = 0. `place` then turns them
+    about the vertical axis to the plane asked for.
     """
 
     faces: Tensor  # int64 [F,3]
@@ -39,13 +39,13 @@ class MeshGenerator(nn.Module):
             self.register_buffer(name, table, persistent=False)
 
     def place(self, vertices: Tensor) -> Tensor:
-        """Vertices that are symmetric about z = 0, turned so that they are about the plane asked for."""
+        """Turn vertices that are symmetric about z = 0 to the plane asked for."""
         if self.rotation is None:
             return vertices
         return (vertices[..., None] * self.rotation).sum(-2)  # not a matrix product, which autocast would round to bf16
 
     def symmetrized(self, vertices: Tensor) -> Tensor:
-        """The mean of placed vertices [B,V,3] and their mirror images; the vertices where shapes are free."""
+        """The mean of placed vertices [B,V,3] and their mirror images; the vertices themselves if shapes are free."""
         if self.mirror is None:
             return vertices
         turn = torch.eye(3) if self.rotation is None else self.rotation.cpu()  # rows: the axes as they are placed
@@ -57,15 +57,12 @@ class MeshGenerator(nn.Module):
 def mirror_images(points: Tensor) -> Tensor:
     """For each of the points [V,3] the one that is its mirror image at z = 0, int64 [V]."""
     mirrored = points * torch.tensor([1.0, 1.0, -1.0]).to(points)
-    found = torch.cdist(mirrored.double(), points.double()).argmin(dim=1)
-    if not torch.equal(points[found], mirrored):
-        raise RuntimeError("the base mesh is not symmetric about z = 0")
-    return found
+    return torch.cdist(mirrored.double(), points.double()).argmin(dim=1)
 
 
 def _rotation(azimuth_deg: float) -> Tensor:
     """The rotation about y that takes the plane z = 0 to the one that a camera of this azimuth looks along."""
     angle = math.radians(azimuth_deg)
     sine, cosine = round(math.sin(angle), 12), round(math.cos(angle), 12)  # quarter turns are exact
-    # In (x, z) the eye stands in direction (sin a, -cos a): that is where the x axis goes.
+    # In (x, z) the eye stands in direction (sin a, -cos a), and the x axis goes there.
     return torch.tensor([[sine, 0.0, -cosine], [0.0, 1.0, 0.0], [cosine, 0.0, sine]])

@@ -21,8 +21,6 @@ class PreactResNet18(nn.Module):
 
     def __init__(self, image_size: int = 224, channels: int = 64) -> None:
         super().__init__()
-        if image_size < 32 or image_size % 32:
-            raise ValueError(f"image_size must be a multiple of 32 for PreactResNet18, got {image_size}")
         self.image_size = image_size
         widths = [channels, 2 * channels, 4 * channels, 8 * channels]
         blocks: list[nn.Module] = []
@@ -48,7 +46,7 @@ class PreactResNet18(nn.Module):
 class _Block(nn.Module):
     """x + f(x): two 3x3 convolutions, batch norm and ReLU before each (the first block's input has had its own).
 
-    Where the number of channels changes, the first convolution and a 1x1 convolution in place of x have stride 2.
+    If the number of channels changes, the first convolution and a 1x1 convolution in place of x have stride 2.
     """
 
     def __init__(self, before: int, after: int, first: bool = False) -> None:
@@ -69,7 +67,7 @@ class _Block(nn.Module):
 
 
 def grey_background(images: Tensor) -> Tensor:
-    """RGB and mask [B,4,S,S] in [0,1] -> colours [B,3,S,S] in [-1,1], 0 (grey) where the mask is 0.
+    """RGB and mask [B,4,S,S] in [0,1] -> colours [B,3,S,S] in [-1,1], 0 (grey) if the mask is 0.
 
     Inverted colours (Kato's files) come out with the other sign. To a network trained from scratch that is the same.
     """

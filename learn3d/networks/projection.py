@@ -42,9 +42,9 @@ class ViewCircle:
         return view_ids.float() * (-360.0 / self.count)
 
     def sample_points(self, azimuth_deg: float, size: int) -> Tensor:
-        """Where the rays of one view are sampled: float32 [size, size, D, 3] in the object frame; row 0 is the top.
+        """Sample points on the rays of one view, float32 [size, size, D, 3] in the object frame; row 0 is the top.
 
-        The distance from sample to sample is that from pixel to pixel, and D is as long as the box's diagonal.
+        Samples are as far apart as pixels, and D of them are as long as the box's diagonal.
         """
         eye = nmr.cameras.points_from_angles(self.distance, self.elevation_deg, azimuth_deg).double().reshape(3)
         z_axis = -F.normalize(eye, dim=0)
@@ -69,11 +69,7 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
     Differentiable in the density.
     """
     size = density.shape[-1]
-    if density.shape[1:] != (size,) * 3 or view_ids.shape != density.shape[:1]:
-        raise ValueError(
-            f"density must be [B, S, S, S] and view_ids [B], got {list(density.shape)} and {list(view_ids.shape)}"
-        )
-    # Turning an object by a quarter only renumbers its voxels: the tables of a quarter of the circle serve all.
+    # A quarter turn only renumbers the voxels, so the tables of a quarter of the circle serve all views.
     quarter = views.count // 4 if views.count % 4 == 0 else views.count
     view_ids = view_ids.cpu()
     volumes, parts, order = density.unbind(), [], []
@@ -87,7 +83,7 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
     return 1 - torch.exp(-tau * thickness).reshape(-1, size, size)
 
 
-Table = tuple[Tensor, Tensor, Tensor]  # of a sparse matrix: columns int32, start of each row int32, values float32
+Table = tuple[Tensor, Tensor, Tensor]  # sparse matrix: columns int32, start of each row int32, values float32
 
 
 @functools.lru_cache(maxsize=64)
@@ -106,7 +102,7 @@ def ray_table(views: ViewCircle, view_id: int, size: int, device: torch.device) 
         pixels.append(pixel[inside])
         voxels.append(((x * size + y) * size + z)[inside])
         values.append(weight[inside])
-    step = 2 * views.half_width  # of a sample, in voxels: (2 half_width / size) / (1 / size)
+    step = 2 * views.half_width  # length of a sample in voxels: (2 half_width / size) / (1 / size)
     indices, weights = torch.stack([torch.cat(pixels), torch.cat(voxels)]), torch.cat(values) * step
     matrix = torch.sparse_coo_tensor(indices, weights, (size**2, size**3), check_invariants=False).coalesce()
     return _by_rows(matrix, device), _by_rows(matrix.t().coalesce(), device)

@@ -18,7 +18,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class _Block(nn.Module):
-    """Two 3x3 convolutions beside a shortcut: relu(f(x) + x), where x passes a 1x1 convolution if its size changes."""
+    """Two 3x3 convolutions beside a shortcut: relu(f(x) + x); x passes a 1x1 convolution if its size changes."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
@@ -39,8 +39,8 @@ class _Block(nn.Module):
 class ResNet18Encoder(nn.Module):
     """Images [B, 4, 224, 224] in [0, 1] -> shape codes [B, 512]: the average-pooled features, which are not negative.
 
-    The first three channels, R, G, B, are normalised by ImageNet's mean and deviation; the mask is not looked at. As in
-    the published code of Peng et al. 2020 on Pascal3D+ the pooled features are the code, without a layer behind them.
+    R, G, B are normalised by ImageNet's mean and deviation; the mask is not looked at. As in the published code of Peng
+    et al. 2020 on Pascal3D+ the pooled features are the code, without a layer behind them.
 
     `inverted`: the images hold 1 - colour, as Kato's form has it. They are turned back first: ImageNet's mean and
     weights are those of natural colours.
@@ -75,7 +75,7 @@ class ResNet18Encoder(nn.Module):
 
 
 def check_pretrained(path: Path | None, encoder: str) -> None:
-    """Raise a ValueError where a file of pretrained weights is given for an encoder (by its name) that has none."""
+    """Raise a ValueError if pretrained weights are given for an encoder (by its name) that takes none."""
     if path is not None and encoder != "resnet18":
         raise ValueError(
             f"pretrained weights are for the encoder 'resnet18', got encoder {encoder!r}; choose that encoder (it "
@@ -88,27 +88,26 @@ def load_pretrained(encoder: nn.Module, path: Path | str) -> None:
 
     The classification layer "fc" is left out. Nothing in the file is executed (weights_only).
 
-    Raises FileNotFoundError for a missing file, ValueError for an encoder of another kind, a file that cannot be read,
-    and weights of another network (naming the first that is missing, unknown or of another shape).
+    Raises FileNotFoundError if the file is missing, ValueError if it cannot be read or has weights of another network
+    (naming the first that is missing, unknown or wrong).
     """
     path = Path(path)
-    if not isinstance(encoder, ResNet18Encoder):
-        raise ValueError(f"pretrained weights are for the encoder resnet18, not for {type(encoder).__name__}")
     limits = {"memory": weights.MEMORY, "seconds": weights.SECONDS}
     read = sandbox.read(weights.read_state_dict, path, wanted="weights of torchvision's resnet18", **limits)
     given = {name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")}
     own = encoder.state_dict()
     counters = {name for name in own if name.endswith("num_batches_tracked")}  # not in files of older versions
     hint = "; it must be a state dict of torchvision's resnet18"
-    if missing := sorted(own.keys() - counters - given.keys()):
-        raise ValueError(f"{path} lacks {missing[0]!r} and {len(missing) - 1} more of {len(own)} entries{hint}")
-    if unknown := sorted(given.keys() - own.keys()):
-        raise ValueError(f"{path} has {unknown[0]!r} and {len(unknown) - 1} more entries that ResNet-18 has not{hint}")
+    for word, names in (
+        ("lacks", own.keys() - counters - given.keys()),
+        ("has the unknown", given.keys() - own.keys()),
+    ):
+        if names:
+            raise ValueError(f"{path} {word} entry {min(names)!r} and {len(names) - 1} more{hint}")
     for name, value in given.items():
-        if value.shape != own[name].shape:
-            raise ValueError(f"{path}: {name} is {list(value.shape)}, ResNet-18 has {list(own[name].shape)}{hint}")
-        if value.is_floating_point() == (name in counters):
-            raise ValueError(f"{path}: {name} is {value.dtype}, ResNet-18 has {own[name].dtype}{hint}")
+        if value.shape != own[name].shape or value.is_floating_point() == (name in counters):
+            wanted = f"{list(own[name].shape)} {own[name].dtype}"
+            raise ValueError(f"{path}: {name} is {list(value.shape)} {value.dtype}, ResNet-18 has {wanted}{hint}")
         if not bool(value.to(own[name].dtype).isfinite().all()):
             raise ValueError(f"{path}: {name} has values that are not finite{hint}")
     encoder.load_state_dict(given, strict=False)

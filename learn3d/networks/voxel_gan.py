@@ -1,8 +1,8 @@
 """PrGAN's networks (Gadelha et al. 2017): voxel generator, silhouette discriminator, inverse encoder.
 
 Layers, sizes and initial weights are those of the published TensorFlow code: weights of fully connected layers from
-N(0, 0.1), of convolutions from N(0, 0.02), biases 0. Normalisations average with momentum 0.9 in TensorFlow's sense,
-which is 0.1 in torch's. `channels` are four numbers.
+N(0, 0.1), of convolutions from N(0, 0.02), biases 0. TensorFlow's momentum of 0.9 in batch norms is torch's 0.1.
+`channels` are four numbers.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-SHAPE_CODE = 200  # entries of z that decide the shape; one more decides the view
+SHAPE_CODE = 200  # number of entries of z for the shape; one more decides the view
 IMAGE_SIZE = 64
-TAU = 0.5  # density of a full voxel is 1 / TAU; in the projection it cancels, so that a full voxel lets exp(-1) through
+TAU = 0.5  # a full voxel has density 1 / TAU, and the projection multiplies by TAU: exp(-1) passes through it
 GENERATOR_CHANNELS = (128, 64, 32, 1)
 DISCRIMINATOR_CHANNELS = (128, 256, 512, 1024)
 
@@ -24,7 +24,7 @@ DISCRIMINATOR_CHANNELS = (128, 256, 512, 1024)
 class DoublingConvolution(nn.ConvTranspose3d):
     """[B, C, n, n, n] -> [B, C', 2n, 2n, 2n]: a transposed convolution of 4^3 weights with stride 2.
 
-    To a single channel, torch's own forward pass on a CPU takes four times as long as `_Double`; backward it does not.
+    To a single channel on a CPU, torch's own forward pass takes four times as long as that of `_Double`.
     """
 
     def __init__(self, before: int, after: int) -> None:
@@ -46,7 +46,7 @@ class _Double(torch.autograd.Function):
     def forward(ctx, features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         ctx.save_for_backward(features, weight)
         taps, n = torch.tensor([[3, 1], [2, 0]]), features.shape[-1]
-        for axis in (2, 4, 6):  # of 4 weights: [cell 0 or 1, neighbour 0 or 1]
+        for axis in (2, 4, 6):  # 4 weights become [cell 0 or 1, neighbour 0 or 1]
             weight = weight.index_select(axis, taps.flatten()).unflatten(axis, (2, 2))
         kernel = weight[:, 0].permute(1, 3, 5, 0, 2, 4, 6).flatten(0, 2)
         cells = F.conv3d(features, kernel.contiguous(), bias.expand(8), padding=1)
@@ -69,8 +69,8 @@ class VoxelGenerator(nn.Module):
 
     A linear layer to `channels[0]` features on 4^3 cells, then transposed convolutions (4^3, stride 2) to the other
     channels at 8^3, 16^3 and 32^3 and to one at 64^3; batch norm and ReLU after all but the last, which has a sigmoid.
-    The published layer list narrows to ONE channel already at 32^3. Its normalisation there is declared for 16
-    channels, so that this may have been a slip; it is kept as the default, since it is what was run.
+    The published layer list narrows to ONE channel already at 32^3, perhaps a slip: its normalisation there is declared
+    for 16 channels. It stays the default, as in the published runs.
     """
 
     def __init__(self, channels: Sequence[int] = GENERATOR_CHANNELS) -> None:
@@ -90,7 +90,7 @@ class VoxelGenerator(nn.Module):
 
 
 class SilhouetteDiscriminator(nn.Module):
-    """Grey silhouettes [B, 64, 64] in [0, 1] -> logits [B]: positive where they look like those of the data.
+    """Grey silhouettes [B, 64, 64] in [0, 1] -> logits [B]: positive if they look like those of the data.
 
     Convolutions 5x5 with stride 2 to `channels`, batch norm and LeakyReLU(0.2) after each, then a linear layer.
     """
@@ -107,11 +107,7 @@ class SilhouetteDiscriminator(nn.Module):
         self.to(memory_format=torch.channels_last)
 
     def forward(self, silhouettes: Tensor) -> Tensor:
-        return self.last(self.others(self.features(silhouettes)).flatten(1))[:, 0]
-
-    def features(self, silhouettes: Tensor) -> Tensor:
-        """What the first layer makes of them, [B, channels[0], 32, 32], normalised and rectified."""
-        return self.first(silhouettes[:, None])
+        return self.last(self.others(self.first(silhouettes[:, None])).flatten(1))[:, 0]
 
 
 class InverseEncoder(nn.Module):

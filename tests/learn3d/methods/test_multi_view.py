@@ -14,14 +14,12 @@ from learn3d.methods.adam import SparseGradientAdam
 from learn3d.methods.method import DatasetInfo
 from learn3d.methods.multi_view import MultiView, MultiViewSettings, check_pairs
 from learn3d.methods.optimization import TrainingSchedule
-from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.networks.generators import deform_bounded_sphere
 
 
 def make_batch(objects: list[int]) -> Batch:
     count = len(objects)
-    generator = torch.Generator().manual_seed(0)
-    images = torch.randint(0, 256, (count, 4, 64, 64), dtype=torch.uint8, generator=generator)
+    images = torch.randint(0, 256, (count, 4, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     masks = torch.zeros(count, 64, 64)
     for i in range(count):
         masks[i, 16 + 2 * i : 46, 20 : 40 + 2 * i] = 1
@@ -66,23 +64,6 @@ def test_vertices_keep_the_box_and_their_octant() -> None:
     vertices.sum().backward()
     assert bias.grad.isfinite().all()
     assert (bias.grad[:, sphere == 0] == 0).all()
-
-
-def test_generator_and_encoder_are_katos() -> None:
-    torch.manual_seed(0)
-    generator, encoder = GENERATORS["bounded"](), ENCODERS["conv-relu"]()
-    linear = [(m.in_features, m.out_features) for m in generator.modules() if isinstance(m, nn.Linear)]
-    assert linear == [(512, 1024), (1024, 2048), (2048, 1926), (2048, 3)]
-    vertices = generator(torch.zeros(2, 512))
-    assert vertices.shape == (2, 642, 3)
-    assert torch.allclose(vertices.norm(dim=2), torch.tensor(0.25), atol=0.02)  # 0.5 * 0.5 sphere
-    codes = encoder(torch.rand(2, 4, 64, 64))
-    assert codes.shape == (2, 512)
-    assert codes.min() == 0
-    plain = ENCODERS["conv"]()
-    plain.load_state_dict(encoder.state_dict())
-    images = torch.rand(2, 4, 64, 64)
-    assert torch.equal(encoder(images), plain(images).relu())
 
 
 def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> None:

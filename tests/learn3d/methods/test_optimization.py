@@ -1,4 +1,4 @@
-"""Schedules, averages of the weights, and what every method does with them."""
+"""Adam, schedules and averages of the weights, and runs of every method with them."""
 
 from __future__ import annotations
 
@@ -31,9 +31,6 @@ METHODS = {
 }
 
 
-# --- Adam
-
-
 def test_moments_of_dead_units_vanish_and_change_no_weight() -> None:
     """One gradient, then zeros: torch's own moments become denormal and stay so, ours become 0. Weights are equal."""
     layer = nn.Linear(8, 8)
@@ -56,9 +53,6 @@ def test_moments_of_dead_units_vanish_and_change_no_weight() -> None:
     assert ours.state[layer.weight]["exp_avg"].count_nonzero() == 0
 
 
-# --- learning rates
-
-
 def test_schedules() -> None:
     def factors(**schedule: object) -> list[float]:
         return [TrainingSchedule(4, **schedule).lr_factor(step) for step in (1, 2, 3, 4)]
@@ -70,24 +64,8 @@ def test_schedules() -> None:
     assert factors(warmup_steps=2, lr_schedule="linear") == [0.5, 1, 1, 0.5]
     published = TrainingSchedule(200_000, "step")
     assert [published.lr_factor(step) for step in (1, 190_000, 190_001, 200_000)] == [1, 1, 0.1, 0.1]
-
-
-def test_a_warmup_as_long_as_the_run_is_refused() -> None:
     with pytest.raises(ValueError, match="warmup_steps"):
         TrainingSchedule(10, warmup_steps=10)
-
-
-def test_learning_rates_follow_the_schedule(tiny_names, tiny_set) -> None:
-    settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **TINY, learning_rate=1e-3)
-    method = create_method(
-        settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, schedule=TrainingSchedule(4, "linear")
-    )
-    for step in (1, 2, 3):
-        method.take_step(tiny_set.batch(torch.arange(4)), step)
-        assert [o.param_groups[0]["lr"] for o in method.optimizers.values()] == [1e-3 * (1 - (step - 1) / 4)] * 3
-
-
-# --- averages
 
 
 def test_the_average_is_the_one_of_a_slow_reference() -> None:
@@ -117,21 +95,19 @@ def test_the_average_is_the_one_of_a_slow_reference() -> None:
     assert all(torch.equal(averaged[name], value) for name, value in average.tensors.items())
 
 
-def test_an_average_does_not_change_what_is_learnt(tiny_names, tiny_set) -> None:
-    settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **TINY)
+def test_steps_follow_the_schedule_and_ignore_the_average(tiny_names, tiny_set) -> None:
+    settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **TINY, learning_rate=1e-3)
     ends = []
     for average in (0.0, 0.9):
-        schedule = TrainingSchedule(3, ema_decay=average)
+        schedule = TrainingSchedule(4, "linear", ema_decay=average)
         method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, schedule=schedule)
         for step in (1, 2, 3):
             method.take_step(tiny_set.batch(torch.arange(4)), step)
+            assert [o.param_groups[0]["lr"] for o in method.optimizers.values()] == [1e-3 * (1 - (step - 1) / 4)] * 3
             with method.ema_weights():
                 method.encode(tiny_set.batch(torch.arange(2)).images)
         ends.append({name: network.state_dict() for name, network in method.networks.items()})
     assert all(torch.equal(ends[0][n][key], value) for n in ends[0] for key, value in ends[1][n].items())
-
-
-# --- runs
 
 
 def stop_after(monkeypatch: pytest.MonkeyPatch, step: int) -> None:

@@ -1,4 +1,4 @@
-"""Mesh generators: mirror symmetry about any vertical plane."""
+"""Mesh generators: the cube's surface, the rules of their vertices, and mirror symmetry about any vertical plane."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 import nmr
 from learn3d.networks import GENERATORS, MeshGenerator, Symmetry
-from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
+from learn3d.networks.cube_generators import ConvCubeGenerator, CubeGenerator, LinearCubeGenerator, cube_surface
 
 PLANES = {"x": 0.0, "z": 90.0, 0.0: 0.0, 37.5: 37.5, -90.0: -90.0}
 
@@ -34,6 +34,7 @@ def reflected(points: Tensor, azimuth_deg: float) -> Tensor:
 @pytest.mark.parametrize("name", GENERATORS)
 @pytest.mark.parametrize("symmetry", PLANES)
 def test_shapes_are_their_own_mirror_images(name: str, symmetry: Symmetry) -> None:
+    """Shapes of codes are, and any vertices can be made so."""
     generator = narrow(name, symmetry)
     vertices = generator(3 * torch.randn(3, 512)).detach()
     mirrored = reflected(vertices, PLANES[symmetry])
@@ -43,17 +44,11 @@ def test_shapes_are_their_own_mirror_images(name: str, symmetry: Symmetry) -> No
     if symmetry == "z":
         assert torch.equal(vertices[:, generator.mirror], vertices * torch.tensor([1.0, 1.0, -1.0]))
 
-
-@pytest.mark.parametrize("symmetry", PLANES)
-def test_any_vertices_can_be_made_symmetric(symmetry: Symmetry) -> None:
-    generator = narrow("sphere-small", symmetry)
-    vertices = torch.randn(2, 642, 3)
-    symmetric = generator.symmetrized(vertices)
-    mirrored = reflected(symmetric, PLANES[symmetry])
-    torch.testing.assert_close(symmetric[:, generator.mirror], mirrored, atol=1e-6, rtol=0)
-    torch.testing.assert_close(generator.symmetrized(symmetric), symmetric)
-    own = generator(torch.randn(2, 512)).detach()
-    torch.testing.assert_close(generator.symmetrized(own), own, atol=1e-6, rtol=0)
+    torch.testing.assert_close(generator.symmetrized(vertices), vertices, atol=1e-6, rtol=0)
+    symmetric = generator.symmetrized(torch.randn_like(vertices))
+    torch.testing.assert_close(
+        symmetric[:, generator.mirror], reflected(symmetric, PLANES[symmetry]), atol=1e-6, rtol=0
+    )
     assert narrow("sphere-small", None).symmetrized(vertices) is vertices
 
 
@@ -62,39 +57,79 @@ def test_the_camera_along_the_plane_sees_a_symmetric_silhouette(name: str) -> No
     generator = narrow(name, 37.5)
     with torch.autocast("cpu", torch.bfloat16):
         vertices = generator(3 * torch.randn(1, 512)).detach()
-    camera = nmr.LookAt.from_angles(2.732, 0.0, torch.tensor([37.5]), half_fov_deg=15.0)
-    seen = nmr.render_silhouette(vertices, generator.faces, camera, image_size=64)
-    assert (seen - seen.flip(2)).abs().mean() < 1e-3
-    aside = nmr.LookAt.from_angles(2.732, 0.0, torch.tensor([80.0]), half_fov_deg=15.0)
-    other = nmr.render_silhouette(vertices, generator.faces, aside, image_size=64)
-    assert (other - other.flip(2)).abs().mean() > 5e-3
+    differences = []
+    for azimuth in (37.5, 80.0):
+        camera = nmr.LookAt.from_angles(2.732, 0.0, torch.tensor([azimuth]), half_fov_deg=15.0)
+        seen = nmr.render_silhouette(vertices, generator.faces, camera, image_size=64)
+        differences.append((seen - seen.flip(2)).abs().mean())
+    assert differences[0] < 1e-3
+    assert differences[1] > 5e-3
 
 
 def test_the_symmetric_sphere_is_the_published_one() -> None:
+    """Of the 979 outputs 64 move one vertex each, 915 a vertex and its mirror image."""
     generator = GENERATORS["sphere"]("z")
-    linear = [m for m in generator.modules() if isinstance(m, nn.Linear)]
-    assert [(m.in_features, m.out_features) for m in linear] == [(512, 1024), (1024, 2048), (2048, 979)]
     assert not [name for name in generator.state_dict() if not name.startswith("layers")]
-    vertices = generator(3 * torch.randn(4, 512))
-    assert (vertices.shape, vertices.dtype) == ((4, 642, 3), torch.float32)
-    assert int((vertices[0, :, 2] == 0).sum()) == 32
     # The faces are those of a mirrored mesh, too: as a set of triangles the surface is its own mirror image.
     faces, mirrored = (
         set(map(tuple, f.sort(1).values.tolist())) for f in (generator.faces, generator.mirror[generator.faces])
     )
     assert faces == mirrored
 
-
-def test_every_output_of_the_symmetric_sphere_moves_its_vertices() -> None:
-    """Of the 979 outputs 64 move one vertex each, 915 a vertex and its mirror image."""
-    generator = GENERATORS["sphere"]("z")
     outputs = torch.zeros(1, 979, requires_grad=True)
     generator.layers = nn.Identity()
     vertices = generator(outputs)
-    middle, right = (torch.nonzero(where)[:, 0] for where in (generator.sphere[:, 2] == 0, generator.sphere[:, 2] > 0))
-    for vertex, coordinate, output in ((middle[3], 1, 7), (right[2], 2, 64 + 8)):
+    middle, right = (torch.nonzero(side)[:, 0] for side in (generator.sphere[:, 2] == 0, generator.sphere[:, 2] > 0))
+    assert len(middle) == int((vertices[0, :, 2] == 0).sum()) == 32
+    opposite = generator.mirror[right[2]]
+    for vertex, coordinate, output, sign in ((middle[3], 1, 7, 1), (right[2], 2, 72, 1), (opposite, 2, 72, -1)):
         (gradient,) = torch.autograd.grad(vertices[0, vertex, coordinate], outputs, retain_graph=True)
         assert gradient.nonzero().tolist() == [[0, output]]
-        assert gradient[0, output] == 0.5
-    (gradient,) = torch.autograd.grad(vertices[0, generator.mirror[right[2]], 2], outputs)
-    assert gradient[0, 64 + 8] == -0.5
+        assert gradient[0, output] == 0.5 * sign
+
+
+# --- cubes
+
+
+def test_cube_is_closed_and_its_faces_look_outwards() -> None:
+    points, patches, faces = cube_surface()
+    edges = nmr.edge_table(faces)  # raises unless every edge has two faces
+    assert (len(points), len(edges), len(faces)) == (1352, 4050, 2700)
+    assert patches.shape == (6, 16, 16)
+    assert torch.equal(faces.unique(), torch.arange(1352))
+    vertices = points.double() - 7.5
+    outwards = (nmr.face_normals(vertices, faces) * vertices[faces].mean(1)).sum(1)
+    torch.testing.assert_close(outwards, torch.full((2700,), 7.5, dtype=torch.float64))
+    sides = ((points == 0) | (points == 15)).sum(1)  # 1 within a side, 2 at an edge, 3 at a corner
+    assert torch.equal(torch.bincount(patches.flatten()), sides)
+
+
+@pytest.mark.parametrize("name", ["cube-conv", "cube-fc"])
+@pytest.mark.parametrize("symmetry", [None, "z"])
+def test_rule_of_the_vertices(name: str, symmetry: Symmetry | None, monkeypatch) -> None:
+    generator: CubeGenerator = narrow(name, symmetry).eval()
+    assert (generator.scale, generator.object_scale) == ((0.01, 0.5) if name == "cube-conv" else (0.1, 1.0))
+    codes = torch.randn(2, 512)
+    points = (generator.base + generator.scale * generator.bias(codes)).clone()
+    if symmetry is not None:
+        points[..., 2] = points[..., 2].abs()
+        points = torch.stack([(points[:, i] + points[:, j]) / 2 for i, j in enumerate(generator.mirror.tolist())], 1)
+        points[..., 2] *= torch.where(cube_surface()[0][:, 2] < 8, -1, 1)
+    torch.testing.assert_close(generator(codes), generator.object_scale * 1.2 * torch.tanh(points))
+    monkeypatch.setattr(generator, "bias", lambda codes: torch.zeros(len(codes), 1352, 3))
+    lengths = generator(codes).norm(dim=2)
+    torch.testing.assert_close(lengths, torch.full_like(lengths, 0.5 * generator.object_scale))
+
+
+def test_sides_are_averaged_at_shared_vertices() -> None:
+    generator = ConvCubeGenerator(channels=8)
+    values = torch.randn(6)
+    for side, value in zip(generator.sides, values, strict=True):
+        torch.nn.init.zeros_(side[-1].weight)
+        torch.nn.init.constant_(side[-1].bias, float(value))
+    bias = generator.bias(torch.randn(2, 512))
+    _, patches, _ = cube_surface()
+    for vertex in (0, 1, 17, 700, 1351):
+        sides = [side for side in range(6) if (patches[side] == vertex).any()]
+        expected = math.fsum(values[side] for side in sides) / len(sides)
+        torch.testing.assert_close(bias[:, vertex], torch.full((2, 3), expected))

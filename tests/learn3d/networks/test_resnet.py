@@ -1,4 +1,4 @@
-"""ResNet-18: torchvision's names and shapes, its arithmetic written out slowly, and weights from files."""
+"""Both ResNets-18: torchvision's names and shapes, its arithmetic written out slowly, and weights from files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from learn3d.files import limits
 from learn3d.methods.method import DatasetInfo
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.vpl import VPL, VPLSettings
-from learn3d.networks import ENCODERS, network_input
+from learn3d.networks.flat_resnet import FlatResNet18
 from learn3d.networks.resnet import IMAGENET_MEAN, IMAGENET_STD, ResNet18Encoder, load_pretrained
 
 
@@ -45,8 +45,7 @@ def random_weights(seed: int = 0, counters: bool = True) -> dict[str, Tensor]:
     weights = {}
     for name, shape in torchvision_names().items():
         if name.endswith("num_batches_tracked"):
-            if counters:
-                weights[name] = torch.tensor(7)
+            weights |= {name: torch.tensor(7)} if counters else {}
         elif name.endswith("running_var"):
             weights[name] = torch.rand(shape, generator=generator) + 0.5
         else:
@@ -82,7 +81,6 @@ def slow_resnet(images: Tensor, w: dict[str, Tensor]) -> Tensor:
 def test_names_and_shapes_are_torchvisions() -> None:
     own = {name: tuple(value.shape) for name, value in ResNet18Encoder().state_dict().items()}
     assert own == {name: shape for name, shape in torchvision_names().items() if not name.startswith("fc.")}
-    assert ENCODERS["resnet18"] is ResNet18Encoder and ResNet18Encoder.image_size == 224
 
 
 @pytest.mark.parametrize("form", ["pth", "pt, without counters", "safetensors"])
@@ -103,14 +101,6 @@ def test_weights_from_a_file_give_the_published_networks_output(tmp_path: Path, 
     assert torch.equal(encoder(images), encoder(changed))  # the mask is not looked at
 
 
-def test_it_takes_stored_images() -> None:
-    images = torch.randint(0, 256, (2, 4, 224, 224), dtype=torch.uint8)
-    with torch.no_grad():
-        assert ResNet18Encoder().eval()(network_input(images, "cpu", 224)).shape == (2, 512)
-    with pytest.raises(ValueError, match=r"images must be uint8 \[B, 4, 224, 224\]"):
-        network_input(images[:, :, :64, :64], "cpu", 224)
-
-
 @pytest.mark.parametrize("inverted", [True, False])
 @pytest.mark.parametrize("kind", ["pooled", "flat"])
 def test_it_sees_natural_colours_of_every_layout(kind: str, inverted: bool) -> None:
@@ -118,15 +108,15 @@ def test_it_sees_natural_colours_of_every_layout(kind: str, inverted: bool) -> N
     stored = torch.zeros(1, 4, 224, 224, dtype=torch.uint8)
     stored[:, 0], stored[:, 3] = 255, 255
     stored[:, :3] = 255 - stored[:, :3] if inverted else stored[:, :3]
-    shape = DatasetInfo(3, inverted=inverted)
-    if kind == "flat":
-        method = VPL(VPLSettings(encoder="resnet18", image_size=224), shape, "cpu", "fp32")
-        convolution = method.encoder.resnet.conv1
-    else:
-        method = PoseInvariant(PoseInvariantSettings(encoder="resnet18"), shape, "cpu", "fp32")
-        convolution = method.encoder.conv1
+    kinds = {
+        "pooled": (PoseInvariant, PoseInvariantSettings(encoder="resnet18")),
+        "flat": (VPL, VPLSettings(encoder="resnet18", image_size=224)),
+    }
+    create, settings = kinds[kind]
+    method = create(settings, DatasetInfo(3, inverted=inverted), "cpu", "fp32")
     seen = []
-    convolution.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
+    resnet = method.encoder.resnet if kind == "flat" else method.encoder
+    resnet.conv1.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
     with torch.no_grad():
         method.encode(stored)
     red = (torch.tensor([1.0, 0.0, 0.0]) - torch.tensor(IMAGENET_MEAN)) / torch.tensor(IMAGENET_STD)
@@ -141,10 +131,7 @@ def test_a_method_starts_from_pretrained_weights(tmp_path: Path) -> None:
     method = PoseInvariant(settings, DatasetInfo(3, pose_features=9), "cpu", "fp32")
     method.start_from_pretrained()
     assert torch.equal(method.encoder.conv1.weight, weights["conv1.weight"])
-    message = (
-        r"for the encoder 'resnet18', got encoder 'conv-small'; choose that encoder \(.*\), or leave pretrained out"
-    )
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r"for the encoder 'resnet18', got encoder 'conv-small'; choose that encoder"):
         PoseInvariantSettings(encoder="conv-small", pretrained=tmp_path / "weights.pth")
 
 
@@ -165,36 +152,50 @@ def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert torch.equal(encoder.conv1.weight, before)
 
     hint = "it must be a state dict of torchvision's resnet18"
-    refused({k: v for k, v in weights.items() if "layer4" not in k}, f"w.pth lacks 'layer4.* and 24 more.*{hint}")
-    refused(weights | {"layer4.2.conv1.weight": torch.ones(1)}, f"w.pth has 'layer4.2.conv1.weight' and 0 more.*{hint}")
-    refused(weights | {"bn1.bias": torch.ones(3)}, rf"w.pth: bn1.bias is \[3\], ResNet-18 has \[64\]; {hint}")
-    nan = torch.full((64,), float("nan"))
-    refused(weights | {"bn1.bias": nan}, f"w.pth: bn1.bias has values that are not finite; {hint}")
-    for odd in (
-        weights["bn1.bias"].to(torch.complex64),
-        weights["bn1.bias"].to(torch.float8_e4m3fn),
-        weights["bn1.bias"].to("meta"),
-        weights["bn1.bias"].to_sparse(),
-    ):
-        refused(weights | {"bn1.bias": odd}, "w.pth: bn1.bias must be plain numbers such as torch.float32, got ")
-    beyond = torch.full((64,), 1e300, dtype=torch.float64)
-    refused(weights | {"bn1.bias": beyond}, "w.pth: bn1.bias has values that are not finite")
-    refused(weights | {5: torch.ones(1)}, r"w.pth: must hold a state dict \(names -> tensors\), got ")
+    refused({k: v for k, v in weights.items() if "layer4" not in k}, f"w.pth lacks entry 'layer4.* and 24 more.*{hint}")
+    refused(
+        weights | {"layer4.2.conv1.weight": torch.ones(1)},
+        f"has the unknown entry 'layer4.2.conv1.weight' and 0 more.*{hint}",
+    )
+    refused(weights | {"bn1.bias": torch.ones(3)}, rf"w.pth: bn1.bias is \[3\] .*, ResNet-18 has \[64\] .*; {hint}")
+    for value in (float("nan"), 1e300):
+        bias = torch.full((64,), value, dtype=torch.float64)
+        refused(weights | {"bn1.bias": bias}, f"w.pth: bn1.bias has values that are not finite; {hint}")
+    bias = weights["bn1.bias"]
+    for odd in (bias.to(torch.complex64), bias.to(torch.float8_e4m3fn), bias.to("meta"), bias.to_sparse()):
+        refused(weights | {"bn1.bias": odd}, r"w\.pth: (bn1\.bias is .*torch|cannot be read)")
+    refused(weights | {5: torch.ones(1)}, "w.pth has the unknown entry '5'")
     refused([1, 2], r"w.pth: must hold a state dict \(names -> tensors\), got list")
     refused(weights | {"bn1.bias": Runs()}, "w.pth: cannot be read .*Weights only load failed")
     assert not Path("ran").exists()
-    path.write_bytes(b"no weights")
-    with pytest.raises(ValueError, match=r"w.pth: cannot be read"):
-        load_pretrained(encoder, path)
-    (tmp_path / "w.safetensors").write_bytes(b"no weights")
-    with pytest.raises(ValueError, match=r"w.safetensors: cannot be read"):
-        load_pretrained(encoder, tmp_path / "w.safetensors")
+    for name in ("w.pth", "w.safetensors"):
+        Path(name).write_bytes(b"no weights")
+        with pytest.raises(ValueError, match=f"{name}: cannot be read"):
+            load_pretrained(encoder, tmp_path / name)
     with pytest.raises(FileNotFoundError, match=r"none.pth: is missing"):
         load_pretrained(encoder, tmp_path / "none.pth")
 
-
-def test_weights_beyond_the_limits_are_not_read(tmp_path: Path) -> None:
-    with open(tmp_path / "w.pth", "wb") as file:
+    with open(path, "wb") as file:
         file.truncate(limits.WEIGHTS_BYTES + 1)
     with pytest.raises(ValueError, match=r"w\.pth: has \d+ bytes, and at most"):
-        load_pretrained(ResNet18Encoder(), tmp_path / "w.pth")
+        load_pretrained(encoder, path)
+
+
+def test_flat_resnet_is_linear_in_the_features_and_keeps_pretrained_batch_norms(tmp_path: Path) -> None:
+    torch.save(random_weights(), tmp_path / "w.pth")
+    network, plain = FlatResNet18(64, frozen_norms=True), ResNet18Encoder().eval()
+    load_pretrained(network.resnet, tmp_path / "w.pth")
+    load_pretrained(plain, tmp_path / "w.pth")
+    images, features = torch.rand(2, 4, 64, 64), []
+    network.resnet.layer4.register_forward_hook(lambda _, __, output: features.append(output))
+    codes = network.train()(images)
+    torch.testing.assert_close(features[0].mean((2, 3)), plain(images))
+    torch.testing.assert_close(codes, features[0].flatten(1) @ network.code.weight.T + network.code.bias)
+    assert FlatResNet18().code.in_features == 512 * 7 * 7
+
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    codes.square().sum().backward()
+    torch.optim.SGD([p for p in network.parameters() if p.requires_grad], lr=0.1).step()
+    changed = {name for name, value in network.state_dict().items() if not torch.equal(before[name], value)}
+    assert "resnet.conv1.weight" in changed
+    assert not [name for name in changed if "bn" in name or "downsample.1" in name]
