@@ -1,33 +1,30 @@
-"""The page itself: what is on it, what its buttons do, and the server. Pictures of visitors are read in workers."""
+"""The page itself: its parts, the work of its buttons, and the server. Pictures of visitors are read in workers."""
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import io
 import logging
 import os
-import socket
+import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image
+from starlette.middleware import Middleware
 
 from learn3d.data.framing import TOLERANCE, read_picture, threshold_mask
-from learn3d.demo import fit_tab, picture_tab
-from learn3d.demo.fit_tab import SIDES
-from learn3d.demo.picture_tab import Picture
+from learn3d.demo.gate import Gate
+from learn3d.demo.picture import SIDE, Picture, example, make_mesh, open_picture, write_cutout, write_mesh
 from learn3d.files.findings import DamagedFile
 from learn3d.make_data.shapes import CATEGORIES
-from learn3d.pictures.sheets import save_png
-from learn3d.pictures.surfaces import Surface
 from learn3d.reconstruction import Model, load_model
-from learn3d.terminal import stop_on_signal
+from learn3d.terminal import plain, say, stop_on_signal
 
 os.environ |= {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_OFFLINE": "1"}  # before gradio is imported
 import gradio as gr
@@ -35,58 +32,22 @@ import gradio as gr
 if TYPE_CHECKING:
     from gradio.data_classes import FileData
 
-WAITING = 16  # visitors; the next one is asked to come back
+WAITING = 64  # requests in the queue; the next visitor is asked to come back
+VISITORS = 256  # whose pictures are kept, 1 MB each
+KEPT = 3600  # seconds for which the files of a visitor are kept
 _MASK = (0, 200, 235)  # few objects have this colour
-_CANVAS = 320  # pixels of a silhouette
 _STRENGTH = 0.55  # opacity of the mask over the picture
 _PICTURES = [".png", ".jpg", ".jpeg", ".webp", ".bmp"]
 _ALONE = {"concurrency_limit": 1, "concurrency_id": "networks", "show_progress": "minimal"}  # one visitor at a time
 _EDITOR = {"sources": [], "transforms": [], "layers": False, "buttons": [], "format": "png", "fixed_canvas": True}
 _EDITOR |= {"brush": gr.Brush(20, [(f"rgb{_MASK}", _STRENGTH)], color_mode="fixed"), "eraser": gr.Eraser(20)}
 _LAUNCH = {"share": False, "ssr_mode": False, "mcp_server": False, "enable_monitoring": False, "run_history": False}
-_LAUNCH |= {"prevent_thread_lock": True, "quiet": True, "footer_links": []}
-_LAUNCH |= {"max_file_size": 32 * 2**20, "state_session_capacity": WAITING}
-_LAUNCH["theme"] = gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
-
-
-def _layer(file: bytes | FileData | None, flatten_on_white: bool = False) -> np.ndarray | None:
-    """Opacity uint8 [H,W] of a layer that a browser sends; None for the background and the composite."""
-    if file is None or flatten_on_white:
-        return None
-    with _told(), tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "drawing") if isinstance(file, bytes) else Path(file.path)
-        if isinstance(file, bytes):
-            path.write_bytes(file)
-        colors, alpha = read_picture(path, picture_tab.SIDE)
-    return np.full(colors.shape[:2], 255, np.uint8) if alpha is None else alpha
-
-
-def _drawing(**options: Any) -> gr.ImageEditor:
-    """A picture to paint a mask on, which is read as any stranger's picture."""
-    editor = gr.ImageEditor(**_EDITOR, **options)
-    editor.convert_and_format_image = _layer  # gradio's own opens what the browser sends in this process
-    return editor
-
-
-def drawn(value: dict | None) -> np.ndarray | None:
-    """What is painted in any layer of a drawing, uint8 [H,W], 0 or 255; None: there is nothing to paint on."""
-    layers = value["layers"] if value else []
-    return 255 * (np.max(layers, axis=0) > 64).astype(np.uint8) if layers else None
-
-
-def _painted(mask: np.ndarray) -> np.ndarray:
-    """A mask uint8 [H,W] as a layer to correct with brush and eraser."""
-    layer = np.zeros((*mask.shape, 4), np.uint8)
-    layer[mask > 127] = (*_MASK, round(255 * _STRENGTH))
-    return layer
-
-
-def _editor(background: np.ndarray | str, mask: np.ndarray) -> dict:
-    return {"background": background, "layers": [_painted(mask)], "composite": None}
+_LAUNCH |= {"prevent_thread_lock": True, "quiet": True, "footer_links": [], "state_session_capacity": VISITORS}
+_LAUNCH |= {"max_file_size": 32 * 2**20, "theme": gr.themes.Default(font=["system-ui"], font_mono=["monospace"])}
 
 
 @contextlib.contextmanager
-def _told() -> Iterator[None]:
+def _sentences() -> Iterator[None]:
     """Show errors about a visitor's picture on the page, as one sentence."""
     try:
         yield
@@ -95,197 +56,152 @@ def _told() -> Iterator[None]:
         raise gr.Error(text, print_exception=False) from None
 
 
-def _shown(surface: Surface, name: str, azimuth_deg: float, root: Path) -> tuple:
-    """What a `_viewer` is to show: a mesh from this azimuth, and its files, in a new folder of `root`."""
-    if not len(surface.faces):
-        raise ValueError("the model makes an empty shape of this picture; try another picture, or another model")
-    glb, obj = map(str, picture_tab.write_mesh(surface, Path(tempfile.mkdtemp(dir=root)), name))
-    radius = 3.3 * float(surface.vertices.norm(dim=1).max())  # all of it is seen in a narrow window, too
-    mesh = gr.Model3D(glb, camera_position=(-azimuth_deg, 70, radius))
-    return mesh, *(gr.DownloadButton(value=file, interactive=True) for file in (glb, obj))
+def _layer(file: bytes | FileData | None, flatten_on_white: bool = False) -> np.ndarray | None:
+    """Opacity uint8 [H,W] of a layer that a browser sends; None for the background and the composite."""
+    if file is None or flatten_on_white:
+        return None
+    with _sentences(), tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "drawing") if isinstance(file, bytes) else Path(file.path)
+        if isinstance(file, bytes):
+            path.write_bytes(file)
+        colors, alpha = read_picture(path, SIDE)
+    return np.full(colors.shape[:2], 255, np.uint8) if alpha is None else alpha
 
 
-def _viewer(label: str) -> list:
-    """A place for a mesh, and for its files."""
-    mesh = gr.Model3D(label=label, height=440, interactive=False)
-    with gr.Row():
-        return [mesh, *(gr.DownloadButton(k, size="sm", min_width=60, interactive=False) for k in ("GLB", "OBJ"))]
-
-
-def _example_buttons() -> dict[str, gr.Button]:
-    with gr.Row():
-        return {category: gr.Button(category, size="sm", min_width=60) for category in CATEGORIES}
-
-
-def picture_page(models: dict[str, Model], root: Path) -> None:
-    """Tab 1: a picture and its mask on the left, the meshes of all models on the right."""
-
-    def show(new: Picture) -> tuple:
-        return new, _editor(new.colors, new.mask)
-
-    def upload(path: str, tolerance: float) -> tuple:
-        with _told():
-            return show(picture_tab.open_picture(Path(path), tolerance))
-
-    def paint(given: Picture | None, mask: Callable[[Picture], np.ndarray]) -> dict | None:
-        return given and _editor(given.colors, mask(given))
-
-    def threshold(given: Picture | None, tolerance: float) -> dict | None:
-        return paint(given, lambda picture: threshold_mask(picture.colors, tolerance))
-
-    def cut_out(given: Picture | None) -> dict | None:
-        return paint(given, lambda picture: picture_tab.object_mask(picture.colors))
-
-    def empty(given: Picture | None) -> dict | None:
-        return paint(given, lambda picture: np.zeros_like(picture.mask))
-
-    def restore(given: Picture | None) -> dict | None:
-        return paint(given, lambda picture: picture.mask)
-
-    def draw_example(category: str) -> tuple:
-        return show(picture_tab.example(category, time.time_ns() % 2**32))
-
-    def make(given: Picture | None, chosen: list[str], drawing: dict | None = None) -> list:
-        outputs = []
-        with _told():
-            if given is None:
-                raise ValueError("Give a picture first, or take an example")
-            mask = drawn(drawing)
-            new = given if mask is None else given._replace(mask=mask)
-            cutout = picture_tab.write_cutout(new, Path(tempfile.mkdtemp(dir=root)))
-            outputs.append(gr.DownloadButton(value=str(cutout), interactive=True))
-            for label, model in models.items():
-                if label not in chosen:
-                    outputs += [gr.skip()] * 3
-                    continue
-                name = new.name if len(models) == 1 else f"{new.name} {label}"
-                surface, azimuth = picture_tab.make_mesh(model, new)
-                outputs += _shown(surface, name, azimuth, root)
-        return outputs
-
-    def clear() -> list:
-        off = gr.DownloadButton(interactive=False)
-        return [None, None, off, *[None, off, off] * len(models)]
-
-    picture = gr.State()
-    gr.Markdown(
-        "1. Give a picture of an object, or press a category. 2. See that the mask covers the object. 3. Turn the mesh."
-    )
-    with gr.Row():
-        with gr.Column(scale=2, min_width=320):
-            upload_box = gr.File(label="Picture", height=140, file_types=_PICTURES)
-            examples = _example_buttons()
-            editor = _drawing(label="Mask (bright blue)", canvas_size=(picture_tab.SIDE, picture_tab.SIDE))
-            tolerance = gr.Slider(0, 1, TOLERANCE, label="Threshold", info="Difference to the background")
-            with gr.Row():
-                emptied, again = gr.Button("Empty mask", size="sm"), gr.Button("Mask as at first", size="sm")
-            removed = gr.Button("Find the object (rembg)", visible=find_spec("rembg") is not None)
-            cutout = gr.DownloadButton("Save the cut-out (PNG)", size="sm", interactive=False)
-        with gr.Column(scale=3, min_width=320):
-            chosen = gr.CheckboxGroup(list(models), value=list(models), label="Models", visible=len(models) > 1)
-            start = gr.Button("Make the mesh", variant="primary")
-            columns, meshes = [], []
-            with gr.Row():
-                for label in models:
-                    with gr.Column(min_width=240) as column:
-                        meshes += _viewer(label)
-                    columns.append(column)
-    chosen.change(lambda names: [gr.Column(visible=label in names) for label in models], [chosen], columns)
-    shown, made = [picture, editor], [cutout, *meshes]
-    tolerance.release(threshold, [picture, tolerance], editor, **_ALONE)
-    for button, mask in ((again, restore), (emptied, empty), (removed, cut_out)):
-        button.click(mask, [picture], editor, **_ALONE)
-    arrivals = [example.click(partial(draw_example, name), None, shown, **_ALONE) for name, example in examples.items()]
-    uploaded = upload_box.upload(clear, None, [*shown, *made]).then(upload, [upload_box, tolerance], shown, **_ALONE)
-    for arrival in (uploaded, *arrivals):
-        arrival.success(make, [picture, chosen], made, **_ALONE)
-    start.click(make, [picture, chosen, editor], made, **_ALONE)
-
-
-def fit_page(root: Path) -> None:
-    """Tab 2: silhouettes above, the fit and its mesh below."""
-
-    def draw_example(category: str) -> list[dict]:
-        masks = fit_tab.example_silhouettes(category, time.time_ns() % 2**32).values()
-        large = (np.asarray(Image.fromarray(mask).resize((_CANVAS, _CANVAS))) for mask in masks)
-        return [_editor(paper, mask) for mask in large]
-
-    def fit(*drawings: dict | None) -> Iterator[tuple]:
-        with _told():
-            for moment in fit_tab.fit(dict(zip(SIDES, map(drawn, drawings), strict=True))):
-                yield moment.picture, f"step {moment.step}, IoU {moment.iou:.2f}", moment.surface
-
-    def show(surface: Surface) -> tuple:
-        return _shown(surface, "fitted", -30, root)
-
-    paper = str(root / "paper.png")  # a file: each picture that is given as an array is written anew while it is sent
-    save_png(Path(paper), np.full((_CANVAS, _CANVAS, 3), 255, np.uint8))
-    gr.Markdown("Paint one object from two or three sides, or take an example: a sphere is then fitted to it.")
-    examples = _example_buttons()
-    with gr.Row():
-        how = {"value": {"background": paper, "layers": [], "composite": None}, "canvas_size": (_CANVAS, _CANVAS)}
-        drawings = [_drawing(label=f"From the {side}", min_width=240, **how) for side in SIDES]
-    with gr.Row():
-        start = gr.Button("Fit", variant="primary")
-        stop = gr.Button("Stop")
-    with gr.Row():
-        with gr.Column(min_width=320):
-            live = gr.Image(label="Orange: yours; blue: the mesh; grey: both", buttons=[], height=440, format="png")
-            said = gr.Markdown()
-        with gr.Column(min_width=320):
-            fitted = _viewer("Fitted mesh")
-    for category, example in examples.items():
-        example.click(partial(draw_example, category), None, drawings, **_ALONE)
-    surface = gr.State()
-    fitting = start.click(fit, drawings, [live, said, surface], **_ALONE)
-    fitting.success(show, [surface], fitted, **_ALONE)
-    stop.click(None, cancels=[fitting])
+def _show(picture: Picture, mask: np.ndarray) -> dict:
+    """The content of the editor: a mask uint8 [H,W] over the picture, as a layer to correct with brush and eraser."""
+    layer = np.zeros((*mask.shape, 4), np.uint8)
+    layer[mask > 127] = (*_MASK, round(255 * _STRENGTH))
+    return {"background": picture.colors, "layers": [layer], "composite": None}
 
 
 def page(models: dict[str, Model], root: Path) -> gr.Blocks:
-    """The page; files of meshes are written below `root`."""
-    with gr.Blocks(title="learn3d demo", analytics_enabled=False) as blocks:
-        gr.Markdown("# learn3d demo")
-        with gr.Tab("Picture to mesh"):
-            picture_page(models, root)
-        with gr.Tab("Fit a mesh"):
-            fit_page(root)
+    """The page: a picture and its mask on the left, the meshes of all models on the right; files go below `root`."""
+
+    def open_upload(path: str, tolerance: float) -> tuple:
+        with _sentences():
+            new = open_picture(Path(path), tolerance)
+        return new, _show(new, new.mask)
+
+    def draw_example(category: str) -> tuple:
+        new = example(category, time.time_ns() % 2**32)
+        return new, _show(new, new.mask)
+
+    def threshold(given: Picture | None, tolerance: float) -> dict | None:
+        return given and _show(given, threshold_mask(given.colors, tolerance))
+
+    def empty(given: Picture | None) -> dict | None:
+        return given and _show(given, np.zeros_like(given.mask))
+
+    def make(given: Picture | None, drawing: dict | None = None) -> list:
+        with _sentences():
+            if given is None:
+                raise ValueError("Give a picture first, or take an example")
+            if drawing and drawing["layers"]:
+                given = given._replace(mask=255 * (np.max(drawing["layers"], axis=0) > 64).astype(np.uint8))
+            files, meshes = [write_cutout(given, Path(tempfile.mkdtemp(dir=root)))], []
+            for label, model in models.items():
+                surface, azimuth = make_mesh(model, given)
+                if not len(surface.faces):
+                    raise ValueError("the model makes an empty shape of this picture; try another picture or model")
+                name = given.name if len(models) == 1 else f"{given.name} {label}"
+                files += write_mesh(surface, Path(tempfile.mkdtemp(dir=root)), name)
+                radius = 3.3 * float(surface.vertices.norm(dim=1).max())  # a narrow window shows all of it, too
+                meshes.append(gr.Model3D(str(files[-2]), camera_position=(-azimuth, 70, radius)))
+        return [*meshes, *(gr.DownloadButton(value=str(file), interactive=True) for file in files)]
+
+    def clear() -> list:
+        return [None, None, *[None] * len(models), *[gr.DownloadButton(interactive=False)] * len(files)]
+
+    with gr.Blocks(title="learn3d demo", analytics_enabled=False, delete_cache=(KEPT // 10, KEPT)) as blocks:
+        gr.Markdown("# Picture to mesh")
+        gr.Markdown(
+            "1. Give a picture of an object, or press a category. 2. Check that the mask covers the object. "
+            "3. Turn the mesh."
+        )
+        picture, meshes = gr.State(), []
+        with gr.Row():
+            with gr.Column(scale=2, min_width=320):
+                upload = gr.File(label="Picture", height=140, file_types=_PICTURES)
+                with gr.Row():
+                    examples = {category: gr.Button(category, size="sm", min_width=60) for category in CATEGORIES}
+                editor = gr.ImageEditor(label="Mask (bright blue)", canvas_size=(SIDE, SIDE), **_EDITOR)
+                editor.convert_and_format_image = _layer  # gradio's own opens uploads in this process
+                tolerance = gr.Slider(0, 1, TOLERANCE, label="Threshold", info="Difference to the background")
+                emptied = gr.Button("Empty mask", size="sm")
+                files = [gr.DownloadButton("Save the cut-out (PNG)", size="sm", interactive=False)]
+            with gr.Column(scale=3, min_width=320):
+                start = gr.Button("Make the mesh", variant="primary")
+                with gr.Row():
+                    for label in models:
+                        with gr.Column(min_width=240):
+                            meshes.append(gr.Model3D(label=label, height=440, interactive=False))
+                            with gr.Row():
+                                small = {"size": "sm", "min_width": 60, "interactive": False}
+                                files += [gr.DownloadButton(kind, **small) for kind in ("GLB", "OBJ")]
+        shown, made = [picture, editor], [*meshes, *files]
+        tolerance.release(threshold, [picture, tolerance], editor, **_ALONE)
+        emptied.click(empty, [picture], editor, **_ALONE)
+        arrivals = [
+            button.click(partial(draw_example, name), None, shown, **_ALONE) for name, button in examples.items()
+        ]
+        uploaded = upload.upload(clear, None, [*shown, *made])
+        arrivals.append(uploaded.then(open_upload, [upload, tolerance], shown, **_ALONE))
+        for arrival in arrivals:
+            arrival.success(make, [picture], made, **_ALONE)
+        start.click(make, [picture, editor], made, **_ALONE)
+    for block in blocks.blocks.values():
+        if isinstance(block, gr.components.Component):
+            block.async_move_resource_to_block_cache = partial(_keep, block.async_move_resource_to_block_cache)
     return blocks.queue(max_size=WAITING)
 
 
+async def _keep(keep: Any, path: str | Path | None) -> str | None:
+    """Take a file into the cache, by gradio's own `keep`, which would fetch it if a request names an address."""
+    if "://" in str(path):
+        raise gr.Error("a picture must be uploaded: nothing is fetched from elsewhere", print_exception=False)
+    return await keep(path)
+
+
+class _PlainStderr(io.TextIOBase):
+    """Stderr by way of `plain`: tracebacks of gradio and logs of uvicorn quote a visitor's words."""
+
+    def __init__(self) -> None:
+        self._stream = sys.stderr
+
+    def write(self, text: str) -> int:
+        self._stream.write(plain(text))
+        self._stream.flush()
+        return len(text)
+
+
 def labels(runs: Sequence[Path]) -> list[str]:
-    """A name for each run: that of its folder or file; numbered where they would be the same."""
-    paths = [Path(run).resolve() for run in runs]
-    names = [path.stem if path.is_file() else path.name for path in paths]
+    """A name for each run: that of its folder or file; numbered if several have the same."""
+    names = [Path(run).resolve().name for run in runs]
     return [f"{name} {i + 1}" if names.count(name) > 1 else name for i, name in enumerate(names)]
 
 
-def check_address(host: str, port: int) -> None:
-    """OSError, in a sentence, where nobody can listen there."""
-    try:
-        with socket.create_server((host, port)):
-            pass
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise OSError(f"cannot open a page at {host}:{port} ({reason}); give another --port or --host") from None
-
-
-def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool, report: Callable[[str], None]) -> None:
+def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
     """Load the models of `runs` (none: the package's small one) and serve the page until a signal asks for the end.
 
     Raises ValueError and OSError for models that cannot be loaded and an address that is taken.
     """
-    check_address(host, port)
     models = dict(zip(labels(runs), map(load_model, runs), strict=True)) if runs else {"small model": load_model(None)}
     with tempfile.TemporaryDirectory(prefix="learn3d-demo-") as folder, stop_on_signal() as stop:
-        os.environ["GRADIO_TEMP_DIR"] = folder  # uploads go there, too
-        blocks = page(models, Path(folder))
-        where = {"server_name": host, "server_port": port, "inbrowser": browser, "allowed_paths": [folder]}
-        _, url, _ = blocks.launch(**where, **_LAUNCH)
-        logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)  # tracebacks where a visitor leaves early
-        report(f"the page is at {url} (Ctrl-C ends it)")
-        while not stop.name:
-            time.sleep(0.1)
-        blocks.server.force_exit = True  # it would wait for pages that are open
-        blocks.close(verbose=False)
+        os.environ["GRADIO_TEMP_DIR"] = f"{folder}/uploads"
+        root = Path(folder, "results")
+        root.mkdir()
+        blocks = page(models, root)
+        gate = {"app_kwargs": {"middleware": [Middleware(Gate, host=host)]}}
+        with contextlib.redirect_stderr(_PlainStderr()):
+            try:
+                _, url, _ = blocks.launch(server_name=host, server_port=port, inbrowser=browser, **gate, **_LAUNCH)
+            except OSError as error:
+                raise OSError(f"cannot open a page at {host}:{port}; give another --port or --host") from error
+            say(f"the page is at {url} (Ctrl-C ends it)")
+            while not stop.name:
+                time.sleep(0.1)
+            logging.getLogger("uvicorn.error").disabled = True  # it reports its own end as an error
+            blocks.server.force_exit = True  # it would wait for pages that are open
+            blocks.close(verbose=False)
     gc.freeze()  # taking all of it apart when Python ends would take seconds

@@ -1,4 +1,4 @@
-"""From a picture to meshes: a mask by the colour of the background, and the files of each model's mesh."""
+"""From a picture to a mesh: a mask by the colour of the background, and the files of each model's mesh."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Picture(NamedTuple):
 
 
 def open_picture(path: Path, tolerance: float = TOLERANCE) -> Picture:
-    """Read a picture file. Its mask is its transparency or, if it has none, what `threshold_mask` finds.
+    """Read a picture file. Its mask is its transparency or, if it has none, that of `threshold_mask`.
 
     Raises ValueError for a file that is no picture.
     """
@@ -46,13 +46,6 @@ def open_picture(path: Path, tolerance: float = TOLERANCE) -> Picture:
     return Picture(padded, mask, path.stem)
 
 
-def object_mask(colors: np.ndarray) -> np.ndarray:
-    """What the package rembg takes for the object in a picture uint8 [H,W,3]: uint8 [H,W]."""
-    import rembg  # optional, and slow to import
-
-    return np.asarray(rembg.remove(Image.fromarray(colors), only_mask=True))
-
-
 def example(category: str, seed: int) -> Picture:
     """A generated object of `make_data.shapes.CATEGORIES`, as Kato's camera sees it from some side."""
     rng = np.random.default_rng(seed)
@@ -66,14 +59,12 @@ def example(category: str, seed: int) -> Picture:
 def make_mesh(model: Model, picture: Picture) -> tuple[Surface, float]:
     """The model's mesh of a picture and, in degrees, the azimuth from which it looks like the picture.
 
-    Raises ValueError for masks that cannot be right.
+    Raises ValueError if the mask cannot be right.
     """
     try:
         check_mask(picture.mask)
     except ValueError as error:
-        text = str(error).replace("its mask", "The mask", 1)
-        end = "" if text.endswith("?") else "."
-        raise ValueError(f"{text}{end} Correct it with the threshold or the brush") from None
+        raise ValueError(f"{error} (correct it with the threshold or the brush)") from None
     stored = model.prepare(picture.colors, picture.mask, crop=not picture.framed)
     (surface,) = reconstruct(model.method, stored[None])
     return surface, input_azimuth_deg(surface, stored[3])
@@ -87,7 +78,7 @@ def write_cutout(picture: Picture, folder: Path) -> Path:
 
 
 def write_mesh(surface: Surface, folder: Path, name: str) -> tuple[Path, Path]:
-    """Write <name>.glb (in clay where the shape has no colours) and <name>.obj; returns both paths."""
+    """Write <name>.glb (in clay if the shape has no colours) and <name>.obj; returns both paths."""
     folder.mkdir(parents=True, exist_ok=True)
     if surface.colors is None:
         surface = surface._replace(colors=torch.tensor(CLAY).expand_as(surface.vertices))
