@@ -1,4 +1,4 @@
-"""What a training run is: one frozen dataclass, filled in from a preset, with its checks and its JSON form."""
+"""The options of a training run: a frozen dataclass, filled in from a preset, with its checks and its JSON form."""
 
 from __future__ import annotations
 
@@ -14,20 +14,18 @@ from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import LAYOUTS, Layout, check_options
 from learn3d.data.sampling import Sampling
 from learn3d.files import limits
-from learn3d.files.findings import DamagedFile
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.methods import LRSchedule, MethodSettings, TrainingSchedule
-from learn3d.presets import PRESETS, full_name
+from learn3d.presets import PRESETS, Preset, full_name
 from learn3d.settings import Count, FilePath, Items, Rare, Step, checked
 
 DEFAULT_PRESET = "plus-kato"
 
 #: Options that the preset decides if they are None.
-FROM_PRESET = ("settings", "layout", "sampling", "augment", "iterations", "batch_size", "lr_schedule", "warmup_steps")
-FROM_PRESET += ("ema_decay",)
+FROM_PRESET = tuple(field.name for field in dataclasses.fields(Preset) if field.name not in ("label", "source"))
 
 T = TypeVar("T")
-_MAY_DIFFER = "a resumed run may have another value"  # it decides how to compute or report, not what is learnt
+_MAY_DIFFER = "a resumed run may have another value"  # the option decides how to compute or report, not the result
 MayDiffer = Annotated[T, _MAY_DIFFER]
 
 
@@ -36,27 +34,25 @@ class TrainConfig:
     """One training run. It is saved with the run (config.json and in every checkpoint)."""
 
     data: MayDiffer[FilePath]
-    """Folder with the data set's files, such as 02691156_train_images.npz (what `learn3d make-dataset` writes)."""
+    """Folder of the data set: its files are called 02691156_train_images.npz and so on in the layout kato."""
     category: Annotated[str, Field(min_length=1)]
-    """Object category to train on: a name such as airplane or chair, a synset id, or the file prefix of your own set.
-    Several, separated by commas, are trained on together."""
+    """Categories to train on together, separated by commas: names (chair), synset ids, or names of your own."""
     output: MayDiffer[FilePath]
-    """Folder of this run: checkpoints, metrics, pictures. It must be new or empty unless you resume or overwrite."""
+    """Folder of this run: checkpoints, metrics, pictures. It must be new or empty, or see --resume, --overwrite."""
     preset: Annotated[str, AfterValidator(full_name)] = DEFAULT_PRESET
-    """Method, or preset of a method for other data, that decides the defaults of the other options."""
+    """Method, or preset of a method for other data: decides the defaults of the other options."""
     settings: Rare[Annotated[MethodSettings | None, SkipValidation]] = None
-    """Settings of the method (default: the preset's)."""
+    """Settings of the method (default: from the preset)."""
     layout: Layout | None = None
     """Arrangement of the files of the data set, see docs/data-sets.md."""
     view_bins: Rare[str | None] = None
-    """View classes as cells of azimuth and elevation in degrees, such as 15x20 (default: 15x20 for kar; one class for
-    each camera if cameras are fixed)."""
+    """View classes as cells of azimuth and elevation in degrees (default: 15x20 for kar; a class for each camera if
+    cameras are fixed)."""
     views_per_object: Rare[Count | None] = None
-    """Number of views of each object to train on: the first ones for kar and r2n2, else drawn at random, the same in
-    every run (default: the layout's protocol, one for kar, else all)."""
+    """Number of views of each object to train on: the first ones for kar and r2n2, else the same random ones in every
+    run (default: one for kar, else all)."""
     sampling: Rare[Sampling | None] = None
-    """How a batch is drawn: views (each on its own), pairs (two views of an object) or classes (categories drawn
-    uniformly)."""
+    """Draw views (each on its own), pairs (two views of an object) or classes (categories drawn uniformly)."""
     augment: Rare[Annotated[tuple[Augmentation, ...], Items] | None] = None
     """Random changes of the training images (--augment without a name: none)."""
     iterations: MayDiffer[Step | None] = None
@@ -64,14 +60,11 @@ class TrainConfig:
     batch_size: Annotated[int, Field(ge=1, le=65_536)] | None = None
     """Images per training step."""
     lr_schedule: Rare[LRSchedule | None] = None
-    """Course of the learning rate over the run. linear, cosine: it falls to 0. step: it falls to a tenth for the last
-    5 % of all iterations."""
+    """Course of the learning rate. linear, cosine: it falls to 0. step: it is a tenth in the last 5 % of all steps."""
     warmup_steps: Rare[Annotated[int, Field(ge=0, le=10**9)] | None] = None
-    """Steps over which the learning rate grows from 0 at the beginning (default: the preset's, and never more than a
-    tenth of the iterations)."""
+    """Steps over which the learning rate ramps up from 0 (default: from the preset, at most a tenth of the run)."""
     ema_decay: Rare[Annotated[float, Field(ge=0, lt=1)] | None] = None
-    """Decay, for each step, of an exponential moving average of all weights, which validation, the best checkpoint,
-    evaluation and reconstruction use. 0: no average."""
+    """Decay a step of the EMA of all weights, which evaluation and reconstruction use. 0: they use the weights."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial weights and of the order of the images."""
     device: MayDiffer[Literal["cpu", "cuda"]] = "cpu"
@@ -79,8 +72,7 @@ class TrainConfig:
     precision: Rare[Literal["auto", "bf16", "fp32"]] = "auto"
     """Arithmetic of the networks. auto: bf16 if it is faster (CUDA, CPUs with bf16 instructions), else fp32."""
     threads: MayDiffer[Annotated[int, Field(ge=1, le=4096)] | None] = None
-    """Number of CPU threads (default: one or all, whichever makes the steps faster, tried at the beginning and when
-    steps become slow)."""
+    """Number of CPU threads (default: one or all, as is faster; tried at the beginning and when steps become slow)."""
     val_split: Rare[MayDiffer[Literal["val", "test"]]] = "val"
     """Split for validation during training, and for choosing the best checkpoint."""
     validate_every: MayDiffer[Step] = 2000
@@ -91,10 +83,8 @@ class TrainConfig:
     """Steps between picture grids."""
     checkpoint_every: Rare[MayDiffer[Step]] = 1000
     """Steps between saves of the last checkpoint."""
-    keep_checkpoints: Rare[MayDiffer[Step]] = 2
-    """Number of checkpoints to keep: last.safetensors and the ones before it, in checkpoints/."""
     log_every: Rare[MayDiffer[Step]] = 50
-    """Steps between logged losses. A method that trains its networks in turns logs the losses of the last two steps."""
+    """Steps between logged losses."""
 
     def __post_init__(self) -> None:
         preset = PRESETS[self.preset]
@@ -103,22 +93,18 @@ class TrainConfig:
             object.__setattr__(self, name, value)
         if "warmup_steps" in chosen:
             object.__setattr__(self, "warmup_steps", min(self.warmup_steps, self.iterations // 10))
-        if type(self.settings) is not type(preset.settings):
-            raise ValueError(
-                f"preset {self.preset!r} takes {type(preset.settings).__name__}, got {type(self.settings).__name__}"
-            )
+        wanted, given = type(preset.settings).__name__, type(self.settings).__name__
+        if wanted != given:
+            raise ValueError(f"preset {self.preset!r} takes {wanted}, got {given}")
         check_options(self.layout, image_size=self.settings.image_size, view_bins=self.view_bins)
         if self.val_split == "val" and not LAYOUTS[self.layout].validation:
             raise ValueError(f"the layout {self.layout!r} has no split val; validate on test (val_split test)")
         if "flip" in self.augment and self.settings.reads_view_ids:
             raise ValueError(
-                "augment 'flip' moves the camera into another view class, but "
-                f"{self.preset!r} learns with the class of the original; leave 'flip' out"
+                f"augment 'flip' changes the view class, but {self.preset!r} learns with the class of the original"
             )
         if self.sampling == "pairs" and self.batch_size % 2:
-            raise ValueError(
-                f"sampling 'pairs' takes two views of each object: batch_size must be even, got {self.batch_size}"
-            )
+            raise ValueError(f"with sampling 'pairs' batch_size must be even, got {self.batch_size}")
         self.settings.check_run(iterations=self.iterations, batch_size=self.batch_size)
         self.schedule  # noqa: B018 (it checks itself)
 
@@ -147,13 +133,13 @@ def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Read the config.json of a run. Raises ValueError where there is none, or none that can be read."""
+    """Read the config.json of a run. Raises ValueError if there is none, or if it is damaged."""
     try:
-        values = parse_json(read_bytes(path, limits.CONFIG_BYTES, "the options of a run"))
+        content = read_bytes(path, limits.CONFIG_BYTES, "the options of a run")
     except FileNotFoundError:
         raise ValueError(f"no {path}: is this the folder of a training run? One begins without --resume") from None
-    except DamagedFile:
-        raise
+    try:
+        values = parse_json(content)
     except ValueError as error:
         raise ValueError(f"{path} is not valid JSON: {error}") from None
     return config_from_dict(values, source=str(path))
@@ -169,9 +155,8 @@ _MAY_DIFFER_NAMES = {
 def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
     """Reasons why `config` is another run than `saved`: a line for each option that must not differ."""
     old, new = (_flat(c) for c in (saved, config))
-    varies = config.settings.varies_over_run
-    if config.lr_schedule != "constant":
-        varies = f"the schedule {config.lr_schedule}"
+    schedule = f"the schedule {config.lr_schedule}" if config.lr_schedule != "constant" else ""
+    varies = schedule or config.settings.varies_over_run
     allowed = _MAY_DIFFER_NAMES - ({"iterations"} if varies else set())
     return [
         f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"
@@ -188,7 +173,7 @@ def check_resume(config: TrainConfig, saved: TrainConfig) -> None:
 
 
 def _flat(config: TrainConfig) -> dict[str, Any]:
-    """Options by name, the method's settings among them, without the preset, which only says where they came from."""
-    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(TrainConfig) if f.name != "preset"}
-    settings = values.pop("settings")
-    return {"method": type(settings).__name__.removesuffix("Settings")} | values | dataclasses.asdict(settings)
+    """Options by name, those of the method among them. The preset does not count: it only sets the others."""
+    values = {"method": type(config.settings).__name__.removesuffix("Settings"), **vars(config)}
+    del values["preset"], values["settings"]
+    return values | dataclasses.asdict(config.settings)

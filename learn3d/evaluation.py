@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,95 +16,55 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import Definition
 from learn3d.data.dataset import ViewDataset
-from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.losses import mmd_from_distances
 from learn3d.methods import Grids, Meshes, Method
 from learn3d.methods.surfaces import grid_surface
 from learn3d.pictures.surfaces import Surface
 
-#: What brings the predicted shapes of a batch to the true ones before they are compared; see `evaluate`.
+#: A function that brings the predicted shapes of a batch to the true ones before they are compared; see `evaluate`.
 Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]
 
 CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
 F_SCORE_DISTANCE = 0.05  # units of the object frame, where the longest side is 1 (Pascal3D+: up to 2)
 
+#: Figures of each image.
+MEASURED = (
+    "voxel_iou",  # kato18; NaN if prediction and truth are empty
+    "voxel_iou_kato19",
+    "precision",  # part of the predicted voxels that is true (kato18)
+    "recall",  # part of the true voxels that is predicted
+    "hollow",  # 1 if the mesh reaches beyond the grid, so that kato18 finds no inside
+    "chamfer_l1",  # NaN if a surface is empty
+    "f_score",  # 0 if the prediction alone is empty
+    "silhouette_iou",  # for data without voxels
+)
+NO_MMD = "no MMD: it takes two images of each of two views"
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Result for one class: a value per image, and the MMDs (None when fewer than two views have codes)."""
+    """Figures of each image of one class, and their means."""
 
     object_ids: Tensor  # int64 [M]
     view_ids: Tensor  # int64 [M]
-    ious: dict[Definition, Tensor]  # [M] per voxeliser; NaN where prediction and truth are empty; {} without truth
-    precision: Tensor | None  # float64 [M]: part of the predicted voxels that is true, by the first voxeliser
-    recall: Tensor | None  # float64 [M]: part of the true voxels that is predicted; both NaN where there are none
-    hollow: int  # meshes that reach beyond the grid, where the first voxeliser finds no inside
-    chamfer_l1: Tensor | None  # float [M], NaN where a surface is empty; None when not asked for or without truth
-    f_score: Tensor | None  # float [M], 0 where the prediction alone is empty; likewise
-    silhouette_iou: Tensor | None  # float [M], where there are no voxels and shapes are meshes
-    mmd: float | None
-    mmd_paper: float | None
-
-    @property
-    def images(self) -> int:
-        """Number of images."""
-        return len(self.object_ids)
-
-    @property
-    def mmd_codes(self) -> int:
-        """Codes of each view that the MMDs compare; the fewer, the larger the MMDs come out (bias of 1 / codes)."""
-        return codes_per_view(self.view_ids)
-
-    @property
-    def without_mmd(self) -> str:
-        """Why there is no MMD; empty where there is one."""
-        if self.mmd_codes:
-            return ""
-        views = len(self.view_ids.unique())
-        return f"no MMD: it takes two images of each of two views, and these are {self.images} images of {views} views"
-
-    @property
-    def undefined(self) -> int:
-        """Images whose prediction and truth are both empty; they are left out of the mean."""
-        ious = next(iter(self.ious.values())) if self.ious else self.silhouette_iou
-        return 0 if ious is None else int(ious.isnan().sum())
-
-    @property
-    def without_distance(self) -> int | None:
-        """Images whose predicted (or true) surface is empty; they are left out of the mean Chamfer distance."""
-        return None if self.chamfer_l1 is None else int(self.chamfer_l1.isnan().sum())
+    values: dict[str, Tensor]  # float64 [M] for each name of `MEASURED`; NaN if undefined or not asked for
+    means: dict[str, float]  # over the images that have a value, and "mmd", "mmd_paper"; without a value: no entry
 
     @property
     def voxel_iou(self) -> float | None:
-        """Mean IoU over the images by the first voxeliser; None when it is defined for no image."""
-        return _mean(next(iter(self.ious.values()))) if self.ious else None
+        """Mean voxel IoU (kato18)."""
+        return self.means.get("voxel_iou")
 
     @property
-    def chosen_by(self) -> tuple[str, float | None]:
-        """Name and value of what networks are chosen by: the voxel IoU, or that of silhouettes where it is all."""
-        if self.silhouette_iou is not None:
-            return "silhouette IoU", _mean(self.silhouette_iou)
-        return "voxel IoU", self.voxel_iou
+    def mmd(self) -> float | None:
+        """MMD by the published code."""
+        return self.means.get("mmd")
 
-    def summary(self) -> dict[str, Any]:
-        """Means as plain values; what was not computed is None."""
-        return {
-            "voxel_iou": self.voxel_iou,
-            **{f"voxel_iou_{name}": _mean(values) for name, values in self.ious.items()},
-            "precision": _mean(self.precision),
-            "recall": _mean(self.recall),
-            "chamfer_l1": _mean(self.chamfer_l1),
-            "f_score": _mean(self.f_score),
-            "silhouette_iou": _mean(self.silhouette_iou),
-            "mmd": self.mmd,
-            "mmd_paper": self.mmd_paper,
-            "mmd_codes": self.mmd_codes,
-            "images": self.images,
-            "undefined": self.undefined,
-            "hollow": self.hollow,
-            "without_distance": self.without_distance,
-        }
+    @property
+    def selection_metric(self) -> Literal["voxel_iou", "silhouette_iou"]:
+        """Name of the metric that selects the best networks: the IoU of silhouettes if no voxels are known."""
+        return "silhouette_iou" if "silhouette_iou" in self.means else "voxel_iou"
 
 
 @torch.no_grad()
@@ -112,134 +72,140 @@ def evaluate(
     method: Method,
     dataset: ViewDataset,
     *,
-    definitions: Sequence[Definition] = ("kato18",),
     max_images: int | None = None,
-    paper_mmd: bool = False,
-    surfaces: bool = False,
+    detailed: bool = False,
     align: Align | None = None,
     batch_size: int = 256,
 ) -> Evaluation:
-    """Voxel IoU of every image of a split, and the mean MMD over all pairs of view classes.
+    """Measure the shape of every image of a split, and the mean MMD over all pairs of view classes.
 
-    Every image is encoded, its shape voxelised in the data set's convention and compared with the object's voxels, by
-    each voxeliser of `definitions`. With `max_images` only that many images are used, always the same ones: see
-    `spread_samples`. `paper_mmd` also computes the MMD as the paper prints it. `surfaces` also compares points on the
-    surfaces, in units of the object frame: Chamfer-L1 and F-score at a distance of 0.05, 2,000 points of each;
-    where the data set has no points, the truth is the surface of its voxels, which limits them to about 1/32.
+    Shapes are voxelised in the data set's convention and compared with the object's voxels. If the data set has none,
+    meshes are seen by the camera of another image of the object (of the only one if there is no other) and compared
+    with that image's mask: the IoU of silhouettes. Without voxels and poses nothing is compared.
 
-    Where the data set has no voxels, meshes are seen by the camera of another image of the object instead (of the only
-    one where there is no other) and compared with that image's mask: the IoU of silhouettes. Without voxels and poses
-    there is nothing to compare with.
+    max_images: use only that many images, always the same ones (see `spread_samples`).
+    detailed: add the voxel IoU by kato19, the MMD as the paper prints it, and Chamfer-L1 and F-score between 2,000
+    points on each surface, in one process only. If the data set has no points, the truth is the surface of its voxels,
+    which limits distances to about 1/32.
+    align: a function of the predicted shapes, the batch and the data set that returns the shapes to be compared, for
+    methods whose shapes may be turned or moved against the true ones.
 
-    `align` is for methods whose shapes may stand otherwise than the true ones: a function of the predicted shapes, the
-    batch and the data set that returns the shapes to be compared.
-
-    Where several processes train the method, all of them call this; they share the work, and all return the result that
-    one process gives with these networks. Raises ValueError for `surfaces` there: they are measured in one process.
+    If several processes train the method, all of them call this, share the work, and return the same result.
     """
     group = method.group
-    if surfaces and group.world_size > 1:
-        raise ValueError("surfaces are measured in one process; evaluate the run when it has ended")
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
-    generator = torch.Generator().manual_seed(0)
-    truth = _true_surfaces(dataset, generator) if surfaces else None
-    ious: dict[Definition, list[Tensor]] = {name: [] for name in definitions if dataset.voxels is not None}
-    codes, distances, silhouettes, overlaps = [], [], [], []
-    others = _other_images(dataset.object_ids) if dataset.voxels is None else None
     samples = spread_samples(dataset.object_ids, dataset.view_ids, count)
-    view_ids = torch.from_numpy(dataset.view_ids[samples.numpy()]).to(torch.int64)
-    compared = _first_of_each_view(view_ids)
-    chunks = samples.split(batch_size)
+    others = _other_images(dataset.object_ids)
+    generator = torch.Generator().manual_seed(0)
+    surfaces = _true_surfaces(dataset, generator) if detailed else None
     rows = torch.arange(count).split(batch_size)[group.rank :: group.world_size]
+    codes, values = [], []
     was_training = method.training
     method.set_training(False)
     try:
-        for numbers, chosen in zip(rows, chunks[group.rank :: group.world_size], strict=True):
+        for chosen in (samples[numbers] for numbers in rows):
             batch = dataset.batch(chosen)
             code = method.encode(batch.images)
             shapes = method.decode(code)
             if align is not None:
                 shapes = align(shapes, batch, dataset)
-            for number, name in enumerate(ious):
-                filled = occupancy(shapes, dataset, name)
-                ious[name].append(nmr.metrics.voxel_iou(filled, batch.voxels))
-                if number == 0:
-                    precision, recall = nmr.metrics.voxel_precision_recall(filled, batch.voxels)
-                    hollow = torch.zeros(len(filled), dtype=torch.bool)
-                    if isinstance(shapes, Meshes):
-                        hollow = dataset.convention.exceeds_grid(shapes.vertices, name)
-                    overlaps.append(torch.stack([precision, recall, hollow.to(precision)], dim=1))
-            if truth is not None:
-                points = [_sample(surface, generator) for surface in shapes.surfaces()]
-                distances += [_compare(a, truth[b]) for a, b in zip(points, batch.object_ids.tolist(), strict=True)]
-            if dataset.voxels is None and dataset.poses is not None and isinstance(shapes, Meshes):
-                silhouettes.append(_silhouette_ious(shapes, dataset.batch(others[chosen])))
-            codes.append(code.float().cpu()[compared[numbers]])
+            measured = {}
+            if dataset.voxels is not None:
+                measured = _compare_voxels(shapes, batch, dataset, detailed)
+            elif dataset.poses is not None and isinstance(shapes, Meshes):
+                measured = _compare_silhouettes(shapes, dataset.batch(others[chosen]))
+            if surfaces is not None:
+                measured |= _compare_surfaces(shapes, [surfaces[k] for k in batch.object_ids.tolist()], generator)
+            unknown = torch.full((len(chosen),), math.nan)
+            values.append(torch.stack([measured.get(name, unknown).double() for name in MEASURED], dim=1))
+            codes.append(code.float().cpu())
     finally:
         method.set_training(was_training)
-    forms = ("released", "paper") if paper_mmd else ("released",)
     own = torch.cat(rows) if rows else torch.empty(0, dtype=torch.int64)
-    place = (compared.cumsum(0) - 1)[own[compared[own]]]  # of this process's codes among all that are compared
-    all_codes = group.all_gather(codes, place, int(compared.sum()))
-    means = mean_mmd(all_codes, view_ids[compared], forms=forms, group=group)
-    chamfer, f_score = torch.tensor(distances).T if distances else (None, None)
-    seen = group.any(bool(silhouettes))
-    precision, recall, hollow = group.all_gather(overlaps, own, count).T if ious else (None, None, torch.zeros(0))
-    return Evaluation(
-        object_ids=torch.from_numpy(dataset.object_ids[samples.numpy()]).to(torch.int64),
-        view_ids=view_ids,
-        ious={name: group.all_gather(values, own, count) for name, values in ious.items()},
-        precision=precision,
-        recall=recall,
-        hollow=int(hollow.sum()),
-        chamfer_l1=chamfer,
-        f_score=f_score,
-        silhouette_iou=group.all_gather(silhouettes, own, count) if seen else None,
-        mmd=means.get("released"),
-        mmd_paper=means.get("paper"),
-    )
+    object_ids, view_ids = (torch.from_numpy(ids[samples]) for ids in (dataset.object_ids, dataset.view_ids))
+    figures = dict(zip(MEASURED, group.all_gather(values, own, count).T, strict=True))
+    means = {name: float(v.nanmean()) for name, v in figures.items() if not v.isnan().all()}
+    mmds = mean_mmd(group.all_gather(codes, own, count), view_ids, ("mmd", "mmd_paper") if detailed else ("mmd",))
+    return Evaluation(object_ids.long(), view_ids.long(), figures, means | mmds)
 
 
 def occupancy(shapes: Meshes | Grids, dataset: ViewDataset, definition: Definition) -> Tensor:
     """Predictions as bool [B, 32, 32, 32] in the data set's voxel axes. A voxeliser makes no difference to grids."""
     if isinstance(shapes, Meshes):
         return dataset.voxelize(shapes.vertices, shapes.faces, definition)
-    if dataset.convention.box != 1.0:
+    if dataset.convention.cube_side != 1.0:
         raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {dataset.convention.name} voxels")
     return dataset.convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))
+
+
+def _compare_voxels(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, detailed: bool) -> dict[str, Tensor]:
+    grid = occupancy(shapes, dataset, "kato18")
+    precision, recall = nmr.metrics.voxel_precision_recall(grid, batch.voxels)
+    found = {"voxel_iou": nmr.metrics.voxel_iou(grid, batch.voxels), "precision": precision, "recall": recall}
+    if detailed:
+        found["voxel_iou_kato19"] = nmr.metrics.voxel_iou(occupancy(shapes, dataset, "kato19"), batch.voxels)
+    is_mesh = isinstance(shapes, Meshes)
+    found["hollow"] = dataset.convention.exceeds_grid(shapes.vertices, "kato18") if is_mesh else torch.zeros(len(grid))
+    return found
+
+
+def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
+    """IoU of silhouettes at the cameras of a batch with its masks: sum of the smaller over sum of the larger value.
+
+    1 if they are equal, soft borders included; NaN if both are empty.
+    """
+    size = batch.masks.shape[-1]
+    seen = nmr.render_silhouette(shapes.vertices, shapes.faces, batch.cameras, image_size=size).flatten(1)
+    masks = batch.masks.flatten(1)
+    return {"silhouette_iou": torch.minimum(seen, masks).sum(1) / torch.maximum(seen, masks).sum(1)}
+
+
+def _compare_surfaces(shapes: Meshes | Grids, truth: list[Tensor], generator: torch.Generator) -> dict[str, Tensor]:
+    """Chamfer-L1 and F-score with the true points [P, 3] of each object.
+
+    An empty surface has no distance (NaN). If only one of the two is empty, the F-score is 0.
+    """
+    found = []
+    for surface, theirs in zip(shapes.surfaces(), truth, strict=True):
+        ours = _sample(surface, generator)
+        if len(ours) and len(theirs):
+            distance = nmr.metrics.chamfer_distance(ours, theirs, form="l1")
+            found.append((float(distance), float(nmr.metrics.f_score(ours, theirs, F_SCORE_DISTANCE))))
+        else:
+            found.append((math.nan, 0.0 if len(ours) or len(theirs) else math.nan))
+    chamfer, f_score = torch.tensor(found).T
+    return {"chamfer_l1": chamfer, "f_score": f_score}
+
+
+def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Tensor] | None:
+    """Points [P, 3] on the true surface of every object, in the object frame; None if nothing is known."""
+    convention = dataset.convention
+    parts = np.split(np.arange(dataset.num_objects), range(256, dataset.num_objects, 256))
+    if dataset.points is not None:
+        return [points.float() for part in parts for points in torch.from_numpy(dataset.points[part])]
+    if dataset.voxels is None:
+        return None
+    grids = (grid for part in parts for grid in convention.to_object(torch.from_numpy(dataset.voxels[part])))
+    return [_sample(grid_surface(grid.float(), box=convention.cube_side), generator) for grid in grids]
+
+
+def _sample(surface: Surface, generator: torch.Generator) -> Tensor:
+    """Points [P, 3] on a surface; [0, 3] if it is empty."""
+    if len(surface.faces) == 0:
+        return torch.empty(0, 3)
+    return nmr.metrics.sample_surface(surface.vertices, surface.faces, SURFACE_POINTS, generator=generator).points
 
 
 def _other_images(object_ids: np.ndarray) -> Tensor:
     """For each sample another one of its object, int64 [M]: a quarter of the object's images further on.
 
-    That is a quarter turn where the views go around the object: half of one would show the same outline mirrored.
+    That is a quarter turn if the views go around the object. After half a turn the outline is the same, mirrored.
     """
     order = np.argsort(object_ids, kind="stable")
     others = np.empty_like(order)
     for group in np.split(order, np.flatnonzero(np.diff(object_ids[order])) + 1):
         others[group] = np.roll(group, -max(1, len(group) // 4))
     return torch.from_numpy(others)
-
-
-def _silhouette_ious(shapes: Meshes, batch: Batch) -> Tensor:
-    """IoU [B] of silhouettes at the cameras of a batch with its masks: sum of the smaller over sum of the larger value.
-
-    1 where they are equal, soft borders included; NaN where both are empty.
-    """
-    size = batch.masks.shape[-1]
-    seen = nmr.render_silhouette(shapes.vertices, shapes.faces, batch.cameras, image_size=size).flatten(1)
-    masks = batch.masks.flatten(1)
-    return torch.minimum(seen, masks).sum(1) / torch.maximum(seen, masks).sum(1)
-
-
-def _first_of_each_view(view_ids: Tensor) -> Tensor:
-    """Which images are the first 512 of their view, bool [M]: `mean_mmd` compares the codes of these alone."""
-    order = view_ids.argsort(stable=True)
-    counts = view_ids.unique(return_counts=True)[1]
-    begin = counts.cumsum(0) - counts
-    first = torch.empty(len(view_ids), dtype=torch.bool)
-    first[order] = torch.arange(len(view_ids)) - begin.repeat_interleave(counts) < CODES_PER_VIEW
-    return first
 
 
 def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> Tensor:
@@ -252,39 +218,30 @@ def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> 
     if count >= total:
         return torch.arange(total)
     order = np.random.default_rng(0).permutation(total)
-    views_taken, objects_taken = np.zeros(view_ids.max() + 1, int), np.zeros(object_ids.max() + 1, int)
-    left = np.ones(total, bool)
-    chosen = np.empty(count, np.int64)
     views, objects = view_ids[order], object_ids[order]
+    load = np.zeros(total, int)
+    chosen = np.empty(count, np.int64)
     for i in range(count):
-        load = views_taken[views] + objects_taken[objects] + np.where(left, 0, 2 * total)
         best = int(load.argmin())
-        left[best] = False
-        views_taken[views[best]] += 1
-        objects_taken[objects[best]] += 1
+        load += (views == views[best]).astype(int) + (objects == objects[best])
+        load[best] += 2 * total
         chosen[i] = order[best]
     return torch.from_numpy(np.sort(chosen))
 
 
-def mean_mmd(
-    codes: Tensor,
-    view_ids: Tensor,
-    *,
-    per_view: int = CODES_PER_VIEW,
-    forms: tuple[Literal["released", "paper"], ...] = ("released",),
-    group: ProcessGroup = SINGLE_PROCESS,
-) -> dict[str, float]:
-    """Mean MMD over all pairs of views (276 for 24) between the codes [N,C] of their images; {} for a single view.
+def mean_mmd(codes: Tensor, view_ids: Tensor, forms: Sequence[str] = ("mmd",)) -> dict[str, float]:
+    """Mean MMD over all pairs of views (276 for 24) between the codes [N,C] of their images, by name of the form.
 
-    Of each view the first `per_view` codes count; all views use as many as the poorest one has. Views with one code are
-    left out: between two single codes the MMD is a constant (6.19), whatever they are. Distances within a view are
-    computed once, not once per pair. Several processes share the pairs.
+    Of each view the first 512 codes count, and no more than the view with the fewest has: with n codes the MMD has a
+    bias of 1 / n. Views with one code are left out: between two single codes the MMD is a constant (6.19). {} if fewer
+    than two views are left.
     """
     of_views = [codes[view_ids == view] for view in view_ids.unique()]
-    size = codes_per_view(view_ids, per_view=per_view)
-    if size == 0:
+    of_views = [codes_of_view for codes_of_view in of_views if len(codes_of_view) > 1]
+    if len(of_views) < 2:
         return {}
-    groups = [of_view[:size].double() for of_view in of_views if len(of_view) > 1]
+    size = min(CODES_PER_VIEW, *map(len, of_views))
+    groups = [codes_of_view[:size].double() for codes_of_view in of_views]
     norms = [codes_of_view.square().sum(1) for codes_of_view in groups]
 
     def distances(i: int, j: int) -> Tensor:
@@ -292,52 +249,10 @@ def mean_mmd(
         return (squared + norms[i][:, None]).clamp_min_(0).float()
 
     within = [distances(i, i) for i in range(len(groups))]
-    pairs = list(itertools.combinations(range(len(groups)), 2))
-    own = torch.arange(len(pairs))[group.rank :: group.world_size]
-    values: dict[str, list[Tensor]] = {form: [] for form in forms}
-    for i, j in pairs[group.rank :: group.world_size]:
+    values = {form: [] for form in forms}
+    for i, j in itertools.combinations(range(len(groups)), 2):
         between = distances(i, j)
-        for form in forms:
-            values[form].append(mmd_from_distances(within[i], within[j], between, form)[None])
-    of_pairs = {form: group.all_gather(parts, own, len(pairs)) for form, parts in values.items()}
-    return {form: sum(of_pairs[form].tolist()) / len(pairs) for form in forms}
-
-
-def codes_per_view(view_ids: Tensor, *, per_view: int = CODES_PER_VIEW) -> int:
-    """How many codes of each view `mean_mmd` uses: as many as the poorest view of several codes has; 0 for no MMD."""
-    counts = view_ids.unique(return_counts=True)[1]
-    counts = counts[counts > 1]
-    return min(per_view, int(counts.min())) if len(counts) > 1 else 0
-
-
-def _mean(values: Tensor | None) -> float | None:
-    """Mean of what is defined."""
-    if values is None or bool(values.isnan().all()):
-        return None
-    return float(values.nanmean())
-
-
-def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Tensor] | None:
-    """Points [P, 3] on the true surface of every object, in the object frame; None where nothing is known."""
-    parts = np.split(np.arange(dataset.num_objects), range(256, dataset.num_objects, 256))
-    if dataset.points is not None:
-        return [points.float() for part in parts for points in torch.from_numpy(dataset.points[part])]
-    if dataset.voxels is None:
-        return None
-    grids = (grid for part in parts for grid in dataset.convention.to_object(torch.from_numpy(dataset.voxels[part])))
-    return [_sample(grid_surface(grid.float(), box=dataset.convention.box), generator) for grid in grids]
-
-
-def _sample(surface: Surface, generator: torch.Generator) -> Tensor:
-    """Points [P, 3] on a surface; [0, 3] if it is empty."""
-    if len(surface.faces) == 0:
-        return torch.empty(0, 3)
-    return nmr.metrics.sample_surface(surface.vertices, surface.faces, SURFACE_POINTS, generator=generator).points
-
-
-def _compare(a: Tensor, b: Tensor) -> tuple[float, float]:
-    """(Chamfer-L1, F-score) of two sets of points. A set that is empty has no distance (NaN), and where the other is
-    not, nothing of either is found: an F-score of 0."""
-    if not (len(a) and len(b)):
-        return math.nan, 0.0 if len(a) or len(b) else math.nan
-    return float(nmr.metrics.chamfer_distance(a, b, form="l1")), float(nmr.metrics.f_score(a, b, F_SCORE_DISTANCE))
+        for form, found in values.items():
+            kind = "paper" if form == "mmd_paper" else "released"
+            found.append(float(mmd_from_distances(within[i], within[j], between, kind)))
+    return {form: sum(found) / len(found) for form, found in values.items()}

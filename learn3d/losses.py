@@ -1,6 +1,6 @@
-"""Losses on shape codes, pose logits and silhouettes, the MMD between sets of codes. (IoU, smoothness: nmr.losses.)
+"""Losses on shape codes, pose logits and silhouettes, and the MMD between sets of codes, all in float32.
 
-Everything is computed in float32, whatever precision the networks ran in.
+The losses of IoU and smoothness are in nmr.losses.
 """
 
 from __future__ import annotations
@@ -25,15 +25,13 @@ def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -
     """L_adv: distance of the discriminator's output from the uniform distribution over K views (eq. 4), batch mean.
 
     "probability", as printed: sum_k (p_k - 1/K)^2. "log", as in the published code: sum_k (log(1/K) - log p_k)^2, which
-    is unbounded and much stronger where the discriminator is sure of itself. logits [B,K]; differentiable.
+    is unbounded and much stronger if the discriminator is sure of itself. logits [B,K]; differentiable.
     """
     views = logits.shape[1]
     if form == "log":
         difference = F.log_softmax(logits.float(), dim=1) + math.log(views)
-    elif form == "probability":
-        difference = F.softmax(logits.float(), dim=1) - 1 / views
     else:
-        raise ValueError(f"form must be 'log' or 'probability', got {form!r}")
+        difference = F.softmax(logits.float(), dim=1) - 1 / views
     return difference.square().sum(dim=1).mean()
 
 
@@ -45,28 +43,19 @@ def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tens
     codes = codes.float()
     if form == "squared":
         return codes.square().sum(dim=1).mean()
-    if form == "norm":
-        return torch.linalg.vector_norm(codes, dim=1).mean()
-    raise ValueError(f"form must be 'squared' or 'norm', got {form!r}")
+    return torch.linalg.vector_norm(codes, dim=1).mean()
 
 
-def silhouette_pyramid_loss(prediction: Tensor, target: Tensor, levels: int = 5) -> Tensor:
-    """Distance of silhouettes at several resolutions (published code of Kato and Harada 2019).
+def silhouette_pyramid_loss(prediction: Tensor, target: Tensor) -> Tensor:
+    """Distance of silhouettes at five resolutions (published code of Kato and Harada 2019).
 
     sum over levels l of the batch mean of |p_l / |p_l| - t_l / |t_l||^2, with p_0 = prediction and p_(l+1) = p_l halved
-    by the mean of 2x2 pixels. An empty silhouette has p / |p| = 0. prediction, target float [B,S,S], S >= 2^(levels-1);
+    by the mean of 2x2 pixels. An empty silhouette has p / |p| = 0. prediction, target float [B,S,S], S >= 16;
     differentiable in both.
     """
-    if prediction.ndim != 3 or prediction.shape != target.shape or len(prediction) == 0:
-        raise ValueError(
-            "prediction and target must be [B, S, S] of one shape with B >= 1, "
-            f"got {list(prediction.shape)} and {list(target.shape)}"
-        )
-    if min(prediction.shape[1:]) < 2 ** (levels - 1):
-        raise ValueError(f"{levels} levels need at least {2 ** (levels - 1)} pixels, got {list(prediction.shape[1:])}")
     pair = torch.stack([prediction.float(), target.float()])
     total = pair.new_zeros(())
-    for level in range(levels):
+    for level in range(5):
         if level > 0:
             pair = F.avg_pool2d(pair, 2)
         p, t = F.normalize(pair.flatten(2), dim=2)
@@ -75,15 +64,13 @@ def silhouette_pyramid_loss(prediction: Tensor, target: Tensor, levels: int = 5)
 
 
 def silhouette_energy_distance(drawn: Tensor, real: Tensor) -> Tensor:
-    """How differently two sets of silhouettes are distributed: their energy distance (Szekely and Rizzo 2013).
+    """Energy distance of the distributions of two sets of silhouettes (Szekely and Rizzo 2013).
 
-    2 mean_ij d(p_i, t_j) - mean_(i != k) d(p_i, p_k), with d(a, b) = 1 - a.b / (a.a + b.b - a.b). That is 1 - IoU where
-    silhouettes are 0 or 1 (Tanimoto's similarity, a positive definite kernel: Ralaivola et al. 2005). The third term,
+    2 mean_ij d(p_i, t_j) - mean_(i != k) d(p_i, p_k), with d(a, b) = 1 - a.b / (a.a + b.b - a.b). For silhouettes of 0
+    and 1 this d is 1 - IoU (Tanimoto's similarity, a positive definite kernel: Ralaivola et al. 2005). The third term,
     which has only real silhouettes, is constant and left out. Differentiable in drawn, float [N,D] with N >= 2; real
     is float [M,D] with M >= 1. Two empty silhouettes are alike: d = 0.
     """
-    if len(drawn) < 2 or len(real) < 1 or drawn.ndim != 2 or drawn.shape[1] != real.shape[1]:
-        raise ValueError(f"want [N, D] with N >= 2 and [M, D] with M >= 1, got {list(drawn.shape)}, {list(real.shape)}")
     across, within = _tanimoto_distances(drawn, real), _tanimoto_distances(drawn, drawn)
     pairs = len(drawn) * (len(drawn) - 1)
     return 2 * across.mean() - (within.sum() - within.diagonal().sum()) / pairs
@@ -96,46 +83,29 @@ def _tanimoto_distances(x: Tensor, y: Tensor) -> Tensor:
     return torch.where(union > 0, 1 - product / union.clamp_min(1e-12), 0)
 
 
-def mmd(
-    x: Tensor, y: Tensor, form: Literal["released", "paper"] = "released", *, bandwidth: float | None = None
-) -> Tensor:
+def mmd(x: Tensor, y: Tensor, form: Literal["released", "paper"] = "released") -> Tensor:
     """Maximum mean discrepancy between two sets of codes: 0 when they are alike, differentiable.
 
-    x, y float [N,C]. With b the `bandwidth`, by default the mean squared distance over all pairs of different rows of x
-    and y together (a constant for the gradient):
+    x, y float [N,C]. With b the mean squared distance over all pairs of different rows of x and y together (a constant
+    for the gradient):
     "released", the published code's quantity and the one in the paper's table: mean(XX + YY - XY - YX) with the sum of
     the five kernels exp(-d^2 / (b * 2^i)), i = -2..2, and no root.
     "paper", as printed: the square root of it with one kernel; the text gives no bandwidth, so i = 0 is taken.
     """
-    if x.ndim != 2 or x.shape != y.shape or x.shape[0] == 0:
-        raise ValueError(f"x and y must be [N, C] of one shape with N >= 1, got {list(x.shape)} and {list(y.shape)}")
-    x, y = x.float(), y.float()
     xx, yy, xy = (_squared_distances(a, b) for a, b in ((x, x), (y, y), (x, y)))
-    return mmd_from_distances(xx, yy, xy, form, bandwidth=bandwidth)
+    return mmd_from_distances(xx, yy, xy, form)
 
 
-def mmd_from_distances(
-    xx: Tensor,
-    yy: Tensor,
-    xy: Tensor,
-    form: Literal["released", "paper"] = "released",
-    *,
-    bandwidth: float | None = None,
-) -> Tensor:
+def mmd_from_distances(xx: Tensor, yy: Tensor, xy: Tensor, form: Literal["released", "paper"] = "released") -> Tensor:
     """The MMD of `mmd` from squared distances [N,N] within x, within y and from x to y."""
     rows = 2 * xx.shape[0]
-    if bandwidth is None:
-        width = ((xx.sum() + yy.sum() + 2 * xy.sum()) / (rows * rows - rows)).detach()
-    else:
-        width = torch.as_tensor(bandwidth, dtype=xx.dtype, device=xx.device)
+    width = ((xx.sum() + yy.sum() + 2 * xy.sum()) / (rows * rows - rows)).detach()
     width = width.clamp_min(1e-30)  # all codes equal: every kernel is 1, the MMD is 0
     if form == "released":
         means = [_five_kernels(d, width).mean() for d in (xx, yy, xy)]
         return means[0] + means[1] - 2 * means[2]
-    if form == "paper":
-        means = [torch.exp(-d / width).mean() for d in (xx, yy, xy)]
-        return (means[0] + means[1] - 2 * means[2]).clamp_min(0).sqrt()
-    raise ValueError(f"form must be 'released' or 'paper', got {form!r}")
+    means = [torch.exp(-d / width).mean() for d in (xx, yy, xy)]
+    return (means[0] + means[1] - 2 * means[2]).clamp_min(0).sqrt()
 
 
 def _five_kernels(distances: Tensor, bandwidth: Tensor) -> Tensor:

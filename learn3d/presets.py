@@ -1,6 +1,6 @@
 """Presets: the options of an experiment, named <source>-<data set>[-<variant>]: a publication, or "plus".
 
-A preset fills in what the command line leaves out; every option can be given on its own.
+A preset fills in the options that the command line leaves out; every option can be given on its own.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class Preset:
     batch_size: int
     source: str  # where the figures come from
     sampling: Sampling = "views"
-    augment: tuple[Augmentation, ...] = ()  # what is done to every training batch
-    lr_schedule: LRSchedule = "constant"  # of the learning rate
-    warmup_steps: int = 0  # in which it grows to its full size
-    ema_decay: float = 0.0  # of the exponential moving average of the weights a step; 0: no average
+    augment: tuple[Augmentation, ...] = ()  # changes of every training batch
+    lr_schedule: LRSchedule = "constant"
+    warmup_steps: int = 0  # steps over which the learning rate grows to its full size
+    ema_decay: float = 0.0  # decay a step of the exponential moving average of the weights; 0: no average
 
 
 class NamedMethod(NamedTuple):
@@ -67,8 +67,38 @@ _CODE = "published code of Peng et al. 2020"
 _PAPER = "Peng et al. 2020, section 4"
 _VPL_CODE = "published code of Kato and Harada 2019"
 
+_KATO = Preset("Proposed", PoseInvariantSettings(), "kato", 20_000, 128, f"{_PAPER}; losses: {_CODE}")
+_KAR = replace(_KATO, layout="kar", source=f"{_PAPER}: one image per object, K = 72; losses: {_CODE}")
+# ResNet-18 starts from random weights in the published code; `pretrained` gives it ImageNet's.
+_ON_PASCAL: dict[str, Any] = {
+    "encoder": "resnet18",
+    "symmetry": "z",
+    "lambda_adversarial": 0.01,
+    "lambda_prior": 0.01,
+}
+# The paper is silent about iterations and batch size: 40,000 is the published training script's, 128 its default.
+_PASCAL = replace(
+    _KATO,
+    settings=PoseInvariantSettings(**_ON_PASCAL),
+    layout="pascal3d",
+    iterations=40_000,
+    source=f"{_PAPER}, experiment on real-world data; iterations, batch size and augmentation: {_CODE}",
+    augment=("crop", "flip-image"),
+)
+_PLUS = replace(
+    _KATO,
+    label="Plus",
+    settings=PlusSettings(),
+    iterations=80_000,
+    batch_size=32,
+    source="docs/methods/plus.md",
+    augment=("colors",),
+    lr_schedule="cosine",
+    warmup_steps=100,
+    ema_decay=0.99,
+)
 #: What Kato and Harada 2019 use on both data sets.
-_VPL_ALWAYS = {
+_VPL: dict[str, Any] = {
     "image_size": 224,
     "silhouette_size": 224,
     "adversary": "reversal",
@@ -79,6 +109,7 @@ _VPL_ALWAYS = {
 }
 #: On Kar's data: one view of each object, silhouettes only, with lambda_D = 0.1.
 _KAR_VPL = VPLSettings(
+    **_VPL,
     encoder="preact-resnet18",
     generator="cube-conv",
     vertex_scale=0.01,
@@ -90,10 +121,10 @@ _KAR_VPL = VPLSettings(
     learning_rate=4e-4,
     lambda_inflation=1e-4,
     lambda_discriminator=0.1,
-    **_VPL_ALWAYS,
 )
 #: On Pascal3D+, without their perceptual loss of colours.
 _PASCAL_VPL = VPLSettings(
+    **_VPL,
     encoder="resnet18",
     generator="cube-fc",
     symmetry="z",
@@ -106,12 +137,55 @@ _PASCAL_VPL = VPLSettings(
     learning_rate=2e-5,
     lambda_inflation=3e-5,
     lambda_discriminator=0.5,
-    **_VPL_ALWAYS,
 )
 
 
-_VPL_PRESETS: dict[str, Preset] = {
-    "peng2020-kato-vpl": Preset("VPL", VPLSettings(), "kato", 20_000, 128, f"{_CODE}: its VPL for Kato's data"),
+def _vanilla(preset: Preset) -> Preset:
+    """The baseline: the same without the losses on codes."""
+    none = dict.fromkeys(("lambda_classification", "lambda_adversarial", "lambda_prior"), 0.0)
+    settings = replace(preset.settings, **none)
+    return replace(preset, label="Vanilla-AE", settings=settings, source=f"baseline; otherwise {preset.source}")
+
+
+#: "peng2020-kato" is what the published code computes, and what the paper's tables were made with. The equations as
+#: printed (with the sign slip of the projection loss corrected) need adversarial_form "probability" and prior_form
+#: "norm". Both place the vertices at 0.5 * (unit sphere + displacement), as the published code does: the text's unit
+#: sphere is larger than the image at the data set's camera, so that no edge is visible and the silhouette gives no
+#: gradient.
+PRESETS: dict[str, Preset] = {
+    "peng2020-kato": _KATO,
+    "peng2020-kato-vanilla": _vanilla(_KATO),
+    "plus-kato": _PLUS,
+    "peng2020-kar": _KAR,
+    "peng2020-kar-vanilla": _vanilla(_KAR),
+    # Cameras differ within a view class, so the class's masks say little about a single camera: docs/methods/plus.md.
+    "plus-kar": replace(_PLUS, layout="kar", settings=PlusSettings(lambda_novel_view=0.0)),
+    "plus-pascal": replace(  # it flips images itself; resnet18 ignores the mask, so no image loses its colours
+        _PLUS, settings=PlusSettings(**_ON_PASCAL), layout="pascal3d", iterations=160_000, augment=("crop", "channels")
+    ),
+    # The figures are those of airplanes: docs/methods/vanilla-ae.md has the other categories.
+    "kato2018-kato": replace(
+        _KATO,
+        label="Vanilla-AE (multi-view)",
+        settings=MultiViewSettings(),
+        iterations=200_000,
+        source="published code of Kato et al. 2018, one category: 64 pairs of views, iterations of airplane",
+        sampling="pairs",
+        lr_schedule="step",
+    ),
+    # 50 epochs for the GAN and as many for the encoder, of the 2,831 x 24 training images of airplanes.
+    "gadelha2017-kato": replace(
+        _KATO,
+        label="PrGAN",
+        settings=PrGANSettings(),
+        iterations=106_100,
+        batch_size=64,
+        source="published code of Gadelha et al. 2017: 50 + 50 epochs; 24 views: Peng et al. 2020, section 4, who do "
+        "not give the projection",
+    ),
+    "peng2020-kato-vpl": replace(
+        _KATO, label="VPL", settings=VPLSettings(), source=f"{_CODE}: its VPL for Kato's data"
+    ),
     "kato2019-kar": Preset(
         "VPL",
         _KAR_VPL,
@@ -132,89 +206,6 @@ _VPL_PRESETS: dict[str, Preset] = {
         sampling="classes",
         augment=("crop", "flip-image"),
     ),
-}
-
-
-def _vanilla(preset: Preset, source: str) -> Preset:
-    """The same without the losses on codes."""
-    none = dict.fromkeys(("lambda_classification", "lambda_adversarial", "lambda_prior"), 0.0)
-    return replace(preset, label="Vanilla-AE", settings=replace(preset.settings, **none), source=source)
-
-
-_KATO = Preset("Proposed", PoseInvariantSettings(), "kato", 20_000, 128, f"{_PAPER}; losses: {_CODE}")
-_KAR_SOURCE = f"{_PAPER}: one image per object, K = 72; losses: {_CODE}"
-_KAR = replace(_KATO, layout="kar", source=_KAR_SOURCE)
-# ResNet-18 starts from random weights in the published code; `pretrained` gives it ImageNet's.
-_ON_PASCAL: dict[str, Any] = {
-    "encoder": "resnet18",
-    "symmetry": "z",
-    "lambda_adversarial": 0.01,
-    "lambda_prior": 0.01,
-}
-# The paper is silent about iterations and batch size: 40,000 is the published training script's, 128 its default.
-_PASCAL = Preset(
-    "Proposed",
-    PoseInvariantSettings(**_ON_PASCAL),
-    "pascal3d",
-    40_000,
-    128,
-    f"{_PAPER}, experiment on real-world data; iterations, batch size and augmentation: {_CODE}",
-    augment=("crop", "flip-image"),
-)
-
-_PLUS = replace(
-    _KATO,
-    label="Plus",
-    settings=PlusSettings(),
-    iterations=80_000,
-    batch_size=32,
-    source="docs/methods/plus.md",
-    augment=("colors",),
-    lr_schedule="cosine",
-    warmup_steps=100,
-    ema_decay=0.99,
-)
-
-#: "peng2020-kato" is what the published code computes, and what the paper's tables were made with. The equations as
-#: printed (with the sign slip of the projection loss corrected) need adversarial_form "probability" and prior_form
-#: "norm". Both place the vertices at 0.5 * (unit sphere + displacement), as the published code does: the text's unit
-#: sphere is larger than the image at the data set's camera, so that no edge is visible and the silhouette gives no
-#: gradient.
-PRESETS: dict[str, Preset] = {
-    "peng2020-kato": _KATO,
-    "peng2020-kato-vanilla": _vanilla(_KATO, f"{_PAPER}: the baseline trained on single views"),
-    "plus-kato": _PLUS,
-    "peng2020-kar": _KAR,
-    "peng2020-kar-vanilla": _vanilla(_KAR, f"{_PAPER}: the baseline on the same images"),
-    # Cameras differ within a view class, so the class's masks say little about a single camera: docs/methods/plus.md.
-    "plus-kar": replace(_PLUS, layout="kar", settings=PlusSettings(lambda_novel_view=0.0)),
-    "plus-pascal": replace(  # it flips images itself; resnet18 ignores the mask, so no image loses its colours
-        _PLUS, settings=PlusSettings(**_ON_PASCAL), layout="pascal3d", iterations=160_000, augment=("crop", "channels")
-    ),
-    # The figures are those of airplanes: docs/methods/vanilla-ae.md has the other categories.
-    "kato2018-kato": Preset(
-        "Vanilla-AE (multi-view)",
-        MultiViewSettings(),
-        "kato",
-        200_000,
-        128,
-        "published code of Kato et al. 2018, one category: 64 pairs of views, iterations of airplane",
-        sampling="pairs",
-        lr_schedule="step",
-    ),
-    # 50 epochs for the GAN and as many for the encoder, of the 2,831 x 24 training images of airplanes.
-    "gadelha2017-kato": Preset(
-        "PrGAN",
-        PrGANSettings(),
-        "kato",
-        106_100,
-        64,
-        "published code of Gadelha et al. 2017: 50 + 50 epochs; 24 views: Peng et al. 2020, section 4, who do not give "
-        "the projection",
-    ),
-    **_VPL_PRESETS,
     "peng2020-pascal": _PASCAL,
-    "peng2020-pascal-vanilla": _vanilla(
-        _PASCAL, f"{_PAPER}, experiment on real-world data: the baseline; otherwise: {_CODE}"
-    ),
+    "peng2020-pascal-vanilla": _vanilla(_PASCAL),
 }

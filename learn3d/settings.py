@@ -25,7 +25,7 @@ T = TypeVar("T")
 def checked(cls: type[T]) -> type[T]:
     """Class decorator: a frozen dataclass. A wrong, missing or unknown field is a ValueError, a sentence that names it.
 
-    What several fields have to do with each other is for `__post_init__`, which may raise a ValueError as well.
+    `__post_init__` checks what several fields have to do with each other, and may raise a ValueError as well.
     """
     cls = dataclass(frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False))(cls)
     check: Callable[..., None] = cls.__init__
@@ -52,12 +52,11 @@ _WORDS = {
     "a valid number": "a number",
     "a valid string": "text",
     "a valid tuple": "a list",
-    "a valid boolean": "true or false",
 }
 
 
 def _sentence(error: Any, cls: type) -> str:
-    """What one error of pydantic's says, as part of a sentence: the field, what was wanted, what came."""
+    """One error of pydantic's as part of a sentence: the field, what was wanted, what came."""
     name = error["loc"][0] if error["loc"] else ""
     if isinstance(name, int):  # given by position
         name = fields(cls)[name].name

@@ -32,9 +32,7 @@ def without_traceback(*errors: type[Exception]) -> Callable[[Callable[P, int]], 
         @functools.wraps(main)
         def run(*arguments: P.args, **options: P.kwargs) -> int:
             try:
-                status = main(*arguments, **options)
-                say("", end="")  # flushes the lines that a library has printed
-                return status
+                return main(*arguments, **options)
             except (ValueError, OSError, *errors) as error:
                 note(f"error: {rank_label()}{error}")
                 return 1
@@ -59,21 +57,19 @@ def plain(text: str) -> str:
     return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
-def say(text: str, *, end: str = "\n") -> None:
+def say(text: str) -> None:
     """Print a line of the results, by way of `plain`. A reader that has left (`| head`) is no error.
 
     Raises OSError if it cannot be written for another reason (`> file` on a full disk): the result is lost then.
     """
-    if sys.stdout is not None:  # closed before the program began (`>&-`)
-        with contextlib.suppress(BrokenPipeError):
-            _print(text, sys.stdout, end)
+    with contextlib.suppress(BrokenPipeError):
+        _print(text, sys.stdout)
 
 
 def note(text: str) -> None:
     """Print a line about the progress on stderr, apart from the results. If that fails, work goes on."""
-    if sys.stderr is not None:
-        with contextlib.suppress(OSError, ValueError):  # ValueError: it was closed
-            _print(text, sys.stderr, "\n")
+    with contextlib.suppress(OSError, ValueError):  # ValueError: it was closed
+        _print(text, sys.stderr)
 
 
 def is_watched() -> bool:
@@ -81,9 +77,9 @@ def is_watched() -> bool:
     return sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty()
 
 
-def _print(text: str, stream: TextIO, end: str) -> None:
+def _print(text: str, stream: TextIO) -> None:
     try:
-        print(plain(text), file=stream, end=end, flush=True)
+        print(plain(text), file=stream, flush=True)
     except OSError:
         # Python flushes once more when it ends. See "Note on SIGPIPE" in the documentation of `signal`.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
@@ -126,11 +122,9 @@ def stop_on_signal() -> Iterator[Stop]:
             raise KeyboardInterrupt
         stop.name = signal.Signals(number).name
 
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        numbers.append(signal.SIGHUP)
+    hangup = [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
     try:
-        for number in numbers:
+        for number in (signal.SIGINT, signal.SIGTERM, *hangup):
             with contextlib.suppress(ValueError):  # not the main thread
                 previous[number] = signal.signal(number, handle)
         yield stop

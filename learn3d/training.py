@@ -16,9 +16,8 @@ from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.methods import create_method
 from learn3d.runs import folder as run_folder
-from learn3d.runs.faults import advice_on_errors
 from learn3d.runs.log import open_log
-from learn3d.runs.state import Run, fingerprint_of
+from learn3d.runs.state import Run, describe_images
 from learn3d.runs.summary import Summary, describe_run
 from learn3d.runs.threads import ThreadTuner
 from learn3d.terminal import is_watched, stop_on_signal
@@ -37,10 +36,11 @@ def train(
     Several processes, each with its own `group`, train one model together; rank 0 writes.
 
     Raises ValueError for a folder in use, options or training data that conflict with the resumed run or data that do
-    not fit, FloatingPointError when a loss is no longer finite (the last checkpoint is from before that), OSError when
-    a checkpoint cannot be written or another process works in the folder, MemoryError when there is too little memory.
+    not fit, FloatingPointError if a loss is no longer finite (the last checkpoint is from before that), OSError if
+    a checkpoint cannot be written or another process works in the folder.
     """
     started, folder = time.monotonic(), config.output
+    config = dataclasses.replace(config, precision=resolve_precision(config.precision, config.device))
     keep_freed_memory()
     threads = ThreadTuner(config.threads, processes=group.world_size)
     with run_folder.lock_folder(folder) if group.is_main else contextlib.nullcontext():
@@ -49,23 +49,24 @@ def train(
         group = group.split_batch(config.batch_size, config.sampling)
         train_set, val_set = load_splits(config, progress=group.is_main)
         info = train_set.info(find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None)
-        precision = resolve_precision(config.precision, config.device)
-        how = {"device": config.device, "precision": precision, "seed": config.seed, "schedule": config.schedule}
+        how = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
         method = create_method(config.settings, info, **how)
         method.check_batch(next(batches(train_set, config, rows=group.rows)))  # before an older run is removed
-        run = Run(config, method, info, fingerprint_of(train_set, precision), group)
+        run = Run(config, method, info, describe_images(train_set), group)
         progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:  # also after a kill between the last save and the end
-            return Summary.of(config, progress, started, was_finished=True)
+            return Summary.of(config, progress, started)
         before, start = progress.seconds, progress.step + 1
         threads.resume(progress.threads)
 
-        with advice_on_errors(folder), stop_on_signal() as stop, open_log(config, progress, group.is_main) as log:
-            warnings = (*notes, *train_set.notes, *val_set.notes, train_set.check_masks())
-            for warning in filter(None, (*warnings, threads.oversubscription_warning(group.local_world_size))):
+        with (
+            run_folder.advice_on_errors(folder),
+            stop_on_signal() as stop,
+            open_log(config, progress, group.is_main) as log,
+        ):
+            for warning in filter(None, (*notes, train_set.check_masks())):
                 log.say(f"warning: {warning}")
-            for line in describe_run(run, progress, train_set, val_set, threads):
-                log.say(line)
+            log.say(describe_run(run, progress, train_set, val_set, threads))
             for step, batch in enumerate(batches(train_set, config, start, group.rows), start):
                 step_began = time.monotonic()
                 losses = method.take_step(batch, step)
@@ -90,15 +91,13 @@ def train(
                     then = run_folder.resume_command(folder)
                     log.say(f"stopped by {stopped_by} after step {step}; continue with: {then}")
                     break
-            summary = Summary.of(config, progress, started)
-            log.note(str(summary))
-    return summary
+    return Summary.of(config, progress, started)
 
 
 def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDataset, ViewDataset]:
     """The training and the validation split of a run. Both have the same view classes.
 
-    progress: on a terminal, show a bar where many files are read.
+    progress: show a bar on a terminal if many files are read.
     """
     options = {"image_size": config.settings.image_size, "view_bins": config.view_bins}
     load = functools.partial(load_dataset, config.layout, config.data, config.category, **options)

@@ -1,4 +1,4 @@
-"""What a run measures and draws while it trains: IoU and MMD of the validation split, pictures of a few images."""
+"""Validation of a run while it trains: IoU and MMD of the validation split, pictures of a few images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
-from learn3d.evaluation import evaluate
+from learn3d.evaluation import NO_MMD, evaluate
 from learn3d.figures.grids import picture_grid
 from learn3d.methods import Method
 from learn3d.pictures.sheets import save_png
@@ -23,29 +23,24 @@ PICTURE_ROWS = 8
 
 
 def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog | SilentLog) -> Progress:
-    """Measure IoU and MMD on the validation images; keep the networks when their IoU is the best so far.
+    """Measure IoU and MMD on the validation images; keep the networks if their IoU is the best so far.
 
-    It is the IoU of voxels; where no true shapes are known that of silhouettes, at cameras that were not the input's.
-    Returns the progress with the best IoU and its step.
+    It is the IoU of voxels or, if no true shapes are known, of silhouettes at novel views. Returns the progress with
+    the best IoU and its step.
     """
     config, step = run.config, progress.step
     with run.method.ema_weights():
         result = evaluate(run.method, val_set, max_images=config.max_val_images)
-    log.metrics(step, config.val_split, {k: v for k, v in result.summary().items() if v is not None})
-    mmd = "" if result.mmd is None else f", MMD {result.mmd:.3f}"
-    without = f"; {result.without_mmd}" if result.mmd is None else ""
-    if without and result.images < len(val_set):
-        without += f" (max_val_images {config.max_val_images})"
-    kind, iou = result.chosen_by
-    better = iou is not None and iou > progress.best_iou
-    mark = " (best so far)" if better else ""
+    log.metrics(step, config.val_split, result.means)
+    metric = result.selection_metric
+    iou = result.means.get(metric)
     shown = "undefined" if iou is None else f"{iou:.4f}"
-    log.say(f"step {step}: {config.val_split} {kind} {shown}{mmd}{mark}{without}")
-    if result.undefined:
-        log.say(f"warning: {result.undefined} images have no IoU (prediction and truth are both empty); left out")
-    if better:
+    mmd = NO_MMD if result.mmd is None else f"MMD {result.mmd:.3f}"
+    if iou is not None and iou > progress.best_iou:
+        shown += " (best so far)"
         progress = dataclasses.replace(progress, best_iou=iou, best_step=step)
         run.save_best(progress)
+    log.say(f"step {step}: {config.val_split} {metric.replace('_iou', ' IoU')} {shown}, {mmd}")
     return progress
 
 
@@ -54,11 +49,8 @@ def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, l
     with method.ema_weights():
         grid = picture_grid(method, val_set, picture_samples(val_set, PICTURE_ROWS))
     folder = config.output / PICTURES
-    try:
-        folder.mkdir(exist_ok=True)
-        save_png(folder / f"{step:06}.png", grid)
-    except OSError as error:
-        log.warn("pictures cannot be written", error, "training goes on")
+    folder.mkdir(exist_ok=True)
+    save_png(folder / f"{step:06}.png", grid)
     log.picture(step, config.val_split, grid)
 
 

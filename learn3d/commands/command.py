@@ -1,17 +1,13 @@
 """A command is a dataclass: its docstring describes it, its fields are its options, the strings below explain these.
 
-tyro parses the command line into it and writes the help. If a field's default is not a value but stands for "not
-given", its text says what happens then, in parentheses: "(default: ...)".
+tyro parses the command line into it and writes the help. A field that holds a dataclass adds the fields of that to the
+options. If a default stands for "not given", its text says what happens then, in parentheses: "(default: ...)".
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import inspect
-import re
-import shutil
-import textwrap
 import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +16,6 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import docstring_parser
 import tyro
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 from learn3d.settings import RARE
 
@@ -47,20 +42,16 @@ class Command:
     def parse(cls, name: str, arguments: Sequence[str]) -> Self:
         """The command with the options that are given. Prints the help and ends if that is asked for."""
         defaults, everything = cls.defaults(arguments), "--help-all" in arguments
-        about, brief = "", bool({"-h", "--help"} & set(arguments)) and not everything
-        if brief or everything:
-            about = cls.about(everything)
-        if brief and any(tyro.conf.Suppress in _marks(o.type) for o in _options(cls, None, defaults, brief=True)):
+        brief = bool({"-h", "--help"} & set(arguments)) and not everything
+        options = list(_options(cls, defaults))
+        about = cls.about(everything) if brief or everything else ""
+        if brief and any(rare for *_, rare in options):
             about += f"\n\nlearn3d {name} --help-all shows more options."
-        build = tyro.cli(
-            cls,
-            args=["--help"] if everything else arguments,
-            prog=f"learn3d {name}",
-            description=wrap(about),
-            config=(tyro.conf.OmitArgPrefixes,),
-            registry=_registry(defaults, brief),
-        )
-        return build()
+        fields = [(n, tyro.conf.Suppress[hint] if brief and rare else hint, field) for n, hint, field, rare in options]
+        # The command is built afterwards: tyro would catch the ValueError of a value that is refused.
+        flat = dataclasses.make_dataclass(cls.__name__, fields, kw_only=True)
+        words = ["--help"] if everything else arguments
+        return _build(cls, defaults, vars(tyro.cli(flat, args=words, prog=f"learn3d {name}", description=about)))
 
     def run(self) -> int | None:
         """Do the work; returns the exit status if that is not 0."""
@@ -79,77 +70,38 @@ class OnDataset(Command):
     """Part of the data set."""
     which: Which = "last"
     """Networks of a run to use: the last ones, or those with the best validation IoU."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Device on which the networks run."""
 
     @property
-    def where(self) -> dict[str, Any]:
+    def source(self) -> dict[str, Any]:
         """The options above by name."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(OnDataset)}
 
 
-def wrap(text: str) -> str:
-    """A docstring for the width of the terminal: paragraphs are filled, lines that begin with a space stay apart.
-
-    Command lines are never broken, as users copy them. Filled lines get a hanging indent: tyro would join them again.
-    """
-    width, lines = shutil.get_terminal_size((100, 40)).columns, []
-    for line in text.splitlines():
-        if line[:1].strip() and lines and lines[-1][:1].strip():  # both are of one paragraph
-            lines[-1] += f" {line}"
-        else:
-            lines.append(line)
-    return "\n".join(map(functools.partial(_fill, width=width), lines))
-
-
-def _fill(line: str, width: int) -> str:
-    if line.lstrip().startswith(("learn3d", "torchrun")):
-        return line
-    start = re.match(r" +\S.*?  +| *", line)[0]  # up to the text of a line such as "  NAME    text"
-    return textwrap.fill(line, width, subsequent_indent=" " * max(2, len(start)))
-
-
-def _registry(defaults: Mapping[str, Any], brief: bool) -> ConstructorRegistry:
-    """How tyro sees a dataclass: `defaults` replace its own, and the fields of a dataclass in it are options, too.
-
-    brief: hide rare options.
-    """
-    registry = ConstructorRegistry()
-
-    @registry.struct_rule
-    def options_of(info: StructTypeInfo) -> StructConstructorSpec | None:
-        if not dataclasses.is_dataclass(info.type):
-            return None
-        fields = tuple(_options(info.type, info.default, defaults, brief))
-        # It is built afterwards: tyro would catch the ValueError of a value that is refused.
-        return StructConstructorSpec(lambda **values: functools.partial(_build, info.type, defaults, values), fields)
-
-    return registry
-
-
 def _options(
-    kind: type, instance: Any, defaults: Mapping[str, Any], brief: bool, rare: bool = False
-) -> Iterator[StructFieldSpec]:
-    """The options of a dataclass, which are its fields and those of the dataclasses in it."""
+    kind: type, defaults: Mapping[str, Any], instance: Any = None, rare: bool = False
+) -> Iterator[tuple[str, Any, Any, bool]]:
+    """Name, type, field and whether it is rare, of each option of a dataclass and of the dataclasses in it.
+
+    The values of an `instance` go before the defaults of its fields.
+    """
     hints, texts = typing.get_type_hints(kind, include_extras=True), _texts(kind)
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
-        value = tyro.MISSING if field.default is dataclasses.MISSING else field.default
-        value = getattr(instance, field.name) if isinstance(instance, kind) else defaults.get(field.name, value)
-        hidden = brief and (rare or RARE in _marks(hint))
+        value = getattr(instance, field.name, defaults.get(field.name, field.default))
+        is_rare = rare or RARE in getattr(hint, "__metadata__", ())
         if inner := _inner(hint, value):
-            yield from _options(inner, value, defaults, brief, hidden)
+            yield from _options(inner, defaults, value, is_rare)
             continue
         text = texts.get(field.name, "")
         explained = "(default: " in text
-        if field.default is None and (explained or field.name in defaults):  # None is nothing that one could type
-            hint = tyro.conf.DisallowNone[hint]
+        if field.default is None and (explained or field.name in defaults):
+            hint = tyro.conf.DisallowNone[hint]  # None means "not given"
         if value is False:
             hint = tyro.conf.FlagCreatePairsOff[hint]
-        if explained or value is False or value in ((), ""):
-            label = "" if explained or value is False else "(default: none)"
-            hint = Annotated[hint, tyro.conf.arg(help_behavior_hint=label)]
-        yield StructFieldSpec(field.name, tyro.conf.Suppress[hint] if hidden else hint, value, text)
+        shown = {"help_behavior_hint": ""} if explained or value is False or value in ((), "") else {}
+        hint = Annotated[hint, tyro.conf.arg(help=text, **shown)]
+        default = {} if value is dataclasses.MISSING else {"default": value}
+        yield field.name, hint, dataclasses.field(**default), is_rare
 
 
 def _build(kind: type, defaults: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
@@ -167,14 +119,7 @@ def _inner(hint: Any, value: Any) -> type | None:
     return kind if dataclasses.is_dataclass(kind) else None
 
 
-def _marks(hint: Any) -> tuple[Any, ...]:
-    return getattr(hint, "__metadata__", ())
-
-
 def _texts(kind: type) -> dict[str, str]:
     """The strings below the fields of a dataclass and of its base classes, each in one line."""
-    texts: dict[str, str] = {}
-    for base in reversed(kind.__mro__[:-1]):
-        for text in docstring_parser.parse_from_object(base).params:
-            texts[text.arg_name] = " ".join((text.description or "").split())
-    return texts
+    bases = [docstring_parser.parse_from_object(base).params for base in reversed(kind.__mro__[:-1])]
+    return {text.arg_name: " ".join((text.description or "").split()) for texts in bases for text in texts}

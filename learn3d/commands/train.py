@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +16,6 @@ from learn3d.distributed.process_group import LostPeerError
 from learn3d.presets import METHODS, PRESETS, full_name
 from learn3d.terminal import INTERRUPTED, say, without_traceback
 from learn3d.training import train
-
-_HELP = {"-h", "--help", "--help-all"}
 
 
 @dataclass(frozen=True)
@@ -35,8 +32,7 @@ class Train(Command):
     """Train a model that turns one image into a 3D shape.
 
     Examples:
-      learn3d train --data DATA --category airplane --output runs/airplane
-      learn3d train --data DATA --category airplane,car --preset vanilla --output runs/vanilla
+      learn3d train --data DATA --category airplane,car --output runs/airplane --preset vanilla
       learn3d train --resume --output runs/airplane
       torchrun --nproc-per-node 2 -m learn3d train --data DATA --category airplane --output runs/airplane
     """
@@ -49,17 +45,16 @@ class Train(Command):
 
     @classmethod
     def about(cls, everything: bool) -> str:
-        lines = [f"  {name:10}  {method.summary}" for name, method in METHODS.items()]
-        text = "\n".join([super().about(everything), "", "Methods (--preset NAME):", *lines])
-        if not everything:
-            return text
-        lines = [f"  {name:23}  {preset.label}; {preset.source}" for name, preset in PRESETS.items()]
-        return "\n".join([text, "", "Presets (--preset NAME --help-all shows the settings of one):", *lines])
+        lines = ["Methods (--preset NAME):", *(f"  {name:10}  {method.summary}" for name, method in METHODS.items())]
+        if everything:
+            lines += ["", "Presets (--preset NAME --help-all shows the settings of one):"]
+            lines += [f"  {name:23}  {preset.label}; {preset.source}" for name, preset in PRESETS.items()]
+        return "\n".join([super().about(everything), "", *lines])
 
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> Mapping[str, Any]:
         """The options of the saved run with --resume, else those of the preset."""
-        given = [word for word in arguments if word not in _HELP]
+        given = [word for word in arguments if word not in ("-h", "--help", "--help-all")]
         origin, _ = tyro.cli(_Origin, args=given, return_unknown_args=True, add_help=False)
         preset = None if origin.preset is None else full_name(origin.preset)
         if not origin.resume or len(given) < len(arguments):
@@ -70,7 +65,7 @@ class Train(Command):
         saved = load_config(origin.output / "config.json")
         if preset not in (None, saved.preset):
             raise ValueError(f"{origin.output} was started with the preset {saved.preset}, got {preset}")
-        return {field.name: getattr(saved, field.name) for field in dataclasses.fields(saved)}
+        return vars(saved)
 
     @without_traceback(LostPeerError)
     def run(self) -> int:

@@ -21,8 +21,6 @@ from torch import Tensor, nn
 
 from learn3d.terminal import Stop
 
-LARGE = 1 << 18  # gradients with as many entries are summed in place; smaller ones are sent together
-
 
 class LostPeerError(RuntimeError):
     """Another process of the group ended, or no longer answers."""
@@ -81,14 +79,14 @@ class ProcessGroup:
         return dict(zip(values, means.tolist(), strict=True))
 
     def all_gather(self, parts: list[Tensor], rows: Tensor, count: int) -> Tensor:
-        """float64 [count] or [count, C]: `parts` are this process's values of the rows `rows`; others give the rest.
+        """float64 [count, C]: `parts` [b, C] are this process's rows, numbers `rows`; others give the rest.
 
         Every row is the sum of one value and zeros, so it has the bits that a single process would compute.
         """
         if self.world_size == 1:
             return torch.cat(parts).double()
-        width = int(self._all_reduce_max(parts[0].shape[1] if parts and parts[0].ndim == 2 else 0))
-        values = torch.zeros((count, width) if width else count, dtype=torch.float64)
+        width = int(self._all_reduce_max(parts[0].shape[1] if parts else 0))
+        values = torch.zeros(count, width, dtype=torch.float64)
         if parts:
             values[rows] = torch.cat(parts).double()
         return _all_reduce(values)
@@ -98,10 +96,6 @@ class ProcessGroup:
         if self.world_size == 1:
             return values
         return _AllReduce.apply(values.new_zeros((count, *values.shape[1:])).index_copy(0, rows, values))
-
-    def any(self, value: bool) -> bool:
-        """Whether it is true in at least one process."""
-        return value if self.world_size == 1 else bool(self._all_reduce_max(int(value)))
 
     def stopped_by(self, stop: Stop) -> str:
         """The name of a signal that asked any of the processes to stop, or ""; the same in all of them."""
@@ -124,8 +118,8 @@ class ProcessGroup:
         if self.world_size == 1:
             return
         checksums = torch.tensor([zlib.crc32(repr(value).encode()) for value in values.values()])
-        both = _all_reduce(torch.stack([checksums, -checksums]), dist.ReduceOp.MAX)
-        if differing := [name for name, high, low in zip(values, *both.tolist(), strict=True) if high != -low]:
+        extremes = _all_reduce(torch.stack([checksums, -checksums]), dist.ReduceOp.MAX).tolist()
+        if differing := [name for name, high, low in zip(values, *extremes, strict=True) if high != -low]:
             raise ValueError(
                 f"the processes of this run differ in {', '.join(differing)}; give all of them the same options, data "
                 "and checkpoint, and the same versions on machines of one kind"
@@ -151,17 +145,12 @@ def weights_checksum(networks: Mapping[str, nn.Module]) -> int:
 def all_reduce_gradients(optimizer: torch.optim.Optimizer, *_: Any) -> None:
     """Replace the gradients of an optimizer by their sums over the processes.
 
-    Large ones are summed in place, the others as one tensor: a copy of all takes as long as sending them.
+    Each is summed by itself: to copy all of them into one tensor and back takes as long as it saves, or longer.
     """
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-    small = [grad for grad in gradients if grad.numel() < LARGE or not grad.is_contiguous()]
     for grad in gradients:
-        if grad.numel() >= LARGE and grad.is_contiguous():
-            _all_reduce(grad)
-    if small:
-        bucket = _all_reduce(torch.cat([grad.reshape(-1) for grad in small]))
-        for grad, total in zip(small, bucket.split([grad.numel() for grad in small]), strict=True):
-            grad.copy_(total.view(grad.shape))
+        if (total := _all_reduce(grad.contiguous())) is not grad:
+            grad.copy_(total)
 
 
 class _AllReduce(torch.autograd.Function):

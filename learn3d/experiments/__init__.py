@@ -1,1 +1,1 @@
-"""The tables of the paper: which runs they need, running them, and reports that put the paper's figures beside ours."""
+"""The tables of the paper: their runs, and reports that put the paper's figures beside ours."""

@@ -6,19 +6,19 @@ import dataclasses
 import json
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
 from learn3d.config import TrainConfig
 from learn3d.data.layouts import LAYOUTS, Layout
-from learn3d.experiments.tables import TABLES, VARIANTS, Table, Variant
+from learn3d.experiments.tables import TABLES, VARIANTS, Row
 from learn3d.presets import PRESETS
 from learn3d.settings import Rare, split_names
 from learn3d.terminal import unknown_name
 
 _FIRST = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")  # in every command line
-_NOT_CHANGEABLE = (*_FIRST, "settings", "layout")  # by --set: the request or the table decides them
+_FIXED = (*_FIRST, "layout", "device", "threads")  # not changed by --set: the request or the table decides them
 
 
 @dataclass(frozen=True)
@@ -54,27 +54,19 @@ class Request:
     """Runs at a time, each in a process of its own with its share of the cores."""
     cluster: Rare[str | None] = None
     """Address or scheduler file of the Dask cluster that runs them, see docs/scale.md (default: they run here)."""
-    overwrite: bool = False
-    """Start runs anew that are there with other options."""
     report_only: bool = False
     """Train nothing: report the runs that are complete."""
 
     @property
     def categories(self) -> tuple[str, ...]:
         """The names in `category`."""
-        return split_names(self.category)
+        return tuple(dict.fromkeys(split_names(self.category)))
 
     def __post_init__(self) -> None:
         if self.table not in TABLES:
             raise ValueError(f"{unknown_name('table', self.table, TABLES)} (see --list)")
-        if self.jobs < 1:
-            raise ValueError(f"jobs must be a number of processes, at least 1, got {self.jobs}")
-        if self.seeds is not None and self.seeds < 1:
-            raise ValueError(f"seeds must be a number of seeds, at least 1, got {self.seeds}")
-        if len(set(self.categories)) != len(self.categories):
-            raise ValueError(f"categories must be different ones, got {', '.join(self.categories)}")
-        if self.report_only and self.overwrite:
-            raise ValueError("--report-only trains nothing and --overwrite trains anew; give one of them")
+        if self.jobs < 1 or (self.seeds is not None and self.seeds < 1):
+            raise ValueError(f"jobs and seeds must be at least 1, got {self.jobs} and {self.seeds}")
 
 
 @dataclass(frozen=True)
@@ -82,37 +74,31 @@ class PlannedRun:
     """A training run and its test. The folder identifies it: every table that needs the run finds it there."""
 
     variant: str
-    category: str
-    seed: int
     config: TrainConfig
 
     @property
     def folder(self) -> Path:
+        """OUTPUT/runs/<category>/<variant>-seed<k>."""
         return self.config.output
 
     @property
     def name(self) -> str:
         """<category>/<variant>-seed<k>."""
-        return f"{self.category}/{self.folder.name}"
-
-    @property
-    def checkpoint(self) -> Literal["last", "best"]:
-        """The checkpoint that is tested."""
-        return VARIANTS[self.variant].checkpoint
+        return f"{self.config.category}/{self.folder.name}"
 
 
-def selected_rows(table: Table, name: str, methods: Sequence[str]) -> dict[str, str | None]:
-    """The rows of a table, label -> variant, whose label or variant is among `methods` (all for none), and quoted ones.
+def select_rows(request: Request) -> dict[str, Row]:
+    """The rows of the table whose label or variant is among the methods of the request (all for none), by label.
 
-    Raises ValueError naming a method that the table does not have.
+    Quoted rows are always among them. Raises ValueError naming a method that the table does not have.
     """
-    variants = [variant for variant in table.rows.values() if variant]
-    labels = {label.lower(): variant for label, variant in table.rows.items()} | {v: v for v in variants}
-    if unknown := [method for method in methods if not labels.get(method.lower())]:
-        unknown_names = ", ".join(map(repr, unknown))
-        raise ValueError(f"the table {name} has no method {unknown_names}; it has {', '.join(variants)}")
-    chosen = [labels[method.lower()] for method in methods] or variants
-    return {label: variant for label, variant in table.rows.items() if variant is None or variant in chosen}
+    rows = TABLES[request.table].rows
+    names = {label.lower(): row.variant for label, row in rows.items()} | {r.variant: r.variant for r in rows.values()}
+    asked = [method.lower() for method in request.methods] or list(names)
+    if unknown := [method for method in asked if method not in names]:
+        raise ValueError(unknown_name("method of the table", unknown[0], filter(None, names.values())))
+    chosen = {names[method] for method in asked}
+    return {label: row for label, row in rows.items() if row.variant is None or row.variant in chosen}
 
 
 def plan_runs(request: Request) -> list[PlannedRun]:
@@ -123,12 +109,12 @@ def plan_runs(request: Request) -> list[PlannedRun]:
     """
     table = TABLES[request.table]
     layout = request.layout or table.layout
-    if layout in LAYOUTS and not LAYOUTS[layout].voxels:
+    if not LAYOUTS[layout].voxels:
         raise ValueError(f"the layout {layout!r} has no true voxels, so that no run of the table could be measured")
-    variants = [variant for variant in selected_rows(table, request.table, request.methods).values() if variant]
-    changes = _parse_changes(variants, table, request.set)
+    variants = [row.variant for row in select_rows(request).values() if row.variant]
+    changes = _parse_changes(variants, request.set)
     return [
-        PlannedRun(name, category, seed, _configure(request, layout, name, changes[name], category, seed))
+        PlannedRun(name, _configure(request, name, changes[name], layout=layout, category=category, seed=seed))
         for category in request.categories or table.categories
         for name in variants
         for seed in range(request.seeds or table.seeds)
@@ -136,20 +122,18 @@ def plan_runs(request: Request) -> list[PlannedRun]:
 
 
 def _configure(
-    request: Request, layout: Layout, name: str, given: dict[str, Any], category: str, seed: int
+    request: Request, name: str, given: dict[str, Any], *, layout: Layout, category: str, seed: int
 ) -> TrainConfig:
-    variant: Variant = VARIANTS[name]
+    variant = VARIANTS[name]
     preset, length_of = PRESETS[variant.preset], PRESETS[variant.length_of or variant.preset]
-    changes = dict(variant.changes) | given
-    divisor = variant.batch_divisor
+    changes, divisor = dict(variant.changes) | given, variant.batch_divisor
     iterations = (request.iterations or length_of.iterations) * divisor
     batch_size = request.batch_size or length_of.batch_size
     if batch_size % divisor:
         raise ValueError(f"{name} divides batches by {divisor}: batch_size must be a multiple, got {batch_size}")
     if "warmup_steps" in changes:  # as for presets
         changes["warmup_steps"] = min(changes["warmup_steps"], iterations // 10)
-    setting_names = {field.name for field in dataclasses.fields(preset.settings)}
-    settings = {key: value for key, value in changes.items() if key in setting_names}
+    settings = {field.name: changes.pop(field.name) for field in fields(preset.settings) if field.name in changes}
     return TrainConfig(
         data=request.data,
         category=category,
@@ -162,44 +146,37 @@ def _configure(
         seed=seed,
         device=request.device,
         threads=request.threads,
-        **{key: value for key, value in changes.items() if key not in setting_names},
+        **changes,
     )
 
 
-def _parse_changes(variants: Sequence[str], table: Table, texts: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """The changes "name=value" and "method:name=value" by variant; without a method, of all variants with that name."""
-    labels = {label.lower(): variant for label, variant in table.rows.items()}
-    options = {field.name: field.default for field in dataclasses.fields(TrainConfig)} | {"augment": ()}
-    known = {v: dataclasses.asdict(PRESETS[VARIANTS[v].preset].settings) | options for v in variants}
-    changes: dict[str, dict[str, Any]] = {variant: {} for variant in known}
+def _parse_changes(variants: Sequence[str], texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The changes "name=value" and "variant:name=value" by variant; without a variant, of all that have that name."""
+    known = {name: _flatten(TrainConfig(Path(), "-", Path(), VARIANTS[name].preset)) for name in variants}
+    changes: dict[str, dict[str, Any]] = {variant: {} for variant in variants}
     for text in texts:
         target, separator, value = text.partition("=")
-        method, _, name = target.rpartition(":")
-        name, method = name.strip().replace("-", "_"), labels.get(method.strip().lower(), method.strip())
-        if not separator or not name:
-            raise ValueError(f"a change is written as name=value or method:name=value, got {text!r}")
-        if name in _NOT_CHANGEABLE:
-            raise ValueError(f"{name} has an option of its own, or belongs to the table; {text!r} cannot change it")
-        if method and method not in known:
-            raise ValueError(f"{text!r} names the method {method!r}; there are {', '.join(known)}")
-        meant = [method] if method else list(known)
-        with_name = [variant for variant in meant if name in known[variant]]
-        if not with_name:
-            raise ValueError(f"{text!r}: there is no setting {name!r}; there are {', '.join(known[meant[0]])}")
-        for variant in with_name:
-            changes[variant][name] = _parse_value(value, is_tuple=isinstance(known[variant][name], tuple))
+        variant, _, name = target.rpartition(":")
+        name = name.replace("-", "_")
+        meant = [v for v in variants if variant in ("", v) and name in known[v] and name not in _FIXED]
+        if not meant or not separator:
+            raise ValueError(
+                f"--set {text}: give NAME=VALUE or METHOD:NAME=VALUE, with a method of {', '.join(variants)}, and an "
+                "option of `learn3d train` that neither the table nor another option decides"
+            )
+        for v in meant:
+            changes[v][name] = _parse_value(value, isinstance(known[v][name], tuple))
     return changes
 
 
-def _parse_value(text: str, is_tuple: bool = False) -> Any:
-    """A value as in JSON (0.5, true, null, [1, 2]), else the text itself; for a tuple also "a,b"."""
+def _parse_value(text: str, is_list: bool = False) -> Any:
+    """A value as in JSON (0.5, true, null), else the text itself; a list is written as "a,b"."""
+    if is_list:
+        return tuple(_parse_value(part) for part in text.strip("[]").split(",") if part)
     try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        value = text
-    if is_tuple and isinstance(value, str):
-        return tuple(_parse_value(part) for part in value.split(",") if part)
-    return tuple(value) if isinstance(value, list) else value
+        return json.loads(text)
+    except ValueError:
+        return text
 
 
 def command_line(config: TrainConfig, **placeholders: str) -> str:
@@ -221,5 +198,5 @@ def command_line(config: TrainConfig, **placeholders: str) -> str:
 
 def _flatten(config: TrainConfig) -> dict[str, Any]:
     """Options by name, the method's settings among them."""
-    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    values = {field.name: getattr(config, field.name) for field in fields(config)}
     return values | dataclasses.asdict(values.pop("settings"))

@@ -1,24 +1,12 @@
-"""Confidence intervals over seeds (t) and over objects (bootstrap)."""
+"""Confidence intervals over test objects, by the bootstrap."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
 
-LEVEL = 0.95
 RESAMPLES = 2000
-
-Interval = tuple[float, float]
-
-
-def t_interval(values: Sequence[float]) -> Interval | None:
-    """95 % confidence interval of the mean of independent values, by Student's t; None for fewer than two."""
-    if len(values) < 2:
-        return None
-    half = float(stats.t.ppf((1 + LEVEL) / 2, len(values) - 1) * stats.sem(values))
-    return float(np.mean(values)) - half, float(np.mean(values)) + half
 
 
 def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray], *, seed: int = 0) -> np.ndarray:
@@ -40,10 +28,7 @@ def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray], *,
     return total / len(sums)
 
 
-def percentile_interval(resampled: np.ndarray) -> Interval | None:
-    """The middle 95 % of resampled values, None where none is defined."""
+def percentile_interval(resampled: np.ndarray) -> tuple[float, float] | None:
+    """The middle 95 % of resampled values; None if none is defined."""
     known = resampled[np.isfinite(resampled)]
-    if len(known) == 0:
-        return None
-    low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return float(low), float(high)
+    return tuple(np.quantile(known, [0.025, 0.975]).tolist()) if len(known) else None

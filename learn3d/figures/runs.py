@@ -1,4 +1,4 @@
-"""Saved checkpoints, opened for figures: method, data and a name for each."""
+"""Saved checkpoints, opened for figures and pages: method, data and a name for each."""
 
 from __future__ import annotations
 
@@ -8,23 +8,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import torch
-from torch import Tensor
-
-from learn3d.config import TrainConfig, differences
+from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.methods import Method
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
+from learn3d.runs.checkpoint import Metadata
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
     """A trained method with the data that figures show it on. Runs on the same data share one `dataset`."""
 
-    label: str  # what figures call it; different for the runs of one category
+    label: str
     method: Method  # in evaluation mode
     dataset: ViewDataset
+    metadata: Metadata | None = None
 
 
 def open_runs(
@@ -40,68 +39,34 @@ def open_runs(
 ) -> list[Run]:
     """Open run folders or checkpoint files, with one split of the data.
 
-    `data` and `category` default to those each run was trained with, `labels` to the names of their presets. Raises
-    ValueError without runs, for a wrong number of labels, and where a checkpoint or data set cannot be read.
+    `data` and `category` default to those each run was trained with, `labels` to `name_runs`. Raises ValueError without
+    runs, for a wrong number of labels, and if a checkpoint or data set cannot be read.
     """
     if not paths:
         raise ValueError("give at least one run folder or checkpoint to draw")
     loaded, datasets = [], {}
     for path in paths:
         report_progress(f"opening {path}")
-        method, config, _ = checkpoint.load_method(checkpoint.find(path, which), device=device)
+        method, config, metadata = checkpoint.load_method(path, which, device=device)
         config = dataclasses.replace(config, data=data or config.data, category=category or config.category)
         key = (config.layout, config.data.resolve(), config.category, method.image_size, config.view_bins)
         if key not in datasets:
             datasets[key] = checkpoint.load_data(config, split)
-        loaded.append((method, config, datasets[key]))
-    names = name_runs([config for _, config, _ in loaded], paths, labels)
-    return [Run(name, method, dataset) for name, (method, _, dataset) in zip(names, loaded, strict=True)]
+        loaded.append((config, method, datasets[key], metadata))
+    names = name_runs([config for config, *_ in loaded], paths, labels)
+    return [Run(name, *rest) for name, (_, *rest) in zip(names, loaded, strict=True)]
 
 
-def name_runs(
-    configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Sequence[str] = (), *, seeds_apart: bool = True
-) -> list[str]:
-    """What to call each run in a figure: the given label, else the preset's.
+def name_runs(configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Sequence[str] = ()) -> list[str]:
+    """Names of runs in a figure: the labels, else those of the presets, with the category if there are several.
 
-    Runs of one preset and category that differ in more than their seed are called after their folders. With
-    `seeds_apart` the seed is said where runs differ by it alone; without, such runs have one name.
+    Runs that would have the same name are called after their folders. Raises ValueError for a wrong number of labels.
     """
     if labels:
         if len(labels) != len(paths):
             raise ValueError(f"there are {len(paths)} runs but {len(labels)} labels; give one label per run, or none")
         return list(labels)
-    names = [PRESETS[config.preset].label for config in configs]
-    for i, config in enumerate(configs):
-        alike = [c for c in configs if (c.preset, c.category) == (config.preset, config.category)]
-        if any(differences(dataclasses.replace(config, seed=c.seed), c) for c in alike):
-            names[i] = _folder_name(paths[i])
-        elif seeds_apart and len(alike) > 1:
-            same_seed = sum(c.seed == config.seed for c in alike) > 1
-            names[i] = _folder_name(paths[i]) if same_seed else f"{names[i]}, seed {config.seed}"
-    return names
-
-
-def title_of(run: Run, runs: Sequence[Run]) -> str:
-    """The run's label, with its category where several are shown."""
-    several = len({r.dataset.category for r in runs}) > 1
-    return f"{run.dataset.category}: {run.label}" if several else run.label
-
-
-def by_dataset(runs: Sequence[Run]) -> list[list[Run]]:
-    """The runs in groups that share a data set, in the order of their first appearance."""
-    groups: dict[int, list[Run]] = {}
-    for run in runs:
-        groups.setdefault(id(run.dataset), []).append(run)
-    return list(groups.values())
-
-
-@torch.no_grad()
-def encode(method: Method, dataset: ViewDataset, samples: Tensor, *, batch_size: int = 256) -> Tensor:
-    """Shape codes float32 [n, C] of the images `samples` int64 [n], on the CPU."""
-    parts = [method.encode(dataset.batch(part).images).float().cpu() for part in samples.split(batch_size)]
-    return torch.cat(parts)
-
-
-def _folder_name(path: Path) -> str:
-    path = Path(path).resolve()
-    return f"{path.parent.name}/{path.stem}" if path.is_file() else path.name
+    several = len({config.category for config in configs}) > 1
+    names = [f"{c.category}: " * several + PRESETS[c.preset].label for c in configs]
+    folders = [f"{p.parent.name}/{p.stem}" if p.is_file() else p.name for p in map(Path.resolve, map(Path, paths))]
+    return [folder if names.count(name) > 1 else name for name, folder in zip(names, folders, strict=True)]

@@ -65,14 +65,14 @@ function drawPanes() {
   const shown = page.items[item], reach = shown.reach;
   const axis = { visible: false, range: [-reach, reach], autorange: false };
   for (const { mesh, scene, title } of panes) {
-    const { x, y, z, faces, empty } = shown.meshes[mesh], run = page.runs[mesh];
+    const { empty, ...mesh3d } = shown.meshes[mesh], run = page.runs[mesh];
     const name = run ? run.name : "true shape";
     const score = run ? `, ${page.kind} ${iou(shown.ious[mesh])}` : "";
     title.replaceChildren();
     if (run) element(title, "i").style.background = run.color;
     title.append(name + score + (empty ? " (empty)" : ""));
     scene.setAttribute("aria-label", `${name}${score}: 3D shape; arrow keys turn it, plus and minus bring it nearer`);
-    const trace = { type: "mesh3d", x, y, z, ...page.faces[faces], color: color("--clay"), hoverinfo: "skip",
+    const trace = { type: "mesh3d", ...mesh3d, color: color("--clay"), hoverinfo: "skip",
       lighting: { ambient: 0.35, diffuse: 0.7, specular: 0.05, roughness: 0.8, fresnel: 0.05 }, lightposition: { x: -1e5, y: 1e5, z: 5e4 } };
     Plotly.react(scene, empty ? [] : [trace], layout(() => ({ margin: { l: 0, r: 0, t: 0, b: 0 },
       scene: { xaxis: axis, yaxis: axis, zaxis: axis, aspectmode: "cube", dragmode: "turntable", camera } })), config);

@@ -26,9 +26,9 @@ def make_row(rgb: np.ndarray, alpha: np.ndarray, voxels: np.ndarray) -> list[np.
     """
     thickness = voxels.sum(axis=2).T[::-1]
     ink = np.where(thickness > 0, 60 + 195 * thickness / max(1, thickness.max()), 15)  # the grid's own square is grey
-    grey = [255 - alpha[0], 255 - ink.astype(np.uint8)]
-    pictures = [*(rgb[view] for view in _columns(len(rgb))), *(np.repeat(g[..., None], 3, axis=-1) for g in grey)]
-    return [np.asarray(Image.fromarray(p).resize((CELL, CELL), Image.Resampling.BOX)) for p in pictures]
+    pictures = [*map(Image.fromarray, rgb[_shown(len(rgb))]), Image.fromarray(255 - alpha[0])]
+    pictures.append(Image.fromarray(255 - ink.astype(np.uint8)))
+    return [np.asarray(p.resize((CELL, CELL), Image.Resampling.BOX).convert("RGB")) for p in pictures]
 
 
 def draw_sheet(splits: Mapping[str, Sequence[list[np.ndarray]]], views: int) -> np.ndarray:
@@ -40,10 +40,10 @@ def draw_sheet(splits: Mapping[str, Sequence[list[np.ndarray]]], views: int) -> 
     for split, of_split in splits.items():
         chosen = np.unique(np.linspace(0, len(of_split) - 1, ROWS).astype(int)) if of_split else ()
         rows += [of_split[i] for i in chosen]
-        names += [split if k == 0 else "" for k in range(len(chosen))]
-    titles = [*(f"view {view}" for view in _columns(views)), "mask of 0", "voxels"]
+        names += [split, *[""] * (len(chosen) - 1)][: len(chosen)]
+    titles = [*(f"view {view}" for view in _shown(views)), "mask of 0", "voxels"]
     return tile(rows, titles, tile_size=CELL, row_titles=names, rules=[r for r, name in enumerate(names) if name])
 
 
-def _columns(views: int) -> range:
+def _shown(views: int) -> range:
     return range(0, views, -(-views // VIEWS))

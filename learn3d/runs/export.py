@@ -10,13 +10,8 @@ import torch
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
 
-SMALL_MODEL = Path(__file__).parents[1] / "models" / "small.safetensors"
-NO_SMALL_MODEL = "this installation has no small model of its own; name a trained one with --run"
-_TRAINING_ONLY = (
-    "lambda_classification",
-    "lambda_adversarial",
-    "lambda_novel_view",
-)  # weights of what needs more networks
+SMALL_MODEL = Path(__file__).parents[1] / "models" / "small.safetensors"  # the one that comes with the package
+_TRAINING_ONLY = ("lambda_classification", "lambda_adversarial", "lambda_novel_view")  # weights of further networks
 
 
 def export(source: Path, target: Path, *, which: str = "last") -> int:
@@ -25,7 +20,7 @@ def export(source: Path, target: Path, *, which: str = "last") -> int:
     The file is a checkpoint that `evaluate` and `reconstruct` take. Numbers are rounded to float16 (three digits);
     folders of the run are left out. Raises ValueError for methods other than the pose-invariant ones and Plus.
     """
-    method, config, metadata = checkpoint.load_method(checkpoint.find(source, which))
+    method, config, metadata = checkpoint.load_method(source, which)
     if not isinstance(config.settings, PoseInvariantSettings):
         raise ValueError(f"only runs of proposed, vanilla and plus can be exported, this one is of {config.preset}")
     names = {field.name for field in dataclasses.fields(config.settings)} & set(_TRAINING_ONLY)
@@ -36,12 +31,5 @@ def export(source: Path, target: Path, *, which: str = "last") -> int:
         for name, tensor in checkpoint.network_tensors(method).items()
         if name.startswith(("network.encoder.", "network.generator."))
     }
-    checkpoint.save(target, tensors, dataclasses.replace(metadata, config=config, optimizers={}))
+    checkpoint.save(target, tensors, dataclasses.replace(metadata, config=config))
     return target.stat().st_size
-
-
-def small_model() -> Path:
-    """The exported model that comes with the package; FileNotFoundError where it does not."""
-    if not SMALL_MODEL.is_file():
-        raise FileNotFoundError(NO_SMALL_MODEL)
-    return SMALL_MODEL

@@ -1,4 +1,4 @@
-"""A run that goes on: what is saved so that it continues bit for bit, and what it must find again as it was."""
+"""A run that goes on: everything that is saved so that it continues bit for bit."""
 
 from __future__ import annotations
 
@@ -16,35 +16,25 @@ from learn3d.files import writing
 from learn3d.methods import DatasetInfo, Method
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
-from learn3d.runs.checkpoint import DataFingerprint, Metadata, Progress
-from learn3d.runs.folder import BEST, CONFIG, LAST
+from learn3d.runs.checkpoint import Metadata, Progress
+from learn3d.runs.folder import BEST, CONFIG, LAST, PREVIOUS
 from learn3d.runs.log import RunLog, SilentLog
 from learn3d.runs.versions import versions
 
 
-def fingerprint_of(train_set: ViewDataset, precision: str) -> DataFingerprint:
-    """The fingerprint of a run on these training images."""
-    return DataFingerprint(len(train_set), f"{train_set.digest(voxels=False):08x}", precision)
-
-
-@dataclass(frozen=True, eq=False)
-class Saved:
-    """A checkpoint that a run goes on from."""
-
-    path: Path
-    tensors: dict[str, Tensor]
-    metadata: Metadata
-    notes: tuple[str, ...] = ()  # what was wrong with newer ones
+def describe_images(dataset: ViewDataset) -> str:
+    """Number and checksum of the images of a data set, with their masks, poses and classes."""
+    return f"{len(dataset)} images with the CRC-32 {dataset.digest(voxels=False):08x}"
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a checkpoint is made of, besides the progress."""
+    """The parts of a checkpoint, besides the progress."""
 
-    config: TrainConfig
+    config: TrainConfig  # with the precision that "auto" stands for
     method: Method
     info: DatasetInfo
-    fingerprint: DataFingerprint
+    data: str  # `describe_images` of the training images
     group: ProcessGroup
     versions: dict[str, str | None] = field(default_factory=versions)  # of the code that runs
 
@@ -53,17 +43,16 @@ class Run:
     ) -> tuple[Progress, tuple[str, ...]]:
         """Bring networks, optimizers and random numbers to where the run stands: its start, or its last checkpoint.
 
-        Then take the folder, where nothing is left that could be wrong, and let all processes learn together. Returns
-        where the run stands, and what to warn of. A finished run stays as it is.
+        Then take the folder, and let all processes learn together. Returns where the run stands, and warnings. A
+        finished run stays as it is.
         """
         config, folder = self.config, self.config.output
-        progress, notes = Progress(object_share=train_set.object_share()), ()
-        saved = None
+        progress, notes, saved = Progress(object_share=train_set.object_share()), (), None
         if resume:
-            with self.group.main_process_first():  # it may have to put an earlier checkpoint in place
-                saved = load_last(config, repair=self.group.is_main)
+            with self.group.main_process_first():  # it may have to put the previous checkpoint in place
+                saved, notes = load_last(config)
         if saved is not None:
-            progress, notes = self._restore(saved), saved.notes
+            progress = self._restore(*saved)
         else:
             self.method.start_from_pretrained()
         if progress.step > config.iterations:
@@ -71,70 +60,55 @@ class Run:
         if self.group.is_main and resume:
             run_folder.remove_partials(folder)
         if progress.step == config.iterations:
-            if self.group.is_main:
-                run_folder.remove_old(folder, progress.step, config.keep_checkpoints)
             return progress, notes
         self.method.distribute(self.group)
-        self._compare_processes(progress, train_set, val_set)
+        self._compare_processes(train_set, val_set)
         if self.group.is_main:
             if not resume:
                 run_folder.remove_old_run(folder, overwrite)
             writing.write_json(folder / CONFIG, config_to_dict(config), sync=True)
         return progress, notes
 
-    def _compare_processes(self, progress: Progress, train_set: ViewDataset, val_set: ViewDataset) -> None:
-        """Raise a ValueError naming what is not the same in all processes of the run."""
-        if self.group.world_size == 1:
-            return
-        options = dataclasses.replace(self.config, data=Path("-"), output=Path("-"), threads=None)
-        same = {
-            "options": config_to_dict(options),
-            "precision": self.fingerprint.precision,
-            "what the networks depend on": self.info,
-            "training data": (self.fingerprint, train_set.digest()),
-            "validation data": (len(val_set), val_set.digest()),
-            "steps taken": progress.step,
-            "weights": weights_checksum(self.method.networks),
-        }
-        self.group.check_equal(**same)
+    def _compare_processes(self, train_set: ViewDataset, val_set: ViewDataset) -> None:
+        """Raise a ValueError naming the things that differ between the processes of the run."""
+        if self.group.world_size > 1:
+            options = dataclasses.replace(self.config, data=Path("-"), output=Path("-"), threads=None)
+            same = {
+                "options": config_to_dict(options),
+                "training data": train_set.digest(),
+                "validation data": val_set.digest(),
+                "weights": weights_checksum(self.method.networks),
+            }
+            self.group.check_equal(**same)
 
-    def _restore(self, saved: Saved) -> Progress:
-        """Bring everything back to the state that `save_last` wrote.
-
-        An option or a condition that differs is a ValueError that names it.
-        """
-        tensors, metadata, precision = saved.tensors, saved.metadata, saved.metadata.fingerprint.precision
-        if precision == self.fingerprint.precision:  # asked for by name or by "auto", it is the same
-            precision = self.config.precision
-        elif self.config.precision == "auto":
-            precision = metadata.config.precision
-        check_resume(self.config, dataclasses.replace(metadata.config, precision=precision))
-        _check_fingerprint(self.fingerprint, metadata.fingerprint, self.config.data)
+    def _restore(self, tensors: dict[str, Tensor], metadata: Metadata) -> Progress:
+        """Bring everything back to its state at `save_last`. A ValueError names options or data that differ."""
+        config, before, path = self.config, metadata.config, self.config.output / LAST
+        check_resume(config, before)
+        if self.data != metadata.data:
+            raise ValueError(
+                f"cannot resume with other training data: {metadata.data} in the run, {self.data} in {config.data}; "
+                "give the run's own data set, or start a new run"
+            )
         if self.info != metadata.info:
-            raise ValueError(f"{saved.path} was trained on data of {metadata.info}, these are {self.info}")
-        checkpoint.restore_networks(self.method, tensors, saved.path)
+            raise ValueError(f"{path} was trained on data of {metadata.info}, these are {self.info}")
+        checkpoint.restore_networks(self.method, tensors, path)
         if self.method.ema is not None:
             with self.method.ema_weights():
-                checkpoint.restore_networks(self.method, tensors, saved.path, "ema")
+                checkpoint.restore_networks(self.method, tensors, path, "ema")
         for name, optimizer in self.method.optimizers.items():
-            others = metadata.optimizers.get(name, {})
-            checkpoint.restore_optimizer(name, optimizer, tensors, others, saved.path)
-        try:
-            torch.set_rng_state(tensors["random.cpu"])
-            if self.config.device == "cuda" and "random.cuda" in tensors:
-                torch.cuda.set_rng_state(tensors["random.cuda"])
-        except (KeyError, RuntimeError, TypeError) as error:
-            raise ValueError(
-                f"{saved.path} holds no state of the random numbers that this torch can use ({error}); is it the last "
-                "checkpoint of a run?"
-            ) from None
-        before = metadata.config
-        if (before.val_split, before.max_val_images) != (self.config.val_split, self.config.max_val_images):
-            return dataclasses.replace(metadata.progress, best_iou=-1.0, best_step=0)  # of other images
+            checkpoint.restore_optimizer(name, optimizer, tensors, path)
+        if "random.cpu" not in tensors:
+            raise ValueError(f"{path} holds no state of the random numbers; is it the last checkpoint of a run?")
+        torch.set_rng_state(tensors["random.cpu"])
+        if config.device == "cuda" and "random.cuda" in tensors:
+            torch.cuda.set_rng_state(tensors["random.cuda"])
+        if (before.val_split, before.max_val_images) != (config.val_split, config.max_val_images):
+            return dataclasses.replace(metadata.progress, best_iou=-1.0, best_step=0)  # it is of other images
         return metadata.progress
 
     def save(self, progress: Progress, log: RunLog | SilentLog) -> None:
-        """Write last.safetensors by the first process, where all have the same weights, and what was logged before."""
+        """Write the metrics so far and last.safetensors, by rank 0. Weights that differ between ranks are refused."""
         self.group.check_equal(weights=0 if self.group.world_size == 1 else weights_checksum(self.method.networks))
         if self.group.is_main:
             log.sync()
@@ -143,11 +117,9 @@ class Run:
     def save_last(self, progress: Progress) -> None:
         """Write last.safetensors: networks, optimizers, random state, and all of `Metadata`.
 
-        A complete file has that name at every moment; the ones before it are kept as `config.keep_checkpoints` says.
-        Raises FloatingPointError, with nothing written, for values that are not finite, as they could not be resumed.
+        A complete file has that name at every moment, and the one before it becomes previous.safetensors.
         """
-        folder, keep, others = self.config.output, self.config.keep_checkpoints, {}
-        self._check_networks()
+        folder = self.config.output
         tensors = checkpoint.network_tensors(self.method)
         if self.method.ema is not None:
             tensors |= {f"ema.{name}": tensor for name, tensor in self.method.ema.tensors.items()}
@@ -155,90 +127,44 @@ class Run:
         if self.config.device == "cuda":
             tensors["random.cuda"] = torch.cuda.get_rng_state()
         for name, optimizer in self.method.optimizers.items():
-            state, others[name] = checkpoint.optimizer_state(name, optimizer)
-            checkpoint.check_finite(f"optimizer of the {name}", state)
-            tensors |= state
-        if keep > 1:
-            run_folder.keep_previous(folder)
-        checkpoint.save(folder / LAST, tensors, self._metadata(progress, others))
-        run_folder.remove_old(folder, progress.step, keep)
+            tensors |= checkpoint.optimizer_tensors(name, optimizer)
+        if (folder / LAST).is_file():
+            writing.give_second_name(folder / LAST, folder / PREVIOUS)
+        checkpoint.save(folder / LAST, tensors, self._metadata(progress))
 
     def save_best(self, progress: Progress) -> None:
         """Write best.safetensors by the first process: the networks, or their averages, for use."""
-        with self.method.ema_weights():
-            self._check_networks()
-            if self.group.is_main:
+        if self.group.is_main:
+            with self.method.ema_weights():
                 networks = checkpoint.network_tensors(self.method)
-                checkpoint.save(self.config.output / BEST, networks, self._metadata(progress, {}))
+                checkpoint.save(self.config.output / BEST, networks, self._metadata(progress))
 
-    def _check_networks(self) -> None:
-        """Refuse to save networks that are no longer finite: the checkpoint on disk is better than they are."""
-        for name, network in self.method.networks.items():
-            checkpoint.check_finite(name, network.state_dict())
-
-    def _metadata(self, progress: Progress, optimizers: dict) -> Metadata:
-        return Metadata(self.config, self.info, progress, self.fingerprint, self.versions, optimizers)
+    def _metadata(self, progress: Progress) -> Metadata:
+        return Metadata(self.config, self.info, progress, self.data, self.versions)
 
 
-def load_last(config: TrainConfig, *, repair: bool = True) -> Saved | None:
-    """The newest checkpoint of a run that is whole, or None where the run was stopped before its first.
+def load_last(config: TrainConfig) -> tuple[tuple[dict[str, Tensor], Metadata] | None, tuple[str, ...]]:
+    """The newest whole checkpoint of a run, or None if the run was stopped before its first; and warnings.
 
-    A damaged last.safetensors is put aside and the one before it takes its place; `notes` say so. Without `repair`
-    nothing is renamed, and a damaged one is an error: of several processes only the first one repairs, before the
-    others look. Raises ValueError where there is no run, or one without a checkpoint that began with other options than
-    `config`, DamagedError where there are checkpoints, but none of them is whole, and OSError where one cannot be
-    reached.
+    If last.safetensors is damaged or missing, previous.safetensors takes its place. Raises ValueError if there is no
+    run, or one that began with other options; DamagedError if no checkpoint is whole; OSError if one cannot be reached.
     """
-    folder = config.output
+    folder, notes = config.output, []
     candidates = run_folder.checkpoints(folder)
-    if not candidates and not (folder / CONFIG).is_file():
-        raise ValueError(f"there is no checkpoint and no {CONFIG} in {folder}; start the run without --resume")
-    notes: list[str] = []
+    if not candidates:
+        if not run_folder.is_run(folder):
+            raise ValueError(f"there is no checkpoint and no {CONFIG} in {folder}; start the run without --resume")
+        check_resume(config, load_config(folder / CONFIG))
     for path in candidates:
         try:
-            tensors, metadata = checkpoint.load(path)
+            saved = checkpoint.load(path)
         except checkpoint.DamagedError as error:
-            if not repair:
-                raise
             notes.append(str(error))
             continue
-        if path.name != LAST and repair:
-            run_folder.put_in_place(path)
-            notes.append(f"going on from the checkpoint before it, {path}; the steps since then are repeated")
-        return Saved(path, tensors, metadata, tuple(notes))
-    best = _reached_by(folder / BEST)
-    if candidates:
-        left = f"; {BEST} can still be evaluated" if best else ""
-        raise checkpoint.DamagedError(
-            "; ".join(notes) + f"; no checkpoint is whole: start a new run (--overwrite){left}"
-        )
-    began = load_config(folder / CONFIG)
-    check_resume(config, began)
-    if best > began.checkpoint_every:
-        raise ValueError(
-            f"the run in {folder} came to step {best} at least ({BEST}), but its checkpoints are missing: put {LAST} "
-            f"or one of {run_folder.EARLIER}/ back, or replace the run (--overwrite)"
-        )
-    return None
-
-
-def _reached_by(path: Path) -> int:
-    """The step of a checkpoint; 0 where there is none that can be read."""
-    try:
-        return checkpoint.load_metadata(path).progress.step
-    except ValueError:
-        return 0
-
-
-def _check_fingerprint(now: DataFingerprint, then: DataFingerprint, data: Path) -> None:
-    """Raise a ValueError naming what differs from the fingerprint that a checkpoint recorded."""
-    if then.precision != now.precision:
-        raise ValueError(
-            f"cannot resume: the run computes in {then.precision}, but precision 'auto' means {now.precision} here; "
-            f"ask for precision {then.precision}"
-        )
-    if then.samples != now.samples or then.images != now.images:
-        raise ValueError(
-            f"cannot resume with other training data: {then.samples} images with the CRC-32 {then.images} in the run, "
-            f"{now.samples} with {now.images} in {data}; give the run's own data set, or start a new run"
-        )
+        if path.name == PREVIOUS:
+            writing.give_second_name(path, folder / LAST)
+            notes.append("going on from the checkpoint before it; the steps since then are repeated")
+        return saved, tuple(notes)
+    if notes:
+        raise checkpoint.DamagedError("; ".join(notes) + "; no checkpoint is whole: start a new run (--overwrite)")
+    return None, ()

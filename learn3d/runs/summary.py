@@ -16,29 +16,25 @@ from learn3d.runs.threads import ThreadTuner
 
 def describe_run(
     run: Run, progress: Progress, train_set: ViewDataset, val_set: ViewDataset, threads: ThreadTuner
-) -> list[str]:
+) -> str:
     """Lines about a run that begins or goes on: method, data, device, and the mirror plane if it was looked for."""
     config, group = run.config, run.group
-    where = f"{config.device}, {run.fingerprint.precision}, {threads}"
-    if group.world_size > 1:
-        where += f" in each of {group.world_size} processes ({group.backend})"
+    processes = f" in each of {group.world_size} processes ({group.backend})" if group.world_size > 1 else ""
+    where = f"{config.device}, {config.precision}, {threads}{processes}"
     data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
     verb = f"resuming at step {progress.step}" if progress.step else "training"
     name = f"{PRESETS[config.preset].label} ({config.preset})"
-    lines = [f"{verb}: {name} on {config.category}, {data}; {where}; output {config.output}"]
-    if config.settings.wants_mirror_plane:
-        lines.append(
-            "no mirror plane: the masks show none (it takes some 150 from all around), so shapes are not mirrored; "
-            "--symmetry names a plane"
-            if run.info.mirror_plane_deg is None
-            else f"mirror plane: a camera of azimuth {run.info.mirror_plane_deg:g} looks along it, as the masks show"
-        )
-    return lines
+    text = f"{verb}: {name} on {config.category}, {data}; {where}; output {config.output}"
+    if config.settings.wants_mirror_plane and run.info.mirror_plane_deg is None:
+        text += "\nno mirror plane: the masks show none (it takes some 150 of them); --symmetry names one"
+    elif config.settings.wants_mirror_plane:
+        text += f"\nmirror plane: a camera of azimuth {run.info.mirror_plane_deg:g} looks along it, as the masks show"
+    return text
 
 
 @dataclass(frozen=True)
 class Summary:
-    """How a call of `train` ended."""
+    """The end of a call of `train`."""
 
     folder: Path
     step: int
@@ -47,22 +43,17 @@ class Summary:
     best_step: int
     seconds: float  # of this call
     total_seconds: float  # of training, over all resumptions
-    was_finished: bool = False  # before this call
 
     @classmethod
-    def of(cls, config: TrainConfig, progress: Progress, started: float, was_finished: bool = False) -> Summary:
+    def of(cls, config: TrainConfig, progress: Progress, started: float) -> Summary:
         """The summary of a call that began at `time.monotonic()` = `started`."""
-        finished, seconds = progress.step == config.iterations, time.monotonic() - started
-        best = (progress.best_iou, progress.best_step)
-        return cls(config.output, progress.step, finished, *best, seconds, progress.seconds, was_finished)
+        finished, best = progress.step == config.iterations, (progress.best_iou, progress.best_step)
+        return cls(config.output, progress.step, finished, *best, time.monotonic() - started, progress.seconds)
 
     def __str__(self) -> str:
-        """One line for the terminal and the journal."""
-        if self.was_finished:
-            end = f"was already finished at step {self.step}"
-        else:
-            end = f"{'finished' if self.finished else 'stopped'} at step {self.step} after {self.seconds / 60:.1f} min"
-            if self.total_seconds > self.seconds + 1:
-                end += f" ({self.total_seconds / 60:.1f} min of training in all)"
+        """One line for the terminal."""
+        end = f"{'finished' if self.finished else 'stopped'} at step {self.step} after {self.seconds / 60:.1f} min"
+        if self.total_seconds > self.seconds + 1:
+            end += f" ({self.total_seconds / 60:.1f} min of training in all)"
         best = f"best validation IoU {self.best_iou:.4f} at step {self.best_step}; " if self.best_step else ""
         return f"{end}; {best}everything is in {self.folder}"

@@ -14,15 +14,9 @@ from collections.abc import Callable
 import torch
 
 WARM_UP, TRIAL = 1, 5  # steps of a trial: the first is not timed, as memory and kernels are prepared in it
-HOPELESS = 2.0  # a trial with one thread ends early when a step takes so many times as long as with all
 WINDOW = 20  # steps whose median is compared with the best so far
 SLOWER = 3.0  # ratio of the two medians at which both numbers are tried again
 REST = 1000  # steps with one thread after which all are tried again; then after twice as many, and so on
-
-
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class ThreadTuner:
@@ -63,13 +57,6 @@ class ThreadTuner:
         """The number of threads, for the line in which a run introduces itself."""
         return f"{self.all} threads or 1, whichever is faster" if self._trying else f"{self.threads} threads"
 
-    def oversubscription_warning(self, processes: int) -> str:
-        """A warning if the threads of all processes on this machine are fixed and more than its cores, else ""."""
-        if not self.fixed or self.threads == 1 or self.threads * processes <= cores():
-            return ""
-        have = f"{self.threads} threads" if processes == 1 else f"{processes} processes of {self.threads} threads each"
-        return f"{have} on {cores()} cores wait for each other; --threads {max(1, cores() // processes)} is faster"
-
     def after_step(self, seconds: float) -> str:
         """Take in the duration of a step. Returns a line for the log when the number has been chosen, else ""."""
         if self.fixed:
@@ -79,7 +66,7 @@ class ThreadTuner:
         if self._trying:
             return self._try()
         if len(self._seconds) == WINDOW:
-            median = statistics.median(self._seconds)
+            median = statistics.median_low(self._seconds)
             self._best = min(self._best, median)
             tired = self.threads == 1 and self._steps >= self._rest
             if median > SLOWER * self._best or tired:
@@ -89,15 +76,13 @@ class ThreadTuner:
         return ""
 
     def _try(self) -> str:
-        timed = list(self._seconds)[WARM_UP:]
-        hopeless = self.threads == 1 and timed and min(timed) > HOPELESS * self._medians[self.all]
-        if len(self._seconds) < TRIAL and not hopeless:
+        if len(self._seconds) < TRIAL:
             return ""
-        self._medians[self.threads] = statistics.median(timed)
+        self._medians[self.threads] = statistics.median(list(self._seconds)[WARM_UP:])
         if self.threads == self.all:
             self._use(1)
             return ""
-        self._trying, self._best = False, float("inf")
+        self._trying, self._best = False, min(self._medians.values())
         times = {count: f"{1000 * self._medians[count]:.0f} ms a step" for count in (1, self.all)}
         self._use(min(self._medians, key=self._medians.__getitem__))
         other = self.all if self.threads == 1 else 1

@@ -1,4 +1,4 @@
-"""What code made a result: versions, and the git commit."""
+"""Versions of the code behind a result, and its git commit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 
 @functools.cache
 def versions() -> dict[str, str | None]:
-    """Versions of the package and of torch, and the git commit of the code (None where it is not known).
+    """Versions of the package and of torch, and the git commit of the code (None if unknown).
 
     A process asks once, before it works: a commit made afterwards is not the code that runs.
     """

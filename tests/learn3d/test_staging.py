@@ -40,9 +40,7 @@ class Copies:
         return tensor.detach().clone()
 
 
-def test_a_download_is_waited_for_when_it_is_needed_and_sends_its_gradient_back(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_download_is_waited_for_when_needed_and_sends_its_gradient_back(monkeypatch: pytest.MonkeyPatch) -> None:
     copies = Copies(monkeypatch)
     x = torch.tensor([1.0, 2.0], requires_grad=True)
     download = Download(2 * x)

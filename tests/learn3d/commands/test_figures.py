@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from learn3d.evaluation import evaluate
-from learn3d.figures import paper
-from learn3d.figures.runs import name_runs, open_runs
-from learn3d.runs import checkpoint
+from learn3d.figures import grids
+from learn3d.figures.runs import name_runs
 
 pytest.importorskip("matplotlib")
 
@@ -26,14 +24,14 @@ def call(command):
 
 def test_all_figures_of_a_run(call, finished_run, tmp_path, monkeypatch) -> None:
     pytest.importorskip("sklearn")
-    monkeypatch.setattr(paper, "FRAMES", 1)
-    monkeypatch.setattr(paper, "MORPH_SIZE", 32)
-    monkeypatch.setattr(paper, "TILE_SIZE", 32)
+    monkeypatch.setattr(grids, "FRAMES", 4)
+    monkeypatch.setattr(grids, "FRAME_SIZE", 32)
+    monkeypatch.setattr(grids, "TILE_SIZE", 32)
     code, out, err = call("all", "--runs", finished_run, "--output", tmp_path / "out", "--split", "train")
     assert code == 0, err
     written = [Path(line) for line in out.splitlines()]
     plots = [f"{name}.{kind}" for name in ("curves", "polar", "tsne") for kind in ("png", "svg")]
-    names = sorted([*plots, "grid.png", "interpolation.gif", "interpolation.png", "polar.json"])
+    names = sorted([*plots, "grid.png", "interpolation.gif", "interpolation.png"])
     assert sorted(path.name for path in written) == names
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     for path in written:
@@ -42,38 +40,18 @@ def test_all_figures_of_a_run(call, finished_run, tmp_path, monkeypatch) -> None
             assert min(picture.shape) > 100
             assert 0.005 < (picture < 200).mean() < 0.7, path  # something is drawn, and the page is not dark
     with Image.open(tmp_path / "out" / "interpolation.gif") as image:
-        assert image.n_frames == 3
-    method, config, _ = checkpoint.load_method(finished_run / "last.safetensors")
-    (run,) = open_runs([finished_run], split="train")
-    stored = json.loads((tmp_path / "out" / "polar.json").read_text())["profiles"][0]
-    assert stored["mean_iou"] == pytest.approx(evaluate(method, run.dataset).voxel_iou, abs=1e-6)
-    assert stored["label"] == "Proposed" and config.seed == 0
-
-
-def test_what_cannot_be_drawn_is_said(call, finished_run, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("learn3d.commands.figures.find_spec", lambda package: None)
-    monkeypatch.setattr(paper, "TILE_SIZE", 32)
-    monkeypatch.setattr(paper, "FRAMES", 1)
-    code, out, err = call("all", "--runs", finished_run, "--output", tmp_path)
-    assert (code, [Path(line).name for line in out.split()]) == (0, ["grid.png"])
-    said = [line for line in err.splitlines() if line.startswith(("not drawn", "drawing"))]
-    assert [line.split(":")[1].strip() for line in said[:3]] == ["tsne", "curves", "polar"]
-    assert all("pip install " in line for line in said[:3])
-    assert said[3:5] == ["drawing grid", "drawing interpolation"]
-    assert said[5].startswith("not drawn: interpolation: "), "the data have a single object"
-    code, out, err = call("tsne", "--runs", tmp_path / "nowhere", "--output", tmp_path)
-    assert code == 1 and "matplotlib" in err, "the package is looked for first"
+        assert image.n_frames == 12
 
 
 def test_the_images_of_an_interpolation_can_be_chosen(call, finished_run, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(paper, "FRAMES", 2)
-    monkeypatch.setattr(paper, "MORPH_SIZE", 32)
-    options = ("--split", "train", "--indices", 1, 30, 60, "--steps", 1)
+    monkeypatch.setattr(grids, "FRAMES", 4)
+    monkeypatch.setattr(grids, "FRAME_SIZE", 32)
+    options = ("--split", "train", "--indices", 1, 30)
     code, out, err = call("interpolation", "--runs", finished_run, "--output", tmp_path / "i.gif", *options)
     assert code == 0, err
     assert out.split() == [str(tmp_path / "i.png"), str(tmp_path / "i.gif")]
     with Image.open(tmp_path / "i.gif") as image:
-        assert image.n_frames == 6
+        assert image.n_frames == 8
 
 
 def test_seeds_are_one_curve(call, finished_run, tmp_path) -> None:
@@ -117,14 +95,10 @@ def test_runs_are_called_by_what_tells_them_apart(tiny_config, tmp_path) -> None
     second, free = dataclasses.replace(proposed, seed=1), tiny_config(tmp_path, lambda_prior=0.0)
     paths = [tmp_path / "a", tmp_path / "b"]
     assert name_runs([vanilla, proposed], paths) == ["Vanilla-AE", "Proposed"]
-    assert name_runs([proposed, second], paths) == ["Proposed, seed 0", "Proposed, seed 1"]
-    assert name_runs([proposed, second], paths, seeds_apart=False) == ["Proposed", "Proposed"]
-    assert name_runs([proposed, free], paths) == ["a", "b"]
-    assert name_runs([proposed, free], paths, seeds_apart=False) == ["a", "b"]
-    assert name_runs([proposed, proposed], paths) == ["a", "b"]
+    assert name_runs([proposed, second], paths) == ["a", "b"]
     chair = dataclasses.replace(proposed, category="chair")
-    assert name_runs([proposed, chair], paths) == ["Proposed", "Proposed"]
+    assert name_runs([proposed, chair], paths) == ["airplane: Proposed", "chair: Proposed"]
     assert name_runs([proposed, chair], paths, ["x", "y"]) == ["x", "y"]
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "best.safetensors").touch()
-    assert name_runs([proposed, proposed], [tmp_path / "a" / "best.safetensors", tmp_path / "b"]) == ["a/best", "b"]
+    assert name_runs([proposed, free], [tmp_path / "a" / "best.safetensors", tmp_path / "b"]) == ["a/best", "b"]

@@ -12,10 +12,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -26,9 +24,8 @@ from train_in_ranks import evaluate_last, linear_optimizer
 
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.distributed import launch
-from learn3d.distributed.launch import all_true, init_process_group, rank_label
+from learn3d.distributed.launch import init_process_group
 from learn3d.distributed.process_group import SINGLE_PROCESS, LostPeerError, ProcessGroup
-from learn3d.distributed.sync_batch_norm import convert_sync_batchnorm
 from learn3d.training import train
 
 TASKS = Path(__file__).parents[2] / "data" / "train_in_ranks.py"
@@ -86,12 +83,11 @@ def test_too_many_processes_are_refused(batch_size: int, sampling: str, message:
 def test_without_torchrun_there_is_one_process(monkeypatch) -> None:
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     with init_process_group("cpu") as group:
-        assert (group, rank_label()) == (SINGLE_PROCESS, "")
+        assert group == SINGLE_PROCESS
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.delenv("RANK", raising=False)
-    with pytest.raises(ValueError, match=r"WORLD_SIZE is 2, but RANK.* not set; start the processes by torchrun"):
-        with init_process_group("cpu"):
-            pass
+    with pytest.raises(ValueError, match="environment variable RANK expected"), init_process_group("cpu"):
+        pass
 
 
 def free_port() -> int:
@@ -108,60 +104,6 @@ def test_processes_that_do_not_meet_say_where_and_what_to_look_for(monkeypatch) 
     said = rf"the 2 processes of the run did not find each other by 127.0.0.1:{port} \(.*\); one of them has ended"
     with pytest.raises(LostPeerError, match=said), init_process_group("cpu"):
         pass
-
-
-def test_a_lost_machine_that_kept_the_store_is_a_lost_process(monkeypatch) -> None:
-    def fail(*_: object) -> None:
-        raise RuntimeError("[pair.cc:537] Connection reset by peer. This is a rare event\nframe #0")
-
-    monkeypatch.setattr(torch.distributed, "all_reduce", fail)
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    monkeypatch.setattr(launch, "GRACE_SECONDS", 0)
-    with pytest.raises(LostPeerError) as lost:
-        ProcessGroup(1, 2).any(True)
-    launch._announce(mock.Mock(check=fail), lost.value)
-    said = "another process of the run failed, was killed or does not answer ([pair.cc:537] Connection reset by peer)"
-    assert str(lost.value) == said
-
-
-def test_what_all_processes_say_is_said_once_on_each_machine(monkeypatch) -> None:
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    monkeypatch.setattr(launch, "GRACE_SECONDS", 0)
-    monkeypatch.setenv("WORLD_SIZE", "4")
-    store, silent = torch.distributed.HashStore(), []
-    for rank, machine in enumerate((0, 0, 1, 1)):
-        monkeypatch.setenv("RANK", str(rank))
-        monkeypatch.setenv("GROUP_RANK", str(machine))
-        silent.append(launch._announce(store, ValueError("there is no such folder")))
-    assert silent == [False, True, False, True]
-
-
-def test_batch_norm_of_one_process_is_the_usual_one() -> None:
-    """The same mean and variance, in training and afterwards; the other tests have it between processes."""
-    torch.manual_seed(0)
-    x, usual, ours = (
-        torch.randn(6, 3, 4, 4) + 5,
-        torch.nn.BatchNorm2d(3, momentum=0.3),
-        torch.nn.BatchNorm2d(3, momentum=0.3),
-    )
-    convert_sync_batchnorm(ours, SINGLE_PROCESS)
-    inputs = [x.clone().requires_grad_() for _ in range(2)]
-    outputs = [norm(value) for norm, value in zip((usual, ours), inputs, strict=True)]
-    torch.testing.assert_close(*outputs)
-    weights = torch.randn_like(x)
-    for output in outputs:
-        (output * weights).sum().backward()
-    torch.testing.assert_close(inputs[0].grad, inputs[1].grad, atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(usual.state_dict(), ours.state_dict())
-    torch.testing.assert_close(usual.eval()(x), ours.eval()(x), rtol=0, atol=0)
-
-
-@pytest.mark.parametrize(("values", "agreed"), [((True, True, True), True), ((True, False, True), False)])
-def test_nccl_is_taken_where_all_can(values: tuple[bool, ...], agreed: bool) -> None:
-    store = torch.distributed.HashStore()
-    with ThreadPoolExecutor(len(values)) as threads:
-        found = threads.map(lambda own: all_true(store, own[0], len(values), own[1]), enumerate(values))
-        assert list(found) == [agreed] * len(values)
 
 
 @pytest.mark.parametrize("name", ["images", "masks", "poses", "view_ids", "object_ids", "voxels"])
@@ -271,8 +213,8 @@ def test_the_files_are_those_of_one_process(runs: Path) -> None:
 def test_validation_is_that_of_one_process_to_the_bit(runs: Path) -> None:
     said = json.loads((runs / "two" / "proposed" / "evaluation.json").read_text())
     result = evaluate_last(runs / "two" / "proposed")
-    assert said == json.loads(json.dumps(result.summary() | {"ious": result.ious["kato18"].tolist()}))
-    assert said["images"] == 24
+    assert said == json.loads(json.dumps(result.means | {"ious": result.values["voxel_iou"].tolist()}))
+    assert len(said["ious"]) == 24
 
 
 def test_two_processes_resume_to_the_bit(runs: Path) -> None:
@@ -297,41 +239,14 @@ def test_the_error_of_one_process_ends_all(tiny_config, tmp_path) -> None:
     (tmp_path / "tasks.json").write_text(json.dumps([task]))
     codes, said = start_processes(TASKS, tmp_path / "tasks.json").wait()
     assert 0 not in codes
-    cause = "the cat is on the keyboard"
-    assert f"RuntimeError: {cause}" in said[1]
-    assert f"ends because of another process: rank 1 on {socket.gethostname()}: {cause}" in said[0]
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_two_processes_share_a_gpu(tiny_config, tmp_path) -> None:
-    tasks = []
-    for name in ("proposed", "vpl"):
-        options = RUNS[name][0] | {"device": "cuda"}
-        with linear_optimizer():
-            train(tiny_config(tmp_path / "one" / name, **options))
-        config = tiny_config(tmp_path / "two" / name, **options)
-        tasks.append({"config": config_to_dict(config), "linear": True})
-    (tmp_path / "tasks.json").write_text(json.dumps(tasks))
-    codes, said = start_processes(TASKS, tmp_path / "tasks.json").wait()
-    assert codes == [0, 0], said
-    for name in ("proposed", "vpl"):
-        assert distance(tmp_path / "one" / name, tmp_path / "two" / name) < 1e-3, name
+    assert "RuntimeError: the cat is on the keyboard" in said[1]
+    assert "another process of the run failed, was killed or does not answer" in said[0]
 
 
 def command(tiny_folder: Path, run_folder: Path) -> list[object]:
-    data = [
-        "--data",
-        tiny_folder,
-        "--category",
-        "airplane",
-        "--output",
-        run_folder,
-        "--batch-size",
-        4,
-        "--log-every",
-        1,
-    ]
-    return [TRAIN, *data, "--preset", "peng2020-kato-vanilla", "--encoder", "conv-small", "--generator", "sphere-small"]
+    where = ["--data", tiny_folder, "--category", "airplane", "--output", run_folder]
+    small = "--batch-size 4 --log-every 1 --encoder conv-small --generator sphere-small"
+    return [TRAIN, *where, "--preset", "peng2020-kato-vanilla", *small.split()]
 
 
 def wait_for_steps(run_folder: Path, process: subprocess.Popen) -> None:
@@ -363,14 +278,12 @@ def test_a_signal_to_one_stops_all_and_a_killed_one_ends_all(tiny_folder, run_fo
     assert all(torch.equal(saved[name], value) for name, value in load_file(run_folder / "last.safetensors").items())
 
 
-def test_torchrun_reports_what_went_wrong_once(tmp_path) -> None:
+def test_torchrun_reports_what_went_wrong(tmp_path) -> None:
     arguments = ["--data", tmp_path, "--category", "airplane", "--output", tmp_path / "run"]
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     result = subprocess.run([*torchrun, str(TRAIN), *map(str, arguments)], capture_output=True, text=True, timeout=120)
     assert result.returncode == 1
-    lines = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1, result.stderr
-    assert "02691156_train_images.npz" in lines[0]
+    assert "error: rank " in result.stderr
     assert "02691156_train_images.npz" in result.stderr.split("Root Cause")[1]
 
 
@@ -383,7 +296,7 @@ if not first and rank == "1":
 with init_process_group("cpu") as group:
     if first:
         raise RuntimeError("once more")
-    assert group.any(rank == "1")
+    assert group.all_reduce_mean({"value": 1.0}) == {"value": 2.0}
 """
 
 

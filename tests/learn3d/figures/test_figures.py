@@ -1,228 +1,371 @@
-"""Picture grids, turntables and the files they go into."""
+"""The paper's figures, drawn with methods whose shapes are known beforehand."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import skimage.color
 import torch
 from PIL import Image
+from torch import Tensor
 
 import nmr
-from learn3d.data.poses import LookAtPoses, RotationPoses
-from learn3d.figures.grids import picture_grid
-from learn3d.methods import DatasetInfo, Grids, Meshes, Method, create_method
-from learn3d.pictures.sheets import (
-    HEADER,
-    MARGIN,
-    TILE,
-    magnify,
-    natural_colors,
-    save_gif,
-    save_png,
-    stack,
-    tile,
-    to_uint8,
-    with_suffix,
+from learn3d.evaluation import evaluate
+from learn3d.figures import curves, grids
+from learn3d.figures.grids import comparison_grid, interpolate, picture_grid, spread_views
+from learn3d.figures.runs import Run
+from learn3d.files import limits
+from learn3d.methods import Grids, Meshes, Method
+from learn3d.pictures.sheets import HEADER, MARGIN, TILE, magnify, natural_colors
+from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("sklearn")
+import matplotlib
+
+from learn3d.figures import paper, plots
+
+STEP = TILE + MARGIN
+TURNS = (0, 60, 120, 180, 240, 300)
+SPHERE, FACES = nmr.icosphere(2)
+
+
+class Ellipsoids(Method):
+    """As wide and as high as the mask; as deep as its centre is red, which differs from view to view."""
+
+    def __init__(self, scale: float = 1.0, depth_of_red: float = 0.7) -> None:
+        self.networks, self.optimizers = {}, {}
+        self.device, self.precision, self.image_size = torch.device("cpu"), "fp32", 64
+        self.scale, self.depth_of_red = scale, depth_of_red
+
+    def create_networks(self):
+        raise NotImplementedError
+
+    def create_optimizers(self):
+        raise NotImplementedError
+
+    def training_step(self, batch, step):
+        raise NotImplementedError
+
+    def encode(self, images: Tensor) -> Tensor:
+        mask, red = images[:, 3] > 127, images[:, 0, 32, 32].float() / 255
+        width, height = (mask.any(dim=axis).float().mean(dim=1) for axis in (1, 2))
+        return 0.5 * self.scale * torch.stack([width, height, 0.2 + self.depth_of_red * red], dim=1)
+
+    def decode(self, codes: Tensor) -> Meshes | Grids:
+        return Meshes(SPHERE * codes[:, None], FACES)
+
+
+class GridEllipsoids(Ellipsoids):
+    """The same as volumes."""
+
+    def decode(self, codes: Tensor) -> Grids:
+        centres = (torch.arange(32) + 0.5) / 32 - 0.5
+        points = torch.stack(torch.meshgrid(centres, centres, centres, indexing="ij"), dim=-1)
+        return Grids(torch.sigmoid(20 * (1 - (points / codes[:, None, None, None]).norm(dim=-1))))
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch) -> None:
+    monkeypatch.setattr(grids, "TILE_SIZE", TILE)
+    monkeypatch.setattr(grids, "FRAMES", 4)
+    monkeypatch.setattr(grids, "FRAME_SIZE", TILE)
+
+
+def cell(grid: np.ndarray, row: int, column: int, *, top: int = HEADER, columns: int = 7) -> np.ndarray:
+    y, x = top + MARGIN + row * STEP, grid.shape[1] - (columns - column) * STEP
+    return grid[y : y + TILE, x : x + TILE]
+
+
+def resized(picture: np.ndarray) -> np.ndarray:
+    return np.asarray(Image.fromarray(picture).resize((TILE,) * 2, Image.Resampling.BICUBIC))
+
+
+@pytest.mark.parametrize("poses", ["known", "unknown"])
+def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set, poses) -> None:
+    dataset = tiny_set if poses == "known" else dataclasses.replace(tiny_set, poses=None)
+    samples, method = torch.tensor([3, 30]), Ellipsoids()
+    grid, batch = picture_grid(method, dataset, samples), dataset.batch(samples)
+    assert grid.shape == (HEADER + 2 * STEP + MARGIN, 9 * STEP + MARGIN, 3)
+    for row in (0, 1):
+        assert np.array_equal(cell(grid, row, 0, columns=9), resized(natural_colors(batch.images[row].numpy())))
+        mask = np.rint(255 * batch.masks[row].numpy()).astype(np.uint8)
+        assert np.array_equal(cell(grid, row, 1, columns=9)[..., 0], resized(mask))
+        rendered = cell(grid, row, 2, columns=9)[..., 0] > 127
+        shaded = (cell(grid, row, 3, columns=9) < 250).any(axis=2)
+        assert 0.01 < rendered.mean() < 0.5 and (shaded == rendered).mean() > 0.95
+    nothing = picture_grid(Ellipsoids(scale=0.0), dataset, samples)
+    assert (cell(nothing, 0, 2, columns=9) == 0).all() and np.array_equal(nothing[:, :STEP], grid[:, :STEP])
+
+
+@pytest.mark.parametrize("truth", [False, True])
+def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, truth) -> None:
+    samples, methods = torch.tensor([3, 40]), [("large", Ellipsoids()), ("small", GridEllipsoids(0.5))]
+    grid, batch = comparison_grid(methods, tiny_set, samples, truth=truth), tiny_set.batch(samples)
+    shown = [method.decode(method.encode(batch.images)).surfaces() for _, method in methods]
+    if truth:
+        shown.insert(0, Grids(tiny_set.convention.to_object(batch.voxels.float())).surfaces())
+    poses = [tiny_set.poses[sample[None]] for sample in samples]
+    pairs = [(shapes[i], orbit(pose, TURNS)) for shapes in shown for i, pose in enumerate(poses)]
+    zoom = common_zoom(pairs, batch.masks)
+    assert zoom > 1 and grid.shape[0] == HEADER + 2 * len(shown) * STEP + MARGIN
+    for i, pose in enumerate(poses):
+        picture = magnify(natural_colors(batch.images.numpy()), zoom)[i]
+        assert np.array_equal(cell(grid, i * len(shown), 0), resized(picture))
+        for k, shapes in enumerate(shown):
+            row = i * len(shown) + k
+            views = draw_surface(shapes[i], orbit(pose, [0, 300], zoom=zoom), image_size=TILE)
+            assert np.array_equal(cell(grid, row, 1), views[0]) and np.array_equal(cell(grid, row, 6), views[1])
+            assert (cell(grid, row, 0) == 255).all() == (k > 0), "the input stands in the first row alone"
+
+
+def test_the_truth_must_be_known(tiny_set) -> None:
+    blind = dataclasses.replace(tiny_set, voxels=None)
+    with pytest.raises(ValueError, match="airplane, test has no true voxels to show"):
+        comparison_grid([("a", Ellipsoids())], blind, torch.tensor([3]), truth=True)
+    with pytest.raises(ValueError, match="airplane, test has no true voxels to compare"):
+        plots.measure(Ellipsoids(), blind)
+
+
+def test_images_for_figures_are_spread_over_objects_and_views(tiny_set) -> None:
+    samples = spread_views(tiny_set, 6)
+    assert len(set(samples.tolist())) == 6
+    assert np.bincount(tiny_set.object_ids[samples.numpy()]).tolist() == [2, 2, 2]
+    azimuths = np.sort(azimuths_deg(tiny_set.poses[samples]).numpy() % 360)
+    assert np.diff(np.append(azimuths, azimuths[0] + 360)).min() >= 15
+    assert sorted(spread_views(tiny_set, 72).tolist()) == list(range(72))
+    assert sorted(spread_views(tiny_set.select(np.array([0, 24, 25])), 3).tolist()) == [0, 1, 2]
+    alike = spread_views(tiny_set, 3, turn_deg=0)
+    assert tiny_set.object_ids[alike.numpy()].tolist() == [0, 1, 2]
+    assert azimuths_deg(tiny_set.poses[alike]).tolist() == pytest.approx([30] * 3)
+    for count in (0, 73):
+        with pytest.raises(ValueError, match=f"has 72 images, {count} were asked for"):
+            spread_views(tiny_set, count)
+
+
+def test_a_walk_goes_through_every_code_in_equal_steps() -> None:
+    codes = torch.tensor([[0.0, 1.0], [4.0, 1.0], [4.0, -3.0]])
+    way = grids.walk(codes)
+    assert way.shape == (12, 2) and torch.equal(way[::4], codes)
+    assert torch.allclose(way[:9].diff(dim=0).norm(dim=1), torch.ones(8))
+    assert torch.allclose(way[10], (codes[2] + codes[0]) / 2)
+
+
+@pytest.mark.parametrize("method", [Ellipsoids(), GridEllipsoids()])
+def test_an_interpolation_goes_round_through_the_reconstructions(tiny_set, method) -> None:
+    samples = torch.tensor([3, 30, 60])
+    strip, frames = interpolate(method, tiny_set, samples)
+    assert strip.shape[0] == 3 * STEP + MARGIN and frames.shape == (12, 2, TILE, TILE, 3)
+    batch = tiny_set.batch(samples)
+    shapes = method.decode(grids.walk(method.encode(batch.images))).surfaces()
+    turns = [azimuth - float(azimuths_deg(batch.poses)[0]) for azimuth in (-135, -45)]
+    zoom = common_zoom([(shape, orbit(batch.poses[:1], turns)) for shape in shapes], batch.masks)
+    for column, shape in zip((0, 4, 8), method.decode(method.encode(batch.images)).surfaces(), strict=True):
+        views = draw_surface(shape, orbit(batch.poses[:1], turns, zoom=zoom), image_size=TILE)
+        assert np.abs(frames[column].astype(int) - views).mean() < 0.1
+        for row in (0, 1):
+            assert np.array_equal(cell(strip, 1 + row, column, top=0, columns=9), frames[column, row])
+        assert (cell(strip, 0, column, top=0, columns=9) < 250).any()
+    assert (cell(strip, 0, 1, top=0, columns=9) == 255).all()
+    with pytest.raises(ValueError, match="at least two images, got 1"):
+        interpolate(method, tiny_set, samples[:1])
+
+
+def write_metrics(folder: Path, records: list[object], tail: str = "") -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records) + tail)
+    return folder
+
+
+def records(offset: float, steps: int = 4) -> list[dict]:
+    training = [{"step": 50 * k, "split": "train", "projection": 1 / k + offset, "total": 2.0} for k in range(1, steps)]
+    return [*training, {"step": 100, "split": "val", "voxel_iou": 0.5 + offset, "seconds": 3}]
+
+
+def test_metrics_become_curves(tmp_path) -> None:
+    read = curves.read_metrics(write_metrics(tmp_path / "run", records(0.25), tail='{"step": 200, "spl'))
+    assert set(read) == {("train", "projection"), ("train", "total"), ("val", "voxel_iou")}
+    assert read["train", "projection"] == pytest.approx({50: 1.25, 100: 0.75, 150: 1 / 3 + 0.25})
+    assert curves.panels([read]) == [("val", "voxel_iou"), ("train", "projection"), ("train", "total")]
+
+
+NO_RECORD = "line 1 is no record with a step and a split"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("[]", rf"{NO_RECORD}: '\[\]'"),
+        ("[" * 100_000, NO_RECORD),
+        ('{"step": true, "split": "val"}', NO_RECORD),
+        ('{"step": 1e300, "split": "val"}', NO_RECORD),
+        ("\udcff", NO_RECORD),
+        ('{"step": 1, "split": "train", "\\ud800": 1.0}', "line 1 has a number whose name is none: 'train "),
+        ('{"step": 1, "split": "train", "\\u001b[2J": 1.0}', "line 1 has a number whose name is none: 'train "),
+        (json.dumps({"step": 1, "split": "train", "a" * 61: 1.0}), "line 1 has a number whose name is none: 'train a"),
+        (json.dumps({"step": 1, "split": "t"} | {f"n{k}": 1.0 for k in range(101)}), r"holds 10\d different numbers"),
+        ("\n" * 100_000, r"metrics\.jsonl: has \d+ bytes, and at most 90000 are read"),
+    ],
 )
-from learn3d.pictures.surfaces import Surface, azimuths_deg, common_zoom, draw_surface, orbit, turntable
-from learn3d.presets import PRESETS
+def test_hostile_logs_are_refused(tmp_path, monkeypatch, line, message) -> None:
+    monkeypatch.setattr(limits, "METRICS_BYTES", 200_000 if line.startswith("[") else 90_000)
+    folder = write_metrics(tmp_path / "run", records(0.25))
+    content = (folder / "metrics.jsonl").read_bytes()
+    (folder / "metrics.jsonl").write_bytes(line.encode("utf-8", "surrogateescape") + b"\n" + content)
+    with pytest.raises(ValueError, match=message):
+        curves.read_metrics(folder)
 
 
-def create_vanilla() -> Method:
-    settings = PRESETS["peng2020-kato-vanilla"].settings
-    return create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
+def test_numbers_of_a_run_have_titles(finished_run) -> None:
+    names = {name for _, name in curves.read_metrics(finished_run)}
+    assert {"voxel_iou", "projection"} <= names <= curves.TITLES.keys()
 
 
-@pytest.fixture(scope="module")
-def egg() -> tuple[torch.Tensor, torch.Tensor]:
-    """A sphere stretched along x."""
-    sphere, faces = nmr.icosphere(3)
-    return sphere * torch.tensor([0.5, 0.2, 0.2]), faces
+def test_seeds_become_a_band(tmp_path) -> None:
+    runs = [curves.read_metrics(write_metrics(tmp_path / "a", records(*given))) for given in ((0.0, 4), (0.5, 3))]
+    figure = plots.draw_curves({"Proposed": runs, "Vanilla-AE": runs[:1]})
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["voxel IoU, val", "projection loss (1 - IoU), train", "total loss (weighted), train"]
+    panel = figure.axes[1]
+    assert panel.lines[0].get_xdata().tolist() == [50, 100]  # the second run has not got further
+    assert panel.lines[0].get_ydata().tolist() == [1.25, 0.75]
+    assert panel.lines[1].get_ydata().tolist() == pytest.approx([1.0, 0.5, 1 / 3])
+    assert len(panel.collections) == 1  # one band: the second label has one run
+    edge = panel.collections[0].get_paths()[0].vertices
+    assert {(50.0, 1.0), (50.0, 1.5), (100.0, 0.5), (100.0, 1.0)} <= {tuple(map(float, v)) for v in edge}
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend == ["Proposed (2 seeds: mean and range)", "Vanilla-AE"]
+    assert panel.get_xlabel() == "training step"
 
 
-def test_natural_colors_undo_the_inversion() -> None:
-    stored = np.zeros((2, 4, 3, 5), np.uint8)  # background: black, no alpha
-    stored[1, 0, 2, 4] = 255  # red stored at full strength is cyan
-    colors = natural_colors(stored)
-    assert colors.shape == (2, 3, 5, 3)
-    assert (colors[0] == 255).all()
-    assert colors[1, 2, 4].tolist() == [0, 255, 255]
-    assert natural_colors(stored, inverted=False)[1, 2, 4].tolist() == [255, 0, 0]
+def test_means_by_azimuth_are_those_of_views_or_sectors() -> None:
+    azimuths, means = curves.mean_by_azimuth(
+        np.array([-15.0, 345.0, 359.999, -7.0, 0.0]), np.array([1, 3, 5, 7, np.nan])
+    )
+    assert azimuths.tolist() == [0.0, 345.0] and means.tolist() == [6.0, 2.0]
 
 
-def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set) -> None:
-    method = create_vanilla()
-    grid = picture_grid(method, tiny_set, torch.tensor([3, 30]))
-    step = TILE + MARGIN
-    assert grid.shape == (HEADER + 2 * step + MARGIN, 9 * step + MARGIN, 3)
-    assert grid.dtype == np.uint8
-
-    def cell(row: int, column: int) -> np.ndarray:
-        y, x = HEADER + MARGIN + row * step, MARGIN + column * step
-        return grid[y : y + TILE, x : x + TILE]
-
-    def resized(picture: np.ndarray) -> np.ndarray:
-        return np.asarray(Image.fromarray(picture).resize((TILE,) * 2, Image.Resampling.BICUBIC))
-
-    unknown = picture_grid(method, dataclasses.replace(tiny_set, poses=None), torch.tensor([3, 30]))
-    assert unknown.shape == grid.shape, "drawn from view 0"
-    batch = tiny_set.batch(torch.tensor([3, 30]))
-    assert np.array_equal(cell(1, 0), resized(natural_colors(batch.images[1].numpy())))
-    assert np.array_equal(cell(1, 1), resized(to_uint8(batch.masks[1])))
-    rendered = cell(0, 2)[..., 0] > 127
-    assert 0.3 < rendered.mean() < 0.45  # the untrained sphere covers a disk of radius 0.34 of the side
-    for column in range(3, 9):
-        assert ((cell(0, column) < 250).any(axis=2) == rendered).mean() > 0.95
+def test_pairwise_iou() -> None:
+    voxels = np.zeros((4, 4, 4, 4), bool)
+    voxels[0, :2], voxels[1, 1:3] = True, True
+    table = plots.pairwise_iou(voxels)
+    assert table[0, 1] == table[1, 0] == pytest.approx(1 / 3)
+    assert table[0, 2] == 0.0 and np.isnan(table[2, 3])  # both are empty
 
 
-@pytest.mark.parametrize("kind", ["look-at", "rotation"])
-def test_shaded_views_agree_with_the_renderings_at_the_poses(egg, kind) -> None:
-    vertices, faces = egg[0] + torch.tensor([0.15, 0.1, 0.05]), egg[1]
-    poses = LookAtPoses(torch.tensor([-75.0, -40.0, 100.0]), torch.tensor([30.0, 30.0, -10.0]), 2.732, 15.0)
-    if kind == "rotation":  # the same cameras without perspective, the last one rolled by 25 degrees
-        poses = RotationPoses(torch.stack([rotation(-75, 30), rotation(-40, 30), rotation(100, -10, roll_deg=25)]))
-    silhouettes = nmr.render_silhouette(vertices[None].expand(3, -1, -1), faces, poses.cameras(), image_size=256) > 0.5
-    first = orbit(poses[torch.tensor([0])], [0, 35, -35])  # the second pose is 35 degrees on
-    last = orbit(poses[torch.tensor([2])], [0])
-    surface = Surface(vertices, faces)
-    shaded = [(draw_surface(surface, c, image_size=256) < 205).any(axis=3) for c in (first, last)]
-
-    def overlap(a: np.ndarray, b: torch.Tensor) -> float:
-        return float((a & b.numpy()).sum() / (a | b.numpy()).sum())
-
-    assert overlap(shaded[0][0], silhouettes[0]) > 0.97
-    assert overlap(shaded[0][1], silhouettes[1]) > 0.97
-    assert overlap(shaded[0][2], silhouettes[1]) < 0.8
-    assert overlap(shaded[1][0], silhouettes[2]) > 0.97
+@pytest.mark.parametrize("method", [Ellipsoids(), GridEllipsoids()])
+def test_ious_are_those_of_the_evaluation(tiny_set, method) -> None:
+    ious, agreement, consistency = plots.measure(method, tiny_set)
+    assert np.allclose(ious, evaluate(method, tiny_set).values["voxel_iou"].numpy(), atol=1e-6)
+    assert agreement.shape == (72,) and 0.3 < consistency < 0.99
 
 
-def rotation(azimuth_deg: float, elevation_deg: float, *, roll_deg: float = 0.0) -> torch.Tensor:
-    """Rows right, up, away of a camera that looks at the origin."""
-    away = -nmr.cameras.points_from_angles(1.0, elevation_deg, azimuth_deg).float()
-    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), away)
-    right = right / right.norm()
-    up = torch.linalg.cross(away, right)
-    cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
-    return torch.stack([cos * right + sin * up, cos * up - sin * right, away])
+def test_consistency_is_the_mean_over_pairs_of_views(tiny_set) -> None:
+    few = tiny_set.select(np.array([0, 1, 2, 30, 31, 60]))  # 3, 2 and 1 views of the objects
+    meshes = Ellipsoids().decode(Ellipsoids().encode(few.batch(torch.arange(6)).images))
+    iou = plots.pairwise_iou(few.voxelize(meshes.vertices, meshes.faces).numpy())
+    _, agreement, consistency = plots.measure(Ellipsoids(), few)
+    expected = ((iou[0, 1] + iou[0, 2] + iou[1, 2]) / 3 + iou[3, 4]) / 2
+    assert consistency == pytest.approx(expected, abs=1e-6) and expected < 0.95
+    assert agreement[0] == pytest.approx((iou[0, 1] + iou[0, 2]) / 2, abs=1e-6)
+    assert np.isnan(agreement).tolist() == [False] * 5 + [True]  # of the object that was seen once
+    assert plots.measure(Ellipsoids(depth_of_red=0.0), few)[2] == 1.0
 
 
-def test_azimuths_are_read_from_poses_of_either_kind() -> None:
-    look_at = LookAtPoses(torch.tensor([-75.0, 190.0]), 30.0, 2.732, 15.0)
-    rotations = RotationPoses(torch.stack([rotation(-75, 30), rotation(190, -20, roll_deg=40)]))
-    for poses in (look_at, rotations):
-        assert azimuths_deg(poses).tolist() == pytest.approx([-75, -170], abs=1e-4)
+def test_the_polar_plot_shows_the_means_of_the_views(tiny_set) -> None:
+    run = Run("a", Ellipsoids(), tiny_set)
+    before = dict(matplotlib.rcParams)
+    left, right = plots.draw_polar([run, Run("b", Ellipsoids(0.8), tiny_set)]).axes
+    assert dict(matplotlib.rcParams) == before, "the style is left alone"
+    ious, agreement, consistency = plots.measure(run.method, tiny_set)
+    for axes, values in ((left, ious), (right, agreement)):
+        of_views = [values[tiny_set.view_ids == -k % 24].mean() for k in (*range(24), 0)]  # closed
+        assert axes.lines[0].get_ydata().tolist() == pytest.approx(of_views)
+        assert np.allclose(axes.lines[0].get_xdata()[:-1], np.deg2rad(15 * np.arange(24)))
+        assert max(of_views) < axes.get_ylim()[1] <= 1
+        assert axes.get_theta_offset() == pytest.approx(1.5 * np.pi)  # azimuth 0 below
+        assert axes.get_theta_direction() == 1  # and 90 to the right
+    legends = [axes.get_legend().get_texts()[0].get_text() for axes in (left, right)]
+    assert legends == [f"a: {ious.mean():.3f}", f"a: {consistency:.3f}"]
+    alone = tiny_set.select(np.array([0, 24, 48]))
+    assert len(plots.draw_polar([Run("a", Ellipsoids(), alone)]).axes) == 1
 
 
-def test_an_orbit_needs_one_pose() -> None:
-    with pytest.raises(ValueError, match="one camera, got 2 poses"):
-        orbit(LookAtPoses(torch.zeros(2), 30.0, 2.732, 15.0), [0])
+VIEWS, OBJECTS = np.tile(np.arange(12), 20), np.repeat(np.arange(20), 12)
 
 
-def test_the_light_goes_with_the_camera() -> None:
-    sphere = Surface(*nmr.icosphere(4))
-    cameras = orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 25.0), [0, 60, 180, 300])
-    pictures = draw_surface(sphere, cameras, image_size=32).astype(int)
-    brightness = [picture[10:22, 10:22].mean() for picture in pictures]
-    assert max(brightness) - min(brightness) < 4
-    assert pictures[0][10:16].mean() > pictures[0][16:22].mean() + 8  # and it comes from above
+def entangled(share: float) -> np.ndarray:
+    """Codes [240, 16] of 20 objects from 12 sides: `share` of the view, the rest of the object."""
+    rng = np.random.default_rng(0)
+    of_view, of_object = rng.normal(size=(12, 16))[VIEWS], rng.normal(size=(20, 16))[OBJECTS]
+    return share * of_view + (1 - share) * of_object + 0.1 * rng.normal(size=(240, 16))
 
 
-def test_shapes_are_drawn_in_their_colours() -> None:
-    vertices, faces = nmr.icosphere(3)
-    red = torch.tensor([1.0, 0.0, 0.0]).expand_as(vertices)
-    cameras = orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 25.0), [0])
-    (surface,) = Meshes(vertices[None], faces, red[None]).surfaces()
-    middle = draw_surface(surface, cameras, image_size=32)[0, 16, 16]
-    assert middle[0] > 120 and middle[1:].max() < 10
+def test_the_view_is_told_from_entangled_codes_alone() -> None:
+    accuracy, chance = plots.view_accuracy(entangled(0.95), VIEWS, OBJECTS)
+    assert accuracy > 0.95 and chance == pytest.approx(1 / 12, abs=0.03)
+    accuracy, _ = plots.view_accuracy(entangled(0.0), VIEWS, OBJECTS)
+    assert 0.02 < accuracy < 0.17  # as often as by chance, not never: views of the same object do not count
+    assert plots.view_accuracy(entangled(0.5)[:12], VIEWS[:12], OBJECTS[:12]) is None
+    assert plots.view_accuracy(entangled(0.5), 0 * VIEWS, OBJECTS) is None
 
 
-def test_grids_are_drawn_where_their_cells_are() -> None:
-    occupancy = torch.zeros(2, 16, 16, 16)
-    occupancy[0, 2:6, 8:14, 15:] = 1.0  # touches the far end of z
-    full, empty = Grids(occupancy).surfaces()
-    low, high = full.vertices.amin(dim=0), full.vertices.amax(dim=0)
-    half = 0.5 / 16  # the surface runs half way between the centres of neighbouring cells: through their border
-    assert low.tolist() == pytest.approx([2 / 16 - 0.5, 8 / 16 - 0.5, 15 / 16 - 0.5], abs=half / 8)
-    assert high.tolist() == pytest.approx([6 / 16 - 0.5, 14 / 16 - 0.5, 0.5], abs=half / 8)
-    assert len(empty.faces) == 0
-    cameras = orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 15.0), [0, 90])
-    pictures = draw_surface(empty, cameras, image_size=8)
-    assert pictures.shape == (2, 8, 8, 3)
-    assert (pictures == 255).all()
-    assert (draw_surface(full, cameras, image_size=32) < 250).any()
+def test_an_embedding_keeps_neighbours_and_is_always_the_same() -> None:
+    codes = entangled(0.9)[:60]
+    points = plots.embed(codes)
+    assert points.shape == (60, 2) and np.array_equal(points, plots.embed(codes))
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
+    np.fill_diagonal(distances, np.inf)
+    assert (VIEWS[:60][distances.argmin(axis=1)] == VIEWS[:60]).mean() > 0.9
+    with pytest.raises(ValueError, match=r"at least 10 images, got \[9, 16\]"):
+        plots.embed(codes[:9])
 
 
-def test_common_zoom_fills_the_picture_with_the_largest_shape_or_mask(egg) -> None:
-    pose, turns = LookAtPoses(torch.zeros(1), 0.0, 2.732, 15.0), [0, 90]
-    surface, small = Surface(*egg), Surface(egg[0] * 0.3, egg[1])
-    cameras, no_masks = orbit(pose, turns), torch.zeros(1, 64, 64)
-    zoom = common_zoom([(surface, cameras), (small, cameras)], no_masks)
-    picture = draw_surface(surface, orbit(pose, turns, zoom=zoom), image_size=100)[0]
-    columns = np.flatnonzero((picture < 250).any(axis=(0, 2)))
-    assert 1 <= columns[0] <= 4  # 5 % of the half side are left free
-    assert columns[-1] == 99 - columns[0]
-    masks = no_masks.clone()
-    masks[0, 16:48, 20:56] = 1.0  # reaches 24 / 32 of the half side
-    assert common_zoom([(small, cameras)], masks) == pytest.approx(0.95 / (23.5 / 32), rel=1e-6)
-    assert common_zoom([(small, cameras)], torch.ones(1, 64, 64)) == 1.0
+def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set, tmp_path, monkeypatch) -> None:
+    points = np.random.default_rng(0).normal(size=(72, 2)).astype(np.float32)
+    monkeypatch.setattr(plots, "embed", lambda codes: points)
+    runs, wheel = [Run("$\\bad$", Ellipsoids(), tiny_set), Run("b", Ellipsoids(), tiny_set)], plots.cyclic_colors()
+    scatter = plots.draw_tsne(runs).axes[0].collections[0]
+    azimuths = azimuths_deg(tiny_set.poses).numpy() % 360
+    for position, color in zip(scatter.get_offsets(), scatter.get_facecolors(), strict=True):
+        (index,) = np.flatnonzero((points == position).all(axis=1))
+        assert np.allclose(color[:3], wheel[int(azimuths[index] / 360 * 256)], atol=1e-6)
+    written = paper.save_tsne(runs, tmp_path / "new" / "maps.svg")
+    assert written == [tmp_path / "new" / "maps.png", tmp_path / "new" / "maps.svg"]
+    assert Image.open(written[0]).size > (800, 400)
+    text = written[1].read_text()
+    assert all(words in text for words in ("$\\bad$", "view told from the code: ", " % (chance 4 %)", "90°"))
+    paper.save_tsne(runs, tmp_path / "again")
+    assert (tmp_path / "again.svg").read_text() == text
 
 
-def test_magnified_keeps_the_middle() -> None:
-    pictures = np.zeros((1, 40, 40, 3), np.uint8)
-    pictures[:, 10:30, 10:30] = 255
-    assert magnify(pictures, 2.0).shape == (1, 20, 20, 3)
-    assert (magnify(pictures, 2.0) == 255).all()
-    assert np.array_equal(magnify(pictures, 1.0), pictures)
+def test_the_colours_of_the_wheel_can_be_told_apart_by_everyone() -> None:
+    lab = skimage.color.rgb2lab(plots.cyclic_colors(72)[None])[0]
+    steps = np.linalg.norm(np.diff(lab, axis=0, append=lab[:1]), axis=1)
+    assert steps.max() < 8  # no jump, at the end neither
+    lightness_and_blue = lab[:, [0, 2]]  # the colours that remain without red-green vision
+    opposite = np.linalg.norm(lightness_and_blue - np.roll(lightness_and_blue, 36, axis=0), axis=1)
+    assert opposite.min() > 45 and lab[:, 0].max() < 85  # none vanishes on white
 
 
-def test_a_sheet_has_titles_free_places_and_rules() -> None:
-    black = np.zeros((8, 8, 3), np.uint8)
-    plain = tile([[black, None], [black, black]], tile_size=20)
-    step = 20 + MARGIN
-    assert plain.shape == (2 * step + MARGIN, 2 * step + MARGIN, 3)
-    assert plain[MARGIN + 5, MARGIN + 5].tolist() == [0, 0, 0]
-    assert (plain[: step - 1, step + MARGIN :] == 255).all()  # the free place
-    titled = tile([[black, None], [black, black]], ["a", "b"], tile_size=20, row_titles=["one", "two"], rules=[1])
-    left = titled.shape[1] - plain.shape[1]
-    assert left > 10 and titled.shape[0] == plain.shape[0] + HEADER
-    assert (titled[:HEADER] < 128).any() and (titled[HEADER:, :left] < 128).any()
-    rule = titled[HEADER + step + MARGIN // 2]
-    assert len(np.unique(rule, axis=0)) == 1 and rule[0, 0] not in (0, 255)
+def test_categories_stand_below_each_other(tiny_set, tmp_path) -> None:
+    chairs = dataclasses.replace(tiny_set, category="chair")
+    runs = [Run(label, Ellipsoids(), data) for data in (tiny_set, chairs) for label in ("a", "b")]
+    (one,) = paper.save_grid(runs[:2], tmp_path / "one", images=1)
+    (two,) = paper.save_grid(runs, tmp_path / "2", images=1)
+    assert Image.open(two).height == 2 * Image.open(one).height + 10
+    with pytest.raises(ValueError, match="indices must lie in"):
+        paper.save_grid(runs[:1], tmp_path / "four.png", indices=[72])
 
 
-def test_pictures_are_put_below_each_other() -> None:
-    low, high = np.zeros((10, 30, 3), np.uint8), np.zeros((20, 40, 3), np.uint8)
-    both = stack([low, high], gap=4)
-    assert both.shape == (34, 40, 3) and (both[10:14] == 255).all() and (both[14:] == 0).all()
-
-
-def test_endings_are_replaced_only_where_they_are_those_of_pictures() -> None:
-    assert with_suffix(Path("a/b.png"), ".svg") == Path("a/b.svg")
-    assert with_suffix(Path("a/lambda-0.5"), ".svg") == Path("a/lambda-0.5.svg")
-
-
-def test_turntable_turns(egg) -> None:
-    frames = turntable(Surface(*egg), frames=4, image_size=48)
-    assert frames.shape == (4, 48, 48, 3)
-    widths = [(frame < 250).any(axis=(0, 2)).sum() for frame in frames]
-    assert widths[0] > 1.5 * widths[1]
-    assert abs(widths[0] - widths[2]) <= 1
-    assert (frames[:, 0, 0] == 255).all()
-    assert 42 <= widths[0] <= 48  # fills the picture, and
-    assert not (frames[:, :, 0] < 250).any()  # is not cut off
-
-
-def test_png_and_gif_can_be_read_back(tmp_path, egg) -> None:
-    frames = turntable(Surface(*egg), frames=3, image_size=32)
-    save_png(tmp_path / "a.png", frames[0])
-    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), frames[0])
-    save_gif(tmp_path / "a.gif", frames, frames_per_second=10)
-    with Image.open(tmp_path / "a.gif") as image:
-        assert (image.n_frames, image.size, image.info["duration"], image.info["loop"]) == (3, (32, 32), 100, 0)
-        first = np.asarray(image.convert("RGB")).astype(int)
-    assert np.abs(first - frames[0]).max() <= 16
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gif", "a.png"]
+def test_all_figures_say_which_could_not_be_drawn(tiny_set, tmp_path) -> None:
+    alone = dataclasses.replace(tiny_set.select(np.arange(8)), voxels=None)
+    said: list[str] = []
+    written = paper.save_all([Run("a", Ellipsoids(), alone)], [tmp_path], tmp_path / "out", say=said.append)
+    assert [path.name for path in written] == ["grid.png", "interpolation.png", "interpolation.gif"]
+    not_drawn = [text.split(":")[1].strip() for text in said if text.startswith("not drawn")]
+    assert not_drawn == ["tsne", "polar", "curves"]

@@ -72,6 +72,10 @@ def changed(before: np.ndarray, after: np.ndarray) -> float:
 def test_a_drag_turns_all_meshes(page, visit) -> None:
     tab = visit(page)
     assert tab.locator(".mesh").count() == 3
+    assert all(place.get_attribute("alt") for place in tab.locator("img").all())
+    assert all(place.get_attribute("aria-label") for place in tab.locator(".plot").all())
+    assert "</script><b>one" in tab.locator("figcaption").nth(1).inner_text()
+    assert "</script><b>one" in tab.locator(".mesh").first.get_attribute("aria-label")
     before = [picture(tab, number) for number in range(3)]
     for image in before:  # a shaded shape on an even ground
         assert 0.05 < (np.abs(image.astype(int) - image[3, 3]).max(axis=2) > 30).mean() < 0.9
@@ -133,23 +137,17 @@ def test_the_table_sorts_and_shows_all_objects(page, visit) -> None:
     assert names == sorted(names) and heads.nth(2).get_attribute("aria-sort") is None
 
 
-def test_it_fits_narrow_and_wide_windows(page, visit) -> None:
+def test_it_can_be_read_in_narrow_and_wide_windows_in_light_and_dark(page, visit) -> None:
     tab = visit(page)
-    for width in (340, 390, 1900):
+    for width, scheme in ((340, "dark"), (1900, "light")):  # as when evening comes
         tab.set_viewport_size({"width": width, "height": 900})
+        tab.emulate_media(color_scheme=scheme)
         picture(tab)
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
         for place in tab.locator(".mesh, .mesh canvas, .plot, .plot .main-svg >> nth=0, #picture").all():
             box = place.bounding_box()
             assert 120 <= box["width"] and box["x"] >= 0 and box["x"] + box["width"] <= width
         assert (picture(tab).std(axis=(0, 1)) > 5).all()
-
-
-def test_text_can_be_read_in_light_and_dark(page, visit) -> None:
-    tab = visit(page)
-    for scheme in ("dark", "light"):  # as when evening comes
-        tab.emulate_media(color_scheme=scheme)
-        tab.wait_for_timeout(300)
         ground = brightness(tab, "body", "backgroundColor")
         assert ground > 0.9 if scheme == "light" else ground < 0.15
         for place in ("h1", "p", "#objects td", "#curves .xtick text"):
@@ -161,14 +159,6 @@ def brightness(tab: Any, place: str, attribute: str) -> float:
     """Of the first such element's colour, 0 to 1."""
     text = tab.locator(place).first.evaluate(f"element => getComputedStyle(element).{attribute}")
     return float(np.mean([float(value) for value in text.strip("rgba()").split(",")[:3]])) / 255
-
-
-def test_pictures_and_fields_have_names(page, visit) -> None:
-    tab = visit(page)
-    assert all(image.get_attribute("alt") for image in tab.locator("img").all())
-    assert all(place.get_attribute("aria-label") for place in tab.locator(".mesh, .plot").all())
-    assert "</script><b>one" in tab.locator("figcaption").nth(1).inner_text()
-    assert "</script><b>one" in tab.locator(".mesh").first.get_attribute("aria-label")
 
 
 def test_of_many_runs_four_are_shown_at_a_time(runs, tmp_path, visit) -> None:

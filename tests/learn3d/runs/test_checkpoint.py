@@ -1,10 +1,17 @@
-"""Checkpoint files: what goes in comes out, and damage is said."""
+"""Checkpoint files: they give back everything that was saved, and any other content is refused by name."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import struct
+import zlib
+from pathlib import Path
+
 import pytest
 import torch
-from runs import metadata
+from memory_checks import at_most
+from runs import metadata, same_bits
 from safetensors.torch import save_file
 
 from learn3d.runs import checkpoint
@@ -16,33 +23,135 @@ def test_round_trip_keeps_bits_names_and_metadata(tmp_path) -> None:
     checkpoint.save(path, tensors, metadata(3, versions={"torch": "ä"}))
     loaded, about = checkpoint.load(path)
     assert loaded.keys() == tensors.keys()
-    assert all(torch.equal(loaded[key], tensors[key]) for key in tensors)
-    assert about == metadata(3, versions={"torch": "ä"})
+    assert all(same_bits(loaded[key], tensors[key]) for key in tensors)
+    assert about == checkpoint.load_metadata(path) == metadata(3, versions={"torch": "ä"})
     assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
 
 
-def test_missing_foreign_and_future_files(tmp_path, monkeypatch) -> None:
-    with pytest.raises(ValueError, match="there is no checkpoint"):
-        checkpoint.load(checkpoint.find(tmp_path))
-    save_file({"x": torch.zeros(1)}, tmp_path / "foreign.safetensors")
-    with pytest.raises(ValueError, match="not a checkpoint of learn3d"):
-        checkpoint.load(tmp_path / "foreign.safetensors")
-    monkeypatch.setattr(checkpoint, "FORMAT", 99)
-    checkpoint.save(tmp_path / "future.safetensors", {"x": torch.zeros(1)}, metadata())
-    monkeypatch.undo()
-    with pytest.raises(ValueError, match="checkpoint format 99"):
-        checkpoint.load(tmp_path / "future.safetensors")
-
-
-def test_load_method_gives_the_saved_one_for_use(finished_run) -> None:
+def test_load_method_opens_a_run_for_use(finished_run) -> None:
     random = torch.get_rng_state()
-    method, config, about = checkpoint.load_method(checkpoint.find(finished_run, "last"))
-    networks = method.networks
+    method, config, about = checkpoint.load_method(finished_run, "last")
     assert torch.equal(torch.get_rng_state(), random)
     tensors, _ = checkpoint.load(finished_run / "last.safetensors")
-    assert torch.equal(networks["encoder"].layers[0].weight, tensors["network.encoder.layers.0.weight"])
-    assert networks["discriminator"].layers[-1].out_features == 24
-    assert not any(p.requires_grad for network in networks.values() for p in network.parameters())
+    assert torch.equal(method.networks["encoder"].layers[0].weight, tensors["network.encoder.layers.0.weight"])
+    assert not any(p.requires_grad for network in method.networks.values() for p in network.parameters())
     assert not method.training
     assert (config.category, about.progress.step) == ("airplane", 4)
     assert about.versions["torch"] == torch.__version__
+
+
+def test_missing_and_foreign_files(tmp_path) -> None:
+    with pytest.raises(ValueError, match=r"there is no checkpoint .*best\.safetensors"):
+        checkpoint.load_method(tmp_path, "best")
+    path = tmp_path / "last.safetensors"
+    save_file({"x": torch.zeros(1)}, path)
+    with pytest.raises(checkpoint.DamagedError, match="not a checkpoint of learn3d"):
+        checkpoint.load(path)
+    header = b'{"x": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}'
+    path.write_bytes(struct.pack("<Q", 2**60) + header)
+    with at_most(2**20), pytest.raises(checkpoint.DamagedError, match="is damaged or was cut short"):
+        checkpoint.load(path)
+
+
+def test_a_flipped_bit_in_any_byte_is_found(tmp_path) -> None:
+    path = tmp_path / "last.safetensors"
+    checkpoint.save(path, {"x": torch.arange(3.0), "y": torch.tensor([True])}, metadata(3))
+    content = path.read_bytes()
+    for position in range(len(content)):
+        bit = 1 << position % 8
+        path.write_bytes(content[:position] + bytes([content[position] ^ bit]) + content[position + 1 :])
+        with pytest.raises(checkpoint.DamagedError):
+            checkpoint.load(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"progress": {"step": "abc"}}, "step must be a whole number, got 'abc'"),
+        ({"progress": {"losses": {"total": "high"}}}, "losses must be a number"),
+        ({"progress": {"surprise": 1}}, "there is no option 'surprise'"),
+        ({"config": [1]}, "config must be"),
+        ({"versions": None}, "versions must be"),
+        ({"info": {"num_views": 10**9}}, "num_views must be at most"),
+        ({"info": {}}, "num_views is missing"),
+        ("[1]", "must be a mapping"),
+        ("[" * 100_000, "nested too deeply"),
+        ('{"step": NaN}', "NaN"),
+    ],
+)
+def test_metadata_of_another_form(tmp_path, change, message: str) -> None:
+    values = dataclasses.asdict(metadata()) | change if isinstance(change, dict) else None
+    text = change if values is None else json.dumps(values, default=str)
+    header = {"learn3d": text, "crc32": f"{zlib.crc32(text.encode()):08x}"}
+    save_file({}, tmp_path / "a.safetensors", metadata=header)
+    for read in (checkpoint.load, checkpoint.load_metadata):
+        with pytest.raises(ValueError, match=f"a.safetensors is no checkpoint of this version.*{message}"):
+            read(tmp_path / "a.safetensors")
+
+
+class StandIn:
+    """As much of a method as a checkpoint asks for, with a step of Adam behind it."""
+
+    def __init__(self) -> None:
+        self.networks = {"encoder": torch.nn.Linear(3, 2)}
+        self.optimizer = torch.optim.Adam(self.networks["encoder"].parameters(), fused=True)
+        self.networks["encoder"](torch.ones(1, 3)).sum().backward()
+        self.optimizer.step()
+
+
+@pytest.mark.parametrize(
+    "change", [{"network.encoder.weight": torch.zeros(3, 2)}, {"network.encoder.more": torch.zeros(1)}]
+)
+def test_weights_that_do_not_fit(change: dict[str, torch.Tensor]) -> None:
+    tensors = checkpoint.network_tensors(StandIn()) | change
+    with pytest.raises(ValueError, match=r"run\.safetensors does not fit the encoder"):
+        checkpoint.restore_networks(StandIn(), tensors, Path("run.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"0.exp_avg": torch.zeros(1)}, r"0.exp_avg is \[1\], wanted \[2, 3\]"),
+        ({"0.step": torch.zeros(2)}, r"0.step is \[2\], wanted \[\]"),
+        ({"7.step": torch.tensor(1.0)}, "7.step belongs to no parameter"),
+        ({"-1.step": torch.tensor(1.0)}, "-1.step belongs to no parameter"),
+    ],
+)
+def test_states_of_adam_that_do_not_fit(change: dict[str, torch.Tensor], message: str) -> None:
+    """The fused kernel would read and write beyond a tensor that is too small."""
+    tensors = checkpoint.optimizer_tensors("encoder", StandIn().optimizer)
+    tensors |= {f"optimizer.encoder.{key}": value for key, value in change.items()}
+    with pytest.raises(ValueError, match=f"the checkpoint does not fit the optimizer encoder: {message}"):
+        checkpoint.restore_optimizer("encoder", StandIn().optimizer, tensors)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        torch.optim.Adam,
+        lambda parameters: torch.optim.AdamW(parameters, fused=True, amsgrad=True),
+        lambda parameters: torch.optim.SGD(parameters, lr=0.1, momentum=0.9),
+        torch.optim.Adafactor,
+    ],
+    ids=["Adam", "fused", "SGD", "Adafactor"],
+)
+def test_any_optimizer_goes_on_as_if_it_had_not_been_saved(tmp_path, make) -> None:
+    torch.manual_seed(0)
+    images = torch.rand(2, 3, 8, 8)
+
+    def steps(network: torch.nn.Module, optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
+        for _ in range(3):
+            optimizer.zero_grad()
+            network(images).square().sum().backward()
+            optimizer.step()
+        return [p.detach().clone() for p in network.parameters()]
+
+    network, other = (torch.nn.Conv2d(3, 4, 3).to(memory_format=torch.channels_last) for _ in range(2))
+    optimizer, resumed = make(network.parameters()), make(other.parameters())
+    steps(network, optimizer)
+    tensors = checkpoint.optimizer_tensors("encoder", optimizer)
+    checkpoint.save(tmp_path / "a.safetensors", tensors, metadata())
+    loaded, _ = checkpoint.load(tmp_path / "a.safetensors")
+    other.load_state_dict(network.state_dict())
+    checkpoint.restore_optimizer("encoder", resumed, loaded)
+    assert all(torch.equal(a, b) for a, b in zip(steps(network, optimizer), steps(other, resumed), strict=True))

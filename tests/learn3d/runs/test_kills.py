@@ -1,8 +1,4 @@
-"""Runs that are killed at any moment and resumed end as if nothing had happened.
-
-Kills before each kind of thing that a run does in its folder, in the middle of a checkpoint, and signals at random
-times. KILL_SEED=<number> draws others.
-"""
+"""Runs that are killed at any moment and resumed end as if nothing had happened. KILL_SEED=<number> draws others."""
 
 from __future__ import annotations
 
@@ -27,7 +23,6 @@ from learn3d import validation
 from learn3d.config import TrainConfig
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
-from learn3d.runs import folder as run_folder
 from learn3d.training import train
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and SIGKILL")
@@ -70,12 +65,10 @@ def uninterrupted(server, killed_config) -> tuple[Path, float, int]:
 
 
 def check_whole(folder: Path) -> None:
-    """What has a name is whole, whenever the run was killed."""
-    checkpoints = run_folder.checkpoints(folder)
-    assert not checkpoints or checkpoints[0].name == "last.safetensors"
-    for path in [*checkpoints, folder / "best.safetensors"]:
-        if path.exists():
-            checkpoint.load(path)
+    """Every file under its own name is whole, whenever the run was killed."""
+    assert (folder / "last.safetensors").exists() or not (folder / "previous.safetensors").exists()
+    for path in folder.glob("*.safetensors"):
+        checkpoint.load(path)
     if (folder / "config.json").exists():
         json.loads((folder / "config.json").read_text())
 
@@ -98,7 +91,8 @@ def test_killed_at_any_place(server, killed_config, uninterrupted, wanted: int) 
             assert answer["status"] == -signal.SIGKILL, config.output.with_suffix(".log").read_text()
             kills += 1
             check_whole(config.output)
-        assert server(config, resume=(config.output / "config.json").exists())["status"] == 0
+        answer = server(config, resume=(config.output / "config.json").exists())
+        assert answer["status"] == 0, config.output.with_suffix(".log").read_text()
         check_same(config.output, reference)
 
 
@@ -107,18 +101,15 @@ def test_killed_at_any_place(server, killed_config, uninterrupted, wanted: int) 
 def test_killed_in_the_middle_of_each_checkpoint(server, killed_config, uninterrupted, name: str) -> None:
     """Half of a file under its temporary name, whatever is saved; it is removed when the run goes on."""
     reference, _, things = uninterrupted
-    halves = 0
     for place in range(things // 4, things):
         config = dataclasses.replace(killed_config, output=reference.with_name(f"half-{name}-{place}"))
         server(config, kill_at=place, half=True)
         if (config.output / f".{name}.safetensors.partial").exists():
-            halves += 1
             check_whole(config.output)
             assert server(config, resume=True)["status"] == 0
             check_same(config.output, reference)
-        if halves == 1:
             return
-    raise AssertionError(f"{halves} halves of {name}")
+    raise AssertionError(f"no kill left half of {name}")
 
 
 def test_signals_at_any_time(server, killed_config, uninterrupted) -> None:
@@ -134,13 +125,6 @@ def test_signals_at_any_time(server, killed_config, uninterrupted) -> None:
         else:
             assert status in (0, -number)
     assert server(config, resume=(config.output / "config.json").exists())["status"] == 0
-    check_same(config.output, reference)
-
-
-def test_a_run_that_was_put_to_sleep_goes_on(server, killed_config, uninterrupted) -> None:
-    reference, seconds, _ = uninterrupted
-    config = dataclasses.replace(killed_config, output=reference.with_name("asleep"))
-    assert server(config, after=seconds / 2, signal=signal.SIGSTOP)["status"] == 0
     check_same(config.output, reference)
 
 

@@ -1,6 +1,6 @@
-"""A day of training scaled down: 10,000 steps, with everything that a run does now and then, use no more at the end
-than at the beginning. What else the machine does makes the CPU time of a step longer, never shorter, so the least of it
-is compared, and a second attempt is allowed.
+"""A day of training scaled down: 10,000 steps use no more at the end than at the beginning.
+
+Other programs make the CPU time of a step longer, never shorter: its least is compared, and a second attempt allowed.
 """
 
 from __future__ import annotations

@@ -1,0 +1,145 @@
+"""Commands on data sets: make, convert and check one, and fetch meshes for one."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from learn3d.commands.command import Command, Split
+from learn3d.data import shards
+from learn3d.data.categories import synset_of
+from learn3d.data.checking import check_folder
+from learn3d.data.conventions import IMAGE_SIZE
+from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
+from learn3d.data.readers import READERS
+from learn3d.files.writing import check_target, write_json
+from learn3d.make_data.config import DatasetConfig
+from learn3d.make_data.debian.models import FetchConfig, fetch_debian_models
+from learn3d.settings import Count, split_names
+from learn3d.terminal import is_watched, say
+
+
+@dataclass(frozen=True)
+class MakeDataset(Command):
+    """Render a data set from a folder of meshes, a mesh pack or procedural shapes, in the layout of a published one.
+
+    Examples:
+      learn3d make-dataset --output data --category chair --source my_chairs --augment 5
+      learn3d make-dataset --output data --category airplane --procedural 300
+      learn3d make-dataset --output big --category chair --source my_chairs --shards --jobs 8
+    """
+
+    config: DatasetConfig
+
+    def run(self) -> int:
+        from learn3d.make_data.render import make_dataset
+        from learn3d.make_data.sharded import make_shards
+
+        if self.config.shards:
+            return make_shards(self.config)
+        say(make_dataset(self.config).text())
+        return 0
+
+
+@dataclass(frozen=True)
+class FetchDebianModels(Command):
+    """Take airplanes, chairs, tables, cabinets, sofas and lamps out of Debian packages, into a folder of PLY meshes.
+
+    Example:
+      learn3d fetch-debian-models --output models
+    """
+
+    config: FetchConfig
+
+    def run(self) -> None:
+        say(fetch_debian_models(self.config).summary())
+        say(f"written to {self.config.output}")
+
+
+@dataclass(frozen=True)
+class CheckDataset(Command):
+    """Read every file of a data set and list everything that is wrong: missing, cut short, empty, inconsistent.
+
+    Example:
+      learn3d check-dataset DATA --layout kar --category airplane,chair --split train
+
+    The exit status is 1 if training or evaluation would fail (an error), 0 if there are warnings at most.
+    """
+
+    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    """Folder of the data set."""
+    layout: Layout = "kato"
+    """Arrangement of its files, see docs/data-sets.md."""
+    category: str = ""
+    """Categories to read, by name or synset id, separated by commas (default: all that are there)."""
+    split: tuple[Split, ...] = ()
+    """Splits to read (default: all that are there)."""
+    json: Path | None = None
+    """Write the report to this file, too (default: to none)."""
+
+    def run(self) -> int:
+        if self.json is not None:
+            check_target(self.json, "--json")
+        report = check_folder(self.layout, self.folder, split_names(self.category), self.split, progress=is_watched())
+        for problem in [problem for split in report.splits for problem in split.problems]:
+            say(f"{problem.severity}: {problem.path}: {problem.message}")
+        errors, warnings = report.count("error"), report.count("warning")
+        say(f"\n{report.table()}\n\n{errors} errors, {warnings} warnings")
+        if self.json is not None:
+            write_json(self.json, {"errors": errors, "warnings": warnings} | dataclasses.asdict(report))
+        return 1 if errors else 0
+
+
+@dataclass(frozen=True)
+class ConvertDataset(Command):
+    """Convert a data set into shards, which training reads piece by piece: for data that do not fit into memory.
+
+    Example:
+      learn3d convert-dataset --data KAR --layout kar --output SHARDS --category chair,airplane
+
+    Then give SHARDS instead of DATA, with the same layout, to the other commands (docs/scale.md). Splits that are
+    complete already are left as they are.
+    """
+
+    data: Path
+    """Folder of the data set."""
+    output: Path
+    """Folder for the shards. Each category and split gets a folder in it."""
+    category: str = ""
+    """Categories, separated by commas (default: all that are there)."""
+    layout: Layout = "kato"
+    """Arrangement of the files of the data set, see docs/data-sets.md."""
+    image_size: int = IMAGE_SIZE
+    """Side of the images in pixels, for layouts that keep larger ones: the size that the method's encoder takes."""
+    views_per_object: Count | None = None
+    """Number of training images to keep of each object (default: the layout's protocol, one for kar, else all)."""
+
+    def run(self) -> None:
+        check_target(self.output, "--output", folder=True)
+        found = READERS[self.layout].contents(self.data)
+        there = {synset_of(category): splits for category, splits in found.items()}
+        if not (wanted := split_names(self.category) or found):
+            raise ValueError(f"{self.data} holds nothing of the layout {self.layout!r}")
+        for category in wanted:
+            splits = there.get(synset_of(category), ("train",))
+            if self.layout == "pascal3d" and "val" in splits:
+                splits = (*splits, "test")  # the same photographs, which evaluation asks for by this name
+            for split in splits:
+                folder = shards.split_folder(self.output, category, split)
+                if shards.holds(self.output, category, split):
+                    say(f"{folder}: is there; remove it to convert it again")
+                else:
+                    self._convert(category, split, folder)
+
+    def _convert(self, category: str, split: str, folder: Path) -> None:
+        options = {"image_size": self.image_size} if "image_size" in LAYOUTS[self.layout].options else {}
+        if split == "train":
+            options["views_per_object"] = self.views_per_object
+        dataset = load_dataset(self.layout, self.data, category, split, **options)
+        shards.remove(folder)  # an unfinished conversion
+        count = shards.write_set(folder, self.layout, dataset)
+        say(f"{folder}: {len(dataset)} images of {dataset.num_objects} objects in {count} shards")

@@ -1,0 +1,130 @@
+"""Commands on trained models: measure them, take them to images, write them into a small file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from learn3d.commands.command import Command, OnDataset, Runs, Which
+from learn3d.files.writing import check_target, write_json
+from learn3d.terminal import note, say
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(OnDataset):
+    """Measure trained models on a test set: voxel IoU of each category and its mean, and more.
+
+    Example:
+      learn3d evaluate runs/airplane runs/chair --json table.json
+    """
+
+    runs: Runs
+    """Run folders, or checkpoint files."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Device on which the networks run."""
+    json: Path | None = None
+    """Write the figures, with protocol and versions, to this file, too (default: to none)."""
+
+    @classmethod
+    def about(cls, everything: bool) -> str:
+        from learn3d.experiments.measurement import describe_measures
+
+        columns = "Columns of the table (means over the images, then over the categories; - if there is no value):"
+        return f"{super().about(everything)}\n\n{columns}\n{describe_measures()}"
+
+    def run(self) -> None:
+        from learn3d.experiments.measurement import class_means, evaluate_runs, format_table
+
+        if self.json is not None:
+            check_target(self.json, "--json")
+        results = evaluate_runs(self.runs, device=self.device, report_progress=note, **self.source)
+        say(format_table(results))
+        if self.json is not None:
+            protocol = {"split": self.split, "checkpoint": self.which}
+            values = [result.model_dump() for result in results]
+            write_json(self.json, {"protocol": protocol, "results": values, "means": class_means(results)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct(OnDataset):
+    """Turn images into meshes, each with a turntable animation and a strip of views.
+
+    Examples:
+      learn3d reconstruct photo.png --output meshes    (transparent background; the small model of the package)
+      learn3d reconstruct photo.jpg --masks mask.png --run runs/airplane --output meshes
+      learn3d reconstruct --data DATA --indices 0 31 62 --run runs/airplane --output meshes
+    """
+
+    output: Path
+    """Folder for the results: of each image a mesh, a turntable GIF and a PNG strip."""
+    model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
+    """Run folder (or checkpoint file) of the trained model (default: the small model of the package)."""
+    images: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]] = ()
+    """Images of any size, with a transparent background, --masks or --plain-background (default: those of --data)."""
+    masks: tuple[Path, ...] = ()
+    """Mask images (white = object), one for each image (default: the transparency of the images)."""
+    plain_background: bool = False
+    """The background has one colour: the object is all that differs from the colour of the border."""
+    crop: bool = True
+    """Centre and scale the object in each image as in the data set, or leave the images as they are."""
+    data: Path | None = None
+    """Data set from which images are taken (default: image files are given)."""
+    indices: tuple[int, ...] = (0,)
+    """Images of the data set: object * V + view, if each object has V views (Kato's: 24, Kar's: 20)."""
+    refine: bool = False
+    """Fit each shape to its mask afterwards, with the camera that the data set knows: seconds for each image."""
+    format: Literal["glb", "obj", "ply"] = "glb"
+    """Format of the mesh files."""
+
+    def run(self) -> None:
+        self._check()
+        from learn3d.reconstruction import reconstruct_dataset, reconstruct_files
+
+        check_target(self.output, "--output", folder=True)
+        if self.data is not None:
+            options = {"indices": self.indices, "refined": self.refine, **self.source}
+            paths = reconstruct_dataset(self.model, self.output, mesh_format=self.format, **options)
+        else:
+            options = {"crop": self.crop, "plain_background": self.plain_background, "which": self.which}
+            paths = reconstruct_files(
+                self.model, self.output, self.images, self.masks, mesh_format=self.format, **options
+            )
+        say("\n".join(map(str, paths)))
+
+    def _check(self) -> None:
+        """Raise ValueError if options contradict each other."""
+        if bool(self.images) == (self.data is not None):
+            raise ValueError("give either image files, or --data with --indices")
+        kind, others = "image files", ("category", "split", "indices", "refine")
+        if self.data is not None:
+            kind, others = "--data", ("masks", "plain_background", "crop")
+        if wrong := [
+            f"--{name.replace('_', '-')}" for name in others if getattr(self, name) != getattr(Reconstruct, name)
+        ]:
+            raise ValueError(f"{', '.join(wrong)} does not go with {kind}; leave it out")
+
+
+@dataclass(frozen=True)
+class Export(Command):
+    """Write the networks of a run into one small file to give away: half precision, nothing that only training needs.
+
+    Example:
+      learn3d export --run runs/chair --output chair.safetensors
+    """
+
+    source: Annotated[Path, tyro.conf.arg(name="run")]
+    """Run folder (or checkpoint file) of the trained model."""
+    output: Path
+    """File to write, .safetensors."""
+    which: Which = "last"
+    """Networks of a run to use: the last ones, or those with the best validation IoU."""
+
+    def run(self) -> None:
+        from learn3d.runs.export import export
+
+        check_target(self.output, "--output")
+        size = export(self.source, self.output, which=self.which)
+        say(f"{self.output} ({size / 1e6:.1f} MB)")

@@ -1,0 +1,133 @@
+"""A table from stored results: the paper's figures beside ours, with confidence intervals, as Markdown.
+
+The paper's figures are of other meshes, so no difference to them is taken.
+"""
+
+from __future__ import annotations
+
+import functools
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from learn3d.experiments.measurement import MEASURES, Result, figures
+from learn3d.experiments.plan import PlannedRun, Request, command_line, select_rows
+from learn3d.experiments.statistics import percentile_interval, resampled_means
+from learn3d.experiments.tables import CATEGORIES, MEAN, TABLES, Row
+
+Cells = list[list[str]]
+Side = list[dict[int, Result]]  # the results of one method by seed, for each category of a column
+
+LABELS = {"voxel_iou": "kato18", "voxel_iou_kato19": "kato19", "mmd": "mmd"}
+NOTES = (
+    "Measured on the test split. Brackets: 95 % intervals over test objects (bootstrap; objects, not images, are drawn "
+    "again). ±: 95 % intervals over seeds (Student's t).\n\nThe paper's figures are for reference: they are on its own "
+    "data, with its own length of training. In parentheses: its mean over other categories than those here."
+)
+
+
+def make_report(request: Request, runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> tuple[Cells, str]:
+    """The main table and the whole report as Markdown, from the results of runs by folder.
+
+    Commands have DATA and OUTPUT in place of folders, so that no path gets in.
+    """
+    table, done = TABLES[request.table], [run for run in runs if run.folder in results]
+    measured: dict[tuple[str | None, str], dict[int, Result]] = {}
+    for run in done:
+        by_seed = measured.setdefault((run.variant, run.config.category), {})
+        by_seed[run.config.seed] = results[run.folder]
+    categories = list(dict.fromkeys(run.config.category for run in runs))
+    columns = {name: [name] for name in categories} | {MEAN: categories}
+    baseline = table.rows[table.baseline].variant
+    measures = ["mmd"] if table.measure == "mmd" else ["voxel_iou", "voxel_iou_kato19"]
+    main, differences = [["method", "", *columns]], [["method", *columns]]
+    for label, row in select_rows(request).items():
+        ours, theirs = (
+            [[measured.get((variant, name), {}) for name in names] for names in columns.values()]
+            for variant in (row.variant, baseline)
+        )
+        if row.figures:
+            main.append([label, f"paper ({row.about})", *(_format_printed(row, c, categories) for c in columns)])
+        if row.variant:
+            main += [[label, f"here ({LABELS[m]})", *(_compare(m, side) for side in ours)] for m in measures]
+        if row.variant and row.variant != baseline:
+            differences.append([label, *map(functools.partial(_compare, table.measure), ours, theirs)])
+    headers = [header for header, _ in MEASURES.values()]
+    trained = [["run", "networks", "iterations", "batch", "images", *headers, "minutes", "commit"]]
+    for run in done:
+        result = results[run.folder]
+        counts = [f"step {result.step}", str(result.iterations), str(run.config.batch_size), str(result.images)]
+        minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
+        trained.append([run.name, *counts, *figures(vars(result)), minutes, result.commit])
+    commands = (
+        command_line(
+            run.config,
+            data="DATA",
+            category="CATEGORY",
+            seed="SEED",
+            output=f"OUTPUT/runs/CATEGORY/{run.variant}-seedSEED",
+        )
+        for run in done
+    )
+    missing = [run.name for run in runs if run not in done]
+    parts = [f"## {table.title}", _markdown(main), NOTES, *([f"Missing: {', '.join(missing)}."] if missing else [])]
+    parts += [f"Differences to {table.baseline}, paired by seed and by object:", _markdown(differences)]
+    parts += ["What was run:", _markdown(trained), "\n".join(["```sh", *dict.fromkeys(commands), "```"])]
+    return main, "\n\n".join(parts) + "\n"
+
+
+def _format_printed(row: Row, column: str, categories: Sequence[str]) -> str:
+    """The paper's figure for a column. Its mean is taken over the same categories as ours, if it has them."""
+    printed = row.printed
+    if column == MEAN and set(categories) != (set(printed) - {MEAN} or set(CATEGORIES)):
+        if all(name in printed for name in categories):
+            return f"{np.mean([printed[name] for name in categories]):.3f}"
+        return f"({printed[MEAN]:.3f})" if MEAN in printed else "-"
+    return f"{printed[column]:.3f}" if column in printed else "-"
+
+
+def _compare(measure: str, *sides: Side) -> str:
+    """The mean of one side, or the difference of two, with its intervals; "-" if a result is missing."""
+    values = [[[getattr(r, measure) for r in by_seed.values()] for by_seed in side] for side in sides]
+    if not all(v and None not in v for side in values for v in side):
+        return "-"
+    form = ".3f" if len(sides) == 1 else "+.3f"
+    means = [np.mean([np.mean(v) for v in side]) for side in values]
+    text = format(_subtract(means), form)
+    seeds = list(sides[0][0])
+    if len(seeds) > 1 and all(list(by_seed) == seeds for side in sides for by_seed in side):
+        by_seed = _subtract([np.mean(side, axis=0) for side in values])
+        text += f" ±{stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(by_seed):.3f}"
+    if measure == "mmd":
+        return text + (f" (x {means[0] / means[1]:.2f})" if len(means) == 2 else "")
+    for of_category in zip(*sides, strict=True):
+        if len({tuple(o.name for o in r.objects) for by_seed in of_category for r in by_seed.values()}) > 1:
+            return text  # measured on different objects: they cannot be drawn together
+    if interval := percentile_interval(_subtract([_resample(measure, side) for side in sides])):
+        text += f" [{interval[0]:{form}}, {interval[1]:{form}}]"
+    return text
+
+
+def _subtract(values: list) -> np.ndarray:
+    return values[0] - values[1] if len(values) == 2 else values[0]
+
+
+def _resample(measure: str, side: Side) -> np.ndarray:
+    """Mean IoUs over resampled objects [2000]; the IoUs of an object are those of all seeds together."""
+    sums, counts = [], []
+    for by_seed in side:
+        images = np.array([[o.images for o in result.objects] for result in by_seed.values()], float)
+        means = [[getattr(o, measure) or 0.0 for o in result.objects] for result in by_seed.values()]
+        sums.append((means * images).sum(0))
+        counts.append(images.sum(0))
+    return resampled_means(sums, counts)
+
+
+def _markdown(table: Cells) -> str:
+    """The table without HTML: names in results may be a stranger's."""
+    cells = [[html.escape(" ".join(c.splitlines()), quote=False).replace("|", "\\|") for c in row] for row in table]
+    lines = ["| " + " | ".join(row) + " |" for row in cells]
+    return "\n".join([lines[0], "|" + "---|" * len(cells[0]), *lines[1:]])
