@@ -55,15 +55,9 @@ def test_from_pytorch3d_draws_the_same_picture_both_ways():
     assert rgb[0, 128, 180, 0] > rgb[0, 128, 70, 0] and rgb[0, 70, 128, 1] > rgb[0, 180, 128, 1]
     # Nearest to the eye, which is at z = 2.7, is the greatest z.
     assert rgb[0, 128, 128, 2] > 0.9
-
-
-def test_from_pytorch3d_texture_coordinates():
-    """A texel centre of align_corners=True is one of ours."""
-    names = run(ROOT / "docs" / "from-pytorch3d.md")
     names["uv"] = torch.tensor([[0.0, 0.0], [1.0, 1.0], [3 / 127, 5 / 63]])
-    page = (ROOT / "docs" / "from-pytorch3d.md").read_text()
-    exec(re.findall(r"^uv = \(.*$", page, flags=re.MULTILINE)[0], names)
-    texels = names["uv"] * torch.tensor([128, 64]) - 0.5
+    exec(re.findall(r"^uv = \(.*$", (ROOT / "docs" / "from-pytorch3d.md").read_text(), flags=re.MULTILINE)[0], names)
+    texels = names["uv"] * torch.tensor([128, 64]) - 0.5  # a texel centre of align_corners=True is one of ours
     torch.testing.assert_close(texels, torch.tensor([[0.0, 0.0], [127.0, 63.0], [3.0, 5.0]]), atol=1e-4, rtol=0)
 
 

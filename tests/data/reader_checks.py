@@ -1,26 +1,35 @@
-"""What the tests of every reader ask of it: `problems` and `load` must tell of the same faults."""
+"""Questions that the tests of every reader ask: checking and loading must tell of the same faults."""
 
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 
 import nmr
+from learn3d.data.checking import check_folder
 from learn3d.data.dataset import ViewDataset
+from learn3d.data.readers import READERS
+from learn3d.files.findings import Problem
 
 
-def expect(reader: ModuleType, folder: Path, split: str, message: str, severity: str = "error") -> None:
-    """The scan must find this problem and no other; `load` must raise it, or read on if it is a warning."""
-    found = list(reader.problems(folder, "chair", split))
-    assert [p.severity for p in found] == [severity], found
-    assert message in f"{found[0].path}: {found[0].message}"
+def problems(layout: str, folder: Path, split: str, category: str = "chair") -> tuple[Problem, ...]:
+    """Everything that `check-dataset` finds in a split."""
+    (report,) = check_folder(layout, folder, [category], [split]).splits
+    return report.problems
+
+
+def expect(layout: str, folder: Path, split: str, message: str, severity: str = "error") -> None:
+    """The check must find this problem and no other; `load` must raise it, or read on if it is a warning."""
+    (found,) = problems(layout, folder, split)
+    assert found.severity == severity
+    assert message in f"{found.path}: {found.message}"
+    load = READERS[layout].load
     if severity == "warning":
-        reader.load(folder, "chair", split)
+        load(folder, "chair", split)
         return
     with pytest.raises((ValueError, FileNotFoundError)) as error:
-        reader.load(folder, "chair", split)
+        load(folder, "chair", split)
     assert message in str(error.value)
 
 

@@ -1,4 +1,4 @@
-"""Small meshes for tests, and batches of them in every layout."""
+"""Random triangles for tests, and results with several numbers of threads."""
 
 import torch
 
@@ -10,24 +10,6 @@ def random_soup(seed, batch=2, num_faces=12, dtype=torch.float64, size=0.5):
     corners = centre + size * torch.randn(batch, num_faces, 3, 3, generator=g)
     corners[..., 2] = 1 + torch.rand(batch, num_faces, 3, generator=g)
     return corners.reshape(batch, -1, 3).to(dtype), torch.arange(num_faces * 3).view(-1, 3)
-
-
-def different_soups(dtype=torch.float32, sizes=(12, 1, 0, 25)):
-    """Meshes ``[(vertices [V, 3], faces [F, 3]), ...]`` of different sizes, one of them empty; corners are shared."""
-    meshes = []
-    for n, num_faces in enumerate(sizes):
-        vertices, _ = random_soup(n, 1, num_faces, dtype)
-        g = torch.Generator().manual_seed(n)
-        faces = torch.randint(0, max(3 * num_faces, 1), (num_faces, 3), generator=g)
-        meshes.append((vertices[0], faces))
-    return meshes
-
-
-def pack(meshes):
-    """vertices ``[N, 3]``, faces ``[M, 3]``, starts ``[B + 1, 2]`` of a list of meshes."""
-    sizes = torch.tensor([[0, 0]] + [[len(vertices), len(faces)] for vertices, faces in meshes])
-    vertices, faces = zip(*meshes, strict=True)
-    return torch.cat(vertices), torch.cat(faces), sizes.cumsum(0)
 
 
 def for_threads(counts, run):

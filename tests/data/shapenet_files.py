@@ -87,9 +87,9 @@ def rgb(shown: np.ndarray, background: int = 255) -> np.ndarray:
     return np.where(shown[..., None], COLOR, background).astype(np.uint8)
 
 
-def save(path: Path, pixels: np.ndarray, mode: str | None = None) -> None:
+def save(path: Path, pixels: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels, mode).save(path)
+    Image.fromarray(pixels).save(path)
 
 
 def shapes(count: int) -> list[np.ndarray]:
@@ -97,7 +97,7 @@ def shapes(count: int) -> list[np.ndarray]:
     return [BOXES * [1.0, 1.0 - 0.2 * i, 1.0] for i in range(count)]
 
 
-def write_dvr(folder: Path, lists: dict[str, list[str]], prefix: str = "softras_", world: np.ndarray | None = None):
+def write_dvr(folder: Path, lists: dict[str, list[str]], world: np.ndarray | None = None):
     """NMR_Dataset; `world` turns the world of cameras and points away from the mesh's frame."""
     world = np.eye(3) if world is None else world
     names = sorted(name for ids in lists.values() for name in ids)
@@ -122,12 +122,12 @@ def write_dvr(folder: Path, lists: dict[str, list[str]], prefix: str = "softras_
         points = (corner * rng.dirichlet([1, 1, 1], 500)[..., None]).sum(1) @ world.T
         np.savez(root / "pointcloud.npz", points=points.astype(np.float16), normals=np.zeros_like(points))
     for split, ids in lists.items():
-        (folder / CHAIR / f"{prefix}{split}.lst").write_text("\n".join(ids) + "\n")
+        (folder / CHAIR / f"softras_{split}.lst").write_text("\n".join(ids) + "\n")
 
 
-def write_kar(folder: Path, lists: dict[str, list[str]], size: int = 224, seed: int = 0, bits: int = 8):
+def write_kar(folder: Path, lists: dict[str, list[str]], size: int = 224):
     """shapenet_release of LSM, with splits.json laid beside it."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     names = sorted({name for ids in lists.values() for name in ids})
     for name, boxes in zip(names, shapes(len(names)), strict=True):
         root = folder / "renders" / CHAIR / name
@@ -139,7 +139,7 @@ def write_kar(folder: Path, lists: dict[str, list[str]], size: int = 224, seed: 
             shown = draw(swap_frames(eye), swap_frames(right), 16 / 60, size, boxes)
             save(root / f"render_{k}.png", rgb(shown))
             depth = np.where(shown, 90, 255).astype(np.uint8)
-            save(root / f"depth_{k}.png", depth if bits == 8 else depth.astype(np.uint16) * 257)
+            save(root / f"depth_{k}.png", depth)
             rows.append(f"{azimuth:.6f} {elevation:.6f} 0.000000 {distance:.6f}")
         (root / "view.txt").write_text("\n".join(rows) + "\n")
         # Index (i, j, k) is the cell at (-z, y, x) of NMR's frame.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-import tarfile
+import subprocess
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -57,35 +58,17 @@ CHAIR = obj_text(((0, 4, 0), (4, 5, 4)), ((0, 5, 0), (4, 10, 0.5)), ((0, 0, 0), 
 TABLE = obj_text(((0, 4, 0), (8, 5, 5)), ((3, 0, 2), (5, 4, 3)))
 
 
-def tar_of(files: dict[str, bytes | None], kind: str = "xz") -> bytes:
-    """A tar archive of these files; None makes a symbolic link that leads out of it."""
-    data = io.BytesIO()
-    with tarfile.open(fileobj=data, mode=f"w:{kind}") as tar:
-        for path, content in files.items():
-            info = tarfile.TarInfo(path)
-            if content is None:
-                info.type, info.linkname = tarfile.SYMTYPE, "/etc/hostname"
-            else:
-                info.size = len(content)
-            tar.addfile(info, io.BytesIO(content or b""))
-    return data.getvalue()
-
-
-def deb_of(data: bytes, kind: str = "xz") -> bytes:
-    """A Debian package around a tar archive of this compression."""
-    out = b"!<arch>\n"
-    members = {"debian-binary": b"2.0\n", "control.tar.xz": b"odd", f"data.tar.{kind}": data}
-    for name, content in members.items():
-        out += f"{name:<16}{0:<12}{0:<6}{0:<6}{'100644':<8}{len(content):<10}`\n".encode()
-        out += content + b"\n" * (len(content) % 2)
-    return out
-
-
-def deb(folder: Path, name: str, files: dict[str, bytes | None], version: str = "1%3a2.0-1") -> Path:
-    """A package of these files in the folder."""
-    folder.mkdir(exist_ok=True)
-    file = folder / f"{name}_{version}_all.deb"
-    file.write_bytes(deb_of(tar_of(files)))
+def deb(folder: Path, name: str, files: dict[str, bytes]) -> Path:
+    """A Debian package of these files in the folder."""
+    with tempfile.TemporaryDirectory() as root:
+        about = {"Package": name, "Version": "1:2.0-1", "Architecture": "all", "Maintainer": "x", "Description": "x"}
+        control = "".join(f"{key}: {value}\n" for key, value in about.items())
+        for path, content in {"DEBIAN/control": control.encode(), **files}.items():
+            (Path(root) / path).parent.mkdir(parents=True, exist_ok=True)
+            (Path(root) / path).write_bytes(content)
+        folder.mkdir(exist_ok=True)
+        file = folder / f"{name}_1%3a2.0-1_all.deb"
+        subprocess.run(["dpkg-deb", "--build", "-Znone", root, file], check=True, capture_output=True)
     return file
 
 
@@ -105,6 +88,6 @@ def entry(name: str, stem: str, **more: str) -> dict:
     return {"name": name, "category": "Living room", "model": f"/m/{stem}.obj", "creator": "A. Maker", **more}
 
 
-def fetch(folder: Path, debs: Path | None, **more: object) -> Report:
+def fetch(folder: Path, debs: Path | None) -> Report:
     """The recipe on a folder of packages."""
-    return fetch_debian_models(FetchConfig(output=folder, packages_dir=debs, **more), progress=False)
+    return fetch_debian_models(FetchConfig(output=folder, packages_dir=debs), progress=False)

@@ -21,10 +21,6 @@ def crash(path: Path) -> None:
     ctypes.string_at(0)
 
 
-def leave(path: Path) -> None:
-    os._exit(3)
-
-
 def spin(path: Path) -> None:
     while True:
         pass
@@ -49,12 +45,6 @@ def fail(path: Path) -> None:
     raise KeyError("a strange word")
 
 
-def chatter(path: Path) -> str:
-    print("libraries print things")
-    os.write(1, b"also from C")
-    return "done"
-
-
 def shared(path: Path, count: int) -> np.ndarray:
     array = sandbox.empty((count,), np.float64)
     array[:] = 1
@@ -69,9 +59,3 @@ def arrays(path: Path) -> dict[str, object]:
 
 def modules(path: Path) -> list[str]:
     return sorted(sys.modules)
-
-
-def slip(path: Path) -> object:
-    if not path:
-        never = 1
-    return never

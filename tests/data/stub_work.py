@@ -10,38 +10,36 @@ from typing import Any
 
 from learn3d.config import config_to_dict
 from learn3d.distributed.tasks import Task
-from learn3d.experiments.measurement import GroupMeans, Result
+from learn3d.experiments.measurement import ObjectMeans, Result
 from learn3d.experiments.plan import PlannedRun
 from learn3d.files.writing import write_json
 from learn3d.runs.folder import CONFIG
 from learn3d.terminal import stop_on_signal
 
-OBJECTS = GroupMeans(names=list("abcde"), images=[24] * 5, defined=[24] * 5, kato18=[0.5] * 5, kato19=[0.4] * 5)
-
 
 def result(**changes: Any) -> Result:
     """The measurement of a run."""
-    versions: dict[str, Any] = {"trained_by": {"commit": "0123456789ab"}, "tested_by": {"commit": "ba9876543210"}}
     numbers = {"precision": 0.5, "recall": 0.5, "chamfer_l1": 0.1, "f_score": 0.6, "mmd": 0.7, "mmd_paper": 0.5}
-    numbers |= {"voxel_iou_kato18": 0.5, "voxel_iou_kato19": 0.4, "silhouette_iou": None, "seconds": 60.0}
-    counts = {"images": 120, "iterations": 6, "step": 6, "seed": 0, "undefined": 0, "hollow": 0, "without_distance": 0}
-    texts = {"checkpoint": "run/last.safetensors", "method": "Proposed", "preset": "peng2020-kato", "split": "test"}
+    numbers |= {"voxel_iou": 0.5, "voxel_iou_kato19": 0.4, "silhouette_iou": None, "hollow": 0.0, "seconds": 60.0}
+    counts = {"images": 120, "iterations": 6, "step": 6, "seed": 0}
+    texts = {"checkpoint": "run/last.safetensors", "method": "Proposed", "preset": "peng2020-kato"}
     texts |= {"category": "airplane", "data": "/data", "command": "learn3d train ..."}
-    tables = {"config": {}, "fingerprint": {}, "objects": OBJECTS, "views": OBJECTS}
-    return Result(**(versions | numbers | counts | texts | tables | changes))
+    objects = [ObjectMeans(name, 24, 0.5, 0.4) for name in "abcde"]
+    lists = {"versions": {"commit": "0123456789ab"}, "objects": objects}
+    return Result(**(numbers | counts | texts | lists | changes))
 
 
-def work(run: PlannedRun, fresh: bool) -> bool:
+def work(run: PlannedRun) -> bool:
     """A category called "fails" fails, "waits" goes on until it is asked to stop; others leave a result whose IoUs
     depend on the variant, the seed and the object."""
     config = run.config
-    print("threads", config.threads, "fresh", fresh, flush=True)
-    if run.category == "fails":
+    print("threads", config.threads, flush=True)
+    if config.category == "fails":
         print("first line")
         raise ValueError("no such data")
-    if run.category == "dies":
+    if config.category == "dies":
         sys.exit(9)
-    if run.category == "waits":
+    if config.category == "waits":
         with stop_on_signal() as stop:
             print("waiting", flush=True)
             deadline = time.monotonic() + 60
@@ -49,28 +47,25 @@ def work(run: PlannedRun, fresh: bool) -> bool:
                 time.sleep(0.02)
             print("saved", flush=True)
         return False
-    base = {"vanilla": 0.3, "proposed": 0.4}[run.variant] + 0.01 * run.seed
+    base = {"vanilla": 0.3, "proposed": 0.4}[run.variant] + 0.01 * config.seed
     means = [round(base + 0.02 * k, 5) for k in range(5)]
-    iou, objects = sum(means) / 5, OBJECTS.model_copy(update={"kato18": means, "kato19": means})
+    iou = sum(means) / 5
     measured = result(
-        checkpoint=f"{run.folder}/{run.checkpoint}.safetensors",
-        config=config_to_dict(config),
         data=str(config.data.resolve()),
         iterations=config.iterations,
         step=config.iterations,
-        seed=run.seed,
-        voxel_iou_kato18=iou,
+        seed=config.seed,
+        voxel_iou=iou,
         voxel_iou_kato19=iou - 0.05,
         mmd=1 - base,
-        objects=objects,
-        views=objects,
+        objects=[ObjectMeans(name, 24, mean, mean) for name, mean in zip("abcde", means, strict=True)],
     )
     write_json(run.folder / "test.json", measured.model_dump())
     write_json(run.folder / CONFIG, config_to_dict(config))
     return True
 
 
-def fail_if_started(run: PlannedRun, fresh: bool) -> bool:
+def fail_if_started(run: PlannedRun) -> bool:
     """Replaces `work` if nothing may be trained."""
     raise ValueError("started")
 

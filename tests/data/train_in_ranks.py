@@ -60,14 +60,14 @@ def inject(fault: str, stack: contextlib.ExitStack) -> None:
 def evaluate_last(folder: Path, group: ProcessGroup = SINGLE_PROCESS) -> Evaluation:
     method, config, _ = checkpoint.load_method(folder / "last.safetensors")
     method.distribute(group)
-    return evaluate(method, load_splits(config)[1], batch_size=5, paper_mmd=True)
+    return evaluate(method, load_splits(config)[1], batch_size=5)
 
 
 def run(task: dict, group: ProcessGroup) -> None:
     if "evaluate" in task:
         result = evaluate_last(Path(task["evaluate"]), group)
         if group.is_main:
-            summary = result.summary() | {"ious": result.ious["kato18"].tolist()}
+            summary = result.means | {"ious": result.values["voxel_iou"].tolist()}
             Path(task["evaluate"], "evaluation.json").write_text(json.dumps(summary))
         return
     config = config_from_dict(task["config"])

@@ -34,9 +34,10 @@ def run(workload: Workload) -> None:
 def peak_growth(batch: int, size: int, anti_aliasing: bool, outputs: tuple[str, ...], threads: int) -> tuple[int, int]:
     """Bytes that the peak grows: for a first small batch (scratch of each thread and more), and over the large one."""
     torch.set_num_threads(threads)
-    large = deformed_spheres(batch, 3, size, anti_aliasing, outputs)
-    some = slice(0, threads)
-    small = replace(large, vertices=large.vertices[some], camera=replace(large.camera, eye=large.camera.eye[some]))
+    large = deformed_spheres(batch, 3, size, anti_aliasing=anti_aliasing, outputs=outputs)
+    large = replace(large, values=large.vertices if "rgb" in outputs else None)
+    small = large.part(slice(0, threads))
+    small = replace(small, values=small.vertices if "rgb" in outputs else None)
     run(replace(small, size=8))  # loads everything
     growth = []
     for workload in (small, large):
@@ -50,18 +51,16 @@ def peak_growth(batch: int, size: int, anti_aliasing: bool, outputs: tuple[str, 
     return growth[0], growth[1]
 
 
-def bench_memory(threads: tuple[int, ...]) -> None:
+def bench_memory() -> None:
     """Print bytes per image and per raster pixel of forward + backward beside those of the published renderer."""
-    if not STATUS.exists():
-        raise SystemExit("memory is measured by /proc/self/status, which only Linux has")
     print("Growth of the peak resident size, forward + backward from world-space vertices, each in a fresh process")
-    print("outputs".ljust(18) + "workload".ljust(24) + "B".rjust(5) + "threads".rjust(9), end="")
-    print("".join(name.rjust(17) for name in ("bytes / image", "/ raster pixel", "published", "first call MB")))
+    print("| outputs | workload | threads | bytes / image | bytes / raster pixel | published | first call, MB |")
+    print("|---|---|---|---|---|---|---|")
     for outputs, published in PUBLISHED.items():
         for title, (batch, size, anti_aliasing) in WORKLOADS.items():
-            for count in threads:
+            for threads in (1, 2):
                 with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-                    first, more = pool.submit(peak_growth, batch, size, anti_aliasing, outputs, count).result()
+                    first, more = pool.submit(peak_growth, batch, size, anti_aliasing, outputs, threads).result()
                 image, pixels = more / batch, (size * (1 + anti_aliasing)) ** 2
-                print(f"{'+'.join(outputs):<18}{title:<24}{batch:>5}{count:>9}{image:>17,.0f}", end="")
-                print(f"{image / pixels:>17.1f}{published:>17}{first / 1e6:>17.1f}", flush=True)
+                cells = ["+".join(outputs), f"{batch} x {title}", threads, f"{image:,.0f}", f"{image / pixels:.1f}"]
+                print(f"| {' | '.join(map(str, [*cells, published, f'{first / 1e6:.1f}']))} |", flush=True)

@@ -1,10 +1,12 @@
-"""Other programs for the same work: deodr."""
+"""deodr for the same work: a 2.5-D renderer with derivatives, one mesh at a time on one thread."""
 
 from __future__ import annotations
 
 import importlib.util
-import multiprocessing
 import time
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from multiprocessing import get_context
 
 import numpy as np
 import torch
@@ -15,19 +17,16 @@ import nmr
 
 FAR = 100.0  # nmr.render_depth's default
 
-# --- deodr: a 2.5-D renderer with derivatives, one mesh at a time on one thread
-
 
 def has_deodr() -> bool:
     return importlib.util.find_spec("deodr") is not None
 
 
 def deodr_mesh(faces: Tensor):
+    """deodr's mesh, clockwise on the screen: the world is left-handed."""
     from deodr.triangulated_mesh import TriMeshAdjacencies
 
-    return TriMeshAdjacencies(
-        faces.numpy().astype(np.uint32), clockwise=True
-    )  # on the screen: the world is left-handed
+    return TriMeshAdjacencies(faces.numpy().astype(np.uint32), clockwise=True)
 
 
 class DeodrImages(torch.autograd.Function):
@@ -39,7 +38,6 @@ class DeodrImages(torch.autograd.Function):
 
         points, ctx.size, ctx.output, ctx.scenes, images = vertices.detach().double().numpy(), size, output, [], []
         num_vertices, num_faces = points.shape[1], mesh.faces.shape[0]
-        zeros, no_faces = np.zeros((num_vertices, 2)), np.zeros(num_faces, dtype=bool)
         for xyz in points:
             ij = np.stack([(xyz[:, 0] + 1) * size / 2 - 0.5, (1 - xyz[:, 1]) * size / 2 - 0.5], axis=1)
             scene = Scene2D(
@@ -47,11 +45,11 @@ class DeodrImages(torch.autograd.Function):
                 faces_uv=mesh.faces,
                 ij=ij,
                 depths=xyz[:, 2].copy(),
-                textured=no_faces,
-                uv=zeros,
+                textured=np.zeros(num_faces, dtype=bool),
+                uv=np.zeros((num_vertices, 2)),
                 shade=np.zeros(num_vertices),
                 colors=np.ones((num_vertices, 1)) if output == "alpha" else xyz[:, 2:].copy(),
-                shaded=no_faces,
+                shaded=np.zeros(num_faces, dtype=bool),
                 edgeflags=mesh.edge_on_silhouette(ij),
                 height=size,
                 width=size,
@@ -71,55 +69,21 @@ class DeodrImages(torch.autograd.Function):
         for b, scene in enumerate(ctx.scenes):
             scene.clear_gradients()
             scene.render_backward(grad[b].double().numpy()[..., None].copy())
-            result[b, :, 0] = scene.ij_b[:, 0] * ctx.size / 2
-            result[b, :, 1] = -scene.ij_b[:, 1] * ctx.size / 2
+            result[b, :, :2] = scene.ij_b * (ctx.size / 2, -ctx.size / 2)
             if ctx.output == "depth":
                 result[b, :, 2] = scene.colors_b[:, 0]
         return torch.from_numpy(result).to(grad), None, None, None
 
 
-def run_deodr(workload: Workload, targets: tuple[Tensor, ...], mesh) -> Timing:
+def run_deodr(workload: Workload, targets: tuple[Tensor, ...]) -> Timing:
     """At the size of the image, which is less than we draw: ours has the inner resolution of its anti-aliasing."""
-    (output,) = workload.outputs
+    (output,), mesh = workload.outputs, deodr_mesh(workload.faces)
     leaf = workload.vertices.clone().requires_grad_()
     start = time.perf_counter()
     image = DeodrImages.apply(workload.camera.transform(leaf), workload.size, mesh, output)
     forward = time.perf_counter()
     workload.loss((image,), targets).backward()
     return forward - start, time.perf_counter() - start
-
-
-def deodr_process(connection, workload: Workload, targets: tuple[Tensor, ...]) -> None:
-    """Serves a part of the batch: renders whenever it gets True, ends when it gets False."""
-    torch.set_num_threads(1)
-    mesh = deodr_mesh(workload.faces)
-    while connection.recv():
-        connection.send(run_deodr(workload, targets, mesh))
-
-
-class DeodrProcesses:
-    """deodr with the batch shared among processes; the slowest one counts."""
-
-    def __init__(self, workload: Workload, targets: tuple[Tensor, ...], count: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connections, self.processes = [], []
-        for which in range(count):
-            ours, theirs = context.Pipe()
-            arguments = (theirs, workload.part(which, count), tuple(t[which::count] for t in targets))
-            self.processes.append(context.Process(target=deodr_process, args=arguments, daemon=True))
-            self.processes[-1].start()
-            self.connections.append(ours)
-
-    def __call__(self) -> Timing:
-        for connection in self.connections:
-            connection.send(True)
-        results = [connection.recv() for connection in self.connections]
-        return max(r[0] for r in results), max(r[1] for r in results)
-
-    def close(self) -> None:
-        for connection, process in zip(self.connections, self.processes, strict=True):
-            connection.send(False)
-            process.join()
 
 
 def check_same_image(workload: Workload, mesh) -> str:
@@ -143,13 +107,19 @@ def check_same_image(workload: Workload, mesh) -> str:
 
 
 def deodr_programs(
-    workload: Workload, targets: tuple[Tensor, ...], num_processes: int
-) -> tuple[dict[str, Program], DeodrProcesses | None]:
-    """deodr in one process, and in several."""
-    mesh = deodr_mesh(workload.faces)
-    print(f"images of nmr and deodr agree {check_same_image(workload, mesh)}")
-    programs: dict[str, Program] = {"deodr, 1 process": lambda: run_deodr(workload, targets, mesh)}
-    if not 1 < num_processes <= len(workload.vertices):
-        return programs, None
-    processes = DeodrProcesses(workload, targets, num_processes)
-    return programs | {f"deodr, {num_processes} processes": processes}, processes
+    workload: Workload, targets: tuple[Tensor, ...], processes: int, stack: ExitStack
+) -> dict[str, Program]:
+    """deodr in one process, and in several that share the batch, if it is large enough; they end with `stack`."""
+    print(f"images of nmr and deodr agree {check_same_image(workload, deodr_mesh(workload.faces))}")
+    programs: dict[str, Program] = {"deodr, 1 process": lambda: run_deodr(workload, targets)}
+    if not 1 < processes <= len(workload.vertices):
+        return programs
+    pool = stack.enter_context(ProcessPoolExecutor(processes, get_context("spawn"), torch.set_num_threads, (1,)))
+    parts = [slice(which, None, processes) for which in range(processes)]
+    tasks = [(workload.part(some), tuple(target[some] for target in targets)) for some in parts]
+
+    def run_parts() -> Timing:
+        times = list(pool.map(run_deodr, *zip(*tasks, strict=True)))
+        return max(forward for forward, _ in times), max(total for _, total in times)  # the slowest counts
+
+    return programs | {f"deodr, {processes} processes": run_parts}

@@ -1,4 +1,4 @@
-"""A whole training step, what of it is not the networks', and what validation costs beside it."""
+"""A whole training step, and the part of it that is not the networks'."""
 
 from __future__ import annotations
 
@@ -17,27 +17,20 @@ from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import Poses
 from learn3d.data.readers import kato
 from learn3d.data.sampling import sample_indices
-from learn3d.device import keep_freed_memory, resolve_precision
-from learn3d.evaluation import evaluate
+from learn3d.device import resolve_precision
 from learn3d.methods import DatasetInfo, Method, create_method
 
-VALIDATED_IMAGES = 700 * 24  # a tenth of ShapeNet's larger categories in Kato's layout
 
-
-def sphere_dataset(num_objects: int = 48) -> ViewDataset:
-    """Silhouettes of deformed spheres as images, in Kato's views."""
-    spheres = deformed_spheres(num_objects, 3, 64, True)
+def proposed(batch: int | None, num_objects: int = 48) -> tuple[TrainConfig, ViewDataset]:
+    """The paper's method, and silhouettes of deformed spheres as images in Kato's views to train it on."""
+    spheres = deformed_spheres(num_objects, 3, 64)
     vertices = spheres.vertices.repeat_interleave(conventions.NUM_VIEWS, 0)
-    cameras = conventions.view_cameras(torch.arange(conventions.NUM_VIEWS).repeat(num_objects))
+    cameras = conventions.view_poses(torch.arange(conventions.NUM_VIEWS).repeat(num_objects)).cameras()
     masks = (255 * nmr.render_silhouette(vertices, spheres.faces, cameras, image_size=64)).round().to(torch.uint8)
     images = masks.view(num_objects, conventions.NUM_VIEWS, 1, 64, 64).expand(-1, -1, 4, -1, -1).contiguous().numpy()
     voxels = nmr.voxelize(spheres.vertices + 0.5, spheres.faces).numpy()
-    return kato.from_arrays(images, voxels, "spheres", "train")
-
-
-def proposed(batch: int | None) -> tuple[TrainConfig, ViewDataset]:
-    """The paper's method, and spheres to train it on."""
-    return TrainConfig(data="-", category="spheres", output="-", batch_size=batch), sphere_dataset()
+    config = TrainConfig(data="-", category="spheres", output="-", batch_size=batch)
+    return config, kato.from_arrays(images, voxels, "spheres", "train")
 
 
 def build(config: TrainConfig, dataset: ViewDataset, precision: str) -> Method:
@@ -59,8 +52,7 @@ def stop_rendering(method: Method) -> None:
     """Let a method train on grey images of which every vertex has a gradient: its networks have the same to do."""
 
     def render(vertices: Tensor, poses: Poses) -> Tensor:
-        grey = vertices.mean((1, 2)).sigmoid()
-        return grey[:, None, None].expand(-1, MASK_SIZE, MASK_SIZE)
+        return vertices.mean((1, 2)).sigmoid()[:, None, None].expand(-1, MASK_SIZE, MASK_SIZE)
 
     method.render, method.surface_losses = render, lambda vertices: {}
 
@@ -68,46 +60,22 @@ def stop_rendering(method: Method) -> None:
 def bench_step(batch: int | None, threads: int, repeats: int) -> Result:
     """Steps in bf16 and in fp32, in turns with those of networks whose shapes are not rendered.
 
-    The first row is the precision that training would choose here. What is not a network is a small difference of two
-    large times, so it is taken pair by pair: the median of the differences. Distrust it where two calls disagree.
+    The first row is the precision that training would choose here. The rest of a step is a small difference of two
+    large times, so it is taken pair by pair: the median of the differences. Distrust it if two calls disagree.
     """
-    keep_freed_memory()
     config, dataset = proposed(batch)
     best = resolve_precision("auto", "cpu")
-    precisions = (best, "fp32" if best == "bf16" else "bf16")
-    methods, bare = ({name: build(config, dataset, name) for name in precisions} for _ in range(2))
-    for method in bare.values():
-        stop_rendering(method)
-    whole, networks = ({name: [] for name in precisions} for _ in range(2))
-    for step in range(1, repeats + 3):  # the first two do not count
-        for name in precisions:
-            whole[name].append(run_step(config, dataset, methods[name], step)[0])
-            networks[name].append(run_step(config, dataset, bare[name], step)[1])
     rows = []
-    for name in precisions:
-        pairs = list(zip(whole[name], networks[name], strict=True))[2:]
+    for precision in (best, "fp32" if best == "bf16" else "bf16"):
+        method, bare = (build(config, dataset, precision) for _ in range(2))
+        stop_rendering(bare)
+        pairs = [
+            (run_step(config, dataset, method, step)[0], run_step(config, dataset, bare, step)[1])
+            for step in range(1, repeats + 3)
+        ][2:]
         step, rest = 1e3 * median(a for a, _ in pairs), 1e3 * median(a - b for a, b in pairs)
-        title = f"nmr, {rest:.1f} ms of a step of {step:.1f} ms, {name}"
-        rows.append(Row(title, None, 100 * rest / (step - rest), 100 * rest / (step - rest)))
+        share = 100 * rest / (step - rest)
+        rows.append(Row(f"nmr, {rest:.1f} ms of a step of {step:.1f} ms, {precision}", None, share, share))
     about = settings(threads, repeats, batch=config.batch_size)
-    title = f"Training step of {config.preset}, B = {config.batch_size}: what is not a network"
+    title = f"Training step of {config.preset}, B = {config.batch_size}: the part that is not a network"
     return Result("step", title, rows, about, unit="% of the networks")
-
-
-def bench_evaluation(batch: int | None, threads: int, repeats: int) -> Result:
-    """What validating costs, in percent of a run that trains between two validations."""
-    keep_freed_memory()
-    config, dataset = proposed(batch)
-    method, steps, validations = build(config, dataset, resolve_precision("auto", "cpu")), [], []
-    for step in range(1, repeats + 3):
-        steps.append(run_step(config, dataset, method, step)[0])
-    for _ in range(max(2, repeats // 5) + 1):  # the first one is not counted
-        start = time.perf_counter()
-        evaluate(method, dataset)
-        validations.append(time.perf_counter() - start)
-    training = config.validate_every * median(steps[2:])
-    validation = VALIDATED_IMAGES * median(validations[1:]) / len(dataset)
-    share = 100 * validation / (training + validation)
-    name = f"nmr, {validation:.1f} s for {VALIDATED_IMAGES} images every {config.validate_every} steps"
-    about = settings(threads, repeats, batch=config.batch_size)
-    return Result("evaluation", "Validation during training", [Row(name, None, share, share)], about, "% of the run")
