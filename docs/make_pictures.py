@@ -71,9 +71,9 @@ PICTURES = {
         f"results-{kind}.png": Picture(
             f"learn3d figures {kind} --runs {_RUNS} --output {{folder}}/{kind}.png",
             f"{{folder}}/{kind}.png",
-            (f"learn3d/figures/{file}.py",),
+            ("learn3d/figures/plots.py",),
         )
-        for kind, file in {"curves": "curves", "polar": "polar", "tsne": "codes"}.items()
+        for kind in ("curves", "polar", "tsne")
     },
 }
 

@@ -10,7 +10,7 @@ import torch
 import tyro
 
 import nmr
-from learn3d.make_data.meshes import fit_to_box, procedural_sources
+from learn3d.make_data.shapes import make_shape
 from learn3d.pictures.sheets import save_gif, tile
 from learn3d.pictures.surfaces import Surface, draw_surface
 
@@ -49,9 +49,9 @@ def main(output: Path, frames: int = 40, size: int = 120, steps: int = 300) -> d
     turn = [30.0 - 360.0 * frame / frames for frame in range(frames)]
     columns, ious = [], {}
     for category in CATEGORIES:
-        mesh = procedural_sources(category, 1, seed=3)[0].read()
-        vertices = torch.as_tensor(fit_to_box(mesh.vertices) * (1, 1, -1), dtype=torch.float32)  # left-handed
-        faces = torch.as_tensor(mesh.faces)
+        mesh = make_shape(category, np.random.default_rng([3, 0, 0]))
+        vertices = torch.as_tensor(np.asarray(mesh.vertices) * (1, 1, -1), dtype=torch.float32)  # left-handed
+        faces = torch.as_tensor(np.asarray(mesh.faces))
         masks = nmr.render_silhouette(vertices, faces, views, image_size=96)
         shapes = fit(masks, views, steps)
         sphere_faces = nmr.icosphere(4)[1]
@@ -63,7 +63,7 @@ def main(output: Path, frames: int = 40, size: int = 120, steps: int = 300) -> d
             camera = nmr.LookAt.from_angles(2.732, 25.0, [azimuth], half_fov_deg=13.0)
             shape = shapes[min(steps, round(steps * (2 * frame / frames) ** 2))]  # slowly at first
             for row, surface in zip(rows, (Surface(vertices, faces), Surface(shape, sphere_faces)), strict=True):
-                row.append(draw_surface(surface, camera, image_size=size)[0])
+                row.append(draw_surface(surface, [camera], image_size=size)[0])
         columns.append(rows)
     sheets = [
         tile([[column[row][frame] for column in columns] for row in (0, 1)], CATEGORIES, tile_size=size)
