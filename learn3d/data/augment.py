@@ -62,7 +62,8 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *
             if name == "flip":
                 images = torch.where(chosen, images.flip(3), images)
                 masks = torch.where(chosen[:, 0], batch.masks.flip(2), batch.masks)
-                batch = dataclasses.replace(batch, masks=masks)
+                depth = None if batch.depth is None else torch.where(chosen[:, 0], batch.depth.flip(2), batch.depth)
+                batch = dataclasses.replace(batch, masks=masks, depth=depth)
                 if batch.poses is not None:
                     batch = batch.with_poses(batch.step_views.poses.mirrored(mirrored))
         batch = dataclasses.replace(batch, images=torch.cat([colors, images[:, 3:]], dim=1))

@@ -37,6 +37,7 @@ class Batch:
     class_ids: torch.Tensor  # int64 [B]: which category each object belongs to (0 if there is one only)
     voxels: torch.Tensor | None  # bool [B, 32, 32, 32] ground truth in the data set's axes; None if there is none
     crops: Crops | None = None  # the original images, which the augmentation "crop" cuts colours from; None: unknown
+    depth: torch.Tensor | None = None  # float32 [B, 64, 64]: distance along the axis, 0: no surface; None: unknown
     part_of: StepViews | None = None  # all views of the step, if other processes have the rest
 
     def __len__(self) -> int:

@@ -58,6 +58,7 @@ class ViewDataset:
     voxels: Array | None  # bool [N, 32, 32, 32] in the data set's own axes; None if there is no ground truth
     convention: VoxelConvention  # how predictions are brought into those axes
     masks: Array | None = None  # uint8 [M, 64, 64] silhouettes to be matched; None: the images' fourth channel
+    depth: Array | None = None  # uint8 [M, 64, 64], see `depth_levels`; None if unknown
     class_ids: np.ndarray | None = None  # int64 [N]: category of each object, None for a single category
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
     points: Array | None = None  # float32 [N, P, 3]: points on the true surfaces in the object frame, if known
@@ -72,9 +73,11 @@ class ViewDataset:
         masks = self.images.shape[:1] + self.images.shape[2:] if self.masks is None else self.masks.shape
         if masks[1:] != (MASK_SIZE, MASK_SIZE):
             raise ValueError(f"masks must be [M, {MASK_SIZE}, {MASK_SIZE}], got {list(masks)}")
+        if self.depth is not None and self.depth.shape[1:] != (MASK_SIZE, MASK_SIZE):
+            raise ValueError(f"depth must be [M, {MASK_SIZE}, {MASK_SIZE}], got {list(self.depth.shape)}")
         if self.voxels is not None and self.voxels.shape[1:] != (VOXEL_SIZE,) * 3:
             raise ValueError(f"voxels must be [N, {VOXEL_SIZE}, {VOXEL_SIZE}, {VOXEL_SIZE}]")
-        wanted = dict.fromkeys(("poses", "view_ids", "object_ids", "masks", "crops", "sides"), m)
+        wanted = dict.fromkeys(("poses", "view_ids", "object_ids", "masks", "depth", "crops", "sides"), m)
         wanted |= dict.fromkeys(("voxels", "points", "class_ids"), n)
         sizes = {name: len(getattr(self, name)) for name in wanted if getattr(self, name) is not None}
         if wrong := {name: size for name, size in sizes.items() if size != wanted[name]}:
@@ -142,6 +145,7 @@ class ViewDataset:
             class_ids=classes,
             voxels=torch.from_numpy(self.voxels[objects]) if voxels and self.voxels is not None else None,
             crops=None if self.crops is None else self.crops[samples],
+            depth=None if self.depth is None else depth_of_levels(torch.from_numpy(self.depth[samples]), poses),
         )
 
     def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
@@ -150,7 +154,7 @@ class ViewDataset:
 
     def prepare(self, indices: Tensor, rows: Tensor | None = None) -> None:
         """Begin to read what `batch` will be asked for next, if it is on disk."""
-        for array in (self.images, self.masks):
+        for array in (self.images, self.masks, self.depth):
             if isinstance(array, DiskArray):
                 array.prepare((indices if rows is None else indices[rows]).numpy())
 
@@ -158,7 +162,7 @@ class ViewDataset:
         """CRC-32 of images, masks, poses and classes, and of the voxels if wanted; of arrays on disk, of checksums."""
         fields = () if self.poses is None else dataclasses.fields(self.poses)
         poses = [np.asarray(getattr(self.poses, field.name)) for field in fields]
-        parts = [self.images, self.masks, *poses, self.view_ids, self.object_ids, self.class_ids]
+        parts = [self.images, self.masks, self.depth, *poses, self.view_ids, self.object_ids, self.class_ids]
         crc = 0
         for part in parts + [self.voxels] * voxels:
             if part is not None:
@@ -213,11 +217,27 @@ class ViewDataset:
 
     def select(self, samples: np.ndarray) -> ViewDataset:
         """Only the samples `samples`, int64; all objects stay. Arrays on disk stay there."""
-        names = ("images", "masks", "view_ids", "object_ids", "sides", "crops", "poses")
+        names = ("images", "masks", "depth", "view_ids", "object_ids", "sides", "crops", "poses")
         parts = {name: part for name in names if (part := getattr(self, name)) is not None}
         return dataclasses.replace(
             self, **{n: p.select(samples) if isinstance(p, DiskArray) else p[samples] for n, p in parts.items()}
         )
+
+
+DEPTH_REACH = 0.9  # a box of side 1 lies within 0.87 of its centre, at which the cameras look
+
+
+def depth_levels(depth: Tensor, poses: LookAtPoses) -> Tensor:
+    """Depth maps float [M, S, S] as bytes: 1 .. 255 over `DEPTH_REACH` before and behind the centre, 0: no surface."""
+    nearer = (depth - poses.distance[:, None, None]) / DEPTH_REACH
+    level = (1 + 127 * (nearer + 1)).round().clamp(1, 255)
+    return torch.where(nearer.abs() <= 1, level, 0).to(torch.uint8)
+
+
+def depth_of_levels(levels: Tensor, poses: LookAtPoses) -> Tensor:
+    """The inverse: float32 [M, S, S] in units of the object frame, 0 where there is no surface."""
+    depth = ((levels.float() - 1) / 127 - 1) * DEPTH_REACH + poses.distance[:, None, None]
+    return torch.where(levels > 0, depth, 0.0)
 
 
 def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
@@ -251,7 +271,10 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
     starts = np.cumsum([0] + [d.num_objects for d in datasets])[:-1].tolist()
     return dataclasses.replace(
         first,
-        **{name: joined(name) for name in ("images", "masks", "view_ids", "voxels", "points", "sides", "crops")},
+        **{
+            name: joined(name)
+            for name in ("images", "masks", "depth", "view_ids", "voxels", "points", "sides", "crops")
+        },
         poses=join_poses([d.poses for d in datasets]),
         object_ids=np.concatenate([d.object_ids + start for d, start in zip(datasets, starts, strict=True)]),
         object_names=tuple(name for d in datasets for name in d.object_names),

@@ -77,7 +77,7 @@ def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
     mask_image = image if mask_path is None else _open(mask_path)
     mask = _transparency(mask_image)
     if mask is None and mask_path is None:
-        wanted = "give a mask image, white where the object is (reconstruct: --masks, or --plain-background)"
+        wanted = "cut it out, or give a mask (reconstruct: --box, --masks, --plain-background)"
         raise DamagedFile(path, f"has no transparency and no mask: {wanted}")
     mask = np.asarray(mask_image.convert("L")) if mask is None else mask
     if mask_image.size != image.size:

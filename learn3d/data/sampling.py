@@ -14,7 +14,8 @@ from learn3d.data.augment import Augmentation, augment
 from learn3d.data.batch import Batch
 from learn3d.data.dataset import ViewDataset
 
-Sampling = Literal["views", "pairs", "classes"]
+Sampling = Literal["views", "pairs", "groups", "classes"]
+GROUP_SIZE = 5  # views of an object in sampling "groups"
 
 
 class BatchOptions(Protocol):
@@ -46,18 +47,23 @@ def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, se
     """Samples of step `step` (from 1), int64 [batch_size].
 
     "views": every view on its own, epochs of shuffled samples. "pairs": two different views of each of batch_size / 2
-    objects drawn at random, [a_1 .. a_n, b_1 .. b_n] (Kato et al. 2018). "classes": categories drawn uniformly, then a
+    objects drawn at random, [a_1 .. a_n, b_1 .. b_n] (Kato et al. 2018). "groups": likewise GROUP_SIZE views of each,
+    different ones if the object has so many. "classes": categories drawn uniformly, then a
     view of each (Kato and Harada 2019).
     """
     if sampling == "views":
         return shuffled_epochs(len(dataset), batch_size, seed, step)
     rng = np.random.default_rng([seed, step])
-    if sampling == "pairs":
+    if sampling in ("pairs", "groups"):
         starts, order = _views_by_object(dataset)
         sizes = np.diff(starts)
         able = np.flatnonzero(sizes >= 2)
         if len(able) == 0:
             raise ValueError("no object has two views; a multi-view method needs at least two views of an object")
+        if sampling == "groups":
+            objects = able[rng.integers(len(able), size=batch_size // GROUP_SIZE)]
+            views = [rng.permutation(max(size, GROUP_SIZE))[:GROUP_SIZE] % size for size in sizes[objects]]
+            return torch.from_numpy(order[starts[objects, None] + np.array(views)].T.reshape(-1))
         objects = able[rng.integers(len(able), size=batch_size // 2)]
         first = rng.integers(sizes[objects])
         second = (first + rng.integers(1, sizes[objects])) % sizes[objects]

@@ -7,7 +7,8 @@
 
 A shard of n objects and m views has the tensors
 
-    images                          uint8 [m, 4, S, S], as `ViewDataset.images`; likewise `masks`, if there are any
+    images                          uint8 [m, 4, S, S], as `ViewDataset.images`; likewise `masks`, `depth`, if there
+                                    are any
     voxels                          bool [n, 32, 32, 32]; likewise `points` float32 [n, P, 3]; each if there are any
     images.checksums ...            uint32: CRC-32 of each row of these arrays
     object_ids, view_ids, sides     int32 [m] in 0 .. n-1, int32 [m], float32 [m]: tables of the views
@@ -48,9 +49,15 @@ SET_FILE = "set.json"
 SHARD_BYTES = 2**28  # of images in a shard, about
 _FILES = 5 * "[0-9]" + "*.safetensors"
 _REPORTS = 5 * "[0-9]" + "*.report.json"  # lists of meshes, which `make_data.sharded` writes
-_ARRAYS = ("images", "masks", "voxels", "points")  # the first two have a row for each view, the others for each object
+_ARRAYS = (
+    "images",
+    "masks",
+    "depth",
+    "voxels",
+    "points",
+)  # the first three have a row for each view, the others for each object
 _DTYPES = {  # of tensors, by name; all others are float32
-    **dict.fromkeys(("images", "masks"), ("U8", np.uint8)),
+    **dict.fromkeys(("images", "masks", "depth"), ("U8", np.uint8)),
     **dict.fromkeys(("object_ids", "view_ids"), ("I32", np.int32)),
     "voxels": ("BOOL", np.bool_),
     "checksums": ("U32", np.uint32),

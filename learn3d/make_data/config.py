@@ -29,8 +29,8 @@ class DatasetConfig:
     layout: Layout = "kato"
     """Published data set whose files and viewpoints are made, see docs/data-sets.md."""
     views: Count | None = None
-    """Views of each object (default: 20 for kar, 24 for r2n2, 8 for pascal3d, 12 for photos; kato and dvr always have
-    24)."""
+    """Views of each object (default: 20 for kar, 24 for r2n2, 8 for pascal3d, 12 for photos and around; kato and dvr
+    always have 24)."""
     source: FilePath | None = None
     """Folder of meshes, searched with all folders in it, or a mesh pack .npz (default: --procedural is given)."""
     procedural: Amount = 0
@@ -53,7 +53,7 @@ class DatasetConfig:
     """Replace files of this category that are already in the folder."""
     shards: bool = False
     """Write shards, which training reads piece by piece: for data sets that do not fit into memory (docs/scale.md).
-    Only for the layout kato. The same command continues an interrupted one."""
+    Only for the layouts kato and around. The same command continues an interrupted one."""
     jobs: Count = 1
     """Shards that are made at a time, each in a process of its own."""
     cluster: Rare[str | None] = None
@@ -64,10 +64,12 @@ class DatasetConfig:
             raise ValueError(
                 "give either --source (a folder of meshes or a mesh pack .npz) or --procedural (a number of shapes)"
             )
-        if self.shards and self.layout != "kato":
+        if WRITERS[self.layout].only_shards and not self.shards:
+            raise ValueError(f"the layout {self.layout} is made as shards: add --shards")
+        if self.shards and self.layout not in ("kato", "around"):
             raise ValueError(
-                f"shards are made in the layout kato, not {self.layout}; make the data set without --shards, and "
-                "convert it (learn3d convert-dataset)"
+                f"shards are made in the layouts kato and around, not {self.layout}; make the data set without "
+                "--shards, and convert it (learn3d convert-dataset)"
             )
         if not self.shards and (self.jobs > 1 or self.cluster):
             raise ValueError("--jobs and --cluster are for shards: add --shards")

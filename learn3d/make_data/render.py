@@ -23,7 +23,7 @@ from learn3d.make_data.folders import publishing
 from learn3d.make_data.writers import WRITERS, RenderedObject, Writer
 from learn3d.make_data.writers.writer import write_png
 from learn3d.pictures.contact_sheet import LEGEND, ROWS, draw_sheet, make_row
-from learn3d.pictures.studio import KEY_LIGHT, photograph, studio_lights
+from learn3d.pictures.studio import photograph
 
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
 MOST_LISTED = 100  # skipped meshes in the text of a report; the card lists all
@@ -163,8 +163,8 @@ def _render(config: DatasetConfig, writer: Writer, mesh: meshes.RawMesh, item: I
     rng = np.random.default_rng([config.seed, 2, item.number, copy])
     poses = writer.views(placed, config.views, rng)
     vertices, faces = torch.as_tensor(placed, dtype=torch.float32).contiguous(), torch.from_numpy(mesh.faces)
-    lights = studio_lights(tuple((writer.turn @ KEY_LIGHT).tolist()))
-    rgb, alpha = photograph(vertices, faces, color, poses.cameras(), image_size=writer.image_size, lights=lights)
+    face_colors, lights = writer.dress(placed, mesh.faces, color, rng)
+    rgb, alpha = photograph(vertices, faces, face_colors, poses.cameras(), image_size=writer.image_size, lights=lights)
     if not alpha.any():
         raise ValueError("no view shows any of it (all faces have no area, or are smaller than a pixel)")
     name, voxels = f"{item.name}-{copy}" if copy else item.name, writer.voxelize(vertices, faces)

@@ -6,17 +6,14 @@ shards that a killed call has made are kept by the next one.
 
 from __future__ import annotations
 
-import dataclasses
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from learn3d.data.categories import synset_of
-from learn3d.data.dataset import SPLITS, ViewDataset
-from learn3d.data.readers import kato
+from learn3d.data.dataset import SPLITS
 from learn3d.data.shards import finish_set, remove, shard_path, write_shard
 from learn3d.distributed.tasks import Task, run_tasks
 from learn3d.files.reading import parse_json, read_bytes
@@ -24,7 +21,7 @@ from learn3d.files.writing import write_json
 from learn3d.make_data.config import DatasetConfig
 from learn3d.make_data.folders import publishing
 from learn3d.make_data.render import DatasetReport, Item, contact_row, render_meshes, report_files, split_items
-from learn3d.make_data.writers import KatoWriter, RenderedObject
+from learn3d.make_data.writers import WRITERS
 from learn3d.pictures.contact_sheet import ROWS
 from learn3d.terminal import INTERRUPTED, note, say, stop_on_signal
 
@@ -67,26 +64,18 @@ def make_shards(config: DatasetConfig) -> int:
 def make_shard(config: DatasetConfig, path: Path, number: int, items: Sequence[Item], threads: int) -> bool:
     """Make one shard and the list of its meshes; returns False if a signal stopped it."""
     torch.set_num_threads(threads)
-    made, objects = [], []
+    writer, made, objects = WRITERS[config.layout](path.parent, config.category), [], []
     with stop_on_signal() as stop:
-        for mesh, of_mesh in render_meshes(config, KatoWriter(path.parent, config.category), items):
+        for mesh, of_mesh in render_meshes(config, writer, items):
             if stop.name:
                 return False
             made.append(mesh)
             objects += of_mesh
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path.with_suffix(LIST), made, sync=True)
-        write_shard(path.parent, number, _dataset(objects, config.category, items[0].split))
+        write_shard(path.parent, number, writer.dataset(objects, config.category, items[0].split))
     print(f"{path.parent.name} {number}: {len(objects)} objects", flush=True)
     return True
-
-
-def _dataset(objects: Sequence[RenderedObject], category: str, split: str) -> ViewDataset:
-    images, voxels = np.zeros((0, 24, 4, 64, 64), np.uint8), np.zeros((0, 32, 32, 32), bool)
-    if objects:
-        images, voxels = np.stack([KatoWriter.images(o) for o in objects]), np.stack([o.voxels for o in objects])
-    dataset = kato.from_arrays(images, voxels, category, split)
-    return dataclasses.replace(dataset, object_names=tuple(o.name for o in objects))
 
 
 def _prepare(config: DatasetConfig, folder: Path, splits: dict[str, list[Item]]) -> None:
@@ -115,10 +104,10 @@ def _finish(
     """Declare the splits complete, and write the report."""
     lists = [parse_json(read_bytes(path.with_suffix(LIST), 2**28, "the list of a shard's meshes")) for path in shards]
     report = DatasetReport(config, [mesh for found in lists for mesh in found])
-    rows, writer = {}, KatoWriter(folder, config.category)
+    rows, writer = {}, WRITERS[config.layout](folder, config.category)
     for split in report.counts:
         count = sum(path.parent.name == split for path in shards)
-        finish_set(folder / split, config.layout, count, _dataset([], config.category, split))
+        finish_set(folder / split, config.layout, count, writer.dataset([], config.category, split))
         shown = [objects[0] for _, objects in render_meshes(config, writer, splits[split][:ROWS]) if objects]
         rows[split] = [contact_row(writer, item) for item in shown]
     with publishing(config.output, report_files(config.category)) as temporary:

@@ -258,6 +258,34 @@ def barrel_chair(draw: Draw) -> Part:
     return part + support(draw, kind, 0.66 * radius, 0.66 * radius, under)
 
 
+def stool(draw: Draw) -> Part:
+    """A seat without a back, round or square, low or high."""
+    width, height, thickness = draw(0.3, 0.45), draw(0.35, 0.78), draw(0.02, 0.12)
+    depth = width * draw(0.7, 1.0) if draw.maybe(0.4) else width
+    seat = slab(ellipse(width, depth, 24, draw.pick((2.0, 2.0, 4.0, 8.0))), thickness).moved(y=height - thickness)
+    kind = draw.pick(_BAR)
+    return seat + support(draw, kind, 0.38 * width, 0.38 * depth, height - thickness + 0.005)
+
+
+def bench(draw: Draw) -> Part:
+    """A long seat of boards, half of them with a back of boards."""
+    width, depth, height = draw(1.0, 1.7), draw(0.35, 0.5), draw(0.4, 0.47)
+    count, thick, gap = draw.count(1, 6), draw(0.02, 0.06), draw(0.005, 0.03)
+    step = depth / count
+    part = support(draw, draw.pick({"legs": 3, "panels": 2, "loops": 1}), 0.44 * width, 0.38 * depth, height - 0.02)
+    part += between((-0.46 * width, height - 0.04, -depth / 2), (0.46 * width, height, depth / 2))
+    for z in np.arange(count) * step - depth / 2:
+        part += between((-width / 2, height - 0.01, z + gap), (width / 2, height + thick, z + step - gap))
+    if draw.maybe(0.5):
+        lean, top, rear = draw(0.05, 0.2), draw(0.3, 0.45), 0.02 - depth / 2
+        for x in (-0.4 * width, 0.4 * width):
+            part += bar((x, height - 0.02, rear), (x, height + top, rear - lean), 0.05)
+        for t in np.linspace(0.35, 0.95, draw.count(1, 3)):
+            y, z = height + t * top, rear - t * lean
+            part += bar((-width / 2, y, z), (width / 2, y, z), 0.03, draw(0.06, 0.12))
+    return part
+
+
 KINDS = {
     partial(jointed_chair, family="dining"): 5,
     partial(jointed_chair, family="office"): 1.5,
@@ -266,4 +294,6 @@ KINDS = {
     partial(jointed_chair, family="lounge"): 1.5,
     partial(jointed_chair, family="bar"): 1,
     barrel_chair: 1,
+    stool: 1.2,
+    bench: 0.7,
 }

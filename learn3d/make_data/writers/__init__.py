@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from learn3d.make_data.writers.around import AroundWriter
 from learn3d.make_data.writers.kato import DvrWriter, KatoWriter
 from learn3d.make_data.writers.photographs import Pascal3dWriter, PhotosWriter
 from learn3d.make_data.writers.shapenet import KarWriter, R2n2Writer
 from learn3d.make_data.writers.writer import RenderedObject, Writer
 
-__all__ = ["WRITERS", "KatoWriter", "RenderedObject", "Writer"]
+__all__ = ["WRITERS", "RenderedObject", "Writer"]
 
 WRITERS: dict[str, type[Writer]] = {
     "kato": KatoWriter,
@@ -16,4 +17,5 @@ WRITERS: dict[str, type[Writer]] = {
     "r2n2": R2n2Writer,
     "pascal3d": Pascal3dWriter,
     "photos": PhotosWriter,
+    "around": AroundWriter,
 }

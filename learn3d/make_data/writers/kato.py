@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ import torch
 import nmr
 from learn3d.data import conventions
 from learn3d.data.categories import synset_of
-from learn3d.data.dataset import SPLITS
+from learn3d.data.dataset import SPLITS, ViewDataset
 from learn3d.data.readers import kato
 from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer, write_png
 
@@ -34,6 +36,14 @@ class KatoWriter(Writer):
     def images(item: RenderedObject) -> np.ndarray:
         """Images of an object, uint8 [24, 4, 64, 64]: 255 - composite over white, and alpha."""
         return np.concatenate([255 - item.rgb, item.alpha[..., None]], axis=-1).transpose(0, 3, 1, 2)
+
+    @classmethod
+    def dataset(cls, objects: Sequence[RenderedObject], category: str, split: str) -> ViewDataset:
+        images, voxels = np.zeros((0, 24, 4, 64, 64), np.uint8), np.zeros((0, 32, 32, 32), bool)
+        if objects:
+            images, voxels = np.stack([cls.images(o) for o in objects]), np.stack([o.voxels for o in objects])
+        dataset = kato.from_arrays(images, voxels, category, split)
+        return dataclasses.replace(dataset, object_names=tuple(o.name for o in objects))
 
     def write(self, item: RenderedObject) -> None:
         for kept, array in zip(self._arrays[item.split], (self.images(item), item.voxels), strict=True):

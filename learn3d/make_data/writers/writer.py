@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -12,8 +13,11 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+import nmr
 from learn3d.data import conventions
+from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import Poses
+from learn3d.pictures.studio import KEY_LIGHT, studio_lights
 
 #: From the object frame to ShapeNet's coordinates (right-handed, y up, front x): [3, 3], determinant -1.
 WORLD_FROM_OBJECT = conventions.mesh_to_object("y", "x").T
@@ -62,6 +66,7 @@ class Writer(ABC):
     fixed_views: ClassVar[bool] = False  # True if no other number of views is allowed
     default_test: ClassVar[float] = 0.2  # share of the test split; 0 if the layout has no such split
     default_val: ClassVar[float] = 0.1
+    only_shards: ClassVar[bool] = False  # True if there are no other files
     fixed_splits: ClassVar[bool] = False  # True if the order of the objects decides about their splits
     convention: ClassVar[conventions.VoxelConvention] = conventions.KATO
     shared: ClassVar[tuple[str, ...]] = ()  # files with entries for all categories of the folder
@@ -85,6 +90,12 @@ class Writer(ABC):
         """The `count` cameras that look at the placed vertices [V, 3]."""
         return conventions.view_poses(torch.arange(count))
 
+    def dress(
+        self, vertices: np.ndarray, faces: np.ndarray, color: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, nmr.Lights]:
+        """Colours [3] or [F, 3] in [0, 1] of the placed mesh, and its lights. `color` [3]: a light grey."""
+        return color, studio_lights(tuple((self.turn @ KEY_LIGHT).tolist()))
+
     def voxelize(self, vertices: Tensor, faces: Tensor) -> np.ndarray:
         """Occupancy bool [32, 32, 32] of the placed mesh in the axes of the layout."""
         return self.convention.voxelize(vertices, faces)[0].numpy()
@@ -92,6 +103,11 @@ class Writer(ABC):
     @abstractmethod
     def write(self, item: RenderedObject) -> None:
         """Write, or keep, one object."""
+
+    @classmethod
+    def dataset(cls, objects: Sequence[RenderedObject], category: str, split: str) -> ViewDataset:
+        """The objects as a part of a data set in shards; only for the layouts that are made so."""
+        raise NotImplementedError
 
     def split(self, meshes: list[dict]) -> list[dict]:
         """The entries of `DatasetReport.meshes`, with the splits that readers of the layout will see."""

@@ -104,7 +104,7 @@ def test_photos_are_turned_upright(tmp_path: Path) -> None:
 def test_unreadable_photos_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"a.png: is missing"):
         read_photo(tmp_path / "a.png")
-    with pytest.raises(ValueError, match=r"a.png: has no transparency and no mask: give a mask image"):
+    with pytest.raises(ValueError, match=r"a.png: has no transparency and no mask: cut it out, or give a mask"):
         read_photo(save(tmp_path / "a.png", np.full((8, 6, 3), 10, np.uint8)))
     # Pillow would cut values of more than 8 bits off at 255, which leaves all white.
     path = save(tmp_path / "b.png", np.full((8, 6), 30_000, np.uint16))

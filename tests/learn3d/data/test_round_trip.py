@@ -18,6 +18,7 @@ from learn3d.data.disk_array import DiskArray
 from learn3d.data.layouts import LAYOUTS, load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.make_data.render import DatasetConfig, make_dataset
+from learn3d.make_data.writers import WRITERS
 
 SETTINGS = {
     "kato": {"test": 1, "val": 0},
@@ -34,7 +35,7 @@ def sources(tmp_path_factory):
     return write_meshes(tmp_path_factory.mktemp("meshes"))
 
 
-@pytest.fixture(scope="module", params=LAYOUTS)
+@pytest.fixture(scope="module", params=[name for name in LAYOUTS if not WRITERS[name].only_shards])
 def made(request, sources, tmp_path_factory):
     """A data set of each layout."""
     output = tmp_path_factory.mktemp("data")
