@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, SkipValidation
 
 from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import LAYOUTS, Layout, check_options
-from learn3d.data.sampling import Sampling
+from learn3d.data.sampling import GROUP_SIZE, Sampling
 from learn3d.files import limits
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.methods import LRSchedule, MethodSettings, TrainingSchedule
@@ -52,7 +52,8 @@ class TrainConfig:
     """Number of views of each object to train on: the first ones for kar and r2n2, else the same random ones in every
     run (default: one for kar, else all)."""
     sampling: Rare[Sampling | None] = None
-    """Draw views (each on its own), pairs (two views of an object) or classes (categories drawn uniformly)."""
+    """Draw views (each on its own), pairs (two views of an object), groups (five of them) or classes (categories drawn
+    uniformly)."""
     augment: Rare[Annotated[tuple[Augmentation, ...], Items] | None] = None
     """Random changes of the training images (--augment without a name: none)."""
     iterations: MayDiffer[Step | None] = None
@@ -103,8 +104,11 @@ class TrainConfig:
             raise ValueError(
                 f"augment 'flip' changes the view class, but {self.preset!r} learns with the class of the original"
             )
-        if self.sampling == "pairs" and self.batch_size % 2:
-            raise ValueError(f"with sampling 'pairs' batch_size must be even, got {self.batch_size}")
+        size = {"pairs": 2, "groups": GROUP_SIZE}.get(self.sampling, 1)
+        if self.batch_size % size:
+            raise ValueError(
+                f"with sampling {self.sampling!r} batch_size must be a multiple of {size}, got {self.batch_size}"
+            )
         self.settings.check_run(iterations=self.iterations, batch_size=self.batch_size)
         self.schedule  # noqa: B018 (it checks itself)
 

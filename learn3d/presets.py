@@ -12,6 +12,7 @@ from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import Layout
 from learn3d.data.sampling import Sampling
 from learn3d.methods import LRSchedule, MethodSettings
+from learn3d.methods.many_views import ManyViewsSettings
 from learn3d.methods.multi_view import MultiViewSettings
 from learn3d.methods.plus import PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
@@ -50,6 +51,7 @@ METHODS = {
     "proposed": NamedMethod("peng2020-kato", "pose-invariant codes from single views (Peng et al. 2020)"),
     "vanilla": NamedMethod("peng2020-kato-vanilla", "encoder and mesh generator alone, on single views"),
     "multi-view": NamedMethod("kato2018-kato", "the same on pairs of views of an object (Kato et al. 2018)"),
+    "many-views": NamedMethod("many-views-kato", "a shape must explain five views of its object (the package's model)"),
     "vpl": NamedMethod("peng2020-kato-vpl", "novel views must look as plausible as the input's (Kato and Harada 2019)"),
     "prgan": NamedMethod("gadelha2017-kato", "a GAN of voxel grids, then an encoder (PrGAN, Gadelha et al. 2017)"),
 }
@@ -96,6 +98,16 @@ _PLUS = replace(
     lr_schedule="cosine",
     warmup_steps=100,
     ema_decay=0.99,
+)
+_MANY_VIEWS = replace(
+    _PLUS,
+    label="Many views",
+    settings=ManyViewsSettings(),
+    batch_size=160,
+    source="docs/methods/many-views.md",
+    sampling="groups",
+    ema_decay=0.995,
+    iterations=20_000,
 )
 #: What Kato and Harada 2019 use on both data sets.
 _VPL: dict[str, Any] = {
@@ -160,6 +172,13 @@ PRESETS: dict[str, Preset] = {
     "peng2020-kar-vanilla": _vanilla(_KAR),
     # Cameras differ within a view class, so the class's masks say little about a single camera: docs/methods/plus.md.
     "plus-kar": replace(_PLUS, layout="kar", settings=PlusSettings(lambda_novel_view=0.0)),
+    "many-views-kato": _MANY_VIEWS,
+    # The package's model: cameras at unknown distances.
+    "many-views-around": replace(
+        _MANY_VIEWS,
+        settings=ManyViewsSettings(encoder="conv-centred", generator="sphere-small", symmetry="x", lambda_view=1.0),
+        layout="around",
+    ),
     "plus-pascal": replace(  # it flips images itself; resnet18 ignores the mask, so no image loses its colours
         _PLUS, settings=PlusSettings(**_ON_PASCAL), layout="pascal3d", iterations=160_000, augment=("crop", "channels")
     ),

@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 
 from learn3d.device import check_device
+from learn3d.methods.many_views import ManyViews, ManyViewsSettings
 from learn3d.methods.method import DatasetInfo, MeshMethod, Method
 from learn3d.methods.multi_view import MultiView, MultiViewSettings
 from learn3d.methods.optimization import CONSTANT_LR, LRSchedule, TrainingSchedule
@@ -33,6 +34,7 @@ _METHODS: dict[type[MethodSettings], type[Method]] = {
     PoseInvariantSettings: PoseInvariant,
     PlusSettings: Plus,
     MultiViewSettings: MultiView,
+    ManyViewsSettings: ManyViews,
     VPLSettings: VPL,
     PrGANSettings: PrGAN,
 }

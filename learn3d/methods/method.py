@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
@@ -21,6 +22,8 @@ from learn3d.methods.optimization import CONSTANT_LR, EMA, TrainingSchedule, ada
 from learn3d.methods.settings import MeshSettings, MethodSettings
 from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.networks import GENERATORS, MeshGenerator, Symmetry, SymmetryOption, create_encoder, network_input
+
+INSIDE = 0.499  # share of the cube's side: to the voxelizer kato18 a face exactly on the border is outside
 
 
 def plane_of(symmetry: SymmetryOption, info: DatasetInfo) -> Symmetry | None:
@@ -184,6 +187,20 @@ class MeshMethod(Method):
     def decode(self, codes: Tensor) -> Meshes:
         with self.autocast():
             return Meshes(self.generator(codes).cpu(), self.faces)
+
+    def encode_symmetric(self, images: Tensor) -> Tensor:
+        """Shape codes; if shapes are symmetric, the mean of the codes of an image and of its mirror image."""
+        codes = MeshMethod.encode(self, images)
+        return codes if self.generator.mirror is None else (codes + MeshMethod.encode(self, images.flip(3))) / 2
+
+    def clamped(self, shapes: Meshes) -> Meshes:
+        """The shapes, clamped to the cube of the data set, if it has one. Voxelizers take a shape that exceeds their
+        grid for hollow.
+        """
+        if self.info.cube_side is None:
+            return shapes
+        limit = INSIDE * self.info.cube_side
+        return dataclasses.replace(shapes, vertices=shapes.vertices.clamp(-limit, limit))
 
     def predict(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Codes float32 [B, C] and vertices float32 [B, V, 3] of stored images, on the method's device."""

@@ -101,9 +101,7 @@ class Plus(PoseInvariant):
         return super().weights | {"novel_view": self.settings.lambda_novel_view}
 
     def encode(self, images: Tensor) -> Tensor:
-        """Shape codes; if shapes are symmetric, the mean of the codes of an image and of its mirror image."""
-        codes = super().encode(images)
-        return codes if self.generator.mirror is None else (codes + super().encode(images.flip(3))) / 2
+        return self.encode_symmetric(images)
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """A step of `PoseInvariant` with lambda_novel_view times the loss at a novel view, once the mask bank is full.

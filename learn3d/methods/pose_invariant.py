@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Literal
 
 from torch import Tensor, nn
@@ -18,8 +17,6 @@ from learn3d.methods.surfaces import Meshes
 from learn3d.networks import PoseDiscriminator
 from learn3d.networks.resnet import check_pretrained, load_pretrained
 from learn3d.settings import FilePath, Positive, Weight, checked
-
-INSIDE = 0.499  # share of the cube's side: to the voxelizer kato18 a face exactly on the border is outside
 
 
 @checked
@@ -99,10 +96,7 @@ class PoseInvariant(MeshMethod):
 
     def decode(self, codes: Tensor) -> Meshes:
         shapes = super().decode(codes)
-        if not self.settings.clamp_to_cube or self.info.cube_side is None:
-            return shapes
-        limit = INSIDE * self.info.cube_side
-        return dataclasses.replace(shapes, vertices=shapes.vertices.clamp(-limit, limit))
+        return self.clamped(shapes) if self.settings.clamp_to_cube else shapes
 
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:

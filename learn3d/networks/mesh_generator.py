@@ -48,10 +48,17 @@ class MeshGenerator(nn.Module):
         """The mean of placed vertices [B,V,3] and their mirror images; the vertices themselves if shapes are free."""
         if self.mirror is None:
             return vertices
-        turn = torch.eye(3) if self.rotation is None else self.rotation.cpu()  # rows: the axes as they are placed
-        reflection = (turn.T @ torch.diag(torch.tensor([1.0, 1.0, -1.0])) @ turn).to(vertices)
+        reflection = self.reflection.to(vertices)
         mirrored = (vertices[:, self.mirror.to(vertices.device), :, None] * reflection).sum(-2)
         return (vertices + mirrored) / 2
+
+    @property
+    def reflection(self) -> Tensor | None:
+        """The symmetric matrix float32 [3,3] that takes placed shapes to themselves; None if shapes are free."""
+        if self.mirror is None:
+            return None
+        turn = torch.eye(3) if self.rotation is None else self.rotation.cpu()  # rows: the axes as they are placed
+        return turn.T @ torch.diag(torch.tensor([1.0, 1.0, -1.0])) @ turn
 
 
 def mirror_images(points: Tensor) -> Tensor:

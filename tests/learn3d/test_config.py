@@ -26,7 +26,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "many bins": (BASE | {"view_bins": "0.00001x1"}, "there would be 2160000000 bins; at most 100000"),
     "seed": (BASE | {"seed": 2**64}, "seed must be less than"),
     "iterations": (BASE | {"iterations": "abc"}, "iterations must be a whole number, got 'abc'"),
-    "pairs": (BASE | {"sampling": "pairs", "batch_size": 3}, "batch_size must be even, got 3"),
+    "pairs": (BASE | {"sampling": "pairs", "batch_size": 3}, "batch_size must be a multiple of 2, got 3"),
     "unknown": (BASE | {"latent": 1}, "there is no option 'latent'"),
     "channels": (
         BASE | {"preset": "gadelha2017-kato", "settings": {"generator_channels": [10**6, 1, 1, 1]}},

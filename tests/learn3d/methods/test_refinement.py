@@ -15,9 +15,7 @@ from learn3d.reconstruction import reconstruct, reconstruct_dataset
 
 
 def make(plane: float | None):
-    settings = dataclasses.replace(
-        PRESETS["plus-kato"].settings, encoder="conv-small", generator="sphere-small", lambda_novel_view=0.0
-    )
+    settings = dataclasses.replace(PRESETS["plus-kato"].settings, encoder="conv-small", lambda_novel_view=0.0)
     return create_method(settings, DatasetInfo(24, mirror_plane_deg=plane), device="cpu", precision="fp32", seed=0)
 
 

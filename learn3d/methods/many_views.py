@@ -1,0 +1,128 @@
+"""Many views: the shape that one image gives must explain other views of the same object, whose cameras are known.
+
+In the literature: multi-view supervision. It needs several views of every object, and uses their depth if it is known.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+import nmr
+from learn3d.data.batch import Batch
+from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.sampling import GROUP_SIZE
+from learn3d.device import Download, upload
+from learn3d.losses import gaussian_prior_loss, pose_classification_loss
+from learn3d.methods.method import MeshMethod
+from learn3d.methods.settings import MeshSettings
+from learn3d.methods.surfaces import Meshes
+from learn3d.networks import EncoderName, SymmetryOption, network_input
+from learn3d.networks.encoders import ViewClassifier
+from learn3d.settings import Positive, Weight, checked
+
+
+@checked
+class ManyViewsSettings(MeshSettings):
+    """Networks and weights of the terms of the loss; a weight of 0 means that the term is not computed."""
+
+    encoder: EncoderName = "conv-light"
+    symmetry: SymmetryOption = "auto"
+    learning_rate: Positive = 4e-4
+    lambda_smooth: Weight = 3e-4
+    """Weight of the smoothness loss."""
+    lambda_prior: Weight = 1e-4
+    """Weight of the mean squared length of the codes."""
+    lambda_depth: Weight = 3.0
+    """Weight of the depth loss, in views whose depth is known."""
+    lambda_view: Weight = 0.0
+    """Weight of the loss of a network on its own that tells the view class of an image, from which reconstruction
+    places the camera of a picture. 0: there is none."""
+
+
+class ManyViews(MeshMethod):
+    """Encoder and mesh generator, trained on groups of views: batches [a_1 .. a_n, b_1 .. b_n, ...]."""
+
+    settings: ManyViewsSettings
+
+    def create_networks(self) -> dict[str, nn.Module]:
+        networks = super().create_networks()
+        if self.settings.lambda_view > 0:
+            classifier = ViewClassifier(self.info.num_views, inverted=self.info.inverted)
+            networks["view_classifier"] = classifier.to(memory_format=torch.channels_last)
+        return networks
+
+    @property
+    def weights(self) -> dict[str, float]:
+        settings = self.settings
+        return {
+            "projection": 1.0,
+            "depth": settings.lambda_depth,
+            "smoothness": settings.lambda_smooth,
+            "prior": settings.lambda_prior,
+            "view": settings.lambda_view,
+        }
+
+    def encode(self, images: Tensor) -> Tensor:
+        return self.encode_symmetric(images)
+
+    def decode(self, codes: Tensor) -> Meshes:
+        return self.clamped(super().decode(codes))
+
+    def view_probabilities(self, images: Tensor) -> Tensor | None:
+        """How probable each view class is for stored images uint8 [B,4,S,S]: float32 [B,K]; None if not learnt."""
+        return self._view_logits(images).softmax(1).cpu() if self.settings.lambda_view > 0 else None
+
+    def _view_logits(self, images: Tensor) -> Tensor:
+        with self.autocast():
+            return self.view_classifier(network_input(images, self.device, self.image_size)).float()
+
+    def check_batch(self, batch: Batch) -> None:
+        check_groups(batch)
+
+    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
+        """Shapes of the views a, rendered in all views of their object: projection + lambda_depth depth + lambda_smooth
+        smoothness + lambda_prior prior. Every second image of a symmetric object is flipped before it is encoded.
+        Raises ValueError if the batch is not made of groups.
+        """
+        count = check_groups(batch)
+        images = batch.images[:count]
+        flipped = (torch.arange(count) % 2 == 1) & (self.generator.mirror is not None)
+        codes, vertices = self.predict(torch.where(flipped[:, None, None, None], images.flip(3), images))
+        losses = {"prior": gaussian_prior_loss(codes, "squared")} if self.settings.lambda_prior > 0 else {}
+        if self.settings.lambda_view > 0:
+            views = upload(batch.view_ids[:count], self.device)
+            losses["view"] = pose_classification_loss(self._view_logits(images), views)
+        vertices = Download(vertices).wait()
+        uses_depth = batch.depth is not None and self.settings.lambda_depth > 0
+        seen = nmr.render(
+            vertices.repeat(GROUP_SIZE, 1, 1),
+            self.faces,
+            batch.cameras,
+            outputs=("alpha", "depth") if uses_depth else ("alpha",),
+            image_size=MASK_SIZE,
+        )
+        losses["projection"] = nmr.losses.soft_iou_loss(seen.alpha, batch.masks)
+        if uses_depth:
+            losses["depth"] = depth_loss(seen.depth, batch.depth)
+        return self.backward_and_step(losses | self.surface_losses(vertices), step, *self.optimizers)
+
+
+def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
+    """Mean distance between depth maps [B, S, S] where both show a surface; nmr's `far`, 100, and a target of 0 do not.
+
+    Differentiable in depth.
+    """
+    both = (target > 0) & (depth.detach() < 2 * target)
+    return ((depth - target).abs() * both).sum() / both.sum().clamp(min=1)
+
+
+def check_groups(batch: Batch) -> int:
+    """The number n of objects in a batch [a_1 .. a_n, b_1 .. b_n, ...]. Raises ValueError for any other batch."""
+    count, rest = divmod(len(batch), GROUP_SIZE)
+    if rest or not torch.equal(batch.object_ids, batch.object_ids[:count].repeat(GROUP_SIZE)):
+        raise ValueError(
+            f"the method many-views learns from groups of {GROUP_SIZE} views of an object, [a_1 .. a_n, b_1 .. b_n, "
+            f"...], but this batch of {len(batch)} views is not made of such groups; choose sampling 'groups'"
+        )
+    return count
