@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -17,23 +18,30 @@ import nmr
 from learn3d.config import TrainConfig
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.crops import Crops
+from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.framing import OBJECT_SHARE, check_mask, mask_box, read_photo, read_picture, threshold_mask
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
 from learn3d.data.poses import Poses
-from learn3d.files import writing
+from learn3d.files import limits, writing
+from learn3d.fitting.coloring import color_mesh
+from learn3d.fitting.cutting import Box, cut_out
+from learn3d.fitting.familiarity import MOST, distance
+from learn3d.fitting.fit import SHARE, Progress, fit
 from learn3d.methods import MeshMethod, Method
+from learn3d.methods.many_views import ManyViews
 from learn3d.methods.refinement import refine
 from learn3d.networks.encoders import centre
 from learn3d.pictures.sheets import natural_colors, save_gif, save_png, tile
 from learn3d.pictures.surfaces import Surface, azimuths_deg, draw_around, turntable
 from learn3d.runs import checkpoint
-from learn3d.runs.export import SMALL_MODEL
+from learn3d.runs.export import KNOWN_CODES, SMALL_MODEL
+from learn3d.terminal import note
 
 MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 
 STRIP_SIZE = 192  # pixels
-_LARGE = 1024  # pixels a side in which an object is searched for
 _FINE = 4  # pixels, per side, that are averaged to one of a prepared image, or more
+_COLORED = 256  # pixels a side of the picture from which colours are taken
 _LEAST_SHARE = 0.05  # smallest share of the square's side that an object can take
 
 
@@ -43,6 +51,7 @@ class Model(NamedTuple):
     method: Method
     config: TrainConfig
     object_share: float  # of the side of its training images that objects take
+    known_codes: Tensor | None = None  # of `fitting.familiarity`; None: not said in its file
 
     def prepare(self, colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
         """`prepare_image` for these networks."""
@@ -52,8 +61,10 @@ class Model(NamedTuple):
 
 def load_model(run: Path | None, which: str = "last") -> Model:
     """The model of a run folder or checkpoint file; None: the small one that comes with the package."""
-    method, config, metadata = checkpoint.load_method(run or SMALL_MODEL, which)
-    return Model(method, config, metadata.progress.object_share or OBJECT_SHARE)
+    path = checkpoint.find(run or SMALL_MODEL, which)
+    method, config, metadata = checkpoint.load_method(path)
+    known = checkpoint.load(path)[0].get(KNOWN_CODES)
+    return Model(method, config, metadata.progress.object_share or OBJECT_SHARE, known)
 
 
 def reconstruct_files(
@@ -64,13 +75,16 @@ def reconstruct_files(
     *,
     crop: bool = True,
     plain_background: bool = False,
+    box: Box | None = None,
+    refined: bool = True,
     which: str = "last",
     mesh_format: MeshFormat = "glb",
 ) -> list[Path]:
     """Reconstruct image files with the networks of a run (see `load_model`) and save the results in `folder`.
 
     If there are no `masks`, the images have transparency or, with `plain_background`, the object is everything that
-    differs from the border's colour. Returns the files, named after the images (see `save`).
+    differs from the border's colour, or it is cut out of the `box` (`learn3d.fitting.cutting`). refined: see
+    `reconstruct_picture`. Returns the files, named after the images (see `save`).
     """
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
@@ -81,9 +95,15 @@ def reconstruct_files(
     if taken := [name for name in names if Path(folder, f"{name}.png").resolve() in given]:
         raise ValueError(f"{taken[0]}.png would replace an image that was given; give another --output")
     model = load_model(run, which)
-    photos = map(_read, images, masks or [None] * len(images), [plain_background] * len(images))
-    stored = np.stack([model.prepare(*photo, crop=crop) for photo in photos])
-    return save(folder, names, model, stored, reconstruct(model.method, stored), mesh_format=mesh_format)
+    find = threshold_mask if plain_background else functools.partial(cut_out, box=box) if box else None
+    photos = map(_read, images, masks or [None] * len(images), [find] * len(images))
+    made = []
+    for name, photo in zip(names, photos, strict=True):
+        made.append(reconstruct_picture(model, *photo, crop=crop, refined=refined))
+        if made[-1].warning:
+            note(f"warning: {name}: {made[-1].warning}")
+    stored, azimuths = np.stack([each.stored for each in made]), [each.azimuth_deg for each in made]
+    return save(folder, names, model, stored, [each.surface for each in made], azimuths, mesh_format=mesh_format)
 
 
 def reconstruct_dataset(
@@ -112,15 +132,18 @@ def reconstruct_dataset(
     images = batch.images.numpy()
     surfaces = reconstruct(model.method, images, *(batch.masks, batch.poses) if refined else ())
     names = [f"{dataset.category}_{split}_{index:06}" for index in indices]
-    return save(folder, names, model, images, surfaces, batch.poses, mesh_format=mesh_format)
+    azimuths = None if batch.poses is None else azimuths_deg(batch.poses).tolist()
+    return save(folder, names, model, images, surfaces, azimuths, mesh_format=mesh_format)
 
 
-def _read(path: Path, mask_path: Path | None, plain_background: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Colours uint8 [H,W,3] and a mask uint8 [H,W] that can be right; see `read_photo` and `threshold_mask`."""
-    searched = plain_background and mask_path is None
-    colors, mask = read_picture(path, _LARGE) if searched else read_photo(path, mask_path)
+def _read(
+    path: Path, mask_path: Path | None, find: Callable[[np.ndarray], np.ndarray] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colours uint8 [H,W,3] and a mask uint8 [H,W] that can be right: the file's, or the one that `find` finds."""
+    searched = find is not None and mask_path is None
+    colors, mask = read_picture(path, limits.IMAGE_SIDE) if searched else read_photo(path, mask_path)
     if mask is None:
-        mask = threshold_mask(colors)
+        mask = find(colors)
     try:
         check_mask(mask, cropped=not searched)
     except ValueError as error:
@@ -172,6 +195,59 @@ def prepare_image(
     return np.rint(prepared).clip(0, 255).astype(np.uint8)
 
 
+class Reconstruction(NamedTuple):
+    """What a model makes of a picture."""
+
+    surface: Surface  # object frame; in the picture's colours if it was fitted
+    stored: np.ndarray  # uint8 [4, S, S]: the image that the network saw
+    azimuth_deg: float  # from which the shape looks like the picture
+    silhouette_iou: float | None  # IoU of the fitted shape's silhouette and the mask; None: it was not fitted
+    warning: str | None  # why the shape is to be doubted
+
+
+def reconstruct_picture(
+    model: Model,
+    colors: np.ndarray,
+    mask: np.ndarray,
+    *,
+    crop: bool = True,
+    refined: bool = True,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """The shape of a picture uint8 [H, W, 3] with its mask uint8 [H, W], of which no camera is known.
+
+    refined: camera, shape and colours are fitted to the picture (`learn3d.fitting`); a method whose shapes are not
+    meshes predicts them alone. progress: told what is done and which part of it.
+    """
+    method, stored = model.method, model.prepare(colors, mask, crop=crop)
+    if not refined or not isinstance(method, MeshMethod):
+        (surface,) = reconstruct(method, stored[None])
+        return Reconstruction(surface, stored, input_azimuth_deg(surface, stored[3]), None, None)
+    image = torch.from_numpy(stored)
+    fine = prepare_image(colors, mask, object_share=SHARE, size=_COLORED, layout="kar")
+    small = nn.functional.interpolate(
+        torch.from_numpy(fine[None, 3:]).float() / 255, (MASK_SIZE, MASK_SIZE), mode="area"
+    )
+    views = isinstance(method, ManyViews) and model.config.layout == "around"
+    probabilities = method.view_probabilities(image[None])[0] if views else None
+    fitted = fit(method, image, small[0, 0], view_probabilities=probabilities, progress=progress)
+    surface = color_mesh(
+        fitted.vertices, method.faces, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], method.generator.reflection
+    )
+    return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, doubt(model, image))
+
+
+def doubt(model: Model, image: Tensor) -> str | None:
+    """A warning if a stored image uint8 [4, S, S] shows something that the model does not know."""
+    if (
+        model.known_codes is None
+        or distance(model.method.encode(image[None])[0].float().cpu(), model.known_codes) <= MOST
+    ):
+        return None
+    kinds = model.config.category.replace(",", ", ")
+    return f"this looks like nothing that the model was trained on ({kinds}), so its shape is a guess"
+
+
 @torch.no_grad()
 def reconstruct(
     method: Method, images: np.ndarray, masks: Tensor | None = None, poses: Poses | None = None
@@ -220,7 +296,8 @@ def export_mesh(path: Path, surface: Surface) -> None:
         colors = colors**2.2 if kind == "glb" else colors  # those of a GLB are linear
         mesh.visual.vertex_colors = (colors * 255).round().to(torch.uint8).numpy()
     if kind == "glb":
-        content = trimesh.Scene({path.stem: mesh}).export(file_type=kind, tree_postprocessor=_show_both_sides)
+        options = {"include_normals": True, "tree_postprocessor": _show_both_sides}
+        content = trimesh.Scene({path.stem: mesh}).export(file_type=kind, **options)
     else:
         content = mesh.export(file_type=kind)
     writing.write_bytes(path, content.encode() if isinstance(content, str) else content)
@@ -240,18 +317,17 @@ def save(
     model: Model,
     images: np.ndarray,
     surfaces: Sequence[Surface],
-    poses: Poses | None = None,
+    azimuths: Sequence[float] | None = None,
     *,
     mesh_format: MeshFormat = "glb",
 ) -> list[Path]:
     """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input, mask, six views) of each shape.
 
-    images: uint8 [B,4,S,S] as the networks read them. poses: of their cameras; None: azimuths are guessed. Returns the
-    paths, three for each name.
+    images: uint8 [B,4,S,S] as the networks read them. azimuths: of their cameras in degrees; None: they are guessed.
+    Returns the paths, three for each name.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures = natural_colors(images, inverted=LAYOUTS[model.config.layout].inverted)
-    azimuths = None if poses is None else azimuths_deg(poses).tolist()
     paths = []
     for row, (name, surface) in enumerate(zip(names, surfaces, strict=True)):
         mesh, animation, strip = (folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png"))

@@ -74,7 +74,7 @@ def test_draw_fitting(tmp_path):
 
 
 def test_draw_small_model(tmp_path):
-    check_picture(imageio.imread(run("draw_small_model", tmp_path)), 925, 766)
+    check_picture(imageio.imread(run("draw_small_model", tmp_path)), 1065, 886)
 
 
 def test_fit_masks(tmp_path):

@@ -10,13 +10,15 @@ import torch
 import tyro
 
 import nmr
+from learn3d.data.conventions import mesh_to_object
 from learn3d.make_data.shapes import CATEGORIES, make_shape
+from learn3d.make_data.writers.around import natural_look
 from learn3d.pictures.sheets import save_png, tile
 from learn3d.pictures.studio import photograph
 from learn3d.pictures.surfaces import Surface, draw_around
-from learn3d.reconstruction import load_model, reconstruct
+from learn3d.reconstruction import load_model, reconstruct_picture
 
-SIDE = 120  # of each small picture, in pixels
+SIDE = 140  # of each small picture, in pixels
 TURNS = (0, 60, 120)  # degrees from the camera's side
 
 
@@ -26,15 +28,20 @@ def main(output: Path = Path("output"), azimuth: float = 40.0, elevation: float 
     The first object of each category with this seed is taken, whatever comes out (the model was trained with seed 0).
     """
     model = load_model(None)
-    sides = [azimuth - turn for turn in TURNS]
     rows = []
     for category in CATEGORIES:
-        shape = make_shape(category, np.random.default_rng([seed, 0, 0]))
-        truth = Surface(torch.tensor(shape.vertices, dtype=torch.float32), torch.tensor(shape.faces))
+        rng = np.random.default_rng([seed, 0, 0])
+        shape = make_shape(category, rng)
+        vertices = shape.vertices @ mesh_to_object("y", "z").T
+        truth = Surface(torch.tensor(vertices, dtype=torch.float32), torch.tensor(shape.faces))
+        paint, lights = natural_look(vertices, shape.faces, rng)
         camera = nmr.LookAt.from_angles(2.732, elevation, [azimuth], half_fov_deg=15.0)
-        colors, masks = photograph(*truth[:2], (0.35, 0.5, 0.65), camera, image_size=256)
-        [mesh] = reconstruct(model.method, model.prepare(colors[0], masks[0])[None])
-        drawn = [draw_around(surface, sides, elevation_deg=elevation, image_size=SIDE) for surface in (mesh, truth)]
+        colors, masks = photograph(*truth[:2], paint, camera, image_size=256, lights=lights)
+        made = reconstruct_picture(model, colors[0], masks[0])
+        drawn = [
+            draw_around(surface, [start - turn for turn in TURNS], elevation_deg=elevation, image_size=SIDE)
+            for surface, start in ((made.surface, made.azimuth_deg), (truth, azimuth))
+        ]
         rows.append([colors[0], *drawn[0], *drawn[1]])
     turned = [f"turned by {turn}°" for turn in TURNS[1:]]
     titles = ["picture", "mesh", *turned, "truth", *turned]

@@ -68,14 +68,17 @@ class Reconstruct(OnDataset):
     """Mask images (white = object), one for each image (default: the transparency of the images)."""
     plain_background: bool = False
     """The background has one colour: the object is all that differs from the colour of the border."""
+    box: tuple[int, int, int, int] | None = None
+    """X Y WIDTH HEIGHT in pixels of the one photograph that is given: the object is cut out of it (extra photos)."""
     crop: bool = True
     """Centre and scale the object in each image as in the data set, or leave the images as they are."""
     data: Path | None = None
     """Data set from which images are taken (default: image files are given)."""
     indices: tuple[int, ...] = (0,)
     """Images of the data set: object * V + view, if each object has V views (Kato's: 24, Kar's: 20)."""
-    refine: bool = False
-    """Fit each shape to its mask afterwards, with the camera that the data set knows: seconds for each image."""
+    refine: bool | None = None
+    """Fit shapes to the masks after the prediction: with the cameras of a data set, or with cameras that are searched,
+    which also gives image files their colours (default: image files, yes; --data, no)."""
     format: Literal["glb", "obj", "ply"] = "glb"
     """Format of the mesh files."""
 
@@ -85,10 +88,16 @@ class Reconstruct(OnDataset):
 
         check_target(self.output, "--output", folder=True)
         if self.data is not None:
-            options = {"indices": self.indices, "refined": self.refine, **self.source}
+            options = {"indices": self.indices, "refined": bool(self.refine), **self.source}
             paths = reconstruct_dataset(self.model, self.output, mesh_format=self.format, **options)
         else:
-            options = {"crop": self.crop, "plain_background": self.plain_background, "which": self.which}
+            options = {
+                "crop": self.crop,
+                "plain_background": self.plain_background,
+                "box": self.box,
+                "which": self.which,
+            }
+            options["refined"] = self.refine is not False
             paths = reconstruct_files(
                 self.model, self.output, self.images, self.masks, mesh_format=self.format, **options
             )
@@ -98,9 +107,11 @@ class Reconstruct(OnDataset):
         """Raise ValueError if options contradict each other."""
         if bool(self.images) == (self.data is not None):
             raise ValueError("give either image files, or --data with --indices")
-        kind, others = "image files", ("category", "split", "indices", "refine")
+        if self.box is not None and (len(self.images) > 1 or self.masks or self.plain_background):
+            raise ValueError("--box is for one photograph, without --masks and --plain-background")
+        kind, others = "image files", ("category", "split", "indices")
         if self.data is not None:
-            kind, others = "--data", ("masks", "plain_background", "crop")
+            kind, others = "--data", ("masks", "plain_background", "box", "crop")
         if wrong := [
             f"--{name.replace('_', '-')}" for name in others if getattr(self, name) != getattr(Reconstruct, name)
         ]:

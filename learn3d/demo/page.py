@@ -20,9 +20,11 @@ from starlette.middleware import Middleware
 
 from learn3d.data.framing import TOLERANCE, read_picture, threshold_mask
 from learn3d.demo.gate import Gate
-from learn3d.demo.picture import SIDE, Picture, example, make_mesh, open_picture, write_cutout, write_mesh
+from learn3d.demo.picture import SIDE, Picture, example, make_mesh, open_picture, outline, write_cutout, write_mesh
 from learn3d.files.findings import DamagedFile
 from learn3d.make_data.shapes import CATEGORIES
+from learn3d.pictures.sheets import save_gif, save_png
+from learn3d.pictures.surfaces import draw_around
 from learn3d.reconstruction import Model, load_model
 from learn3d.terminal import plain, say, stop_on_signal
 
@@ -36,7 +38,10 @@ WAITING = 64  # requests in the queue; the next visitor is asked to come back
 VISITORS = 256  # whose pictures are kept, 1 MB each
 KEPT = 3600  # seconds for which the files of a visitor are kept
 _MASK = (0, 200, 235)  # few objects have this colour
+_FRAMES, _FRAME_SIDE = 24, 300  # of the picture that turns
 _STRENGTH = 0.55  # opacity of the mask over the picture
+#: On a phone the mesh lies below the picture.
+_SHOW = "() => { if (innerWidth < 700) document.querySelector('.mesh').scrollIntoView({behavior: 'smooth'}) }"
 _PICTURES = [".png", ".jpg", ".jpeg", ".webp", ".bmp"]
 _ALONE = {"concurrency_limit": 1, "concurrency_id": "networks", "show_progress": "minimal"}  # one visitor at a time
 _EDITOR = {"sources": [], "transforms": [], "layers": False, "buttons": [], "format": "png", "fixed_canvas": True}
@@ -76,16 +81,19 @@ def _show(picture: Picture, mask: np.ndarray) -> dict:
 
 
 def page(models: dict[str, Model], root: Path) -> gr.Blocks:
-    """The page: a picture and its mask on the left, the meshes of all models on the right; files go below `root`."""
+    """The page: a picture and its outline on the left, the meshes of all models on the right; files go below `root`."""
 
     def open_upload(path: str, tolerance: float) -> tuple:
         with _sentences():
             new = open_picture(Path(path), tolerance)
-        return new, _show(new, new.mask)
+        return new, outline(new), gr.Accordion(open=False)
 
     def draw_example(category: str) -> tuple:
         new = example(category, time.time_ns() % 2**32)
-        return new, _show(new, new.mask)
+        return new, outline(new), gr.Accordion(open=False)
+
+    def edit(given: Picture | None) -> dict | None:
+        return given and _show(given, given.mask)
 
     def threshold(given: Picture | None, tolerance: float) -> dict | None:
         return given and _show(given, threshold_mask(given.colors, tolerance))
@@ -99,61 +107,93 @@ def page(models: dict[str, Model], root: Path) -> gr.Blocks:
                 raise ValueError("Give a picture first, or take an example")
             if drawing and drawing["layers"]:
                 given = given._replace(mask=255 * (np.max(drawing["layers"], axis=0) > 64).astype(np.uint8))
-            files, meshes = [write_cutout(given, Path(tempfile.mkdtemp(dir=root)))], []
+            files, meshes, words = [write_cutout(given, Path(tempfile.mkdtemp(dir=root)))], [], []
             for label, model in models.items():
-                surface, azimuth = make_mesh(model, given)
+                made = make_mesh(model, given)
+                surface = made.surface
                 if not len(surface.faces):
                     raise ValueError("the model makes an empty shape of this picture; try another picture or model")
                 name = given.name if len(models) == 1 else f"{given.name} {label}"
                 files += write_mesh(surface, Path(tempfile.mkdtemp(dir=root)), name)
                 radius = 3.3 * float(surface.vertices.norm(dim=1).max())  # a narrow window shows all of it, too
-                meshes.append(gr.Model3D(str(files[-2]), camera_position=(-azimuth, 70, radius)))
-        return [*meshes, *(gr.DownloadButton(value=str(file), interactive=True) for file in files)]
+                turns = np.arange(_FRAMES) * (360 / _FRAMES)
+                moving = files[-1].with_suffix(".gif")
+                save_gif(moving, draw_around(surface, made.azimuth_deg - turns, image_size=_FRAME_SIDE))
+                meshes += [str(moving), gr.Model3D(str(files[-2]), camera_position=(-made.azimuth_deg, 70, radius))]
+                words.append(made.warning or "")
+        said = " ".join(f"**Careful:** {text}." for text in dict.fromkeys(words) if text)
+        return [
+            said,
+            outline(given),
+            *meshes,
+            *(gr.DownloadButton(value=str(file), interactive=True) for file in files),
+        ]
 
-    def clear() -> list:
-        return [None, None, *[None] * len(models), *[gr.DownloadButton(interactive=False)] * len(files)]
+    def clear(path: str) -> list:
+        blank, unready = [None] * (3 + 2 * len(models)), [gr.DownloadButton(interactive=False)] * len(files)
+        return [path, "Reading the picture ...", *blank, *unready]
 
     with gr.Blocks(title="learn3d demo", analytics_enabled=False, delete_cache=(KEPT // 10, KEPT)) as blocks:
         gr.Markdown("# Picture to mesh")
         gr.Markdown(
-            "1. Give a picture of an object, or press a category. 2. Check that the mask covers the object. "
-            "3. Turn the mesh."
+            "Drop a picture of one object: an airplane, a car, a chair, a lamp, a sofa or a table. The model was "
+            "trained on generated objects; sides that the picture does not show are guessed."
         )
-        picture, meshes = gr.State(), []
+        arrived, picture, meshes = gr.State(), gr.State(), []
         with gr.Row():
             with gr.Column(scale=2, min_width=320):
-                upload = gr.File(label="Picture", height=140, file_types=_PICTURES)
+                upload = gr.File(label="Picture", height=120, file_types=_PICTURES)
+                gr.Markdown("Or take a generated one:")
                 with gr.Row():
-                    examples = {category: gr.Button(category, size="sm", min_width=60) for category in CATEGORIES}
-                editor = gr.ImageEditor(label="Mask (bright blue)", canvas_size=(SIDE, SIDE), **_EDITOR)
-                editor.convert_and_format_image = _layer  # gradio's own opens uploads in this process
-                tolerance = gr.Slider(0, 1, TOLERANCE, label="Threshold", info="Difference to the background")
-                emptied = gr.Button("Empty mask", size="sm")
-                files = [gr.DownloadButton("Save the cut-out (PNG)", size="sm", interactive=False)]
+                    examples = {
+                        category: gr.Button(category, size="sm", min_width=90, icon=_thumbnail(category, root))
+                        for category in CATEGORIES
+                    }
+                seen = gr.Image(label="The object, as it was found", height=320, interactive=False, buttons=[])
+                with gr.Accordion("Correct the outline", open=False) as correction:
+                    editor = gr.ImageEditor(label="Object (blue)", canvas_size=(SIDE, SIDE), **_EDITOR)
+                    editor.convert_and_format_image = _layer  # gradio's own opens uploads in this process
+                    tolerance = gr.Slider(0, 1, TOLERANCE, label="Threshold", info="Difference to a plain background")
+                    with gr.Row():
+                        emptied = gr.Button("Empty mask", size="sm")
+                        start = gr.Button("Make the mesh again", size="sm", variant="primary")
+                    files = [gr.DownloadButton("Save the cut-out (PNG)", size="sm", interactive=False)]
             with gr.Column(scale=3, min_width=320):
-                start = gr.Button("Make the mesh", variant="primary")
+                status = gr.Markdown("The mesh appears here.")
                 with gr.Row():
                     for label in models:
                         with gr.Column(min_width=240):
-                            meshes.append(gr.Model3D(label=label, height=440, interactive=False))
+                            still = {"height": 300, "interactive": False, "buttons": []}
+                            meshes.append(gr.Image(label=label, elem_classes="mesh", **still))
+                            meshes.append(gr.Model3D(label="To turn by hand", height=380, interactive=False))
                             with gr.Row():
                                 small = {"size": "sm", "min_width": 60, "interactive": False}
                                 files += [gr.DownloadButton(kind, **small) for kind in ("GLB", "OBJ")]
-        shown, made = [picture, editor], [*meshes, *files]
+        shown, made = [picture, seen, correction], [status, seen, *meshes, *files]
         tolerance.release(threshold, [picture, tolerance], editor, **_ALONE)
         emptied.click(empty, [picture], editor, **_ALONE)
         arrivals = [
             button.click(partial(draw_example, name), None, shown, **_ALONE) for name, button in examples.items()
         ]
-        uploaded = upload.upload(clear, None, [*shown, *made])
-        arrivals.append(uploaded.then(open_upload, [upload, tolerance], shown, **_ALONE))
+        uploaded = upload.upload(clear, upload, [arrived, status, upload, picture, seen, *meshes, *files])
+        arrivals.append(uploaded.then(open_upload, [arrived, tolerance], shown, **_ALONE))
         for arrival in arrivals:
-            arrival.success(make, [picture], made, **_ALONE)
+            arrival.success(lambda: "Making the mesh ...", None, status).success(
+                make, [picture], made, **_ALONE
+            ).success(None, js=_SHOW)
+        correction.expand(edit, picture, editor, **_ALONE)
         start.click(make, [picture, editor], made, **_ALONE)
     for block in blocks.blocks.values():
         if isinstance(block, gr.components.Component):
             block.async_move_resource_to_block_cache = partial(_keep, block.async_move_resource_to_block_cache)
     return blocks.queue(max_size=WAITING)
+
+
+def _thumbnail(category: str, root: Path) -> str:
+    """A small picture of a generated object, for the button of its category."""
+    path = root / f"{category}.png"
+    save_png(path, example(category, 4).colors[::4, ::4])
+    return str(path)
 
 
 async def _keep(keep: Any, path: str | Path | None) -> str | None:

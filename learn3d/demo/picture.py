@@ -8,14 +8,17 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from PIL import Image
+from scipy.ndimage import binary_dilation, binary_erosion
 
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
-from learn3d.data.framing import TOLERANCE, check_mask, read_picture, threshold_mask
+from learn3d.data.framing import TOLERANCE, check_mask, read_picture
+from learn3d.fitting.cutting import find_mask
 from learn3d.make_data.shapes import make_shape
+from learn3d.make_data.writers.around import natural_look
 from learn3d.pictures.studio import photograph
 from learn3d.pictures.surfaces import CLAY, Surface
-from learn3d.reconstruction import Model, export_mesh, input_azimuth_deg, reconstruct
+from learn3d.reconstruction import Model, Reconstruction, export_mesh, reconstruct_picture
 
 SIDE = 512  # pixels of the square on which pictures lie; the networks see 64 to 224
 
@@ -35,39 +38,47 @@ def open_picture(path: Path, tolerance: float = TOLERANCE) -> Picture:
     Raises ValueError for a file that is no picture.
     """
     colors, alpha = read_picture(path, SIDE)
+    found = find_mask(colors, tolerance) if alpha is None else alpha
     height, width = colors.shape[:2]
     top, left = (SIDE - height) // 2, (SIDE - width) // 2
     around = (top, SIDE - height - top), (left, SIDE - width - left)
     padded = np.pad(colors, (*around, (0, 0)), mode="edge")  # the background goes on
+    mask = np.pad(found, around)
     if alpha is None:
-        return Picture(padded, threshold_mask(padded, tolerance), path.stem)
-    mask = np.pad(alpha, around)
+        return Picture(padded, mask, path.stem)
     padded[mask == 0] = 255
     return Picture(padded, mask, path.stem)
 
 
 def example(category: str, seed: int) -> Picture:
-    """A generated object of `make_data.shapes.CATEGORIES`, as Kato's camera sees it from some side."""
+    """A generated object of `make_data.shapes.CATEGORIES` in natural colours, seen half from the front."""
     rng = np.random.default_rng(seed)
     mesh = make_shape(category, rng)
-    vertices = torch.from_numpy(np.asarray(mesh.vertices @ mesh_to_object("y", "z").T, np.float32))
-    camera = nmr.LookAt.from_angles(DISTANCE, 30.0, [rng.uniform(0, 360)], half_fov_deg=HALF_FOV_DEG)
-    rgb, alpha = photograph(vertices, torch.tensor(mesh.faces), rng.uniform(0.3, 0.9, 3), camera, image_size=SIDE)
+    vertices = mesh.vertices @ mesh_to_object("y", "z").T
+    colors, lights = natural_look(vertices, mesh.faces, rng)
+    azimuth = rng.choice([-1, 1]) * rng.uniform(20, 70)
+    camera = nmr.LookAt.from_angles(DISTANCE, 22.0, [azimuth], half_fov_deg=HALF_FOV_DEG)
+    faces = torch.tensor(mesh.faces)
+    rgb, alpha = photograph(np.float32(vertices), faces, colors, camera, image_size=SIDE, lights=lights)
     return Picture(rgb[0], alpha[0], category, framed=True)
 
 
-def make_mesh(model: Model, picture: Picture) -> tuple[Surface, float]:
-    """The model's mesh of a picture and, in degrees, the azimuth from which it looks like the picture.
+def outline(picture: Picture) -> np.ndarray:
+    """The picture with a line around its object, uint8 [SIDE, SIDE, 3]: white, with a dark rim."""
+    inside = picture.mask > 127
+    shown = picture.colors.copy()
+    for width, color in ((5, (30, 30, 30)), (3, (255, 255, 255))):
+        shown[binary_dilation(inside, iterations=width) & ~binary_erosion(inside, iterations=width - 2)] = color
+    return shown
 
-    Raises ValueError if the mask cannot be right.
-    """
+
+def make_mesh(model: Model, picture: Picture) -> Reconstruction:
+    """What the model makes of a picture. Raises ValueError if the mask cannot be right."""
     try:
         check_mask(picture.mask)
-    except ValueError as error:
-        raise ValueError(f"{error} (correct it with the threshold or the brush)") from None
-    stored = model.prepare(picture.colors, picture.mask, crop=not picture.framed)
-    (surface,) = reconstruct(model.method, stored[None])
-    return surface, input_azimuth_deg(surface, stored[3])
+    except ValueError:
+        raise ValueError("no object was found in the picture; correct the outline with the brush") from None
+    return reconstruct_picture(model, picture.colors, picture.mask, crop=not picture.framed)
 
 
 def write_cutout(picture: Picture, folder: Path) -> Path:

@@ -14,14 +14,14 @@ KEY_LIGHT = (0.45, 0.8, -0.4)  # towards the light, object frame (x right, y up,
 BACK_LIGHT = 0.35  # share of the diffuse light that comes from the opposite side: shadow sides keep their relief
 
 
-def studio_lights(light: Sequence[float] = KEY_LIGHT, ambient: float = 0.5) -> nmr.Lights:
+def studio_lights(light: Sequence[float] = KEY_LIGHT, ambient: float = 0.5, smooth: bool = False) -> nmr.Lights:
     """A key light from `light` (any length but 0), a weaker one from behind, and a share `ambient` from everywhere.
 
-    A surface that faces the key light has the light 1.
+    A surface that faces the key light has the light 1. smooth: no facets are seen.
     """
     key, direction = 1.0 - ambient, torch.as_tensor(light, dtype=torch.float64)
     direction = direction / direction.norm()
-    return nmr.Lights(ambient, [key, BACK_LIGHT * key], torch.stack([direction, -direction]))
+    return nmr.Lights(ambient, [key, BACK_LIGHT * key], torch.stack([direction, -direction]), smooth=smooth)
 
 
 @torch.no_grad()

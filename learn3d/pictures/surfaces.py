@@ -89,11 +89,16 @@ def draw_surface(surface: Surface, cameras: Cameras, *, image_size: int) -> np.n
     """
     if len(surface.faces) == 0:
         return np.full((len(cameras), image_size, image_size, 3), 255, np.uint8)
-    colors = CLAY if surface.colors is None else surface.colors.detach()[surface.faces].mean(dim=1).numpy()
+    colored = surface.colors is not None  # by a picture, whose light is in the colours
+    colors = surface.colors.detach()[surface.faces].mean(dim=1).numpy() if colored else CLAY
     pictures = []
     for camera in cameras:  # one at a time: the fine images take memory
         light = torch.tensor(_LIGHT, dtype=torch.float64) @ camera.projection().matrix[0, :, :3]
-        fine = {"image_size": image_size, "supersample": 4, "lights": studio_lights(light, ambient=0.4)}
+        fine = {
+            "image_size": image_size,
+            "supersample": 4,
+            "lights": studio_lights(light, 0.85 if colored else 0.4, smooth=colored),
+        }
         pictures.append(photograph(surface.vertices, surface.faces, colors, camera, **fine)[0])
     return np.concatenate(pictures)
 

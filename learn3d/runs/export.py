@@ -7,29 +7,40 @@ from pathlib import Path
 
 import torch
 
+from learn3d.fitting.familiarity import known_codes
+from learn3d.methods import MeshMethod
+from learn3d.methods.many_views import ManyViewsSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
 
 SMALL_MODEL = Path(__file__).parents[1] / "models" / "small.safetensors"  # the one that comes with the package
+KNOWN_CODES = "known_codes"  # name of their tensor
 _TRAINING_ONLY = ("lambda_classification", "lambda_adversarial", "lambda_novel_view")  # weights of further networks
 
 
 def export(source: Path, target: Path, *, which: str = "last") -> int:
-    """Write encoder and generator of a run (or checkpoint file) at half precision; returns the size in bytes.
+    """Write the networks of a run or checkpoint file that turn images into meshes, at half precision.
 
-    The file is a checkpoint that `evaluate` and `reconstruct` take. Numbers are rounded to float16 (three digits);
-    folders of the run are left out. Raises ValueError for methods other than the pose-invariant ones and Plus.
+    Returns the size in bytes. The file is a checkpoint that `evaluate` and `reconstruct` take. Numbers are rounded to
+    float16 (three digits); folders of the run are left out. If the training data are still there, the file also says
+    which codes are known (`learn3d.fitting.familiarity`), so that reconstruction can warn of pictures of other things.
+    Raises ValueError for methods other than the pose-invariant ones, Plus and Many views.
     """
     method, config, metadata = checkpoint.load_method(source, which)
-    if not isinstance(config.settings, PoseInvariantSettings):
-        raise ValueError(f"only runs of proposed, vanilla and plus can be exported, this one is of {config.preset}")
-    names = {field.name for field in dataclasses.fields(config.settings)} & set(_TRAINING_ONLY)
-    settings = dataclasses.replace(config.settings, pretrained=None, **dict.fromkeys(names, 0.0))
+    trained_on, data = config, config.data
+    if not isinstance(config.settings, (PoseInvariantSettings, ManyViewsSettings)):
+        names = "proposed, vanilla, plus and many-views"
+        raise ValueError(f"only runs of {names} can be exported, this one is of {config.preset}")
+    names = {field.name for field in dataclasses.fields(config.settings)}
+    unused = {"pretrained": None, **dict.fromkeys(_TRAINING_ONLY, 0.0)}
+    settings = dataclasses.replace(config.settings, **{name: unused[name] for name in names & unused.keys()})
     config = dataclasses.replace(config, settings=settings, data=Path("data"), output=Path("run"))
     tensors = {
         name: tensor.half() if tensor.dtype == torch.float32 else tensor
         for name, tensor in checkpoint.network_tensors(method).items()
-        if name.startswith(("network.encoder.", "network.generator."))
+        if name.startswith(("network.encoder.", "network.generator.", "network.view_classifier."))
     }
+    if isinstance(method, MeshMethod) and data.is_dir():
+        tensors[KNOWN_CODES] = known_codes(method, checkpoint.load_data(trained_on, "train")).half()
     checkpoint.save(target, tensors, dataclasses.replace(metadata, config=config))
     return target.stat().st_size

@@ -21,7 +21,7 @@ FLOORS = (
     {"evaluation"},
     {"make_data", "runs"},
     {"config"},
-    {"presets"},
+    {"presets", "fitting"},
     {"methods"},
     {"networks", "losses"},
     {"distributed", "pictures"},

@@ -13,6 +13,7 @@ from PIL import Image
 import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.crops import Crops
+from learn3d.data.framing import threshold_mask
 from learn3d.pictures.surfaces import Surface
 from learn3d.reconstruction import _read, export_mesh, prepare_image, reconstruct_dataset, reconstruct_files
 
@@ -53,8 +54,8 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
     assert len(trimesh.load(written[0], force="mesh").faces) > 100
     Image.fromarray(np.full((40, 40, 3), 9, np.uint8)).save(tmp_path / "plain.png")
     with pytest.raises(ValueError, match=r"plain.png: its mask is empty.* or give --masks"):
-        _read(tmp_path / "plain.png", None, True)
-    mask = _read(tmp_path / "box.png", None, True)[1]
+        _read(tmp_path / "plain.png", None, threshold_mask)
+    mask = _read(tmp_path / "box.png", None, threshold_mask)[1]
     assert mask[30:90, 50:110].all() and mask.sum() == 255 * 60 * 60
 
 
@@ -132,7 +133,7 @@ def test_pictures_are_turned_upright(tmp_path, turned: str) -> None:
             exif[0x0112] = 6  # stored lying on its left side: a viewer turns it by 90 degrees clockwise
             pixels = np.rot90(pixels)
         Image.fromarray(np.ascontiguousarray(pixels)).save(tmp_path / f"{name}.png", exif=exif)
-    read, read_mask = _read(tmp_path / "image.png", tmp_path / "mask.png", False)
+    read, read_mask = _read(tmp_path / "image.png", tmp_path / "mask.png", None)
     assert np.array_equal(read, colors)
     assert np.array_equal(read_mask, mask)
 
@@ -144,8 +145,8 @@ def test_read_image_with_transparency_or_mask(tmp_path) -> None:
     Image.fromarray(rgba[..., :3]).save(tmp_path / "b.png")
     Image.fromarray(rgba[..., 3]).save(tmp_path / "mask.png")
     for colors, mask in (
-        _read(tmp_path / "a.png", None, False),
-        _read(tmp_path / "b.png", tmp_path / "mask.png", False),
+        _read(tmp_path / "a.png", None, None),
+        _read(tmp_path / "b.png", tmp_path / "mask.png", None),
     ):
         assert np.array_equal(colors, rgba[..., :3])
         assert np.array_equal(mask, rgba[..., 3])
@@ -160,7 +161,7 @@ def test_read_image_with_transparency_or_mask(tmp_path) -> None:
         (("text.png",), r"text.png.* image"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=message):
-            _read(*(tmp_path / name for name in arguments), *[None] * (2 - len(arguments)), False)
+            _read(*(tmp_path / name for name in arguments), *[None] * (3 - len(arguments)))
 
 
 @pytest.mark.parametrize("kind", ["obj", "glb", "ply"])
@@ -206,7 +207,7 @@ def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_p
     (tmp_path / "in").mkdir()
     Image.fromarray(rgba).save(tmp_path / "photo.png")
     Image.fromarray(rgba).save(tmp_path / "in" / "photo.png")
-    files = reconstruct_files(finished_run, tmp_path / "b", [tmp_path / "photo.png"], crop=False)
+    files = reconstruct_files(finished_run, tmp_path / "b", [tmp_path / "photo.png"], crop=False, refined=False)
     meshes = [trimesh.load(path[0], force="mesh") for path in (files, paths)]
     assert np.array_equal(*(mesh.vertices for mesh in meshes)) and np.array_equal(*(mesh.faces for mesh in meshes))
     twins = [tmp_path / "photo.png", tmp_path / "in" / "photo.png"]

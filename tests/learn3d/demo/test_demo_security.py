@@ -77,13 +77,13 @@ def test_a_request_is_bounded(client) -> None:
 def test_nothing_is_fetched_from_elsewhere(client) -> None:
     assert client.get("gradio_api/file=http://example.com/a.png").status_code == 403
     given = {"path": "https://example.com/a.png", "meta": {"_type": "gradio.FileData"}}
-    success, said = call(client, event(client, "open_upload"), [given, 0.2], uuid.uuid4().hex)
+    success, said = call(client, event(client, "clear"), [given], uuid.uuid4().hex)
     assert not success and "nothing is fetched from elsewhere" in said
 
 
 def test_words_of_a_visitor_reach_the_terminal_written_out(client, server) -> None:
     given = {"path": "/etc/\x1b]0;title\x07", "meta": {"_type": "gradio.FileData"}}
-    success, _ = call(client, event(client, "open_upload"), [given, 0.2], uuid.uuid4().hex)
+    success, _ = call(client, event(client, "clear"), [given], uuid.uuid4().hex)
     assert not success
     errors = (server[0].folder / "errors.txt").read_text()
     assert "Traceback" in errors and r"\x1b]0;title\x07" in errors, "an unexpected error is not hidden"
@@ -95,9 +95,9 @@ def test_thirty_visitors_at_once_all_get_their_mesh(client, tmp_path) -> None:
     colors[16:48, 16:48] = (40, 60, 120)
     Image.fromarray(colors).save(tmp_path / "box.png")
     (path,) = upload(client, "box.png", (tmp_path / "box.png").read_bytes()).json()
-    given = [{"path": path, "meta": {"_type": "gradio.FileData"}}, 0.2]
+    given = [{"path": path, "meta": {"_type": "gradio.FileData"}}]
     sessions = [uuid.uuid4().hex for _ in range(30)]
     with ThreadPoolExecutor(30) as visitors:
-        for name, data in (("open_upload", given), ("make", [None])):
+        for name, data in (("clear", given), ("open_upload", [None, 0.2]), ("make", [None])):
             found = list(visitors.map(partial(call, client, event(client, name), data), sessions))
             assert [said for success, said in found if not success] == []

@@ -44,13 +44,13 @@ def test_no_path_of_the_maker_is_in_the_file(finished_run, tmp_path, monkeypatch
 
 def test_other_methods_are_refused(tiny_config, run_folder, tmp_path) -> None:
     train(tiny_config(run_folder, preset="kato2018-kato", encoder="conv-small", iterations=1))
-    with pytest.raises(ValueError, match="proposed, vanilla and plus"):
+    with pytest.raises(ValueError, match="proposed, vanilla, plus and many-views"):
         export(run_folder, tmp_path / "small.safetensors")
 
 
-@pytest.mark.parametrize(("category", "iou"), [("airplane", 0.35), ("car", 0.6), ("sofa", 0.35)])
+@pytest.mark.parametrize(("category", "iou"), [("airplane", 0.5), ("car", 0.75), ("sofa", 0.55)])
 def test_the_small_model_of_the_package_knows_generated_objects(category: str, iou: float, tmp_path) -> None:
-    assert SMALL_MODEL.stat().st_size < 8e6
+    assert SMALL_MODEL.stat().st_size < 10e6
     make_dataset(DatasetConfig(tmp_path, category, procedural=8, test=6, val=1, seed=99))
     method, *_ = checkpoint.load_method(SMALL_MODEL)
     assert evaluate(method, load_dataset("kato", tmp_path, category, "test")).voxel_iou > iou

@@ -1,0 +1,87 @@
+"""Colours for a mesh from the picture that it was fitted to: what the picture shows sharp, what is guessed blurred."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.sparse import diags_array
+from scipy.sparse.linalg import spsolve
+from torch import Tensor
+
+import nmr
+from learn3d.fitting.fit import View
+from learn3d.fitting.smoothing import joined, smooth
+from learn3d.pictures.surfaces import Surface
+
+SUBDIVISIONS = 2  # levels: the surface is smooth and has a colour every few pixels
+DEPTH_SIZE = 256  # side of the depth map that says which vertices are seen
+BEHIND = 0.02  # distance behind the depth map at which a vertex is hidden, in units of the object frame
+GRAZING = 0.25  # cosine between surface and line of sight below which a colour is not taken
+BORDER = 2  # pixels inside the outline whose colours may be the background's
+
+
+def color_mesh(
+    vertices: Tensor, faces: Tensor, view: View, colors: np.ndarray, mask: np.ndarray, mirror: Tensor | None = None
+) -> Surface:
+    """A smooth surface with the colours of the picture that a view shows.
+
+    vertices float32 [V, 3] in the object frame, faces int64 [F, 3]; view: one view, of a picture uint8 [S, S, 3] with
+    its mask uint8 [S, S], framed as `fitting` says; mirror: float32 [3, 3], the reflection that takes the shape to
+    itself, None if there is none. The side that is not seen has the colours of its mirror image and, where that is not
+    seen either, those around it, blurred.
+    """
+    points, triangles = smooth(vertices, faces, SUBDIVISIONS)
+    normals = nmr.vertex_normals(points, triangles)
+    picture = _Picture(points, triangles, view, colors, mask)
+    seen, weight = picture.look_up(points, normals)
+    if mirror is not None:
+        other, its_weight = picture.look_up(points @ mirror.T, normals @ mirror.T)
+        its_weight = (1 - weight) * its_weight  # own colours first
+        seen = weight[:, None] * seen + its_weight[:, None] * other
+        weight = weight + its_weight
+        seen = seen / weight.clamp(min=1e-6)[:, None]
+    return Surface(points, triangles, _spread(seen, weight, triangles))
+
+
+class _Picture:
+    """A picture with the depth of the surface that it shows."""
+
+    def __init__(self, vertices: Tensor, faces: Tensor, view: View, colors: np.ndarray, mask: np.ndarray) -> None:
+        self.view, self.camera = view, view.cameras()
+        placed = view.place(vertices[None])
+        self.depth = nmr.render_depth(placed, faces, self.camera, image_size=DEPTH_SIZE, anti_aliasing=False)[None]
+        self.pixels = torch.from_numpy(colors.astype(np.float32) / 255).permute(2, 0, 1)[None]
+        inside = torch.from_numpy((mask > 127).astype(np.float32))[None, None]
+        self.trusted = 1 - F.max_pool2d(1 - inside, 2 * BORDER + 1, 1, BORDER)
+
+    def look_up(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours [N, 3] in [0, 1] at points of the surface, and how far they are to be trusted, [N] in [0, 1]."""
+        placed = self.view.place(points[None])
+        x, y, z = self.camera.transform(placed)[0].unbind(1)
+        grid = torch.stack([x, -y], 1)[None, None]
+        depth, trusted = (_sample(image, grid)[0, 0, 0] for image in (self.depth, self.trusted))
+        to_eye = F.normalize(self.camera.eye[0].float() - placed[0], dim=1)
+        slant = (((normals * to_eye).sum(1) - GRAZING) / (0.6 - GRAZING)).clamp(0, 1)
+        visible = (z < depth + BEHIND) & (x.abs() < 1) & (y.abs() < 1)
+        return _sample(self.pixels, grid)[0, :, 0].T, visible * slant * trusted
+
+
+def _sample(image: Tensor, grid: Tensor) -> Tensor:
+    return F.grid_sample(image, grid, padding_mode="border", align_corners=False)
+
+
+def _spread(colors: Tensor, weight: Tensor, faces: Tensor) -> Tensor:
+    """Colours [V, 3] for all vertices: as given where the weight [V] is 1, and from there on as even as can be.
+
+    The minimum of sum_v w_v |c_v - given_v|^2 + e sum_edges |c_a - c_b|^2.
+    """
+    count = len(colors)
+    neighbours = joined(faces.numpy(), count)
+    laplacian = diags_array(neighbours.sum(1)) - neighbours
+    given = weight.double().numpy() ** 2
+    if not given.any():
+        given = np.full(count, 1e-3)
+    system = (diags_array(given + 1e-9) + 0.01 * laplacian).tocsc()
+    right = given[:, None] * colors.double().numpy()
+    return torch.from_numpy(np.asarray(spsolve(system, right))).float().clamp(0, 1)

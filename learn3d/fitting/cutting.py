@@ -1,0 +1,82 @@
+"""Masks of photographs that have none: by the colour of a plain background, or by GrabCut within a box (OpenCV)."""
+
+from __future__ import annotations
+
+import importlib.util
+from types import ModuleType
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from learn3d.data.framing import TOLERANCE, threshold_mask
+
+SIDE = 384  # longer side of the picture that GrabCut works on
+INSET = 0.03  # of each side: without a box the object is taken to lie within the rest
+PLAIN = 0.9  # share of the border that has one colour if the background is plain
+_ROUNDS = 5
+
+Box = tuple[int, int, int, int]  # x and y of the left upper corner, width, height, in pixels
+
+
+def find_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+    """The mask uint8 [H, W], 0 or 255, of the object in a photograph uint8 [H, W, 3]: a first guess.
+
+    Before a plain background it is all that differs from its colour by `tolerance`, else what GrabCut finds in the
+    middle; without OpenCV the first, too.
+    """
+    if is_plain(colors, tolerance) or importlib.util.find_spec("cv2") is None:
+        return threshold_mask(colors, tolerance)
+    return cut_out(colors)
+
+
+def is_plain(colors: np.ndarray, tolerance: float = TOLERANCE) -> bool:
+    """Whether the border of a picture uint8 [H, W, 3] has one colour, but for a tenth."""
+    border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]]).astype(np.float64)
+    difference = np.abs(border - np.median(border, axis=0)).max(axis=1)
+    return bool((difference < 255 * tolerance).mean() > PLAIN)
+
+
+def cut_out(colors: np.ndarray, box: Box | None = None) -> np.ndarray:
+    """GrabCut (Rother et al. 2004): the mask uint8 [H, W], 0 or 255, of the object within a box of a photograph.
+
+    colors: uint8 [H, W, 3]. What lies outside of the box is background, and teaches its colours. Without a box it is
+    the picture without a narrow border. Only the largest region is kept, without its holes. Raises ValueError
+    without OpenCV and for a box that does not lie in the picture or has no room around it.
+    """
+    cv2 = _opencv()
+    height, width = colors.shape[:2]
+    scale = min(1.0, SIDE / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = np.asarray(Image.fromarray(colors).resize(size, Image.Resampling.BOX))
+    x, y, w, h = (
+        (INSET * width, INSET * height, (1 - 2 * INSET) * width, (1 - 2 * INSET) * height) if box is None else box
+    )
+    if w < 2 or h < 2 or x < 0 or y < 0 or x + w > width or y + h > height:
+        raise ValueError(f"the box {box} (x, y, width, height) must lie within the {width}x{height} pixels")
+    labels = np.full(small.shape[:2], cv2.GC_BGD, np.uint8)
+    rows, columns = slice(round(y * scale), round((y + h) * scale)), slice(round(x * scale), round((x + w) * scale))
+    labels[rows, columns] = cv2.GC_PR_FGD
+    if not (labels == cv2.GC_BGD).any():
+        raise ValueError("the box covers the whole picture; leave some background around the object")
+    if (labels == cv2.GC_PR_FGD).any():
+        cv2.setRNGSeed(0)
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), labels, None, *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
+    regions, count = ndimage.label((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
+    if count == 0:
+        return np.zeros((height, width), np.uint8)
+    largest = ndimage.binary_fill_holes(regions == 1 + np.bincount(regions.ravel())[1:].argmax())
+    mask = Image.fromarray(255 * largest.astype(np.uint8)).resize((width, height), Image.Resampling.BILINEAR)
+    return 255 * (np.asarray(mask) > 127).astype(np.uint8)
+
+
+def _opencv() -> ModuleType:
+    try:
+        import cv2
+    except ImportError:
+        raise ValueError(
+            "photographs are cut out with OpenCV, which is not installed: pip install 'nmr-learn3d[photos]', or give "
+            "a picture with transparency or a mask"
+        ) from None
+    return cv2

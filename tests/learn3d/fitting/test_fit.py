@@ -1,0 +1,163 @@
+"""Pictures without a camera: the camera, the shape and the colours that are fitted to them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import nmr
+from learn3d.data.dataset import DatasetInfo
+from learn3d.data.layouts import load_dataset
+from learn3d.fitting.coloring import color_mesh
+from learn3d.fitting.familiarity import MOST, distance
+from learn3d.fitting.fit import AZIMUTHS, SHARE, View, fit, frame_view
+from learn3d.fitting.smoothing import smooth
+from learn3d.methods import create_method
+from learn3d.methods.method import MeshMethod
+from learn3d.networks.encoders import centre
+from learn3d.pictures.studio import photograph
+from learn3d.presets import PRESETS
+from learn3d.reconstruction import Reconstruction, doubt, load_model, reconstruct_picture
+from learn3d.runs.export import export
+
+
+def arrow() -> tuple[torch.Tensor, torch.Tensor]:
+    """A sphere drawn out to a point at x < 0 and bent up at x > 0; its own mirror image at z = 0."""
+    vertices, faces = (part.clone() for part in nmr.icosphere(3))
+    vertices = vertices.float() * torch.tensor([0.3, 0.12, 0.25])
+    vertices[:, 0] -= 0.25 * (-vertices[:, 0] / 0.3).clamp(min=0) ** 4
+    vertices[:, 1] += 0.35 * (vertices[:, 0] / 0.3).clamp(min=0) ** 4
+    return vertices, faces
+
+
+@pytest.fixture(scope="module")
+def method() -> MeshMethod:
+    """A method that predicts the arrow, made longer by its code."""
+    settings = dataclasses.replace(PRESETS["many-views-around"].settings, symmetry="z")
+    method = create_method(settings, DatasetInfo(24, inverted=True), device="cpu", precision="fp32", seed=0)
+    vertices, _ = arrow()
+    base, stretch = vertices[None], torch.tensor([1.0, 0.0, 0.0])
+    method.encode = lambda images: torch.ones(len(images), 4)
+    generator = method.generator
+    generator.forward = lambda codes: base * (1 + 0.5 * (codes[:, :1, None] - 1) * stretch)
+    return method
+
+
+def framed_mask(vertices: torch.Tensor, faces: torch.Tensor, azimuth: float, elevation: float) -> torch.Tensor:
+    cameras = nmr.LookAt.from_angles(3.5, [elevation], [azimuth], half_fov_deg=12.0)
+    return centre(nmr.render_silhouette(vertices, faces, cameras, image_size=128)[:, None].float())[:, :, ::2, ::2][
+        0, 0
+    ]
+
+
+def test_views_are_framed() -> None:
+    vertices, _ = arrow()
+    azimuth, elevation = torch.tensor([0.0, 50.0, -120.0]), torch.tensor([0.0, 30.0, 60.0])
+    many = (vertices + torch.tensor([0.1, -0.2, 0.05])).expand(3, -1, -1)
+    view = frame_view(many, azimuth, elevation)
+    seen = view.cameras().transform(view.place(many))[..., :2]
+    low, high = seen.amin(1), seen.amax(1)
+    assert torch.allclose((low + high) / 2, torch.zeros(3, 2), atol=1e-3)
+    assert torch.allclose((high - low).amax(1), torch.full((3,), 2 * SHARE), atol=2e-3)
+    axes = view.axes()
+    assert torch.allclose(axes @ axes.transpose(1, 2), torch.eye(3).expand(3, 3, 3), atol=1e-6)
+    eyes = torch.nn.functional.normalize(view.cameras().eye.float(), dim=1)
+    assert torch.allclose(axes[:, 2], -eyes, atol=1e-5)
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(35.0, 20.0), (-100.0, 5.0), (110.0, 40.0)])
+def test_the_camera_is_found(method: MeshMethod, azimuth: float, elevation: float) -> None:
+    mask = framed_mask(*arrow(), azimuth, elevation)
+    found = fit(method, torch.zeros(4, 64, 64, dtype=torch.uint8), mask, shape=False)
+    assert found.iou > 0.88
+    apart = (float(found.view.azimuth_deg) - azimuth + 180) % 360 - 180
+    assert abs(apart) < 12 and abs(float(found.view.elevation_deg) - elevation) < 12
+
+
+def test_probabilities_decide_between_views_with_one_outline(method: MeshMethod) -> None:
+    mask = framed_mask(*arrow(), 0.0, 0.0)  # from 0 and from 180 degrees outlines are mirror images
+    mask = torch.maximum(mask, mask.flip(1))
+    for azimuth in (7.5, 172.5):
+        probabilities = torch.full((AZIMUTHS,), 1e-3)
+        probabilities[int((azimuth + 180) // 15)] = 1.0
+        image = torch.zeros(4, 64, 64, dtype=torch.uint8)
+        found = fit(method, image, mask, shape=False, view_probabilities=probabilities)
+        assert abs(float(found.view.azimuth_deg) - azimuth) < 25
+
+
+def test_the_shape_comes_closer_to_the_outline_and_stays_symmetric(method: MeshMethod) -> None:
+    vertices, faces = arrow()
+    longer = vertices * torch.tensor([1.4, 1.0, 1.0]) + 0.04 * torch.tensor([0.0, 1.0, 0.0]) * (vertices[:, :1] > 0.2)
+    mask, said = framed_mask(longer, faces, 20.0, 15.0), []
+    image = torch.zeros(4, 64, 64, dtype=torch.uint8)
+    found = fit(method, image, mask, progress=lambda text, part: said.append((text, part)))
+    assert found.predicted_iou < found.code_iou < found.iou and found.iou > 0.91
+    assert torch.allclose(method.generator.symmetrized(found.vertices[None])[0], found.vertices, atol=1e-5)
+    assert [part for _, part in said] == sorted(part for _, part in said) and said[-1][1] == 1.0
+
+
+def test_edges_are_rounded_and_flat_parts_stay() -> None:
+    box = trimesh.creation.box((1.0, 0.6, 0.4))
+    coarse = [torch.from_numpy(np.array(part)) for part in trimesh.remesh.subdivide(box.vertices, box.faces)]
+    fine, triangles = smooth(coarse[0].float(), coarse[1], 2)
+    assert len(triangles) == 16 * len(coarse[1]) and triangles.max() == len(fine) - 1
+    mesh = trimesh.Trimesh(fine.numpy(), triangles.numpy(), process=False)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(box.volume, rel=0.03)
+    top = fine[(fine[:, :2].abs() < 0.15).all(1) & (fine[:, 2] > 0)]
+    assert len(top) > 5 and torch.allclose(top[:, 2], torch.tensor(0.2), atol=1e-3)
+    corner = fine[(fine - torch.tensor([0.5, 0.3, 0.2])).norm(dim=1).argmin()]
+    assert 0.005 < float((corner - torch.tensor([0.5, 0.3, 0.2])).norm()) < 0.1
+
+
+def test_colours_of_the_seen_side_are_the_pictures_and_the_others_those_of_the_mirror_image() -> None:
+    vertices, faces = arrow()
+    centres = vertices[faces].mean(1)
+    paint = np.where(centres[:, 1:2] > 0, [[0.9, 0.1, 0.1]], [[0.1, 0.1, 0.9]])  # red above, blue below
+    view = frame_view(vertices[None], torch.tensor([20.0]), torch.tensor([10.0]))
+    lights = nmr.Lights(1.0, 0.0)
+    rgb, alpha = photograph(view.place(vertices[None])[0], faces, paint, view.cameras(), image_size=256, lights=lights)
+    reflection = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+    surface = color_mesh(vertices, faces, view, rgb[0], alpha[0], reflection)
+    _, y, z = surface.vertices.T
+    for side in (z < -0.1, z > 0.1):  # the camera stands at z < 0
+        for part, wanted in ((y > 0.05, [0.9, 0.1, 0.1]), (y < -0.05, [0.1, 0.1, 0.9])):
+            found = surface.colors[side & part].mean(0)
+            assert torch.allclose(found, torch.tensor(wanted), atol=0.12), (found, wanted)
+    alone = color_mesh(vertices, faces, view, rgb[0], alpha[0])
+    assert torch.isfinite(alone.colors).all() and alone.colors.min() >= 0 and alone.colors.max() <= 1
+
+
+def test_a_picture_without_a_seen_vertex_still_has_colours() -> None:
+    vertices, faces = arrow()
+    view = View(torch.zeros(1), torch.zeros(1), torch.tensor([3.0]), torch.zeros(1, 2))
+    surface = color_mesh(vertices, faces, view, np.full((64, 64, 3), 99, np.uint8), np.zeros((64, 64), np.uint8))
+    assert surface.colors.isfinite().all()
+
+
+def test_a_picture_is_reconstructed_with_and_without_the_fit(finished_run) -> None:
+    model, size = load_model(finished_run), 128
+    rows, columns = np.ogrid[:size, :size]
+    mask = (255 * (((rows - 60) / 20) ** 2 + ((columns - 64) / 50) ** 2 < 1)).astype(np.uint8)
+    colors = np.full((size, size, 3), (200, 120, 40), np.uint8)
+    fitted, plain = (reconstruct_picture(model, colors, mask, refined=refined) for refined in (True, False))
+    assert isinstance(fitted, Reconstruction) and fitted.silhouette_iou > 0.6
+    assert torch.allclose(fitted.surface.colors.mean(0), torch.tensor([200, 120, 40]) / 255, atol=0.03)
+    assert plain.surface.colors is None and plain.silhouette_iou is None and plain.warning is None
+
+
+def test_unknown_things_are_warned_of(finished_run, tiny_folder, tmp_path) -> None:
+    assert load_model(finished_run).known_codes is None
+    export(finished_run, tmp_path / "small.safetensors")
+    model = load_model(tmp_path / "small.safetensors")
+    images = load_dataset("kato", tiny_folder, "airplane", "train").batch(torch.arange(20)).images
+    codes = model.method.encode(images)
+    near = [distance(code, model.known_codes) for code in codes]
+    far = [distance(code, model.known_codes) for code in -codes]
+    assert max(near) < min(far) and min(far) > MOST
+    assert doubt(model, images[0]) is None
+    other = model._replace(known_codes=-model.known_codes)
+    assert doubt(other, images[0]).startswith("this looks like nothing that the model was trained on (airplane)")
