@@ -40,18 +40,18 @@ def server() -> Iterator[RunServer]:
 def killed_config(tiny_folder, tmp_path_factory) -> TrainConfig:
     """10 steps with everything in them: 5 validations, 4 checkpoints, 3 pictures.
 
-    The best networks are those of step 8: a run that forgets them when it is resumed at step 9 takes those of step 10.
+    The best networks are those of step 6: a run that forgets them when it is resumed at step 9 takes those of step 10.
     """
     folder = tmp_path_factory.mktemp("killed")
     for path in tiny_folder.iterdir():  # not compressed: the tests read them a hundred times
         with np.load(path) as archive:
             np.savez(folder / path.name, archive["arr_0"])
-    small = {"encoder": "conv-small", "generator": "sphere-small", "learning_rate": 1e-2}
+    small = {"encoder": "conv-small", "generator": "sphere", "learning_rate": 1e-2}
     settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **small)
     often = {"log_every": 1, "validate_every": 2, "checkpoint_every": 3, "pictures_every": 4}
     fixed = {"batch_size": 2, "precision": "fp32", "threads": 1, "max_val_images": 4}
     where = {"data": folder, "category": "airplane", "output": folder / "uninterrupted", "preset": "peng2020-kato"}
-    return TrainConfig(**where, settings=settings, iterations=10, seed=3, **fixed, **often)
+    return TrainConfig(**where, settings=settings, iterations=10, seed=4, **fixed, **often)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def uninterrupted(server, killed_config) -> tuple[Path, float, int]:
     started = time.monotonic()
     answer = server(killed_config)
     assert answer["status"] == 0, killed_config.output.with_suffix(".log").read_text()
-    assert checkpoint.load_metadata(killed_config.output / "best.safetensors").progress.step == 8, "see `killed_config`"
+    assert checkpoint.load_metadata(killed_config.output / "best.safetensors").progress.step < 9, "see `killed_config`"
     return killed_config.output, time.monotonic() - started, answer["done"]
 
 
