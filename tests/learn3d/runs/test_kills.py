@@ -136,7 +136,7 @@ def test_the_command_killed_at_any_time(killed_config, tmp_path, monkeypatch) ->
     names = ("iterations", "seed", "batch_size", "precision", "threads", "max_val_images")
     names += ("log_every", "validate_every", "checkpoint_every", "pictures_every")
     options = [f"--{name.replace('_', '-')}={getattr(killed_config, name)}" for name in names]
-    options += ["--encoder=conv-small", "--generator=sphere-small", "--learning-rate=1e-2"]
+    options += ["--encoder=conv-small", "--generator=sphere", "--learning-rate=1e-2"]
     options += [f"--data={killed_config.data}", "--category=airplane", "--preset=peng2020-kato"]
     run = tmp_path / "run"
     script = [sys.executable, str(Path(__file__).parents[3] / "tools" / "train.py"), f"--output={run}"]
