@@ -41,6 +41,7 @@ MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 
 STRIP_SIZE = 192  # pixels
 _FINE = 4  # pixels, per side, that are averaged to one of a prepared image, or more
+_LARGE = 1024  # pixels a side in which an object before a plain background is searched for
 _COLORED = 256  # pixels a side of the picture from which colours are taken
 _LEAST_SHARE = 0.05  # smallest share of the square's side that an object can take
 
@@ -141,7 +142,8 @@ def _read(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours uint8 [H,W,3] and a mask uint8 [H,W] that can be right: the file's, or the one that `find` finds."""
     searched = find is not None and mask_path is None
-    colors, mask = read_picture(path, limits.IMAGE_SIDE) if searched else read_photo(path, mask_path)
+    side = _LARGE if find is threshold_mask else limits.IMAGE_SIDE  # a box counts the file's own pixels
+    colors, mask = read_picture(path, side) if searched else read_photo(path, mask_path)
     if mask is None:
         mask = find(colors)
     try:
