@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, SkipValidation
 
 from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import LAYOUTS, Layout, check_options
-from learn3d.data.sampling import GROUP_SIZE, Sampling
+from learn3d.data.sampling import VIEWS_OF_OBJECT, Sampling
 from learn3d.files import limits
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.methods import LRSchedule, MethodSettings, TrainingSchedule
@@ -104,7 +104,7 @@ class TrainConfig:
             raise ValueError(
                 f"augment 'flip' changes the view class, but {self.preset!r} learns with the class of the original"
             )
-        size = {"pairs": 2, "groups": GROUP_SIZE}.get(self.sampling, 1)
+        size = VIEWS_OF_OBJECT[self.sampling]
         if self.batch_size % size:
             raise ValueError(
                 f"with sampling {self.sampling!r} batch_size must be a multiple of {size}, got {self.batch_size}"

@@ -1,4 +1,4 @@
-"""Losses on shape codes, pose logits and silhouettes, and the MMD between sets of codes, all in float32.
+"""Losses on shape codes, pose logits, silhouettes and depth, and the MMD between sets of codes, all in float32.
 
 The losses of IoU and smoothness are in nmr.losses.
 """
@@ -33,6 +33,15 @@ def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -
     else:
         difference = F.softmax(logits.float(), dim=1) - 1 / views
     return difference.square().sum(dim=1).mean()
+
+
+def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
+    """Mean distance between depth maps [B, S, S] where both show a surface; nmr's `far`, 100, and a target of 0 do not.
+
+    Differentiable in depth.
+    """
+    both = (target > 0) & (depth.detach() < 2 * target)
+    return ((depth - target).abs() * both).sum() / both.sum().clamp(min=1)
 
 
 def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tensor:

@@ -64,8 +64,8 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     """The model of a run folder or checkpoint file; None: the small one that comes with the package."""
     path = checkpoint.find(run or SMALL_MODEL, which)
     method, config, metadata = checkpoint.load_method(path)
-    known = checkpoint.load(path)[0].get(KNOWN_CODES)
-    return Model(method, config, metadata.progress.object_share or OBJECT_SHARE, known)
+    known_codes = checkpoint.load(path)[0].get(KNOWN_CODES)
+    return Model(method, config, metadata.progress.object_share or OBJECT_SHARE, known_codes)
 
 
 def reconstruct_files(
@@ -126,7 +126,7 @@ def reconstruct_dataset(
     """
     require_folder(data)
     model = load_model(run, which)
-    dataset = checkpoint.load_data(model.config, split, data=data, category=category or model.config.category)
+    dataset = checkpoint.load_data(model.config, split, data=data, category=category)
     batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
     if refined and batch.poses is None:
         raise ValueError(f"{dataset.category} has no poses, and shapes are fitted to masks of known pose")
@@ -144,7 +144,7 @@ def _read(
     searched = find is not None and mask_path is None
     side = _LARGE if find is threshold_mask else limits.IMAGE_SIDE  # a box counts the file's own pixels
     colors, mask = read_picture(path, side) if searched else read_photo(path, mask_path)
-    if mask is None:
+    if searched and (mask is None or find is not threshold_mask):  # a box is to be cut out, transparent or not
         mask = find(colors)
     try:
         check_mask(mask, cropped=not searched)
@@ -226,25 +226,31 @@ def reconstruct_picture(
         (surface,) = reconstruct(method, stored[None])
         return Reconstruction(surface, stored, input_azimuth_deg(surface, stored[3]), None, None)
     image = torch.from_numpy(stored)
-    fine = prepare_image(colors, mask, object_share=SHARE, size=_COLORED, layout="kar")
+    fine = prepare_image(colors, mask, object_share=SHARE, size=_COLORED, layout="kar")  # colours as they are
     small = nn.functional.interpolate(
         torch.from_numpy(fine[None, 3:]).float() / 255, (MASK_SIZE, MASK_SIZE), mode="area"
     )
-    views = isinstance(method, ManyViews) and model.config.layout == "around"
-    probabilities = method.view_probabilities(image[None])[0] if views else None
-    fitted = fit(method, image, small[0, 0], view_probabilities=probabilities, progress=progress)
+    fitted = fit(method, image, small[0, 0], view_probabilities=view_probabilities(model, image), progress=progress)
     surface = color_mesh(
         fitted.vertices, method.faces, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], method.generator.reflection
     )
     return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, doubt(model, image))
 
 
+def view_probabilities(model: Model, image: Tensor) -> Tensor | None:
+    """How probable each azimuth cell of `fit` is for a stored image uint8 [4, S, S]; None if that was not learnt."""
+    method, config = model.method, model.config
+    if not isinstance(method, ManyViews) or config.layout != "around" or config.view_bins is not None:
+        return None
+    return method.view_probabilities(image[None])
+
+
 def doubt(model: Model, image: Tensor) -> str | None:
     """A warning if a stored image uint8 [4, S, S] shows something that the model does not know."""
-    if (
-        model.known_codes is None
-        or distance(model.method.encode(image[None])[0].float().cpu(), model.known_codes) <= MOST
-    ):
+    if model.known_codes is None:
+        return None
+    (code,) = model.method.encode(image[None]).float().cpu()
+    if distance(code, model.known_codes) <= MOST:
         return None
     kinds = model.config.category.replace(",", ", ")
     return f"this looks like nothing that the model was trained on ({kinds}), so its shape is a guess"

@@ -11,7 +11,7 @@ from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
-from learn3d.data.sampling import batches
+from learn3d.data.sampling import VIEWS_OF_OBJECT, batches
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.methods import create_method
@@ -46,7 +46,7 @@ def train(
     with run_folder.lock_folder(folder) if group.is_main else contextlib.nullcontext():
         if group.is_main and not resume:
             run_folder.check_can_start(folder, overwrite)  # an older run is removed when all else is well
-        group = group.split_batch(config.batch_size, config.sampling)
+        group = group.split_batch(config.batch_size, VIEWS_OF_OBJECT[config.sampling])
         train_set, val_set = load_splits(config, progress=group.is_main)
         info = train_set.info(find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None)
         how = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}

@@ -23,6 +23,8 @@ class Evaluate(OnDataset):
 
     runs: Runs
     """Run folders, or checkpoint files."""
+    layout: str | None = None
+    """Arrangement of the files of the data set (default: that of the data which each run was trained on)."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Device on which the networks run."""
     json: Path | None = None
@@ -40,7 +42,8 @@ class Evaluate(OnDataset):
 
         if self.json is not None:
             check_target(self.json, "--json")
-        results = evaluate_runs(self.runs, device=self.device, report_progress=note, **self.source)
+        options = {"layout": self.layout, "device": self.device, **self.source}
+        results = evaluate_runs(self.runs, report_progress=note, **options)
         say(format_table(results))
         if self.json is not None:
             protocol = {"split": self.split, "checkpoint": self.which}
@@ -69,7 +72,8 @@ class Reconstruct(OnDataset):
     plain_background: bool = False
     """The background has one colour: the object is all that differs from the colour of the border."""
     box: tuple[int, int, int, int] | None = None
-    """X Y WIDTH HEIGHT in pixels of the one photograph that is given: the object is cut out of it (extra photos)."""
+    """Box around the object in the photograph, if it is a single one: X Y WIDTH HEIGHT in pixels, from the upper left.
+    The object is cut out of it (needs the extra photos)."""
     crop: bool = True
     """Centre and scale the object in each image as in the data set, or leave the images as they are."""
     data: Path | None = None
@@ -91,12 +95,7 @@ class Reconstruct(OnDataset):
             options = {"indices": self.indices, "refined": bool(self.refine), **self.source}
             paths = reconstruct_dataset(self.model, self.output, mesh_format=self.format, **options)
         else:
-            options = {
-                "crop": self.crop,
-                "plain_background": self.plain_background,
-                "box": self.box,
-                "which": self.which,
-            }
+            options = {name: getattr(self, name) for name in ("crop", "plain_background", "box", "which")}
             options["refined"] = self.refine is not False
             paths = reconstruct_files(
                 self.model, self.output, self.images, self.masks, mesh_format=self.format, **options

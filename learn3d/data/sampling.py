@@ -16,6 +16,8 @@ from learn3d.data.dataset import ViewDataset
 
 Sampling = Literal["views", "pairs", "groups", "classes"]
 GROUP_SIZE = 5  # views of an object in sampling "groups"
+#: Views of one object that stand in a batch, [a_1 .. a_n, b_1 .. b_n, ...]; 1 if views are drawn on their own.
+VIEWS_OF_OBJECT: dict[Sampling, int] = {"views": 1, "pairs": 2, "groups": GROUP_SIZE, "classes": 1}
 
 
 class BatchOptions(Protocol):

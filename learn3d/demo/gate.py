@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import socket
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
+from starlette.requests import ClientDisconnect
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -17,7 +19,8 @@ class Gate:
     """ASGI middleware that refuses requests for other names than this machine's, from other origins, and large ones.
 
     A stranger's name can lead a browser to this server (DNS rebinding), so the Host must be `host`, an address or a
-    name of this machine. `/file=http...` would fetch a file from elsewhere.
+    name of this machine. `/file=http...` would fetch a file from elsewhere. A visitor who leaves during an upload is
+    no error.
     """
 
     def __init__(self, app: ASGIApp, host: str) -> None:
@@ -26,7 +29,9 @@ class Gate:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan" or not (refusal := self._refusal(scope)):
-            return await self._app(scope, receive, send)
+            with contextlib.suppress(ClientDisconnect):
+                await self._app(scope, receive, send)
+            return
         await PlainTextResponse(*refusal)(scope, receive, send)
 
     def _refusal(self, scope: Scope) -> tuple[str, int] | None:

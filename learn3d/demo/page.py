@@ -40,6 +40,7 @@ KEPT = 3600  # seconds for which the files of a visitor are kept
 _MASK = (0, 200, 235)  # few objects have this colour
 _FRAMES, _FRAME_SIDE = 24, 300  # of the picture that turns
 _STRENGTH = 0.55  # opacity of the mask over the picture
+_PROGRESS = gr.Progress()
 #: On a phone the mesh lies below the picture.
 _SHOW = "() => { if (innerWidth < 700) document.querySelector('.mesh').scrollIntoView({behavior: 'smooth'}) }"
 _PICTURES = [".png", ".jpg", ".jpeg", ".webp", ".bmp"]
@@ -101,7 +102,7 @@ def page(models: dict[str, Model], root: Path) -> gr.Blocks:
     def empty(given: Picture | None) -> dict | None:
         return given and _show(given, np.zeros_like(given.mask))
 
-    def make(given: Picture | None, drawing: dict | None = None) -> list:
+    def make(given: Picture | None, drawing: dict | None = None, progress: gr.Progress = _PROGRESS) -> list:
         with _sentences():
             if given is None:
                 raise ValueError("Give a picture first, or take an example")
@@ -109,7 +110,7 @@ def page(models: dict[str, Model], root: Path) -> gr.Blocks:
                 given = given._replace(mask=255 * (np.max(drawing["layers"], axis=0) > 64).astype(np.uint8))
             files, meshes, words = [write_cutout(given, Path(tempfile.mkdtemp(dir=root)))], [], []
             for label, model in models.items():
-                made = make_mesh(model, given)
+                made = make_mesh(model, given, lambda text, part: progress(part, f"fitting: {text}"))
                 surface = made.surface
                 if not len(surface.faces):
                     raise ValueError("the model makes an empty shape of this picture; try another picture or model")
@@ -135,9 +136,10 @@ def page(models: dict[str, Model], root: Path) -> gr.Blocks:
 
     with gr.Blocks(title="learn3d demo", analytics_enabled=False, delete_cache=(KEPT // 10, KEPT)) as blocks:
         gr.Markdown("# Picture to mesh")
+        kinds = dict.fromkeys(kind.strip() for m in models.values() for kind in m.config.category.split(","))
         gr.Markdown(
-            "Drop a picture of one object: an airplane, a car, a chair, a lamp, a sofa or a table. The model was "
-            "trained on generated objects; sides that the picture does not show are guessed."
+            f"Drop a picture of one object of a kind that the model knows: {', '.join(kinds)}. "
+            "Sides that the picture does not show are guessed."
         )
         arrived, picture, meshes = gr.State(), gr.State(), []
         with gr.Row():
@@ -179,10 +181,10 @@ def page(models: dict[str, Model], root: Path) -> gr.Blocks:
         arrivals.append(uploaded.then(open_upload, [arrived, tolerance], shown, **_ALONE))
         for arrival in arrivals:
             arrival.success(lambda: "Making the mesh ...", None, status).success(
-                make, [picture], made, **_ALONE
+                make, [picture], made, show_progress_on=meshes, **_ALONE
             ).success(None, js=_SHOW)
         correction.expand(edit, picture, editor, **_ALONE)
-        start.click(make, [picture, editor], made, **_ALONE)
+        start.click(make, [picture, editor], made, show_progress_on=meshes, **_ALONE)
     for block in blocks.blocks.values():
         if isinstance(block, gr.components.Component):
             block.async_move_resource_to_block_cache = partial(_keep, block.async_move_resource_to_block_cache)

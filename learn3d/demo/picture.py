@@ -14,6 +14,7 @@ import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.framing import TOLERANCE, check_mask, read_picture
 from learn3d.fitting.cutting import find_mask
+from learn3d.fitting.fit import Progress
 from learn3d.make_data.shapes import make_shape
 from learn3d.make_data.writers.around import natural_look
 from learn3d.pictures.studio import photograph
@@ -72,13 +73,13 @@ def outline(picture: Picture) -> np.ndarray:
     return shown
 
 
-def make_mesh(model: Model, picture: Picture) -> Reconstruction:
-    """What the model makes of a picture. Raises ValueError if the mask cannot be right."""
+def make_mesh(model: Model, picture: Picture, progress: Progress | None = None) -> Reconstruction:
+    """What the model makes of a picture; `progress` as `fit` has it. Raises ValueError if the mask cannot be right."""
     try:
         check_mask(picture.mask)
     except ValueError:
         raise ValueError("no object was found in the picture; correct the outline with the brush") from None
-    return reconstruct_picture(model, picture.colors, picture.mask, crop=not picture.framed)
+    return reconstruct_picture(model, picture.colors, picture.mask, crop=not picture.framed, progress=progress)
 
 
 def write_cutout(picture: Picture, folder: Path) -> Path:

@@ -45,22 +45,23 @@ class ProcessGroup:
         """Whether this is rank 0, the process that writes files and reports."""
         return self.rank == 0
 
-    def split_batch(self, batch_size: int, sampling: str) -> ProcessGroup:
-        """The same process with its `rows` of batches of `batch_size`: consecutive ones, and both views of a pair.
+    def split_batch(self, batch_size: int, views: int = 1) -> ProcessGroup:
+        """The same process with its `rows` of batches of `batch_size`: consecutive ones, and all `views` of an object.
 
-        Parts differ by at most one row (or pair). Raises ValueError if a process would have no row.
+        A batch has the first view of all objects, then the second, and so on. Parts differ by at most one object.
+        Raises ValueError if a process would have none.
         """
         if self.world_size == 1:
             return self
-        half = batch_size // 2 if sampling == "pairs" else 0
-        if (half or batch_size) < self.world_size:
+        objects = batch_size // views
+        if objects < self.world_size:
+            what = batch_size if views == 1 else f"{objects} objects with {views} views each"
             raise ValueError(
-                f"a batch of {f'{half} pairs' if half else batch_size} is too small for {self.world_size} processes; "
-                f"start at most {half or batch_size}, or choose a larger batch_size"
+                f"a batch of {what} is too small for {self.world_size} processes; start at most {objects}, or choose a "
+                "larger batch_size"
             )
-        rows = torch.arange(half or batch_size).tensor_split(self.world_size)[self.rank]
-        if half:
-            rows = torch.cat([rows, rows + half])
+        part = torch.arange(objects).tensor_split(self.world_size)[self.rank]
+        rows = torch.cat([part + objects * view for view in range(views)])
         return dataclasses.replace(self, rows=rows, batch_share=len(rows) / batch_size)
 
     def all_reduce_moments(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.layouts import require_folder
+from learn3d.data.layouts import Layout, require_folder
 from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, NO_MMD, SURFACE_POINTS, Evaluation, evaluate
 from learn3d.experiments.plan import command_line
 from learn3d.presets import PRESETS
@@ -94,6 +94,7 @@ def measure(
     data: Path | None = None,
     category: str | None = None,
     split: str = "test",
+    layout: Layout | None = None,
     precision: Literal["bf16", "fp32"] = "fp32",
     device: str = "cpu",
     report_progress: Callable[[str], None] = lambda text: None,
@@ -102,7 +103,7 @@ def measure(
     method, config, metadata = checkpoint.load_method(file, device=device, precision=precision)
     label, category, data = PRESETS[config.preset].label, category or config.category, data or config.data
     report_progress(f"{file}: {label} ({config.preset}) on {category}, {split}")
-    dataset = checkpoint.load_data(config, split, data=data, category=category)
+    dataset = checkpoint.load_data(config, split, data=data, category=category, layout=layout)
     evaluation = evaluate(method, dataset, detailed=True)
     means = dict.fromkeys((*MEASURES, "hollow")) | evaluation.means
     if means["hollow"]:

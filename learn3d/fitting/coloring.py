@@ -80,7 +80,7 @@ def _spread(colors: Tensor, weight: Tensor, faces: Tensor) -> Tensor:
     neighbours = joined(faces.numpy(), count)
     laplacian = diags_array(neighbours.sum(1)) - neighbours
     given = weight.double().numpy() ** 2
-    if not given.any():
+    if not given.any():  # the picture shows no vertex well: its colours there count all the same
         given = np.full(count, 1e-3)
     system = (diags_array(given + 1e-9) + 0.01 * laplacian).tocsc()
     right = given[:, None] * colors.double().numpy()

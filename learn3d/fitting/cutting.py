@@ -20,10 +20,10 @@ Box = tuple[int, int, int, int]  # x and y of the left upper corner, width, heig
 
 
 def find_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-    """The mask uint8 [H, W], 0 or 255, of the object in a photograph uint8 [H, W, 3]: a first guess.
+    """Guess where the object is in a photograph uint8 [H, W, 3]: its mask uint8 [H, W], 0 or 255.
 
-    Before a plain background it is all that differs from its colour by `tolerance`, else what GrabCut finds in the
-    middle; without OpenCV the first, too.
+    If the border has one colour, the object is all that differs from it by `tolerance`. Otherwise GrabCut looks for it
+    in the middle or, without OpenCV, the first rule counts as well.
     """
     if is_plain(colors, tolerance) or importlib.util.find_spec("cv2") is None:
         return threshold_mask(colors, tolerance)

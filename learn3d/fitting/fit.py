@@ -82,7 +82,7 @@ def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> 
     zero, tangent = torch.zeros(len(vertices)), math.tan(math.radians(HALF_FOV_DEG))
     view = View(azimuth_deg, elevation_deg, zero, torch.zeros(len(vertices), 2))
     points = vertices @ view.axes().transpose(1, 2)
-    distance, shift = torch.full_like(zero, 1.0 / tangent), points[..., :2].mean(1) * 0
+    distance, shift = torch.full_like(zero, 1.0 / tangent), view.shift
     for _ in range(6):
         scale = (distance[:, None] + points[..., 2]).clamp(min=0.3) * tangent
         seen = (points[..., :2] + shift[:, None]) / scale[..., None]
@@ -98,14 +98,12 @@ def fit(
     image: Tensor,
     mask: Tensor,
     *,
-    shape: bool = True,
     view_probabilities: Tensor | None = None,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit the shape of a stored image uint8 [4, S, S] to its framed mask float32 [64, 64].
 
-    shape: fit code and vertices, too, not the camera alone. view_probabilities: float32 [AZIMUTHS], how probable each
-    cell of azimuths is, from -180 degrees on; None: all the same. progress: told what is done and which part of it.
+    view_probabilities: as `find_view` has them. progress: told what is done next, and which part is done (0 .. 1).
     """
     report = progress or (lambda text, part: None)
     code = method.encode(image[None]).float().cpu()
@@ -116,15 +114,7 @@ def fit(
 
     report("camera", 0.0)
     vertices = decode(code)
-    view = _search(vertices, method.faces, mask, view_probabilities)
-    view = _fit_camera(view, vertices, method.faces, mask)
-    belief = _belief(view.azimuth_deg, view_probabilities)
-    ious = _ious(view, vertices, method.faces, mask)
-    best = (ious + belief).argmax()[None]
-    view, predicted = view.select(best), float(ious[best])
-    if not shape:
-        return Fit(vertices[0], view, predicted, predicted, predicted)
-
+    view, predicted_iou = find_view(vertices[0], method.faces, mask, view_probabilities)
     report("shape", 0.3)
     view, code = _fit_code(view, code, decode, method, mask)
     vertices = decode(code)
@@ -132,7 +122,19 @@ def fit(
     report("surface", 0.7)
     view, vertices = _fit_vertices(view, vertices, method, mask)
     report("done", 1.0)
-    return Fit(vertices[0], view, predicted, code_iou, float(_ious(view, vertices, method.faces, mask)))
+    return Fit(vertices[0], view, predicted_iou, code_iou, float(_ious(view, vertices, method.faces, mask)))
+
+
+@torch.no_grad()
+def find_view(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None = None) -> tuple[View, float]:
+    """The view from which a shape [V, 3], [F, 3] has the outline of a framed mask [64, 64], and their IoU.
+
+    probabilities: float32 [AZIMUTHS], how probable each cell of azimuths is, from -180 degrees on; None: all the same.
+    """
+    view = _fit_camera(_search(vertices[None], faces, mask, probabilities), vertices, faces, mask)
+    ious = _ious(view, vertices, faces, mask)
+    best = (ious + _belief(view.azimuth_deg, probabilities)).argmax()[None]
+    return view.select(best), float(ious[best])
 
 
 def _search(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None) -> View:
@@ -173,7 +175,7 @@ def _ious(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> Tensor:
 
 
 def _parameters(view: View) -> list[Tensor]:
-    # In units in which a step of Adam moves the outline by about as much for each.
+    # Scaled so that one step of Adam moves the outline about equally far for each parameter.
     scaled = view.azimuth_deg / 60, view.elevation_deg / 60, view.log_distance, view.shift
     return [part.clone().requires_grad_() for part in scaled]
 

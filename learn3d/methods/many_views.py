@@ -13,7 +13,7 @@ from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.sampling import GROUP_SIZE
 from learn3d.device import Download, upload
-from learn3d.losses import gaussian_prior_loss, pose_classification_loss
+from learn3d.losses import depth_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod
 from learn3d.methods.settings import MeshSettings
 from learn3d.methods.surfaces import Meshes
@@ -24,7 +24,7 @@ from learn3d.settings import Positive, Weight, checked
 
 @checked
 class ManyViewsSettings(MeshSettings):
-    """Networks and weights of the terms of the loss; a weight of 0 means that the term is not computed."""
+    """Networks, and the weight of each term of the loss. A term with weight 0 is not computed."""
 
     encoder: EncoderName = "conv-light"
     symmetry: SymmetryOption = "auto"
@@ -69,9 +69,9 @@ class ManyViews(MeshMethod):
     def decode(self, codes: Tensor) -> Meshes:
         return self.clamped(super().decode(codes))
 
-    def view_probabilities(self, images: Tensor) -> Tensor | None:
-        """How probable each view class is for stored images uint8 [B,4,S,S]: float32 [B,K]; None if not learnt."""
-        return self._view_logits(images).softmax(1).cpu() if self.settings.lambda_view > 0 else None
+    def view_probabilities(self, image: Tensor) -> Tensor | None:
+        """How probable each view class is for a stored image uint8 [1,4,S,S]: float32 [K]; None if not learnt."""
+        return self._view_logits(image).softmax(1)[0].cpu() if self.settings.lambda_view > 0 else None
 
     def _view_logits(self, images: Tensor) -> Tensor:
         with self.autocast():
@@ -87,7 +87,7 @@ class ManyViews(MeshMethod):
         """
         count = check_groups(batch)
         images = batch.images[:count]
-        flipped = (torch.arange(count) % 2 == 1) & (self.generator.mirror is not None)
+        flipped = (batch.step_views.rows[:count] % 2 == 1) & (self.generator.mirror is not None)
         codes, vertices = self.predict(torch.where(flipped[:, None, None, None], images.flip(3), images))
         losses = {"prior": gaussian_prior_loss(codes, "squared")} if self.settings.lambda_prior > 0 else {}
         if self.settings.lambda_view > 0:
@@ -106,15 +106,6 @@ class ManyViews(MeshMethod):
         if uses_depth:
             losses["depth"] = depth_loss(seen.depth, batch.depth)
         return self.backward_and_step(losses | self.surface_losses(vertices), step, *self.optimizers)
-
-
-def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
-    """Mean distance between depth maps [B, S, S] where both show a surface; nmr's `far`, 100, and a target of 0 do not.
-
-    Differentiable in depth.
-    """
-    both = (target > 0) & (depth.detach() < 2 * target)
-    return ((depth - target).abs() * both).sum() / both.sum().clamp(min=1)
 
 
 def check_groups(batch: Batch) -> int:

@@ -194,8 +194,8 @@ class MeshMethod(Method):
         return codes if self.generator.mirror is None else (codes + MeshMethod.encode(self, images.flip(3))) / 2
 
     def clamped(self, shapes: Meshes) -> Meshes:
-        """The shapes, clamped to the cube of the data set, if it has one. Voxelizers take a shape that exceeds their
-        grid for hollow.
+        """The same shapes within the cube of the data set, if it has one: voxelizers find nothing inside a shape that
+        reaches out of their grid.
         """
         if self.info.cube_side is None:
             return shapes

@@ -44,11 +44,11 @@ class MeshSettings(MethodSettings):
 
     encoder: EncoderName = "conv"
     """Network from images to codes. conv: three convolutions on 64-pixel RGB and mask. conv-light: half the channels,
-    and a fourth convolution (1x1) to 32 channels. conv-small: a fifteenth of the weights. conv-centred: likewise
-    small, for images in which every object is scaled to one size (cameras at unknown distances). conv-relu: conv with
-    a ReLU on the code (Kato et al. 2018). resnet18: on 224-pixel RGB."""
+    and a fourth convolution (1x1) to 32 channels. conv-small: a fifteenth of the weights. conv-centred: a tenth, for
+    images in which every object is scaled to one size (cameras at unknown distances). conv-relu: conv with a ReLU on
+    the code (Kato et al. 2018). resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "sphere"
-    """Network from codes to vertices. sphere: 642 free vertices. sphere-small: the same from fewer weights. bounded:
+    """Network from codes to vertices. sphere: 642 free vertices. sphere-small: the same from half the weights. bounded:
     that of Kato et al. 2018. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or from linear
     layers (Kato and Harada 2019)."""
     symmetry: SymmetryOption = None

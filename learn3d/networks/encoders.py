@@ -59,7 +59,7 @@ class LightConvEncoder(ConvEncoder):
         initialize_he(self.convolutions)
 
     def forward(self, images: Tensor) -> Tensor:
-        return super().forward(images if self.inverted else torch.cat([1 - images[:, :3], images[:, 3:]], dim=1))
+        return super().forward(images if self.inverted else _on_black(images))
 
 
 class SmallConvEncoder(ConvEncoder):
@@ -109,7 +109,7 @@ class ViewClassifier(nn.Module):
         initialize_he(self.convolutions)
 
     def forward(self, images: Tensor) -> Tensor:
-        images = centre(images if self.inverted else torch.cat([1 - images[:, :3], images[:, 3:]], dim=1))
+        images = centre(images if self.inverted else _on_black(images))
         return self.layers(self.convolutions(images).flatten(1))
 
 
@@ -133,6 +133,11 @@ def centre(images: Tensor, share: float = CENTRED_SHARE) -> Tensor:
     centred = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
     centred[:, -1] *= grid.abs().amax(-1) < 1
     return torch.where(inside.any((1, 2))[:, None, None, None], centred, images)
+
+
+def _on_black(images: Tensor) -> Tensor:
+    """Images [B,4,S,S] with their colours inverted, so that a white background is 0."""
+    return torch.cat([1 - images[:, :3], images[:, 3:]], dim=1)
 
 
 def _convolutions(*channels: int) -> nn.Sequential:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from learn3d.config import TrainConfig, config_from_dict
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.layouts import load_dataset
+from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
 from learn3d.device import resolve_precision
 from learn3d.files import writing
 from learn3d.files.reading import parse_json
@@ -164,10 +164,25 @@ def load_method(
     return method, metadata.config, metadata
 
 
-def load_data(config: TrainConfig, split: str, *, data: Path | None = None, category: str | None = None) -> ViewDataset:
-    """A split of the data that a run was trained on, or of another folder or category, in the form of its networks."""
-    form = {"image_size": config.settings.image_size, "view_bins": config.view_bins}
-    return load_dataset(config.layout, data or config.data, category or config.category, split, **form)
+def load_data(
+    config: TrainConfig,
+    split: str,
+    *,
+    data: Path | None = None,
+    category: str | None = None,
+    layout: Layout | None = None,
+) -> ViewDataset:
+    """A split of the data that a run was trained on, or of another folder, category or layout, for its networks.
+
+    Raises ValueError for a layout that stores colours in another way than the one of the training.
+    """
+    layout = layout or config.layout
+    if layout in LAYOUTS and LAYOUTS[layout].inverted != LAYOUTS[config.layout].inverted:
+        raise ValueError(f"the networks were trained on colours as the layout {config.layout} has them, not {layout}")
+    form = {"image_size": config.settings.image_size}
+    if layout == config.layout:
+        form["view_bins"] = config.view_bins
+    return load_dataset(layout, data or config.data, category or config.category, split, **form)
 
 
 def network_tensors(method: Method) -> dict[str, Tensor]:

@@ -12,6 +12,7 @@ from learn3d.methods import MeshMethod
 from learn3d.methods.many_views import ManyViewsSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
+from learn3d.terminal import note
 
 SMALL_MODEL = Path(__file__).parents[1] / "models" / "small.safetensors"  # the one that comes with the package
 KNOWN_CODES = "known_codes"  # name of their tensor
@@ -40,7 +41,9 @@ def export(source: Path, target: Path, *, which: str = "last") -> int:
         for name, tensor in checkpoint.network_tensors(method).items()
         if name.startswith(("network.encoder.", "network.generator.", "network.view_classifier."))
     }
-    if isinstance(method, MeshMethod) and data.is_dir():
+    if not data.is_dir():
+        note(f"note: {data} is not there, so the file does not say which codes are known, and nothing is warned of")
+    elif isinstance(method, MeshMethod):
         tensors[KNOWN_CODES] = known_codes(method, checkpoint.load_data(trained_on, "train")).half()
     checkpoint.save(target, tensors, dataclasses.replace(metadata, config=config))
     return target.stat().st_size

@@ -235,6 +235,16 @@ def test_a_run_on_several_categories_is_measured_on_each(finished_run, monkeypat
     assert class_means(results)[0]["classes"] == 2
 
 
+def test_another_layout_must_store_colours_alike(finished_run, tiny_folder) -> None:
+    (alike,) = evaluate_runs([finished_run], layout="kato", data=tiny_folder)
+    (same,) = evaluate_runs([finished_run], data=tiny_folder)
+    assert alike.voxel_iou == same.voxel_iou
+    with pytest.raises(ValueError, match="colours as the layout kato has them, not kar"):
+        evaluate_runs([finished_run], layout="kar", data=tiny_folder)
+    with pytest.raises(ValueError, match="layout must be one of"):
+        evaluate_runs([finished_run], layout="karo", data=tiny_folder)
+
+
 def test_mean_is_over_classes_not_over_runs() -> None:
     figures = (("airplane", 0.6), ("airplane", 0.4), ("chair", 0.1))
     results = [stub_work.result(category=c, voxel_iou=v, mmd_paper=None) for c, v in figures]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.categories import synset_of
-from learn3d.data.dataset import SPLITS
+from learn3d.data.dataset import DEPTH_REACH, SPLITS
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers.kar import KAR, read_splits
 from learn3d.data.readers.r2n2 import DISTANCE, HALF_FOV_DEG, R2N2
@@ -21,7 +21,6 @@ from learn3d.files.writing import write_json
 from learn3d.make_data.writers.writer import RenderedObject, Writer, distances, uniform, write_png
 
 KAR_HALF_FOV_DEG = 14.9314  # 60 mm lens, 32 mm sensor
-REACH = 0.9  # a box of side 1 lies within 0.87 of its centre
 
 
 class KarWriter(Writer):
@@ -57,8 +56,8 @@ class KarWriter(Writer):
         depth = nmr.render_depth(
             item.vertices, item.faces, cameras, image_size=self.image_size, anti_aliasing=False
         ).numpy()
-        nearest = poses.distance.numpy()[:, None, None] - REACH
-        level = np.rint((depth - nearest) / (2 * REACH) * 240).clip(0, 240)
+        nearest = poses.distance.numpy()[:, None, None] - DEPTH_REACH
+        level = np.rint((depth - nearest) / (2 * DEPTH_REACH) * 240).clip(0, 240)
         level = np.where(depth < 100.0, level, 255).astype(np.uint8)  # 100 is nmr's `far`
         focal, center = self.image_size / 2 / np.tan(np.deg2rad(KAR_HALF_FOV_DEG)), self.image_size / 2
         intrinsics = np.array([[focal, 0, center], [0, focal, center], [0, 0, 1]])

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import socket
+import time
 import uuid
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
 import numpy as np
@@ -72,6 +75,18 @@ def test_a_request_is_bounded(client) -> None:
     assert upload(client, "large.png", bytes(34 * 2**20)).status_code == 413
     unsaid = client.post("gradio_api/upload", content=iter([b"a"]))
     assert unsaid.status_code == 413, "its length must be stated"
+
+
+def test_a_visitor_who_leaves_during_an_upload_is_no_error(client, server) -> None:
+    process, address = server
+    host = urlsplit(address).netloc
+    headers = f"Host: {host}\r\nContent-Length: 1000\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+    with socket.create_connection(host.split(":")) as visitor:
+        visitor.sendall(f"POST /gradio_api/upload HTTP/1.1\r\n{headers}\r\n--b\r\n".encode())
+        time.sleep(0.5)
+    time.sleep(0.5)
+    assert client.get("").status_code == 200
+    assert "ClientDisconnect" not in (process.folder / "errors.txt").read_text()
 
 
 def test_nothing_is_fetched_from_elsewhere(client) -> None:

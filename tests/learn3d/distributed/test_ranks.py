@@ -23,6 +23,7 @@ from safetensors.torch import load_file
 from train_in_ranks import evaluate_last, linear_optimizer
 
 from learn3d.config import TrainConfig, config_to_dict
+from learn3d.data.sampling import VIEWS_OF_OBJECT
 from learn3d.distributed import launch
 from learn3d.distributed.launch import init_process_group
 from learn3d.distributed.process_group import SINGLE_PROCESS, LostPeerError, ProcessGroup
@@ -42,6 +43,7 @@ RUNS: dict[str, tuple[dict[str, object], float, float]] = {
     "proposed": (SMALL | {"augment": ("channels",), "batch_size": 5, "ema_decay": 0.9}, 1e-6, 1e-6),
     "vanilla": (SMALL | {"preset": "peng2020-kato-vanilla", "augment": ("flip",), "lr_schedule": "cosine"}, 1e-6, 1e-6),
     "pairs": ({"preset": "kato2018-kato", "encoder": "conv-small", "batch_size": 6}, 1e-5, 1e-5),
+    "groups": ({"preset": "many-views-kato", **SMALL, "batch_size": 15, "symmetry": "x"}, 1e-5, 1e-5),
     # Batch norms, and for each image a random view of another one, which may be with the other process.
     "vpl": (VPL | {"preset": "peng2020-kato-vpl", "batch_size": 5}, 1e-4, 1e-4),
     "reversal": (PATCH | {"preset": "kato2019-kar", "batch_size": 5, "augment": ()}, 1e-4, 1e-4),
@@ -60,10 +62,11 @@ RUNS: dict[str, tuple[dict[str, object], float, float]] = {
         (2, 5, "views", [[0, 1, 2], [3, 4]]),
         (3, 4, "classes", [[0, 1], [2], [3]]),
         (2, 6, "pairs", [[0, 1, 3, 4], [2, 5]]),
+        (2, 15, "groups", [[0, 1, 3, 4, 6, 7, 9, 10, 12, 13], [2, 5, 8, 11, 14]]),
     ],
 )
 def test_each_row_belongs_to_one_process(world: int, batch_size: int, sampling: str, parts: list[list[int]]) -> None:
-    ranks = [ProcessGroup(rank, world).split_batch(batch_size, sampling) for rank in range(world)]
+    ranks = [ProcessGroup(rank, world).split_batch(batch_size, VIEWS_OF_OBJECT[sampling]) for rank in range(world)]
     assert [r.rows.tolist() for r in ranks] == parts
     assert sum(r.batch_share for r in ranks) == pytest.approx(1)
 
@@ -72,12 +75,12 @@ def test_each_row_belongs_to_one_process(world: int, batch_size: int, sampling: 
     ("batch_size", "sampling", "message"),
     [
         (2, "views", "a batch of 2 is too small for 3 processes; start at most 2"),
-        (4, "pairs", "a batch of 2 pairs is too small for 3 processes; start at most 2"),
+        (4, "pairs", "a batch of 2 objects with 2 views each is too small for 3 processes; start at most 2"),
     ],
 )
 def test_too_many_processes_are_refused(batch_size: int, sampling: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        ProcessGroup(0, 3).split_batch(batch_size, sampling)
+        ProcessGroup(0, 3).split_batch(batch_size, VIEWS_OF_OBJECT[sampling])
 
 
 def test_without_torchrun_there_is_one_process(monkeypatch) -> None:

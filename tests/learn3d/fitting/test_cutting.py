@@ -72,5 +72,11 @@ def test_reconstruct_takes_a_box(scene, finished_run, tmp_path: Path, command) -
     with Image.open(tmp_path / "out" / "disc.png") as strip:
         shown = np.asarray(strip.convert("L"))[40:, 200:390]  # the mask
     assert 0.15 < (shown > 127).mean() < 0.7
+    cut = (tmp_path / "out" / "disc.png").read_bytes()
+    Image.fromarray(
+        np.dstack([scene[0], np.where(np.arange(400) < 390, 255, 0) + np.zeros((300, 1))]).astype(np.uint8)
+    ).save(tmp_path / "disc.png")
+    status, _, said = command(*words, "--box", 80, 50, 220, 220)
+    assert status == 0 and (tmp_path / "out" / "disc.png").read_bytes() == cut, "the box goes before transparency"
     status, _, said = command(*words, "--box", 80, 50, 220, 220, "--plain-background")
     assert status == 1 and "--box is for one photograph" in said

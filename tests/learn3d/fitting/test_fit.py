@@ -14,7 +14,7 @@ from learn3d.data.dataset import DatasetInfo
 from learn3d.data.layouts import load_dataset
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.familiarity import MOST, distance
-from learn3d.fitting.fit import AZIMUTHS, SHARE, View, fit, frame_view
+from learn3d.fitting.fit import AZIMUTHS, SHARE, View, find_view, fit, frame_view
 from learn3d.fitting.smoothing import smooth
 from learn3d.methods import create_method
 from learn3d.methods.method import MeshMethod
@@ -26,7 +26,7 @@ from learn3d.runs.export import export
 
 
 def arrow() -> tuple[torch.Tensor, torch.Tensor]:
-    """A sphere drawn out to a point at x < 0 and bent up at x > 0; its own mirror image at z = 0."""
+    """A test shape, symmetric about z = 0: a sphere, stretched to a point at x < 0 and bent up at x > 0."""
     vertices, faces = (part.clone() for part in nmr.icosphere(3))
     vertices = vertices.float() * torch.tensor([0.3, 0.12, 0.25])
     vertices[:, 0] -= 0.25 * (-vertices[:, 0] / 0.3).clamp(min=0) ** 4
@@ -70,23 +70,21 @@ def test_views_are_framed() -> None:
 
 
 @pytest.mark.parametrize(("azimuth", "elevation"), [(35.0, 20.0), (-100.0, 5.0), (110.0, 40.0)])
-def test_the_camera_is_found(method: MeshMethod, azimuth: float, elevation: float) -> None:
-    mask = framed_mask(*arrow(), azimuth, elevation)
-    found = fit(method, torch.zeros(4, 64, 64, dtype=torch.uint8), mask, shape=False)
-    assert found.iou > 0.88
-    apart = (float(found.view.azimuth_deg) - azimuth + 180) % 360 - 180
-    assert abs(apart) < 12 and abs(float(found.view.elevation_deg) - elevation) < 12
+def test_the_camera_is_found(azimuth: float, elevation: float) -> None:
+    view, iou = find_view(*arrow(), framed_mask(*arrow(), azimuth, elevation))
+    assert iou > 0.88
+    apart = (float(view.azimuth_deg) - azimuth + 180) % 360 - 180
+    assert abs(apart) < 12 and abs(float(view.elevation_deg) - elevation) < 12
 
 
-def test_probabilities_decide_between_views_with_one_outline(method: MeshMethod) -> None:
+def test_probabilities_decide_between_views_with_one_outline() -> None:
     mask = framed_mask(*arrow(), 0.0, 0.0)  # from 0 and from 180 degrees outlines are mirror images
     mask = torch.maximum(mask, mask.flip(1))
     for azimuth in (7.5, 172.5):
         probabilities = torch.full((AZIMUTHS,), 1e-3)
         probabilities[int((azimuth + 180) // 15)] = 1.0
-        image = torch.zeros(4, 64, 64, dtype=torch.uint8)
-        found = fit(method, image, mask, shape=False, view_probabilities=probabilities)
-        assert abs(float(found.view.azimuth_deg) - azimuth) < 25
+        view, _ = find_view(*arrow(), mask, probabilities)
+        assert abs(float(view.azimuth_deg) - azimuth) < 25
 
 
 def test_the_shape_comes_closer_to_the_outline_and_stays_symmetric(method: MeshMethod) -> None:

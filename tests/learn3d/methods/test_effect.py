@@ -1,4 +1,4 @@
-"""What pose confusion is for: a discriminator that tells the views of codes apart loses that by steps of the encoder.
+"""Pose confusion: the encoder learns codes from which a trained discriminator can no longer tell the view.
 
 The effects on the IoU and on the MMD of codes take thousands of steps; docs/results.md has them.
 """

@@ -16,10 +16,11 @@ from learn3d.data.layouts import load_dataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.sampling import GROUP_SIZE, sample_indices
 from learn3d.evaluation import evaluate
+from learn3d.losses import depth_loss
 from learn3d.make_data.config import DatasetConfig
 from learn3d.make_data.sharded import make_shards
 from learn3d.methods import create_method
-from learn3d.methods.many_views import ManyViews, depth_loss
+from learn3d.methods.many_views import ManyViews
 from learn3d.presets import PRESETS
 
 SMALL = {"encoder": "conv-small", "generator": "sphere-small"}

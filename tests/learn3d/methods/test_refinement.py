@@ -19,7 +19,7 @@ def make(plane: float | None):
     return create_method(settings, DatasetInfo(24, mirror_plane_deg=plane), device="cpu", precision="fp32", seed=0)
 
 
-@pytest.mark.parametrize("steps", [(30, 0), (0, 30), (15, 15)])
+@pytest.mark.parametrize("steps", [(60, 0), (0, 30), (15, 15)])
 def test_the_silhouette_comes_closer(tiny_set, steps: tuple[int, int]) -> None:
     method, batch = make(None), tiny_set.batch(torch.tensor([0, 30]))
 
@@ -29,7 +29,7 @@ def test_the_silhouette_comes_closer(tiny_set, steps: tuple[int, int]) -> None:
     with torch.no_grad():
         before = method.decode(method.encode(batch.images)).vertices
         after = refine(method, batch.images, batch.masks, batch.poses, code_steps=steps[0], vertex_steps=steps[1])
-    assert loss(after.vertices) < loss(before) - 0.005
+    assert loss(after.vertices) < loss(before) - 0.02
 
 
 def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set) -> None:
