@@ -17,6 +17,9 @@ setup report
 learn3d=$PWD/.venv/bin/learn3d
 mkdir -p "$out" || fail "cannot make the folder $out"
 
+step "Turning six pictures into meshes in colour, with the model that comes with the package"
+.venv/bin/python docs/examples/draw_small_model.py --output "$out/pictures"
+
 step "Making $objects ${category}s, each rendered from 24 views"
 "$learn3d" make-dataset --output "$out/data" --category "$category" --procedural "$objects" --overwrite
 
@@ -39,8 +42,9 @@ step "Writing the report"
 
 cat <<TEXT
 
-Open in a browser:
-  $out/report.html    both methods on test objects: figures, curves, and meshes to turn by hand
+Look at:
+  $out/pictures/small-model.png    pictures, and the meshes in colour made of them (beside it .glb files)
+  $out/report.html    in a browser: both methods on test objects, with meshes to turn by hand
 
 Also there:
   the data           $(ls "$out"/data/*_contact.png)

@@ -16,7 +16,7 @@ from learn3d.make_data.writers.around import natural_look
 from learn3d.pictures.sheets import save_png, tile
 from learn3d.pictures.studio import photograph
 from learn3d.pictures.surfaces import Surface, draw_around
-from learn3d.reconstruction import load_model, reconstruct_picture
+from learn3d.reconstruction import export_mesh, load_model, reconstruct_picture
 
 SIDE = 140  # of each small picture, in pixels
 TURNS = (0, 60, 120)  # degrees from the camera's side
@@ -25,9 +25,11 @@ TURNS = (0, 60, 120)  # degrees from the camera's side
 def main(output: Path = Path("output"), azimuth: float = 40.0, elevation: float = 20.0, seed: int = 7) -> Path:
     """Writes OUTPUT/small-model.png. Rows: one object of each category; columns: its picture, the mesh, the truth.
 
+    Beside it the pictures without their background, and the meshes in colour: chair.png, chair.glb and so on.
     The first object of each category with this seed is taken, whatever comes out (the model was trained with seed 0).
     """
     model = load_model(None)
+    output.mkdir(parents=True, exist_ok=True)
     rows = []
     for category in CATEGORIES:
         rng = np.random.default_rng([seed, 0, 0])
@@ -38,6 +40,8 @@ def main(output: Path = Path("output"), azimuth: float = 40.0, elevation: float 
         camera = nmr.LookAt.from_angles(2.732, elevation, [azimuth], half_fov_deg=15.0)
         colors, masks = photograph(*truth[:2], paint, camera, image_size=256, lights=lights)
         made = reconstruct_picture(model, colors[0], masks[0])
+        save_png(output / f"{category}.png", np.dstack([colors[0], masks[0]]))
+        export_mesh(output / f"{category}.glb", made.surface)
         drawn = [
             draw_around(surface, [start - turn for turn in TURNS], elevation_deg=elevation, image_size=SIDE)
             for surface, start in ((made.surface, made.azimuth_deg), (truth, azimuth))
@@ -45,7 +49,6 @@ def main(output: Path = Path("output"), azimuth: float = 40.0, elevation: float 
         rows.append([colors[0], *drawn[0], *drawn[1]])
     turned = [f"turned by {turn}°" for turn in TURNS[1:]]
     titles = ["picture", "mesh", *turned, "truth", *turned]
-    output.mkdir(parents=True, exist_ok=True)
     save_png(output / "small-model.png", tile(rows, titles, tile_size=SIDE, row_titles=CATEGORIES))
     return output / "small-model.png"
 

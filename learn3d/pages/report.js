@@ -71,6 +71,7 @@ function drawPanes() {
     title.replaceChildren();
     if (run) element(title, "i").style.background = run.color;
     title.append(name + score + (empty ? " (empty)" : ""));
+    if (!empty) element(title, "button", { type: "button", textContent: "save OBJ", onclick: () => save(mesh3d, `${shown.name} ${name}.obj`) });
     scene.setAttribute("aria-label", `${name}${score}: 3D shape; arrow keys turn it, plus and minus bring it nearer`);
     const trace = { type: "mesh3d", ...mesh3d, color: color("--clay"), hoverinfo: "skip",
       lighting: { ambient: 0.35, diffuse: 0.7, specular: 0.05, roughness: 0.8, fresnel: 0.05 }, lightposition: { x: -1e5, y: 1e5, z: 5e4 } };
@@ -81,6 +82,19 @@ function drawPanes() {
       for (const event of ["plotly_relayouting", "plotly_relayout"]) scene.on(event, moved => follow(scene, moved["scene.camera"]));
     }
   }
+}
+
+function save(mesh, name) {
+  const arrays = "xyzijk".split("").map(key => {
+    const { dtype, bdata } = mesh[key], type = { i2: Int16Array, u2: Uint16Array, u4: Uint32Array }[dtype];
+    return new type(Uint8Array.from(atob(bdata), byte => byte.charCodeAt()).buffer);
+  });
+  const lines = (letter, [a, b, c], text) => Array.from(a, (first, k) => `${letter} ${text(first)} ${text(b[k])} ${text(c[k])}`);
+  const [x, y, z, i, j, k] = arrays;  // z is up in the page, y in the file
+  const points = lines("v", [x, z, y.map(value => -value)], value => (value * page.unit).toFixed(4));
+  const address = URL.createObjectURL(new Blob([[...points, ...lines("f", [i, j, k], value => value + 1), ""].join("\n")]));
+  Object.assign(document.createElement("a"), { href: address, download: name.replace(/[^\w.-]+/g, "-") }).click();
+  URL.revokeObjectURL(address);
 }
 
 function follow(scene, moved) {

@@ -20,7 +20,7 @@ from learn3d.experiments.statistics import percentile_interval, resampled_means
 from learn3d.figures.curves import COLORS, Log, mean, mean_by_azimuth, panels, read_metrics, title_of
 from learn3d.figures.runs import Run, open_runs
 from learn3d.files import writing
-from learn3d.pages.shapes import pack_shapes
+from learn3d.pages.shapes import UNIT, pack_shapes
 from learn3d.pictures.surfaces import azimuths_deg
 from learn3d.presets import PRESETS
 from learn3d.terminal import plain
@@ -142,7 +142,7 @@ def _fill(
         "meaning": MEASURES["voxel_iou" if truth else "silhouette_iou"][1],
         "mmd": MEASURES["mmd"][1],
         "truth": truth,
-        "browser": {"runs": looks, "items": items, "kind": kind, "views": views, "curves": _curves(logs)},
+        "browser": {"runs": looks, "items": items, "kind": kind, "views": views, "curves": _curves(logs), "unit": UNIT},
     }
 
 

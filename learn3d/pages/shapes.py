@@ -14,6 +14,7 @@ from PIL import Image
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.poses import LookAtPoses
 from learn3d.figures.runs import Run
+from learn3d.fitting.smoothing import smooth
 from learn3d.methods.surfaces import grid_surface
 from learn3d.pictures.sheets import natural_colors
 from learn3d.pictures.surfaces import Surface, eyes
@@ -36,7 +37,7 @@ def pack_shapes(runs: Sequence[Run], samples: Sequence[int]) -> list[dict[str, A
     shapes = [run.method.decode(run.method.encode(own)).surfaces() for run, own in zip(runs, images, strict=True)]
     if batch.voxels is not None:
         grids = dataset.convention.to_object(batch.voxels).float()
-        shapes.append([grid_surface(grid, box=dataset.convention.cube_side) for grid in grids])
+        shapes.append([_smoothed(grid_surface(grid, box=dataset.convention.cube_side)) for grid in grids])
     pictures = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
     oblique = LookAtPoses(torch.full((len(samples),), -30.0), 20.0, 1.0, 15.0)
     cameras = eyes(batch.poses or oblique).numpy() @ _TO_PAGE
@@ -57,6 +58,11 @@ def pack_shapes(runs: Sequence[Run], samples: Sequence[int]) -> list[dict[str, A
             }
         )
     return items
+
+
+def _smoothed(surface: Surface) -> Surface:
+    """Without the steps of its voxels."""
+    return Surface(*smooth(surface.vertices, surface.faces, levels=0)) if len(surface.faces) else surface
 
 
 def _mesh(surface: Surface) -> dict[str, Any]:

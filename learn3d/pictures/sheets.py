@@ -80,7 +80,7 @@ def magnify(pictures: np.ndarray, zoom: float) -> np.ndarray:
 
 
 def save_png(path: Path, rgb: np.ndarray) -> None:
-    """Write a picture uint8 [H,W,3]."""
+    """Write a picture uint8 [H,W,3], or [H,W,4] with its opacity."""
     buffer = io.BytesIO()
     Image.fromarray(rgb).save(buffer, format="PNG", optimize=True)
     writing.write_bytes(path, buffer.getvalue())

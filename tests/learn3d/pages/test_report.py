@@ -130,7 +130,7 @@ def test_meshes_are_those_of_the_networks_seen_as_in_mesh_files(page, runs) -> N
     voxels = dataset.convention.to_object(dataset.batch([item["index"]]).voxels)[0].numpy()
     sides = np.array([np.ptp(np.flatnonzero(voxels.any(axis=other))) + 1 for other in ((1, 2), (0, 2), (0, 1))]) / 32
     found = [np.ptp(read(item["meshes"][2][axis])) * UNIT for axis in "xyz"]
-    assert np.allclose(found, sides[[2, 0, 1]], atol=1e-3), "the true shape is the surface of its voxels"
+    assert np.allclose(found, sides[[2, 0, 1]], atol=0.02), "the true shape is the surface of its voxels, smoothed"
 
 
 def test_data_without_truth_or_poses_and_files_without_a_log(tmp_path, runs, tiny_set, monkeypatch) -> None:

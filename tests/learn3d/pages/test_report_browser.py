@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
+
+from learn3d.reconstruction import reconstruct_dataset
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("plotly")
@@ -67,6 +70,20 @@ def picture(tab: Any, number: int = 0) -> np.ndarray:
 def changed(before: np.ndarray, after: np.ndarray) -> float:
     """Share of the pixels that differ clearly."""
     return float((np.abs(before.astype(int) - after).max(axis=2) > 8).mean())
+
+
+def test_a_mesh_is_saved_as_reconstruct_writes_it(page, runs, tiny_folder, browser, tmp_path) -> None:
+    tab = browser.new_page()
+    tab.goto(page.as_uri())
+    with tab.expect_download() as download:
+        tab.locator("figcaption button").first.click()
+    download.value.save_as(tmp_path / "saved.obj")
+    index = tab.evaluate("page.items[0].index")
+    tab.close()
+    paths = reconstruct_dataset(runs[0], tmp_path, tiny_folder, [index], split="train", mesh_format="obj")
+    saved, wanted = (trimesh.load(path) for path in (tmp_path / "saved.obj", paths[0]))
+    assert len(saved.faces) == len(wanted.faces) and np.allclose(saved.bounds, wanted.bounds, atol=2e-4)
+    assert saved.volume == pytest.approx(wanted.volume, rel=0.01)
 
 
 def test_a_drag_turns_all_meshes(page, visit) -> None:
