@@ -2,11 +2,12 @@
 // decided here; the new vertices are computed where the camera is known (nmr/_clip.py).
 //
 // A face with one corner in front becomes one triangle, a face with two becomes two triangles. The new vertices lie on
-// the two edges that cross the plane. Faces wholly in front stay as they are, faces wholly behind are left out. Each
-// cut face has new vertices of its own. Neighbours name the ends of their common edge in the same order, so their new
+// the two edges that cross the plane. Faces wholly in front stay as they are, faces wholly behind are left out. A mesh
+// stays as it is if no face is cut and none could be drawn wrongly (`any_around_eye`). Each cut face has new vertices of its own. Neighbours name the ends of their common edge in the same order, so their new
 // vertices have the same bits and leave no gap.
 #include <algorithm>
 
+#include "geometry.h"
 #include "parallel.h"
 #include "stages.h"
 
@@ -38,7 +39,7 @@ struct Sides {
 };
 
 template <class T>
-Sides sides_of(const T* vertices, const int64_t* face, T near) {
+NMR_INLINE Sides sides_of(const T* vertices, const int64_t* face, T near) {
   Sides sides{};
   bool ordered = true;
   for (int k = 0; k < 3; ++k) {
@@ -48,6 +49,20 @@ Sides sides_of(const T* vertices, const int64_t* face, T near) {
     ordered = ordered && z == z;
   }
   return ordered ? sides : Sides{};
+}
+
+// Whether a face lies wholly behind the plane, but on both sides of the plane of the eye, or touches it: its depths
+// between the corners mean nothing, and could pass for some in front.
+template <class T>
+bool any_around_eye(const MeshBatch<T>& mesh, int64_t b, T near) {
+  const T* vertices = mesh.image_vertices(b);
+  for (int64_t f = 0; f < mesh.face_count(b); ++f) {
+    const int64_t* face = mesh.image_faces(b) + 3 * f;
+    if (sides_of(vertices, face, near).count != 3) continue;
+    const T z0 = vertices[3 * face[0] + 2], z1 = vertices[3 * face[1] + 2], z2 = vertices[3 * face[2] + 2];
+    if (min3(z0, z1, z2) <= 0 && max3(z0, z1, z2) >= 0) return true;
+  }
+  return false;
 }
 
 }  // namespace
@@ -69,7 +84,8 @@ void clip_count(const ClipCount<T>& args) {
       drawn += kPieces[sides.count];
     }
     args.counts[2 * b] = 2 * cut;
-    args.counts[2 * b + 1] = cut ? drawn : num_faces;
+    const bool changes = cut || (drawn < num_faces && any_around_eye(mesh, b, args.near));
+    args.counts[2 * b + 1] = changes ? drawn : num_faces;
   });
 }
 
@@ -102,13 +118,14 @@ void clip_faces(const ClipFaces<T>& args) {
       args.source[n++] = static_cast<int32_t>(f);
     };
     const int64_t num_faces = mesh.face_count(b);
-    bool any_cut = false;
-    for (int64_t f = 0; f < num_faces && !any_cut; ++f)
-      any_cut = sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f, args.near).cut();
+    bool changes = false;
+    for (int64_t f = 0; f < num_faces && !changes; ++f)
+      changes = sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f, args.near).cut();
+    changes = changes || any_around_eye(mesh, b, args.near);
     for (int64_t f = 0; f < num_faces; ++f) {
       const int64_t* face = mesh.image_faces(b) + 3 * f;
       const Sides sides = sides_of(mesh.image_vertices(b), face, args.near);
-      if (!any_cut || sides.count == 0) {
+      if (!changes || sides.count == 0) {
         draw(f, 0, 1, 2);
       } else if (sides.cut()) {
         int i = 0;  // the corner that is alone on its side

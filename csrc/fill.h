@@ -51,7 +51,7 @@ NMR_INLINE void pixel_range(Lanes<T> lo, Lanes<T> hi, T size, Lanes32& first, La
   last = min_of(b, n - one);
 }
 
-// Bounds of q = 1 / depth: level + slope_x i + slope_y j +- margin at any pixel (i, j) inside a face, and `nearest`,
+// Bounds of q = 1 / depth, or -depth without perspective: level + slope_x i + slope_y j +- margin at any pixel (i, j) inside a face, and `nearest`,
 // the largest q.
 template <class T>
 struct DepthBound {
@@ -71,15 +71,17 @@ struct DepthBound {
 // - q' is off by half of that times the range of q at the corners, and by 8 u q for its own rounding;
 // - the plane below adds 80 u M^2 / D times the range and 8 u q, because its coefficients are computed in double and
 //   rounded.
+// Without perspective q is -z, and the same holds with the largest |q| of the face for q.
 // The margin is larger than the sum: 640 u M^2 / D times the range, and 32 u q. If the bounds of two faces are
 // disjoint, their depths differ even after rounding. If E could be large, and for double, the bounds are those of the
 // corners: q' is a weighted mean of their q.
 template <class T>
 NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)[3], const Lanes<T> (&z)[3],
-                                     Lanes<T> lo, Lanes<T> hi, T width, T height) {
+                                     Lanes<T> lo, Lanes<T> hi, T width, T height, bool perspective) {
   constexpr T eps = std::numeric_limits<T>::epsilon();
-  const Lanes<T> zero = splat(T(0)), most = splat(T(1)) / lo, least = splat(T(1)) / hi, range = most - least;
-  const Lanes<T> rounding = splat(16 * eps) * most, half = splat(T(0.5));
+  const Lanes<T> zero = splat(T(0)), most = perspective ? splat(T(1)) / lo : zero - lo;
+  const Lanes<T> least = perspective ? splat(T(1)) / hi : zero - hi, range = most - least;
+  const Lanes<T> rounding = splat(16 * eps) * (perspective ? most : hi), half = splat(T(0.5));
   DepthBound<T> bound{zero, zero, (most + least) * half, range * half + rounding, most + rounding};
   if constexpr (sizeof(T) < sizeof(double)) {
     using Wide = Lanes<double>;
@@ -91,7 +93,8 @@ NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)
       M = max_of(M, max_of(absolute<T>(px), absolute<T>(py)));
       X[k] = convert_lanes<Wide>(px);
       Y[k] = convert_lanes<Wide>(py);
-      q[k] = splat(1.0) / convert_lanes<Wide>(z[k]);
+      const Wide depth = convert_lanes<Wide>(z[k]);
+      q[k] = perspective ? splat(1.0) / depth : splat(0.0) - depth;
     }
     const Wide x1 = X[1] - X[0], x2 = X[2] - X[0], y1 = Y[1] - Y[0], y2 = Y[2] - Y[0], q1 = q[1] - q[0],
                q2 = q[2] - q[0];
@@ -174,7 +177,8 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
       bz[k] = select(bounded, z[k], one);
     }
     const DepthBound<T> bound =
-        bound_depth<T>(bx, by, bz, select(bounded, lo, one), select(bounded, hi, one), width, height);
+        bound_depth<T>(bx, by, bz, select(bounded, lo, one), select(bounded, hi, one), width, height,
+                       image.settings.perspective);
     const Lanes<T> nearest = select(bounded, bound.nearest, infinity);
     store_lanes(block.slope_x, bound.slope_x);
     store_lanes(block.slope_y, bound.slope_y);
@@ -218,7 +222,7 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
 
 // Depths at eight pixels of a row, as published.
 template <class T>
-NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T row) {
+NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T row, bool perspective) {
   const auto& m = plane.weights.m;
   const Lanes<T> zero = splat(T(0)), one = splat(T(1));
   Lanes<T> w[3];
@@ -228,6 +232,8 @@ NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T r
     w[k] = select(w[k] < one, w[k], one);
   }
   const Lanes<T> sum = w[0] + w[1] + w[2];
+  if (!perspective)
+    return w[0] / sum * splat(plane.z[0]) + w[1] / sum * splat(plane.z[1]) + w[2] / sum * splat(plane.z[2]);
   return one / (w[0] / sum / splat(plane.z[0]) + w[1] / sum / splat(plane.z[1]) + w[2] / sum / splat(plane.z[2]));
 }
 
@@ -240,7 +246,8 @@ LaneMask<T> contest(const Image<T>& image, int32_t id, uint32_t contested_bits, 
                     const int32_t* face_index_at) {
   const Lanes<T> column = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i)));
   const T row = static_cast<T>(j);
-  const Lanes<T> z = exact_depths(face_plane(image, id), column, row);
+  const bool perspective = image.settings.perspective;
+  const Lanes<T> z = exact_depths(face_plane(image, id), column, row, perspective);
   const Lanes32 bit = load_lanes<Lanes32>(kBits), among = splat(static_cast<int32_t>(contested_bits)) & bit;
   const LaneMask<T> contested = widen_mask<T>(among > splat(int32_t(0))) & (z > splat(image.settings.near)) &
                                 (z < splat(image.settings.far));  // not NaN either
@@ -249,7 +256,7 @@ LaneMask<T> contest(const Image<T>& image, int32_t id, uint32_t contested_bits, 
   for (uint32_t bits = lane_bits(open); bits; bits = lane_bits(open)) {
     const int32_t rival = face_index_at[lowest_bit(bits)];
     const LaneMask<T> here = open & widen_mask<T>(face_index == splat(rival));
-    const Lanes<T> theirs = exact_depths(face_plane(image, rival), column, row);
+    const Lanes<T> theirs = exact_depths(face_plane(image, rival), column, row, perspective);
     wins = wins | (here & (id < rival ? z <= theirs : z < theirs));
     open = without(open, here);
   }
@@ -347,7 +354,7 @@ Window find_window(const FaceTable<T>& table, int64_t chunks, const Band<T>& ban
           std::min((last / kLanes + 1) * kLanes, rows)};
 }
 
-// The least 1 / depth in each block of pixels of the window.
+// The least q in each block of pixels of the window.
 template <class T>
 NMR_INLINE void bound_blocks(const Band<T>& band, const Window& window, int64_t blocks, T* block_least) {
   for (int64_t j = window.row_first; j < window.row_last; j += kLanes)

@@ -9,7 +9,7 @@ NMR_INLINE void around(T lo, T hi, int64_t size, int64_t& first, int64_t& last) 
 }
 
 // Inserts one face into the lists of the pixels that it covers.
-template <class T>
+template <bool perspective, class T>
 NMR_INLINE void insert_face(const LayerBand<T>& band, int64_t f, bool reversed) {
   const Size raster = band.settings.raster;
   const Triangle<T> t = load_triangle(band.vertices, band.faces + 3 * f, reversed);
@@ -43,7 +43,8 @@ NMR_INLINE void insert_face(const LayerBand<T>& band, int64_t f, bool reversed) 
         T w[3];
         for (int k = 0; k < 3; ++k) w[k] = clamp_weight(column * m.m[k][0] + m.m[k][1] * row + m.m[k][2]);
         const T sum = w[0] + w[1] + w[2];
-        depth[n] = 1 / (w[0] / sum / z[0] + w[1] / sum / z[1] + w[2] / sum / z[2]);
+        depth[n] = perspective ? 1 / (w[0] / sum / z[0] + w[1] / sum / z[1] + w[2] / sum / z[2])
+                               : w[0] / sum * z[0] + w[1] / sum * z[1] + w[2] / sum * z[2];
         covered[n] = !outside & (xp >= left) & (xp <= right) & (depth[n] > near) & (depth[n] < far);
         any |= covered[n];
       }
@@ -69,5 +70,6 @@ NMR_INLINE void insert_face(const LayerBand<T>& band, int64_t f, bool reversed) 
 template <class T>
 void fill_layers(const LayerBand<T>& band) {
   for (int reversed = 0; reversed <= band.settings.fill_back; ++reversed)
-    for (int64_t f = 0; f < band.num_faces; ++f) insert_face(band, f, reversed);
+    for (int64_t f = 0; f < band.num_faces; ++f)
+      band.settings.perspective ? insert_face<true>(band, f, reversed) : insert_face<false>(band, f, reversed);
 }

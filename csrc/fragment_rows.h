@@ -95,7 +95,9 @@ NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32
     p.w[k] = raw[k] / sum;
     p.corner_z[k] = column[3][k];
   }
-  p.z = one / (p.w[0] / p.corner_z[0] + p.w[1] / p.corner_z[1] + p.w[2] / p.corner_z[2]);
+  p.z = scratch.perspective
+            ? one / (p.w[0] / p.corner_z[0] + p.w[1] / p.corner_z[1] + p.w[2] / p.corner_z[2])
+            : p.w[0] * p.corner_z[0] + p.w[1] * p.corner_z[1] + p.w[2] * p.corner_z[2];
   return p;
 }
 
@@ -172,7 +174,8 @@ void fragments_forward_block(const Fragments<T>& args, const FragmentBlock<T>& b
           const LaneMask<T> drawn = widen_mask<T>(ids >= splat(int32_t(0)));
           const LaneMask<T> reversed = widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
           Lanes<T> at[3];
-          for (int k = 0; k < 3; ++k) at[k] = choose(drawn, p.w[k] * p.z / p.corner_z[k], zero);
+          for (int k = 0; k < 3; ++k)
+            at[k] = choose(drawn, scratch.perspective ? p.w[k] * p.z / p.corner_z[k] : p.w[k], zero);
           T value[3][kLanes], z[kLanes];
           store_lanes(z, choose(drawn, p.z, far));
           store_lanes(value[0], choose(reversed, at[2], at[0]));
@@ -239,7 +242,7 @@ NMR_INLINE void store_face_gradients(const Lanes<T> (&grad)[9], int64_t slot, Fa
 }
 
 // With c = g z^2 of each pixel, S_k = sum over pixels of c w_k:  grad z_k = S_k / z_k^2,  grad X_k = S_k sum_m M_m0 /
-// z_m.
+// z_m. Without perspective c = g:  grad z_k = S_k,  grad X_k = -S_k sum_m M_m0 z_m.
 template <class T>
 void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& block, int64_t b,
                           FragmentScratch<T>& scratch, FaceGradients<T>& result) {
@@ -261,7 +264,8 @@ void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& blo
         block, j,
         [&](int64_t i, Lanes32 ids, Lanes<T> y) {
           const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
-          const Lanes<T> z = depth_or_zero<T>(p.z), c = load_lanes<Lanes<T>>(grad + i) * z * z;
+          const Lanes<T> z = scratch.perspective ? depth_or_zero<T>(p.z) : one;
+          const Lanes<T> c = load_lanes<Lanes<T>>(grad + i) * z * z;
           add_quads<T>({c * p.w[0], c * p.w[1], c * p.w[2], zero}, p.slot, 4, sums);
         },
         [](int64_t) {});
@@ -275,19 +279,23 @@ void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& blo
     load_face_quads<T>(table, slot, kEntry, mx);
     load_face_quads<T>(table + 4, slot, kEntry, my);
     load_face_quads<T>(table + 12, slot, kEntry, z);
-    const Lanes<T> slope_x = moderate_or_zero<T>(mx[0] / z[0] + mx[1] / z[1] + mx[2] / z[2]) * half_width;
-    const Lanes<T> slope_y = moderate_or_zero<T>(my[0] / z[0] + my[1] / z[1] + my[2] / z[2]) * half_height;
+    const auto slope = [&](const Lanes<T>(&m)[4]) {
+      return moderate_or_zero<T>(scratch.perspective ? m[0] / z[0] + m[1] / z[1] + m[2] / z[2]
+                                                     : zero - (m[0] * z[0] + m[1] * z[1] + m[2] * z[2]));
+    };
+    const Lanes<T> slope_x = slope(mx) * half_width, slope_y = slope(my) * half_height;
     for (int k = 0; k < 3; ++k) {
       out[3 * k] = sum[k] * slope_x;
       out[3 * k + 1] = sum[k] * slope_y;
-      out[3 * k + 2] = sum[k] * moderate_or_zero<T>(one / (z[k] * z[k]));
+      out[3 * k + 2] = scratch.perspective ? sum[k] * moderate_or_zero<T>(one / (z[k] * z[k])) : sum[k];
     }
     store_face_gradients<T>(out, slot, result);
   }
 }
 
 // With u_m = dL/db_m, g = dL/dz and h_m = z (u_m - sum_k u_k b_k) - g z^2:  dL = sum_m h_m d(w_m / z_m), so that
-// grad z_m = -H_mm / z_m^2 and grad X_k = -sum_m H_mk M_m0 / z_m with H_mk = sum over pixels of h_m w_k.
+// grad z_m = -H_mm / z_m^2 and grad X_k = -sum_m H_mk M_m0 / z_m with H_mk = sum over pixels of h_m w_k. Without
+// perspective h_m = u_m + g z_m:  grad z_m = sum over pixels of g w_m,  grad X_k = -sum_m H_mk M_m0.
 template <class T>
 void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& block, int64_t b,
                               FragmentScratch<T>& scratch, FaceGradients<T>& result) {
@@ -304,12 +312,17 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
         [&](int64_t i, Lanes32 ids, Lanes<T> y) {
           const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
           const int64_t count = std::min(kLanes, W - i);
-          Lanes<T> h[3] = {zero, zero, zero};
+          Lanes<T> h[3] = {zero, zero, zero}, by_depth = zero;
           if (args.grad_depth) {
             T grad[kLanes] = {};
             std::copy_n(args.grad_depth + row + i, count, grad);
-            const Lanes<T> deep = depth_or_zero<T>(p.z);
-            h[0] = h[1] = h[2] = (zero - load_lanes<Lanes<T>>(grad)) * deep * deep;
+            const Lanes<T> g = load_lanes<Lanes<T>>(grad), deep = depth_or_zero<T>(p.z);
+            if (scratch.perspective) {
+              h[0] = h[1] = h[2] = (zero - g) * deep * deep;
+            } else {
+              by_depth = g;
+              for (int m = 0; m < 3; ++m) h[m] = g * depth_or_zero<T>(p.corner_z[m]);
+            }
           }
           if (args.grad_weights) {
             T grad[3][kLanes] = {};
@@ -320,11 +333,13 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
             const Lanes<T> u[3] = {choose(reversed, last, first), load_lanes<Lanes<T>>(grad[1]),
                                    choose(reversed, first, last)};
             Lanes<T> mean = zero;
-            for (int m = 0; m < 3; ++m) mean = mean + u[m] * (p.w[m] * p.z / p.corner_z[m]);
-            for (int m = 0; m < 3; ++m) h[m] = h[m] + p.z * (u[m] - mean);
+            if (scratch.perspective)
+              for (int m = 0; m < 3; ++m) mean = mean + u[m] * (p.w[m] * p.z / p.corner_z[m]);
+            const Lanes<T> scale = scratch.perspective ? p.z : one;
+            for (int m = 0; m < 3; ++m) h[m] = h[m] + scale * (u[m] - mean);
           }
           for (int m = 0; m < 3; ++m)
-            add_quads<T>({h[m] * p.w[0], h[m] * p.w[1], h[m] * p.w[2], zero}, p.slot, 12, sums + 4 * m);
+            add_quads<T>({h[m] * p.w[0], h[m] * p.w[1], h[m] * p.w[2], by_depth * p.w[m]}, p.slot, 12, sums + 4 * m);
         },
         [](int64_t) {});
   }
@@ -338,13 +353,14 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
     load_face_quads<T>(table + 4, slot, kEntry, my);
     load_face_quads<T>(table + 12, slot, kEntry, z);
     for (int m = 0; m < 3; ++m) {
-      slope_x[m] = moderate_or_zero<T>(mx[m] / z[m]) * half_width;
-      slope_y[m] = moderate_or_zero<T>(my[m] / z[m]) * half_height;
+      slope_x[m] = moderate_or_zero<T>(scratch.perspective ? mx[m] / z[m] : mx[m]) * half_width;
+      slope_y[m] = moderate_or_zero<T>(scratch.perspective ? my[m] / z[m] : my[m]) * half_height;
     }
     for (int k = 0; k < 3; ++k) {
       out[3 * k] = zero - (sum[0][k] * slope_x[0] + sum[1][k] * slope_x[1] + sum[2][k] * slope_x[2]);
       out[3 * k + 1] = zero - (sum[0][k] * slope_y[0] + sum[1][k] * slope_y[1] + sum[2][k] * slope_y[2]);
-      out[3 * k + 2] = (zero - sum[k][k]) * moderate_or_zero<T>(one / (z[k] * z[k]));
+      out[3 * k + 2] =
+          scratch.perspective ? (zero - sum[k][k]) * moderate_or_zero<T>(one / (z[k] * z[k])) : sum[k][3];
     }
     store_face_gradients<T>(out, slot, result);
   }

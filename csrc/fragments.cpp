@@ -2,7 +2,7 @@
 // same expressions as in the rasterizer.
 //
 // With w_k the normalised screen weights and q = sum_k w_k / z_k: depth z = 1 / q, perspective-correct weights b_k = z
-// w_k / z_k. Moving corner k by (dX, dY) pixels changes the weights at a fixed pixel by dw_m = -w_k (M_m0 dX + M_m1
+// w_k / z_k. Without perspective, z = sum_k w_k z_k and b_k = w_k. Moving corner k by (dX, dY) pixels changes the weights at a fixed pixel by dw_m = -w_k (M_m0 dX + M_m1
 // dY), M as in geometry.h. The loops over pixels are in fragment_rows.h.
 #include <algorithm>
 #include <cmath>
@@ -35,9 +35,11 @@ struct FragmentScratch {
   std::vector<T> table;        // [visible + 1 + 8, kEntry]
   std::vector<T> rows;         // [2, W + 8] a row of depths or gradients each
   std::vector<T> sums;         // [visible + 1 + 8, 4 or 12] gradients per face
+  bool perspective;
 
-  void reserve_for(int64_t num_faces, const RowBlocks& blocks) {
+  void reserve_for(int64_t num_faces, const RowBlocks& blocks, bool has_perspective) {
     const int64_t most = blocks.most_visible(num_faces);
+    perspective = has_perspective;
     reserve(seen, 2 * num_faces + 1 + kTogether);
     reserve(slots, 2 * num_faces + 1);
     reserve(ids, most + kTogether);
@@ -91,7 +93,7 @@ void forward(const Args& args, Size raster, const Body& body) {
     const RowBlocks blocks(raster, F);
     if (block >= blocks.count) return;
     FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
-    scratch.reserve_for(F, blocks);
+    scratch.reserve_for(F, blocks, args.perspective);
     body(make_block(mesh, args.face_index, blocks, b, block), b, scratch);
   });
 }
@@ -108,7 +110,7 @@ void backward(const Args& args, Size raster, int64_t sums, const Body& body) {
         const RowBlocks blocks(raster, F);
         const int64_t most = blocks.most_visible(F);
         FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
-        scratch.reserve_for(F, blocks);
+        scratch.reserve_for(F, blocks, args.perspective);
         reserve(scratch.sums, (most + 1 + kTogether) * sums);
         reserve(result.ids, most);
         reserve(result.values, 9 * most);

@@ -6,8 +6,8 @@
 // is computed only where the bounds do not decide. Several threads can share one image: set-up by chunks of faces, fill
 // by bands of rows.
 //
-// The bounds are those of q = 1 / depth, which is linear on the screen: at a pixel (i, j) inside a face, q differs from
-// slope_x i + slope_y j + level by at most `margin`. See `bound_depth` in fill.h, where the loops are.
+// The bounds are those of q = 1 / depth, or -depth without perspective, which is linear on the screen: at a pixel (i, j)
+// inside a face, q differs from slope_x i + slope_y j + level by at most `margin`. See `bound_depth` in fill.h, where the loops are.
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -29,7 +29,7 @@ constexpr int64_t kChunk = 2048;  // faces that one thread sets up together
 template <class T>
 struct FaceBlock {
   T x[3][kTogether], y[3][kTogether];                                // corners, in the face's own order
-  T slope_x[kTogether], slope_y[kTogether], level[kTogether];        // of q = 1 / depth
+  T slope_x[kTogether], slope_y[kTogether], level[kTogether];        // of q
   T margin[kTogether];                                               // infinity: no bounds
   T nearest[kTogether];                                              // largest q at any pixel
   // Pixels inside the box.
@@ -64,7 +64,7 @@ template <class T>
 struct BandScratch {
   std::vector<T> columns, rows;  // [W + 8] and [H + 8] pixel centres in [-1, 1]
   Size raster{0, 0};             // for which they are computed
-  // [rows, W + 8] bounds of the nearest face's q = 1 / depth; -infinity on background; 8 more at the end.
+  // [rows, W + 8] bounds of the nearest face's q; -infinity on background; 8 more at the end.
   std::vector<T> most, least;
   std::vector<int32_t> face_index;  // the nearest face
   // [rows / 8, W / 8] the smallest of `least` in a block: the second pass skips what lies behind.

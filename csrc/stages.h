@@ -92,7 +92,7 @@ template <class T>
 struct ClipCount {
   MeshBatch<T> mesh;
   T near;           // faces are cut at this depth
-  int64_t* counts;  // out [B, 2]: new vertices, drawn faces. A mesh that no face crosses keeps all its faces: 0, F
+  int64_t* counts;  // out [B, 2]: new vertices, drawn faces. A mesh that stays as it is: 0, F
   int num_threads;
 };
 
@@ -117,6 +117,7 @@ struct RasterSettings {
   bool fill_back;       // also draw every face with its vertex order reversed
   T near;               // pixels with depth <= near are not drawn
   T far;                // nor those with depth >= far
+  bool perspective = true;  // see Fragments
 };
 
 // Which face is nearest at each pixel (rasterize.cpp).
@@ -189,20 +190,21 @@ struct SoftBackward {
   int num_threads;
 };
 
-// Barycentric weights and depth of the nearest face at each pixel, and their derivatives (fragments.cpp).
+// Barycentric weights and depth of the nearest face at each pixel, and their derivatives (fragments.cpp). On the screen
+// 1 / depth is linear with perspective, and depth itself without.
 template <class T>
 struct Fragments {
   MeshBatch<T> mesh;
   Size raster;           // H x W
   T far;                 // depth of the background
   const int32_t* face_index;  // [B, H, W]
-  T* weights;            // forward out [B, H, W, 3]: of the face's own vertices 0, 1, 2, perspective-correct; 0 on
-                         // background
+  T* weights;            // forward out [B, H, W, 3]: of the face's own vertices 0, 1, 2, in space; 0 on background
   T* depth;              // forward out [B, H, W]
   const T* grad_weights; // backward in [B, H, W, 3], or nullptr
   const T* grad_depth;   // backward in [B, H, W], or nullptr
   T* grad_vertices;      // backward out, like mesh.vertices
   int num_threads;
+  bool perspective = true;
 };
 
 // Depth images: the same depth, averaged over 2x2 pixels with anti-aliasing (fragments.cpp).
@@ -217,6 +219,7 @@ struct DepthImage {
   const T* grad_depth;  // backward in [B, h, w]
   T* grad_vertices;     // backward out, like mesh.vertices
   int num_threads;
+  bool perspective = true;
 };
 
 // Colours from texture cubes (shade.cpp): axis k of a cube is the weight of the face's vertex k.

@@ -53,13 +53,17 @@ class Clipped(NamedTuple):
         return ops.interpolate(self.places, self.corners, face_index, weights, self.place_starts)
 
 
-def clip_near(world: Tensor, mesh: MeshBatch, camera: Camera | None, near: float, far: float) -> Clipped | None:
-    """Cuts the faces that cross z = near; None if there are none.
+def clip_plane(near: float, far: float) -> float:
+    """The depth at which faces are cut, and from which on pixels are drawn."""
+    return max(float(near), (_SMALLEST if near else _NEAREST) * float(far))
+
+
+def clip_near(world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: float) -> Clipped | None:
+    """Cuts the faces that cross z = plane and leaves out those behind it; None if the meshes may stay as they are.
 
     ``world`` and ``mesh`` are the meshes before and after the camera. The new vertices are interpolated in the world
     and then go through the camera, so that gradients reach the corners of the cut edges.
     """
-    plane = max(float(near), (_SMALLEST if near else _NEAREST) * float(far))
     room = _room(mesh, plane)
     if room is None:
         return None
@@ -84,13 +88,13 @@ def _room(mesh: MeshBatch, plane: float) -> list[tuple[int, int]] | None:
 
     What has no values yet (in torch.compile and torch.func.vmap) gets room for the case that every face is cut.
     """
+    counts = mesh.face_counts or (mesh.faces.shape[-2],) * mesh.batch
     if not torch.compiler.is_compiling():
         try:
             room = ops.clip_count(*mesh[:3], plane).tolist()
-            return room if any(new for new, _ in room) else None
+            return room if any(new or drawn != n for (new, drawn), n in zip(room, counts, strict=True)) else None
         except RuntimeError:
             pass
-    counts = mesh.face_counts or (mesh.faces.shape[-2],) * mesh.batch
     return [(2 * n, 2 * n) for n in counts]
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from . import ops
-from ._clip import Clipped, clip_near
+from ._clip import Clipped, clip_near, clip_plane
 from ._packing import MeshBatch, is_list, pack_meshes
 from ._validate import (
     as_floats,
@@ -25,7 +25,7 @@ from ._validate import (
     describe,
 )
 from .cameras import Camera
-from .cameras.projection import ProjectingCamera
+from .cameras.projection import ProjectingCamera, has_perspective
 from .fragments import Fragments
 from .lights import Lights
 from .ops.raster import RasterSettings
@@ -54,11 +54,11 @@ class Scene(NamedTuple):
 
     def rasterize(self) -> Tensor:
         settings = self.settings
-        return ops.rasterize(*self.drawn[:3], *settings.raster, *settings[3:6])
+        return ops.rasterize(*self.drawn[:3], *settings.raster, *settings[3:6], settings.perspective)
 
     def rasterize_layers(self, layers: int) -> Tensor:
         settings = self.settings
-        return ops.rasterize_layers(*self.drawn[:3], *settings.raster, layers, *settings[3:6])
+        return ops.rasterize_layers(*self.drawn[:3], *settings.raster, layers, *settings[3:6], settings.perspective)
 
     def silhouette(self, local: bool) -> tuple[Tensor, Tensor]:
         return ops.silhouette(*self.drawn[:3], *self.settings, local)
@@ -69,7 +69,8 @@ class Scene(NamedTuple):
         return 1 - average(clear.unsqueeze(-1), settings.anti_aliasing).squeeze(-1)
 
     def depth(self, face_index: Tensor) -> Tensor:
-        return ops.depth_image(*self.drawn[:3], face_index, self.settings.anti_aliasing, self.settings.far)
+        settings = self.settings
+        return ops.depth_image(*self.drawn[:3], face_index, settings.anti_aliasing, settings.far, settings.perspective)
 
     def fragments(self, face_index: Tensor) -> Fragments:
         """Those of a face index map ``[B, H, W]``, or of layers ``[B, H, W, K]``."""
@@ -86,7 +87,7 @@ class Scene(NamedTuple):
         return Fragments(*shown, anti_aliasing, eps, self.drawn, drawn_face_index)
 
     def _weights_and_depth(self, face_index: Tensor) -> tuple[Tensor, Tensor]:
-        weights, depth = ops.fragments(*self.drawn[:3], face_index, self.settings.far)
+        weights, depth = ops.fragments(*self.drawn[:3], face_index, self.settings.far, self.settings.perspective)
         return weights if self.clipped is None else self.clipped.weights(face_index, weights), depth
 
     def face_index(self, face_index: Tensor) -> Tensor:
@@ -126,8 +127,10 @@ def make_scene(
     mesh = mesh._replace(faces=check_faces(mesh.faces, mesh.batch, mesh.vertices.device))
     check_depth_range(near, far, mesh.vertices.dtype)
     check_eps(eps, mesh.vertices.dtype)
-    clipped = clip_near(world, mesh, camera, near, far) if clip else None
-    settings = RasterSettings(height, width, bool(anti_aliasing), bool(fill_back), float(near), float(far), float(eps))
+    near = clip_plane(near, far) if clip else float(near)
+    clipped = clip_near(world, mesh, camera, near) if clip else None
+    how = bool(anti_aliasing), bool(fill_back), near, float(far), float(eps)
+    settings = RasterSettings(height, width, *how, has_perspective(camera))
     return Scene(world, mesh, camera, settings, clipped)
 
 

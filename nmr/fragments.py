@@ -35,8 +35,8 @@ class Fragments:
         Face index as :mod:`nmr.ops` takes it. ``sided_face_index[b, y, x] = f``: face f is nearest and seen from its
         front; ``F + f``: from its back; -1: background. ``face_index`` and ``is_back`` say the same as two tensors.
     weights : Tensor [B, H, W, 3]
-        Perspective-correct barycentric weights of the face's vertices in their own order; their sum is 1. 0 on
-        background. Differentiable in the vertices (at fixed face indices). Use ``weights.detach()`` for NMR's
+        Barycentric weights in space (perspective-correct) of the face's vertices in their own order; their sum is 1. 0
+        on background. Differentiable in the vertices (at fixed face indices). Use ``weights.detach()`` for NMR's
         definition, in which colours move vertices only through edges.
     depth : Tensor [B, H, W]
         z of the nearest point, ``far`` on background. Differentiable in the vertices (at fixed face indices).

@@ -30,6 +30,7 @@ def face_index(
     fill_back: bool = True,
     near: float = 0.1,
     far: float = 100.0,
+    perspective: bool = True,
 ) -> Tensor:
     """Index map ``[H, W]`` of one mesh: row 0 = bottom, -1 = background, F + f = back copy of face f."""
     H, W = (raster_size, raster_size) if isinstance(raster_size, int) else raster_size
@@ -59,7 +60,7 @@ def face_index(
             weights.append(w.nan_to_num(0.0).clamp(0, 1))
         total = weights[0] + weights[1] + weights[2]
         w0, w1, w2 = (w / total for w in weights)
-        zp = 1 / (w0 / z[0] + w1 / z[1] + w2 / z[2])
+        zp = 1 / (w0 / z[0] + w1 / z[1] + w2 / z[2]) if perspective else w0 * z[0] + w1 * z[1] + w2 * z[2]
         nearest = inside & (zp > near) & (zp < depth)
         depth[nearest] = zp[nearest]
         index[nearest] = f
@@ -85,13 +86,15 @@ def _screen_weights(corners: Tensor) -> Tensor:
     return screen / screen.sum(-1, keepdim=True)
 
 
-def fragments(vertices: Tensor, faces: Tensor, index: Tensor, far: float = 100.0) -> tuple[Tensor, Tensor]:
-    """Perspective-correct weights ``[H, W, 3]`` and depth ``[H, W]`` of an index map; autograd differentiates both."""
+def fragments(
+    vertices: Tensor, faces: Tensor, index: Tensor, far: float = 100.0, perspective: bool = True
+) -> tuple[Tensor, Tensor]:
+    """Weights in space ``[H, W, 3]`` and depth ``[H, W]`` of an index map; autograd differentiates both."""
     drawn = index >= 0
     corners = vertices[with_back_faces(faces, True)[index.clamp_min(0)]]
     screen, z = _screen_weights(corners), corners[..., 2]
-    depth = 1 / (screen / z).sum(-1)
-    weights = screen / z * depth[..., None]
+    depth = 1 / (screen / z).sum(-1) if perspective else (screen * z).sum(-1)
+    weights = screen / z * depth[..., None] if perspective else screen
     weights = torch.where((index >= len(faces))[..., None], weights.flip(-1), weights)
     return (
         torch.where(drawn[..., None], weights, torch.zeros_like(weights)),

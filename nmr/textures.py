@@ -14,6 +14,7 @@ from torch import Tensor
 from . import ops
 from ._packing import is_list
 from ._validate import check_choice, check_faces, check_values, describe
+from .cameras.projection import has_perspective
 
 if TYPE_CHECKING:
     from .fragments import Fragments
@@ -213,7 +214,10 @@ class UVTexture:
         level = None
         if self.filter == "mipmap":
             texels = ops.mipmaps(texels, grids, count)
-            level = ops.uv_levels(*fragments.mesh[:3], *at, grids)
+            vertices = fragments.vertices
+            if not has_perspective(fragments.camera):  # as at one depth
+                vertices = torch.cat([vertices[..., :2], torch.ones_like(vertices[..., 2:])], dim=-1)
+            level = ops.uv_levels(vertices, *fragments.mesh[1:3], *at, grids)
         return ops.sample_uv(texels, grids, level, *at, ops.WRAPS.index(self.wrap))
 
     def _texels(self, fragments: Fragments) -> tuple[Tensor, Tensor, int]:

@@ -6,7 +6,7 @@ namespace {
 
 template <class T>
 void rasterize_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
-                  Array<int32_t>& face_index, bool fill_back, double near, double far, int num_threads) {
+                  Array<int32_t>& face_index, bool fill_back, double near, double far, bool perspective, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
   require(face_index.ndim() == 3 && face_index.shape(0) == mesh.batch && face_index.shape(1) >= 1 &&
               face_index.shape(1) <= 16384 && face_index.shape(2) >= 1 && face_index.shape(2) <= 16384,
@@ -14,14 +14,15 @@ void rasterize_py(const Array<T>& vertices, const Indices& faces, const std::opt
               shape_of(face_index));
   const Size raster{face_index.shape(1), face_index.shape(2)};
   const Rasterize<T> args{
-      mesh, {raster, fill_back, static_cast<T>(near), static_cast<T>(far)}, face_index.mutable_data(), num_threads};
+      mesh, {raster, fill_back, static_cast<T>(near), static_cast<T>(far), perspective}, face_index.mutable_data(),
+      num_threads};
   py::gil_scoped_release release;
   rasterize(args);
 }
 
 template <class T>
 void rasterize_layers_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
-                         Array<int32_t>& face_index, bool fill_back, double near, double far, int num_threads) {
+                         Array<int32_t>& face_index, bool fill_back, double near, double far, bool perspective, int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
   require(face_index.ndim() == 4 && face_index.shape(0) == mesh.batch && face_index.shape(1) >= 1 &&
               face_index.shape(1) <= 16384 && face_index.shape(2) >= 1 && face_index.shape(2) <= 16384 &&
@@ -29,7 +30,7 @@ void rasterize_layers_py(const Array<T>& vertices, const Indices& faces, const s
           "face_index must have shape [" + std::to_string(mesh.batch) + ", H, W, K] with H and W in 1..16384, got " +
               shape_of(face_index));
   const RasterSettings<T> settings{
-      {face_index.shape(1), face_index.shape(2)}, fill_back, static_cast<T>(near), static_cast<T>(far)};
+      {face_index.shape(1), face_index.shape(2)}, fill_back, static_cast<T>(near), static_cast<T>(far), perspective};
   const RasterizeLayers<T> args{mesh, settings, face_index.shape(3), face_index.mutable_data(), num_threads};
   py::gil_scoped_release release;
   rasterize_layers(args);
@@ -69,9 +70,9 @@ void silhouette_backward_py(const Array<T>& vertices, const Indices& faces, cons
 template <class T>
 void define_raster(py::module_& m) {
   m.def("rasterize", &rasterize_py<T>, array("vertices"), array("faces"), array("starts"), array("face_index"),
-        py::arg("fill_back"), py::arg("near"), py::arg("far"), py::arg("num_threads"));
+        py::arg("fill_back"), py::arg("near"), py::arg("far"), py::arg("perspective"), py::arg("num_threads"));
   m.def("rasterize_layers", &rasterize_layers_py<T>, array("vertices"), array("faces"), array("starts"),
-        array("face_index"), py::arg("fill_back"), py::arg("near"), py::arg("far"), py::arg("num_threads"));
+        array("face_index"), py::arg("fill_back"), py::arg("near"), py::arg("far"), py::arg("perspective"), py::arg("num_threads"));
   m.def("silhouette_forward", &silhouette_forward_py<T>, array("face_index"), array("alpha"), py::arg("anti_aliasing"),
         py::arg("num_threads"));
   const auto define_backward = [&m](const char* name, auto* function) {

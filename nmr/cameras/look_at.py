@@ -254,6 +254,7 @@ class Orthographic(SquarePixels):
     up: Numbers = (0.0, 1.0, 0.0)
     scale: Scalars = 1.0
     right_handed: bool = False
+    perspective = False
 
     def __post_init__(self) -> None:
         scale = _scalar(self.scale, "scale", 0, math.inf, "between 0 and infinity")

@@ -21,8 +21,10 @@ class Camera(Protocol):
     """The interface of cameras: any object that takes vertices to renderer space, differentiably.
 
     For batches ``[B, V, 3]``, a camera of your own needs only ``transform(vertices)``. For lists of meshes of different
-    sizes, ``transform`` must also take ``starts``. For normals and light it may have an attribute ``right_handed``,
-    whether the world is right-handed (default: False), and for highlights it needs ``eye``, ``[3]`` or ``[B, 3]``.
+    sizes, ``transform`` must also take ``starts``. It may have the attributes ``perspective``, whether x and y were
+    divided by the depth (default: True; False: depth, colours and weights are linear on the screen), and, for normals
+    and light, ``right_handed``, whether the world is right-handed (default: False). Highlights need ``eye``, ``[3]`` or
+    ``[B, 3]``.
     """
 
     def transform(self, vertices: Tensor, starts: Tensor | None = None) -> Tensor:
@@ -35,6 +37,8 @@ class Camera(Protocol):
 
 class ProjectingCamera:
     """Base class of cameras that define :meth:`projection`; it provides :meth:`transform`."""
+
+    perspective = True
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         """The camera in its general form, computed in ``dtype`` in host memory; differentiable in its parameters."""
@@ -182,10 +186,19 @@ class _Shaped(ProjectingCamera):
     height: int
     width: int
 
+    @property
+    def perspective(self) -> bool:
+        return self.camera.perspective
+
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         square, short = self.camera.projection(dtype), min(self.height, self.width)
         scale = square.intrinsics.new_tensor([[short / self.width], [short / self.height]])
         return replace(square, intrinsics=square.intrinsics * scale)
+
+
+def has_perspective(camera: Camera | None) -> bool:
+    """Whether x and y are divided by the depth (as without a camera), so that 1 / depth is linear on the screen."""
+    return bool(getattr(camera, "perspective", True))
 
 
 def _check_batch(vertices: object, starts: object) -> tuple[Tensor, int]:

@@ -11,9 +11,10 @@ from ._register import operator
 def clip_count(vertices: Tensor, faces: Tensor, starts: Tensor | None, near: float) -> Tensor:
     """Room that the clipped meshes need: int64 ``[B, 2]`` in host memory, new vertices and drawn faces.
 
-    A mesh that is not cut has no new vertices. All zeros where no vertex lies behind the plane.
+    A mesh that stays as it is has no new vertices, and all its faces are drawn.
     """
     counts = torch.zeros((batch_size(vertices, starts), 2), dtype=torch.int64, device="cpu")
+    counts[:, 1] = faces.shape[-2] if starts is None else starts[:, 1].diff()
     arrays = host_array(vertices), host_array(faces), host_array(starts)
     _C.clip_count(*arrays, near, counts.numpy(), num_threads())
     return counts

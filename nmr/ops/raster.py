@@ -19,6 +19,7 @@ class RasterSettings(NamedTuple):
     near: float
     far: float
     eps: float
+    perspective: bool  # 1 / depth is linear on the screen, else depth itself
 
     @property
     def raster(self) -> tuple[int, int]:
@@ -26,10 +27,10 @@ class RasterSettings(NamedTuple):
         return scale * self.height, scale * self.width
 
 
-def _face_index_map(vertices, faces, starts, height, width, fill_back, near, far) -> Tensor:
+def _face_index_map(vertices, faces, starts, height, width, fill_back, near, far, perspective) -> Tensor:
     face_index = host_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
     arrays = host_array(vertices), host_array(faces), host_array(starts)
-    _C.rasterize(*arrays, face_index.numpy(), fill_back, near, far, num_threads())
+    _C.rasterize(*arrays, face_index.numpy(), fill_back, near, far, perspective, num_threads())
     return face_index
 
 
@@ -46,13 +47,16 @@ def rasterize(
     fill_back: bool,
     near: float,
     far: float,
+    perspective: bool,
 ) -> Tensor:
     """Face index map ``[B, height, width]`` of meshes in renderer space; not differentiable."""
-    return _face_index_map(vertices, faces, starts, height, width, fill_back, near, far).to(vertices.device)
+    return _face_index_map(vertices, faces, starts, height, width, fill_back, near, far, perspective).to(
+        vertices.device
+    )
 
 
 @torch.library.register_fake(rasterize.op)
-def _(vertices, faces, starts, height, width, fill_back, near, far):
+def _(vertices, faces, starts, height, width, fill_back, near, far, perspective):
     return vertices.new_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
 
 
@@ -70,16 +74,17 @@ def rasterize_layers(
     fill_back: bool,
     near: float,
     far: float,
+    perspective: bool,
 ) -> Tensor:
     """Face indices of the nearest surfaces at each pixel, ``[B, height, width, layers]``, nearest first, then -1."""
     face_index = host_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
     arrays = host_array(vertices), host_array(faces), host_array(starts)
-    _C.rasterize_layers(*arrays, face_index.numpy(), fill_back, near, far, num_threads())
+    _C.rasterize_layers(*arrays, face_index.numpy(), fill_back, near, far, perspective, num_threads())
     return face_index.to(vertices.device)
 
 
 @torch.library.register_fake(rasterize_layers.op)
-def _(vertices, faces, starts, height, width, layers, fill_back, near, far):
+def _(vertices, faces, starts, height, width, layers, fill_back, near, far, perspective):
     return vertices.new_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
 
 
@@ -98,6 +103,7 @@ def silhouette(
     near: float,
     far: float,
     eps: float,
+    perspective: bool,
     local: bool,
 ) -> tuple[Tensor, Tensor]:
     """Silhouettes ``alpha [B, height, width]`` and the face index map ``[B, H, W]`` of meshes in renderer space.
@@ -105,14 +111,15 @@ def silhouette(
     Its gradient is :func:`silhouette_backward` or, if ``local``, :func:`local_gradient`.
     """
     scale = 2 if anti_aliasing else 1
-    face_index = _face_index_map(vertices, faces, starts, scale * height, scale * width, fill_back, near, far)
+    raster = scale * height, scale * width
+    face_index = _face_index_map(vertices, faces, starts, *raster, fill_back, near, far, perspective)
     alpha = host_empty((face_index.shape[0], height, width), dtype=vertices.dtype)
     _C.silhouette_forward(face_index.numpy(), alpha.numpy(), anti_aliasing, num_threads())
     return alpha.to(vertices.device), face_index.to(vertices.device)
 
 
 @torch.library.register_fake(silhouette.op)
-def _(vertices, faces, starts, height, width, anti_aliasing, fill_back, near, far, eps, local):
+def _(vertices, faces, starts, height, width, anti_aliasing, fill_back, near, far, eps, perspective, local):
     batch, scale = batch_size(vertices, starts), 2 if anti_aliasing else 1
     alpha = vertices.new_empty((batch, height, width))
     return alpha, vertices.new_empty((batch, scale * height, scale * width), dtype=torch.int32)
@@ -129,10 +136,10 @@ def _silhouette_setup(ctx, inputs, output):
 
 def _silhouette_backward(ctx, grad_alpha, _grad_face_index):
     if grad_alpha is None:
-        return (None,) * 11
+        return (None,) * 12
     gradient = local_gradient if ctx.local else silhouette_backward
     settings = ctx.settings
-    return gradient(*ctx.saved_tensors, grad_alpha, settings.anti_aliasing, settings.eps), *(None,) * 10
+    return gradient(*ctx.saved_tensors, grad_alpha, settings.anti_aliasing, settings.eps), *(None,) * 11
 
 
 register_autograd(silhouette, _silhouette_backward, _silhouette_setup)

@@ -76,7 +76,7 @@ struct Run {
 
   // The face index map; SoftRas's silhouette; the nearest one to three faces.
   void surfaces() {
-    const RasterSettings<T> settings{raster, s.fill_back, s.near, s.far};
+    const RasterSettings<T> settings{raster, s.fill_back, s.near, s.far, s.perspective};
     int32_t* index = r.template out<int32_t>("face_index", pixels);
     face_index = index;
     rasterize(Rasterize<T>{mesh, settings, index, threads});
@@ -121,12 +121,12 @@ struct Run {
     T* weights_out = out("weights", 3 * pixels);
     const Fragments<T> args{mesh, raster, s.far, face_index, weights_out, out("depth", pixels),
                             in_if(!s.no_grad_weights, "grad_weights", 3 * pixels), in_if(!s.no_grad_depth, "grad_depth", pixels),
-                            out("grad_fragments", 3 * rows), threads};
+                            out("grad_fragments", 3 * rows), threads, s.perspective};
     fragments_forward(args);
     fragments_backward(args);
     weights = weights_out;
     const DepthImage<T> image{mesh, s.image, s.anti_aliasing, s.far, face_index, out("depth_image", image_pixels),
-                              in("grad_depth_image", image_pixels), out("grad_depth_vertices", 3 * rows), threads};
+                              in("grad_depth_image", image_pixels), out("grad_depth_vertices", 3 * rows), threads, s.perspective};
     depth_forward(image);
     depth_backward(image);
   }

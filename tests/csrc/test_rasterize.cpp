@@ -28,7 +28,7 @@ struct SlowFace {
   }
 
   // Depth at a pixel, row 0 at the bottom; infinite outside the face.
-  T depth(int64_t column, int64_t row, Size raster) const {
+  T depth(int64_t column, int64_t row, Size raster, bool perspective) const {
     const T H = T(raster.height), W = T(raster.width), px = (2 * T(column) + 1 - W) / W, py = (2 * T(row) + 1 - H) / H;
     bool inside = drawn && px >= std::min({x[0], x[1], x[2]}) && px <= std::max({x[0], x[1], x[2]}) &&
                   py >= std::min({y[0], y[1], y[2]}) && py <= std::max({y[0], y[1], y[2]});
@@ -37,7 +37,7 @@ struct SlowFace {
       inside = !((py - y[a]) * (x[b] - x[a]) < (px - x[a]) * (y[b] - y[a]));
     }
     if (!inside) return std::numeric_limits<T>::infinity();
-    T X[3], Y[3], weights[3], inverse = 0;
+    T X[3], Y[3], weights[3], inverse = 0, mean = 0;
     for (int k = 0; k < 3; ++k) X[k] = (x[k] * W + W - 1) / 2, Y[k] = (y[k] * H + H - 1) / 2;
     const T det = X[2] * (Y[0] - Y[1]) + X[0] * (Y[1] - Y[2]) + X[1] * (Y[2] - Y[0]);
     for (int k = 0; k < 3; ++k) {
@@ -46,23 +46,26 @@ struct SlowFace {
       weights[k] = w > 0 ? std::min(w, T(1)) : T(0);
     }
     const T sum = weights[0] + weights[1] + weights[2];
-    for (int k = 0; k < 3; ++k) inverse += weights[k] / sum / z[k];
-    return 1 / inverse;
+    for (int k = 0; k < 3; ++k) {
+      inverse += weights[k] / sum / z[k];
+      mean += weights[k] / sum * z[k];
+    }
+    return perspective ? 1 / inverse : mean;
   }
 };
 
 template <class T>
-void check_rasterize(const Scene<T>& scene) {
+void check_rasterize_as_it_is(const Scene<T>& scene) {
   const MeshBatch<T> mesh = scene.mesh();
   const Size raster = scene.raster();
   std::vector<int32_t> face_index(scene.pixels(), -7), expected(scene.pixels(), -1);
-  rasterize(Rasterize<T>{mesh, {raster, scene.fill_back, scene.near, scene.far}, face_index.data(), 2});
+  rasterize(Rasterize<T>{mesh, {raster, scene.fill_back, scene.near, scene.far, scene.perspective}, face_index.data(), 2});
   for (int64_t b = 0; b < scene.batch; ++b) {
     std::vector<T> nearest(raster.pixels(), scene.far);
     for (int64_t id = 0; id < mesh.face_count(b) * (scene.fill_back ? 2 : 1); ++id) {
       const SlowFace<T> face(mesh, b, id);
       for (int64_t n = 0; n < raster.pixels(); ++n) {
-        const T depth = face.depth(n % raster.width, raster.height - 1 - n / raster.width, raster);
+        const T depth = face.depth(n % raster.width, raster.height - 1 - n / raster.width, raster, scene.perspective);
         if (!(depth > scene.near && depth < nearest[n])) continue;  // of equally near faces the first wins
         nearest[n] = depth;
         expected[b * raster.pixels() + n] = static_cast<int32_t>(id);
@@ -70,6 +73,15 @@ void check_rasterize(const Scene<T>& scene) {
     }
   }
   for (size_t n = 0; n < expected.size(); ++n) CHECK_EQUAL(face_index[n], expected[n]);
+}
+
+// With and without perspective.
+template <class T>
+void check_rasterize(Scene<T> scene) {
+  for (const bool perspective : {true, false}) {
+    scene.perspective = perspective;
+    check_rasterize_as_it_is(scene);
+  }
 }
 
 constexpr Size kRasters[] = {{1, 1}, {2, 2}, {7, 7}, {24, 24}, {33, 64}, {1, 9}, {9, 1}, {40, 7}, {130, 24}, {12, 90}};
@@ -117,7 +129,8 @@ TEST_REAL(rasterize_of_almost_equally_near_faces_is_exact) {
   for (uint64_t seed = 0; seed < 60; ++seed) {
     Mesh mesh = soup(15, seed);
     for (size_t n = 0; n < mesh.vertices.size(); n += 3) {
-      const double z = 1 / (0.4 + 0.02 * static_cast<double>(seed % 5) * mesh.vertices[n] - 0.03 * mesh.vertices[n + 1]);
+      const double q = 0.4 + 0.02 * static_cast<double>(seed % 5) * mesh.vertices[n] - 0.03 * mesh.vertices[n + 1];
+      const double z = seed % 2 ? 1 / q : 2 + q;  // one plane with perspective, or without
       mesh.vertices[n + 2] = z * (1 + static_cast<double>(n * (seed + 1) % 7) * std::numeric_limits<T>::epsilon());
     }
     Scene<T> scene = single<T>(mesh);

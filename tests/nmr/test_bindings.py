@@ -16,7 +16,9 @@ import torch
 from nmr import _C, ops
 
 CALLS = {
-    "rasterize": lambda a: _C.rasterize(a["vertices"], a["faces"], a["starts"], a["face_index"], True, 0.1, 100.0, 1),
+    "rasterize": lambda a: _C.rasterize(
+        a["vertices"], a["faces"], a["starts"], a["face_index"], True, 0.1, 100.0, True, 1
+    ),
     "silhouette": lambda a: _C.silhouette_forward(a["face_index"], a["alpha"], True, 1),
     "silhouette_backward": lambda a: _C.silhouette_backward(
         a["vertices"], a["faces"], a["starts"], a["face_index"], a["alpha"], a["grad"], True, 1e-4, 1
@@ -108,7 +110,7 @@ def test_no_call_reads_or_writes_outside_an_array(calls, change, words):
     [
         (lambda v, wrong, face_index: _C.smoothness_forward(v, wrong.reshape(-1, 4), np.zeros(1), 1), "edges refer to"),
         (
-            lambda v, wrong, face_index: _C.rasterize(v, wrong, None, face_index, True, 0.1, 100.0, 1),
+            lambda v, wrong, face_index: _C.rasterize(v, wrong, None, face_index, True, 0.1, 100.0, True, 1),
             "faces refer to vertex",
         ),
         (
@@ -169,7 +171,7 @@ def test_nothing_is_converted_silently(change):
     faces = None if change is None else np.arange(12).reshape(4, 3)
     faces = faces.astype(change) if change is np.int32 else faces if change is None else change(faces)
     with pytest.raises(TypeError, match="incompatible function arguments"):
-        _C.rasterize(np.zeros((2, 12, 3)), faces, None, np.zeros((2, 8, 8), np.int32), True, 0.1, 100.0, 1)
+        _C.rasterize(np.zeros((2, 12, 3)), faces, None, np.zeros((2, 8, 8), np.int32), True, 0.1, 100.0, True, 1)
 
 
 def promised(gigabytes, dtype):
@@ -183,7 +185,7 @@ def promised(gigabytes, dtype):
 def test_more_faces_than_an_face_index_map_can_name():
     faces, face_index = promised(24, np.int64).reshape(-1, 3), np.zeros((1, 8, 8), np.int32)
     with pytest.raises(ValueError, match=r"at most 2\^30 faces per mesh"):
-        _C.rasterize(np.zeros((1, 3, 3)), faces, None, face_index, True, 0.1, 100.0, 1)
+        _C.rasterize(np.zeros((1, 3, 3)), faces, None, face_index, True, 0.1, 100.0, True, 1)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory that is promised and never touched")
@@ -193,7 +195,7 @@ def test_more_vertices_than_the_set_up_of_faces_can_name(packed):
     starts = np.array([[0, 0], [len(vertices), 1]]) if packed else None
     face_index = np.zeros((1, 8, 8), np.int32)
     with pytest.raises(ValueError, match=r"at most 2\^29 vertices per mesh"):
-        _C.rasterize(vertices if packed else vertices[None], faces, starts, face_index, True, 0.1, 100.0, 1)
+        _C.rasterize(vertices if packed else vertices[None], faces, starts, face_index, True, 0.1, 100.0, True, 1)
 
 
 def test_gradients_of_gradients_are_refused():

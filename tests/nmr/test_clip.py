@@ -189,3 +189,39 @@ def test_near_zero():
     assert torch.equal(alpha, nmr.render_silhouette(*floor(150), CAMERA, image_size=SIZE, near=0.0))
     tiny = [nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=near) for near in (1e-6, 1e-7, 1e-12)]
     assert torch.equal(tiny[0], tiny[1]) and torch.equal(tiny[0], tiny[2]) and (tiny[0] >= alpha).all()
+
+
+@pytest.mark.parametrize("camera", [CAMERA, nmr.Orthographic([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])])
+def test_what_is_nearer_than_near_is_never_drawn(camera):
+    corners = torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    faces = torch.tensor([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]])
+    far_away = torch.tensor([[-9.0, -9.0, 4.0], [9.0, -9.0, 4.0], [0.0, 9.0, 4.0]])
+    for seed in range(40):
+        generator = torch.Generator().manual_seed(seed)
+        turn = torch.linalg.qr(torch.randn(3, 3, generator=generator)).Q
+        vertices = ((corners * torch.rand(3, generator=generator)) @ turn).requires_grad_()
+        near = 1.01 * float(camera.transform(vertices)[..., 2].max())
+        how = {"image_size": SIZE, "near": near}
+        alone = nmr.render(vertices, faces, camera, outputs=("alpha", "depth", "fragments"), **how)
+        assert not alone.alpha.any() and (alone.depth == 100).all()
+        (grad,) = torch.autograd.grad(alone.depth.sum() + alone.alpha.sum(), vertices)
+        assert not grad.any()
+        both = nmr.render_fragments(
+            [torch.cat([vertices, far_away]), vertices],
+            [torch.cat([faces, torch.tensor([[8, 9, 10]])]), faces],
+            camera,
+            **how,
+        )
+        assert both.face_index.unique().tolist() == [-1, 8] and not both.covered[1].any()
+        assert both.weights.min() >= 0 and both.weights.max() <= 1
+
+
+def test_near_zero_draws_the_same_whatever_other_faces_do():
+    small = torch.tensor([[-5e-4, -5e-4, 5e-4], [5e-4, -5e-4, 5e-4], [0.0, 5e-4, 5e-4]])
+    vertices, faces = floor(1)
+    how = {"image_size": SIZE, "near": 0.0}
+    assert not nmr.render_silhouette(small, torch.tensor([[0, 1, 2]]), CAMERA, **how).any()
+    joint = torch.cat([vertices, small]), torch.cat([faces, torch.tensor([[0, 1, 2]]) + len(vertices)])
+    assert torch.equal(
+        nmr.render_silhouette(*joint, CAMERA, **how), nmr.render_silhouette(vertices, faces, CAMERA, **how)
+    )

@@ -13,7 +13,7 @@ EPS = 1e-3
 
 
 def face_index_of(vertices, faces, raster_size, fill_back=True, starts=None):
-    return nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, fill_back, 0.1, 50.0)
+    return nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, fill_back, 0.1, 50.0, True)
 
 
 def random_image(face_index, channels, dtype=torch.float64, seed=0):
@@ -56,7 +56,7 @@ def test_coverage_as_a_channel_has_the_gradient_of_the_silhouette(name):
     vertices, faces = torch.from_numpy(v["vertices"]).requires_grad_(), torch.from_numpy(v["faces"]).long()
     anti_aliasing, far = bool(v["anti_aliasing"]), float(v["far"])
     size = int(v["image_size"]) * (2 if anti_aliasing else 1)
-    settings = size, size, bool(v["fill_back"]), float(v["near"]), far
+    settings = size, size, bool(v["fill_back"]), float(v["near"]), far, True
     face_index = nmr.ops.rasterize(vertices.detach(), faces, None, *settings)
     image = (face_index >= 0).float()[..., None]
     alpha = nmr.ops.resolve(image, None, vertices, faces, None, face_index, anti_aliasing, float(v["eps"]))[..., 0]

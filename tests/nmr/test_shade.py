@@ -11,8 +11,8 @@ EPS = 1e-3
 
 
 def fragments_of(vertices, faces, raster_size, starts=None):
-    face_index = nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, True, 0.1, 50.0)
-    return face_index, nmr.ops.fragments(vertices, faces, starts, face_index, 50.0)[0]
+    face_index = nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, True, 0.1, 50.0, True)
+    return face_index, nmr.ops.fragments(vertices, faces, starts, face_index, 50.0, True)[0]
 
 
 def random_like(shape, dtype=torch.float64, seed=0):
