@@ -4,6 +4,7 @@
 #include <limits>
 #include <vector>
 
+#include "distortion.h"
 #include "parallel.h"
 #include "stages.h"
 
@@ -12,7 +13,7 @@ namespace {
 
 constexpr int kGroup = 16;  // vertices processed together, and partial sums per gradient; the same on every processor
 constexpr int64_t kChunk = 512;  // vertices per task: sums are taken per chunk, then over chunks
-constexpr int kSums = 12 + 6 + 5;        // sums over vertices per camera: gradients of matrix, intrinsics, distortion
+constexpr int kSums = 12 + 6 + 8;        // sums over vertices per camera: gradients of matrix, intrinsics, distortion
 constexpr int kTotals = kSums + 3 + 1;   // plus the gradients of origin and extent, which follow from the sums
 
 // Derivatives, and gradients multiplied by them, count as infinite beyond this limit. It is small enough that sums
@@ -23,15 +24,16 @@ template <> constexpr float kLimit<float> = 1e30f;
 // The camera of one image.
 template <class T>
 struct Lens {
-  T a[12], k[6], d[5], o[3], extent, inverse_extent;
+  T a[12], k[6], d[kMostCoefficients], o[3], extent, inverse_extent;
+  T reach2;                           // r^2 up to which the distortion is that of a lens
   T largest_a, largest_k, largest_d;  // largest |a|, |k / extent|, |d|; the first and the last at least 1
   bool usable;                        // all of it is finite, and extent is not 0
 
   Lens(const Project<T>& args, int64_t b)
-      : d{}, o{}, extent(1), largest_a(1), largest_k(0), largest_d(1), usable(true) {
+      : d{}, o{}, extent(1), reach2(std::numeric_limits<T>::infinity()), largest_a(1), largest_k(0), largest_d(1), usable(true) {
     std::copy_n(args.matrix + 12 * b, 12, a);
     std::copy_n(args.intrinsics + 6 * b, 6, k);
-    if (args.distortion) std::copy_n(args.distortion + 5 * b, 5, d);
+    if (args.distortion) std::copy_n(args.distortion + args.coefficients * b, args.coefficients, d);
     if (args.origin) std::copy_n(args.origin + 3 * b, 3, o);
     if (args.extent) extent = args.extent[b];
     inverse_extent = 1 / extent;
@@ -43,6 +45,9 @@ struct Lens {
     for (T value : d) usable = usable && std::abs(value) < kLimit<T>;
     for (T value : o) usable = usable && std::isfinite(value);
     usable = usable && std::isfinite(extent) && std::isfinite(inverse_extent);
+    if (!args.distortion || !args.perspective || !usable) return;
+    const int64_t n = args.coefficients;
+    reach2 = static_cast<T>(n == 4 ? square_reach<4>(d) : n == 5 ? square_reach<5>(d) : square_reach<8>(d));
   }
 };
 
@@ -129,7 +134,7 @@ void project_backward(const Project<T>& args) {
       for (int k = 0; k < kTotals; ++k) sum[k] += totals[r * kTotals + k];
     write(sum, 12, args.grad_matrix, b);
     write(sum + 12, 6, args.grad_intrinsics, b);
-    write(sum + 18, 5, args.grad_distortion, b);
+    write(sum + 18, static_cast<int>(args.coefficients), args.grad_distortion, b);
     write(sum + kSums, 3, args.grad_origin, b);
     write(sum + kSums + 3, 1, args.grad_extent, b);
   }

@@ -17,6 +17,8 @@ template <class T>
 struct Sight {
   T inverse_z;
   T px, py;    // before the distortion
+  T cx, cy;    // the nearest point within the reach of the distortion: (px, py) itself, or share times that
+  T share;
   T qx, qy;    // after it, divided by the extent
   T x, y, z;   // in renderer space
   T slope;     // bound of the derivative of extent q by the vertex in camera axes, up to a factor below 10
@@ -25,7 +27,7 @@ struct Sight {
 
 // x, y, z are relative to the origin. Images use divisions, which round as the published ones. Derivatives (kExact
 // false) use one reciprocal instead, which saves time.
-template <class T, bool kPerspective, bool kDistorted, bool kExact>
+template <class T, bool kPerspective, int kDistortion, bool kExact>
 NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
   Sight<T> s;
   const T ux = c.a[0] * x + c.a[1] * y + c.a[2] * z + c.a[3];
@@ -38,14 +40,23 @@ NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
   s.slope = kPerspective ? reach * std::abs(s.inverse_z) : T(1);
   s.qx = s.px;
   s.qy = s.py;
-  // q = p (1 + k1 r^2 + k2 r^4 + k3 r^6) + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y)
-  if (kDistorted) {
-    const T r2 = s.px * s.px + s.py * s.py, xy = s.px * s.py;
-    const T radial = 1 + r2 * (c.d[0] + r2 * (c.d[1] + r2 * c.d[4]));
-    s.qx = s.px * radial + 2 * c.d[2] * xy + c.d[3] * (r2 + 2 * s.px * s.px);
-    s.qy = s.py * radial + c.d[2] * (r2 + 2 * s.py * s.py) + 2 * c.d[3] * xy;
-    s.slope *= 1 + r2 * (std::abs(c.d[0]) + r2 * (std::abs(c.d[1]) + r2 * std::abs(c.d[4]))) +
-               reach * (std::abs(c.d[2]) + std::abs(c.d[3]));
+  if (kDistortion) {
+    const T length2 = s.px * s.px + s.py * s.py;
+    s.share = length2 > c.reach2 ? std::sqrt(c.reach2 / length2) : T(1);
+    s.cx = s.share * s.px;
+    s.cy = s.share * s.py;
+    const T r2 = s.cx * s.cx + s.cy * s.cy, xy = s.cx * s.cy;
+    const Radial<T> radial = radial_of<kDistortion>(c.d, r2);
+    s.qx = s.cx * radial.m;
+    s.qy = s.cy * radial.m;
+    s.slope *= 1 + std::abs(radial.m) + r2 * std::abs(radial.slope);
+    if (kDistortion != kFisheye) {
+      s.qx = s.qx + 2 * c.d[2] * xy + c.d[3] * (r2 + 2 * s.cx * s.cx);
+      s.qy = s.qy + c.d[2] * (r2 + 2 * s.cy * s.cy) + 2 * c.d[3] * xy;
+      s.slope *= 1 + reach * (std::abs(c.d[2]) + std::abs(c.d[3]));
+    }
+    s.qx += s.px - s.cx;
+    s.qy += s.py - s.cy;
   }
   s.qx = kExact ? s.qx / c.extent : s.qx * c.inverse_extent;
   s.qy = kExact ? s.qy / c.extent : s.qy * c.inverse_extent;
@@ -55,11 +66,11 @@ NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
   return s;
 }
 
-template <class T, bool kPerspective, bool kDistorted>
+template <class T, bool kPerspective, int kDistortion>
 NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T* __restrict points) {
   const T infinity = std::numeric_limits<T>::infinity();
   for (int l = 0; l < kGroup; ++l) {
-    const Sight<T> s = sight_of<T, kPerspective, kDistorted, true>(
+    const Sight<T> s = sight_of<T, kPerspective, kDistortion, true>(
         c, vertices[3 * l] - c.o[0], vertices[3 * l + 1] - c.o[1], vertices[3 * l + 2] - c.o[2]);
     points[3 * l] = is_finite(s.size) ? s.x : infinity;
     points[3 * l + 1] = is_finite(s.size) ? s.y : infinity;
@@ -70,15 +81,15 @@ NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T*
 // Adds the gradient of kGroup vertices to grad_vertices, and that of the camera to the partial sums. A vertex without
 // an image, or whose gradient would overflow although the upstream gradient is finite, gets gradient 0 and contributes
 // 0 to the camera. If the upstream gradient is infinite or NaN, that of the vertex and of the camera is NaN.
-template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
+template <class T, bool kPerspective, int kDistortion, bool kSumCamera>
 NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, const T* __restrict grad_points,
                                T* __restrict grad_vertices, T (*__restrict sums)[kGroup]) {
   for (int l = 0; l < kGroup; ++l) {
     T x = vertices[3 * l] - c.o[0], y = vertices[3 * l + 1] - c.o[1], z = vertices[3 * l + 2] - c.o[2];
     T gx = grad_points[3 * l], gy = grad_points[3 * l + 1], gz = grad_points[3 * l + 2];
-    Sight<T> s = sight_of<T, kPerspective, kDistorted, false>(c, x, y, z);
+    Sight<T> s = sight_of<T, kPerspective, kDistortion, false>(c, x, y, z);
     T reach = larger(std::abs(s.qx), std::abs(s.qy)) + c.largest_k * s.slope;
-    if (kDistorted) {
+    if (kDistortion) {
       const T r2 = 1 + s.px * s.px + s.py * s.py;
       reach = (reach + c.largest_k * r2 * r2 * r2 * r2) * c.largest_d;
     }
@@ -97,20 +108,49 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
     const T gqx = (c.k[0] * gx + c.k[3] * gy) * c.inverse_extent;
     const T gqy = (c.k[1] * gx + c.k[4] * gy) * c.inverse_extent;
     T gpx = gqx, gpy = gqy;
-    if (kDistorted) {
-      const T r2 = s.px * s.px + s.py * s.py, xy = s.px * s.py;
-      const T radial = 1 + r2 * (c.d[0] + r2 * (c.d[1] + r2 * c.d[4]));
-      const T along = gqx * s.px + gqy * s.py;  // gradient of `radial`
-      const T g_r2 = along * (c.d[0] + r2 * (2 * c.d[1] + r2 * (3 * c.d[4]))) + gqx * c.d[3] + gqy * c.d[2];
-      const T cross = 2 * (gqx * c.d[2] + gqy * c.d[3]);  // gradient of x y
-      gpx = gqx * radial + cross * s.py + 4 * gqx * c.d[3] * s.px + 2 * g_r2 * s.px;
-      gpy = gqy * radial + cross * s.px + 4 * gqy * c.d[2] * s.py + 2 * g_r2 * s.py;
-      if (kSumCamera) {
-        sums[18][l] += along * r2;
-        sums[19][l] += along * r2 * r2;
-        sums[20][l] += 2 * gqx * xy + gqy * (r2 + 2 * s.py * s.py);
-        sums[21][l] += gqx * (r2 + 2 * s.px * s.px) + 2 * gqy * xy;
-        sums[22][l] += along * r2 * r2 * r2;
+    if (kDistortion) {
+      const T x = keep ? s.cx : T(0), y = keep ? s.cy : T(0);
+      const T r2 = x * x + y * y, xy = x * y;
+      const Radial<T> radial = radial_of<kDistortion>(c.d, r2);
+      const T along = gqx * x + gqy * y;  // gradient of m
+      gpx = gqx * radial.m, gpy = gqy * radial.m;
+      if (kDistortion == kFisheye) {
+        gpx += 2 * along * radial.slope * x;
+        gpy += 2 * along * radial.slope * y;
+      } else {
+        const T g_r2 = along * radial.slope + gqx * c.d[3] + gqy * c.d[2];
+        const T cross = 2 * (gqx * c.d[2] + gqy * c.d[3]);  // gradient of x y
+        gpx = gpx + cross * y + 4 * gqx * c.d[3] * x + 2 * g_r2 * x;
+        gpy = gpy + cross * x + 4 * gqy * c.d[2] * y + 2 * g_r2 * y;
+      }
+      const bool within = s.share == T(1);
+      // Beyond the reach q = q(c) + p - c, where c = share p has the constant length of the reach.
+      const T length2 = within ? T(1) : s.px * s.px + s.py * s.py, length = std::sqrt(keep ? length2 : T(1));
+      const T nx = s.px / length, ny = s.py / length, vx = gpx - gqx, vy = gpy - gqy, out = vx * nx + vy * ny;
+      gpx = within ? gpx : gqx + s.share * (vx - nx * out);
+      gpy = within ? gpy : gqy + s.share * (vy - ny * out);
+      if (kSumCamera) {  // beyond the reach: 0
+        const T g = within ? along : T(0), gx_in = within ? gqx : T(0), gy_in = within ? gqy : T(0);
+        if (kDistortion == kFisheye) {
+          T power = g * radial.per_r;
+          for (int k = 0; k < 4; ++k) {
+            power *= radial.angle2;
+            sums[18 + k][l] += power;
+          }
+        } else {
+          const T by_numerator = kDistortion == kRational ? g * radial.inverse : g;
+          sums[18][l] += by_numerator * r2;
+          sums[19][l] += by_numerator * r2 * r2;
+          sums[20][l] += 2 * gx_in * xy + gy_in * (r2 + 2 * y * y);
+          sums[21][l] += gx_in * (r2 + 2 * x * x) + 2 * gy_in * xy;
+          sums[22][l] += by_numerator * r2 * r2 * r2;
+          if (kDistortion == kRational) {
+            const T by_denominator = -by_numerator * radial.m;
+            sums[23][l] += by_denominator * r2;
+            sums[24][l] += by_denominator * r2 * r2;
+            sums[25][l] += by_denominator * r2 * r2 * r2;
+          }
+        }
       }
     }
     const T gux = kPerspective ? gpx * s.inverse_z : gpx, guy = kPerspective ? gpy * s.inverse_z : gpy;
@@ -146,14 +186,14 @@ struct Padded {
   }
 };
 
-template <class T, bool kPerspective, bool kDistorted>
+template <class T, bool kPerspective, int kDistortion>
 NMR_INLINE void forward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run) {
   const T* vertices = args.vertices + 3 * run.vertices;
   T* points = args.points + 3 * run.points;
   const int64_t whole = run.count / kGroup * kGroup, rest = run.count - whole;
   Padded<T> last(vertices + 3 * whole, rest);
   for (int64_t n = 0; n < run.count; n += kGroup)  // one call, so that it is inlined
-    forward_lanes<T, kPerspective, kDistorted>(lens, n < whole ? vertices + 3 * n : last.vertices,
+    forward_lanes<T, kPerspective, kDistortion>(lens, n < whole ? vertices + 3 * n : last.vertices,
                                                n < whole ? points + 3 * n : last.out);
   std::copy_n(last.out, 3 * rest, points + 3 * whole);
 }
@@ -168,15 +208,19 @@ void forward_run(const Project<T>& args, const Run& run) {
       points[3 * n + 2] = 0;
     }
   } else if (!args.perspective) {
-    forward_run_of<T, false, false>(args, lens, run);
+    forward_run_of<T, false, 0>(args, lens, run);
   } else if (!args.distortion) {
-    forward_run_of<T, true, false>(args, lens, run);
+    forward_run_of<T, true, 0>(args, lens, run);
+  } else if (args.coefficients == 4) {
+    forward_run_of<T, true, 4>(args, lens, run);
+  } else if (args.coefficients == 5) {
+    forward_run_of<T, true, 5>(args, lens, run);
   } else {
-    forward_run_of<T, true, true>(args, lens, run);
+    forward_run_of<T, true, 8>(args, lens, run);
   }
 }
 
-template <class T, bool kPerspective, bool kDistorted, bool kSumCamera>
+template <class T, bool kPerspective, int kDistortion, bool kSumCamera>
 NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run, T* grad_vertices,
                                 double* total) {
   T sums[kSums][kGroup] = {};
@@ -188,7 +232,7 @@ NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, con
   std::copy_n(grad_vertices + 3 * whole, 3 * rest, last.out);
   for (int64_t n = 0; n < run.count; n += kGroup) {
     const bool inside = n < whole;
-    backward_lanes<T, kPerspective, kDistorted, kSumCamera>(lens, inside ? vertices + 3 * n : last.vertices,
+    backward_lanes<T, kPerspective, kDistortion, kSumCamera>(lens, inside ? vertices + 3 * n : last.vertices,
                                                             inside ? grad_points + 3 * n : last.grad_points,
                                                             inside ? grad_vertices + 3 * n : last.out, sums);
   }
@@ -213,13 +257,19 @@ void backward_run(const Project<T>& args, const Run& run, T* grad_vertices, doub
   if (!lens.usable) {
     if (total) std::fill_n(total, kTotals, 0.0);
   } else if (!args.perspective) {
-    total ? backward_run_of<T, false, false, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, false, false, false>(args, lens, run, grad_vertices, total);
+    total ? backward_run_of<T, false, 0, true>(args, lens, run, grad_vertices, total)
+          : backward_run_of<T, false, 0, false>(args, lens, run, grad_vertices, total);
   } else if (!args.distortion) {
-    total ? backward_run_of<T, true, false, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, true, false, false>(args, lens, run, grad_vertices, total);
+    total ? backward_run_of<T, true, 0, true>(args, lens, run, grad_vertices, total)
+          : backward_run_of<T, true, 0, false>(args, lens, run, grad_vertices, total);
+  } else if (args.coefficients == 4) {
+    total ? backward_run_of<T, true, 4, true>(args, lens, run, grad_vertices, total)
+          : backward_run_of<T, true, 4, false>(args, lens, run, grad_vertices, total);
+  } else if (args.coefficients == 5) {
+    total ? backward_run_of<T, true, 5, true>(args, lens, run, grad_vertices, total)
+          : backward_run_of<T, true, 5, false>(args, lens, run, grad_vertices, total);
   } else {
-    total ? backward_run_of<T, true, true, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, true, true, false>(args, lens, run, grad_vertices, total);
+    total ? backward_run_of<T, true, 8, true>(args, lens, run, grad_vertices, total)
+          : backward_run_of<T, true, 8, false>(args, lens, run, grad_vertices, total);
   }
 }

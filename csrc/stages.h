@@ -55,7 +55,7 @@ struct Pose {
 };
 
 // World space to renderer space (camera.cpp). Per image b: u = A (v - origin) + t with [A | t] = matrix; then
-//   perspective:   p = (u_x / u_z, u_y / u_z), distorted as OpenCV does; q = p / extent;
+//   perspective:   p = (u_x / u_z, u_y / u_z), distorted as OpenCV does (distortion.h); q = p / extent;
 //                  out = (K00 q_x + K01 q_y + K02, K10 q_x + ...,
 //                  u_z), K = intrinsics
 //   orthographic:  the same with p = (u_x, u_y), without distortion.
@@ -72,7 +72,8 @@ struct Project {
   int64_t num_vertices;  // V
   const T* matrix;       // [B, 3, 4]
   const T* intrinsics;   // [B, 2, 3]: renderer-space x and y from q
-  const T* distortion;   // [B, 5] k1 k2 p1 p2 k3, or nullptr
+  const T* distortion;   // [B, coefficients], or nullptr
+  int64_t coefficients;  // 5: k1 k2 p1 p2 k3; 8: also k4 k5 k6; 4: k1 k2 k3 k4 of a fisheye
   const T* origin;       // [B, 3], or nullptr (0)
   const T* extent;       // [B], or nullptr (1)
   bool perspective;
@@ -81,7 +82,7 @@ struct Project {
   T* grad_vertices;      // backward out, like vertices (summed over images when vertex_batch is 1), or nullptr
   T* grad_matrix;        // backward out [B, 3, 4], or nullptr
   T* grad_intrinsics;    // backward out [B, 2, 3], or nullptr
-  T* grad_distortion;    // backward out [B, 5], or nullptr
+  T* grad_distortion;    // backward out [B, coefficients], or nullptr
   T* grad_origin;        // backward out [B, 3], or nullptr
   T* grad_extent;        // backward out [B], or nullptr
   int num_threads;

@@ -48,7 +48,12 @@ Project<T> project_args(const Array<T>& vertices, const Array<T>& matrix, const 
           "matrix must have shape [B, 3, 4], got " + shape_of(matrix));
   args.batch = matrix.shape(0);
   require_shape(intrinsics, "intrinsics", {args.batch, 2, 3});
-  if (distortion) require_shape(*distortion, "distortion", {args.batch, 5});
+  if (distortion) {
+    require(distortion->ndim() == 2 && distortion->shape(0) == args.batch &&
+                (distortion->shape(1) == 4 || distortion->shape(1) == 5 || distortion->shape(1) == 8),
+            "distortion must have shape [" + std::to_string(args.batch) + ", 4, 5 or 8], got " + shape_of(*distortion));
+    args.coefficients = distortion->shape(1);
+  }
   if (origin) require_shape(*origin, "origin", {args.batch, 3});
   if (extent) require_shape(*extent, "extent", {args.batch});
   if (starts) {
@@ -111,7 +116,7 @@ void project_backward_py(const Array<T>& vertices, const Array<T>& matrix, const
   args.grad_vertices = optional_like(grad_vertices, "grad_vertices", vertices);
   args.grad_matrix = optional_out(grad_matrix, "grad_matrix", {args.batch, 3, 4});
   args.grad_intrinsics = optional_out(grad_intrinsics, "grad_intrinsics", {args.batch, 2, 3});
-  args.grad_distortion = optional_out(grad_distortion, "grad_distortion", {args.batch, 5});
+  args.grad_distortion = optional_out(grad_distortion, "grad_distortion", {args.batch, args.coefficients});
   args.grad_origin = optional_out(grad_origin, "grad_origin", {args.batch, 3});
   args.grad_extent = optional_out(grad_extent, "grad_extent", {args.batch});
   py::gil_scoped_release release;

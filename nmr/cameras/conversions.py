@@ -73,6 +73,7 @@ def from_opencv(
     height: float,
     width: float,
     pixel_center: float = 0.0,
+    fisheye: bool = False,
 ) -> Pinhole:
     """A camera of OpenCV: ``c = R v + t``, distorted, ``(u, v) = K (c_x / c_z, c_y / c_z, 1)`` in pixels.
 
@@ -81,13 +82,16 @@ def from_opencv(
     K, R : [3, 3] or [B, 3, 3]
         For a rotation vector use ``cv2.Rodrigues`` first.
     t : [3], [3, 1], [B, 3] or [B, 3, 1]
-    dist_coeffs : [4] or [5], [B, 4] or [B, 5], also as a column, optional
-        k1, k2, p1, p2 and k3.
+    dist_coeffs : [4], [5] or [8], or [B, 4] and so on, also as a column, optional
+        k1, k2, p1, p2, then k3, then k4, k5, k6. Beyond the reach of the formula the image goes on straight, as
+        :class:`nmr.Pinhole` says.
     height, width : number
         The image that K belongs to. The rendered image shows all of it, stretched if it has another shape.
     pixel_center : float
         Coordinate of the centre of the first pixel: 0 in OpenCV, 0.5 where pixel coordinates begin at its corner
         (COLMAP; :class:`nmr.Pinhole` itself).
+    fisheye : bool
+        dist_coeffs are the k1, k2, k3, k4 of ``cv2.fisheye``.
 
     Returns
     -------
@@ -106,21 +110,25 @@ def from_opencv(
     t = as_numbers(t, "t", "numbers of shape [3], [3, 1], [B, 3] or [B, 3, 1]")
     t = t.squeeze(-1) if t.shape[-1:] == (1,) else t
     if dist_coeffs is not None:
-        d = as_numbers(dist_coeffs, "dist_coeffs", "4 or 5 numbers")
+        d = as_numbers(dist_coeffs, "dist_coeffs", "4, 5 or 8 numbers")
         d = d.squeeze(-1) if d.ndim > 1 and d.shape[-1] == 1 else d
-        if d.ndim not in (1, 2) or d.shape[-1] not in (4, 5):
+        if d.ndim not in (1, 2) or d.shape[-1] not in ((4,) if fisheye else (4, 5, 8)):
+            wanted = "k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, p1, p2, also with k3, also with k4, k5, k6"
             raise ValueError(
-                f"dist_coeffs must be k1, k2, p1, p2 or k1, k2, p1, p2, k3, got shape {list(d.shape)}; "
-                "OpenCV's models with 8, 12 and 14 numbers are not supported"
+                f"dist_coeffs must be {wanted}, got shape {list(d.shape)}; OpenCV's models with 12 and 14 numbers are "
+                "not supported"
             )
-        dist_coeffs = d if d.shape[-1] == 5 else torch.cat([d, torch.zeros_like(d[..., :1])], dim=-1)
+        dist_coeffs = d if fisheye or d.shape[-1] != 4 else torch.cat([d, torch.zeros_like(d[..., :1])], dim=-1)
+    elif fisheye:
+        dist_coeffs = torch.zeros(4, **_HOST)
     return Pinhole(K + shift, R, t, dist_coeffs, orig_size=(height, width))
 
 
 def to_opencv(
     camera: ProjectingCamera, *, height: float, width: float, pixel_center: float = 0.0
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """``K [B, 3, 3]``, ``R [B, 3, 3]``, ``t [B, 3]`` and ``dist_coeffs [B, 5]`` or None, as :func:`from_opencv` takes.
+    """``K [B, 3, 3]``, ``R [B, 3, 3]``, ``t [B, 3]`` and ``dist_coeffs [B, 5]`` ([B, 8]; [B, 4] of a fisheye)
+    or None, as :func:`from_opencv` takes.
 
     A vertex keeps its pixel in images of ``image_size=(height, width)``.
     The determinant of R is -1 for the cameras of a left-handed world (see above). An orthographic camera raises a

@@ -15,7 +15,7 @@ _CENTRE = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64,
 
 @dataclass(frozen=True, eq=False)
 class Pinhole(ProjectingCamera):
-    """The published renderer's ``projection`` camera: a calibrated pinhole with OpenCV's distortion.
+    """A calibrated pinhole with OpenCV's distortion; the published renderer's ``projection`` camera.
 
     ``c = R v + t``; ``p = (c_x, c_y) / c_z``, distorted; pixel ``(u, v) = K (p_x, p_y, 1)``, u right and v DOWN; then
     ``x = 2 u / width - 1``, ``y = 1 - 2 v / height``, depth ``c_z``. Pixels are counted from the corner of the first
@@ -28,8 +28,11 @@ class Pinhole(ProjectingCamera):
         Pixels of an image of ``orig_size``; only the first two rows are used.
     R : [3, 3] or [B, 3, 3]
     t : [3], [B, 3] or [B, 1, 3]
-    dist_coeffs : [5] or [B, 5], optional
-        k1, k2, p1, p2, k3. The gradient is finite also on the optical axis.
+    dist_coeffs : [5], [8] or [4], or [B, 5] and so on, optional
+        k1, k2, p1, p2, k3; with 8 also k4, k5, k6; with 4 the k1, k2, k3, k4 of OpenCV's fisheye. Beyond the radius at
+        which the formula turns back (or comes near to it, with p1 and p2), where no lens follows it, the image goes on
+        straight: nothing is folded into the picture, and vertices there have no gradient to the coefficients. Edges of
+        faces are drawn straight: give large faces smaller ones.
     orig_size : number or (height, width), keyword only
         The image that K belongs to. It is mapped onto the whole rendered image: stretched, if that has another shape.
 
@@ -62,7 +65,9 @@ class Pinhole(ProjectingCamera):
         t = t.squeeze(1) if t.ndim == 3 and t.shape[1] == 1 else t
         object.__setattr__(self, "t", as_parameter(t, "t", 3))
         if self.dist_coeffs is not None:
-            object.__setattr__(self, "dist_coeffs", as_parameter(self.dist_coeffs, "dist_coeffs", 5))
+            numbers = as_numbers(self.dist_coeffs, "dist_coeffs", "numbers of shape [5], [8] or [4], or [B, 5] ...")
+            count = numbers.shape[-1] if numbers.ndim and numbers.shape[-1] in (4, 8) else 5
+            object.__setattr__(self, "dist_coeffs", as_parameter(numbers, "dist_coeffs", count))
         object.__setattr__(self, "orig_size", height_and_width(self.orig_size, "orig_size"))
         named = {"K": (self.K, 3), "R": (self.R, 3), "t": (self.t, 2), "dist_coeffs": (self.dist_coeffs, 2)}
         common_batch(**{name: x for name, (x, ndim) in named.items() if x is not None and x.ndim == ndim})
@@ -73,5 +78,5 @@ class Pinhole(ProjectingCamera):
         matrix = torch.cat([R.expand(batch, 3, 3), t.expand(batch, 3, 1)], dim=-1)
         height, width = self.orig_size
         intrinsics = K[:, :2] * K.new_tensor([[2 / width], [-2 / height]]) + _CENTRE
-        distortion = None if self.dist_coeffs is None else batched(self.dist_coeffs, dtype, 5)
+        distortion = None if self.dist_coeffs is None else batched(self.dist_coeffs, dtype, self.dist_coeffs.shape[-1])
         return Projection(matrix, intrinsics.to(dtype), distortion)

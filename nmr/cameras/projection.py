@@ -106,8 +106,9 @@ class Projection(ProjectingCamera):
         ``[A | t]``, world to camera axes.
     intrinsics : Tensor [B, 2, 3]
         Maps p to renderer space. Its second row usually changes the sign of y, which is up there.
-    distortion : Tensor [B, 5], optional
-        OpenCV's k1, k2, p1, p2, k3. Not used without perspective.
+    distortion : Tensor [B, 4], [B, 5] or [B, 8], optional
+        OpenCV's k1, k2, p1, p2, k3; with 8 also k4, k5, k6; with 4 the k1, k2, k3, k4 of a fisheye. Not used without
+        perspective. See :class:`nmr.Pinhole` for what lies beyond the reach of the formula.
     perspective : bool
         False: ``p = (u_x, u_y)``.
     origin : Tensor [B, 3], optional
@@ -133,6 +134,8 @@ class Projection(ProjectingCamera):
         shapes = (("matrix", (3, 4)), ("intrinsics", (2, 3)), ("distortion", (5,)), ("origin", (3,)), ("extent", ()))
         for name, shape in shapes:
             value = getattr(self, name)
+            if name == "distortion" and isinstance(value, Tensor) and value.shape[1:] in ((4,), (8,)):
+                shape = value.shape[1:]
             if value is None and name not in ("matrix", "intrinsics"):
                 continue
             if not isinstance(value, Tensor) or value.ndim != len(shape) + 1 or value.shape[1:] != shape:

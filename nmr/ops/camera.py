@@ -67,8 +67,8 @@ def project(
     """Vertices ``[B or 1, V, 3]`` or packed ``[N, 3]`` in renderer space, ``[B, V, 3]`` or ``[N, 3]``.
 
     ``u = A (v - origin) + t`` with ``matrix [B, 3, 4] = [A | t]``, ``origin [B, 3]`` or None (0); ``p = (u_x, u_y)``,
-    if perspective divided by u_z and distorted by ``distortion [B, 5]`` or None; divided by ``extent [B]`` or None (1);
-    x and y are ``intrinsics [B, 2, 3]`` times ``(p_x, p_y, 1)``, z is u_z.
+    if perspective divided by u_z and distorted by ``distortion`` ``[B, 4]``, ``[B, 5]``, ``[B, 8]`` or None;
+    divided by ``extent [B]`` or None (1); x and y are ``intrinsics [B, 2, 3]`` times ``(p_x, p_y, 1)``, z is u_z.
     """
     points = host_empty(_points_shape(vertices, matrix, starts), dtype=vertices.dtype)
     arrays = [host_array(x) for x in (vertices, matrix, intrinsics, distortion, origin, extent, starts)]

@@ -29,7 +29,7 @@ def random_arguments(batch, num_vertices, *, shared=False, distorted=True, dtype
     vertices = torch.rand(1 if shared else batch, num_vertices, 3, dtype=torch.float64) - 0.5
     matrix, intrinsics = torch.randn(batch, 3, 4), torch.randn(batch, 2, 3)
     matrix[:, 2] = torch.tensor([0.1, -0.2, 1.0, 3.0])
-    distortion = 0.1 * torch.randn(batch, 5) if distorted else None
+    distortion = 0.01 * torch.randn(batch, 5) if distorted else None  # all vertices are within its reach
     arguments = vertices, matrix, intrinsics, distortion, 0.1 * torch.randn(batch, 3), 0.5 + torch.rand(batch)
     return [None if x is None else x.to(dtype) for x in arguments]
 

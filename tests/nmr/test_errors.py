@@ -179,7 +179,11 @@ VALUES = [
     ("orig_size must be positive .* got large", lambda: nmr.Pinhole(I3, I3, EYE, orig_size="large")),
     (r"matrix must be a tensor of shape \[B, 3, 4\], got float32 \[42, 3\]", lambda: cameras.Projection(V, V)),
     ("height and width must be positive", lambda: cameras.from_opencv(I3, I3, EYE, height=0, width=4)),
-    (r"got shape \[8\]; .* 8, 12", lambda: cameras.from_opencv(I3, I3, EYE, [0.1] * 8, height=4, width=4)),
+    (r"got shape \[12\]; .* 12 and 14", lambda: cameras.from_opencv(I3, I3, EYE, [0.1] * 12, height=4, width=4)),
+    (
+        "k4 of a fisheye, got shape",
+        lambda: cameras.from_opencv(I3, I3, EYE, [0.1] * 5, height=4, width=4, fisheye=True),
+    ),
     ("no orthographic camera", lambda: cameras.to_opencv(nmr.Orthographic(EYE), height=4, width=4)),
     (r"last row of view must be \(0, 0, 0, 1\)", lambda: cameras.from_opengl(entry(I4, 3, 0), FRUSTUM)),
     ("last row of projection must be", lambda: cameras.from_opengl(I4, FRUSTUM.T)),
