@@ -19,6 +19,7 @@ from ._validate import (
     check_depth_range,
     check_eps,
     check_faces,
+    check_flag,
     check_image_size,
     check_transformed,
     check_vertices,
@@ -127,9 +128,9 @@ def make_scene(
     mesh = mesh._replace(faces=check_faces(mesh.faces, mesh.batch, mesh.vertices.device))
     check_depth_range(near, far, mesh.vertices.dtype)
     check_eps(eps, mesh.vertices.dtype)
-    near = clip_plane(near, far) if clip else float(near)
+    near = clip_plane(near, far) if check_flag(clip, "clip") else float(near)
     clipped = clip_near(world, mesh, camera, near) if clip else None
-    how = bool(anti_aliasing), bool(fill_back), near, float(far), float(eps)
+    how = check_flag(anti_aliasing, "anti_aliasing"), check_flag(fill_back, "fill_back"), near, float(far), float(eps)
     settings = RasterSettings(height, width, *how, has_perspective(camera))
     return Scene(world, mesh, camera, settings, clipped)
 

@@ -48,6 +48,9 @@ def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
         )
     if vertices.ndim not in (2, 3) or vertices.shape[-1] != 3:
         raise ValueError(f"vertices must have shape [B, V, 3] or [V, 3], got {describe(vertices)}")
+    if vertices.layout != torch.strided or vertices.device.type == "meta":
+        kind = "without values (device meta)" if vertices.device.type == "meta" else f"of layout {vertices.layout}"
+        raise TypeError(f"vertices must be an ordinary tensor, got one {kind}")
     vertices = cast_under_autocast(vertices)
     if vertices.dtype not in _FLOATS:
         raise TypeError(f"vertices must be float32 or float64, got {describe(vertices)}; call vertices.float()")
@@ -195,8 +198,27 @@ def check_choice(value: object, name: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name} must be {' or '.join(map(repr, choices))}, got {value!r}")
 
 
+def check_flag(value: object, name: str) -> bool:
+    """True or False, or 0 or 1, also of NumPy."""
+    if isinstance(value, (bool, int, float, np.generic)) and value in (0, 1):
+        return bool(value)
+    raise TypeError(f"{name} must be True or False, got {value!r}")
+
+
+def holds_for_all(condition: Tensor) -> bool:
+    """Whether all values are true; also true if they cannot be read, in torch.compile and torch.func.vmap."""
+    if torch.compiler.is_compiling() or condition.device.type != "cpu":
+        return True
+    try:
+        return bool(condition.all())
+    except RuntimeError:
+        return True
+
+
 def check_number(value: object, name: str) -> float:
-    """A Python or NumPy number, or a tensor with one element, as float."""
+    """A Python or NumPy number, or a tensor with one element and without a gradient, as float."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise TypeError(f"{name} has no gradient here; pass {name}.item(), or a number")
     try:
         return float(value)
     except (TypeError, ValueError, RuntimeError) as error:

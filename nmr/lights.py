@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ._validate import as_floats, describe
+from ._validate import as_floats, describe, holds_for_all
 
 if TYPE_CHECKING:
     from .fragments import Fragments
@@ -83,8 +83,8 @@ class Lights:
     Raises
     ------
     TypeError, ValueError
-        For values that are not floats, for wrong shapes, and if the numbers of lights differ; when drawn, also if
-        values per image do not match the number of images.
+        For values that are not floats or not finite, a negative shininess, wrong shapes, and if the numbers of lights
+        differ; when drawn, also if values per image do not match the number of images.
 
     Examples
     --------
@@ -120,6 +120,10 @@ class Lights:
             value = as_floats(getattr(self, name), name, shape)
             if value.ndim not in dimensions or 0 in value.shape or ("3" in shape and value.shape[-1] != 3):
                 raise ValueError(f"{name} must have shape {shape}, got {describe(value)}")
+            if not holds_for_all(value.isfinite()):
+                raise ValueError(f"{name} must be finite, got {value}")
+            if name == "shininess" and not holds_for_all(value >= 0):
+                raise ValueError(f"shininess must be 0 or more, got {value}")
             object.__setattr__(self, name, value)
         for group in (_DIRECTIONAL, _POINT):
             if group[0] in unused:

@@ -5,6 +5,7 @@ Any object with ``sample(fragments) -> [B, H, W, C]`` can be used as colours: se
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from . import ops
 from ._packing import is_list
-from ._validate import check_choice, check_faces, check_values, describe
+from ._validate import callers_level, check_choice, check_faces, check_values, describe
 from .cameras.projection import has_perspective
 
 if TYPE_CHECKING:
@@ -195,6 +196,12 @@ class UVTexture:
         for image in _each(check_values(self.image, "image", "H, W, C")):
             if 0 in image.shape[-3:]:
                 raise ValueError(f"image must have texels, got {describe(image)}")
+            if image.shape[-3] <= 4 < min(image.shape[-2:]):
+                warnings.warn(
+                    f"image {list(image.shape)} is taken for [H, W, C] with {image.shape[-1]} channels; if it is "
+                    "[C, H, W], give image.permute(1, 2, 0)",
+                    stacklevel=callers_level(),
+                )
         for uv in _each(check_values(self.uv, "uv", "T, 2")):
             if uv.shape[-1] != 2:
                 raise ValueError(f"uv must have shape [T, 2] or [B, T, 2], got {describe(uv)}")

@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._validate import as_numbers, describe
+from .._validate import as_numbers, describe, holds_for_all
 from .pinhole import Pinhole
 from .projection import (
     Numbers,
@@ -105,6 +105,8 @@ def from_opencv(
     """
     height, width = height_and_width((height, width), "height and width")
     K = batched(as_parameter(K, "K", 3, 3), torch.float64, 3, 3)
+    if not holds_for_all(K[:, 2, :2].abs() < 1e-3):
+        raise ValueError("the last row of K must be (0, 0, 1); is it transposed?")
     shift = torch.zeros(3, 3, **_HOST)
     shift[:2, 2] = 0.5 - pixel_center
     t = as_numbers(t, "t", "numbers of shape [3], [3, 1], [B, 3] or [B, 3, 1]")

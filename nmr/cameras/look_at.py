@@ -20,6 +20,7 @@ from .projection import (
     as_parameter,
     batched,
     common_batch,
+    warn_if_not_finite,
 )
 
 Scalars = float | Sequence[float] | Tensor
@@ -78,6 +79,7 @@ def _check_pose(camera: ProjectingCamera, *names: str, **scalar: float | Tensor)
     vectors = {name: as_parameter(getattr(camera, name), name, 3) for name in names}
     for name, value in (vectors | scalar).items():
         object.__setattr__(camera, name, value)
+    warn_if_not_finite(camera, *vectors)
     common_batch(
         **{name: x for name, x in vectors.items() if x.ndim == 2},
         **{name: x for name, x in scalar.items() if isinstance(x, Tensor) and x.ndim == 1},

@@ -7,7 +7,16 @@ from dataclasses import KW_ONLY, dataclass
 import torch
 
 from .._validate import as_numbers
-from .projection import Numbers, ProjectingCamera, Projection, as_parameter, batched, common_batch, height_and_width
+from .projection import (
+    Numbers,
+    ProjectingCamera,
+    Projection,
+    as_parameter,
+    batched,
+    common_batch,
+    height_and_width,
+    warn_if_not_finite,
+)
 
 # From pixels (u right, v down) to [-1, 1]: x = 2 u / width - 1, y = 1 - 2 v / height.
 _CENTRE = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], dtype=torch.float64, device="cpu")
@@ -69,6 +78,7 @@ class Pinhole(ProjectingCamera):
             count = numbers.shape[-1] if numbers.ndim and numbers.shape[-1] in (4, 8) else 5
             object.__setattr__(self, "dist_coeffs", as_parameter(numbers, "dist_coeffs", count))
         object.__setattr__(self, "orig_size", height_and_width(self.orig_size, "orig_size"))
+        warn_if_not_finite(self, "K", "R", "t", "dist_coeffs")
         named = {"K": (self.K, 3), "R": (self.R, 3), "t": (self.t, 2), "dist_coeffs": (self.dist_coeffs, 2)}
         common_batch(**{name: x for name, (x, ndim) in named.items() if x is not None and x.ndim == ndim})
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._validate import as_numbers, check_vertices, describe
+from .._validate import as_numbers, callers_level, check_vertices, describe, holds_for_all
 
 Numbers = float | Sequence | np.ndarray | Tensor
 
@@ -223,6 +224,16 @@ def common_batch(**parameters: Tensor | None) -> int:
         shapes = ", ".join(f"{name} {list(x.shape)}" for name, x in parameters.items() if x is not None)
         raise ValueError(f"the parameters of a camera must have one batch size (or 1), got {shapes}")
     return sizes.pop() if sizes else 1
+
+
+def warn_if_not_finite(camera: ProjectingCamera, *names: str) -> None:
+    """Warns of cameras with an infinite or missing number, whose image is empty; not if compiled or on a GPU."""
+    for name in names:
+        value = getattr(camera, name)
+        if isinstance(value, Tensor) and not holds_for_all(value.detach().isfinite()):
+            warnings.warn(
+                f"{name} of a {type(camera).__name__} is not finite: its image is empty", stacklevel=callers_level()
+            )
 
 
 def as_parameter(value: Numbers, name: str, *shape: int) -> Tensor:

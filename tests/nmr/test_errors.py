@@ -74,6 +74,8 @@ def renderer(**how):
     return nr.Renderer(8, **{"camera_mode": "look_at", **how})
 
 
+SIGMA = torch.tensor(1e-3, requires_grad=True)
+
 TYPES = [
     # meshes
     ("vertices must be a float tensor .* got list; use torch.as_tensor", lambda: nmr.face_normals([V], F)),
@@ -88,6 +90,11 @@ TYPES = [
     ("near must be a number, got str", lambda: render(near="close")),
     (r"far must be a number, got float32 \[2\]", lambda: render(far=torch.ones(2))),
     ("faces_per_pixel", lambda: fragments(faces_per_pixel=2.0)),
+    ("anti_aliasing must be True or False, got 'no'", lambda: render(anti_aliasing="no")),
+    ("clip must be True or False, got None", lambda: render(clip=None)),
+    ("sigma has no gradient here", lambda: nmr.render_soft_silhouette(V, F, LOOK, sigma=SIGMA)),
+    ("ordinary tensor, got one of layout torch.sparse_coo", lambda: render(V.to_sparse())),
+    ("ordinary tensor, got one without values", lambda: render(V.to("meta"))),
     ("size must be an integer", lambda: nmr.voxelize(V, F, 2.5)),
     ("subdivisions must be an integer, got float", lambda: nmr.icosphere(2.5)),
     # cameras
@@ -184,6 +191,9 @@ VALUES = [
         "k4 of a fisheye, got shape",
         lambda: cameras.from_opencv(I3, I3, EYE, [0.1] * 5, height=4, width=4, fisheye=True),
     ),
+    ("last row of K must be", lambda: cameras.from_opencv(entry(I3, 2, 0, 320.0), I3, EYE, height=4, width=4)),
+    ("shininess must be 0 or more", lambda: nmr.Lights(specular=0.5, shininess=-3.0)),
+    ("directional must be finite", lambda: nmr.Lights(0.5, math.nan)),
     ("no orthographic camera", lambda: cameras.to_opencv(nmr.Orthographic(EYE), height=4, width=4)),
     (r"last row of view must be \(0, 0, 0, 1\)", lambda: cameras.from_opengl(entry(I4, 3, 0), FRUSTUM)),
     ("last row of projection must be", lambda: cameras.from_opengl(I4, FRUSTUM.T)),
@@ -293,3 +303,17 @@ def test_light_for_other_images():
     drawing.eye = None
     with pytest.raises(ValueError, match=r"camera_mode='look_at' needs an eye; set renderer\.eye"):
         drawing.render_silhouettes(BATCH, FACES)
+
+
+@pytest.mark.parametrize(
+    ("words", "call"),
+    [
+        ("eye of a LookAt is not finite: its image is empty", lambda: nmr.LookAt([0.0, math.nan, 1.0])),
+        ("t of a Pinhole is not finite", lambda: nmr.Pinhole(I3, I3, [0.0, 0.0, math.inf], orig_size=8)),
+        (r"if it is \[C, H, W\], give image.permute", lambda: nmr.UVTexture(torch.rand(3, 8, 8), UV)),
+    ],
+)
+def test_warnings(words, call):
+    with pytest.warns(UserWarning, match=words) as said:
+        call()
+    assert said[0].filename == __file__
