@@ -6,19 +6,19 @@ are corrected here (``docs/from-neural-renderer.md`` lists them). The operators 
 ``[B, F, ts, ts, ts, 3]``. :func:`install_as` lets other people's ``import neural_renderer`` find this package.
 """
 
-from .get_points_from_angles import get_points_from_angles
-from .install_as import install_as
-from .lighting import lighting
-from .load_obj import load_obj
-from .look import look
-from .look_at import look_at
-from .mesh import Mesh
-from .perspective import perspective
-from .projection import projection
-from .rasterize import Rasterize, rasterize, rasterize_depth, rasterize_rgbad, rasterize_silhouettes
-from .renderer import Renderer
-from .save_obj import save_obj
-from .vertices_to_faces import vertices_to_faces
+from nmr.neural_renderer.get_points_from_angles import get_points_from_angles
+from nmr.neural_renderer.install_as import install_as
+from nmr.neural_renderer.lighting import lighting
+from nmr.neural_renderer.load_obj import load_obj
+from nmr.neural_renderer.look import look
+from nmr.neural_renderer.look_at import look_at
+from nmr.neural_renderer.mesh import Mesh
+from nmr.neural_renderer.perspective import perspective
+from nmr.neural_renderer.projection import projection
+from nmr.neural_renderer.rasterize import Rasterize, rasterize, rasterize_depth, rasterize_rgbad, rasterize_silhouettes
+from nmr.neural_renderer.renderer import Renderer
+from nmr.neural_renderer.save_obj import save_obj
+from nmr.neural_renderer.vertices_to_faces import vertices_to_faces
 
 __all__ = [
     "Mesh",

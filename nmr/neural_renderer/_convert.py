@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._scene import LARGEST_IMAGE
-from .._validate import as_floats, check_image_size, check_vertices, describe
+from nmr._scene import LARGEST_IMAGE
+from nmr._validate import as_floats, check_image_size, check_vertices, describe
 
 Numbers = float | Sequence | np.ndarray | Tensor
 

@@ -7,9 +7,9 @@ import numbers
 import torch
 from torch import Tensor
 
-from .._validate import as_numbers
-from ..cameras import points_from_angles
-from ._convert import Numbers
+from nmr._validate import as_numbers
+from nmr.cameras import points_from_angles
+from nmr.neural_renderer._convert import Numbers
 
 
 def get_points_from_angles(

@@ -17,7 +17,8 @@ def install_as(name: str = "neural_renderer", *, replace: bool = False) -> None:
     Parameters
     ----------
     name : str
-        The name under which that code imports the package.
+        The name under which that code imports the package; with dots if it lies in a package of theirs
+        ("external.neural_renderer").
     replace : bool
         Take the name also if a package of that name is installed or already imported. Code that has imported it keeps
         what it has.
@@ -27,13 +28,13 @@ def install_as(name: str = "neural_renderer", *, replace: bool = False) -> None:
     ImportError
         If there is such a package, and ``replace`` is False.
     ValueError
-        For a name that is no identifier.
+        For a name that no import could have.
 
     >>> nr.install_as()
     >>> from neural_renderer.projection import projection
     """
-    if not isinstance(name, str) or not name.isidentifier():
-        raise ValueError(f"name must be an identifier like 'neural_renderer', got {name!r}")
+    if not isinstance(name, str) or not all(part.isidentifier() for part in name.split(".")):
+        raise ValueError(f"name must be one of a module, like 'neural_renderer', got {name!r}")
     here = sys.modules[_HERE]
     if sys.modules.get(name) is not here:
         if not replace and (found := _find(name)):
@@ -41,7 +42,7 @@ def install_as(name: str = "neural_renderer", *, replace: bool = False) -> None:
                 f"there is another package {name}, {found}; uninstall it (pip uninstall neural_renderer_pytorch), or "
                 "call install_as(replace=True)"
             )
-        for module in [key for key in sys.modules if key.partition(".")[0] == name]:
+        for module in [key for key in sys.modules if key == name or key.startswith(f"{name}.")]:
             del sys.modules[module]
     # With the modules, too: an import of one would otherwise read its file a second time, as part of another package.
     for key, module in list(sys.modules.items()):

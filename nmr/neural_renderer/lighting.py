@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._validate import describe
-from ._convert import Numbers, check_textures, like
+from nmr._validate import describe
+from nmr.neural_renderer._convert import Numbers, check_textures, like
 
 
 def face_light(

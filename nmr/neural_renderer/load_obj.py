@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ._images import read_image
+from nmr.neural_renderer._images import read_image
 
 texture_wrapping_dict = {"REPEAT": 0, "MIRRORED_REPEAT": 1, "CLAMP_TO_EDGE": 2, "CLAMP_TO_BORDER": 3}
 _GREY = 0.5  # colour of faces without a material

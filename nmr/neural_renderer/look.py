@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from .._validate import as_numbers
-from ..cameras import Orthographic
-from ._convert import Numbers, check_batch
+from nmr._validate import as_numbers
+from nmr.cameras import Orthographic
+from nmr.neural_renderer._convert import Numbers, check_batch
 
 
 def orthographic_look(eye: Numbers, direction: Numbers, up: Numbers) -> Orthographic:

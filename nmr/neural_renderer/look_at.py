@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ..cameras import Orthographic
-from ._convert import Numbers, check_batch
+from nmr.cameras import Orthographic
+from nmr.neural_renderer._convert import Numbers, check_batch
 
 
 def look_at(vertices: Tensor, eye: Numbers, at: Numbers = (0, 0, 0), up: Numbers = (0, 1, 0)) -> Tensor:

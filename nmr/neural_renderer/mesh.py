@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._validate import describe
-from .load_obj import load_obj
+from nmr._validate import describe
+from nmr.neural_renderer.load_obj import load_obj
 
 
 class Mesh:

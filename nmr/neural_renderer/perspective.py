@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ..cameras import LookAt
-from ._convert import check_batch
+from nmr.cameras import LookAt
+from nmr.neural_renderer._convert import check_batch
 
 
 def perspective(vertices: Tensor, angle: float | Tensor = 30.0) -> Tensor:

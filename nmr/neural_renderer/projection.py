@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._validate import as_numbers
-from ..cameras import Pinhole
-from ._convert import Numbers, check_batch
+from nmr._validate import as_numbers
+from nmr.cameras import Pinhole
+from nmr.neural_renderer._convert import Numbers, check_batch
 
 
 def projection(

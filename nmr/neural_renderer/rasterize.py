@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .. import ops
-from .._validate import describe
-from ..fragments import Fragments
-from ..render import render
-from ._convert import Numbers, check_textures, height_and_width, like
+from nmr import ops
+from nmr._validate import describe
+from nmr.fragments import Fragments
+from nmr.neural_renderer._convert import Numbers, check_textures, height_and_width, like
+from nmr.render import render
 
 DEFAULT_IMAGE_SIZE = 256
 DEFAULT_ANTI_ALIASING = True

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..cameras import Look, LookAt, Orthographic
-from ._convert import check_batch, height_and_width, integer_faces
-from .lighting import face_light
-from .look import orthographic_look
-from .projection import projection
-from .rasterize import DEFAULT_EPS, DEFAULT_FAR, DEFAULT_NEAR, draw
-from .vertices_to_faces import vertices_to_faces
+from nmr.cameras import Look, LookAt, Orthographic
+from nmr.neural_renderer._convert import check_batch, height_and_width, integer_faces
+from nmr.neural_renderer.lighting import face_light
+from nmr.neural_renderer.look import orthographic_look
+from nmr.neural_renderer.projection import projection
+from nmr.neural_renderer.rasterize import DEFAULT_EPS, DEFAULT_FAR, DEFAULT_NEAR, draw
+from nmr.neural_renderer.vertices_to_faces import vertices_to_faces
 
 _MODES = ("projection", "look_at", "look", "none")
 
@@ -70,6 +70,8 @@ class Renderer(torch.nn.Module):
     >>> rgb, depth, alpha = renderer(vertices, faces, textures)
     """
 
+    camera_up = (0, 1, 0)  # of the class: renderers saved whole by the published code do not have it
+
     def __init__(
         self,
         image_size=256,
@@ -111,7 +113,6 @@ class Renderer(torch.nn.Module):
         tangent = math.tan(math.radians(viewing_angle))  # 0 is possible for cameras that do not use the angle
         self.eye = [0, 0, -(1 / tangent + 1)] if tangent else None
         self.camera_direction = camera_direction
-        self.camera_up = (0, 1, 0)
         self.near = near
         self.far = far
         self.light_intensity_ambient = light_intensity_ambient

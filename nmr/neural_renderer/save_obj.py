@@ -7,9 +7,9 @@ import os
 import numpy as np
 from torch import Tensor
 
-from .._validate import describe
-from ._convert import check_textures
-from ._images import write_png
+from nmr._validate import describe
+from nmr.neural_renderer._convert import check_textures
+from nmr.neural_renderer._images import write_png
 
 _EPS = 1e-5  # keeps texture coordinates below the last texel
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ._convert import check_batch, integer_faces
+from nmr.neural_renderer._convert import check_batch, integer_faces
 
 
 def vertices_to_faces(vertices: Tensor, faces: Tensor) -> Tensor:

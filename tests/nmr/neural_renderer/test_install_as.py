@@ -95,9 +95,27 @@ def test_other_names_and_second_calls():
     nr.install_as("nmr_alias")
     assert importlib.import_module("nmr_alias.projection").projection is nr.projection
     assert "neural_renderer" not in sys.modules
-    for name in ("nmr.alias", "", None, "neural-renderer"):
-        with pytest.raises(ValueError, match="name must be an identifier"):
+    for name in ("nmr..alias", "", None, "neural-renderer"):
+        with pytest.raises(ValueError, match="name must be one of a module"):
             nr.install_as(name)
+
+
+def test_a_copy_inside_of_a_package(tmp_path):
+    package(tmp_path, "body", **{"__init__.py": "", "fit.py": "from .external.neural_renderer import projection\n"})
+    package(tmp_path / "body", "external", **{"__init__.py": ""})
+    nr.install_as("body.external.neural_renderer")
+    assert importlib.import_module("body.fit").projection is nr.projection
+    namespace = {}
+    exec("import body.external.neural_renderer as nr\nfrom body.external import neural_renderer as same", namespace)
+    assert namespace["nr"] is namespace["same"] is nr
+
+
+def test_an_alias_by_hand_has_its_modules():
+    sys.modules["nmr_alias"] = nr
+    vertices, faces = nmr.icosphere(1)
+    rasterize = importlib.import_module("nmr_alias.rasterize").rasterize_silhouettes
+    corners = importlib.import_module("nmr_alias.vertices_to_faces").vertices_to_faces(vertices[None], faces[None])
+    assert rasterize(corners, image_size=16).any()
 
 
 @pytest.mark.parametrize("imported", [False, True])

@@ -1,6 +1,7 @@
 import copy
 import inspect
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -247,3 +248,11 @@ def test_renderers_can_be_copied_and_nested():
     assert [name for name, _ in model.named_parameters()] == ["renderer.eye"]
     model.renderer.eye = nr.get_points_from_angles(2.7, 0, 90)
     assert not list(model.parameters()) and model.renderer.render_silhouettes(*sphere()).any()
+
+
+def test_a_renderer_saved_whole_by_the_published_code_draws():
+    renderer = nr.Renderer(camera_mode="look_at", image_size=16)
+    assert "camera_up" not in renderer.__dict__, "which has no such attribute"
+    vertices, faces = nmr.icosphere(1)
+    again = pickle.loads(pickle.dumps(renderer))
+    assert again.render_silhouettes(0.5 * vertices[None], faces[None]).any()
