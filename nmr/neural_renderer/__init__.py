@@ -6,6 +6,9 @@ are corrected here (``docs/from-neural-renderer.md`` lists them). The operators 
 ``[B, F, ts, ts, ts, 3]``. :func:`install_as` lets other people's ``import neural_renderer`` find this package.
 """
 
+import sys
+from types import ModuleType
+
 from nmr.neural_renderer.get_points_from_angles import get_points_from_angles
 from nmr.neural_renderer.install_as import install_as
 from nmr.neural_renderer.lighting import lighting
@@ -43,3 +46,14 @@ __all__ = [
 # The version of the interface; some scripts check it.
 __version__ = "1.1.3"
 name = "neural_renderer_pytorch"
+
+
+class _Package(ModuleType):
+    """Functions here have the names of their modules, and stay functions if a module is imported under another name."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (isinstance(value, ModuleType) and callable(self.__dict__.get(name))):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

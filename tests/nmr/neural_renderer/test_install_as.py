@@ -116,6 +116,7 @@ def test_an_alias_by_hand_has_its_modules():
     rasterize = importlib.import_module("nmr_alias.rasterize").rasterize_silhouettes
     corners = importlib.import_module("nmr_alias.vertices_to_faces").vertices_to_faces(vertices[None], faces[None])
     assert rasterize(corners, image_size=16).any()
+    assert callable(nr.rasterize) and callable(nr.vertices_to_faces), "the functions of these names are not replaced"
 
 
 @pytest.mark.parametrize("imported", [False, True])
