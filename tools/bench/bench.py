@@ -1,66 +1,36 @@
-"""Measure the renderer and what belongs to it, beside other programs in the same run (compare within one run only).
+"""Measure the renderer and what belongs to it, beside deodr if it is installed (compare within one run only).
 
-  bench.py all: every row of the table, as Markdown; exit code 1 if a target is missed
-  bench.py w1: 64 spheres, 64x64 anti-aliased; also deodr
+  bench.py all: everything below
+  bench.py w1: 64 spheres, 64x64 anti-aliased
   bench.py w2: one mesh of 81,920 faces, 512x512
   bench.py w3: one mesh of 1,280 faces, 1024x1024
   bench.py w4: w1 with depth instead of silhouettes
-  bench.py colors: w1 in colour, with one thread: white, vertex colours, texture images, lights; exit code as for all
-  bench.py two-threads: w1 with two threads and with one
+  bench.py colors: w1 in colour, with one thread: white, vertex colours, texture images, lights
   bench.py voxels: voxel IoU of 1000 predictions
-  bench.py step: a whole training step in bf16 and in fp32, and what of it is not the networks'
-  bench.py memory: bytes per image and per raster pixel, in fresh processes (Linux)
+  bench.py step: a whole training step in bf16 and in fp32, and the time of its networks alone
 
-Medians over repeats that alternate between the programs, and the fastest. Freed memory is kept for all of them, as in
-training (learn3d/device.py). `pip install deodr` for the comparison.
+Medians over repeats that alternate between the programs, and the fastest, in milliseconds. Freed memory is kept for
+all of them, as in training (learn3d/device.py). `pip install deodr` for the comparison.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import bench_peers as peers
 import torch
 import tyro
-from bench_memory import bench_memory
-from bench_step import bench_step
-from bench_work import Program, Result, Timing, Workload, colored_spheres, deformed_spheres, measure, settings, show
+from bench_step import step_programs
+from bench_work import Program, Timing, colored_spheres, deformed_spheres, report
 
 import nmr
 from learn3d.device import keep_freed_memory
 from learn3d.terminal import unknown_name, without_traceback
 
-
-class Target(NamedTuple):
-    """The most that the first row of a result may have, or, with a ``peer``, how many times as fast it must be."""
-
-    limit: float
-    peer: str | None = None  # a program of the same run: such a target depends little on the machine
-
-    def __str__(self) -> str:
-        return f">= {self.limit:g} x {self.peer}" if self.peer else f"<= {self.limit:g}"
-
-
-ONE_THREAD = "one thread of the same"
-TARGETS = {
-    "w1, 64": Target(5, "deodr, 2 processes"),
-    "w1, 128": Target(5, "deodr, 2 processes"),
-    "w2": Target(8, "deodr, 1 process"),  # one mesh: deodr cannot share it
-    "w3": Target(5, "deodr, 1 process"),
-    "w4, 64": Target(6, "deodr, 2 processes"),
-    "colors white": Target(25),  # rgb follows from the silhouette
-    "colors vertex": Target(28),  # as white, and one interpolation
-    "colors uv": Target(40),  # as vertex colours, and four texels a pixel
-    "colors uv-lights": Target(50),  # as texture images, and the light of each face
-    "two-threads": Target(1.85, ONE_THREAD),  # the meshes of a batch are independent
-    "step": Target(8),  # 26 ms beside networks of 334 ms: 20,000 steps in two hours
-}
 COLORS = {
     "white": "white",
     "vertex": "vertex colours",
@@ -74,74 +44,48 @@ class Options:
     workload: tyro.conf.Positional[str] = "w1"
     """Name of the workload, from the list above."""
     batch: int | None = None
-    """Meshes of w1, w4 and colors, by default 64 (all: w1 with 64 and with 128); images of a step, by default 128."""
+    """Meshes of w1, w4 and colors, by default 64; images of a step, by default 128."""
     threads: int = 2
     """Threads of ours and of torch (colors takes one). deodr has none: it gets one process, and as many as these."""
     repeats: int = 15
     """Timed runs of each program."""
 
-    @property
-    def meshes(self) -> int:
-        return self.batch or 64
+
+def with_threads(threads: int, program: Program) -> Timing:
+    torch.set_num_threads(threads)
+    return program()
 
 
-def bench_render(name: str, options: Options, batch: int = 1) -> Result:
+def bench_render(name: str, options: Options) -> None:
     """Ours beside deodr."""
-    key, size, output = name, "64x64 anti-aliased", "depth" if name == "w4" else "alpha"
     if name in ("w1", "w4"):
-        workload, key = deformed_spheres(batch, 3, 64, outputs=(output,)), f"{name}, {batch}"
+        work = deformed_spheres(options.batch or 64, 3, 64, outputs=("depth" if name == "w4" else "alpha",))
     else:
-        size = "512x512" if name == "w2" else "1024x1024"
-        workload = deformed_spheres(1, 6 if name == "w2" else 3, int(size.split("x")[0]), anti_aliasing=False)
-    programs = {f"nmr, {options.threads} threads": _program(workload)}
+        subdivisions, size = {"w2": (6, 512), "w3": (3, 1024)}[name]
+        work = deformed_spheres(1, subdivisions, size, anti_aliasing=False)
+    run = partial(work.run, work.targets())
+    programs = {f"nmr, {n} threads": partial(with_threads, n, run) for n in dict.fromkeys((options.threads, 1))}
     with ExitStack() as stack:
         if peers.has_deodr():
-            programs |= peers.deodr_programs(workload, workload.targets(), options.threads, stack)
-        else:
-            print("deodr is not installed (pip install deodr): no comparison with it")
-        rows = measure(programs, options.repeats)
-    loss = "the mean squared difference" if name == "w4" else "1 - soft IoU"
-    title = f"{name.upper()}: {output}, {batch} meshes of {len(workload.faces)} faces, {size}"
-    about = settings(options.threads, options.repeats, batch=batch)
-    return Result(key, f"{title}, forward + backward of {loss}", rows, about)
+            programs |= peers.deodr_programs(work, work.targets(), options.threads, stack)
+        report(f"{name}: {work}, forward + backward", programs, options.repeats)
 
 
-def _program(workload: Workload, learn_values: bool = False) -> Program:
-    return partial(workload.run, workload.targets(), learn_values)
+def bench_colors(options: Options) -> None:
+    """One thread; fixed colours and learned ones take turns."""
+    for kind, about in COLORS.items():
+        work = colored_spheres(kind, options.batch or 64)
+        learned = [False] if work.values is None else [False, True]
+        programs = {
+            "nmr, 1 thread" + ", colours learned, too" * learn: partial(
+                with_threads, 1, partial(work.run, work.targets(), learn)
+            )
+            for learn in learned
+        }
+        report(f"colors: {work}, {about}, forward + backward", programs, options.repeats)
 
 
-def bench_colors(options: Options) -> list[Result]:
-    """One thread; fixed colours, which targets apply to, and learned ones take turns."""
-    torch.set_num_threads(1)
-    results = []
-    for kind, name in COLORS.items():
-        workload = colored_spheres(kind, options.meshes)
-        programs = {"nmr, 1 thread": _program(workload)}
-        if workload.values is not None:
-            programs["nmr, 1 thread, colours learned, too"] = _program(workload, learn_values=True)
-        title = f"Colours: {options.meshes} meshes, 1280 faces, 64x64 anti-aliased, {name}, forward + backward"
-        about = settings(1, options.repeats, batch=options.meshes)
-        results.append(Result(f"colors {kind}", title, measure(programs, options.repeats), about))
-        show(results[-1])
-    torch.set_num_threads(options.threads)
-    return results
-
-
-def bench_two_threads(options: Options) -> Result:
-    """Two threads beside one, alternately."""
-    program = _program(deformed_spheres(options.meshes, 3, 64))
-
-    def run(threads: int) -> Timing:
-        torch.set_num_threads(threads)
-        return program()
-
-    rows = measure({"nmr, 2 threads": partial(run, 2), ONE_THREAD: partial(run, 1)}, options.repeats)
-    torch.set_num_threads(options.threads)
-    about = settings(2, options.repeats, batch=options.meshes)
-    return Result("two-threads", "W1 with two threads and with one", rows, about)
-
-
-def bench_voxels(options: Options) -> Result:
+def bench_voxels(options: Options) -> None:
     """Voxels, and in all with the IoU."""
     spheres = deformed_spheres(1000, 3, 64)
     vertices = spheres.vertices * (31 / 32) + 0.5
@@ -153,92 +97,30 @@ def bench_voxels(options: Options) -> Result:
         nmr.metrics.voxel_iou(voxels, voxels.roll(1, 0))
         return forward - start, time.perf_counter() - start
 
-    repeats = min(options.repeats, 5)
-    rows = measure({f"nmr, {options.threads} threads": run}, repeats)
-    about = settings(options.threads, repeats, batch=1000)
-    return Result("voxels", "Voxel IoU of 1000 meshes of 1280 faces at 32^3", rows, about)
+    programs = {f"nmr, {options.threads} threads": partial(with_threads, options.threads, run)}
+    report("voxels: voxel IoU of 1000 meshes of 1280 faces at 32^3", programs, min(options.repeats, 5))
 
 
-def bench_all(options: Options) -> list[Result]:
-    """Every row of the table."""
-    results = []
-    for name, batch in (("w1", 64), ("w1", 128), ("w2", 1), ("w3", 1), ("w4", 64)):
-        results.append(bench_render(name, options, batch))
-        show(results[-1])
-    for bench in SINGLE.values():
-        results.append(bench(options))
-        show(results[-1])
-    return results
+def bench_step(options: Options) -> None:
+    """The difference of a step and of its networks is small beside both: distrust it if two calls disagree."""
+    torch.set_num_threads(options.threads)
+    batch = options.batch or 128
+    report(f"step: training step of the default preset, {batch} images", step_programs(batch), options.repeats)
 
 
-def reached(result: Result) -> float | None:
-    """The figure that is compared with the target; None without a target, or if its peer was not measured."""
-    ours = result.rows[0].total
-    if result.key not in TARGETS or TARGETS[result.key].peer is None:
-        return ours if result.key in TARGETS else None
-    return next((row.total / ours for row in result.rows if row.program == TARGETS[result.key].peer), None)
-
-
-def missed(result: Result) -> bool:
-    """Whether a result misses its target."""
-    if (value := reached(result)) is None:
-        return False
-    target = TARGETS[result.key]
-    return not (value >= target.limit if target.peer else value <= target.limit)
-
-
-def markdown(results: list[Result]) -> str:
-    """One line for each of our rows; peers and target stand in the first line of their workload."""
-    lines = ["| workload | ours | peers, in the same run | target |", "|---|---|---|---|"]
-    for result in results:
-        first, target = result.rows[0], TARGETS.get(result.key, "-")
-        peers = [row for row in result.rows if not row.program.startswith("nmr")]
-        theirs = "; ".join(f"{row.program} {row.total:.1f} ({row.total / first.total:.2f} x)" for row in peers)
-        more = [result.title, theirs or "-", f"{target}{': missed' if missed(result) else ''}"]
-        for row in result.rows:
-            if row not in peers:
-                about = row.program.partition(", ")[2]
-                ours = f"**{row.total:.2f}** {result.unit.split()[0]} ({about}); fastest {row.fastest:.2f}"
-                lines.append(f"| {more[0]} | {ours} | {more[1]} | {more[2]} |")
-                more = ["", "-", "-"]
-    return "\n".join(lines)
-
-
-SINGLE: dict[str, Callable[[Options], Result]] = {
-    "two-threads": bench_two_threads,
-    "voxels": bench_voxels,
-    "step": lambda options: bench_step(options.batch, options.threads, options.repeats),
-}
-ALONE: dict[str, Callable[[Options], Result]] = SINGLE | {
-    "w1": lambda options: bench_render("w1", options, options.meshes),
-    "w2": lambda options: bench_render("w2", options),
-    "w3": lambda options: bench_render("w3", options),
-    "w4": lambda options: bench_render("w4", options, options.meshes),
-}
-TABLES: dict[str, Callable[[Options], list[Result]]] = {"all": bench_all, "colors": bench_colors}
+BENCHES = {name: partial(bench_render, name) for name in ("w1", "w2", "w3", "w4")}
+BENCHES |= {"colors": bench_colors, "voxels": bench_voxels, "step": bench_step}
 
 
 @without_traceback()
 def main() -> int:
     options = tyro.cli(Options, description=__doc__)
-    name = options.workload
-    torch.set_num_threads(options.threads)
-    if name == "memory":
-        bench_memory()
-        return 0
+    if options.workload not in ("all", *BENCHES):
+        raise ValueError(unknown_name("workload", options.workload, ["all", *BENCHES]))
     keep_freed_memory()
-    if name in ALONE:
-        show(ALONE[name](options))
-        return 0
-    if name not in TABLES:
-        raise ValueError(unknown_name("workload", name, [*TABLES, *ALONE, "memory"]))
-    results = TABLES[name](options)
-    about = ", ".join(f"{key} {value}" for key, value in results[0].settings.items() if key != "batch")
-    print(f"\nForward + backward, medians; {about}\n\n{markdown(results)}", flush=True)
-    wrong = [r for r in results if missed(r)]
-    lines = [f"{r.title}: {reached(r):.2f}, not {TARGETS[r.key]}" for r in wrong]
-    if lines:
-        sys.exit("\n".join(["targets missed:", *lines]))
+    for name, bench in BENCHES.items():
+        if options.workload in ("all", name):
+            bench(options)
     return 0
 
 

@@ -1,15 +1,13 @@
-"""Workloads, our renderer on them, the stopwatch and the report of tools/bench/bench.py."""
+"""Workloads of tools/bench/bench.py, our renderer on them, and the stopwatch."""
 
 from __future__ import annotations
 
 import math
 import os
 import platform
-import re
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from statistics import median
 
 import torch
@@ -33,21 +31,22 @@ class Workload:
     values: Tensor | None = None  # colours [B, V, 3] of vertices, or texture images [B, 128, 128, 3]; None: white
     lights: bool = False
 
+    def __str__(self) -> str:
+        size = f"{self.size}x{self.size}" + " anti-aliased" * self.anti_aliasing
+        return f"{', '.join(self.outputs)}, {len(self.vertices)} meshes of {len(self.faces)} faces, {size}"
+
     def images(self, vertices: Tensor, values: Tensor | None = None) -> tuple[Tensor, ...]:
         """Our images of ``vertices`` with the colours ``values``, in the order of ``outputs``."""
         options = {"image_size": self.size, "anti_aliasing": self.anti_aliasing}
-        if self.outputs == ("alpha",):
-            return (nmr.render_silhouette(vertices, self.faces, self.camera, **options),)
-        if self.outputs == ("depth",):
-            return (nmr.render_depth(vertices, self.faces, self.camera, **options),)
-        values = self.values if values is None else values
-        colors = values if values is None or values.ndim == 4 else nmr.VertexColors(values)
-        if values is not None and values.ndim == 4:
-            colors = nmr.UVTexture(values, sphere_uv(nmr.icosphere(3)[0]))
-        options |= {"colors": colors, "lights": nmr.Lights() if self.lights else None}
-        if self.outputs == ("rgb",):
-            return (nmr.render_rgb(vertices, self.faces, self.camera, **options),)
-        return tuple(nmr.render(vertices, self.faces, self.camera, outputs=self.outputs, **options))
+        if "rgb" in self.outputs:
+            values = self.values if values is None else values
+            if values is not None:
+                of_vertices = values.ndim == 3
+                uv = sphere_uv(nmr.icosphere(3)[0])
+                options["colors"] = nmr.VertexColors(values) if of_vertices else nmr.UVTexture(values, uv)
+            options["lights"] = nmr.Lights() if self.lights else None
+        images = nmr.render(vertices, self.faces, self.camera, outputs=self.outputs, **options)
+        return tuple(getattr(images, name) for name in self.outputs)
 
     def targets(self) -> tuple[Tensor, ...]:
         """Images of the neighbour in the batch (of an ellipsoid if there is none)."""
@@ -107,29 +106,8 @@ Timing = tuple[float, float]  # seconds forward, and in all
 Program = Callable[[], Timing]
 
 
-@dataclass(frozen=True)
-class Row:
-    """One program on one workload; medians but for ``fastest``. The name of ours begins with nmr."""
-
-    program: str
-    forward: float | None
-    total: float
-    fastest: float
-
-
-@dataclass(frozen=True)
-class Result:
-    """One workload; the first row is ours, and the target applies to it."""
-
-    key: str  # in bench.TARGETS, if it has a target
-    title: str
-    rows: list[Row]
-    settings: dict[str, int | float | str] = field(default_factory=dict)
-    unit: str = "ms"
-
-
-def measure(programs: dict[str, Program], repeats: int) -> list[Row]:
-    """Median and fastest milliseconds of each program.
+def measure(programs: dict[str, Program], repeats: int) -> dict[str, tuple[float, float, float]]:
+    """Milliseconds of each program: median forward, median in all, fastest in all.
 
     Repeats alternate between them; the first call of each turn finds the caches full of another program's data and is
     not timed.
@@ -139,36 +117,22 @@ def measure(programs: dict[str, Program], repeats: int) -> list[Row]:
         for name, program in programs.items():
             program()
             times[name].append(program())
-    rows = []
+    rows = {}
     for name, seconds in times.items():
         forward, total = ([1e3 * second for second in column] for column in zip(*seconds, strict=True))
-        rows.append(Row(name, median(forward), median(total), min(total)))
+        rows[name] = median(forward), median(total), min(total)
     return rows
 
 
-def settings(threads: int, repeats: int, **more: int | float | str) -> dict[str, int | float | str]:
-    """What a figure depends on besides the program. A load far above 0 at the start means that the machine was busy."""
-    cpuinfo = Path("/proc/cpuinfo")
-    name = re.search(r"model name\s*: (.+)", cpuinfo.read_text()) if cpuinfo.exists() else None
-    about = {"threads": threads, **more, "repeats": repeats, "torch": torch.__version__}
-    return about | {
-        "machine": name[1] if name else platform.machine(),
-        "cores": num_cores(),
-        "load": round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else "unknown",
-    }
+def report(title: str, programs: dict[str, Program], repeats: int) -> None:
+    """Measure and print one workload, and what its figures depend on besides the programs.
 
-
-def num_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def show(result: Result) -> None:
-    """Print one result as text."""
-    print(f"\n{result.title}\n" + ", ".join(f"{k} {v}" for k, v in result.settings.items()))
-    print(f"{'program':<58}" + "".join(f"{name:>12}" for name in ("forward", "total", "fastest", "x ours")))
-    for row in result.rows:
-        forward = f"{row.forward:>12.2f}" if row.forward is not None else f"{'':>12}"
-        ratio = row.total / result.rows[0].total
-        print(f"{row.program:<58}{forward}{row.total:>12.2f}{row.fastest:>12.2f}{ratio:>12.2f}")
-    print(f"({result.unit}; medians, and the fastest total)", flush=True)
+    A load far above 0 means that the machine was busy.
+    """
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
+    rows = measure(programs, repeats)
+    print(f"\n{title}\n{repeats} repeats, torch {torch.__version__}, {platform.machine()}, load {load:.1f}")
+    print(f"{'program':<40}" + "".join(f"{name:>12}" for name in ("forward", "total", "fastest", "x first")))
+    first = next(iter(rows.values()))[1]
+    for name, (forward, total, fastest) in rows.items():
+        print(f"{name:<40}{forward:>12.2f}{total:>12.2f}{fastest:>12.2f}{total / first:>12.2f}", flush=True)
