@@ -2,7 +2,7 @@
 
 python docs/make_pictures.py views.png     # draw this one (without names: list them, and say which are out of date)
 python docs/make_pictures.py views.png --record     # the picture is there already: only record it
-OUTPUT=results python docs/make_pictures.py results-polar.png     # from the runs of `learn3d experiment plus`
+OUTPUT=results python docs/make_pictures.py results-tsne.png      # from the runs of `learn3d experiment plus`
 """
 
 import base64
@@ -67,14 +67,11 @@ PICTURES = {
         "{folder}/grid.png",
         ("learn3d/figures/grids.py",),
     ),
-    **{
-        f"results-{kind}.png": Picture(
-            f"learn3d figures {kind} --runs {_RUNS} --output {{folder}}/{kind}.png",
-            f"{{folder}}/{kind}.png",
-            ("learn3d/figures/plots.py",),
-        )
-        for kind in ("curves", "polar", "tsne")
-    },
+    "results-tsne.png": Picture(
+        f"learn3d figures tsne --runs {_RUNS} --output {{folder}}/tsne.png",
+        "{folder}/tsne.png",
+        ("learn3d/figures/tsne.py",),
+    ),
 }
 
 

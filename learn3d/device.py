@@ -1,8 +1,4 @@
-"""The device and the precision of the networks, copies of tensors to and from it, and the memory of a step.
-
-Tensors to and from a GPU go through page-locked memory, so that the CPU only queues the copy and goes on. On the CPU
-every function hands on the tensor that it was given, and the same code runs everywhere.
-"""
+"""The device and the precision of the networks, and the memory of a step."""
 
 from __future__ import annotations
 
@@ -44,66 +40,8 @@ def check_device(device: str) -> None:
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
-    """Queue the copy of a tensor on the CPU to `device`. Gradients of the copy go to the original."""
-    if device.type == "cpu" or tensor.device.type != "cpu":
-        return tensor.to(device)
-    return _Uploaded.apply(tensor, device)
-
-
-class Download:
-    """The copy of a tensor to the CPU, started when this is made. Work that is queued on the device later runs on."""
-
-    def __init__(self, tensor: Tensor) -> None:
-        self._tensor = tensor
-        self._copy, self._arrived = _start_copy(tensor.detach())
-
-    def wait(self) -> Tensor:
-        """The tensor on the CPU, as soon as it is there. Gradients of it go to the original."""
-        if self._arrived is None:
-            return self._tensor
-        return _Downloaded.apply(self._tensor, self)
-
-    def finish(self) -> Tensor:
-        """The copy itself, without gradient."""
-        if self._arrived is not None:
-            self._arrived.synchronize()
-        return self._copy
-
-
-def _start_copy(tensor: Tensor) -> tuple[Tensor, torch.cuda.Event | None]:
-    """The copy, and the event after which it is complete; None if there was nothing to copy."""
-    if tensor.device.type == "cpu":
-        return tensor, None
-    copy = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
-    copy.copy_(tensor, non_blocking=True)
-    arrived = torch.cuda.Event()
-    arrived.record(torch.cuda.current_stream(tensor.device))
-    return copy, arrived
-
-
-def _send(tensor: Tensor, device: torch.device) -> Tensor:
-    return tensor.detach().contiguous().pin_memory().to(device, non_blocking=True)
-
-
-class _Uploaded(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, tensor: Tensor, device: torch.device) -> Tensor:
-        return _send(tensor, device)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
-        return Download(grad).finish(), None
-
-
-class _Downloaded(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, tensor: Tensor, download: Download) -> Tensor:
-        ctx.device = tensor.device
-        return download.finish()
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
-        return _send(grad, ctx.device), None
+    """Queue the copy of a tensor on the CPU to `device`; on the CPU the tensor itself. Gradients go to the original."""
+    return tensor.to(device, non_blocking=True)
 
 
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # <malloc.h>

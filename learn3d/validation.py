@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
-import torch
-from torch import Tensor
-
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
-from learn3d.evaluation import NO_MMD, evaluate
+from learn3d.evaluation import NO_MMD, evaluate, spread_samples
 from learn3d.figures.grids import picture_grid
 from learn3d.methods import Method
 from learn3d.pictures.sheets import save_png
@@ -47,19 +43,9 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog | S
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
     """Write pictures/<step>.png: the same few validation images every time, of different objects and views."""
     with method.ema_weights():
-        grid = picture_grid(method, val_set, picture_samples(val_set, PICTURE_ROWS))
+        samples = spread_samples(val_set.object_ids, val_set.view_ids, PICTURE_ROWS)
+        grid = picture_grid(method, val_set, samples)
     folder = config.output / PICTURES
     folder.mkdir(exist_ok=True)
     save_png(folder / f"{step:06}.png", grid)
     log.picture(step, config.val_split, grid)
-
-
-def picture_samples(dataset: ViewDataset, count: int) -> Tensor:
-    """Samples for pictures, int64 [count] or fewer: of objects spread over the set, each seen from another side."""
-    rows = min(count, len(dataset))
-    chosen = []
-    for row, number in enumerate(np.linspace(0, dataset.num_objects - 1, rows).round().astype(int)):
-        samples = np.flatnonzero(dataset.object_ids == number)
-        if len(samples):
-            chosen.append(samples[(row * 7 + 3) % len(samples)])
-    return torch.from_numpy(np.array(chosen))

@@ -18,21 +18,16 @@ class Figures(OnDataset):
     """Draw the paper's figures from trained runs.
 
     Figures:
-      all            every figure with its defaults, as far as data and runs allow; --output is a folder
       grid           test images and each run's shape from the input's view and five more (PNG)
       tsne           shape codes of test images in the plane, coloured by the view (PNG, SVG)
       interpolation  shapes between those of some test images: a strip (PNG) and a morph (GIF)
-      curves         losses, validation IoU and MMD over the steps, a band over seeds (PNG, SVG)
-      polar          IoU and agreement of shapes by the azimuth of the input view (PNG, SVG)
 
     Examples:
       learn3d figures grid --runs runs/vanilla runs/proposed --output pictures/comparison.png
-      learn3d figures curves --runs runs/vanilla runs/proposed --output pictures/curves.png
+      learn3d figures tsne --runs runs/vanilla runs/proposed --output pictures/tsne.png
     """
 
-    figure: tyro.conf.Positional[
-        Annotated[Literal["all", "grid", "tsne", "interpolation", "curves", "polar"], tyro.conf.arg(metavar="FIGURE")]
-    ]
+    figure: tyro.conf.Positional[Annotated[Literal["grid", "tsne", "interpolation"], tyro.conf.arg(metavar="FIGURE")]]
     """One of the figures above."""
     runs: tuple[Path, ...]
     """Folders of training runs (or checkpoint files), in the order in which they are shown."""
@@ -51,19 +46,13 @@ class Figures(OnDataset):
         from learn3d.figures import paper
         from learn3d.figures.runs import open_runs
 
-        check_target(self.output if self.figure == "all" else self.output.parent, "--output", folder=True)
+        check_target(self.output.parent, "--output", folder=True)
         allowed = {"grid": ("images", "indices", "truth"), "interpolation": ("images", "indices")}
         own = {name: getattr(self, name) for name in allowed["grid"] if getattr(self, name) != getattr(Figures, name)}
         if wrong := [f"--{name}" for name in own if name not in allowed.get(self.figure, ())]:
             raise ValueError(f"the figure {self.figure} has no {', '.join(wrong)}; leave it out")
-        if self.figure == "curves":
-            paths = paper.save_curves(self.runs, self.output, labels=self.labels)
-        else:
-            runs = open_runs(self.runs, labels=self.labels, report_progress=note, **self.source)
-            if self.figure == "all":
-                paths = paper.save_all(runs, self.runs, self.output, labels=self.labels, say=note)
-            else:
-                paths = getattr(paper, f"save_{self.figure}")(runs, self.output, **own)
+        runs = open_runs(self.runs, labels=self.labels, report_progress=note, **self.source)
+        paths = getattr(paper, f"save_{self.figure}")(runs, self.output, **own)
         say("\n".join(map(str, paths)))
 
 

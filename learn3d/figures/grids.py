@@ -11,7 +11,6 @@ from torch import Tensor
 import nmr
 from learn3d.data.conventions import view_poses
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
-from learn3d.data.poses import wrap_deg
 from learn3d.methods import Method
 from learn3d.methods.surfaces import grid_surface
 from learn3d.pictures.sheets import TILE, magnify, natural_colors, tile
@@ -24,7 +23,6 @@ FRAMES = 16  # of an interpolation from one image to the next
 STRIP_STEPS = 4  # of them in its strip; divides FRAMES
 FRAME_SIZE = 192  # pixels
 _AROUND = [f"+{turn}°" for turn in TURNS_DEG[1:]]
-_GOLDEN_DEG = 137.508  # any number of directions, none near another
 
 
 @torch.no_grad()
@@ -118,20 +116,3 @@ def interpolate(
     inputs[::STRIP_STEPS] = magnify(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom)
     titles = [title, *(f"azimuth {azimuth:g}°" for azimuth in AZIMUTHS_DEG)]
     return tile([inputs, *in_strip.swapaxes(0, 1)], row_titles=titles), frames
-
-
-def spread_views(dataset: ViewDataset, count: int, *, turn_deg: float = _GOLDEN_DEG) -> Tensor:
-    """`count` different samples for a figure, int64 [count]: objects spread evenly, each seen `turn_deg` further on.
-
-    A function of the data set alone. Raises ValueError if there are fewer samples, or no poses.
-    """
-    if not 1 <= count <= len(dataset):
-        raise ValueError(f"the data set has {len(dataset)} images, {count} were asked for")
-    azimuths, present = azimuths_deg(dataset.poses), np.unique(dataset.object_ids)
-    chosen: list[int] = []
-    for k in range(count):
-        off = wrap_deg(azimuths - 30 - k * turn_deg).abs().numpy()
-        off += 1000 * (dataset.object_ids != present[k * len(present) // count])  # only if that object has no more
-        off[chosen] = np.inf
-        chosen.append(int(off.argmin()))
-    return torch.tensor(chosen)

@@ -1,19 +1,19 @@
-"""The paper's figures, each from opened runs into files; the functions that `learn3d figures` calls."""
+"""The paper's figures, each from opened runs into files: the functions that `learn3d figures` calls."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from learn3d.config import differences, load_config
-from learn3d.figures import plots
-from learn3d.figures.curves import Log, read_metrics
-from learn3d.figures.grids import FRAME_SIZE, comparison_grid, interpolate, spread_views
-from learn3d.figures.runs import Run, name_runs
+from learn3d.data.dataset import ViewDataset
+from learn3d.evaluation import spread_samples
+from learn3d.figures import tsne
+from learn3d.figures.grids import FRAME_SIZE, comparison_grid, interpolate
+from learn3d.figures.runs import Run
 from learn3d.pictures.sheets import save_gif, save_png, stack, tile
 
 
@@ -22,12 +22,12 @@ def save_grid(
 ) -> list[Path]:
     """Reconstructions of test images, the runs of a category below each other, as a PNG.
 
-    images: how many of each category, chosen by `spread_views`. indices: samples to show instead, of every category.
+    images: how many of each category, chosen by `choose_samples`. indices: samples to show instead, of every category.
     truth: show the true voxels, too.
     """
     blocks, datasets = [], {id(run.dataset): run.dataset for run in runs}
     for dataset in datasets.values():
-        samples = torch.tensor(indices) if indices else spread_views(dataset, images)
+        samples = choose_samples(dataset, images, indices)
         methods = [(run.label, run.method) for run in runs if run.dataset is dataset]
         title = dataset.category if len(datasets) > 1 else "input"
         blocks.append(comparison_grid(methods, dataset, samples, truth=truth, title=title))
@@ -39,7 +39,7 @@ def save_grid(
 
 def save_tsne(runs: Sequence[Run], output: Path) -> list[Path]:
     """Shape codes of test images in the plane, coloured by the view, a map per run, as PNG and SVG."""
-    return plots.save_figure(plots.draw_tsne(runs), output)
+    return tsne.save_figure(tsne.draw_tsne(runs), output)
 
 
 def save_interpolation(
@@ -47,11 +47,11 @@ def save_interpolation(
 ) -> list[Path]:
     """Shapes between those of some test images: a strip per run as PNG, and an endless walk as GIF.
 
-    images: how many, of different objects seen from the same side; indices: samples to use instead.
+    images: how many, chosen by `choose_samples`. indices: samples to use instead.
     """
     strips, walks = [], []
     for run in runs:
-        samples = torch.tensor(indices) if indices else spread_views(run.dataset, images, turn_deg=0)
+        samples = choose_samples(run.dataset, images, indices)
         title = run.label if len(runs) > 1 else "input"
         strip, frames = interpolate(run.method, run.dataset, samples, title=title)
         strips.append(strip)
@@ -65,54 +65,13 @@ def save_interpolation(
     return paths
 
 
-def save_curves(paths: Sequence[Path], output: Path, *, labels: Sequence[str] = ()) -> list[Path]:
-    """Learning curves of run folders as PNG and SVG; runs of one label are one line with a band.
+def choose_samples(dataset: ViewDataset, count: int, indices: Sequence[int] = ()) -> Tensor:
+    """The samples `indices`, int64, or else `count` of them, of different objects and views as far as possible.
 
-    By default these are runs that differ in their seed alone.
+    Raises ValueError if the data set has fewer.
     """
-    if not paths:
-        raise ValueError("give at least one run folder to draw")
-    lines: dict[str, list[Log]] = {}
-    logs = [read_metrics(path) for path in paths]
-    for label, log in zip(name_runs((), paths, labels) if labels else _name_lines(paths), logs, strict=True):
-        lines.setdefault(label, []).append(log)
-    return plots.save_figure(plots.draw_curves(lines), output)
-
-
-def _name_lines(paths: Sequence[Path]) -> list[str]:
-    """Names of runs, the same for runs that differ in their seed alone."""
-    configs = [load_config(path / "config.json") for path in paths]
-    alike = [[not differences(dataclasses.replace(a, seed=b.seed), b) for b in configs].index(True) for a in configs]
-    kinds = sorted(set(alike))
-    names = name_runs([configs[k] for k in kinds], [paths[k] for k in kinds])
-    return [names[kinds.index(k)] for k in alike]
-
-
-def save_polar(runs: Sequence[Run], output: Path) -> list[Path]:
-    """Voxel IoU with the truth, and among the shapes of an object, by the azimuth of the view, as PNG and SVG."""
-    return plots.save_figure(plots.draw_polar(runs), output)
-
-
-def save_all(
-    runs: Sequence[Run],
-    paths: Sequence[Path],
-    folder: Path,
-    *,
-    labels: Sequence[str] = (),
-    say: Callable[[str], None] = lambda text: None,
-) -> list[Path]:
-    """Every figure with its defaults, into files of these names in `folder`; returns the files that were written.
-
-    runs: `paths`, opened. What cannot be drawn is said, with the reason.
-    """
-    written = []
-    figures: dict[str, Callable[..., list[Path]]] = {"grid": save_grid, "tsne": save_tsne}
-    figures |= {"interpolation": save_interpolation, "polar": save_polar, "curves": save_curves}
-    for name, save in figures.items():
-        say(f"drawing {name}")
-        try:
-            target = folder / name
-            written += save_curves(paths, target, labels=labels) if save is save_curves else save(runs, target)
-        except (ValueError, OSError) as error:
-            say(f"not drawn: {name}: {error}")
-    return written
+    if indices:
+        return torch.tensor(indices)
+    if not 1 <= count <= len(dataset):
+        raise ValueError(f"the data set has {len(dataset)} images, {count} were asked for")
+    return spread_samples(dataset.object_ids, dataset.view_ids, count)

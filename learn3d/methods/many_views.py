@@ -12,7 +12,7 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.sampling import GROUP_SIZE
-from learn3d.device import Download, upload
+from learn3d.device import upload
 from learn3d.losses import depth_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod
 from learn3d.methods.settings import MeshSettings
@@ -93,7 +93,7 @@ class ManyViews(MeshMethod):
         if self.settings.lambda_view > 0:
             views = upload(batch.view_ids[:count], self.device)
             losses["view"] = pose_classification_loss(self._view_logits(images), views)
-        vertices = Download(vertices).wait()
+        vertices = vertices.cpu()
         uses_depth = batch.depth is not None and self.settings.lambda_depth > 0
         seen = nmr.render(
             vertices.repeat(GROUP_SIZE, 1, 1),

@@ -6,7 +6,6 @@ import torch
 
 import nmr
 from learn3d.data.batch import Batch
-from learn3d.device import Download
 from learn3d.methods.adam import SparseGradientAdam
 from learn3d.methods.method import MeshMethod
 from learn3d.methods.settings import MeshSettings
@@ -55,8 +54,7 @@ class MultiView(MeshMethod):
         mean smoothness of the shapes. Raises ValueError if the batch is not made of pairs.
         """
         pairs = check_pairs(batch)
-        _, vertices = self.predict(batch.images)
-        vertices = Download(vertices).wait()
+        vertices = self.predict(batch.images)[1].cpu()
         # Shapes a, b, a, b in the views a, a, b, b.
         seen = torch.arange(2 * pairs).reshape(2, pairs)[[0, 0, 1, 1]].flatten()
         silhouettes = self.render(torch.cat([vertices, vertices]), batch.poses[seen])

@@ -11,7 +11,6 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from learn3d.device import Download
 from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 
 LRSchedule = Literal["constant", "cosine", "linear", "step"]
@@ -145,11 +144,8 @@ def backpropagate(
 
 def read_back(losses: Mapping[str, Tensor]) -> dict[str, float]:
     """The values of scalar losses; one copy for all that lie on one device."""
-    by_device: dict[torch.device, list[str]] = {}
-    for name, loss in losses.items():
-        by_device.setdefault(loss.device, []).append(name)
-    copies = [Download(torch.stack([losses[n].detach().float() for n in names])) for names in by_device.values()]
-    found: dict[str, float] = {}
-    for names, copy in zip(by_device.values(), copies, strict=True):
-        found |= zip(names, copy.finish().tolist(), strict=True)
-    return {name: found[name] for name in losses}
+    values: dict[str, float] = dict.fromkeys(losses, 0.0)
+    for device in {loss.device for loss in losses.values()}:
+        names = [name for name, loss in losses.items() if loss.device == device]
+        values |= zip(names, torch.stack([losses[name].detach().float() for name in names]).tolist(), strict=True)
+    return values

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 import nmr
 from learn3d.data.batch import Batch
-from learn3d.device import Download, upload
+from learn3d.device import upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod
 from learn3d.methods.optimization import frozen
@@ -112,9 +112,8 @@ class PoseInvariant(MeshMethod):
 
     def _train(self, images: Tensor, view_ids: Tensor, batch: Batch, step: int) -> dict[str, float]:
         codes, vertices = self.predict(images)
-        download = Download(vertices)  # a GPU computes the losses on codes while the CPU waits and renders
         on_codes = self._losses_on_codes(codes, view_ids, step)
-        vertices = download.wait()
+        vertices = vertices.cpu()
         losses = self._silhouette_losses(vertices, batch) | self.surface_losses(vertices) | on_codes
         trained = ["encoder", "generator"] + ["discriminator"] * ("classification" in losses)
         return self.backward_and_step(losses, step, *trained)

@@ -19,7 +19,7 @@ import nmr
 from learn3d.data.batch import Batch, StepViews
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
-from learn3d.device import Download, upload
+from learn3d.device import upload
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.method import DatasetInfo, MeshMethod, plane_of
 from learn3d.methods.optimization import adam, frozen
@@ -177,7 +177,7 @@ class VPL(MeshMethod):
         return self.backward_and_step(losses, step, *trained)
 
     def _vertices(self, batch: Batch) -> Tensor:
-        return Download(self.predict(batch.images)[1]).wait()
+        return self.predict(batch.images)[1].cpu()
 
     def render(self, vertices: Tensor, poses: Poses) -> Tensor:
         """Silhouettes float32 [B,s,s] with the size, samples and gradient of the settings."""

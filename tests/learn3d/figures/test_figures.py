@@ -14,9 +14,8 @@ from PIL import Image
 from torch import Tensor
 
 import nmr
-from learn3d.evaluation import evaluate
 from learn3d.figures import curves, grids
-from learn3d.figures.grids import comparison_grid, interpolate, picture_grid, spread_views
+from learn3d.figures.grids import comparison_grid, interpolate, picture_grid
 from learn3d.figures.runs import Run
 from learn3d.files import limits
 from learn3d.methods import Grids, Meshes, Method
@@ -25,9 +24,8 @@ from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, o
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("sklearn")
-import matplotlib
 
-from learn3d.figures import paper, plots
+from learn3d.figures import paper, tsne
 
 STEP = TILE + MARGIN
 TURNS = (0, 60, 120, 180, 240, 300)
@@ -127,24 +125,6 @@ def test_the_truth_must_be_known(tiny_set) -> None:
     blind = dataclasses.replace(tiny_set, voxels=None)
     with pytest.raises(ValueError, match="airplane, test has no true voxels to show"):
         comparison_grid([("a", Ellipsoids())], blind, torch.tensor([3]), truth=True)
-    with pytest.raises(ValueError, match="airplane, test has no true voxels to compare"):
-        plots.measure(Ellipsoids(), blind)
-
-
-def test_images_for_figures_are_spread_over_objects_and_views(tiny_set) -> None:
-    samples = spread_views(tiny_set, 6)
-    assert len(set(samples.tolist())) == 6
-    assert np.bincount(tiny_set.object_ids[samples.numpy()]).tolist() == [2, 2, 2]
-    azimuths = np.sort(azimuths_deg(tiny_set.poses[samples]).numpy() % 360)
-    assert np.diff(np.append(azimuths, azimuths[0] + 360)).min() >= 15
-    assert sorted(spread_views(tiny_set, 72).tolist()) == list(range(72))
-    assert sorted(spread_views(tiny_set.select(np.array([0, 24, 25])), 3).tolist()) == [0, 1, 2]
-    alike = spread_views(tiny_set, 3, turn_deg=0)
-    assert tiny_set.object_ids[alike.numpy()].tolist() == [0, 1, 2]
-    assert azimuths_deg(tiny_set.poses[alike]).tolist() == pytest.approx([30] * 3)
-    for count in (0, 73):
-        with pytest.raises(ValueError, match=f"has 72 images, {count} were asked for"):
-            spread_views(tiny_set, count)
 
 
 def test_a_walk_goes_through_every_code_in_equal_steps() -> None:
@@ -225,74 +205,11 @@ def test_numbers_of_a_run_have_titles(finished_run) -> None:
     assert {"voxel_iou", "projection"} <= names <= curves.TITLES.keys()
 
 
-def test_seeds_become_a_band(tmp_path) -> None:
-    runs = [curves.read_metrics(write_metrics(tmp_path / "a", records(*given))) for given in ((0.0, 4), (0.5, 3))]
-    figure = plots.draw_curves({"Proposed": runs, "Vanilla-AE": runs[:1]})
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert titles == ["voxel IoU, val", "projection loss (1 - IoU), train", "total loss (weighted), train"]
-    panel = figure.axes[1]
-    assert panel.lines[0].get_xdata().tolist() == [50, 100]  # the second run has not got further
-    assert panel.lines[0].get_ydata().tolist() == [1.25, 0.75]
-    assert panel.lines[1].get_ydata().tolist() == pytest.approx([1.0, 0.5, 1 / 3])
-    assert len(panel.collections) == 1  # one band: the second label has one run
-    edge = panel.collections[0].get_paths()[0].vertices
-    assert {(50.0, 1.0), (50.0, 1.5), (100.0, 0.5), (100.0, 1.0)} <= {tuple(map(float, v)) for v in edge}
-    legend = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert legend == ["Proposed (2 seeds: mean and range)", "Vanilla-AE"]
-    assert panel.get_xlabel() == "training step"
-
-
 def test_means_by_azimuth_are_those_of_views_or_sectors() -> None:
     azimuths, means = curves.mean_by_azimuth(
         np.array([-15.0, 345.0, 359.999, -7.0, 0.0]), np.array([1, 3, 5, 7, np.nan])
     )
     assert azimuths.tolist() == [0.0, 345.0] and means.tolist() == [6.0, 2.0]
-
-
-def test_pairwise_iou() -> None:
-    voxels = np.zeros((4, 4, 4, 4), bool)
-    voxels[0, :2], voxels[1, 1:3] = True, True
-    table = plots.pairwise_iou(voxels)
-    assert table[0, 1] == table[1, 0] == pytest.approx(1 / 3)
-    assert table[0, 2] == 0.0 and np.isnan(table[2, 3])  # both are empty
-
-
-@pytest.mark.parametrize("method", [Ellipsoids(), GridEllipsoids()])
-def test_ious_are_those_of_the_evaluation(tiny_set, method) -> None:
-    ious, agreement, consistency = plots.measure(method, tiny_set)
-    assert np.allclose(ious, evaluate(method, tiny_set).values["voxel_iou"].numpy(), atol=1e-6)
-    assert agreement.shape == (72,) and 0.3 < consistency < 0.99
-
-
-def test_consistency_is_the_mean_over_pairs_of_views(tiny_set) -> None:
-    few = tiny_set.select(np.array([0, 1, 2, 30, 31, 60]))  # 3, 2 and 1 views of the objects
-    meshes = Ellipsoids().decode(Ellipsoids().encode(few.batch(torch.arange(6)).images))
-    iou = plots.pairwise_iou(few.voxelize(meshes.vertices, meshes.faces).numpy())
-    _, agreement, consistency = plots.measure(Ellipsoids(), few)
-    expected = ((iou[0, 1] + iou[0, 2] + iou[1, 2]) / 3 + iou[3, 4]) / 2
-    assert consistency == pytest.approx(expected, abs=1e-6) and expected < 0.95
-    assert agreement[0] == pytest.approx((iou[0, 1] + iou[0, 2]) / 2, abs=1e-6)
-    assert np.isnan(agreement).tolist() == [False] * 5 + [True]  # of the object that was seen once
-    assert plots.measure(Ellipsoids(depth_of_red=0.0), few)[2] == 1.0
-
-
-def test_the_polar_plot_shows_the_means_of_the_views(tiny_set) -> None:
-    run = Run("a", Ellipsoids(), tiny_set)
-    before = dict(matplotlib.rcParams)
-    left, right = plots.draw_polar([run, Run("b", Ellipsoids(0.8), tiny_set)]).axes
-    assert dict(matplotlib.rcParams) == before, "the style is left alone"
-    ious, agreement, consistency = plots.measure(run.method, tiny_set)
-    for axes, values in ((left, ious), (right, agreement)):
-        of_views = [values[tiny_set.view_ids == -k % 24].mean() for k in (*range(24), 0)]  # closed
-        assert axes.lines[0].get_ydata().tolist() == pytest.approx(of_views)
-        assert np.allclose(axes.lines[0].get_xdata()[:-1], np.deg2rad(15 * np.arange(24)))
-        assert max(of_views) < axes.get_ylim()[1] <= 1
-        assert axes.get_theta_offset() == pytest.approx(1.5 * np.pi)  # azimuth 0 below
-        assert axes.get_theta_direction() == 1  # and 90 to the right
-    legends = [axes.get_legend().get_texts()[0].get_text() for axes in (left, right)]
-    assert legends == [f"a: {ious.mean():.3f}", f"a: {consistency:.3f}"]
-    alone = tiny_set.select(np.array([0, 24, 48]))
-    assert len(plots.draw_polar([Run("a", Ellipsoids(), alone)]).axes) == 1
 
 
 VIEWS, OBJECTS = np.tile(np.arange(12), 20), np.repeat(np.arange(20), 12)
@@ -306,30 +223,30 @@ def entangled(share: float) -> np.ndarray:
 
 
 def test_the_view_is_told_from_entangled_codes_alone() -> None:
-    accuracy, chance = plots.view_accuracy(entangled(0.95), VIEWS, OBJECTS)
+    accuracy, chance = tsne.view_accuracy(entangled(0.95), VIEWS, OBJECTS)
     assert accuracy > 0.95 and chance == pytest.approx(1 / 12, abs=0.03)
-    accuracy, _ = plots.view_accuracy(entangled(0.0), VIEWS, OBJECTS)
+    accuracy, _ = tsne.view_accuracy(entangled(0.0), VIEWS, OBJECTS)
     assert 0.02 < accuracy < 0.17  # as often as by chance, not never: views of the same object do not count
-    assert plots.view_accuracy(entangled(0.5)[:12], VIEWS[:12], OBJECTS[:12]) is None
-    assert plots.view_accuracy(entangled(0.5), 0 * VIEWS, OBJECTS) is None
+    assert tsne.view_accuracy(entangled(0.5)[:12], VIEWS[:12], OBJECTS[:12]) is None
+    assert tsne.view_accuracy(entangled(0.5), 0 * VIEWS, OBJECTS) is None
 
 
 def test_an_embedding_keeps_neighbours_and_is_always_the_same() -> None:
     codes = entangled(0.9)[:60]
-    points = plots.embed(codes)
-    assert points.shape == (60, 2) and np.array_equal(points, plots.embed(codes))
+    points = tsne.embed(codes)
+    assert points.shape == (60, 2) and np.array_equal(points, tsne.embed(codes))
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(distances, np.inf)
     assert (VIEWS[:60][distances.argmin(axis=1)] == VIEWS[:60]).mean() > 0.9
     with pytest.raises(ValueError, match=r"at least 10 images, got \[9, 16\]"):
-        plots.embed(codes[:9])
+        tsne.embed(codes[:9])
 
 
 def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set, tmp_path, monkeypatch) -> None:
     points = np.random.default_rng(0).normal(size=(72, 2)).astype(np.float32)
-    monkeypatch.setattr(plots, "embed", lambda codes: points)
-    runs, wheel = [Run("$\\bad$", Ellipsoids(), tiny_set), Run("b", Ellipsoids(), tiny_set)], plots.cyclic_colors()
-    scatter = plots.draw_tsne(runs).axes[0].collections[0]
+    monkeypatch.setattr(tsne, "embed", lambda codes: points)
+    runs, wheel = [Run("$\\bad$", Ellipsoids(), tiny_set), Run("b", Ellipsoids(), tiny_set)], tsne.cyclic_colors()
+    scatter = tsne.draw_tsne(runs).axes[0].collections[0]
     azimuths = azimuths_deg(tiny_set.poses).numpy() % 360
     for position, color in zip(scatter.get_offsets(), scatter.get_facecolors(), strict=True):
         (index,) = np.flatnonzero((points == position).all(axis=1))
@@ -344,7 +261,7 @@ def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set,
 
 
 def test_the_colours_of_the_wheel_can_be_told_apart_by_everyone() -> None:
-    lab = skimage.color.rgb2lab(plots.cyclic_colors(72)[None])[0]
+    lab = skimage.color.rgb2lab(tsne.cyclic_colors(72)[None])[0]
     steps = np.linalg.norm(np.diff(lab, axis=0, append=lab[:1]), axis=1)
     assert steps.max() < 8  # no jump, at the end neither
     lightness_and_blue = lab[:, [0, 2]]  # the colours that remain without red-green vision
@@ -358,14 +275,7 @@ def test_categories_stand_below_each_other(tiny_set, tmp_path) -> None:
     (one,) = paper.save_grid(runs[:2], tmp_path / "one", images=1)
     (two,) = paper.save_grid(runs, tmp_path / "2", images=1)
     assert Image.open(two).height == 2 * Image.open(one).height + 10
+    chosen = paper.choose_samples(tiny_set, 3).numpy()
+    assert len(set(tiny_set.object_ids[chosen])) == len(set(tiny_set.view_ids[chosen])) == 3
     with pytest.raises(ValueError, match="indices must lie in"):
         paper.save_grid(runs[:1], tmp_path / "four.png", indices=[72])
-
-
-def test_all_figures_say_which_could_not_be_drawn(tiny_set, tmp_path) -> None:
-    alone = dataclasses.replace(tiny_set.select(np.arange(8)), voxels=None)
-    said: list[str] = []
-    written = paper.save_all([Run("a", Ellipsoids(), alone)], [tmp_path], tmp_path / "out", say=said.append)
-    assert [path.name for path in written] == ["grid.png", "interpolation.png", "interpolation.gif"]
-    not_drawn = [text.split(":")[1].strip() for text in said if text.startswith("not drawn")]
-    assert not_drawn == ["tsne", "polar", "curves"]

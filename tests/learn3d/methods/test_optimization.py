@@ -1,4 +1,4 @@
-"""Adam, schedules and averages of the weights, and runs of every method with them."""
+"""Losses, Adam, schedules and averages of the weights, and runs of every method with them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from learn3d.methods import DatasetInfo, Method, TrainingSchedule, create_method
-from learn3d.methods.optimization import EMA, adam
+from learn3d.methods.optimization import EMA, adam, backpropagate
 from learn3d.networks import ENCODERS
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
@@ -29,6 +29,27 @@ METHODS = {
     "prgan": {"preset": "gadelha2017-kato", "encoder_from_step": 3}
     | {"generator_channels": (2, 2, 2, 1), "discriminator_channels": (2, 2, 2, 2)},
 }
+
+
+def test_losses_are_weighted_added_up_and_returned_in_their_order() -> None:
+    x = torch.tensor(3.0, requires_grad=True)
+    values = backpropagate({"b": x.square(), "a": 2 * x, "c": -x}, {"a": 0.5, "b": 1.0, "c": 0.0}, step=1)
+    assert list(values.items()) == [("b", 9.0), ("a", 6.0), ("c", -3.0), ("total", 12.0)]
+    assert x.grad == 7.0
+
+
+@pytest.mark.parametrize("name", ["projection", "prior"])
+def test_a_loss_that_is_not_finite_stops_before_any_gradient(name: str) -> None:
+    x = torch.tensor(1.0, requires_grad=True)
+    losses = {"projection": x, "prior": x, name: x * torch.inf}
+    with pytest.raises(FloatingPointError, match=rf"iteration 7 .*{name} inf"):
+        backpropagate(losses, {"projection": 1.0, "prior": 1e-3}, step=7)
+    assert x.grad is None
+
+
+def test_a_loss_without_a_weight_is_an_error() -> None:
+    with pytest.raises(ValueError, match="lack norm; they have nrom"):
+        backpropagate({"norm": torch.tensor(1.0)}, {"nrom": 0.1}, step=1)
 
 
 def test_moments_of_dead_units_vanish_and_change_no_weight() -> None:
