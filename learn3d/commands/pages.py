@@ -20,7 +20,7 @@ class Figures(OnDataset):
     Figures:
       grid           test images and each run's shape from the input's view and five more (PNG)
       tsne           shape codes of test images in the plane, coloured by the view (PNG, SVG)
-      interpolation  shapes between those of some test images: a strip (PNG) and a morph (GIF)
+      interpolation  shapes between those of some test images (PNG)
 
     Examples:
       learn3d figures grid --runs runs/vanilla runs/proposed --output pictures/comparison.png

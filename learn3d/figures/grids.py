@@ -1,4 +1,4 @@
-"""Pictures of shapes in rows: the grid shown during training, the comparison of runs, and walks between shapes."""
+"""Pictures of shapes in rows: the grid shown during training, the comparison of runs, and interpolations."""
 
 from __future__ import annotations
 
@@ -19,9 +19,7 @@ from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, o
 TURNS_DEG = (0, 60, 120, 180, 240, 300)
 TILE_SIZE = 128  # pixels of a picture in a comparison
 AZIMUTHS_DEG = (-135.0, -45.0)  # viewpoints of an interpolation, oblique for whichever axis the object faces
-FRAMES = 16  # of an interpolation from one image to the next
-STRIP_STEPS = 4  # of them in its strip; divides FRAMES
-FRAME_SIZE = 192  # pixels
+STEPS = 4  # of an interpolation from one image to the next
 _AROUND = [f"+{turn}°" for turn in TURNS_DEG[1:]]
 
 
@@ -86,33 +84,26 @@ def comparison_grid(
     return tile(rows, [title, "input view", *_AROUND], tile_size=TILE_SIZE, row_titles=labels, rules=rules)
 
 
-def walk(codes: Tensor) -> Tensor:
-    """Codes on an endless walk from each of `codes` [n, C] to the next in `FRAMES` equal steps: [n * FRAMES, C]."""
-    share = torch.arange(FRAMES, dtype=codes.dtype, device=codes.device)[:, None] / FRAMES
-    return torch.lerp(codes[:, None], codes.roll(-1, 0)[:, None], share).flatten(0, 1)
-
-
 @torch.no_grad()
-def interpolate(
-    method: Method, dataset: ViewDataset, samples: Tensor, *, title: str = "input"
-) -> tuple[np.ndarray, np.ndarray]:
-    """The way from the shape of each image `samples` int64 [n] to that of the next: (strip, frames).
+def interpolate(method: Method, dataset: ViewDataset, samples: Tensor, *, title: str = "input") -> np.ndarray:
+    """Shapes on the way from that of each image `samples`, int64 [n], to that of the next: uint8 [H,W,3].
 
-    strip uint8 [H,W,3] has the images, each over its own reconstruction, and a row per viewpoint with (n - 1) * 4 + 1
-    shapes; `title` stands before the images. frames uint8 [n * 16,2,S,S,3] are seen from the same two viewpoints and go
-    on to the first image again. Raises ValueError for fewer than two images.
+    The images, each over its own reconstruction, and below them a row per viewpoint with (n - 1) * STEPS + 1 shapes, in
+    equal steps through the space of codes; `title` stands before the images. Raises ValueError for fewer than two.
     """
     if len(samples) < 2:
         raise ValueError(f"an interpolation takes at least two images, got {len(samples)}")
     batch, pose = dataset.batch(samples), dataset.poses[samples[:1]]
-    shapes = method.decode(walk(method.encode(batch.images))).surfaces()
+    codes = method.encode(batch.images)
+    share = torch.arange(STEPS, dtype=codes.dtype, device=codes.device)[:, None] / STEPS
+    way = torch.lerp(codes[:-1, None], codes[1:, None], share).flatten(0, 1)
+    shapes = method.decode(torch.cat([way, codes[-1:]])).surfaces()
     turns = [azimuth - float(azimuths_deg(pose)[0]) for azimuth in AZIMUTHS_DEG]
     cameras = orbit(pose, turns)
     zoom = common_zoom([(surface, cameras) for surface in shapes], batch.masks)
     cameras = orbit(pose, turns, zoom=zoom)
-    frames = np.stack([draw_surface(surface, cameras, image_size=FRAME_SIZE) for surface in shapes])
-    in_strip = frames[: (len(samples) - 1) * FRAMES + 1 : FRAMES // STRIP_STEPS]
-    inputs: list[np.ndarray | None] = [None] * len(in_strip)
-    inputs[::STRIP_STEPS] = magnify(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom)
+    pictures = np.stack([draw_surface(surface, cameras, image_size=TILE) for surface in shapes])
+    inputs: list[np.ndarray | None] = [None] * len(shapes)
+    inputs[::STEPS] = magnify(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom)
     titles = [title, *(f"azimuth {azimuth:g}°" for azimuth in AZIMUTHS_DEG)]
-    return tile([inputs, *in_strip.swapaxes(0, 1)], row_titles=titles), frames
+    return tile([inputs, *pictures.swapaxes(0, 1)], row_titles=titles)

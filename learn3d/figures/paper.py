@@ -12,9 +12,9 @@ from torch import Tensor
 from learn3d.data.dataset import ViewDataset
 from learn3d.evaluation import spread_samples
 from learn3d.figures import tsne
-from learn3d.figures.grids import FRAME_SIZE, comparison_grid, interpolate
+from learn3d.figures.grids import comparison_grid, interpolate
 from learn3d.figures.runs import Run
-from learn3d.pictures.sheets import save_gif, save_png, stack, tile
+from learn3d.pictures.sheets import save_png, stack
 
 
 def save_grid(
@@ -31,10 +31,7 @@ def save_grid(
         methods = [(run.label, run.method) for run in runs if run.dataset is dataset]
         title = dataset.category if len(datasets) > 1 else "input"
         blocks.append(comparison_grid(methods, dataset, samples, truth=truth, title=title))
-    output.parent.mkdir(parents=True, exist_ok=True)
-    path = output.with_suffix(".png")
-    save_png(path, stack(blocks, gap=10))
-    return [path]
+    return _save_sheets(blocks, output)
 
 
 def save_tsne(runs: Sequence[Run], output: Path) -> list[Path]:
@@ -45,24 +42,28 @@ def save_tsne(runs: Sequence[Run], output: Path) -> list[Path]:
 def save_interpolation(
     runs: Sequence[Run], output: Path, *, images: int = 3, indices: Sequence[int] = ()
 ) -> list[Path]:
-    """Shapes between those of some test images: a strip per run as PNG, and an endless walk as GIF.
+    """Shapes between those of some test images, a strip per run, as a PNG.
 
     images: how many, chosen by `choose_samples`. indices: samples to use instead.
     """
-    strips, walks = [], []
-    for run in runs:
-        samples = choose_samples(run.dataset, images, indices)
-        title = run.label if len(runs) > 1 else "input"
-        strip, frames = interpolate(run.method, run.dataset, samples, title=title)
-        strips.append(strip)
-        walks.append(frames)
-    names = [run.label for run in runs] if len(runs) > 1 else ()
-    frames = [tile(rows, tile_size=FRAME_SIZE, row_titles=names) for rows in zip(*walks, strict=True)]
+    strips = [
+        interpolate(
+            run.method,
+            run.dataset,
+            choose_samples(run.dataset, images, indices),
+            title=run.label if len(runs) > 1 else "input",
+        )
+        for run in runs
+    ]
+    return _save_sheets(strips, output)
+
+
+def _save_sheets(sheets: Sequence[np.ndarray], output: Path) -> list[Path]:
+    """Write pictures below each other as a PNG."""
     output.parent.mkdir(parents=True, exist_ok=True)
-    paths = [output.with_suffix(".png"), output.with_suffix(".gif")]
-    save_png(paths[0], stack(strips, gap=10))
-    save_gif(paths[1], np.stack(frames))
-    return paths
+    path = output.with_suffix(".png")
+    save_png(path, stack(sheets, gap=10))
+    return [path]
 
 
 def choose_samples(dataset: ViewDataset, count: int, indices: Sequence[int] = ()) -> Tensor:

@@ -14,7 +14,7 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.sampling import GROUP_SIZE
 from learn3d.device import upload
 from learn3d.losses import depth_loss, gaussian_prior_loss, pose_classification_loss
-from learn3d.methods.method import MeshMethod
+from learn3d.methods.method import MeshMethod, check_groups
 from learn3d.methods.settings import MeshSettings
 from learn3d.methods.surfaces import Meshes
 from learn3d.networks import EncoderName, SymmetryOption, network_input
@@ -78,14 +78,14 @@ class ManyViews(MeshMethod):
             return self.view_classifier(network_input(images, self.device, self.image_size)).float()
 
     def check_batch(self, batch: Batch) -> None:
-        check_groups(batch)
+        check_groups(batch, GROUP_SIZE, "groups")
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Shapes of the views a, rendered in all views of their object: projection + lambda_depth depth + lambda_smooth
         smoothness + lambda_prior prior. Every second image of a symmetric object is flipped before it is encoded.
         Raises ValueError if the batch is not made of groups.
         """
-        count = check_groups(batch)
+        count = check_groups(batch, GROUP_SIZE, "groups")
         images = batch.images[:count]
         flipped = (batch.step_views.rows[:count] % 2 == 1) & (self.generator.mirror is not None)
         codes, vertices = self.predict(torch.where(flipped[:, None, None, None], images.flip(3), images))
@@ -106,14 +106,3 @@ class ManyViews(MeshMethod):
         if uses_depth:
             losses["depth"] = depth_loss(seen.depth, batch.depth)
         return self.backward_and_step(losses | self.surface_losses(vertices), step, *self.optimizers)
-
-
-def check_groups(batch: Batch) -> int:
-    """The number n of objects in a batch [a_1 .. a_n, b_1 .. b_n, ...]. Raises ValueError for any other batch."""
-    count, rest = divmod(len(batch), GROUP_SIZE)
-    if rest or not torch.equal(batch.object_ids, batch.object_ids[:count].repeat(GROUP_SIZE)):
-        raise ValueError(
-            f"the method many-views learns from groups of {GROUP_SIZE} views of an object, [a_1 .. a_n, b_1 .. b_n, "
-            f"...], but this batch of {len(batch)} views is not made of such groups; choose sampling 'groups'"
-        )
-    return count

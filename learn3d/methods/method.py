@@ -214,12 +214,24 @@ class MeshMethod(Method):
         return nmr.render_silhouette(vertices, self.faces, poses.cameras(), image_size=MASK_SIZE)
 
     def surface_losses(self, vertices: Tensor) -> dict[str, Tensor]:
-        """Those of the losses smoothness, volume and inflation that have a weight above 0."""
+        """Those of the losses smoothness and inflation that have a weight above 0."""
         losses = {}
         if self.weights.get("smoothness", 0.0) > 0:
             losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.edges)
-        if self.weights.get("volume", 0.0) > 0:
-            losses["volume"] = nmr.losses.volume_loss(vertices, self.faces)
         if self.weights.get("inflation", 0.0) > 0:
             losses["inflation"] = nmr.losses.inflation_loss(vertices, self.faces)
         return losses
+
+
+def check_groups(batch: Batch, size: int, sampling: Literal["pairs", "groups"]) -> int:
+    """The number n of objects in a batch of `size` views each, [a_1 .. a_n, b_1 .. b_n, ...].
+
+    Raises ValueError for any other batch; `sampling` makes the right ones.
+    """
+    count, rest = divmod(len(batch), size)
+    if rest or not torch.equal(batch.object_ids, batch.object_ids[:count].repeat(size)):
+        raise ValueError(
+            f"the method learns from batches of {size} views of each object, [a_1 .. a_n, b_1 .. b_n, ...], but this "
+            f"batch of {len(batch)} views is not made so; choose sampling {sampling!r}"
+        )
+    return count

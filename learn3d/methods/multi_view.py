@@ -6,8 +6,8 @@ import torch
 
 import nmr
 from learn3d.data.batch import Batch
-from learn3d.methods.adam import SparseGradientAdam
-from learn3d.methods.method import MeshMethod
+from learn3d.methods.method import MeshMethod, check_groups
+from learn3d.methods.optimization import SparseGradientAdam
 from learn3d.methods.settings import MeshSettings
 from learn3d.networks import EncoderName, GeneratorName
 from learn3d.settings import Weight, checked
@@ -32,18 +32,19 @@ class MultiView(MeshMethod):
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         rate = self.settings.learning_rate
-        slow = list(self.generator.centroid.parameters()) if hasattr(self.generator, "centroid") else []
-        others = [p for p in self.generator.parameters() if not any(p is q for q in slow)]
+        of_generator = dict(self.generator.named_parameters())
+        slow = [parameter for name, parameter in of_generator.items() if name.startswith("centroid.")]
+        others = [parameter for name, parameter in of_generator.items() if not name.startswith("centroid.")]
         optimizers = {
             "encoder": SparseGradientAdam(self.encoder.parameters(), lr=rate),
             "generator": SparseGradientAdam(others, lr=rate),
         }
-        if slow:
+        if slow:  # the bounded generator's
             optimizers["centroid"] = SparseGradientAdam(slow, lr=CENTROID_LEARNING_RATE * rate)
         return optimizers
 
     def check_batch(self, batch: Batch) -> None:
-        check_pairs(batch)
+        check_groups(batch, 2, "pairs")
 
     @property
     def weights(self) -> dict[str, float]:
@@ -53,7 +54,7 @@ class MultiView(MeshMethod):
         """Render the shapes of both views, {a, b}, in both views: the mean of four IoU losses, and lambda_s times the
         mean smoothness of the shapes. Raises ValueError if the batch is not made of pairs.
         """
-        pairs = check_pairs(batch)
+        pairs = check_groups(batch, 2, "pairs")
         vertices = self.predict(batch.images)[1].cpu()
         # Shapes a, b, a, b in the views a, a, b, b.
         seen = torch.arange(2 * pairs).reshape(2, pairs)[[0, 0, 1, 1]].flatten()
@@ -61,14 +62,3 @@ class MultiView(MeshMethod):
         losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks[seen])}
         losses |= self.surface_losses(vertices)
         return self.backward_and_step(losses, step, *self.optimizers)
-
-
-def check_pairs(batch: Batch) -> int:
-    """The number n of pairs in a batch [a_1 .. a_n, b_1 .. b_n]. Raises ValueError for any other batch."""
-    half = len(batch) // 2
-    if len(batch) % 2 or not torch.equal(batch.object_ids[:half], batch.object_ids[half:]):
-        raise ValueError(
-            "the method multi-view learns from pairs of views of one object, [a_1 .. a_n, b_1 .. b_n], but this batch "
-            f"of {len(batch)} views is not made of such pairs; choose sampling 'pairs'"
-        )
-    return half

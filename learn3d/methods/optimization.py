@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -106,6 +106,51 @@ def _drop_vanished(optimizer: torch.optim.Optimizer, *_: object) -> None:
         if parameter.device.type == "cpu" and state["step"] % DROP_EVERY == 0:
             for name, least in (("exp_avg", 1e-20), ("exp_avg_sq", 1e-36)):  # beside eps = 1e-8, and its square
                 torch.hardshrink(state[name], least, out=state[name])
+
+
+CHUNK = 1 << 20  # weights that are updated at once
+
+
+class SparseGradientAdam(torch.optim.Adam):
+    """Kato et al. 2018's Adam: a weight whose gradient is exactly zero in a step keeps its value and its moments.
+
+    So the weights of a ReLU that is off for a whole batch stay where they are. Torch's Adam would carry them on by
+    their momentum and forget their second moment.
+    As in Chainer, epsilon is added before the bias correction of the second moment: lr' m / (sqrt(v) + eps), with
+    lr' = lr sqrt(1 - beta_2^t) / (1 - beta_1^t), and all weights share the count t. The state is that of torch's Adam.
+    """
+
+    def __init__(self, params: Iterable[Tensor], lr: float) -> None:
+        super().__init__(params, lr=lr)
+
+    @torch.no_grad()
+    def step(self) -> None:
+        for group in self.param_groups:
+            for parameter in (p for p in group["params"] if p.grad is not None):
+                state = self.state[parameter]
+                if not state:
+                    state["step"] = torch.tensor(0.0)
+                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+                state["step"] += 1
+                self._update(parameter, state, group)
+
+    def _update(self, parameter: Tensor, state: dict[str, Tensor], group: dict) -> None:
+        """Update in chunks that share two buffers: allocating more takes five times as long as computing."""
+        (beta1, beta2), count = group["betas"], float(state["step"])
+        rate = group["lr"] * math.sqrt(1 - beta2**count) / (1 - beta1**count)
+        row = parameter[0].numel()
+        rows = max(1, CHUNK // row)
+        memory = parameter.new_empty(2, min(rows, len(parameter)) * row)
+        tensors = (parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"])
+        for weight, grad, first, second in zip(*(tensor.split(rows) for tensor in tensors), strict=True):
+            touched, change = (part[: weight.numel()].view(weight.shape) for part in memory)
+            touched.copy_(grad).ne_(0)
+            torch.sub(grad, first, out=change)
+            first.addcmul_(touched, change, value=1 - beta1)
+            torch.mul(grad, grad, out=change).sub_(second)
+            second.addcmul_(touched, change, value=1 - beta2)
+            torch.sqrt(second, out=change).add_(group["eps"])
+            weight.addcdiv_(touched.mul_(first), change, value=-rate)
 
 
 def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:

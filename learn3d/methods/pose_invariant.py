@@ -34,8 +34,6 @@ class PoseInvariantSettings(MeshSettings):
     lambda_smooth_end: Positive | None = None
     """Weight of the smoothness loss at the end of the run, approached by a constant factor a step. If it is None the
     weight stays lambda_smooth."""
-    lambda_volume: Weight = 0.0
-    """Weight of the volume that shapes enclose."""
     lambda_classification: Weight = 1.0
     """Weight of the discriminator's own loss (lambda_2)."""
     lambda_adversarial: Weight = 1.0
@@ -81,7 +79,6 @@ class PoseInvariant(MeshMethod):
         return {
             "projection": 1.0,
             "smoothness": settings.lambda_smooth,
-            "volume": settings.lambda_volume,
             "classification": settings.lambda_classification,
             "confusion": settings.lambda_adversarial,
             "prior": settings.lambda_prior,

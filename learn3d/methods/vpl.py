@@ -26,10 +26,9 @@ from learn3d.methods.optimization import adam, frozen
 from learn3d.methods.settings import MeshSettings
 from learn3d.networks import ENCODERS, GENERATORS, MeshGenerator
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
-from learn3d.networks.flat_resnet import FlatResNet18
 from learn3d.networks.layers import reverse_gradient
 from learn3d.networks.preact_resnet import PreactResNet18
-from learn3d.networks.resnet import check_pretrained, load_pretrained
+from learn3d.networks.resnet import FlatResNet18, check_pretrained, load_pretrained
 from learn3d.settings import Channels, FilePath, Pixels, Positive, Weight, checked
 
 MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object if alpha is at least this

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from learn3d.figures import grids
 from learn3d.figures.runs import name_runs
 
 pytest.importorskip("matplotlib")
@@ -28,15 +27,10 @@ def test_a_figure_from_a_run_to_a_file(call, finished_run, tmp_path) -> None:
         assert 0.005 < (np.asarray(image.convert("L")) < 200).mean() < 0.7  # something is drawn on white
 
 
-def test_the_images_of_an_interpolation_can_be_chosen(call, finished_run, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(grids, "FRAMES", 4)
-    monkeypatch.setattr(grids, "FRAME_SIZE", 32)
+def test_the_images_of_an_interpolation_can_be_chosen(call, finished_run, tmp_path) -> None:
     options = ("--split", "train", "--indices", 1, 30)
     code, out, err = call("interpolation", "--runs", finished_run, "--output", tmp_path / "i.gif", *options)
-    assert code == 0, err
-    assert out.split() == [str(tmp_path / "i.png"), str(tmp_path / "i.gif")]
-    with Image.open(tmp_path / "i.gif") as image:
-        assert image.n_frames == 8
+    assert (code, out.split()) == (0, [str(tmp_path / "i.png")]), err
 
 
 def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> None:

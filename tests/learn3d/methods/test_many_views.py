@@ -52,7 +52,7 @@ def test_groups_are_different_views_of_one_object(dataset: ViewDataset) -> None:
 
 
 def test_other_batches_are_refused(dataset: ViewDataset) -> None:
-    with pytest.raises(ValueError, match=r"groups of 5 views of an object.*choose sampling 'groups'"):
+    with pytest.raises(ValueError, match=r"5 views of each object.*choose sampling 'groups'"):
         create(dataset).check_batch(dataset.batch(torch.arange(10)))
 
 

@@ -10,10 +10,9 @@ from torch import nn
 import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.poses import LookAtPoses
-from learn3d.methods.adam import SparseGradientAdam
-from learn3d.methods.method import DatasetInfo
-from learn3d.methods.multi_view import MultiView, MultiViewSettings, check_pairs
-from learn3d.methods.optimization import TrainingSchedule
+from learn3d.methods.method import DatasetInfo, check_groups
+from learn3d.methods.multi_view import MultiView, MultiViewSettings
+from learn3d.methods.optimization import SparseGradientAdam, TrainingSchedule
 from learn3d.networks.generators import deform_bounded_sphere
 
 
@@ -91,8 +90,8 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> N
 
 @pytest.mark.parametrize("objects", [[0, 1, 1, 0], [0, 1, 0]])
 def test_batches_must_be_pairs(objects: list[int]) -> None:
-    with pytest.raises(ValueError, match="is not made of such pairs; choose sampling 'pairs'"):
-        check_pairs(make_batch(objects))
+    with pytest.raises(ValueError, match="is not made so; choose sampling 'pairs'"):
+        check_groups(make_batch(objects), 2, "pairs")
 
 
 def slow_adam(weight: float, grads: list[float], rate: float, skip: bool) -> float:
@@ -107,7 +106,7 @@ def slow_adam(weight: float, grads: list[float], rate: float, skip: bool) -> flo
 
 
 def test_zero_gradients_leave_weights_and_moments_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learn3d.methods.adam.CHUNK", 4)  # several pieces
+    monkeypatch.setattr("learn3d.methods.optimization.CHUNK", 4)  # several pieces
     rng = np.random.default_rng(0)
     grads = rng.normal(size=(6, 5, 3)) * (rng.random((6, 5, 3)) < 0.6)
     grads[:, 0] = 0

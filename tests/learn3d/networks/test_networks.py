@@ -18,10 +18,10 @@ from learn3d.networks import ENCODERS, GENERATORS, PoseDiscriminator, create_enc
 from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
 from learn3d.networks.encoders import CENTRED_SHARE, EncoderName, centre
-from learn3d.networks.flat_resnet import FlatResNet18
 from learn3d.networks.generators import deform_sphere
 from learn3d.networks.layers import reverse_gradient
 from learn3d.networks.preact_resnet import PreactResNet18, grey_background
+from learn3d.networks.resnet import FlatResNet18
 from learn3d.networks.voxel_gan import InverseEncoder, SilhouetteDiscriminator, VoxelGenerator
 from learn3d.presets import PRESETS
 

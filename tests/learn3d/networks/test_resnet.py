@@ -14,8 +14,7 @@ from learn3d.files import limits
 from learn3d.methods.method import DatasetInfo
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.vpl import VPL, VPLSettings
-from learn3d.networks.flat_resnet import FlatResNet18
-from learn3d.networks.resnet import IMAGENET_MEAN, IMAGENET_STD, ResNet18Encoder, load_pretrained
+from learn3d.networks.resnet import IMAGENET_MEAN, IMAGENET_STD, FlatResNet18, ResNet18Encoder, load_pretrained
 
 
 def torchvision_names() -> dict[str, tuple[int, ...]]:
