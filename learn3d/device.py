@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-CPUINFO = "/proc/cpuinfo"  # where Linux lists the instructions of the CPU
+CPUINFO = "/proc/cpuinfo"  # Linux lists the instructions of the CPU in it
 
 
 def resolve_precision(precision: Literal["auto", "bf16", "fp32"], device: str) -> Literal["bf16", "fp32"]:

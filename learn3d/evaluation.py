@@ -26,7 +26,7 @@ Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]
 
 CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
-F_SCORE_DISTANCE = 0.05  # units of the object frame, where the longest side is 1 (Pascal3D+: up to 2)
+F_SCORE_DISTANCE = 0.05  # units of the object frame: objects are 1 long (Pascal3D+: up to 2)
 
 #: Figures of each image.
 MEASURED = (
@@ -49,7 +49,7 @@ class Evaluation:
     object_ids: Tensor  # int64 [M]
     view_ids: Tensor  # int64 [M]
     values: dict[str, Tensor]  # float64 [M] for each name of `MEASURED`; NaN if undefined or not asked for
-    means: dict[str, float]  # over the images that have a value, and "mmd", "mmd_paper"; without a value: no entry
+    means: dict[str, float]  # over the images that have a value, and "mmd", "mmd_paper"; no entry if undefined
 
     @property
     def voxel_iou(self) -> float | None:

@@ -36,9 +36,9 @@ def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -
 
 
 def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
-    """Mean distance between depth maps [B, S, S] where both show a surface; nmr's `far`, 100, and a target of 0 do not.
+    """Mean distance between depth maps [B, S, S] over the pixels in which both show a surface.
 
-    Differentiable in depth.
+    A rendered pixel without a surface has nmr's `far`, 100, and a pixel of the target 0. Differentiable in depth.
     """
     both = (target > 0) & (depth.detach() < 2 * target)
     return ((depth - target).abs() * both).sum() / both.sum().clamp(min=1)

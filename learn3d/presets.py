@@ -23,18 +23,18 @@ from learn3d.terminal import unknown_name
 
 @dataclass(frozen=True)
 class Preset:
-    """Options of one experiment, and where they come from."""
+    """Options of one experiment, and their source."""
 
     label: str  # what tables call it
-    settings: MethodSettings  # of the method, which is decided by their type
-    layout: Layout  # layout of the data set that it was made for
+    settings: MethodSettings  # their type decides the method
+    layout: Layout  # layout of the data set of the experiment
     iterations: int
     batch_size: int
-    source: str  # where the figures come from
+    source: str  # publication or page that the figures are from
     sampling: Sampling = "views"
     augment: tuple[Augmentation, ...] = ()  # changes of every training batch
     lr_schedule: LRSchedule = "constant"
-    warmup_steps: int = 0  # steps over which the learning rate grows to its full size
+    warmup_steps: int = 0  # steps over which the learning rate ramps up from 0
     ema_decay: float = 0.0  # decay a step of the exponential moving average of the weights; 0: no average
 
 

@@ -84,18 +84,18 @@ def _path(value: Any) -> Path:
     return Path(value)
 
 
-MOST = 1e30  # of any number: float32 ends at 3e38
+MOST = 1e30  # the largest number of a setting: float32 ends at 3e38
 
 Positive = Annotated[float, Field(gt=0, le=MOST)]
 Weight = Annotated[float, Field(ge=0, le=MOST)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Step = Annotated[int, Field(ge=1, le=10**9)]  # of training, from 1
+Step = Annotated[int, Field(ge=1, le=10**9)]  # a training step, counted from 1
 Count = Annotated[int, Field(ge=1)]
 Pixels = Annotated[int, Field(ge=1, le=1024)]  # side of the networks' images; 224 in the papers
-#: Of a network's first layer, whose widest layer has eight times as many: up to 4.1 GB; 128 in the papers.
+#: Channels of a network's first layer; its widest layer has eight times as many. 512 take 4.1 GB; 128 in the papers.
 Channels = Annotated[int, Field(ge=1, le=512)]
-LayerChannels = Annotated[int, Field(ge=1, le=1024)]  # of each layer that a setting names
-RARE = "shown by --help-all, not by --help"  # a mark of an option
+LayerChannels = Annotated[int, Field(ge=1, le=1024)]  # channels of a layer that has a setting of its own
+RARE = "shown by --help-all, not by --help"  # marks an option's type
 Rare = Annotated[T, RARE]
 FilePath = Annotated[Path, BeforeValidator(_path)]
 Items = Field(strict=False)  # Annotated[tuple[...], Items]: JSON has lists alone

@@ -49,12 +49,12 @@ def train(
         group = group.split_batch(config.batch_size, VIEWS_OF_OBJECT[config.sampling])
         train_set, val_set = load_splits(config, progress=group.is_main)
         info = train_set.info(find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None)
-        how = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
-        method = create_method(config.settings, info, **how)
+        options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
+        method = create_method(config.settings, info, **options)
         method.check_batch(next(batches(train_set, config, rows=group.rows)))  # before an older run is removed
         run = Run(config, method, info, describe_images(train_set), group)
         progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
-        if progress.step == config.iterations:  # also after a kill between the last save and the end
+        if progress.step == config.iterations:  # finished, or killed between the last save and the end
             return Summary.of(config, progress, started)
         before, start = progress.seconds, progress.step + 1
         threads.resume(progress.threads)

@@ -21,7 +21,7 @@ from learn3d.runs import folder as run_folder
 from learn3d.terminal import INTERRUPTED, align, note, say
 from learn3d.training import train
 
-LOG_FILE, RESULT_FILE = "log.txt", "test.json"  # in a run's folder
+LOG_FILE, RESULT_FILE = "log.txt", "test.json"  # files in a run's folder
 
 
 def train_and_test(run: PlannedRun) -> bool:

@@ -63,10 +63,10 @@ class Result(BaseModel, strict=True):
     category: str
     data: str
     command: str  # repeats the training
-    iterations: Step  # of the whole training
-    step: Amount  # of these networks
+    iterations: Step  # length of the whole training
+    step: Amount  # step after which these networks were saved
     seed: Amount
-    seconds: Number  # of training
+    seconds: Number  # duration of the training
     versions: dict[str, str | None]  # that trained it
     images: Amount
     hollow: Number  # share of meshes that reach beyond the voxel grid

@@ -17,8 +17,8 @@ from learn3d.presets import PRESETS
 from learn3d.settings import Rare, split_names
 from learn3d.terminal import unknown_name
 
-_FIRST = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")  # in every command line
-_FIXED = (*_FIRST, "layout", "device", "threads")  # not changed by --set: the request or the table decides them
+_FIRST = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")  # options of every command line
+_FIXED = (*_FIRST, "layout", "device", "threads")  # the request or the table decides these, --set cannot
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ class Table:
     """One table."""
 
     title: str
-    baseline: str  # label of the row from which differences are taken
+    baseline: str  # label of the row that is subtracted from the others
     rows: Mapping[str, Row]  # by label
     measure: Literal["voxel_iou", "mmd"] = "voxel_iou"
     layout: Layout = "kato"

@@ -19,7 +19,7 @@ from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, o
 TURNS_DEG = (0, 60, 120, 180, 240, 300)
 TILE_SIZE = 128  # pixels of a picture in a comparison
 AZIMUTHS_DEG = (-135.0, -45.0)  # viewpoints of an interpolation, oblique for whichever axis the object faces
-STEPS = 4  # of an interpolation from one image to the next
+STEPS = 4  # shapes of an interpolation from one image up to the next
 _AROUND = [f"+{turn}°" for turn in TURNS_DEG[1:]]
 
 

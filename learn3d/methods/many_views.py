@@ -67,7 +67,7 @@ class ManyViews(MeshMethod):
         return self.encode_symmetric(images)
 
     def decode(self, codes: Tensor) -> Meshes:
-        return self.clamped(super().decode(codes))
+        return self.clamp_to_cube(super().decode(codes))
 
     def view_probabilities(self, image: Tensor) -> Tensor | None:
         """How probable each view class is for a stored image uint8 [1,4,S,S]: float32 [K]; None if not learnt."""

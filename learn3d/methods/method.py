@@ -23,7 +23,7 @@ from learn3d.methods.settings import MeshSettings, MethodSettings
 from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.networks import GENERATORS, MeshGenerator, Symmetry, SymmetryOption, create_encoder, network_input
 
-INSIDE = 0.499  # share of the cube's side: to the voxelizer kato18 a face exactly on the border is outside
+INSIDE = 0.499  # share of the cube's side; the voxelizer kato18 takes a face on the border (0.5) for outside
 
 
 def plane_of(symmetry: SymmetryOption, info: DatasetInfo) -> Symmetry | None:
@@ -193,9 +193,10 @@ class MeshMethod(Method):
         codes = MeshMethod.encode(self, images)
         return codes if self.generator.mirror is None else (codes + MeshMethod.encode(self, images.flip(3))) / 2
 
-    def clamped(self, shapes: Meshes) -> Meshes:
-        """The same shapes within the cube of the data set, if it has one: voxelizers find nothing inside a shape that
-        reaches out of their grid.
+    def clamp_to_cube(self, shapes: Meshes) -> Meshes:
+        """The shapes with their vertices clamped to the cube of the data set, if it has one.
+
+        Voxelizers find nothing inside a shape that reaches out of their grid.
         """
         if self.info.cube_side is None:
             return shapes

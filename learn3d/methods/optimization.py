@@ -67,7 +67,7 @@ class EMA:
         for name, average in self.tensors.items():
             if average.is_floating_point():
                 average.lerp_(self._own[name].detach(), new)
-            else:  # a number of batches
+            else:  # the number of batches that a batch norm has seen
                 average.copy_(self._own[name])
 
     @contextlib.contextmanager

@@ -93,7 +93,7 @@ class PoseInvariant(MeshMethod):
 
     def decode(self, codes: Tensor) -> Meshes:
         shapes = super().decode(codes)
-        return self.clamped(shapes) if self.settings.clamp_to_cube else shapes
+        return self.clamp_to_cube(shapes) if self.settings.clamp_to_cube else shapes
 
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:

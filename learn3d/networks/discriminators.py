@@ -65,13 +65,13 @@ class SpectralPatchDiscriminator(nn.Module):
     def __init__(self, view_features: int, channels: int = 32, num_classes: int | None = None) -> None:
         super().__init__()
         widths = [2 * channels, 2 * channels, 4 * channels, 8 * channels, 8 * channels]
-        self.first = nn.Sequential(_spectral_conv(1, channels), *_centred(nn.BatchNorm2d(channels)))
+        self.first = nn.Sequential(_spectral_conv(1, channels), *_norm_without_gain(nn.BatchNorm2d(channels)))
         self.view = nn.Sequential(
-            spectral_norm(nn.Linear(view_features, channels, bias=False)), *_centred(nn.BatchNorm1d(channels))
+            spectral_norm(nn.Linear(view_features, channels, bias=False)), *_norm_without_gain(nn.BatchNorm1d(channels))
         )
         layers: list[nn.Module] = []
         for before, after in itertools.pairwise(widths):
-            layers += [_spectral_conv(before, after), *_centred(nn.BatchNorm2d(after))]
+            layers += [_spectral_conv(before, after), *_norm_without_gain(nn.BatchNorm2d(after))]
         self.layers = nn.Sequential(*layers)
         self.last = _spectral_conv(widths[-1], 1, bias=True)
         self.num_classes = num_classes
@@ -122,7 +122,7 @@ def _spectral_conv(before: int, after: int, bias: bool = False) -> nn.Module:
     return spectral_norm(nn.Conv2d(before, after, 5, stride=2, padding=2, bias=bias))
 
 
-def _centred(norm: nn.BatchNorm1d | nn.BatchNorm2d) -> list[nn.Module]:
+def _norm_without_gain(norm: nn.BatchNorm1d | nn.BatchNorm2d) -> list[nn.Module]:
     """Batch norm with an offset but no gain (it would undo the spectral normalisation), and leaky ReLU."""
     norm.eps = BATCH_NORM_EPS
     norm.weight.requires_grad_(False)

@@ -41,7 +41,7 @@ class ReluConvEncoder(ConvEncoder):
 
 
 class LightConvEncoder(ConvEncoder):
-    """ConvEncoder with half the channels and a 1x1 convolution to 32 channels before the linear layers; no paper's.
+    """ConvEncoder with half the channels and a 1x1 convolution to 32 channels before the linear layers. From no paper.
 
     3.9 million weights, not 19. Its convolutions start from He's initial weights: with torch's, images hardly change
     the codes of the first hundred steps, and all shapes may become one. A white background has the same effect, so
@@ -65,7 +65,7 @@ class LightConvEncoder(ConvEncoder):
 class SmallConvEncoder(ConvEncoder):
     """The same input and output with a quarter of the channels and one hidden layer: 1.3 million weights, not 19.
 
-    For small data sets and quick experiments; no paper's.
+    For small data sets and quick experiments. From no paper.
     """
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ class CentredConvEncoder(LightConvEncoder):
     object has the same size in it.
 
     A cut-out picture does not show the camera's distance. With this encoder, training images do not show it either:
-    the size of an object is learnt from its looks. 2.0 million weights; no paper's.
+    the size of an object is learnt from its looks. 2.0 million weights. From no paper.
     """
 
     hidden_sizes = (576,)
@@ -98,7 +98,7 @@ class CentredConvEncoder(LightConvEncoder):
 class ViewClassifier(nn.Module):
     """Images [B,4,64,64], as an encoder gets them -> logits [B,K] over K view classes; each object scaled to one size.
 
-    0.2 million weights; no paper's.
+    0.2 million weights. From no paper.
     """
 
     def __init__(self, num_views: int, *, inverted: bool) -> None:

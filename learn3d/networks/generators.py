@@ -65,7 +65,7 @@ class SphereGenerator(MeshGenerator):
 
 class SmallSphereGenerator(SphereGenerator):
     """The same input and output with hidden layers of 1024: half the weights. For the package's model, small data sets
-    and quick experiments; no paper's.
+    and quick experiments. From no paper.
     """
 
     def __init__(self, symmetry: Symmetry | None = None) -> None:

@@ -25,7 +25,7 @@ from learn3d.pictures.surfaces import azimuths_deg
 from learn3d.presets import PRESETS
 from learn3d.terminal import plain
 
-POINTS = 500  # of a curve; of more, every n-th is drawn
+POINTS = 500  # the most that are drawn of a curve: every n-th of a longer one
 MOST_SHOWN = 100  # images with shapes; each takes some 60 kB
 
 
@@ -94,12 +94,12 @@ def _fill(
     """All that the template is filled with; "browser" is for its script."""
     dataset = runs[0].dataset
     ids, names, truth = dataset.object_ids, dataset.object_names, dataset.voxels is not None
-    ious = np.full((len(runs), len(ids)), np.nan)  # of each run on each image
+    ious = np.full((len(runs), len(ids)), np.nan)  # run by image
     for row, result in zip(ious, results, strict=True):
         row[:] = result.values[result.selection_metric].numpy()
     sums = np.stack([np.bincount(ids, np.nan_to_num(row), len(names)) for row in ious])
     counts = np.stack([np.bincount(ids, ~np.isnan(row), len(names)) for row in ious])
-    means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)  # of each run on each object
+    means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)  # run by object
     over_runs = np.array([mean(column) for column in means.T])
     ranked = np.unique(ids)  # the best object first
     ranked = ranked[np.argsort(-np.nan_to_num(over_runs[ranked], nan=-1.0), kind="stable")]

@@ -20,8 +20,8 @@ from learn3d.pictures.sheets import natural_colors
 from learn3d.pictures.surfaces import Surface, eyes
 from learn3d.terminal import plain
 
-UNIT = 1e-4  # of stored coordinates, which are int16: they reach to 3.3, objects to 1
-#: Turns row vectors of the object frame into the page's axes, where z is up (in mesh files y is up).
+UNIT = 1e-4  # unit of the stored int16 coordinates: they reach to 3.3, objects to 1
+#: Turns row vectors of the object frame into the page's axes: z is up (in mesh files y is).
 _TO_PAGE = mesh_to_object() @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 

@@ -17,7 +17,7 @@ from learn3d.pictures.studio import photograph, studio_lights
 
 CLAY = (0.62, 0.68, 0.78)
 _LIGHT = (-0.5, -0.45, -0.75)  # towards the light: left of, above and behind the camera, in its axes (y is down)
-_FAR = 5.0  # where orthographic cameras stand: outside of any object, so that faces turn to the right side
+_FAR = 5.0  # distance of orthographic cameras: outside of any object, or its faces would seem turned away
 
 Cameras = Sequence[nmr.LookAt | nmr.Orthographic]  # each of one view
 
@@ -26,7 +26,7 @@ class Surface(NamedTuple):
     """One shape as triangles, on the CPU."""
 
     vertices: Tensor  # float32 [V, 3], object frame
-    faces: Tensor  # int64 [F, 3]; F = 0 is an empty shape, of which nothing is drawn
+    faces: Tensor  # int64 [F, 3]; F = 0 is an empty shape, for which nothing is drawn
     colors: Tensor | None = None  # float32 [V, 3] in [0, 1], R, G, B of each vertex; None: clay
 
 
@@ -64,7 +64,7 @@ def azimuths_deg(poses: Poses | None) -> Tensor:
     Raises ValueError without poses.
     """
     if poses is None:
-        raise ValueError("these data do not say where the cameras stood, which this figure needs")
+        raise ValueError("this figure needs camera poses, and these data have none")
     x, _, z = eyes(poses).T
     return torch.rad2deg(torch.atan2(x, -z))
 

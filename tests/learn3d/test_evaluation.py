@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import stub_work
 import torch
+from fixed_method import FixedMethod
 
 import nmr
 from learn3d import evaluation
@@ -19,26 +20,15 @@ from learn3d.data.readers.pascal3d import PASCAL3D
 from learn3d.evaluation import NO_MMD, evaluate, mean_mmd, spread_samples
 from learn3d.experiments.measurement import class_means, evaluate_runs, format_table
 from learn3d.losses import mmd
-from learn3d.methods import Grids, Meshes, Method
+from learn3d.methods import Grids, Meshes
 
 
-class Constant(Method):
+class Constant(FixedMethod):
     """Codes from the brightness of the image; the same shape for all."""
 
-    image_size = 64
-
     def __init__(self, shape: Meshes | Grids) -> None:
-        self.networks, self.optimizers, self.device, self.precision = {}, {}, torch.device("cpu"), "fp32"
+        super().__init__()
         self.shape = shape
-
-    def create_networks(self):
-        raise NotImplementedError
-
-    def create_optimizers(self):
-        raise NotImplementedError
-
-    def training_step(self, batch, step):
-        raise NotImplementedError
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
         return images.float().mean(dim=(2, 3))

@@ -36,7 +36,7 @@ def build(config: TrainConfig, dataset: ViewDataset, precision: str) -> Method:
 
 
 def stop_rendering(method: Method) -> None:
-    """Let a method train on grey images of which every vertex has a gradient: its networks have the same to do."""
+    """Let a method train on grey images that depend on every vertex: its networks have the same to do."""
 
     def render(vertices: Tensor, poses: Poses) -> Tensor:
         return vertices.mean((1, 2)).sigmoid()[:, None, None].expand(-1, MASK_SIZE, MASK_SIZE)

@@ -27,7 +27,7 @@ class Workload:
     camera: nmr.LookAt
     size: int
     anti_aliasing: bool = True
-    outputs: tuple[str, ...] = ("alpha",)  # of nmr.render; the loss is the sum over them
+    outputs: tuple[str, ...] = ("alpha",)  # outputs of nmr.render; the loss is the sum over them
     values: Tensor | None = None  # colours [B, V, 3] of vertices, or texture images [B, 128, 128, 3]; None: white
     lights: bool = False
 

@@ -70,7 +70,7 @@ def test_the_program_lists_its_commands(command) -> None:
         ("train --data x --category y --output z --iteration 3", "--iterations"),
         ("train --data x --category y --output z --no-clamp-to-cub", "--no-clamp-to-cube"),
         ("check-dataset x --jsno y", "--json"),
-        ("figures --output x --runs y polr", "polar"),
+        ("figures --output x --runs y tsn", "tsne"),
         ("experiment kaot --data x --output y", "'kato'"),
     ],
 )

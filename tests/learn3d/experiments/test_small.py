@@ -1,8 +1,8 @@
 """Every table of the paper in small: `learn3d experiment` from its command line to its reports.
 
 Procedural airplanes in three layouts, small networks, two steps of batch 8: the figures say nothing, but each of the
-runs is planned, trained, measured, shared between tables and reported as in the real thing. Then the one preset that
-no table has, on two categories. (Runs in processes of their own are the matter of `test_runs`.)
+runs is planned, trained, measured, shared between tables and reported as in the real thing. Runs in processes of
+their own are in `test_runs`.
 """
 
 from __future__ import annotations
@@ -14,14 +14,13 @@ import math
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 import stub_work
-import trimesh
 
 from learn3d import commands
 from learn3d.data.layouts import Layout
@@ -90,7 +89,7 @@ class Laboratory:
         words += ["--category", CATEGORY, "--iterations", 2, "--batch-size", 8, "--jobs", 2, "--threads", 1]
         words += ["--seeds", PASCAL_SEEDS if table == "pascal" else 1]
         words += ["--set", "max_val_images=6", "log_every=1"]
-        words += ["precision=fp32"] if table != "precision" else []
+        words += ["precision=fp32"]
         words += [f"{variant}:{change}" for variant in variants for change in SMALLER[variant]]
         status, _, said = call_tool("experiment", *words)
         return Outcome(status, said, (self.folder / "out" / f"{table}.md").read_text())
@@ -114,12 +113,11 @@ def call_tool(name: str, *words: object) -> tuple[int, str, str]:
 def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Laboratory]:
     """Data of each layout that a table takes; the runs are removed at the end, as checkpoints are large."""
     folder = tmp_path_factory.mktemp("laboratory")
-    for layout, category in [*((layout, CATEGORY) for layout in DATA), ("kar", "chair")]:
-        config = DatasetConfig(output=folder / layout, category=category, layout=layout, **DATA[layout])
+    for layout in DATA:
+        config = DatasetConfig(output=folder / layout, category=CATEGORY, layout=layout, **DATA[layout])
         make_dataset(config, progress=False)
     yield Laboratory(folder)
-    for name in ("out", "conditional"):
-        shutil.rmtree(folder / name, ignore_errors=True)
+    shutil.rmtree(folder / "out", ignore_errors=True)
 
 
 @pytest.fixture(scope="module")
@@ -197,47 +195,3 @@ def test_settings_of_rows_reach_their_runs(laboratory: Laboratory, outcomes: dic
 
     counts = {widths: metadata(f"bins-{widths}", "best").info.num_views for widths in VIEW_CLASSES}
     assert counts == VIEW_CLASSES
-    assert [metadata(f"proposed-{p}", "last").config.precision for p in ("fp32", "bf16")] == ["fp32", "bf16"]
-
-
-def test_losses_that_an_ablation_turns_off_are_not_computed(
-    laboratory: Laboratory, outcomes: dict[str, Outcome], read_metrics: Callable[[Path], list[dict[str, Any]]]
-) -> None:
-    off = {"without-prior": {"prior"}, "without-adversarial": {"classification", "confusion"}}
-    off |= {"proposed": set(), "without-smoothness": {"smoothness"}}
-    logged = {}
-    for name in off:
-        lines = read_metrics(laboratory.runs / f"{name}-seed0")
-        logged[name] = {key for line in lines if line["split"] == "train" for key in line} - {"split", "step"}
-    for name, terms in off.items():
-        assert logged["proposed"] - logged[name] == terms, name
-
-
-def test_a_class_conditional_model_goes_from_meshes_to_meshes(laboratory: Laboratory, tmp_path: Path) -> None:
-    """make_dataset (two categories) -> train -> evaluate -> reconstruct, each by its command."""
-    data, run = laboratory.folder / "kar", laboratory.folder / "conditional"
-    words = ["--preset", "kato2019-kar", "--class-conditional", "--data", data, "--category", f"{CATEGORY},chair"]
-    words += ["--output", run]
-    words += ["--iterations", 2, "--batch-size", 4, "--precision", "fp32", "--threads", 1, "--max-val-images", 6]
-    words += [word for change in _VPL for word in f"--{change.replace('_', '-')}".split("=")]
-    status, _, said = call_tool("train", *words)
-    assert status == 0, said
-    assert checkpoint.load_metadata(run / "last.safetensors").info.num_classes == 2
-    tensors, _ = checkpoint.load(run / "last.safetensors")
-    (name,) = (name for name in tensors if name.startswith("network.discriminator.classes.") and "original" in name)
-    assert tensors[name].shape[1] == 2, "the discriminator is told one of two classes"
-
-    status, _, said = call_tool("evaluate", run, "--json", tmp_path / "figures.json")
-    assert status == 0, said
-    results = json.loads((tmp_path / "figures.json").read_text())["results"]
-    assert [(result["category"], result["images"]) for result in results] == [(CATEGORY, 40), ("chair", 40)]
-    for result in results:
-        assert 0 < result["voxel_iou"] <= 1 and 0 < result["voxel_iou_kato19"] <= 1
-        assert 0 <= result["f_score"] <= 1 and math.isfinite(result["chamfer_l1"] + result["mmd"])
-
-    words = ["--run", run, "--output", tmp_path, "--data", data, "--category", "chair", "--indices", 0, 25]
-    status, out, said = call_tool("reconstruct", *words, "--format", "ply")
-    assert status == 0, said
-    meshes = [trimesh.load(path) for path in out.split() if path.endswith(".ply")]
-    assert len(meshes) == 2 and len(out.split()) == 6
-    assert all(mesh.is_watertight and abs(mesh.vertices).max() < 2 for mesh in meshes)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import skimage.color
 import torch
+from fixed_method import FixedMethod
 from PIL import Image
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from learn3d.figures import curves, grids
 from learn3d.figures.grids import comparison_grid, interpolate, picture_grid
 from learn3d.figures.runs import Run
 from learn3d.files import limits
-from learn3d.methods import Grids, Meshes, Method
+from learn3d.methods import Grids, Meshes
 from learn3d.pictures.sheets import HEADER, MARGIN, TILE, magnify, natural_colors
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
 
@@ -32,22 +33,12 @@ TURNS = (0, 60, 120, 180, 240, 300)
 SPHERE, FACES = nmr.icosphere(2)
 
 
-class Ellipsoids(Method):
+class Ellipsoids(FixedMethod):
     """As wide and as high as the mask; as deep as its centre is red, which differs from view to view."""
 
     def __init__(self, scale: float = 1.0, depth_of_red: float = 0.7) -> None:
-        self.networks, self.optimizers = {}, {}
-        self.device, self.precision, self.image_size = torch.device("cpu"), "fp32", 64
+        super().__init__()
         self.scale, self.depth_of_red = scale, depth_of_red
-
-    def create_networks(self):
-        raise NotImplementedError
-
-    def create_optimizers(self):
-        raise NotImplementedError
-
-    def training_step(self, batch, step):
-        raise NotImplementedError
 
     def encode(self, images: Tensor) -> Tensor:
         mask, red = images[:, 3] > 127, images[:, 0, 32, 32].float() / 255

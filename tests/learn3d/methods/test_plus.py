@@ -123,9 +123,3 @@ def test_the_length_of_a_run_whose_smoothness_falls_is_kept(tiny_config, tmp_pat
     assert differences(dataclasses.replace(config, iterations=7), config) == [
         "iterations: 6 in the run, 7 asked for (lambda_smooth_end depends on it)"
     ]
-
-
-def test_warm_up_of_a_short_run(tiny_config, tmp_path) -> None:
-    assert tiny_config(tmp_path, preset="plus-kato", iterations=40).warmup_steps == 4
-    assert tiny_config(tmp_path, preset="plus-kato", iterations=40, warmup_steps=30).warmup_steps == 30
-    assert tiny_config(tmp_path, preset="plus-kato", iterations=3000).warmup_steps == 100

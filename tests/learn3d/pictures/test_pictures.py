@@ -101,7 +101,7 @@ def test_shaded_views_agree_with_the_renderings_at_the_poses(egg, kind) -> None:
 
 def test_figures_need_poses() -> None:
     assert azimuths_deg(LookAtPoses(torch.tensor([190.0]), 30.0, 2.7, 15.0)).tolist() == pytest.approx([-170], abs=1e-4)
-    with pytest.raises(ValueError, match="do not say where the cameras stood"):
+    with pytest.raises(ValueError, match="needs camera poses, and these data have none"):
         azimuths_deg(None)
 
 
