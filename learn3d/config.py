@@ -51,6 +51,8 @@ class TrainConfig:
     views_per_object: Rare[Count | None] = None
     """Number of views of each object to train on: the first ones for kar and r2n2, else the same random ones in every
     run (default: one for kar, else all)."""
+    poses: MayDiffer[FilePath | None] = None
+    """Table of poses that learn3d estimate-poses made from these data, which replaces their own (default: none)."""
     sampling: Rare[Sampling | None] = None
     """Draw views (each on its own), pairs (two views of an object), groups (five of them) or classes (categories drawn
     uniformly)."""

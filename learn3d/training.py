@@ -99,7 +99,7 @@ def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDat
 
     progress: show a bar on a terminal if many files are read.
     """
-    options = {"image_size": config.settings.image_size, "view_bins": config.view_bins}
+    options = {"image_size": config.settings.image_size, "view_bins": config.view_bins, "poses": config.poses}
     load = functools.partial(load_dataset, config.layout, config.data, config.category, **options)
     progress = progress and is_watched()
     train_set = load("train", views_per_object=config.views_per_object, progress=progress)

@@ -14,6 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 from learn3d.data.batch import Batch, StepViews
+from learn3d.data.candidates import PoseCandidates
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
 from learn3d.data.crops import Crops, join_crops
 from learn3d.data.disk_array import DiskArray
@@ -65,6 +66,7 @@ class ViewDataset:
     inverted: bool = True  # colours stored as 255 - colour over black (Kato's form), or as they are
     crops: Crops | None = None  # M: sources of the augmentation "crop"; None if unknown
     sides: np.ndarray | None = None  # float32 [M]: `object_sides`, if they are known already
+    candidates: PoseCandidates | None = None  # M: poses to draw from in training; None: `poses` alone
 
     def __post_init__(self) -> None:
         m, n = len(self.images), self.num_objects
@@ -77,7 +79,7 @@ class ViewDataset:
             raise ValueError(f"depth must be [M, {MASK_SIZE}, {MASK_SIZE}], got {list(self.depth.shape)}")
         if self.voxels is not None and self.voxels.shape[1:] != (VOXEL_SIZE,) * 3:
             raise ValueError(f"voxels must be [N, {VOXEL_SIZE}, {VOXEL_SIZE}, {VOXEL_SIZE}]")
-        wanted = dict.fromkeys(("poses", "view_ids", "object_ids", "masks", "depth", "crops", "sides"), m)
+        wanted = dict.fromkeys(("poses", "view_ids", "object_ids", "masks", "depth", "crops", "sides", "candidates"), m)
         wanted |= dict.fromkeys(("voxels", "points", "class_ids"), n)
         sizes = {name: len(getattr(self, name)) for name in wanted if getattr(self, name) is not None}
         if wrong := {name: size for name, size in sizes.items() if size != wanted[name]}:
@@ -163,6 +165,8 @@ class ViewDataset:
         fields = () if self.poses is None else dataclasses.fields(self.poses)
         poses = [np.asarray(getattr(self.poses, field.name)) for field in fields]
         parts = [self.images, self.masks, self.depth, *poses, self.view_ids, self.object_ids, self.class_ids]
+        if self.candidates is not None:
+            parts += [self.candidates.weights, self.candidates.poses.azimuth_deg, self.candidates.view_ids]
         crc = 0
         for part in parts + [self.voxels] * voxels:
             if part is not None:

@@ -10,6 +10,7 @@ from typing import Literal
 from learn3d.data import shards
 from learn3d.data.conventions import IMAGE_SIZE, LayoutProperties
 from learn3d.data.dataset import ViewDataset, concatenate
+from learn3d.data.pose_table import PoseTable
 from learn3d.data.readers import READERS
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.findings import DamagedFile, MissingFile
@@ -51,6 +52,7 @@ def load_dataset(
     image_size: int = IMAGE_SIZE,
     view_bins: str | None = None,
     views_per_object: int | None = None,
+    poses: Path | None = None,
     progress: bool = False,
 ) -> ViewDataset:
     """Read one split ("train", "val" or "test") of one category, or of several joined by commas, of a folder.
@@ -61,6 +63,7 @@ def load_dataset(
     view_bins: view classes from cells of azimuth and elevation, see `AngleBins.parse`; None: the layout's own.
     views_per_object: use only so many views of every object (kar: the first; else drawn at random, the same in every
     run); None: as in the layout's published protocol.
+    poses: a table of estimated poses (`PoseTable`) that replaces those of the data set.
     progress: show a bar if many files are read.
 
     Raises ValueError for an unknown layout, an option that the layout does not have, and damaged files (named);
@@ -92,6 +95,8 @@ def load_dataset(
         raise type(error)(error.path, message) from error
     if views_per_object is not None and (any(stored) or "views_per_object" not in options):
         dataset = dataset.with_few_views(views_per_object)
+    if poses is not None:
+        dataset = PoseTable.read(poses).applied(dataset, str(poses))
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
 
 

@@ -39,6 +39,8 @@ def batches(dataset: ViewDataset, options: BatchOptions, start: int = 1, rows: T
     indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, start)
     for step in range(start, options.iterations + 1):
         batch = dataset.batch(indices, rows, voxels=False)
+        if dataset.candidates is not None:
+            batch = dataset.candidates.draw(batch, indices, options.seed, step)
         if step < options.iterations:
             indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, step + 1)
             dataset.prepare(indices, rows)

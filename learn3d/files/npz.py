@@ -58,6 +58,13 @@ def read_those_there(path: Path, names: Iterable[str], most: int) -> dict[str, n
     return {name: read(path, name, most) for name in names if name in there}
 
 
+def read_table(path: Path, names: list[str]) -> dict[str, np.ndarray]:
+    """All of the named arrays. Raises ValueError if the file has others, or not all of them."""
+    if sorted(there := keys(path)) != sorted(names):
+        raise ValueError(f"has the arrays {', '.join(there)[:200]}; expected {', '.join(names)}")
+    return {name: read(path, name) for name in names}
+
+
 def read_with_items(path: Path, key: str, others: dict[str, int]) -> list[Any]:
     """`read_ragged` of an array, and other arrays with as many items of so many bytes, at most, as it has."""
     first = read_ragged(path, key)

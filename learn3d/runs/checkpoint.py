@@ -182,6 +182,8 @@ def load_data(
     form = {"image_size": config.settings.image_size}
     if layout == config.layout:
         form["view_bins"] = config.view_bins
+    if data is None and category is None and layout == config.layout:
+        form["poses"] = config.poses
     return load_dataset(layout, data or config.data, category or config.category, split, **form)
 
 

@@ -55,10 +55,10 @@ class Photo:
     line: int
     file: Path
     mask: Path | None
-    azimuth_deg: Annotated[float, Field(gt=-limits.ANGLE_DEG, lt=limits.ANGLE_DEG)]
-    elevation_deg: Annotated[float, Field(gt=-90, lt=90)]
-    distance: Annotated[float, Field(gt=0.5, lt=limits.DISTANCE[1])]
-    fov_deg: Annotated[float, Field(gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])]
+    azimuth_deg: Annotated[float, Field(gt=-limits.ANGLE_DEG, lt=limits.ANGLE_DEG)] | None
+    elevation_deg: Annotated[float, Field(gt=-90, lt=90)] | None
+    distance: Annotated[float, Field(gt=0.5, lt=limits.DISTANCE[1])] | None
+    fov_deg: Annotated[float, Field(gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None
     object: str
     split: Literal[(None, *SPLITS)]
 
@@ -96,11 +96,16 @@ def load(
         elif result.touches_border:
             findings.warn(photo.file, "its object touches the border; what lies outside counts as empty")
         framed.append(findings.take(result))
-    _check_scales(table, [pair for pair in zip(chosen, framed, strict=True) if pair[1] is not None], findings)
+    if chosen[0].distance is not None:
+        _check_scales(table, [pair for pair in zip(chosen, framed, strict=True) if pair[1] is not None], findings)
+    else:
+        findings.warn(table, "has no poses: learn3d estimate-poses --layout photos finds them from the masks")
     if not findings.strict:
         return None
-    poses = _poses(chosen)
-    view_ids, view_names = view_classes(poses, _poses(training))
+    poses, view_ids, view_names = None, np.zeros(len(chosen), np.int64), ("unknown",)
+    if chosen[0].distance is not None:
+        poses = _poses(chosen)
+        view_ids, view_names = view_classes(poses, _poses(training))
     return ViewDataset(
         category=category,
         split=split,
@@ -119,7 +124,7 @@ def load(
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """The categories of a folder and the splits of each."""
     found = {}
-    for table in sorted(Path(folder).glob(f"*/{TABLE}")):
+    for table in sorted({path.parent / TABLE for name in (TABLE, "images") for path in Path(folder).glob(f"*/{name}")}):
         try:
             splits = set(split_objects(table, read_table(table, Findings())).values())
         except (ValueError, OSError):  # reading a split will tell
@@ -183,11 +188,18 @@ def read_table(table: Path, findings: Findings) -> list[Photo]:
 
     Raises MissingFile, and DamagedFile for what is no such table.
     """
-    lines = read_text(table, limits.PHOTO_TABLE_BYTES, _WANTED, encoding="utf-8-sig").splitlines()
+    if not table.exists() and (table.parent / "images").is_dir():
+        names = sorted(path.name for path in (table.parent / "images").iterdir() if not path.name.startswith("."))
+        if not names:
+            raise DamagedFile(table.parent / "images", f"is empty; expected photographs, and {_WANTED} in {TABLE}")
+        lines = ["file", *('"' + name.replace('"', '""') + '"' for name in names)]
+    else:
+        lines = read_text(table, limits.PHOTO_TABLE_BYTES, _WANTED, encoding="utf-8-sig").splitlines()
     delimiter = ";" if lines and ";" in lines[0] else ","
     reader = csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True)
     reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
-    if not {"file", *NUMBERS} <= set(names) <= {"file", *NUMBERS, *OPTIONAL}:
+    numbers = set(names) & set(NUMBERS)
+    if "file" not in names or len(numbers) not in (0, 4) or not set(names) <= {"file", *NUMBERS, *OPTIONAL}:
         raise DamagedFile(table, f"has the columns {', '.join(names)[:200]}; expected {_WANTED}")
     masks = {path.stem: path for path in sorted((table.parent / "masks").glob("*"))}
     photos: dict[Path, Photo] = {}
@@ -241,7 +253,7 @@ def _photo(table: Path, line: int, row: dict[str, Any], masks: dict[str, Path], 
             mask=masks.get(file.stem),
             object=values.get("object") or file.stem,
             split=values.get("split") or None,
-            **{name: _number(values[name]) for name in NUMBERS},
+            **{name: _number(values[name]) if name in values else None for name in NUMBERS},
         )
     except ValueError as error:
         raise DamagedFile(table, f"line {line}: {error}") from None

@@ -1,0 +1,82 @@
+"""`learn3d estimate-poses`."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+from tqdm import tqdm
+
+from learn3d.commands.command import Command
+from learn3d.data.layouts import Layout, load_dataset
+from learn3d.data.poses import wrap_deg
+from learn3d.files.findings import MissingFile
+from learn3d.files.writing import check_target
+from learn3d.pictures.sheets import save_png
+from learn3d.poses.estimate import PoseOptions
+from learn3d.poses.sheet import LEGEND, draw_sheet
+from learn3d.poses.views import SURE, CameraOptions, compare, estimate_views
+from learn3d.settings import Count
+from learn3d.terminal import is_watched, note, say
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimatePoses(Command):
+    """Find out from which side each image of a data set was taken, from the masks alone, for `learn3d train --poses`.
+
+    Examples:
+      learn3d estimate-poses photos --layout photos --category mug --elevation 20 --output mug-poses.npz
+      learn3d estimate-poses DATA --category airplane --output poses.npz --compare
+
+    Beside the table it writes a sheet (poses.png). Look at it: the images below each azimuth must all be seen from
+    there. Azimuths are counted from a side that the estimate chooses.
+    """
+
+    data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    """Folder of the data set."""
+    category: str
+    """Categories, separated by commas. They share their prototypes."""
+    output: Path
+    """File of the table (.npz)."""
+    layout: Layout = "kato"
+    """Arrangement of the files of the data set, see docs/data-sets.md."""
+    options: PoseOptions
+    cameras: CameraOptions
+    candidates: Annotated[int, tyro.conf.arg(metavar="INT")] = 4
+    """Number of poses of each image in the table, each with its probability; training draws one in each step."""
+    compare: bool = False
+    """Compare with the data set's own azimuths, and turn the table into their frame, so that voxel IoU is measured."""
+    views_per_object: Count | None = None
+    """Number of training images of each object (default: the layout's protocol, one for kar, else all)."""
+
+    def run(self) -> None:
+        if not 1 <= self.candidates <= 64:
+            raise ValueError(f"candidates must lie in 1 .. 64, got {self.candidates}")
+        check_target(self.output, "--output")
+        datasets = [
+            load_dataset(self.layout, self.data, self.category, "train", views_per_object=self.views_per_object)
+        ]
+        for split in ("val", "test"):
+            with contextlib.suppress(MissingFile):
+                datasets.append(load_dataset(self.layout, self.data, self.category, split))
+        with tqdm(total=self.options.all_steps, desc="poses", unit="step", disable=not is_watched()) as bar:
+            views = estimate_views(datasets, self.cameras, self.options, self.candidates, bar.update)
+        table = views.table
+        doubtful = float((table.confidence < SURE).mean())
+        say(f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below .5: {doubtful:.0%}")
+        if self.compare:
+            comparison = compare(views)
+            say(comparison.text())
+            turned = wrap_deg(torch.from_numpy(table.azimuth_deg) + comparison.offset_deg).numpy()
+            table = dataclasses.replace(table, azimuth_deg=turned)
+        for warning in views.warnings:
+            note(f"warning: {warning}")
+        table.write(self.output)
+        sheet = self.output.with_suffix(".png")
+        save_png(sheet, draw_sheet(views))
+        say(f"written to {self.output}; sheet {sheet}: {LEGEND}")

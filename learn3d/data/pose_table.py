@@ -1,0 +1,119 @@
+"""Tables of estimated poses: an npz file beside a data set, which takes the place of the poses that it has.
+
+Every row belongs to one image. It is found by a fingerprint, a hash of the object's name and the mask, so that a table
+fits any part of the data that it was made from, in any order, and no other data.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from learn3d.data.candidates import PoseCandidates
+from learn3d.data.dataset import ViewDataset
+from learn3d.data.poses import LookAtPoses
+from learn3d.data.readers.photos import view_classes
+from learn3d.files import npz
+from learn3d.files.findings import DamagedFile
+from learn3d.files.sandbox import read
+from learn3d.files.writing import replacing
+
+_WANTED = "a table that learn3d estimate-poses wrote"
+_DTYPES = {"fingerprint": np.dtype(np.uint64)}  # the others are float32
+_MOST_CANDIDATES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTable:
+    """C candidates for each of N images, the best first."""
+
+    fingerprint: np.ndarray  # uint64 [N]
+    azimuth_deg: np.ndarray  # float32 [N, C]
+    elevation_deg: np.ndarray  # float32 [N, C]
+    weights: np.ndarray  # float32 [N, C]; their sum is 1
+    distance: np.ndarray  # float32 [N]
+    half_fov_deg: np.ndarray  # float32 [N]
+    confidence: np.ndarray  # float32 [N]: probability that the best azimuth is right to 30 degrees
+
+    def __post_init__(self) -> None:
+        count, shape = len(self.fingerprint), self.azimuth_deg.shape
+        if not count or len(shape) != 2 or not 1 <= shape[1] <= _MOST_CANDIDATES:
+            raise ValueError(f"azimuth_deg must be [N, C] with N >= 1 and C in 1 .. {_MOST_CANDIDATES}, got {shape}")
+        for field in dataclasses.fields(self):
+            values = getattr(self, field.name)
+            dtype = _DTYPES.get(field.name, np.dtype(np.float32))
+            wanted = (count, shape[1]) if field.name in ("azimuth_deg", "elevation_deg", "weights") else (count,)
+            if (values.dtype, values.shape) != (dtype, wanted):
+                raise ValueError(f"{field.name} must be {dtype} {list(wanted)}, got {values.dtype} {values.shape}")
+            if not np.isfinite(values).all():
+                raise ValueError(f"{field.name} has values that are not finite")
+        if not self.poses(np.arange(count)).in_range().all():
+            raise ValueError("some of its cameras are impossible (elevation, distance or field of view)")
+        for name in ("weights", "confidence"):
+            if not ((values := getattr(self, name)) >= 0).all() or not (values <= 1.001).all():
+                raise ValueError(f"{name} must lie in 0 .. 1")
+        if not np.allclose(self.weights.sum(axis=1), 1, atol=1e-3):
+            raise ValueError("the weights of the candidates of an image must add up to 1")
+
+    def poses(self, rows: np.ndarray, best: bool = False) -> LookAtPoses:
+        """The poses of these rows, candidate by candidate, or the best ones alone."""
+        last = 1 if best else self.azimuth_deg.shape[1]
+        angles = (values[rows, :last].reshape(-1) for values in (self.azimuth_deg, self.elevation_deg))
+        return LookAtPoses(*angles, *(values[rows].repeat(last) for values in (self.distance, self.half_fov_deg)))
+
+    def write(self, path: Path) -> None:
+        """Write the table; the same table gives the same bytes."""
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **vars(self))
+
+    @classmethod
+    def read(cls, path: Path | str) -> PoseTable:
+        """Read a table that somebody else may have made. Raises DamagedFile and MissingFile."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        arrays = read(npz.read_table, Path(path), names, wanted=_WANTED)
+        try:
+            return cls(**arrays)
+        except ValueError as error:
+            raise DamagedFile(Path(path), f"{error}; expected {_WANTED}") from None
+
+    def applied(self, dataset: ViewDataset, source: str) -> ViewDataset:
+        """The data set with the poses of this table, and view classes of them. `source` names the table in messages.
+
+        Raises ValueError if an image is not in the table.
+        """
+        wanted = fingerprints(dataset)
+        order = np.argsort(self.fingerprint, kind="stable")
+        rows = order[np.searchsorted(self.fingerprint[order], wanted).clip(max=len(order) - 1)]
+        if len(missing := np.flatnonzero(self.fingerprint[rows] != wanted)):
+            first = dataset.object_names[dataset.object_ids[missing[0]]]
+            raise ValueError(
+                f"{source} has no pose for {len(missing)} of {len(dataset)} {dataset.split} images of "
+                f"{dataset.category} (the first is of object {first}): it was made from other data; run learn3d "
+                "estimate-poses on these"
+            )
+        poses, training = self.poses(rows, best=True), self.poses(np.arange(len(order)), best=True)
+        view_ids, view_names = view_classes(poses, training)
+        every = self.poses(rows)
+        candidates = PoseCandidates(every, view_classes(every, training)[0], self.weights[rows])
+        parts = {"view_ids": view_ids, "view_names": view_names, "candidates": candidates}
+        return dataclasses.replace(dataset, poses=poses, **parts)
+
+
+def fingerprints(dataset: ViewDataset) -> np.ndarray:
+    """A hash of the object's name and the mask of every image: uint64 [M]."""
+    found = np.empty(len(dataset), np.uint64)
+    for rows in np.array_split(np.arange(len(dataset)), len(dataset) // 1024 + 1):
+        for row, mask in zip(rows, masks_of(dataset, rows), strict=True):
+            name = dataset.object_names[dataset.object_ids[row]].encode()
+            digest = hashlib.blake2b(name + b"\0" + mask.tobytes(), digest_size=8).digest()
+            found[row] = int.from_bytes(digest, "little")
+    return found
+
+
+def masks_of(dataset: ViewDataset, rows: np.ndarray) -> np.ndarray:
+    """The masks to be matched of some images: uint8 [B, 64, 64]."""
+    return dataset.images[rows][:, 3] if dataset.masks is None else dataset.masks[rows]

@@ -1,0 +1,47 @@
+"""A picture that tells at once whether poses were found: prototypes, and images sorted by azimuth."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from learn3d.data.poses import LookAtPoses
+from learn3d.pictures.sheets import natural_colors, tile
+from learn3d.pictures.surfaces import Surface, draw_surface, orbit
+from learn3d.poses.views import EstimatedViews
+
+COLUMNS = 12  # azimuths
+PROTOTYPES, ROWS = 6, 8
+TILE = 64
+LEGEND = "columns: azimuths; first rows: prototypes, rendered there; other rows: images whose estimate is there"
+
+
+def draw_sheet(views: EstimatedViews) -> np.ndarray:
+    """Uint8 [H, W, 3]: the most frequent prototypes at 12 azimuths, and below each azimuth images estimated there."""
+    candidates, result = views.candidates, views.result
+    count = min(COLUMNS, len(candidates.azimuth_deg))
+    azimuths = candidates.azimuth_deg[torch.linspace(0, len(candidates.azimuth_deg), count + 1)[:-1].long()]
+    middle = candidates.elevation_deg[len(candidates.elevation_deg) // 2 : len(candidates.elevation_deg) // 2 + 1]
+    front = LookAtPoses(torch.zeros(1), middle, candidates.distance, candidates.half_fov_deg)
+    cameras = orbit(front, azimuths.tolist())
+    order = result.weights.argsort(descending=True)[:PROTOTYPES]
+    rows = [list(draw_surface(Surface(result.prototypes[m], result.faces), cameras, image_size=TILE)) for m in order]
+    starts = np.cumsum([0, *map(len, views.datasets)])
+    found = torch.from_numpy(views.table.azimuth_deg[:, 0])[views.shown]
+    columns = []
+    for azimuth in azimuths:
+        near = torch.nonzero((torch.remainder(found - azimuth + 180, 360) - 180).abs() < 180 / count)[:, 0]
+        chosen = near[torch.linspace(0, len(near) - 1, min(ROWS, len(near))).long()]
+        pictures = []
+        for row in views.shown[chosen].tolist():
+            part = int(np.searchsorted(starts, row, side="right")) - 1
+            dataset = views.datasets[part]
+            pictures.append(
+                natural_colors(dataset.images[np.array([row - starts[part]])], inverted=dataset.inverted)[0]
+            )
+        columns.append(pictures + [None] * (ROWS - len(pictures)))
+    names = [f"prototype, {float(result.weights[m]):.0%}" for m in order] + ["images", *[""] * (ROWS - 1)]
+    titles = [f"{azimuth:g}°" for azimuth in azimuths.tolist()]
+    return tile(
+        [*rows, *map(list, zip(*columns, strict=True))], titles, tile_size=TILE, row_titles=names, rules=(len(rows),)
+    )

@@ -1,0 +1,216 @@
+"""From data sets to poses: the views of all splits, their estimate, the table, and a comparison with true poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from learn3d.data.dataset import MASK_SIZE, ViewDataset
+from learn3d.data.pose_table import PoseTable, fingerprints, masks_of
+from learn3d.data.poses import LookAtPoses, wrap_deg
+from learn3d.poses.estimate import FEWEST, NEAR_DEG, SIZE, Candidates, Estimate, Masks, PoseOptions, estimate
+
+ELEVATION_STEP_DEG = 15.0  # between candidates, at most
+DEFAULT_ELEVATION_DEG, DEFAULT_FOV_DEG = 30.0, 30.0
+SURE = 0.5  # confidence below which an image counts as doubtful
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """The cameras, as far as they are known."""
+
+    elevation: str | None = None
+    """Height angle of all cameras in degrees, or its range, LOW:HIGH (default: the data set's own, or 30 if it has
+    none)."""
+    distance: float | None = None
+    """Distance of all cameras in lengths of the object (default: the data set's own, or such that the largest mask is
+    one length)."""
+    fov_deg: float | None = None
+    """Full field of view of all cameras in degrees (default: the data set's own, or 30 if it has none)."""
+
+    def elevations(self) -> tuple[float, float] | None:
+        """The lowest and the highest one; None: not given."""
+        if self.elevation is None:
+            return None
+        try:
+            low, _, high = self.elevation.partition(":")
+            low, high = float(low), float(high or low)
+        except ValueError:
+            low, high = 1.0, 0.0
+        if not -90 < low <= high < 90:
+            raise ValueError(f"elevation must be degrees within -90 .. 90, or LOW:HIGH, got {self.elevation!r}")
+        return low, high
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedViews:
+    """The images of all splits, one after the other, and their poses."""
+
+    datasets: tuple[ViewDataset, ...]
+    shown: Tensor  # int64: rows that show something
+    candidates: Candidates
+    result: Estimate  # of these rows
+    table: PoseTable  # of all rows
+    warnings: tuple[str, ...]
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the poses can be told at all."""
+        return float(self.result.confidence.mean()) >= SURE
+
+
+def estimate_views(
+    datasets: Sequence[ViewDataset],
+    cameras: CameraOptions,
+    options: PoseOptions,
+    kept: int,
+    tick: Callable[[], object] = lambda: None,
+) -> EstimatedViews:
+    """Poses of all images of the splits, training first; shapes are fitted to the training images.
+
+    kept: number of candidates of each image in the table. Raises ValueError if all masks are empty, or cameras are
+    rotations.
+    """
+    masks = torch.cat([_masks(dataset) for dataset in datasets])
+    elevation, distance, half_fov = _cameras(datasets, cameras, masks)
+    shown = torch.nonzero(masks.sum((1, 2)) > 1)[:, 0]
+    training = shown[shown < len(datasets[0])]
+    if not len(training):
+        raise ValueError("all training masks are empty, so that no pose can be told; look at the data")
+    span = cameras.elevations() or (float(elevation.min()), float(elevation.max()))
+    grid = torch.linspace(*span, 1 + int(np.ceil((span[1] - span[0]) / ELEVATION_STEP_DEG)))
+    azimuths = torch.arange(options.azimuths) * (360 / options.azimuths)
+    candidates = Candidates(azimuths, grid, float(distance.median()), float(half_fov.median()))
+    size = distance * torch.tan(half_fov.deg2rad())
+    masks = _scaled(masks, size / (candidates.distance * np.tan(np.radians(candidates.half_fov_deg))))
+    allowed = torch.ones(len(masks), len(grid), dtype=torch.bool)
+    if cameras.elevation is None:
+        nearest = (elevation[:, None] - grid).abs().argmin(1)
+        allowed = nearest[:, None] == torch.arange(len(grid))
+    starts = np.cumsum([0, *(dataset.num_objects for dataset in datasets)])
+    objects = torch.from_numpy(np.concatenate([d.object_ids + s for d, s in zip(datasets, starts, strict=False)]))
+    data = Masks(F.avg_pool2d(masks[:, None], MASK_SIZE // SIZE).flatten(1), allowed, objects.long())[shown]
+    result = estimate(data, torch.searchsorted(shown, training), candidates, options, tick)
+
+    posterior = torch.full((len(masks), len(azimuths) * len(grid)), 1 / (len(azimuths) * len(grid)))
+    posterior[shown] = result.posterior.flatten(1)
+    confidence = torch.zeros(len(masks)).index_copy(0, shown, result.confidence)
+    weights, chosen = posterior.topk(min(kept, posterior.shape[1]), 1)
+    heights = grid[chosen % len(grid)]
+    if cameras.elevation is None:
+        heights = elevation[:, None].expand_as(heights)
+    table = PoseTable(
+        np.concatenate([fingerprints(dataset) for dataset in datasets]),
+        *(part.numpy().astype(np.float32) for part in (wrap_deg(azimuths[chosen // len(grid)]), heights)),
+        *(part.numpy() for part in (weights / weights.sum(1, keepdim=True), distance, half_fov, confidence)),
+    )
+    views = EstimatedViews(tuple(datasets), shown, candidates, result, table, ())
+    return EstimatedViews(tuple(datasets), shown, candidates, result, table, tuple(_warnings(views, len(training))))
+
+
+def _warnings(views: EstimatedViews, training: int) -> list[str]:
+    warnings = []
+    if empty := len(views.table.confidence) - len(views.shown):
+        warnings.append(f"{empty} images have an empty mask; their poses are unknown")
+    if training < FEWEST:
+        warnings.append(f"{training} training images are too few to tell poses; {FEWEST} are the least")
+    elif not views.is_sure:
+        warnings.append(
+            "poses cannot be told from these masks: nearly equal masks of different objects got different azimuths, as "
+            "if objects looked alike from several sides. Look at the sheet before training on this table"
+        )
+    return warnings
+
+
+def _masks(dataset: ViewDataset) -> Tensor:
+    """Float32 [M, 64, 64] in 0 .. 1."""
+    return torch.from_numpy(masks_of(dataset, np.arange(len(dataset)))).float() / 255
+
+
+def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions, masks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Elevation, distance and half field of view of every image: given, or the data's own, or a guess."""
+    given = cameras.elevations() or (DEFAULT_ELEVATION_DEG,) * 2
+    half_fov = torch.full((len(masks),), (cameras.fov_deg or DEFAULT_FOV_DEG) / 2)
+    share = max(float(dataset.object_sides().max()) for dataset in datasets)
+    guess = 0.5 / (max(share, 0.01) * np.tan(np.radians(float(half_fov[0]))))
+    distance, elevation = torch.full_like(half_fov, guess), torch.full_like(half_fov, sum(given) / 2)
+    if any(dataset.poses is not None for dataset in datasets):
+        if not all(isinstance(dataset.poses, LookAtPoses) for dataset in datasets):
+            raise ValueError(
+                "poses are estimated for cameras that look at the object; those of this layout are rotations"
+            )
+        own = [_column(datasets, name) for name in ("elevation_deg", "distance", "half_fov_deg")]
+        elevation = own[0] if cameras.elevation is None else elevation
+        distance, half_fov = own[1], half_fov if cameras.fov_deg else own[2]
+    if cameras.distance is not None:
+        distance = torch.full_like(half_fov, cameras.distance)
+    return elevation, distance, half_fov
+
+
+def _column(datasets: Sequence[ViewDataset], name: str) -> Tensor:
+    """One value of the poses of all images, float32."""
+    columns = [torch.as_tensor(getattr(d.poses, name), dtype=torch.float32).expand(len(d)) for d in datasets]
+    return torch.cat(columns)
+
+
+def _scaled(masks: Tensor, factor: Tensor) -> Tensor:
+    """Each mask magnified about its centre, as another distance or field of view shows it, about."""
+    if bool((factor - 1).abs().max() < 1e-3):
+        return masks
+    theta = torch.zeros(len(masks), 2, 3)
+    theta[:, 0, 0] = theta[:, 1, 1] = 1 / factor
+    grid = F.affine_grid(theta, (len(masks), 1, MASK_SIZE, MASK_SIZE), align_corners=False)
+    return F.grid_sample(masks[:, None], grid, align_corners=False)[:, 0]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Estimated azimuths against true ones, after one rotation of the frame by `offset_deg`."""
+
+    offset_deg: float
+    accuracy: float  # Acc@30
+    median_deg: float
+    mean_deg: float
+    flips: float  # share of errors of at least 150 degrees
+    objects_flipped: float  # share of the objects whose images are mostly flips
+    calibration: tuple[tuple[float, float, int], ...]  # mean confidence, accuracy and number of images, by confidence
+
+    def text(self) -> str:
+        """Lines for the terminal."""
+        lines = [
+            f"against the data's azimuths (frame turned by {self.offset_deg:g} degrees): Acc@30 {self.accuracy:.3f}, "
+            f"median error {self.median_deg:.1f}, mean {self.mean_deg:.1f} degrees, flips {self.flips:.3f}, objects "
+            f"flipped as a whole {self.objects_flipped:.3f}"
+        ]
+        return "\n".join(lines + [f"confidence {c:.2f}: right {a:.2f} ({n} images)" for c, a, n in self.calibration])
+
+
+def compare(views: EstimatedViews) -> Comparison:
+    """The errors of the best azimuths. The frame is turned by the whole number of degrees with the smallest mean error
+    of the validation images, or of all if there are none. Raises ValueError without true poses.
+    """
+    if any(dataset.poses is None for dataset in views.datasets):
+        raise ValueError("--compare needs true poses, which these data do not have")
+    true, found = _column(views.datasets, "azimuth_deg"), torch.from_numpy(views.table.azimuth_deg[:, 0])
+    splits = np.concatenate([[dataset.split] * len(dataset) for dataset in views.datasets])
+    chosen = torch.from_numpy(splits == "val") if "val" in splits else torch.ones(len(true), dtype=torch.bool)
+    offsets = torch.arange(360.0)
+    means = torch.stack([wrap_deg(found[chosen] + o - true[chosen]).abs().mean() for o in offsets])
+    offset = float(offsets[means.argmin()])
+    errors = wrap_deg(found + offset - true).abs()[views.shown]
+    flips, objects = (
+        (errors >= 150).double(),
+        torch.cat([torch.from_numpy(d.object_ids) + 10**6 * i for i, d in enumerate(views.datasets)]),
+    )
+    _, which = objects[views.shown].unique(return_inverse=True)
+    by_object = torch.bincount(which, flips) / torch.bincount(which)
+    right, confidence = (errors <= NEAR_DEG).double(), views.result.confidence.double()
+    bins = [torch.nonzero((10 * confidence).floor().clamp(max=9) == k)[:, 0] for k in range(10)]
+    calibration = tuple((float(confidence[b].mean()), float(right[b].mean()), len(b)) for b in bins if len(b))
+    numbers = (right.mean(), errors.median(), errors.mean(), flips.mean(), (by_object > 0.5).double().mean())
+    return Comparison(offset, *map(float, numbers), calibration)
