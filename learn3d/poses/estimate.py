@@ -147,7 +147,7 @@ def estimate(
         found = _normalized(alone**0.3 * (near.message(smooth) + 1e-3))
         posterior[rows] = found
         confidence[rows] = _calibrated(near_mass(near.message(own.sum(1)).sum(2), found.sum(2).argmax(1)))
-    if len(some) < FEWEST:
+    if len(some) < FEWEST or _views_coincide(posterior.sum(2).argmax(1), data.objects, options.azimuths):
         confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
     return Estimate(posterior, confidence, *shapes.placed(), own.sum((2, 3)).mean(0))
 
@@ -157,6 +157,20 @@ def near_mass(mass: Tensor, azimuth: Tensor) -> Tensor:
     reach = math.floor(NEAR_DEG * mass.shape[1] / 360)
     near = (azimuth[:, None] + torch.arange(-reach, reach + 1)) % mass.shape[1]
     return mass.gather(1, near).sum(1) / mass.sum(1).clamp_min(1e-9)
+
+
+def _views_coincide(azimuth: Tensor, objects: Tensor, count: int) -> bool:
+    """Whether most pairs of views of an object have nearly equal azimuths, as if it looked alike from all sides."""
+    _, which = objects.unique(return_inverse=True)
+    views = torch.zeros(int(which.max()) + 1, count).index_put_(
+        (which, azimuth), torch.ones(len(which)), accumulate=True
+    )
+    number = views.sum(1, keepdim=True)
+    pairs = views * (number - 1)
+    close = views * (
+        near_mass(views.repeat_interleave(count, 0), torch.arange(count).repeat(len(views))).view_as(views) * number - 1
+    )
+    return bool(pairs.sum() > 0 and close.sum() > 0.5 * pairs.sum())
 
 
 def _calibrated(agreement: Tensor) -> Tensor:

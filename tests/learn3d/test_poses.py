@@ -1,0 +1,183 @@
+"""Poses from masks: azimuths are found or doubted, tables are matched and refused, training draws from them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import nmr
+from learn3d.config import TrainConfig
+from learn3d.data.candidates import PoseCandidates
+from learn3d.data.dataset import ViewDataset
+from learn3d.data.layouts import load_dataset
+from learn3d.data.pose_table import PoseTable, fingerprints
+from learn3d.data.poses import LookAtPoses
+from learn3d.data.readers import kato
+from learn3d.data.sampling import batches
+from learn3d.files.findings import DamagedFile
+from learn3d.poses.estimate import PoseOptions
+from learn3d.poses.sheet import draw_sheet
+from learn3d.poses.views import CameraOptions, EstimatedViews, compare, estimate_views
+from learn3d.training import train
+
+QUICK = PoseOptions(steps=25, restarts=1, prototypes=3)
+
+
+def darts(objects: int) -> ViewDataset:
+    """Objects with a thick front and a thin back, in Kato's 24 views."""
+    sphere, faces = nmr.icosphere(2)
+    rng, images = np.random.default_rng(0), np.zeros((objects, 24, 4, 64, 64), np.uint8)
+    poses = kato.from_arrays(images[:1], None, "dart", "train").poses
+    for image in images:
+        width = torch.from_numpy(rng.uniform(0.9, 1.1, 3)) * torch.tensor([0.3, 0.1, 0.5])
+        taper = torch.stack([1 - 0.9 * sphere[:, 2], 1 - 0.9 * sphere[:, 2], torch.ones(len(sphere))], 1)
+        vertices = (sphere * taper * width).float().expand(24, -1, -1)
+        image[:, 3] = (255 * nmr.render_silhouette(vertices, faces, poses.cameras(), image_size=64)).byte().numpy()
+    return kato.from_arrays(images, None, "dart", "train")
+
+
+def estimated(dataset: ViewDataset, **options: object) -> EstimatedViews:
+    return estimate_views([dataset], CameraOptions(), dataclasses.replace(QUICK, **options), 2)
+
+
+@pytest.fixture(scope="module")
+def found() -> EstimatedViews:
+    return estimated(darts(8), steps=40, restarts=2)
+
+
+def test_azimuths_of_distinct_shapes_are_found(found: EstimatedViews) -> None:
+    result = compare(found)
+    assert result.accuracy > 0.9 and result.flips < 0.1 and found.is_sure and not found.warnings
+    assert found.table.weights.shape == (192, 2)
+    assert draw_sheet(found).ndim == 3
+
+
+def test_the_frame_is_free_and_turned_for_the_comparison(found: EstimatedViews) -> None:
+    """A data set whose azimuths are counted from another side gives the same poses, and another offset."""
+    (dataset,), before = found.datasets, compare(found)
+    poses = dataclasses.replace(dataset.poses, azimuth_deg=dataset.poses.azimuth_deg + 45)
+    after = compare(dataclasses.replace(found, datasets=(dataclasses.replace(dataset, poses=poses),)))
+    assert (after.offset_deg - before.offset_deg) % 360 == 45 and after.accuracy == before.accuracy
+
+
+def test_a_seed_gives_the_same_bits() -> None:
+    dataset, options = darts(5), {"steps": 3}
+    first, again, other = (estimated(dataset, seed=seed, **options).table for seed in (0, 0, 1))
+    assert all(np.array_equal(getattr(first, name), getattr(again, name)) for name in vars(first))
+    assert not np.array_equal(first.weights, other.weights)
+
+
+def test_a_range_of_elevations_and_unknown_cameras() -> None:
+    quick = dataclasses.replace(QUICK, steps=3)
+    views = estimate_views([dataclasses.replace(darts(5), poses=None)], CameraOptions("0:30", 2.5, 31.0), quick, 3)
+    assert set(np.unique(views.table.elevation_deg)) <= {0.0, 15.0, 30.0}
+    assert (views.table.distance == 2.5).all() and (views.table.half_fov_deg == 15.5).all()
+    with pytest.raises(ValueError, match=r"elevation must be degrees within -90 .. 90, or LOW:HIGH, got '30:x'"):
+        CameraOptions("30:x").elevations()
+    with pytest.raises(ValueError, match="--compare needs true poses"):
+        compare(views)
+
+
+def test_poses_that_cannot_be_told_are_doubted() -> None:
+    """One outline from all sides, too few images, and empty masks."""
+    rng, images = np.random.default_rng(0), np.zeros((10, 24, 4, 64, 64), np.uint8)
+    for image, (h, w) in zip(images, rng.integers(8, 24, (10, 2)), strict=True):
+        image[:, 3, 32 - h : 32 + h, 32 - w : 32 + w] = 255
+    views = estimated(kato.from_arrays(images, None, "box", "train"), steps=10)
+    assert not views.is_sure and "poses cannot be told" in views.warnings[0]
+    few = darts(1)
+    few.images[:4] = 0
+    views = estimated(few, steps=3)
+    assert views.table.confidence.max() < 0.5 and (views.table.confidence[:4] == 0).all()
+    assert (
+        views.warnings[0].startswith("4 images have an empty mask")
+        and "20 training images are too" in views.warnings[1]
+    )
+    few.images[:] = 0
+    with pytest.raises(ValueError, match="all training masks are empty"):
+        estimated(few)
+
+
+def random_table(dataset: ViewDataset, candidates: int = 3) -> PoseTable:
+    count, rng = len(dataset), np.random.default_rng(0)
+    angles = (rng.uniform(low, high, (count, candidates)).astype(np.float32) for low, high in ((-180, 180), (0, 40)))
+    weights = rng.dirichlet(np.ones(candidates), count).astype(np.float32)
+    numbers = (np.full(count, value, np.float32) for value in (2.7, 15.0, 0.9))
+    return PoseTable(fingerprints(dataset), *angles, weights, *numbers)
+
+
+def test_a_table_is_read_as_written_and_matched_by_image(tmp_path: Path, tiny_set: ViewDataset) -> None:
+    images = np.random.default_rng(0).integers(0, 256, tiny_set.images.shape, np.uint8)
+    dataset = dataclasses.replace(tiny_set, images=images)
+    random_table(dataset).write(tmp_path / "poses.npz")
+    table = PoseTable.read(tmp_path / "poses.npz")
+    rows = np.random.default_rng(1).permutation(len(dataset))[:7]
+    part = table.applied(dataset.select(rows), "poses.npz")
+    assert np.array_equal(part.poses.azimuth_deg, table.azimuth_deg[rows, 0])
+    assert np.array_equal(part.candidates.weights, table.weights[rows])
+    with pytest.raises(
+        ValueError, match=r"poses.npz has no pose for 72 of 72 test images of airplane .* of object 0000"
+    ):
+        table.applied(tiny_set, "poses.npz")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"azimuth_deg": None}, "has the arrays .*; expected fingerprint"),
+        ({"extra": np.zeros(3)}, "has the arrays .*; expected fingerprint"),
+        ({"weights": np.zeros((72, 3), np.float32)}, "must add up to 1"),
+        ({"weights": np.full((72, 3), 1 / 3)}, "weights must be float32"),
+        ({"distance": np.zeros(72, np.float32)}, "impossible"),
+        ({"distance": np.ones(71, np.float32)}, r"distance must be float32 \[72\]"),
+        ({"confidence": np.full(72, np.nan, np.float32)}, "not finite"),
+        ({"confidence": np.full(72, -1, np.float32)}, r"confidence must lie in 0 \.\. 1"),
+        ({"azimuth_deg": np.zeros((72, 0), np.float32)}, r"azimuth_deg must be \[N, C\]"),
+        ({"distance": np.array([{}] * 72)}, "'distance' must be numbers"),
+    ],
+)
+def test_a_hostile_table_is_refused(
+    tmp_path: Path, tiny_set: ViewDataset, change: dict[str, np.ndarray | None], message: str
+) -> None:
+    arrays = {name: a for name, a in (vars(random_table(tiny_set)) | change).items() if a is not None}
+    np.savez(tmp_path / "poses.npz", **arrays)
+    with pytest.raises(DamagedFile, match=rf"poses.npz: .*{message}"):
+        PoseTable.read(tmp_path / "poses.npz")
+
+
+def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset) -> None:
+    """By (seed, step) alone, pose and class together, also if processes share the step."""
+    count = len(tiny_set)
+    poses = LookAtPoses(torch.arange(2.0 * count), 30.0, 2.7, 15.0)
+    weights = np.tile(np.float32([0.75, 0.25]), (count, 1))
+    dataset = dataclasses.replace(tiny_set, candidates=PoseCandidates(poses, np.arange(2 * count) % 24, weights))
+    indices, second = torch.arange(count), []
+    for step in range(200):
+        batch = dataset.candidates.draw(dataset.batch(indices), indices, 0, step)
+        assert np.array_equal(batch.view_ids, batch.poses.azimuth_deg.long() % 24)
+        second.append((batch.poses.azimuth_deg % 2).mean())
+        rows = torch.tensor([5, 1])
+        shared = dataset.candidates.draw(dataset.batch(indices, rows), indices, 0, step)
+        assert np.array_equal(shared.poses.azimuth_deg, batch.poses.azimuth_deg[rows])
+        assert np.array_equal(shared.view_ids, batch.view_ids[rows])
+        assert np.array_equal(shared.step_views.view_ids, batch.view_ids)
+    assert abs(np.mean(second) - 0.25) < 0.02
+    options = TrainConfig(data=Path("."), category="x", output=Path("."), batch_size=8, iterations=2, augment=())
+    assert all((b.poses.azimuth_deg % 2).sum() < 8 for b in batches(dataset, options))
+
+
+@pytest.mark.parametrize("preset", ["plus-kato", "peng2020-kato", "peng2020-kato-vanilla", "peng2020-kato-vpl"])
+def test_methods_learn_from_a_table(
+    preset: str, tmp_path: Path, run_folder: Path, tiny_folder: Path, tiny_config: Callable[..., TrainConfig]
+) -> None:
+    sets = [load_dataset("kato", tiny_folder, "airplane", split) for split in ("train", "val")]
+    tables = [random_table(dataset) for dataset in sets]
+    columns = (np.concatenate([getattr(table, name) for table in tables]) for name in vars(tables[0]))
+    PoseTable(*columns).write(tmp_path / "poses.npz")
+    config = tiny_config(run_folder, preset=preset, iterations=2, poses=tmp_path / "poses.npz")
+    assert train(config).finished
