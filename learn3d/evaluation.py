@@ -122,7 +122,7 @@ def evaluate(
     finally:
         method.set_training(was_training)
     own = torch.cat(rows) if rows else torch.empty(0, dtype=torch.int64)
-    object_ids, view_ids = (torch.from_numpy(ids[samples]) for ids in (dataset.object_ids, dataset.view_ids))
+    object_ids, view_ids = (torch.from_numpy(ids[samples.numpy()]) for ids in (dataset.object_ids, dataset.view_ids))
     figures = dict(zip(MEASURED, group.all_gather(values, own, count).T, strict=True))
     means = {name: float(v.nanmean()) for name, v in figures.items() if not v.isnan().all()}
     mmds = mean_mmd(group.all_gather(codes, own, count), view_ids, ("mmd", "mmd_paper") if detailed else ("mmd",))

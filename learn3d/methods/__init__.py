@@ -60,7 +60,7 @@ def create_method(
     if kind.needs_poses and info.pose_features == 0:
         raise ValueError(
             f"{kind.__name__} learns from images whose camera poses are known, but this data set has no poses; take "
-            "a data set with poses, or a method that estimates them"
+            "a data set with poses, or estimate them from its masks (learn3d estimate-poses, then --poses)"
         )
     if device == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # fp32 is to mean fp32, in convolutions too

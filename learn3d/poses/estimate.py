@@ -32,6 +32,8 @@ MOST = 6000  # images that shapes are fitted to and that neighbours are looked f
 FEWEST = 100  # images below which no pose is trusted
 NEAR_DEG = 30.0  # azimuths that are closer count as the same
 ROUNDS = 3  # stages of the prototypes
+#: Confidence of an image whose nearest masks all agree: objects that are turned by 180 degrees as a whole agree, too.
+SUREST = 0.92
 _BATCH = 256
 _TEMPERATURE = 0.02  # of 1 - IoU
 _NEIGHBOURS, _VOTERS = 8, 5  # nearest masks that smooth, and that vote on turns
@@ -146,7 +148,7 @@ def estimate(
         alone = _posteriors(-shapes.all_distances(part) / _TEMPERATURE, "free").sum(1)
         found = _normalized(alone**0.3 * (near.message(smooth) + 1e-3))
         posterior[rows] = found
-        confidence[rows] = _calibrated(near_mass(near.message(own.sum(1)).sum(2), found.sum(2).argmax(1)))
+        confidence[rows] = SUREST * near_mass(near.message(own.sum(1)).sum(2), found.sum(2).argmax(1))
     if len(some) < FEWEST or _views_coincide(posterior.sum(2).argmax(1), data.objects, options.azimuths):
         confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
     return Estimate(posterior, confidence, *shapes.placed(), own.sum((2, 3)).mean(0))
@@ -171,11 +173,6 @@ def _views_coincide(azimuth: Tensor, objects: Tensor, count: int) -> bool:
         near_mass(views.repeat_interleave(count, 0), torch.arange(count).repeat(len(views))).view_as(views) * number - 1
     )
     return bool(pairs.sum() > 0 and close.sum() > 0.5 * pairs.sum())
-
-
-def _calibrated(agreement: Tensor) -> Tensor:
-    """From the share of the nearest masks that agree to a probability."""
-    return agreement
 
 
 class Shapes:

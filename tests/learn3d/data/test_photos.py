@@ -14,6 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
+from learn3d.commands.poses import EstimatePoses
 from learn3d.config import TrainConfig
 from learn3d.data.checking import check_folder
 from learn3d.data.layouts import load_dataset
@@ -195,6 +196,26 @@ def test_all_mistakes_are_listed(chairs: Path) -> None:
     rows[1]["distance"], rows[3]["fov_deg"] = "far", "0"
     write_rows(chairs, rows)
     assert [text.split(":")[0] for _, text in check(chairs, "error")] == ["line 3", "line 5"]
+
+
+def test_photographs_without_poses_learn_from_an_estimate(chairs: Path, tmp_path: Path) -> None:
+    """A table without numbers keeps objects together; without any table each photograph is of another object."""
+    write_rows(chairs, [{"file": row["file"], "object": row["object"]} for row in read_rows(chairs)])
+    assert photos.load(chairs.parent, "chair", "train").num_objects == 2
+    (chairs / "poses.csv").unlink()
+    assert photos.load(chairs.parent, "chair", "train").poses is None
+    assert {text.split(":")[0] for _, text in check(chairs, "warning")} == {"has no poses"}
+    table, options = tmp_path / "poses.npz", ["--steps", "2", "--restarts", "1", "--prototypes", "2"]
+    words = [str(chairs.parent), "--category", "chair", "--layout", "photos", "--output", str(table), *options]
+    EstimatePoses.parse("estimate-poses", words).run()
+    assert table.with_suffix(".png").is_file()
+    settings = PoseInvariantSettings(encoder="conv-small", generator="sphere-small")
+    about = {"data": chairs.parent, "category": "chair", "layout": "photos", "preset": "peng2020-kato"}
+    config = TrainConfig(**about, settings=settings, output=tmp_path / "run", iterations=1, batch_size=4, poses=table)
+    assert train(config).finished
+    for path in (chairs / "images").iterdir():
+        path.unlink()
+    refused(chairs, "images: is empty; expected photographs")
 
 
 def test_tables_that_are_none_are_named(chairs: Path, tmp_path: Path) -> None:
