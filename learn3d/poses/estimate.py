@@ -268,7 +268,9 @@ def _posteriors(logits: Tensor, prior: str) -> Tensor:
     return torch.softmax(biased.flatten(1), 1).reshape(logits.shape)
 
 
-def _mean_shape(data: Masks, candidates: Candidates, options: PoseOptions, rng: torch.Generator, tick) -> Shapes:
+def _mean_shape(
+    data: Masks, candidates: Candidates, options: PoseOptions, rng: torch.Generator, tick: Callable[[], object]
+) -> Shapes:
     """The mean shape with the smallest silhouette loss of several."""
     found = []
     for _ in range(options.restarts):
@@ -290,6 +292,7 @@ class Neighbours:
 
     @classmethod
     def of(cls, data: Masks, known: Masks, apart: tuple[Tensor, ...] = (), count: int = _NEIGHBOURS) -> Neighbours:
+        """Neighbours of `data` among `known`, whose objects are others. apart: int64 [N] each, ids that must differ."""
         rows, weights = [], []
         size = len(data.masks)
         for mirrored in (False, True):
