@@ -33,7 +33,7 @@ FEWEST = 100  # images below which no pose is trusted
 NEAR_DEG = 30.0  # azimuths that are closer count as the same
 ROUNDS = 3  # stages of the prototypes
 #: Confidence of an image whose nearest masks all agree: objects that are turned by 180 degrees as a whole agree, too.
-SUREST = 0.92
+SUREST = 0.88
 _BATCH = 256
 _TEMPERATURE = 0.02  # of 1 - IoU
 _NEIGHBOURS, _VOTERS = 8, 5  # nearest masks that smooth, and that vote on turns
