@@ -2,7 +2,8 @@
 //
 // At pixel centre p, face j has the probability D_j = 1 / (1 + exp(-x_j)) with x_j = +-d^2 / sigma: d is the distance
 // from p to the border of the triangle, + inside and - outside. Faces outside with d^2 >= reach are left out. alpha =
-// 1 - clear, where clear = prod_j (1 - D_j). The derivative needs no division: d alpha / d x_j = clear D_j.
+// 1 - clear, where clear = prod_j (1 - D_j). The derivative needs no division: d alpha / d x_j = clear D_j. That of
+// sigma is the sum of -x_j / sigma times this.
 //
 // Distances are measured in units of half the shorter side of the raster. The nearest point of the border lies on one
 // of the three sides, at p_a + t (p_b - p_a); the derivative of d^2 with respect to p_a is -2 (1 - t) (p - nearest),
@@ -13,8 +14,8 @@
 #include <limits>
 #include <vector>
 
-#include "geometry.h"
 #include "parallel.h"
+#include "soft_weights.h"
 #include "stages.h"
 
 namespace nmr {
@@ -23,7 +24,7 @@ namespace {
 constexpr int64_t kGroup = 16;      // pixels evaluated together
 constexpr int64_t kBandRows = 32;   // rows per task, forward
 constexpr int64_t kFaceChunk = 64;  // faces per task, backward
-constexpr int64_t kSums = 6;        // x and y of three corners
+constexpr int64_t kSums = 7;        // x and y of three corners, sigma
 
 // A face ready to be evaluated: corners counter-clockwise, and the pixels that it can reach.
 template <class T>
@@ -31,6 +32,7 @@ struct SoftFace {
   T x[3], y[3], side_x[3], side_y[3];  // corner k; side k leads to corner k + 1
   T inverse[3];                        // 1 / squared length of side k, 0 if it has none
   int64_t corner[3];                   // vertices
+  bool back;                           // seen from behind
   int64_t column_first, column_last, row_first, row_last;  // rows from the bottom
 };
 
@@ -74,7 +76,8 @@ NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& f
   const bool listed = face.corner[0] != face.corner[1] || face.corner[1] != face.corner[2];  // not the padding of a list
   if (!listed || !usable || !beyond_near || !before_far) return false;
   T *x = face.x, *y = face.y;
-  if ((y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0])) {  // clockwise
+  face.back = (y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0]);  // clockwise
+  if (face.back) {
     if (!image.settings.fill_back) return false;
     std::swap(x[0], x[2]), std::swap(y[0], y[2]), std::swap(face.corner[0], face.corner[2]);
   }
@@ -92,6 +95,14 @@ NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& f
           image.settings.raster.height, face.row_first, face.row_last);
   return face.column_first <= face.column_last && face.row_first <= face.row_last;
 }
+
+// Rows [first, last] of one image, from the bottom, and the faces that reach each pixel, nearest first.
+template <class T>
+struct SoftBand {
+  int64_t layers, first, last;
+  T* depth;             // [rows, W, K]; `far` where there is no face
+  int32_t* face_index;  // [H, W, K] of the image, row 0 = top
+};
 
 }  // namespace
 }  // namespace nmr
@@ -169,10 +180,11 @@ void soft_backward(const SoftBackward<T>& args) {
         const int own = face.corner[k] == image.faces[3 * f + k] ? k : 2 - k;
         std::copy_n(grad + 2 * k, 2, grads.data() + kSums * (first_face[b] + f) + 2 * own);
       }
+      grads[kSums * (first_face[b] + f) + 6] = grad[6];
     }
   });
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
-    T* grad_vertices = args.grad_vertices + 3 * mesh.vertex_start(b);
+    T *grad_vertices = args.grad_vertices + 3 * mesh.vertex_start(b), grad_sigma = 0;
     for (int64_t f = 0; f < mesh.face_count(b); ++f) {
       if (!drawn[first_face[b] + f]) continue;
       for (int k = 0; k < 3; ++k) {
@@ -181,7 +193,26 @@ void soft_backward(const SoftBackward<T>& args) {
         grad[0] += own[0];
         grad[1] += own[1];
       }
+      grad_sigma += grads[kSums * (first_face[b] + f) + 6];
     }
+    args.grad_sigma[b] = grad_sigma;
+  });
+}
+
+template <class T>
+void soft_layers(const SoftLayers<T>& args) {
+  const Size raster = args.settings.raster.raster;
+  const std::vector<T> columns = scaled_columns<T>(raster);
+  const int64_t K = args.layers, bands = (raster.height + kBandRows - 1) / kBandRows;
+  parallel_for(args.mesh.batch * bands, args.num_threads, [&](int64_t task) {
+    const int64_t b = task / bands, first = task % bands * kBandRows,
+                  last = std::min(first + kBandRows, raster.height) - 1, count = (last - first + 1) * raster.width * K;
+    std::vector<T> depth(count, args.settings.raster.far);
+    int32_t* face_index = args.face_index + b * raster.pixels() * K;
+    std::fill_n(face_index + (raster.height - 1 - last) * raster.width * K, count, -1);
+    const SoftImage<T> image = soft_image(args.mesh, args.settings, b, columns.data());
+    const SoftBand<T> band{K, first, last, depth.data(), face_index};
+    NMR_AT_BEST_LEVEL(soft_layers_band, image, band);
   });
 }
 
@@ -189,5 +220,7 @@ template void soft_forward(const SoftForward<float>&);
 template void soft_forward(const SoftForward<double>&);
 template void soft_backward(const SoftBackward<float>&);
 template void soft_backward(const SoftBackward<double>&);
+template void soft_layers(const SoftLayers<float>&);
+template void soft_layers(const SoftLayers<double>&);
 
 }  // namespace nmr

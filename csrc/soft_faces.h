@@ -36,6 +36,8 @@ struct SoftPixel {
   T sign;            // +1 inside, -1 outside
   T away_x, away_y;  // from the nearest point of the border to the pixel
   T share[3];        // of the corners in that point
+  T square;          // d^2
+  bool reaches;
 };
 
 template <class T, bool kWithGradient>
@@ -64,6 +66,8 @@ NMR_INLINE SoftPixel<T> evaluate(const SoftFace<T>& face, T px, T py, T sigma, T
   p.covers = inside ? large : outside_covers;
   p.clears = inside ? small : outside_clears;
   p.sign = inside ? T(1) : T(-1);
+  p.square = least;
+  p.reaches = inside | (least < reach);
   return p;
 }
 
@@ -88,7 +92,48 @@ void soft_forward_band(const SoftImage<T>& image, int64_t first, int64_t last, T
   }
 }
 
-// The gradient of one face, x and y of its corners; pull [H, W] is the gradient of x_j without the factor D_j: grad
+// Inserts every face into the lists of the pixels that it reaches, behind those that are equally near.
+template <class T>
+void soft_layers_band(const SoftImage<T>& image, const SoftBand<T>& band) {
+  const Size raster = image.settings.raster;
+  const int64_t K = band.layers;
+  for (int64_t f = 0; f < image.num_faces; ++f) {
+    SoftFace<T> face;
+    if (!set_up_face(image, f, face)) continue;
+    T z[3];
+    for (int k = 0; k < 3; ++k) z[k] = image.vertices[3 * face.corner[k] + 2];
+    const int32_t id = static_cast<int32_t>(face.back ? image.num_faces + f : f);
+    for (int64_t j = std::max(face.row_first, band.first); j <= std::min(face.row_last, band.last); ++j) {
+      const T py = image.row(j);
+      for (int64_t i = face.column_first; i <= face.column_last; i += kGroup) {
+        T depth[kGroup];
+        int32_t reaches[kGroup], any = 0;
+        for (int64_t n = 0; n < kGroup; ++n) {
+          const T px = image.columns[i + n];
+          depth[n] = SoftWeights<T>(face.x, face.y, px, py).depth(z, image.settings.perspective);
+          reaches[n] = evaluate<T, false>(face, px, py, image.sigma, image.reach).reaches &
+                       (depth[n] > image.settings.near) & (depth[n] < image.settings.far);
+          any |= reaches[n];
+        }
+        const int64_t lanes = any ? std::min(kGroup, face.column_last - i + 1) : 0;
+        for (int64_t n = 0; n < lanes; ++n) {
+          T* depths = band.depth + ((j - band.first) * raster.width + i + n) * K;
+          if (!reaches[n] || !(depth[n] < depths[K - 1])) continue;
+          int32_t* face_indices = band.face_index + ((raster.height - 1 - j) * raster.width + i + n) * K;
+          int64_t k = K - 1;
+          for (; k > 0 && depth[n] < depths[k - 1]; --k) {
+            depths[k] = depths[k - 1];
+            face_indices[k] = face_indices[k - 1];
+          }
+          depths[k] = depth[n];
+          face_indices[k] = id;
+        }
+      }
+    }
+  }
+}
+
+// The gradient of one face: x and y of its corners, and sigma; pull [H, W] is the gradient of x_j without the factor D_j: grad
 // alpha * clear.
 template <class T>
 void soft_backward_face(const SoftImage<T>& image, const SoftFace<T>& face, const T* pull, T* grad) {
@@ -104,6 +149,7 @@ void soft_backward_face(const SoftImage<T>& image, const SoftFace<T>& face, cons
       for (int64_t n = 0; n < kGroup; ++n) {
         const SoftPixel<T> p = evaluate<T, true>(face, image.columns[i + n], py, image.sigma, image.reach);
         const T strength = g[n] * p.covers * p.sign * (T(-2) / image.sigma);
+        sums[6][n] += strength * p.square;
         for (int k = 0; k < 3; ++k) {
           sums[2 * k][n] += strength * p.share[k] * p.away_x;
           sums[2 * k + 1][n] += strength * p.share[k] * p.away_y;
@@ -114,6 +160,6 @@ void soft_backward_face(const SoftImage<T>& image, const SoftFace<T>& face, cons
   for (int64_t k = 0; k < kSums; ++k) {
     T sum = 0;
     for (int64_t n = 0; n < kGroup; ++n) sum += sums[k][n];
-    grad[k] = sum * (k % 2 ? image.scale_y : image.scale_x);
+    grad[k] = sum * (k == 6 ? 1 / (2 * image.sigma) : k % 2 ? image.scale_y : image.scale_x);
   }
 }

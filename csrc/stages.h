@@ -188,6 +188,37 @@ struct SoftBackward {
   const T* clear;       // [B, H, W] of the forward pass
   const T* grad_clear;  // [B, H, W]
   T* grad_vertices;     // out, like mesh.vertices; z gets 0
+  T* grad_sigma;        // out [B]
+  int num_threads;
+};
+
+// The K nearest of the faces that reach a pixel, nearest first (soft.cpp). The depth of a face at a pixel outside is
+// that of SoftWeights (soft_weights.h); faces without area are left out. settings.sigma may be any positive number.
+template <class T>
+struct SoftLayers {
+  MeshBatch<T> mesh;
+  SoftSettings<T> settings;
+  int64_t layers;       // K
+  int32_t* face_index;  // out [B, H, W, K]; -1 after the last face, F + f: face f seen from behind
+  int num_threads;
+};
+
+// Of such faces: weights, depth and distance, and their derivatives (soft_fragments.cpp).
+template <class T>
+struct SoftFragments {
+  MeshBatch<T> mesh;
+  Size raster;                // H x W
+  int64_t layers;             // K
+  T far;                      // depth of the background
+  bool perspective;           // see Fragments
+  const int32_t* face_index;  // [B, H, W, K]
+  T* weights;                 // forward out [B, H, W, K, 3], of the face's vertices in their own order
+  T* depth;                   // forward out [B, H, W, K]
+  T* distances;               // forward out [B, H, W, K]: d^2 of a pixel outside, -d^2 inside; background: 0
+  const T* grad_weights;      // backward in, as the outputs
+  const T* grad_depth;
+  const T* grad_distances;
+  T* grad_vertices;           // backward out, like mesh.vertices
   int num_threads;
 };
 
@@ -446,6 +477,9 @@ template <class T> void silhouette_backward(const SilhouetteBackward<T>& args);
 template <class T> void local_gradient(const SilhouetteBackward<T>& args);
 template <class T> void soft_forward(const SoftForward<T>& args);
 template <class T> void soft_backward(const SoftBackward<T>& args);
+template <class T> void soft_layers(const SoftLayers<T>& args);
+template <class T> void soft_fragments_forward(const SoftFragments<T>& args);
+template <class T> void soft_fragments_backward(const SoftFragments<T>& args);
 template <class T> void fragments_forward(const Fragments<T>& args);
 template <class T> void fragments_backward(const Fragments<T>& args);
 template <class T> void depth_forward(const DepthImage<T>& args);

@@ -7,11 +7,13 @@ render_silhouette   meshes -> anti-aliased silhouettes, differentiable with NMR'
 render_soft_silhouette    meshes -> the soft silhouettes of SoftRas, with their true derivative
 render_rgb          meshes -> colour images, with the same gradient
 render_depth        meshes -> depth images, with their true derivative
-render_normals      meshes -> normals in world space
+render_normals      meshes -> normals in world or camera space
+render_soft_rgb     meshes -> the soft colours of SoftRas and PyTorch3D, with their true derivative
+render_transparent  meshes -> colour images of transparent surfaces
 render_fragments    meshes -> Fragments: face, weights and depth at each pixel, for shading of your own
 render_face_index   meshes -> which face is nearest at each pixel
 VertexColors, FaceColors, TextureCubes, UVTexture   colours of meshes; Colors: the interface for a class of your own
-Lights              ambient and directional lights, flat or smooth
+Lights              ambient, directional and point lights, spherical harmonics; NormalMap: normals from an image
 LookAt, Look, Pinhole, Orthographic, Camera   cameras: world space -> renderer space; ``nmr.cameras`` converts them
 voxelize            meshes -> filled occupancy grids (kato18 or kato19, the published voxel IoU)
 icosphere, edge_table, unique_edges, losses   a sphere to deform, its edges, loss functions
@@ -31,6 +33,7 @@ from . import cameras, losses, metrics
 from .cameras import Camera, Look, LookAt, Orthographic, Pinhole
 from .fragments import Fragments
 from .images import Images
+from .layers import render_soft_rgb, render_transparent
 from .lights import Lights
 from .mesh import edge_table, face_normals, icosphere, unique_edges, vertex_normals
 from .render import (
@@ -43,7 +46,7 @@ from .render import (
     render_silhouette,
     render_soft_silhouette,
 )
-from .textures import Colors, FaceColors, TextureCubes, UVTexture, VertexColors
+from .textures import Colors, FaceColors, NormalMap, TextureCubes, UVTexture, VertexColors
 from .voxels import voxelize
 
 __version__ = "0.1.0"
@@ -57,6 +60,7 @@ __all__ = [
     "Lights",
     "Look",
     "LookAt",
+    "NormalMap",
     "Orthographic",
     "Pinhole",
     "TextureCubes",
@@ -75,7 +79,9 @@ __all__ = [
     "render_normals",
     "render_rgb",
     "render_silhouette",
+    "render_soft_rgb",
     "render_soft_silhouette",
+    "render_transparent",
     "unique_edges",
     "vertex_normals",
     "voxelize",

@@ -64,9 +64,9 @@ class Scene(NamedTuple):
     def silhouette(self, local: bool) -> tuple[Tensor, Tensor]:
         return ops.silhouette(*self.drawn[:3], *self.settings, local)
 
-    def soft_silhouette(self, sigma: float, dist_eps: float) -> Tensor:
-        settings, reach = self.settings, sigma * math.log(1 / dist_eps - 1)
-        clear = ops.soft_silhouette(*self.drawn[:3], *settings.raster, *settings[3:6], float(sigma), reach)
+    def soft_silhouette(self, sigma: Tensor, dist_eps: float) -> Tensor:
+        settings, reach = self.settings, math.log(1 / dist_eps - 1)
+        clear = ops.soft_silhouette(*self.drawn[:3], *settings.raster, sigma, *settings[3:6], reach)
         return 1 - average(clear.unsqueeze(-1), settings.anti_aliasing).squeeze(-1)
 
     def depth(self, face_index: Tensor) -> Tensor:
@@ -86,6 +86,19 @@ class Scene(NamedTuple):
         anti_aliasing, eps = self.settings.anti_aliasing, self.settings.eps
         shown = face_index, weights, depth, self.mesh, self.world, self.camera
         return Fragments(*shown, anti_aliasing, eps, self.drawn, drawn_face_index)
+
+    def soft_fragments(self, layers: int, sigma: Tensor, reach: float) -> Fragments:
+        """The nearest faces whose border is at a squared distance of less than ``sigma * reach``."""
+        settings = self.settings
+        how = *settings[3:6], settings.perspective
+        drawn_index = ops.soft_layers(*self.drawn[:3], *settings.raster, layers, sigma.detach(), *how, reach)
+        of_drawn = ops.soft_fragments(*self.drawn[:3], drawn_index, settings.far, settings.perspective)
+        face_index, (weights, depth, distances) = drawn_index, of_drawn
+        if self.clipped is not None:
+            weights = self.clipped.weights(drawn_index.flatten(2), weights.flatten(2, 3)).view_as(weights)
+            face_index = self.clipped.face_index(drawn_index)
+        shown = face_index, weights, depth, self.mesh, self.world, self.camera
+        return Fragments(*shown, settings.anti_aliasing, settings.eps, self.drawn, None, distances)
 
     def _weights_and_depth(self, face_index: Tensor) -> tuple[Tensor, Tensor]:
         weights, depth = ops.fragments(*self.drawn[:3], face_index, self.settings.far, self.settings.perspective)
@@ -142,7 +155,10 @@ def shade(
     background: float | Sequence[float] | Tensor,
     interpolation_gradient: bool,
 ) -> tuple[Tensor, Tensor]:
-    """The shaded raster ``[B, H, W, C]``, undefined where there is no face, and the background ``[B | 1, C]``."""
+    """The shaded raster ``[B, H, W, C]``, undefined where there is no face, and the background ``[B | 1, C]``.
+
+    Of layers ``[B, H, W, K, C]``.
+    """
     if not interpolation_gradient:
         fragments = replace(fragments, weights=fragments.weights.detach())
     shape = fragments.sided_face_index.shape
@@ -158,7 +174,7 @@ def shade(
                 f"got {describe(colors)}"
             )
         image = colors.sample(fragments)
-        if not isinstance(image, Tensor) or image.ndim != 4 or image.shape[:3] != shape or not image.shape[3]:
+        if not isinstance(image, Tensor) or image.shape[:-1] != shape or not image.shape[-1]:
             raise ValueError(f"colors.sample must return a tensor {[*shape, 'C']}, got {describe(image)}")
     if lights is not None:
         if image is not None and image.shape[-1] not in (1, 3):

@@ -225,6 +225,16 @@ def check_number(value: object, name: str) -> float:
         raise TypeError(f"{name} must be a number, got {describe(value)}") from error
 
 
+def as_positive(value: object, name: str, dtype: torch.dtype) -> Tensor:
+    """A number, or a float tensor with one element, which may want a gradient, as a tensor ``[]``."""
+    tensor = as_floats(value, name, "a number or a tensor []")
+    if tensor.numel() != 1:
+        raise ValueError(f"{name} must be a number or a tensor [], got {describe(tensor)}")
+    if not holds_for_all((tensor >= torch.finfo(dtype).tiny) & (tensor < float("inf"))):
+        raise ValueError(f"{name} must be positive in {dtype} and finite, got {value}")
+    return tensor.reshape([])
+
+
 def check_depth_range(near: float, far: float, dtype: torch.dtype) -> None:
     """0 <= near < far; the sum of 2x2 pixels of depth far must be finite in the dtype."""
     near, far = check_number(near, "near"), check_number(far, "far")

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from . import ops
 from ._packing import MeshBatch
-from ._validate import as_floats, cast_under_autocast, check_values, describe
+from ._validate import as_floats, cast_under_autocast, check_choice, check_values, describe
 from .cameras.projection import ProjectingCamera
+from .mesh import _unit
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -43,9 +44,13 @@ class Fragments:
     vertices, faces
         The meshes in renderer space, ``[B, V, 3]``; for a list of meshes ``[N, 3]``, one mesh after the other.
 
-    With ``faces_per_pixel`` K > 1 these have one more axis: sided_face_index and depth ``[B, H, W, K]``, weights
-    ``[B, H, W, K, 3]``, nearest first. So do the results of :meth:`interpolate`, :meth:`per_face`, :meth:`normals` and
-    of the properties. For colours, lights and :meth:`resolve` take one :meth:`layer` at a time.
+    distances : Tensor [B, H, W, K], or None without blur_radius
+        Squared distance of the pixel from the border of the face, in units of half the shorter side of the image;
+        negative inside of the face. Differentiable in x and y of the vertices.
+
+    With ``faces_per_pixel`` K > 1 or a ``blur_radius`` these have one more axis: sided_face_index and depth ``[B, H, W,
+    K]``, weights ``[B, H, W, K, 3]``, nearest first. So do the results of :meth:`interpolate`, :meth:`per_face`,
+    :meth:`normals`, of colours and lights, and of the properties. :meth:`resolve` takes one image.
     """
 
     sided_face_index: Tensor
@@ -57,7 +62,8 @@ class Fragments:
     anti_aliasing: bool
     eps: float
     _drawn: MeshBatch  # the meshes as drawn: faces that cross the near plane are cut
-    _drawn_face_index: Tensor | None  # None: surfaces behind others, which have no edge gradient
+    _drawn_face_index: Tensor | None  # None: surfaces behind others, or blurred, which have no edge gradient
+    distances: Tensor | None = None
 
     @property
     def vertices(self) -> Tensor:
@@ -81,22 +87,20 @@ class Fragments:
         if self.layers is None or not -self.layers <= k < self.layers:
             have = "one layer without an axis for it" if self.layers is None else f"layers 0..{self.layers - 1}"
             raise IndexError(f"layer {k} was requested of fragments with {have}; see faces_per_pixel")
+        index = self._drawn_face_index
         return replace(
             self,
             sided_face_index=self.sided_face_index[..., k],
             weights=self.weights[..., k, :],
             depth=self.depth[..., k],
-            _drawn_face_index=self._drawn_face_index[..., k] if k in (0, -self.layers) else None,
+            _drawn_face_index=None if index is None or k not in (0, -self.layers) else index[..., k],
+            distances=None if self.distances is None else self.distances[..., k],
         )
 
     def _wide(self) -> Fragments:
         """All layers side by side, as one raster ``[B, H, W K]``."""
         index, weights, depth = self.sided_face_index.flatten(2), self.weights.flatten(2, 3), self.depth.flatten(2)
         return replace(self, sided_face_index=index, weights=weights, depth=depth)
-
-    def _require_one_layer(self, what: str) -> None:
-        if self.layers:
-            raise ValueError(f"{what} take one layer at a time: pass fragments.layer(k), k from 0 to {self.layers - 1}")
 
     def _each_layer(self, raster: Tensor) -> Tensor:
         """Values ``[B, H, W K, C]`` of :meth:`_wide` as ``[B, H, W, K, C]``."""
@@ -165,17 +169,32 @@ class Fragments:
         # embedding, not indexing: its backward pass sums in a fixed order.
         return F.embedding(index, rows, padding_idx=len(rows) - 1)
 
-    def normals(self, smooth: bool = False) -> Tensor:
-        """Unit normals in world space of the side that is seen, ``[B, H, W, 3]``, 0 on background.
+    def normals(self, smooth: bool = False, space: str = "world") -> Tensor:
+        """Unit normals of the side that is seen, ``[B, H, W, 3]``, 0 on background.
 
         Flat: the normal of the face. Smooth: the normals of its vertices (means over the adjacent faces, weighted by
         area), interpolated. In a left-handed world (LookAt) the front of face (v0, v1, v2) has the normal
         ``(v0 - v1) x (v2 - v1)``, as in the published renderer, in a right-handed one (Pinhole) the opposite one.
         Differentiable in the world-space vertices and, if smooth, in weights.
+
+        With ``space="camera"`` the axes are those of renderer space: x to the right of the image, y up, z away from the
+        viewer (so z is negative where a face looks at the viewer). It needs one of nmr's cameras, or none, and is
+        differentiable in its rotation, too.
         """
+        check_choice(space, "space", ("world", "camera"))
         if self.layers:
-            return self._each_layer(self._wide().normals(smooth))
-        return self._lit(None, None, torch.zeros(0, 3, dtype=torch.int64, device="cpu"), smooth)
+            return self._each_layer(self._wide().normals(smooth, space))
+        normals = self._lit(None, None, torch.zeros(0, 3, dtype=torch.int64, device="cpu"), smooth)
+        if space == "world" or self.camera is None:
+            return normals
+        if not isinstance(self.camera, ProjectingCamera):
+            raise ValueError(
+                f"normals in camera space need one of nmr's cameras, not {type(self.camera).__name__}; "
+                "rotate those in world space"
+            )
+        matrix, intrinsics, *_ = self.camera.projection(normals.dtype).parameters()
+        turn = (_image_axes(intrinsics.to(normals)) @ torch.linalg.inv(matrix[:, :, :3].to(normals)).mT)[:, None]
+        return _unit(normals @ turn.mT)
 
     def _lit(
         self,
@@ -185,16 +204,33 @@ class Fragments:
         smooth: bool,
         positions: bool = False,
         highlights: bool = False,
+        own: Tensor | None = None,
     ) -> Tensor:
         """Lit colours ``[B, H, W, 3]`` (:func:`nmr.ops.lit`); without parameters the normals.
 
-        ``positions``: the light depends on where a point lies; ``highlights``: also on where the eye is.
+        ``positions``: the light depends on where a point lies; ``highlights``: also on where the eye is; ``own``:
+        outward normals of the vertices in the layout of the meshes, or of the pixels ``[B, H, W, 3]``.
         """
+        viewer = self._viewer(highlights)
+        if own is not None and own.ndim == 4:  # a mesh of one face with one vertex for each pixel
+            count, points = own[0, ..., 0].numel(), torch.zeros_like(own)
+            if positions:
+                points = ops.interpolate(usable(self.world), self.faces, *self._at)
+            number = torch.arange(count, dtype=torch.int32, device=own.device)
+            index = number.view(1, *own.shape[1:3]) + count * self.is_back
+            index = torch.where(self.covered, index, -1).int()
+            faces, weights = number.long().view(-1, 1).expand(-1, 3), own.new_tensor([1.0, 0.0, 0.0]).expand_as(own)
+            at = viewer, points.flatten(1, 2), faces, index, weights, None, True
+            return ops.lit(colors, -own.flatten(1, 2), parameters, layout, *at)
         world = self.world.expand(len(self.faces), -1, -1) if self.faces.ndim == 3 else self.world
-        normals = ops.normals(world, self.faces, self.mesh.starts, smooth)
-        viewer, at = self._viewer(highlights), (self.faces, self.sided_face_index, self.weights, self.mesh.starts)
+        normals = ops.normals(world, self.faces, self.mesh.starts, smooth) if own is None else -own
         points = usable(world) if positions else world.detach()
-        return ops.lit(colors, normals, parameters, layout, viewer, points, *at, smooth)
+        at = viewer, points, self.faces, *self._at, smooth or own is not None
+        return ops.lit(colors, normals, parameters, layout, *at)
+
+    @property
+    def _at(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        return self.sided_face_index, self.weights, self.mesh.starts
 
     def _viewer(self, needs_eye: bool) -> Tensor:
         """From where each image is seen, ``[B, 5]``: see :func:`nmr.ops.viewer_of`."""
@@ -246,6 +282,15 @@ class Fragments:
     def _resolve(self, image: Tensor, background: Tensor | None) -> Tensor:
         """The same; pixels without a face have the colour ``background [B | 1, C]``, if it is given."""
         return ops.resolve(image, background, *self._drawn[:3], self._drawn_face_index, self.anti_aliasing, self.eps)
+
+
+def _image_axes(intrinsics: Tensor) -> Tensor:
+    """Right and up in the image and the direction of view ``[B, 3, 3]``, in camera axes; a skew turns nothing."""
+    up = _unit(intrinsics[:, 1, :2])
+    right = torch.stack([up[:, 1], -up[:, 0]], dim=1)
+    right = right * torch.where((right * intrinsics[:, 0, :2]).sum(1, keepdim=True) < 0, -1.0, 1.0)
+    flat = torch.nn.functional.pad(torch.stack([right, up], dim=1), (0, 1))
+    return torch.cat([flat, flat.new_tensor([[[0.0, 0.0, 1.0]]]).expand(len(flat), 1, 3)], dim=1)
 
 
 def usable(points: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Light: ambient and directional, as in the Neural Mesh Renderer; point lights; highlights."""
+"""Light: ambient and directional, as in the Neural Mesh Renderer; point lights; highlights; spherical harmonics."""
 
 from __future__ import annotations
 
@@ -9,14 +9,29 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ._validate import as_floats, describe, holds_for_all
+from ._packing import is_list
+from ._validate import as_floats, check_values, describe, holds_for_all
 
 if TYPE_CHECKING:
     from .fragments import Fragments
+    from .textures import Colors
 
 __all__ = ["Lights"]
 
 Numbers = float | Sequence | Tensor
+
+# Real spherical harmonics of bands 0 to 2: the factors of 1; y, z, x; xy, yz, 3 z^2 - 1, xz, x^2 - y^2.
+_HARMONICS = (
+    0.28209479,
+    0.48860251,
+    0.48860251,
+    0.48860251,
+    1.09254843,
+    1.09254843,
+    0.31539157,
+    1.09254843,
+    0.54627422,
+)
 
 # In the order of the kernel's enum Light: the shapes that are accepted, and the number of axes after those of lights.
 _SHAPES = {
@@ -38,12 +53,12 @@ _POINT = ("point", "point_color", "position", "falloff")
 
 @dataclass(frozen=True, eq=False)
 class Lights:
-    """Ambient light, directional lights, point lights, and the highlights of the last two.
+    """Ambient light, directional lights, point lights, the highlights of the last two, and spherical harmonics.
 
     ``rgb = color * light + highlight``, with n the unit normal in world space of the side that is seen
     (:meth:`Fragments.normals`) and x the point that is seen::
 
-        light = ambient ambient_color + sum over lights of c relu(n . l)
+        light = ambient ambient_color + sum over lights of c relu(n . l) + sum over i of harmonics_i Y_i(n)
         highlight = specular * sum over lights with n . l > 0 of c relu(r . v)^shininess        (Phong)
 
     A directional light has ``l = direction`` and ``c = directional directional_color``. A point light has l of length 1
@@ -75,6 +90,14 @@ class Lights:
         Strength of highlights. They have the colour of the light, not of the surface. The number 0: none.
     shininess : number, or Tensor [] or [B]
         The larger, the smaller a highlight is.
+    harmonics : [9, 3] or [B, 9, 3], optional
+        Light from all around as a function of n: coefficients of the real, orthonormal spherical harmonics of bands 0,
+        1, 2, that is of 1; y, z, x; xy, yz, 3 z^2 - 1, xz, x^2 - y^2, for each colour. From those of an environment map
+        L, ``harmonics = L * [1, 2/3, 1/4]`` by band (Ramamoorthi and Hanrahan 2001, divided by pi). It may be negative.
+    normals : Tensor [V, 3], [B, V, 3], a list of [V_b, 3], :class:`NormalMap` or any object with ``sample``, optional
+        Own normals in world space in place of those of the mesh: of the vertices, interpolated and normalised (as
+        :func:`vertex_normals` they point outward), or of pixels: ``sample(fragments) -> [B, H, W, 3]``. If a face shows
+        the side from which its :func:`face_normals` points away, they are turned. ``smooth`` is then ignored.
 
     Tensors are differentiable, and so are the vertices: through their normals, and through the points that are lit.
     The eye is known for nmr's cameras (without a camera the viewer looks along z); for highlights, a camera of your own
@@ -108,6 +131,8 @@ class Lights:
     falloff: Numbers = 0.0
     specular: Numbers = 0.0
     shininess: Numbers = 20.0
+    harmonics: Numbers | None = None
+    normals: Tensor | list[Tensor] | Colors | None = None
 
     def __post_init__(self) -> None:
         unused = _POINT if self.position is None else ()
@@ -125,6 +150,16 @@ class Lights:
             if name == "shininess" and not holds_for_all(value >= 0):
                 raise ValueError(f"shininess must be 0 or more, got {value}")
             object.__setattr__(self, name, value)
+        if self.harmonics is not None:
+            wanted = "[9, 3] or [B, 9, 3]"
+            value = as_floats(self.harmonics, "harmonics", wanted)
+            if value.ndim not in (2, 3) or value.shape[-2:] != (9, 3):
+                raise ValueError(f"harmonics must have shape {wanted}, got {describe(value)}")
+            object.__setattr__(self, "harmonics", value)
+        if self.normals is not None and not callable(getattr(self.normals, "sample", None)):
+            value = check_values(self.normals, "normals", "V, 3")
+            if value[0].shape[-1] != 3:
+                raise ValueError(f"normals must have 3 coordinates, got {describe(value[0])}")
         for group in (_DIRECTIONAL, _POINT):
             if group[0] in unused:
                 continue
@@ -134,18 +169,25 @@ class Lights:
                 raise ValueError(f"{names} must have the same number of lights (or one light), got {shapes}")
 
     def shade(self, fragments: Fragments, colors: Tensor | None = None) -> Tensor:
-        """``colors`` ``[B, H, W, 3 or 1]``, lit: ``[B, H, W, 3]``; 0 on background. Without colours a white surface."""
-        fragments._require_one_layer("lights")
+        """``colors`` ``[B, H, W, 3 or 1]``, lit: ``[B, H, W, 3]``; 0 on background. Without colours a white surface.
+
+        Of fragments with layers, ``[B, H, W, K, 3]``.
+        """
+        own = self._own_normals(fragments)
+        if fragments.layers:
+            colors = None if colors is None else colors.flatten(2, 3)
+            own = own.flatten(2, 3) if own is not None and own.ndim == 5 else own
+            return fragments._each_layer(self._shade(fragments._wide(), colors, own))
+        return self._shade(fragments, colors, own)
+
+    def _shade(self, fragments: Fragments, colors: Tensor | None, own: Tensor | None) -> Tensor:
         batch, values, layout, first = fragments.mesh.batch, [], [], 0
         for name in _SHAPES:
             if name in self._unused:
                 layout.append((first, 1, 0))
                 continue
             value = _rows(getattr(self, name), name)
-            if value.shape[0] not in (1, batch):
-                raise ValueError(
-                    f"{name} is given for {value.shape[0]} images, but {batch} are drawn; give it once or for each"
-                )
+            _check_images(value, name, batch)
             values.append(value.reshape(-1).to(fragments.weights))
             layout.append((first, *value.shape[:2]))
             first += value.numel()
@@ -153,7 +195,35 @@ class Lights:
         positions = highlights or "position" not in self._unused
         colors = None if colors is None else colors.to(fragments.weights)
         parameters, layout = torch.cat(values), torch.tensor(layout, device="cpu")
-        return fragments._lit(colors, parameters, layout, bool(self.smooth), positions, highlights)
+        smooth = bool(self.smooth)
+        lit = fragments._lit(colors, parameters, layout, smooth, positions, highlights, own)
+        if self.harmonics is None:
+            return lit
+        x, y, z = fragments._lit(None, None, layout[:0], smooth, own=own).unbind(-1)
+        basis = torch.stack([torch.ones_like(x), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], dim=-1)
+        harmonics = self.harmonics.to(x).reshape(-1, 9, 3)
+        _check_images(harmonics, "harmonics", batch)
+        light = (basis * basis.new_tensor(_HARMONICS)) @ harmonics.unsqueeze(1)
+        light = torch.where(fragments.covered.unsqueeze(-1), light, torch.zeros_like(light))
+        return lit + (light if colors is None else colors * light)
+
+    def _own_normals(self, fragments: Fragments) -> Tensor | None:
+        """Of the vertices in the layout of the meshes, or of the pixels ``[B, H, W, 3]``."""
+        if self.normals is None:
+            return None
+        if isinstance(self.normals, Tensor) or is_list(self.normals):
+            return fragments.mesh.values(check_values(self.normals, "normals", "V, 3"), "normals", "vertex")
+        normals, shape = self.normals.sample(fragments), (*fragments.sided_face_index.shape, 3)
+        if not isinstance(normals, Tensor) or normals.shape != shape:
+            raise ValueError(f"normals.sample must return a tensor {list(shape)}, got {describe(normals)}")
+        return normals.to(fragments.weights)
+
+
+def _check_images(value: Tensor, name: str, batch: int) -> None:
+    if value.shape[0] not in (1, batch):
+        raise ValueError(
+            f"{name} is given for {value.shape[0]} images, but {batch} are drawn; give it once or for each"
+        )
 
 
 def _rows(value: Tensor, name: str) -> Tensor:

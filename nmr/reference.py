@@ -301,3 +301,55 @@ def soft_silhouette(
         counts = inside | (square < sigma * math.log(1 / dist_eps - 1))
         clear = clear * torch.where(counts, 1 - covers, torch.ones_like(covers))
     return 1 - clear
+
+
+def soft_colors(
+    vertices: Tensor,
+    faces: Tensor,
+    colors: Tensor,
+    background: Tensor,
+    raster_size: tuple[int, int],
+    sigma: Tensor,
+    gamma: Tensor,
+    layers: int,
+    near: float,
+    far: float,
+    background_eps: float = 1e-3,
+    dist_eps: float = 1e-4,
+    perspective: bool = True,
+) -> tuple[Tensor, Tensor]:
+    """Soft colours ``[H, W, C]`` of vertex colours ``[V, C]`` and alpha ``[H, W]`` (:func:`nmr.render_soft_rgb`)."""
+    height, width = raster_size
+    units = torch.tensor([width, height], dtype=vertices.dtype) / min(height, width)
+    x, y = torch.arange(width).to(vertices), torch.arange(height).to(vertices)
+    x, y = (2 * x + 1 - width) / width, (height - 1 - 2 * y) / height
+    pixel = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) * units
+    covers, depths, values = [], [], []
+    for face in faces:
+        corners, z = vertices[face, :2] * units, vertices[face, 2]
+        a, b, c = corners
+        matrix = torch.stack([a - c, b - c], dim=1)
+        first = (pixel - c) @ torch.linalg.inv(matrix).T
+        weights = torch.cat([first, 1 - first.sum(-1, keepdim=True)], dim=-1)
+        inside = (weights > 0).all(-1)
+        sides = corners.roll(-1, 0) - corners
+        along = ((pixel[:, :, None] - corners) * sides).sum(-1) / sides.square().sum(-1)
+        border = corners + along.clamp(0, 1)[..., None] * sides
+        square = (pixel[:, :, None] - border).square().sum(-1).amin(-1)
+        weights = weights.clamp(0, 1)
+        weights = weights / weights.sum(-1, keepdim=True)
+        weights = weights / z if perspective else weights
+        depth = 1 / weights.sum(-1) if perspective else weights @ z
+        weights = weights * depth[..., None] if perspective else weights
+        counts = (inside | (square < sigma * math.log(1 / dist_eps - 1))) & (depth > near) & (depth < far)
+        covers.append(torch.where(counts, torch.sigmoid(torch.where(inside, square, -square) / sigma), 0.0))
+        depths.append(torch.where(counts, depth, far))
+        values.append(weights @ colors[face])
+    depth, order = torch.stack(depths, -1).sort(dim=-1, stable=True)
+    covers, depth = torch.stack(covers, -1).gather(-1, order)[..., :layers], depth[..., :layers]
+    values = torch.stack(values, -2).gather(-2, order[..., None].expand(*order.shape, colors.shape[1]))[..., :layers, :]
+    closeness = torch.cat([(far - depth) / (far - near), torch.full_like(depth[..., :1], background_eps)], dim=-1)
+    covers = torch.cat([covers, torch.ones_like(covers[..., :1])], dim=-1)
+    share = torch.softmax(covers.log() + closeness / gamma, dim=-1).unsqueeze(-1)
+    values = torch.cat([values, background.expand(height, width, 1, -1)], dim=-2)
+    return (share * values).sum(-2), 1 - (1 - covers[..., :-1]).prod(-1)

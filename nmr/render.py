@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ._packing import is_list
 from ._scene import Meshes, average, background_rows, make_scene, shade
-from ._validate import check_choice, check_number, check_size
+from ._validate import as_positive, check_choice, check_number, check_size
 from .cameras import Camera
 from .fragments import Fragments
 from .images import OUTPUTS, Images
@@ -293,7 +293,7 @@ def render_soft_silhouette(
     faces: Meshes,
     camera: Camera | None = None,
     *,
-    sigma: float = 1e-5,
+    sigma: float | Tensor = 1e-5,
     dist_eps: float = 1e-4,
     image_size: int | tuple[int, int] = 256,
     anti_aliasing: bool = False,
@@ -306,7 +306,7 @@ def render_soft_silhouette(
 
     Parameters
     ----------
-    sigma : float
+    sigma : float or Tensor []
         How soft the image is. A pixel at the distance d from the border of a face is covered by it with probability
         ``D = sigmoid(d^2 / sigma)`` if it is inside, else ``sigmoid(-d^2 / sigma)``. d is in units of half the shorter
         side of the image: at sqrt(sigma) from the border D is 0.27 or 0.73.
@@ -321,9 +321,9 @@ def render_soft_silhouette(
     Notes
     -----
     Differentiable in x and y of the vertices (and through the camera): this is the true derivative of the image (up to
-    the jump of dist_eps). z gets 0. Formulas and constants are the published ones. Unlike there, faces that lie wholly
-    in front of ``near`` or behind ``far`` are left out, and ``fill_back=False`` leaves out those seen from behind.
-    There is no second derivative.
+    the jump of dist_eps), and in sigma. z gets 0. Formulas and constants are the published ones. Unlike there, faces
+    that lie wholly in front of ``near`` or behind ``far`` are left out, and ``fill_back=False`` leaves out those seen
+    from behind. There is no second derivative.
 
     Raises
     ------
@@ -337,12 +337,15 @@ def render_soft_silhouette(
     >>> soft = nmr.render_soft_silhouette(vertices, faces, camera, sigma=1e-3, image_size=64)
     """
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip)
-    sigma, dist_eps = check_number(sigma, "sigma"), check_number(dist_eps, "dist_eps")
-    if not torch.finfo(scene.mesh.vertices.dtype).tiny <= sigma < float("inf"):
-        raise ValueError(f"sigma must be positive in {scene.mesh.vertices.dtype} and finite, got {sigma}")
+    sigma = as_positive(sigma, "sigma", scene.mesh.vertices.dtype)
+    return scene.soft_silhouette(sigma, check_dist_eps(dist_eps))
+
+
+def check_dist_eps(dist_eps: float) -> float:
+    dist_eps = check_number(dist_eps, "dist_eps")
     if not 0 < dist_eps < 0.5:
         raise ValueError(f"dist_eps must lie between 0 and 0.5, got {dist_eps}")
-    return scene.soft_silhouette(sigma, dist_eps)
+    return dist_eps
 
 
 def render_depth(
@@ -391,6 +394,7 @@ def render_normals(
     camera: Camera | None = None,
     *,
     smooth: bool = False,
+    space: str = "world",
     image_size: int | tuple[int, int] = 256,
     anti_aliasing: bool = True,
     fill_back: bool = True,
@@ -398,7 +402,14 @@ def render_normals(
     far: float = 100.0,
     clip: bool = True,
 ) -> Tensor:
-    """Normals of meshes in world space; the arguments are those of :func:`render_silhouette`.
+    """Normals of meshes in world or camera space; other arguments as in :func:`render_silhouette`.
+
+    Parameters
+    ----------
+    smooth : bool
+        Interpolated normals of the vertices instead of normals of the faces.
+    space : "world" or "camera"
+        "camera": x to the right of the image, y up, z away from the viewer.
 
     Returns
     -------
@@ -425,7 +436,7 @@ def render_normals(
     """
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip)
     fragments = scene.fragments(scene.rasterize())
-    return average(fragments.normals(smooth), anti_aliasing)
+    return average(fragments.normals(smooth, space), anti_aliasing)
 
 
 def render_fragments(
@@ -441,6 +452,7 @@ def render_fragments(
     clip: bool = True,
     eps: float = 1e-4,
     faces_per_pixel: int = 1,
+    blur_radius: float = 0.0,
 ) -> Fragments:
     """Face, weights and depth at each pixel, for shading of your own; arguments as in :func:`render_silhouette`.
 
@@ -448,6 +460,10 @@ def render_fragments(
     ----------
     faces_per_pixel : int
         K in 1..1024: how many surfaces to return, one behind the other. 1 means the nearest, without an axis for K.
+    blur_radius : float
+        If positive, faces count also for pixels outside whose squared distance from their border (in units of half the
+        shorter side of the image) is less than this, and there is an axis for K. Weights outside are clamped to [0, 1]
+        and divided by their sum, as in SoftRas, and depth follows from them. See :attr:`Fragments.distances`.
 
     Returns
     -------
@@ -477,7 +493,11 @@ def render_fragments(
     >>> thickness = layers.depth[..., 1] - layers.depth[..., 0]
     """
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
-    layers = check_size(faces_per_pixel, "faces_per_pixel", 1024)
+    layers, blur_radius = check_size(faces_per_pixel, "faces_per_pixel", 1024), check_number(blur_radius, "blur_radius")
+    if not 0 <= blur_radius < float("inf"):
+        raise ValueError(f"blur_radius must be 0 or more and finite, got {blur_radius}")
+    if blur_radius > 0:
+        return scene.soft_fragments(layers, torch.tensor(blur_radius, dtype=torch.float64, device="cpu"), 1.0)
     return scene.fragments(scene.rasterize() if layers == 1 else scene.rasterize_layers(layers))
 
 

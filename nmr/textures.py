@@ -6,7 +6,7 @@ Any object with ``sample(fragments) -> [B, H, W, C]`` can be used as colours: se
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import torch
@@ -16,18 +16,22 @@ from . import ops
 from ._packing import is_list
 from ._validate import callers_level, check_choice, check_faces, check_values, describe
 from .cameras.projection import has_perspective
+from .mesh import _unit
 
 if TYPE_CHECKING:
     from .fragments import Fragments
 
-__all__ = ["Colors", "FaceColors", "TextureCubes", "UVTexture", "VertexColors"]
+__all__ = ["Colors", "FaceColors", "NormalMap", "TextureCubes", "UVTexture", "VertexColors"]
 
 
 class Colors(Protocol):
     """The interface of colours: write a class with this method for shading of your own."""
 
     def sample(self, fragments: Fragments) -> Tensor:
-        """``[B, H, W, C]`` in the dtype of the vertices; values on the background are ignored."""
+        """``[B, H, W, C]`` in the dtype of the vertices; values on the background are ignored.
+
+        Of fragments with layers, ``[B, H, W, K, C]``.
+        """
         ...
 
 
@@ -135,7 +139,8 @@ class TextureCubes:
 
     def sample(self, fragments: Fragments) -> Tensor:
         """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
-        fragments._require_one_layer("texture cubes")
+        if fragments.layers:
+            return fragments._each_layer(self.sample(fragments._wide()))
         textures = check_values(self.textures, "textures", "F, ts, ts, ts, C")
         textures = fragments.mesh.values(textures, "textures", "face")
         return ops.sample_texture_cubes(
@@ -214,7 +219,10 @@ class UVTexture:
 
     def sample(self, fragments: Fragments) -> Tensor:
         """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
-        fragments._require_one_layer("texture images")
+        if fragments.layers and self.filter == "mipmap":  # the level depends on the place of a pixel in the image
+            return torch.stack([self.sample(fragments.layer(k)) for k in range(fragments.layers)], dim=3)
+        if fragments.layers:
+            return fragments._each_layer(self.sample(fragments._wide()))
         attributes, corners, starts = fragments._corner_values(self.uv, self.uv_faces, "uv", "uv_faces")
         at = attributes, corners, fragments.sided_face_index, fragments.weights, starts
         texels, grids, count = self._texels(fragments)
@@ -246,6 +254,54 @@ class UVTexture:
             texels = torch.cat([part.reshape(-1, part.shape[-1]) for part in image])
         grids = torch.tensor(grids, dtype=torch.int64, device="cpu").view(len(sizes), levels, 3)
         return texels.to(fragments.weights), grids, first
+
+
+class NormalMap(UVTexture):
+    """Normals from an image in tangent space, for ``Lights(normals=...)``; the arguments are those of UVTexture.
+
+    A texel (x, y, z) means the direction ``x T + y B + z N``, normalised. N is the interpolated normal of the vertices,
+    outward for faces that are counter-clockwise from outside. T is the direction in which u grows on the face, made
+    orthogonal to N, and B completes the two to the side in which v grows. Image files hold (texel + 1) / 2: pass ``2 *
+    image - 1``. Frames belong to faces: unlike MikkTSpace's, T and B are not interpolated between them.
+
+    Differentiable in the image, the uv coordinates and the vertices.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> bumps = torch.rand(16, 32, 3) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
+    >>> lights = nmr.Lights(normals=nmr.NormalMap(bumps, vertices[:, :2], wrap="mirror"))
+    >>> rgb = nmr.render_rgb(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), lights=lights, image_size=64)
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for image in _each(self.image):
+            if image.shape[-1] != 3:
+                raise ValueError(f"the image of normals must have 3 channels, got {describe(image)}")
+
+    def sample(self, fragments: Fragments) -> Tensor:
+        """Outward normals in world space ``[B, H, W, 3]`` of fragments, 0 on background."""
+        if fragments.layers:
+            return torch.stack([self.sample(fragments.layer(k)) for k in range(fragments.layers)], dim=3)
+        texel, world = super().sample(fragments), fragments.world
+        all_vertices = world.expand(len(fragments.faces), -1, -1) if fragments.faces.ndim == 3 else world
+        normals = -ops.normals(all_vertices, fragments.faces, fragments.mesh.starts, True)
+        n = _unit(ops.interpolate(normals, fragments.faces, *fragments._at))
+        sides, changes = [], []  # from corner 0 to corners 1 and 2, in space and in uv
+        for k in (1, 2):
+            weights = torch.zeros(3).to(fragments.weights)
+            weights[0], weights[k] = -1.0, 1.0
+            side = replace(fragments, weights=weights.expand_as(fragments.weights))
+            sides.append(ops.interpolate(world, fragments.faces, *side._at))
+            changes.append(side._interpolate(self.uv, self.uv_faces, "uv", "uv_faces"))
+        (du1, dv1), (du2, dv2) = (change.split(1, dim=-1) for change in changes)
+        turned = torch.sign(du1 * dv2 - du2 * dv1)  # -1: the image is mirrored on the face
+        along = turned * (dv2 * sides[0] - dv1 * sides[1])
+        t = _unit(along - n * (n * along).sum(-1, keepdim=True))
+        x, y, z = texel.split(1, dim=-1)
+        mapped = _unit(x * t + y * turned * torch.linalg.cross(n, t) + z * n)
+        return mapped
 
 
 def _each(values: Tensor | tuple[Tensor, ...] | list[Tensor]) -> tuple[Tensor, ...]:

@@ -21,7 +21,13 @@ from .losses import soft_iou, soft_iou_backward
 from .mesh import smoothness, smoothness_backward, voxels
 from .raster import local_gradient, rasterize, rasterize_layers, silhouette, silhouette_backward
 from .shade import interpolate, interpolate_backward, sample_texture_cubes, texture_cubes_backward
-from .soft import soft_silhouette, soft_silhouette_backward
+from .soft import (
+    soft_fragments,
+    soft_fragments_backward,
+    soft_layers,
+    soft_silhouette,
+    soft_silhouette_backward,
+)
 from .texture import WRAPS, mipmaps, mipmaps_backward, sample_uv, sample_uv_backward, uv_levels
 
 __all__ = [
@@ -57,8 +63,11 @@ __all__ = [
     "silhouette_backward",
     "smoothness",
     "smoothness_backward",
+    "soft_fragments",
+    "soft_fragments_backward",
     "soft_iou",
     "soft_iou_backward",
+    "soft_layers",
     "soft_silhouette",
     "soft_silhouette_backward",
     "texture_cubes_backward",

@@ -87,7 +87,9 @@ struct Run {
     const SoftSettings<T> soft{settings, sigma, seed % 5 == 0 ? T(100) : T(7) * sigma};
     T* clear = out("clear", pixels);
     soft_forward(SoftForward<T>{mesh, soft, clear, threads});
-    soft_backward(SoftBackward<T>{mesh, soft, clear, in("grad_clear", pixels), out("grad_soft", 3 * rows), threads});
+    soft_backward(SoftBackward<T>{mesh, soft, clear, in("grad_clear", pixels), out("grad_soft", 3 * rows),
+                                   out("grad_sigma", s.batch), threads});
+    soft_layers(SoftLayers<T>{mesh, soft, layers, r.template out<int32_t>("soft_layers", layers * pixels), threads});
 
     for (int64_t n = 0; n < pixels && s.foreign_face_index; ++n) {
       const double u = (noise(stream_of("face_index"), n) + 1) / 2;
@@ -125,6 +127,12 @@ struct Run {
     fragments_forward(args);
     fragments_backward(args);
     weights = weights_out;
+    // Of a map of one's own, pixels lie inside and outside of their faces.
+    SoftFragments<T> soft{mesh, raster, 1, s.far, s.perspective, face_index, out("soft_weights", 3 * pixels),
+                          out("soft_depth", pixels), out("distances", pixels), in("grad_soft_weights", 3 * pixels),
+                          in("grad_soft_depth", pixels), in("grad_distances", pixels), out("grad_soft_fragments", 3 * rows), threads};
+    soft_fragments_forward(soft);
+    soft_fragments_backward(soft);
     const DepthImage<T> image{mesh, s.image, s.anti_aliasing, s.far, face_index, out("depth_image", image_pixels),
                               in("grad_depth_image", image_pixels), out("grad_depth_vertices", 3 * rows), threads, s.perspective};
     depth_forward(image);
@@ -462,6 +470,12 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     check(r.get("alpha")[n] == T(covered) / T(step * step), "alpha is the covered share of a pixel");
   }
   const size_t count = face_index.empty() ? 0 : layers.size() / face_index.size();
+  const std::vector<int32_t>& around = r.template get<int32_t>("soft_layers");
+  for (size_t n = 0; n < around.size(); ++n) {
+    const int64_t id = around[n], F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
+    check(id >= -1 && id < (scene.fill_back ? 2 * F : F), "a soft layer names a face of its image, or -1");
+    if (n % count > 0) check(id < 0 || (around[n - 1] >= 0 && around[n - 1] != id), "soft layers are different faces, then -1");
+  }
   for (size_t n = 0; n < layers.size(); ++n) {
     const int64_t id = layers[n], F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
     check(id >= -1 && id < (scene.fill_back ? 2 * F : F), "a layer names a face of its image, or -1");
@@ -518,7 +532,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
 
   const auto finite = [](T x) { return std::isfinite(x); };
   check_all({"grad_local", "grad_world", "grad_matrix", "grad_intrinsics", "grad_distortion", "grad_origin", "grad_extent",
-             "grad_soft", "grad_forward", "grad_up", "iou", "grad_prediction", "grad_target"},
+             "grad_soft", "grad_sigma", "grad_forward", "grad_up", "iou", "grad_prediction", "grad_target"},
             finite, "a gradient is finite");
   if (!foreign) check_all({"grad_silhouette", "grad_edges"}, finite, "a gradient of edges is finite");
   if (!tame) return broken;

@@ -112,14 +112,15 @@ TEST_REAL(the_order_of_faces_changes_nothing) {
   Scene<T> scene = single<T>(mesh), other = single<T>(turned);
   scene.image = other.image = {24, 31};
   const Results<T> a = run_stages(scene, 1), b = run_stages(other, 1);
-  for (const char* name : {"face_index", "layers"}) {
+  for (const char* name : {"face_index", "layers", "soft_layers"}) {
     std::vector<int32_t> renamed = b.template get<int32_t>(name);
     for (int32_t& id : renamed) id = id < 0 ? id : (id / 20) * 20 + (7 * (id % 20) + 3) % 20;
     CHECK(renamed == a.template get<int32_t>(name));
   }
   for (const char* name : {"voxels", "touched"}) CHECK(a.template get<unsigned char>(name) == b.template get<unsigned char>(name));
   for (const char* name : {"alpha", "weights", "depth", "depth_image", "values"}) CHECK(a.get(name) == b.get(name));
-  for (const char* name : {"clear", "grad_soft", "grad_silhouette", "grad_local", "grad_edges", "grad_fragments", "grad_depth_vertices"})
+  for (const char* name : {"clear", "grad_soft", "grad_silhouette", "grad_local", "grad_edges", "grad_fragments", "grad_depth_vertices",
+                           "grad_soft_fragments"})
     CHECK(relative_difference(a.get(name), b.get(name)) < (sizeof(T) == 4 ? 1e-4 : 1e-12));
 }
 
@@ -147,7 +148,8 @@ TEST(float_agrees_with_double) {
 TEST_REAL(an_upstream_gradient_that_is_not_finite_is_seen_in_its_image_alone) {
   const std::pair<const char*, std::vector<const char*>> cases[] = {
       {"grad_alpha", {"grad_silhouette", "grad_local"}},
-      {"grad_clear", {"grad_soft"}},
+      {"grad_clear", {"grad_soft", "grad_sigma"}},
+      {"grad_distances", {"grad_soft_fragments"}},
       {"grad_weights", {"grad_fragments"}},
       {"grad_depth", {"grad_fragments"}},
       {"grad_depth_image", {"grad_depth_vertices"}},

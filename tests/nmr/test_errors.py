@@ -74,8 +74,6 @@ def renderer(**how):
     return nr.Renderer(8, **{"camera_mode": "look_at", **how})
 
 
-SIGMA = torch.tensor(1e-3, requires_grad=True)
-
 TYPES = [
     # meshes
     ("vertices must be a float tensor .* got list; use torch.as_tensor", lambda: nmr.face_normals([V], F)),
@@ -92,7 +90,9 @@ TYPES = [
     ("faces_per_pixel", lambda: fragments(faces_per_pixel=2.0)),
     ("anti_aliasing must be True or False, got 'no'", lambda: render(anti_aliasing="no")),
     ("clip must be True or False, got None", lambda: render(clip=None)),
-    ("sigma has no gradient here", lambda: nmr.render_soft_silhouette(V, F, LOOK, sigma=SIGMA)),
+    (r"sigma must be a number or a tensor \[\], got str", lambda: nmr.render_soft_silhouette(V, F, sigma="wide")),
+    (r"eps has no gradient here", lambda: render(eps=torch.tensor(1e-3, requires_grad=True))),
+    ("normals must be a float tensor .* got float", lambda: nmr.Lights(normals=0.5)),
     ("ordinary tensor, got one of layout torch.sparse_coo", lambda: render(V.to_sparse())),
     ("ordinary tensor, got one without values", lambda: render(V.to("meta"))),
     ("size must be an integer", lambda: nmr.voxelize(V, F, 2.5)),
@@ -232,7 +232,23 @@ VALUES = [
     (r"attribute eye, \[3\]", lambda: render(camera=Shifted(), lights=nmr.Lights(specular=0.5))),
     (r"image must have shape \[1, 4, 4, 'C'\]", lambda: fragments().resolve(torch.zeros(1, 4, 4))),
     (r"layer\(0\)", lambda: fragments(faces_per_pixel=2).layer(1).resolve(torch.zeros(1, 4, 4, 3))),
-    (r"lights take one layer .* fragments.layer\(k\)", lambda: nmr.Lights().shade(fragments(faces_per_pixel=2))),
+    (r"harmonics must have shape \[9, 3\]", lambda: nmr.Lights(harmonics=torch.rand(3, 9))),
+    ("^harmonics .* 3 images, but 1", lambda: rgb(None, lights=nmr.Lights(harmonics=torch.rand(3, 9, 3)))),
+    ("normals must have 3 coordinates", lambda: nmr.Lights(normals=V[:, :2])),
+    ("normals must have one row per vertex", lambda: rgb(None, lights=nmr.Lights(normals=V[:5]))),
+    (
+        r"normals.sample must return .* got .* 1\]",
+        lambda: rgb(None, lights=nmr.Lights(normals=nmr.VertexColors(V[:, :1]))),
+    ),
+    ("image of normals must have 3 channels", lambda: nmr.NormalMap(IMAGE[..., :2], UV)),
+    ("space must be 'world' or 'camera'", lambda: fragments().normals(space="view")),
+    ("camera space need .*, not Shifted", lambda: nmr.render_normals(V, F, Shifted(), space="camera", image_size=4)),
+    ("blur_radius must be 0 or more", lambda: fragments(blur_radius=-1.0)),
+    ("gamma must be positive", lambda: nmr.render_soft_rgb(V, F, gamma=0.0)),
+    (r"sigma must be a number or a tensor \[\], got", lambda: nmr.render_soft_rgb(V, F, sigma=torch.ones(2))),
+    (r"opacity must lie in \[0, 1\], got 2", lambda: nmr.render_transparent(V, F, opacity=2.0)),
+    (r"opacity must be a number, \[\] or \[1\]", lambda: nmr.render_transparent(V, F, opacity=torch.rand(3))),
+    ("opacity must have one channel", lambda: nmr.render_transparent(V, F, opacity=nmr.VertexColors(V))),
     # losses and metrics
     (r"same shape \[B, \.\.\.\] with B >= 1, got float32", lambda: losses.soft_iou_loss(ONES, ONES[:, :2])),
     ("values from 0 to 255; divide a mask", lambda: losses.soft_iou_loss(ONES, torch.tensor([[0, 255, 9]]))),

@@ -28,6 +28,7 @@ def bumpy(subdivisions, seed, scale):
 MESHES = [bumpy(2, 0, 0.9), bumpy(1, 1, 0.6), (torch.zeros(0, 3), torch.zeros(0, 3).long()), bumpy(3, 2, 0.8)]
 EYES = torch.tensor([[0.0, 0.5, -2.5], [1.5, 0.0, -2.0], [0.0, 0.0, -3.0], [-1.0, 1.0, 2.0]])
 INSIDE = 0.1 * EYES
+HARMONICS = noise(9, 3, seed=2)
 LIGHTS = dict(position=(0.5, 1.0, -2.0), specular=0.3, falloff=0.1)
 
 
@@ -50,6 +51,24 @@ def of_colors(make, smooth=False):
     return draw
 
 
+def of_soft_rgb(v, f, eyes, size, colors):
+    how = dict(colors=nmr.VertexColors(colors), sigma=1e-3, gamma=0.02, faces_per_pixel=5, near=0.1, image_size=size)
+    return (*nmr.render_soft_rgb(v, f, nmr.LookAt(eyes), lights=nmr.Lights(**LIGHTS), **how),)
+
+
+def of_transparent(v, f, eyes, size, colors, opacity):
+    how = dict(colors=nmr.VertexColors(colors), opacity=nmr.FaceColors(opacity), faces_per_pixel=3, image_size=size)
+    lights = nmr.Lights(harmonics=HARMONICS, normals=Outward(), **LIGHTS)
+    return (*nmr.render_transparent(v, f, nmr.LookAt(eyes), lights=lights, **how),)
+
+
+class Outward:
+    """Normals of pixels: the directions of their places."""
+
+    def sample(self, fragments):
+        return torch.stack([fragments.weights[..., 0] - 0.5, fragments.weights[..., 1], 1 + 0 * fragments.depth], -1)
+
+
 def seams(image, uv, faces):
     return nmr.UVTexture(image, uv, faces, "mirror", "mipmap")
 
@@ -62,6 +81,8 @@ FUNCTIONS = {
     "depth": (of_render("render_depth"), None),
     "fragments": (of_fragments, None),
     "layers": (lambda *a: of_fragments(*a, faces_per_pixel=3), None),
+    "soft_rgb": (of_soft_rgb, lambda v, f: [noise(len(v), 3)]),
+    "transparent": (of_transparent, lambda v, f: [noise(len(v), 3), noise(len(f), 1)]),
     "white": (of_colors(lambda: None), None),
     "vertices": (of_colors(nmr.VertexColors, True), lambda v, f: [noise(len(v), 3)]),
     "faces": (of_colors(nmr.FaceColors), lambda v, f: [noise(len(f), 3)]),
@@ -261,6 +282,8 @@ OUTSIDE = (
     "local",
     "soft",
     "layers",
+    "soft_rgb",
+    "transparent",
     "white",
     "vertices",
     "cubes",

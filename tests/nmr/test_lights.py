@@ -205,3 +205,113 @@ def test_small_and_large_meshes_have_unit_normals():
             assert ((normals.norm(dim=-1) - 1).abs() < 1e-5).all()
             if not smooth:
                 torch.testing.assert_close(normals.double(), expected, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, nmr.LookAt([0.0, 1.0, 2.5], right_handed=True)], ids=["left", "right"])
+def test_own_normals_are_lit_as_those_of_the_mesh(camera):
+    """Given at vertices or in pixels, from both sides of a surface with a hole."""
+    vertices, faces = bumpy_sphere()
+    faces, outward = faces[::2], nmr.vertex_normals(vertices, faces[::2])
+    lamp = dict(position=[1.0, 2.0, -3.0], specular=0.4, harmonics=torch.rand(9, 3))
+    flat = torch.tensor([0.0, 0.0, 1.0]).expand(4, 4, 3)
+    wanted = nmr.render_rgb(vertices, faces, camera, lights=nmr.Lights(smooth=True, **lamp), **SIZE)
+    for normals in (outward, nmr.VertexColors(outward), nmr.NormalMap(flat, vertices[:, :2])):
+        own = nmr.render_rgb(vertices, faces, camera, lights=nmr.Lights(normals=normals, **lamp), **SIZE)
+        torch.testing.assert_close(own, wanted, rtol=1e-6, atol=1e-9)
+    tilted = nmr.render_rgb(vertices, faces, camera, lights=nmr.Lights(normals=outward.roll(1, 0), **lamp), **SIZE)
+    assert (tilted - wanted).abs().max() > 0.1
+
+
+def test_normal_maps_tilt_along_u_and_v():
+    """A square in the plane z = 0 of a right-handed world; mirrored coordinates mirror the tilt."""
+    vertices = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=torch.float64)
+    faces, camera = torch.tensor([[0, 1, 2], [0, 2, 3]]), nmr.Orthographic([0.0, 0.0, 3.0], right_handed=True)
+    fragments = nmr.render_fragments(vertices, faces, camera, image_size=4)
+    texel = torch.nn.functional.normalize(torch.tensor([0.3, 0.5, 1.0], dtype=torch.float64), dim=0)
+    for flip in (torch.tensor([1.0, 1.0]), torch.tensor([-1.0, 1.0]), torch.tensor([1.0, -1.0])):
+        uv = flip * (vertices[:, :2] + 1) / 2
+        normals = nmr.NormalMap(texel.expand(2, 2, 3), uv).sample(fragments)
+        wanted = texel * torch.cat([flip, torch.ones(1)])
+        torch.testing.assert_close(normals, wanted.expand_as(normals).to(normals))
+    leaves = [x.clone().requires_grad_() for x in (vertices + 0.1 * torch.rand(4, 3), torch.rand(3, 3, 3).double())]
+
+    def lit(v, image):
+        fragments = nmr.render_fragments(v, faces, camera, image_size=4)
+        normals = nmr.NormalMap(image + 0.5, vertices[:, :2])
+        return nmr.Lights(normals=normals, position=[0.5, 0.3, 2.0], specular=0.5, shininess=3.0).shade(fragments)
+
+    assert torch.autograd.gradcheck(lit, leaves, eps=1e-7, atol=1e-5)
+
+
+def test_spherical_harmonics_are_orthonormal_and_in_their_order():
+    """Integrals over the sphere, seen as the light of every single harmonic on a sphere; and the light of a lamp."""
+    count = 20000
+    z = (2 * torch.arange(count, dtype=torch.float64) + 1) / count - 1
+    angle, radius = torch.arange(count) * 2.399963229728653, (1 - z * z).sqrt()
+    n = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
+    vertices = torch.tensor([[-3.0, -3.0, 2.0], [3.0, -3.0, 2.0], [0.0, 5.0, 2.0]], dtype=torch.float64)
+    fragments = nmr.render_fragments(vertices, torch.tensor([[0, 2, 1]]), image_size=(100, 200))
+
+    class Given:
+        def sample(self, fragments):
+            return n.view(1, 100, 200, 3)
+
+    assert fragments.is_back.all(), "clockwise: the side to which vertex_normals points is seen"
+
+    def light(coefficients):
+        lights = nmr.Lights(0.0, 0.0, normals=Given(), harmonics=coefficients)
+        return lights.shade(fragments)[0].view(-1, 3)[:, 0]
+
+    one = torch.eye(9, dtype=torch.float64).unsqueeze(-1).expand(9, 9, 3)
+    basis = torch.stack([light(x) for x in one])
+    products = basis @ basis.T * (4 * torch.pi / count)
+    torch.testing.assert_close(products, torch.eye(9, dtype=torch.float64), rtol=0, atol=1e-3)
+    x, y, z = n.unbind(-1)
+    for row, polynomial in zip(basis[1:], (y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y), strict=True):
+        assert torch.corrcoef(torch.stack([row, polynomial]))[0, 1] > 0.9999
+    # A lamp far away: relu(n . z), bands 0 to 2 of which are 1/4, 1/2 z and 5/32 (3 z^2 - 1).
+    lamp = z.relu()
+    fitted = light((basis @ lamp * (4 * torch.pi / count))[:, None].expand(9, 3))
+    torch.testing.assert_close(fitted, 0.25 + z / 2 + 5 / 32 * (3 * z * z - 1), rtol=0, atol=1e-3)
+    leaf = torch.rand(9, 3, dtype=torch.float64, requires_grad=True)
+    (grad,) = torch.autograd.grad(light(leaf).sum(), leaf)
+    torch.testing.assert_close(grad[:, 0], basis.sum(1))
+
+
+ANGLED = [[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]
+CAMERAS = {
+    "orthographic": nmr.Orthographic([0.5, 0.7, -3.0]),
+    "right-handed": nmr.Orthographic([0.5, 0.7, -3.0], right_handed=True),
+    "pytorch3d": nmr.cameras.from_pytorch3d(
+        torch.diag(torch.tensor([-1.0, 1.0, -1.0])), [0, 0, 3.0], orthographic=True
+    ),
+    "opengl": nmr.cameras.from_opengl(
+        torch.cat([torch.cat([torch.tensor(ANGLED), torch.tensor([[0.0], [0], [-3]])], 1), torch.eye(4)[3:]]),
+        torch.diag(torch.tensor([1.0, 1.0, -0.1, 1.0])),
+    ),
+}
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_normals_in_camera_space_are_those_of_the_depth(camera):
+    """Where depth is f(x, y), the normal towards the viewer is (df/dx, df/dy, -1), normalised."""
+    vertices, faces = bumpy_sphere(1)
+    fragments = nmr.render_fragments(vertices, faces, camera, image_size=64)
+    normals, depth, index = fragments.normals(space="camera")[0], fragments.depth[0], fragments.face_index[0]
+    same = (index[1:-1, 1:-1] >= 0) & (index[1:-1, 2:] == index[1:-1, :-2]) & (index[2:, 1:-1] == index[:-2, 1:-1])
+    same &= index[1:-1, 2:] == index[1:-1, 1:-1]
+    same &= index[2:, 1:-1] == index[1:-1, 1:-1]
+    slope_x, slope_y = 16 * (depth[1:-1, 2:] - depth[1:-1, :-2]), 16 * (depth[:-2, 1:-1] - depth[2:, 1:-1])
+    wanted = torch.nn.functional.normalize(torch.stack([slope_x, slope_y, -torch.ones_like(slope_x)], -1), dim=-1)
+    assert same.sum() > 300
+    torch.testing.assert_close(normals[1:-1, 1:-1][same], wanted[same], rtol=0, atol=1e-5)
+
+
+def test_a_camera_that_turns_with_the_mesh_sees_the_same_normals():
+    vertices, faces = bumpy_sphere()
+    images = []
+    for eye in ([0.0, 0.0, -3.0], [0.0, 0.0, 3.0]):
+        turned = vertices * torch.tensor([1.0, 1.0, 1.0] if eye[2] < 0 else [-1.0, 1.0, -1.0])
+        images.append(nmr.render_normals(turned, faces, nmr.LookAt(eye), smooth=True, space="camera", **SIZE))
+    torch.testing.assert_close(*images)
+    assert (images[0][..., 2] <= 1e-2).all() and images[0][..., 2].min() < -0.9

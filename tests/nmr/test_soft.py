@@ -52,11 +52,12 @@ def test_gradients_are_the_derivative(anti_aliasing):
     vertices, faces = soup(1)
     camera = nmr.LookAt([0.0, 0.0, -2.0], half_fov_deg=25.0)
 
-    def draw(vertices):  # faces are left out nowhere, so that the image is smooth
-        options = {"sigma": 0.05, "dist_eps": 1e-30, "image_size": (5, 8), "anti_aliasing": anti_aliasing}
+    def draw(vertices, sigma):  # faces are left out nowhere, so that the image is smooth
+        options = {"sigma": sigma, "dist_eps": 1e-30, "image_size": (5, 8), "anti_aliasing": anti_aliasing}
         return nmr.render_soft_silhouette(vertices, faces[1:], camera, **options)
 
-    assert torch.autograd.gradcheck(draw, vertices.requires_grad_(), eps=1e-6, atol=1e-6, rtol=1e-5)
+    given = vertices.requires_grad_(), torch.tensor(0.05, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(draw, given, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
 def test_published_constants():

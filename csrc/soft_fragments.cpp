@@ -1,0 +1,163 @@
+// Weights, depth and signed squared distance of the faces around each pixel (soft_layers), and their derivatives.
+//
+// With v_k of SoftWeights and q = sum_k v_k / z_k: depth z = 1 / q and weights b_k = z v_k / z_k; without perspective z
+// = sum_k v_k z_k and b_k = v_k. A clamped weight has no derivative. Moving corner k by e changes the weight w_m on the
+// screen by -w_k (gradient of w_m at the pixel) . e. The derivative of the distance stands in soft.cpp.
+#include <algorithm>
+#include <cmath>
+
+#include "blocks.h"
+#include "soft_weights.h"
+
+namespace nmr {
+namespace {
+
+// A face at the centre of one pixel of a raster [H, W K], in units of half the shorter side.
+template <class T>
+struct SoftFragment {
+  const int64_t* face;
+  T x[3], y[3], z[3], px, py, scale_x, scale_y;
+
+  SoftFragment(const SoftFragments<T>& args, int64_t b, int64_t id, int64_t row, int64_t column) {
+    const Size raster = args.raster;
+    const T shorter = static_cast<T>(std::min(raster.height, raster.width));
+    scale_x = static_cast<T>(raster.width) / shorter, scale_y = static_cast<T>(raster.height) / shorter;
+    face = args.mesh.image_faces(b) + 3 * (id % args.mesh.face_count(b));
+    for (int k = 0; k < 3; ++k) {
+      const T* v = args.mesh.image_vertices(b) + 3 * face[k];
+      x[k] = v[0] * scale_x, y[k] = v[1] * scale_y, z[k] = v[2];
+    }
+    px = pixel_centre<T>(column, raster.width) * scale_x;
+    py = pixel_centre<T>(raster.height - 1 - row, raster.height) * scale_y;
+  }
+};
+
+// The nearest point of the border.
+template <class T>
+struct Nearest {
+  T square, away_x, away_y, share;  // share: of corner `side` + 1; the other end has 1 - share
+  int side;
+
+  explicit Nearest(const SoftFragment<T>& f) : square(std::numeric_limits<T>::max()), away_x(0), away_y(0), share(0), side(0) {
+    for (int k = 0; k < 3; ++k) {
+      const int q = (k + 1) % 3;
+      const T sx = f.x[q] - f.x[k], sy = f.y[q] - f.y[k], dx = f.px - f.x[k], dy = f.py - f.y[k], length = sx * sx + sy * sy;
+      const T t = length > std::numeric_limits<T>::min() ? clamp_weight((dx * sx + dy * sy) / length) : T(0);
+      const T ax = dx - t * sx, ay = dy - t * sy, d = ax * ax + ay * ay;
+      if (d < square) square = d, away_x = ax, away_y = ay, share = t, side = k;
+    }
+  }
+};
+
+template <class T>
+bool inside(const SoftWeights<T>& weights) {
+  return weights.w[0] > 0 && weights.w[1] > 0 && weights.w[2] > 0;
+}
+
+// Adds the gradient of one fragment to the corners of its face, [3, 3].
+template <class T>
+void fragment_backward(const SoftFragment<T>& f, bool perspective, const T* grad_weights, T grad_depth, T grad_distance,
+                       T* grads) {
+  const SoftWeights<T> weights(f.x, f.y, f.px, f.py);
+  const T *v = weights.v, *z = f.z;
+  T grad_v[3], mean = 0;
+  if (perspective) {
+    const T depth = weights.depth(z, true);
+    T by_depth = grad_depth;
+    for (int k = 0; k < 3; ++k) by_depth += grad_weights[k] * v[k] / z[k];
+    for (int k = 0; k < 3; ++k) {
+      grad_v[k] = (grad_weights[k] - depth * by_depth) * depth / z[k];
+      grads[3 * k + 2] -= grad_v[k] * v[k] / z[k];
+    }
+  } else {
+    for (int k = 0; k < 3; ++k) {
+      grad_v[k] = grad_weights[k] + grad_depth * z[k];
+      grads[3 * k + 2] += grad_depth * v[k];
+    }
+  }
+  for (int k = 0; k < 3; ++k) mean += grad_v[k] * v[k];
+  T by_x = 0, by_y = 0;  // of the pixel, through the weights on the screen
+  for (int k = 0; k < 3; ++k) {
+    if (!(weights.w[k] > 0 && weights.w[k] < 1)) continue;
+    const int q = (k + 1) % 3, r = (k + 2) % 3;
+    const T grad_w = (grad_v[k] - mean) / weights.sum / weights.area;
+    by_x += grad_w * (f.y[q] - f.y[r]);
+    by_y += grad_w * (f.x[r] - f.x[q]);
+  }
+  const Nearest<T> nearest(f);
+  const T strength = (inside(weights) ? 2 : -2) * grad_distance;
+  for (int k = 0; k < 3; ++k) {
+    const T share = k == nearest.side ? 1 - nearest.share : k == (nearest.side + 1) % 3 ? nearest.share : T(0);
+    grads[3 * k] += (strength * share * nearest.away_x - weights.w[k] * by_x) * f.scale_x;
+    grads[3 * k + 1] += (strength * share * nearest.away_y - weights.w[k] * by_y) * f.scale_y;
+  }
+}
+
+// The gradients of the faces that own an entry of a block of rows.
+template <class T>
+struct SoftSums {
+  VisibleFaces visible;
+  std::vector<T> values;  // [count, 3, 3]
+};
+
+}  // namespace
+
+template <class T>
+void soft_fragments_forward(const SoftFragments<T>& args) {
+  const int64_t H = args.raster.height, wide = args.raster.width * args.layers;
+  parallel_for(args.mesh.batch * H, args.num_threads, [&](int64_t line) {
+    for (int64_t n = line * wide; n < (line + 1) * wide; ++n) {
+      T* weights = args.weights + 3 * n;
+      std::fill_n(weights, 3, T(0));
+      args.depth[n] = args.far;
+      args.distances[n] = 0;
+      if (args.face_index[n] < 0) continue;
+      const SoftFragment<T> f(args, line / H, args.face_index[n], line % H, n % wide / args.layers);
+      const SoftWeights<T> screen(f.x, f.y, f.px, f.py);
+      const T square = Nearest<T>(f).square;
+      args.depth[n] = screen.depth(f.z, args.perspective);
+      for (int k = 0; k < 3; ++k) weights[k] = args.perspective ? args.depth[n] * screen.v[k] / f.z[k] : screen.v[k];
+      args.distances[n] = inside(screen) ? -square : square;
+    }
+  });
+}
+
+template <class T>
+void soft_fragments_backward(const SoftFragments<T>& args) {
+  const MeshBatch<T>& mesh = args.mesh;
+  const int64_t H = args.raster.height, wide = args.raster.width * args.layers;
+  const auto blocks_of = [&](int64_t b) { return RowBlocks({H, wide}, mesh.face_count(b)); };
+  std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
+  sum_blocks<SoftSums<T>>(
+      mesh.batch, false, args.num_threads, [&](int64_t b) { return blocks_of(b).count; },
+      [&](int64_t b, int64_t block, SoftSums<T>& sums) {
+        const RowBlocks blocks = blocks_of(b);
+        const int64_t F = mesh.face_count(b), first = (b * H + blocks.first(block)) * wide,
+                      last = (b * H + blocks.last(block)) * wide;
+        sums.visible.reserve_for(F, blocks.most_visible(F));
+        sums.visible.find(args.face_index + first, last - first, F);
+        T* values = reserve(sums.values, 9 * sums.visible.count);
+        std::fill_n(values, 9 * sums.visible.count, T(0));
+        for (int64_t n = first; n < last; ++n) {
+          const int64_t id = args.face_index[n];
+          if (id < 0) continue;
+          const SoftFragment<T> f(args, b, id, n / wide % H, n % wide / args.layers);
+          fragment_backward(f, args.perspective, args.grad_weights + 3 * n, args.grad_depth[n], args.grad_distances[n],
+                            values + 9 * sums.visible.slots[id + 1]);
+        }
+      },
+      [&](int64_t b, SoftSums<T>& sums) {
+        for (int64_t n = 1; n < sums.visible.count; ++n) {
+          const int64_t* face = mesh.image_faces(b) + 3 * (sums.visible.ids[n] % mesh.face_count(b));
+          for (int k = 0; k < 9; ++k)
+            args.grad_vertices[3 * (mesh.vertex_start(b) + face[k / 3]) + k % 3] += sums.values[9 * n + k];
+        }
+      });
+}
+
+template void soft_fragments_forward(const SoftFragments<float>&);
+template void soft_fragments_forward(const SoftFragments<double>&);
+template void soft_fragments_backward(const SoftFragments<float>&);
+template void soft_fragments_backward(const SoftFragments<double>&);
+
+}  // namespace nmr
