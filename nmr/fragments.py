@@ -213,7 +213,7 @@ class Fragments:
         """
         viewer = self._viewer(highlights)
         if own is not None and own.ndim == 4:  # a mesh of one face with one vertex for each pixel
-            count, points = own[0, ..., 0].numel(), torch.zeros_like(own)
+            count, points = own.shape[1] * own.shape[2], torch.zeros_like(own)
             if positions:
                 points = ops.interpolate(usable(self.world), self.faces, *self._at)
             number = torch.arange(count, dtype=torch.int32, device=own.device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -118,7 +119,7 @@ def _blend(
     behind = torch.exp((least - nearest) / gamma)
     colors = torch.where(fragments.covered.unsqueeze(-1), colors, zero)
     rgb = (share.unsqueeze(-1) * colors).sum(-2) + behind * background[:, None, None]
-    return rgb / (share.sum(-1, keepdim=True) + behind), 1 - (1 - covers).prod(-1)
+    return rgb / (share.sum(-1, keepdim=True) + behind), 1 - _running_products(1 - covers)[..., -1]
 
 
 def render_transparent(
@@ -181,12 +182,17 @@ def render_transparent(
     fragments = scene.fragments(scene.rasterize_layers(check_size(faces_per_pixel, "faces_per_pixel", 1024)))
     image, behind = shade(fragments, colors, lights, background, interpolation_gradient)
     opacity = torch.where(fragments.covered, _opacity_at(fragments, opacity), image.new_zeros(()))
-    clear = torch.cumprod(1 - opacity, dim=-1)
+    clear = _running_products(1 - opacity)
     before = torch.cat([torch.ones_like(clear[..., :1]), clear[..., :-1]], dim=-1)
     image = torch.where(fragments.covered.unsqueeze(-1), image, image.new_zeros(()))
     rgb = ((before * opacity).unsqueeze(-1) * image).sum(-2) + clear[..., -1:] * behind[:, None, None]
     both = fragments.layer(0)._resolve(torch.cat([rgb, 1 - clear[..., -1:]], dim=-1), None)
     return Images({"rgb": both[..., :-1], "alpha": both[..., -1]})
+
+
+def _running_products(factors: Tensor) -> Tensor:
+    """As torch.cumprod along the last axis, whose gradient rounds otherwise if one factor of the batch is 0."""
+    return torch.stack([*accumulate(factors.unbind(-1), torch.mul)], dim=-1)
 
 
 def _opacity_at(fragments: Fragments, opacity: float | Tensor | Colors) -> Tensor:
