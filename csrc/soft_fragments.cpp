@@ -5,6 +5,8 @@
 // screen by -w_k (gradient of w_m at the pixel) . e. The derivative of the distance stands in soft.cpp.
 #include <algorithm>
 #include <cmath>
+#include <limits>
+#include <vector>
 
 #include "blocks.h"
 #include "soft_weights.h"
@@ -38,10 +40,12 @@ struct Nearest {
   T square, away_x, away_y, share;  // share: of corner `side` + 1; the other end has 1 - share
   int side;
 
-  explicit Nearest(const SoftFragment<T>& f) : square(std::numeric_limits<T>::max()), away_x(0), away_y(0), share(0), side(0) {
+  explicit Nearest(const SoftFragment<T>& f)
+      : square(std::numeric_limits<T>::max()), away_x(0), away_y(0), share(0), side(0) {
     for (int k = 0; k < 3; ++k) {
       const int q = (k + 1) % 3;
-      const T sx = f.x[q] - f.x[k], sy = f.y[q] - f.y[k], dx = f.px - f.x[k], dy = f.py - f.y[k], length = sx * sx + sy * sy;
+      const T sx = f.x[q] - f.x[k], sy = f.y[q] - f.y[k], dx = f.px - f.x[k], dy = f.py - f.y[k];
+      const T length = sx * sx + sy * sy;
       const T t = length > std::numeric_limits<T>::min() ? clamp_weight((dx * sx + dy * sy) / length) : T(0);
       const T ax = dx - t * sx, ay = dy - t * sy, d = ax * ax + ay * ay;
       if (d < square) square = d, away_x = ax, away_y = ay, share = t, side = k;
