@@ -290,13 +290,17 @@ def input_azimuth_deg(surface: Surface, mask: np.ndarray) -> float:
 
 
 def export_mesh(path: Path, surface: Surface) -> None:
-    """Write a mesh of the object frame as OBJ, GLB or PLY (by the file's ending), y up, right-handed.
+    """Write a mesh of the object frame as OBJ, GLB or PLY (by the file's ending): see `mesh_bytes`."""
+    writing.write_bytes(path, mesh_bytes(surface, path.suffix.lower().lstrip("."), path.stem))
+
+
+def mesh_bytes(surface: Surface, kind: str, name: str) -> bytes:
+    """A file of the kind "obj", "glb" or "ply" with a mesh of the object frame, y up, right-handed.
 
     The object frame is left-handed; the reflection back turns the faces, whose normals point outwards in the file.
-    GLB and PLY keep the colours of the vertices. A GLB's node has the file's name, and its material shows faces from
-    both sides: learnt surfaces cross themselves, and by glTF's rule a viewer leaves out what is seen from behind.
+    GLB and PLY keep the colours of the vertices. A GLB's node has the name, and its material shows faces from both
+    sides: learnt surfaces cross themselves, and by glTF's rule a viewer leaves out what is seen from behind.
     """
-    kind = path.suffix.lower().lstrip(".")
     points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
     mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)
     if surface.colors is not None and kind != "obj":
@@ -305,10 +309,10 @@ def export_mesh(path: Path, surface: Surface) -> None:
         mesh.visual.vertex_colors = (colors * 255).round().to(torch.uint8).numpy()
     if kind == "glb":
         options = {"include_normals": True, "tree_postprocessor": _show_both_sides}
-        content = trimesh.Scene({path.stem: mesh}).export(file_type=kind, **options)
+        content = trimesh.Scene({name: mesh}).export(file_type=kind, **options)
     else:
         content = mesh.export(file_type=kind)
-    writing.write_bytes(path, content.encode() if isinstance(content, str) else content)
+    return content.encode() if isinstance(content, str) else content
 
 
 def _show_both_sides(tree: dict) -> None:

@@ -105,6 +105,6 @@ class Demo(Command):
     """Open a browser, or only print the address."""
 
     def run(self) -> None:
-        from learn3d.demo.page import serve
+        from learn3d.demo.server import serve
 
         serve(self.runs, host=self.host, port=self.port, browser=self.browser)

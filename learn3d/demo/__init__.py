@@ -1,1 +1,1 @@
-"""The page of `learn3d demo`: `picture` computes, `page` lays it out and serves it, behind `gate` (extra `demo`)."""
+"""The page of `learn3d demo` (extra `demo`): `server` serves it behind `gate`, `picture` computes, `page/` is seen."""

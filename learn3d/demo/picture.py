@@ -1,100 +1,101 @@
-"""From a picture to a mesh: a mask by the colour of the background, and the files of each model's mesh."""
+"""From pixels that a browser sends to a mask and meshes, one message for each step, and the example pictures."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import NamedTuple
+import base64
+import io
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from PIL import Image
-from scipy.ndimage import binary_dilation, binary_erosion
 
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
-from learn3d.data.framing import TOLERANCE, check_mask, read_picture
-from learn3d.fitting.cutting import find_mask
-from learn3d.fitting.fit import Progress
+from learn3d.data.framing import check_mask, mask_box
+from learn3d.fitting.cutting import Box, correct, cut_out, find_mask
 from learn3d.make_data.shapes import make_shape
 from learn3d.make_data.writers.around import natural_look
 from learn3d.pictures.studio import photograph
-from learn3d.pictures.surfaces import CLAY, Surface
-from learn3d.reconstruction import Model, Reconstruction, export_mesh, reconstruct_picture
+from learn3d.reconstruction import Model, mesh_bytes, reconstruct_picture
 
-SIDE = 512  # pixels of the square on which pictures lie; the networks see 64 to 224
+SIDE = 512  # pixels that a picture has at most a side; the networks see 64 to 224
+EXAMPLES = {"airplane": 1, "car": 2, "chair": 6, "lamp": 0, "sofa": 3, "table": 7}  # seeds
+_MARGIN = 24  # pixels around the object of an example
+
+Tell = Callable[[dict[str, Any]], None]
 
 
 class Picture(NamedTuple):
-    """A picture on a square, and where its object is."""
+    """A picture, and what is known of its object."""
 
-    colors: np.ndarray  # uint8 [SIDE, SIDE, 3]
-    mask: np.ndarray  # uint8 [SIDE, SIDE], 255: object
-    name: str = "picture"
-    framed: bool = False  # as the networks' training images are: the object is as large in it as its distance makes it
+    colors: np.ndarray  # uint8 [H, W, 3]
+    mask: np.ndarray  # uint8 [H, W], above 127: object; 255 everywhere: not known
+    strokes: np.ndarray | None = None  # uint8 [H, W] as `cutting.correct` has them; None: no corrections
+    box: Box | None = None  # around the object
 
 
-def open_picture(path: Path, tolerance: float = TOLERANCE) -> Picture:
-    """Read a picture file. Its mask is its transparency or, if it has none, that of `threshold_mask`.
+def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> Picture:
+    """The picture that a browser sends: R, G, B, mask for each pixel, then possibly a byte of strokes for each.
 
-    Raises ValueError for a file that is no picture.
+    Raises ValueError unless it has as many bytes as that.
     """
-    colors, alpha = read_picture(path, SIDE)
-    found = find_mask(colors, tolerance) if alpha is None else alpha
-    height, width = colors.shape[:2]
-    top, left = (SIDE - height) // 2, (SIDE - width) // 2
-    around = (top, SIDE - height - top), (left, SIDE - width - left)
-    padded = np.pad(colors, (*around, (0, 0)), mode="edge")  # the background goes on
-    mask = np.pad(found, around)
-    if alpha is None:
-        return Picture(padded, mask, path.stem)
-    padded[mask == 0] = 255
-    return Picture(padded, mask, path.stem)
+    pixels = width * height
+    if not (0 < width <= SIDE and 0 < height <= SIDE) or len(content) not in (4 * pixels, 5 * pixels):
+        raise ValueError(f"a picture of {width} x {height} pixels came in {len(content)} bytes; at most {SIDE} a side")
+    given = np.frombuffer(content, np.uint8)
+    planes = given[: 4 * pixels].reshape(height, width, 4)
+    strokes = given[4 * pixels :].reshape(height, width) if len(given) > 4 * pixels else None
+    return Picture(np.ascontiguousarray(planes[..., :3]), planes[..., 3].copy(), strokes, box)
 
 
-def example(category: str, seed: int) -> Picture:
-    """A generated object of `make_data.shapes.CATEGORIES` in natural colours, seen half from the front."""
-    rng = np.random.default_rng(seed)
+def find_object(picture: Picture) -> np.ndarray:
+    """The object's mask uint8 [H, W]: within the box, by the strokes, as given, or else looked for."""
+    if picture.box is not None:
+        return cut_out(picture.colors, picture.box)
+    if picture.strokes is not None:
+        return correct(picture.colors, picture.mask, picture.strokes)
+    return find_mask(picture.colors) if picture.mask.min() == 255 else picture.mask
+
+
+def make_meshes(models: Mapping[str, Model], picture: Picture, tell: Tell) -> None:
+    """Tell the mask, the progress, and in the end the meshes of all models, or an error as a sentence."""
+    try:
+        mask = find_object(picture)
+        tell({"mask": _base64(np.packbits(mask > 127).tobytes())})
+        try:
+            check_mask(mask, cropped=True)
+        except ValueError:
+            raise ValueError("No object was found. Draw a box around it, or paint it with Add.") from None
+        tell({"meshes": [_mesh(label, model, picture.colors, mask, tell) for label, model in models.items()]})
+    except ValueError as error:
+        tell({"error": str(error)})
+
+
+def _mesh(label: str, model: Model, colors: np.ndarray, mask: np.ndarray, tell: Tell) -> dict[str, Any]:
+    made = reconstruct_picture(model, colors, mask, progress=lambda text, part: tell({"progress": text, "part": part}))
+    if not len(made.surface.faces):
+        raise ValueError(f"The model {label} makes an empty shape of this picture. Try another picture.")
+    angle = np.radians(made.azimuth_deg)
+    x, _, z = np.array([np.sin(angle), 0.0, -np.cos(angle)]) @ mesh_to_object()
+    glb = mesh_bytes(made.surface, "glb", "object")
+    return {"label": label, "glb": _base64(glb), "yaw": float(np.arctan2(x, z)), "warning": made.warning}
+
+
+def example(category: str) -> bytes:
+    """A PNG of a generated object, cut out, in natural colours, seen half from the front."""
+    rng = np.random.default_rng(EXAMPLES[category])
     mesh = make_shape(category, rng)
-    vertices = mesh.vertices @ mesh_to_object("y", "z").T
+    vertices = np.float32(mesh.vertices @ mesh_to_object("y", "z").T)
     colors, lights = natural_look(vertices, mesh.faces, rng)
     azimuth = rng.choice([-1, 1]) * rng.uniform(20, 70)
     camera = nmr.LookAt.from_angles(DISTANCE, 22.0, [azimuth], half_fov_deg=HALF_FOV_DEG)
-    faces = torch.tensor(mesh.faces)
-    rgb, alpha = photograph(np.float32(vertices), faces, colors, camera, image_size=SIDE, lights=lights)
-    return Picture(rgb[0], alpha[0], category, framed=True)
+    rgb, alpha = photograph(vertices, mesh.faces, colors, camera, image_size=SIDE, lights=lights)
+    left, top, right, bottom = mask_box(alpha[0])
+    image = Image.fromarray(np.dstack([rgb[0], alpha[0]]))
+    image.crop((left - _MARGIN, top - _MARGIN, right + _MARGIN, bottom + _MARGIN)).save(png := io.BytesIO(), "png")
+    return png.getvalue()
 
 
-def outline(picture: Picture) -> np.ndarray:
-    """The picture with a line around its object, uint8 [SIDE, SIDE, 3]: white, with a dark rim."""
-    inside = picture.mask > 127
-    shown = picture.colors.copy()
-    for width, color in ((5, (30, 30, 30)), (3, (255, 255, 255))):
-        shown[binary_dilation(inside, iterations=width) & ~binary_erosion(inside, iterations=width - 2)] = color
-    return shown
-
-
-def make_mesh(model: Model, picture: Picture, progress: Progress | None = None) -> Reconstruction:
-    """What the model makes of a picture; `progress` as `fit` has it. Raises ValueError if the mask cannot be right."""
-    try:
-        check_mask(picture.mask)
-    except ValueError:
-        raise ValueError("no object was found in the picture; correct the outline with the brush") from None
-    return reconstruct_picture(model, picture.colors, picture.mask, crop=not picture.framed, progress=progress)
-
-
-def write_cutout(picture: Picture, folder: Path) -> Path:
-    """Write <name>.png, the square picture with its mask as transparency, which `open_picture` reads; its path."""
-    path = folder / f"{picture.name}.png"
-    Image.fromarray(np.dstack([picture.colors, picture.mask])).save(path)
-    return path
-
-
-def write_mesh(surface: Surface, folder: Path, name: str) -> tuple[Path, Path]:
-    """Write <name>.glb (in clay if the shape has no colours) and <name>.obj; returns both paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    if surface.colors is None:
-        surface = surface._replace(colors=torch.tensor(CLAY).expand_as(surface.vertices))
-    paths = folder / f"{name}.glb", folder / f"{name}.obj"
-    for path in paths:
-        export_mesh(path, surface)
-    return paths
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()

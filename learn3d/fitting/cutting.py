@@ -14,7 +14,9 @@ from learn3d.data.framing import TOLERANCE, threshold_mask
 SIDE = 384  # longer side of the picture that GrabCut works on
 INSET = 0.03  # of each side: without a box the object is taken to lie within the rest
 PLAIN = 0.9  # share of the border that has one colour if the background is plain
+KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # what strokes say of a pixel
 _ROUNDS = 5
+_AROUND = 16  # pixels around the strokes from which GrabCut learns colours
 
 Box = tuple[int, int, int, int]  # x and y of the left upper corner, width, height, in pixels
 
@@ -69,6 +71,28 @@ def cut_out(colors: np.ndarray, box: Box | None = None) -> np.ndarray:
     largest = ndimage.binary_fill_holes(regions == 1 + np.bincount(regions.ravel())[1:].argmax())
     mask = Image.fromarray(255 * largest.astype(np.uint8)).resize((width, height), Image.Resampling.BILINEAR)
     return 255 * (np.asarray(mask) > 127).astype(np.uint8)
+
+
+def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.ndarray:
+    """A mask uint8 [H, W], 0 or 255, corrected by hand; GrabCut decides in the neighbourhood of the strokes.
+
+    colors: uint8 [H, W, 3]; strokes: uint8 [H, W], for each pixel KEEP (as the mask has it), OBJECT, BACKGROUND, or
+    OPEN. Raises ValueError without OpenCV.
+    """
+    cv2 = _opencv()
+    inside = np.where(strokes == OBJECT, True, (mask > 127) & (strokes != BACKGROUND))
+    if not (unsure := strokes == OPEN).any():
+        return 255 * inside.astype(np.uint8)
+    rows, columns = (np.flatnonzero(unsure.any(axis=axis)) for axis in (1, 0))
+    part = tuple(slice(max(0, line[0] - _AROUND), line[-1] + 1 + _AROUND) for line in (rows, columns))
+    labels = np.where(inside, np.where(unsure, cv2.GC_PR_FGD, cv2.GC_FGD), np.where(unsure, cv2.GC_PR_BGD, cv2.GC_BGD))
+    labels = np.ascontiguousarray(labels[part].astype(np.uint8))
+    if len(np.unique(labels % 2)) == 2:  # odd: object
+        cv2.setRNGSeed(0)
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(np.ascontiguousarray(colors[part][..., ::-1]), labels, None, *models, 2, cv2.GC_INIT_WITH_MASK)
+        inside[part] = labels % 2 == 1
+    return 255 * inside.astype(np.uint8)
 
 
 def _opencv() -> ModuleType:
