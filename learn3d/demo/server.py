@@ -18,7 +18,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -87,7 +87,7 @@ def application(models: dict[str, Model], host: str, desk: Desk) -> Starlette:
             picture = await asyncio.wait_for(_receive(request), PATIENCE)
         except (ValueError, KeyError) as error:
             raise HTTPException(400, f"this is no picture as the page sends it: {error}") from None
-        except asyncio.TimeoutError:
+        except (asyncio.TimeoutError, ClientDisconnect):
             raise HTTPException(408, "the picture did not arrive in time") from None
         job = partial(make_meshes, models, picture)
         return StreamingResponse(desk.messages(job), media_type="application/x-ndjson")
@@ -145,7 +145,7 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
     logging.getLogger("uvicorn").addHandler(errors)
     desk = Desk()
     bounds = {"limit_concurrency": VISITORS, "timeout_graceful_shutdown": 5, "h11_max_incomplete_event_size": 2**14}
-    quiet = {"log_config": None, "log_level": "error", "access_log": False, "server_header": False}
+    quiet = {"log_config": None, "log_level": "error", "access_log": False, "server_header": False, "proxy_headers": False}
     app = application(models, host, desk)
     server = uvicorn.Server(uvicorn.Config(app, http="h11", ws="none", lifespan="off", **bounds, **quiet))
     desk.closed = lambda: server.should_exit

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,15 +12,12 @@ import pytest
 
 @pytest.fixture(scope="module")
 def server(finished_run, tmp_path_factory) -> Iterator[tuple[subprocess.Popen, str]]:
-    pytest.importorskip("gradio", reason="needs the extra demo")
+    pytest.importorskip("uvicorn", reason="needs the extra demo")
     folder = tmp_path_factory.mktemp("demo")
     shutil.copytree(finished_run, folder / "other")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    words = [sys.executable, "-m", "learn3d", "demo", "--port", str(port), "--no-browser", "--run", str(finished_run)]
+    words = [sys.executable, "-m", "learn3d", "demo", "--port", "0", "--no-browser", "--run", str(finished_run)]
     pipes = {"stdout": subprocess.PIPE, "stderr": (folder / "errors.txt").open("w"), "text": True}
-    environment = os.environ | {"TMPDIR": str(folder)}
-    with subprocess.Popen([*words, str(folder / "other")], env=environment, cwd=folder, **pipes) as process:
+    with subprocess.Popen([*words, str(folder / "other")], cwd=folder, **pipes) as process:
         process.folder = folder
         line = process.stdout.readline()
         assert "the page is at" in line, (folder / "errors.txt").read_text()

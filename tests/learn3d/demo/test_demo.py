@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import socket
 
 import numpy as np
@@ -38,40 +40,44 @@ def test_the_mask_is_the_largest_region_without_holes(photo) -> None:
     assert not threshold_mask(photo, 0.9).any()
 
 
-def test_pictures_are_laid_on_a_square_and_keep_their_mask(photo, tmp_path) -> None:
-    Image.fromarray(photo).resize((1600, 1000)).save(tmp_path / "ring.jpg")
-    picture, side = pictures.open_picture(tmp_path / "ring.jpg", 0.2), pictures.SIDE
-    assert (picture.colors.shape, picture.mask.shape, picture.name) == ((side, side, 3), (side, side), "ring")
-    assert (picture.mask > 0).mean() == pytest.approx(np.pi * (30 / 160) ** 2, rel=0.05)
-    assert picture.colors[0].min() > 150, "the background goes on"
-    again = pictures.open_picture(pictures.write_cutout(picture, tmp_path))
-    seen = picture.mask > 0
-    assert again.name == "ring" and np.array_equal(again.mask, picture.mask)
-    assert np.array_equal(again.colors[seen], picture.colors[seen]) and (again.colors[~seen] == 255).all()
+def test_pixels_are_unpacked_as_the_page_packs_them() -> None:
+    given = np.random.default_rng(0).integers(0, 256, (3, 5, 4)).astype(np.uint8)
+    picture = pictures.unpack(given.tobytes(), 5, 3)
+    assert np.array_equal(np.dstack([picture.colors, picture.mask]), given) and picture.strokes is None
+    strokes = np.arange(15, dtype=np.uint8).reshape(3, 5)
+    picture = pictures.unpack(given.tobytes() + strokes.tobytes(), 5, 3)
+    assert np.array_equal(np.dstack([picture.colors, picture.mask]), given) and np.array_equal(picture.strokes, strokes)
 
 
-def test_a_picture_becomes_a_mesh(finished_run, tmp_path) -> None:
-    picture = pictures.example("chair", 3)
-    assert 0.05 < (picture.mask > 127).mean() < 0.5
-    made = pictures.make_mesh(load_model(finished_run), picture)
-    glb, obj = pictures.write_mesh(made.surface, tmp_path / "new", "my chair")
-    meshes = [trimesh.load(path, force="mesh", process=False) for path in (glb, obj)]
-    assert glb.name == "my chair.glb" and list(trimesh.load(glb).geometry) == ["my chair"]
-    assert np.allclose(meshes[0].vertices, meshes[1].vertices, atol=1e-6)
-    assert len(meshes[0].faces) > 100 and 0 < made.silhouette_iou <= 1
-    assert len(made.surface.colors.unique(dim=0)) > 20, "in the picture's colours"
-    for mask in (np.zeros_like(picture.mask), np.full_like(picture.mask, 255)):
-        with pytest.raises(ValueError, match="no object was found in the picture; correct the outline"):
-            pictures.make_mesh(load_model(finished_run), picture._replace(mask=mask))
+def test_the_object_is_given_or_found_or_corrected(photo) -> None:
+    unknown, given = np.full((100, 160), 255, np.uint8), np.zeros((100, 160), np.uint8)
+    given[20:40, 20:40] = 200
+    ring = threshold_mask(photo)
+    assert np.array_equal(pictures.find_object(pictures.Picture(photo, unknown)), ring)
+    assert np.array_equal(pictures.find_object(pictures.Picture(photo, given)), given)
+    strokes = np.zeros_like(given)
+    strokes[10:20, 20:40] = 1
+    corrected = pictures.find_object(pictures.Picture(photo, given, strokes))
+    assert np.flatnonzero(corrected.any(axis=1)).tolist() == list(range(10, 40))
+    assert (pictures.find_object(pictures.Picture(photo, unknown, None, (40, 10, 80, 80))) != ring).mean() < 0.02
 
 
-def test_generated_examples_keep_their_size(finished_run, monkeypatch) -> None:
-    model, crops = load_model(finished_run), []
-    prepare = type(model).prepare
-    monkeypatch.setattr(type(model), "prepare", lambda *given, crop: crops.append(crop) or prepare(*given, crop=crop))
-    for framed in (True, False):
-        pictures.make_mesh(model, pictures.example("car", 3)._replace(framed=framed))
-    assert crops == [False, True]
+def test_a_picture_becomes_a_mesh(finished_run) -> None:
+    with Image.open(io.BytesIO(pictures.example("chair"))) as image:
+        colors, alpha = np.split(np.asarray(image), [3], axis=2)
+    assert 0.2 < (alpha > 127).mean() < 0.7
+    told: list[dict] = []
+    models = {"my run": load_model(finished_run)}
+    pictures.make_meshes(models, pictures.Picture(colors.copy(), alpha[..., 0]), told.append)
+    assert "mask" in told[0] and [each["part"] for each in told[1:-1]] == [0.0, 0.3, 0.7, 1.0]
+    (made,) = told[-1]["meshes"]
+    mesh = trimesh.load(io.BytesIO(base64.b64decode(made["glb"])), "glb", force="mesh")
+    assert made["label"] == "my run" and len(mesh.faces) > 100
+    assert len(np.unique(mesh.visual.vertex_attributes["color"], axis=0)) > 20, "in the picture's colours"
+    for mask in (np.zeros_like(alpha[..., 0]), np.full_like(alpha[..., 0], 254)):
+        told.clear()
+        pictures.make_meshes(models, pictures.Picture(colors, mask), told.append)
+        assert told[-1] == {"error": "No object was found. Draw a box around it, or paint it with Add."}
 
 
 def test_the_side_of_the_input_is_found() -> None:
@@ -87,8 +93,7 @@ def test_the_side_of_the_input_is_found() -> None:
 
 def test_the_packages_own_model_is_the_default(finished_run, tmp_path, monkeypatch, command) -> None:
     monkeypatch.setattr(reconstruction, "SMALL_MODEL", tmp_path / "small.safetensors")
-    picture = pictures.example("car", 1)
-    Image.fromarray(np.dstack([picture.colors, picture.mask])).save(tmp_path / "car.png")
+    (tmp_path / "car.png").write_bytes(pictures.example("car"))
     words = ("reconstruct", tmp_path / "car.png", "--output", tmp_path / "out")
     status, _, error = command(*words)
     assert status == 1 and f"error: there is no checkpoint {tmp_path / 'small.safetensors'}" in error
@@ -100,7 +105,7 @@ def test_the_packages_own_model_is_the_default(finished_run, tmp_path, monkeypat
 
 
 def test_a_page_that_cannot_be_opened_is_one_sentence(finished_run, tmp_path, command) -> None:
-    pytest.importorskip("gradio", reason="needs the extra demo")
+    pytest.importorskip("uvicorn", reason="needs the extra demo")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         status, _, said = command("demo", "--port", port, "--no-browser", "--run", finished_run)
