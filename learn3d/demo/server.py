@@ -145,7 +145,13 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
     logging.getLogger("uvicorn").addHandler(errors)
     desk = Desk()
     bounds = {"limit_concurrency": VISITORS, "timeout_graceful_shutdown": 5, "h11_max_incomplete_event_size": 2**14}
-    quiet = {"log_config": None, "log_level": "error", "access_log": False, "server_header": False, "proxy_headers": False}
+    quiet = {
+        "log_config": None,
+        "log_level": "error",
+        "access_log": False,
+        "server_header": False,
+        "proxy_headers": False,
+    }
     app = application(models, host, desk)
     server = uvicorn.Server(uvicorn.Config(app, http="h11", ws="none", lifespan="off", **bounds, **quiet))
     desk.closed = lambda: server.should_exit

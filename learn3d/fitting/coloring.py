@@ -11,10 +11,9 @@ from torch import Tensor
 
 import nmr
 from learn3d.fitting.fit import View
-from learn3d.fitting.smoothing import joined, smooth
+from learn3d.fitting.smoothing import joined, outer_surface
 from learn3d.pictures.surfaces import Surface
 
-SUBDIVISIONS = 2  # levels: the surface is smooth and has a colour every few pixels
 DEPTH_SIZE = 256  # side of the depth map that says which vertices are seen
 BEHIND = 0.02  # distance behind the depth map at which a vertex is hidden, in units of the object frame
 GRAZING = 0.25  # cosine between surface and line of sight below which a colour is not taken
@@ -31,7 +30,7 @@ def color_mesh(
     itself, None if there is none. The side that is not seen has the colours of its mirror image and, where that is not
     seen either, those around it, blurred.
     """
-    points, triangles = smooth(vertices, faces, SUBDIVISIONS)
+    points, triangles = outer_surface(vertices, faces)
     normals = nmr.vertex_normals(points, triangles)
     picture = _Picture(points, triangles, view, colors, mask)
     seen, weight = picture.look_up(points, normals)

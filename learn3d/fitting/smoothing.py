@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
+import torch.nn.functional as F
 import trimesh
+from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_array, diags_array
+from skimage.measure import marching_cubes
 from torch import Tensor
 
+import nmr
+
 ROUNDS = 4
+CELLS = 112  # of the grid of `outer_surface` along the longest side
+DEPTH_SIDE = 320  # pixels of its depth maps
+_RIM = 4  # cells around the shape
+_GROWTH = 1.0  # cells by which it is thicker than the shape at first, so that thin parts stay whole
 _SHRINK, _GROW = 0.5, -0.53  # of Taubin 1995: smoothing without loss of volume
 
 
@@ -27,6 +38,47 @@ def smooth(vertices: Tensor, faces: Tensor, levels: int = 2) -> tuple[Tensor, Te
         for share in (_SHRINK, _GROW):
             points = points + share * (mean @ points - points)
     return torch.from_numpy(points.astype(np.float32)), torch.from_numpy(np.asarray(triangles, np.int64))
+
+
+@torch.no_grad()
+def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """The surface that is seen of a shape [V, 3], [F, 3] from all around, without folds and crossings; vertices, faces.
+
+    Depth maps of 42 orthographic cameras carve it out of a grid: a cell before the shape in any of them is empty
+    (Curless and Levoy 1996); marching cubes and Taubin's smoothing follow. Faces point outwards.
+    """
+    low, high = vertices.amin(0), vertices.amax(0)
+    centre, cell = (low + high) / 2, float((high - low).max()) / CELLS
+    shape = vertices - centre
+    reach = 1.05 * float(shape.norm(dim=1).max())
+    eyes = F.normalize(nmr.icosphere(1)[0] + torch.tensor([0.013, 0.007, 0.011]), dim=1)  # along no axis
+    cameras = nmr.Orthographic(4 * reach * eyes, scale=1 / reach)
+    copies = shape.expand(len(eyes), -1, -1)
+    depth = nmr.render_depth(copies, faces, cameras, image_size=DEPTH_SIDE, anti_aliasing=False)
+    depth = -depth.clamp(max=8 * reach)
+    for kernel, pad in (((7, 1), (3, 0)), ((1, 7), (0, 3))):  # wider by three pixels on all sides, about 1.3 cells
+        depth = F.max_pool2d(depth, kernel, 1, pad)
+    depth = -depth
+    counts = [math.ceil(float(side) / 2 / cell) + _RIM for side in high - low]
+    axes = [cell * torch.arange(-count, count + 1) for count in counts]
+    frame = cameras.transform(torch.eye(4, 3).expand(len(eyes), -1, -1)).float()  # images of the axes and of 0
+    outside = torch.full([len(axis) for axis in axes], -2.0 * cell)
+    for image, (*steps, origin) in zip(depth, frame, strict=True):
+        x, y, z = (
+            origin[k]
+            + sum(
+                a.reshape([-1 if n == m else 1 for m in range(3)]) * (steps[n][k] - origin[k])
+                for n, a in enumerate(axes)
+            )
+            for k in range(3)
+        )
+        column, row = (((value + 1) * (DEPTH_SIDE / 2)).long().clamp(0, DEPTH_SIDE - 1) for value in (x, -y))
+        outside = torch.maximum(outside, (image[row, column] - z).clamp(max=2 * cell))
+    field = gaussian_filter(outside.numpy(), 0.7)
+    points, triangles, _, _ = marching_cubes(field, _GROWTH * cell, spacing=(cell,) * 3)
+    points = torch.from_numpy(points.astype(np.float32)) + centre - cell * torch.tensor(counts)
+    points, triangles = smooth(points, torch.from_numpy(triangles.astype(np.int64)), levels=0)
+    return points - 0.7 * _GROWTH * cell * nmr.vertex_normals(points, triangles), triangles
 
 
 def joined(faces: np.ndarray, count: int) -> coo_array:
