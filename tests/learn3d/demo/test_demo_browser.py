@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import shutil
 import signal
@@ -14,22 +15,19 @@ import pytest
 import trimesh
 from PIL import Image
 
-pytest.importorskip("gradio", reason="needs the extra demo")
+pytest.importorskip("uvicorn", reason="needs the extra demo")
 api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
 CHROMIUM = shutil.which("chromium")
 if CHROMIUM is None:
     pytest.skip("needs Chromium (apt-get install chromium)", allow_module_level=True)
 
-ARGUMENTS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-#: The viewer of meshes tries WebGPU first and takes WebGL. The editor draws a layer a moment after it is shown.
-HARMLESS = ("WebGPU", "No draw texture found for layer")
-PATIENCE = 30_000  # milliseconds
+PATIENCE = 60_000  # milliseconds
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[api.Browser]:
     with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
         yield browser
         browser.close()
 
@@ -47,91 +45,98 @@ def page(browser, server) -> Iterator[api.Page]:
     page.get_by_role("button", name="sofa").wait_for()
     yield page
     page.close()
-    assert [text for text in said if not any(words in text for words in HARMLESS)] == []
-    assert [url for url in asked if not url.startswith((server[1], "data:", "blob:"))] == []
+    assert said == []
+    assert [url for url in asked if not url.startswith((server[1], f"blob:{server[1]}"))] == []
 
 
-def settled(place: api.Locator) -> np.ndarray:
-    """The pixels of a viewer, once its mesh has come and stays the same: int [H,W,3]."""
-    deadline, last = time.monotonic() + PATIENCE / 1000, None
-    while time.monotonic() < deadline:
-        pixels = np.asarray(Image.open(io.BytesIO(place.screenshot())).convert("RGB")).astype(int)
-        if last is not None and np.ptp(pixels[40:]) > 60 and np.array_equal(pixels, last):
-            return pixels
-        last = pixels
-        time.sleep(0.5)
-    raise AssertionError("no mesh is shown")
+def pixels(place: api.Locator) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(place.screenshot())).convert("RGB")).astype(int)
 
 
-def give(page: api.Page, path: Path) -> None:
-    page.locator("input[type=file]").first.set_input_files(path)
+def made(page: api.Page) -> np.ndarray:
+    """Wait for the meshes; the pixels of the picture with its outline."""
+    page.get_by_text("Drag the mesh to turn it").wait_for()
+    return pixels(page.locator("#picture"))
 
 
-def test_an_upload_becomes_meshes_that_turn_and_can_be_kept(page, tmp_path) -> None:
+@pytest.fixture
+def box(tmp_path) -> Path:
     colors = np.full((200, 300, 3), 200, np.uint8)
     colors[60:140, 80:220] = (40, 60, 120)
     Image.fromarray(colors).save(tmp_path / "box.png")
-    give(page, tmp_path / "box.png")
-    canvas = page.locator(".model3D canvas")
-    canvas.nth(1).wait_for()
+    return tmp_path / "box.png"
+
+
+def download(page: api.Page, name: str, folder: Path) -> Path:
+    with page.expect_download() as event:
+        page.get_by_role("button", name=name).first.click()
+    event.value.save_as(folder / event.value.suggested_filename)
+    return folder / event.value.suggested_filename
+
+
+def test_a_picture_becomes_meshes_that_turn_and_can_be_kept(page, box, tmp_path) -> None:
+    page.locator("#file").set_input_files(box)
+    seen = made(page)
+    assert (seen == (40, 60, 120)).all(axis=2).mean() > 0.1, "the picture is not tinted"
+    assert (seen == 255).all(axis=2).any(), "the outline"
+    canvas = page.locator(".view canvas")
     assert canvas.count() == 2, "one for each run"
-    before = settled(canvas.first)
-    box = canvas.first.bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    page.mouse.move(x, y)
+    before = pixels(canvas.first)
+    assert np.ptp(before) > 60
+    page.wait_for_timeout(4000)
+    assert (np.abs(pixels(canvas.first) - before).max(axis=2) > 20).mean() > 0.01, "it turns by itself"
+    area = canvas.first.bounding_box()
+    page.mouse.move(area["x"] + area["width"] / 2, area["y"] + area["height"] / 2)
     page.mouse.down()
-    page.mouse.move(x + 90, y + 30, steps=5)
-    page.mouse.up()
-    assert (np.abs(settled(canvas.first) - before).max(axis=2) > 20).mean() > 0.01
-    for kind in ("GLB", "OBJ"):
-        with page.expect_download() as download:
-            page.get_by_role("button", name=kind).first.click()
-        name = download.value.suggested_filename
-        assert name.startswith("box ") and name.endswith(f".{kind.lower()}")
-        download.value.save_as(tmp_path / name)
-        assert len(trimesh.load(tmp_path / name, force="mesh").faces) > 100
-    page.get_by_text("Correct the outline").click()
-    with page.expect_download() as download:
-        page.get_by_role("button", name="Save the cut-out").click()
-    download.value.save_as(tmp_path / "saved.png")
-    with Image.open(tmp_path / "saved.png") as image:
-        assert image.mode == "RGBA"
-        assert (np.asarray(image)[..., 3] > 0).sum() == pytest.approx(80 * 140, rel=0.05)
-
-
-def test_the_mask_is_corrected_with_the_brush(page) -> None:
-    page.get_by_role("button", name="table").first.click()
-    page.locator(".model3D canvas").first.wait_for()
-    first = settled(page.locator(".model3D canvas").first)
-
-    page.get_by_text("Correct the outline").click()
-    page.wait_for_timeout(4000)  # until the editor has loaded its layer
-    box = page.locator("canvas").first.bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    page.mouse.move(x, y - 90)
-    page.mouse.down()
-    page.mouse.move(x, y + 90, steps=8)
-    page.mouse.up()
-    deadline = time.monotonic() + PATIENCE / 1000
-    while np.array_equal(settled(page.locator(".model3D canvas").first), first):
-        assert time.monotonic() < deadline, "the mesh is not the one of the painted mask"
-        page.get_by_role("button", name="Make the mesh again").click()  # again while the mask is still on its way
-    page.get_by_role("button", name="Empty mask").click()
+    before = pixels(canvas.first)
+    page.mouse.move(area["x"] + area["width"] / 2 + 90, area["y"] + area["height"] / 2 + 30, steps=5)
     page.wait_for_timeout(1000)
-    page.get_by_role("button", name="Make the mesh again").click()
-    page.get_by_text("no object was found in the picture").wait_for()
+    assert (np.abs(pixels(canvas.first) - before).max(axis=2) > 20).mean() > 0.01, "it turns by hand"
+    page.mouse.up()
+    meshes = [trimesh.load(download(page, kind, tmp_path), force="mesh", process=False) for kind in ("GLB", "OBJ")]
+    assert np.allclose(meshes[0].vertices, meshes[1].vertices, atol=1e-4) and len(meshes[0].faces) > 100
+    (tmp_path / "kept").mkdir()
+    with Image.open(download(page, "Cut-out", tmp_path / "kept")) as image:
+        assert (np.asarray(image)[..., 3] > 0).mean() == pytest.approx(80 * 140 / (200 * 300), rel=0.05)
 
 
-def test_a_broken_picture_gets_a_sentence(page, tmp_path) -> None:
-    page.get_by_text("Correct the outline").click()
-    page.get_by_role("button", name="Make the mesh again").click()
-    page.get_by_text("Give a picture first").wait_for()
+def test_the_outline_is_corrected_by_brushes_and_a_box(page, box) -> None:
+    page.locator("#file").set_input_files(box)
+    first = made(page)
+    area = page.locator("#picture").bounding_box()
+
+    def drag(tool: str, *ends: tuple[float, float]) -> np.ndarray:
+        if page.get_by_role("button", name=tool, exact=True).get_attribute("aria-pressed") == "false":
+            page.get_by_role("button", name=tool, exact=True).click()
+        for step, (x, y) in enumerate(ends):
+            page.mouse.move(area["x"] + x * area["width"], area["y"] + y * area["height"], steps=6)
+            if not step:
+                page.mouse.down()
+        page.mouse.up()
+        return made(page)
+
+    added = drag("Add", (0.1, 0.1), (0.2, 0.1))
+    assert (added != first).any(axis=2)[: len(first) // 5].any(), "an outline around the stroke"
+    removed = drag("Remove", (0.05, 0.1), (0.25, 0.1))
+    assert np.abs(removed - first).mean() < np.abs(added - first).mean()
+    assert np.abs(drag("Box", (0.2, 0.2), (0.8, 0.8)) - first).mean() < 2
+
+
+def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(page, box, tmp_path) -> None:
     (tmp_path / "broken.png").write_bytes(b"no picture")
-    give(page, tmp_path / "broken.png")
-    page.get_by_text("broken.png: cannot be decoded as an image").wait_for()
+    page.locator("#file").set_input_files(tmp_path / "broken.png")
+    page.get_by_text("not a picture that your browser can open").wait_for()
     Image.fromarray(np.full((50, 50, 3), 90, np.uint8)).save(tmp_path / "grey.png")
-    give(page, tmp_path / "grey.png")
-    page.get_by_text("no object was found in the picture").wait_for()
+    page.locator("#file").set_input_files(tmp_path / "grey.png")
+    page.get_by_text("No object was found").wait_for()
+    content = base64.b64encode(box.read_bytes()).decode()
+    page.evaluate(
+        """text => { const data = new DataTransfer(), bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
+        data.items.add(new File([bytes], "box.png")); window.dispatchEvent(new DragEvent("drop", {dataTransfer: data,
+        cancelable: true})); }""",
+        content,
+    )
+    made(page)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -151,7 +156,7 @@ def test_an_interrupt_ends_it_while_the_page_is_open_and_busy(browser, server) -
     page = browser.new_page()
     page.goto(address)
     page.get_by_role("button", name="sofa").click()
-    page.locator(".model3D canvas").first.wait_for()
+    page.locator(".view canvas").first.wait_for(timeout=PATIENCE)
     page.get_by_role("button", name="chair").click()
     start = time.monotonic()
     process.send_signal(signal.SIGINT)
@@ -160,4 +165,3 @@ def test_an_interrupt_ends_it_while_the_page_is_open_and_busy(browser, server) -
     page.close()
     errors = (process.folder / "errors.txt").read_text()
     assert "Traceback" not in errors and "ERROR" not in errors, errors
-    assert not list(process.folder.glob("learn3d-demo-*")), "what visitors gave is gone"
