@@ -343,6 +343,49 @@ struct UVLevels {
   T* level;                // out [B, H, W]; 0 on background
 };
 
+// Meshes in clip space, as OpenGL has it, and which of their faces is nearest at each pixel. Row 0 is the bottom.
+template <class T>
+struct ClipMesh {
+  const T* positions;         // [B or 1, V, 4]: x, y, z, w
+  int64_t position_batch;     // 1 or B
+  int64_t num_vertices;       // V
+  const int64_t* faces;       // [F, 3]
+  int64_t num_faces;          // F
+  const int32_t* face_index;  // [B, H, W]
+  int64_t batch;
+  Size raster;
+  int num_threads;
+};
+
+// Barycentric weights and z / w (clip_space.cpp): (b_0, b_1, z / w, face + 1), and the derivatives of b_0 and b_1 by pixel
+// coordinates (db_0/dX, db_0/dY, db_1/dX, db_1/dY). 0 on background. z / w has no gradient.
+template <class T>
+struct ClipWeights {
+  ClipMesh<T> mesh;
+  T* rast;               // forward out [B, H, W, 4]
+  T* slopes;             // forward out [B, H, W, 4]
+  const T* grad_rast;    // backward in
+  const T* grad_slopes;  // backward in, or nullptr
+  T* grad_positions;     // backward out, like positions
+};
+
+// Pixels blended at silhouette edges (clip_space.cpp). Of two neighbours with different faces, the nearer one's face may
+// have a silhouette edge that crosses the line between their centres at a distance d from its own centre, in pixels. If
+// d > 1/2 the other pixel gets the share d - 1/2 of the nearer one's colour, else the nearer one 1/2 - d of the other's.
+template <class T>
+struct Antialias {
+  ClipMesh<T> mesh;
+  const T* rast;          // [B, H, W, 4] of ClipWeights
+  const int64_t* twins;   // [F, 3]: for the edge opposite to corner k of face f the next of the mesh with the same two
+                          // vertices, 3 f + k; cyclic
+  int64_t channels;       // C
+  const T* colors;        // [B, H, W, C]
+  T* blended;             // forward out [B, H, W, C]
+  const T* grad_blended;  // backward in
+  T* grad_colors;         // backward out, or nullptr
+  T* grad_positions;      // backward out, like positions; or nullptr
+};
+
 // Unit normals of meshes in world space (normals.cpp): n((v0 - v1) x (v2 - v1)) of faces, or of vertices the direction
 // of the sum of these products over the faces around them. 0 where there is no area. A vertex that is not finite, or
 // beyond 1e12, counts as the origin and gets no gradient.
@@ -493,6 +536,10 @@ template <class T> void mipmaps_backward(const Mipmaps<T>& args);
 template <class T> void sample_uv_forward(const SampleUV<T>& args);
 template <class T> void sample_uv_backward(const SampleUV<T>& args);
 template <class T> void uv_levels(const UVLevels<T>& args);
+template <class T> void clip_weights_forward(const ClipWeights<T>& args);
+template <class T> void clip_weights_backward(const ClipWeights<T>& args);
+template <class T> void antialias_forward(const Antialias<T>& args);
+template <class T> void antialias_backward(const Antialias<T>& args);
 template <class T> void normals_forward(const Normals<T>& args);
 template <class T> void normals_backward(const Normals<T>& args);
 template <class T> void lit_forward(const Lit<T>& args);

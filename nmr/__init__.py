@@ -13,6 +13,7 @@ render_transparent  meshes -> colour images of transparent surfaces
 render_fragments    meshes -> Fragments: face, weights and depth at each pixel, for shading of your own
 render_face_index   meshes -> which face is nearest at each pixel
 VertexColors, FaceColors, TextureCubes, UVTexture   colours of meshes; Colors: the interface for a class of your own
+sample_texture      the colours of an image at uv coordinates of your own
 Lights              ambient, directional and point lights, spherical harmonics; NormalMap: normals from an image
 LookAt, Look, Pinhole, Orthographic, Camera   cameras: world space -> renderer space; ``nmr.cameras`` converts them
 voxelize            meshes -> filled occupancy grids (kato18 or kato19, the published voxel IoU)
@@ -20,6 +21,7 @@ icosphere, edge_table, unique_edges, losses   a sphere to deform, its edges, los
 metrics             points on surfaces, Chamfer distance, F-score, IoU of grids
 face_normals, vertex_normals    unit normals, differentiable
 neural_renderer     the interface of neural_renderer_pytorch 1.1.3; import it explicitly
+nvdiffrast          the interface of nvdiffrast.torch; import it explicitly
 
 Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]`` with faces ``[F, 3]`` or
 ``[B, F, 3]``, or lists of ``[V_b, 3]`` and ``[F_b, 3]``. In renderer space x points right, y up, both in [-1, 1] across
@@ -46,7 +48,7 @@ from .render import (
     render_silhouette,
     render_soft_silhouette,
 )
-from .textures import Colors, FaceColors, NormalMap, TextureCubes, UVTexture, VertexColors
+from .textures import Colors, FaceColors, NormalMap, TextureCubes, UVTexture, VertexColors, sample_texture
 from .voxels import voxelize
 
 __version__ = "0.1.0"
@@ -82,6 +84,7 @@ __all__ = [
     "render_soft_rgb",
     "render_soft_silhouette",
     "render_transparent",
+    "sample_texture",
     "unique_edges",
     "vertex_normals",
     "voxelize",

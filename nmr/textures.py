@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from . import ops
@@ -21,7 +22,7 @@ from .mesh import _unit
 if TYPE_CHECKING:
     from .fragments import Fragments
 
-__all__ = ["Colors", "FaceColors", "NormalMap", "TextureCubes", "UVTexture", "VertexColors"]
+__all__ = ["Colors", "FaceColors", "NormalMap", "TextureCubes", "UVTexture", "VertexColors", "sample_texture"]
 
 
 class Colors(Protocol):
@@ -242,18 +243,92 @@ class UVTexture:
             raise ValueError(f"image must be one for all {batch} images drawn, or one for each, got {len(image)}")
         sizes = [tuple(part.shape[:2]) for part in image]
         levels = max([1, *(max(size).bit_length() for size in sizes)]) if self.filter == "mipmap" else 1
-        grids, first = [], 0
-        for height, width in sizes:
-            for _ in range(levels):
-                grids.append((first, height, width))
-                first += height * width
-                height, width = max(height // 2, 1), max(width // 2, 1)
+        grids, count = level_grids(sizes, levels)
         if isinstance(image, Tensor):
             texels = image.reshape(-1, image.shape[-1])
         else:
             texels = torch.cat([part.reshape(-1, part.shape[-1]) for part in image])
-        grids = torch.tensor(grids, dtype=torch.int64, device="cpu").view(len(sizes), levels, 3)
-        return texels.to(fragments.weights), grids, first
+        return texels.to(fragments.weights), grids, count
+
+
+def sample_texture(
+    image: Tensor,
+    uv: Tensor,
+    derivatives: Tensor | None = None,
+    wrap: Literal["repeat", "clamp", "mirror"] = "repeat",
+) -> Tensor:
+    """Colours of a texture image at uv coordinates of your own.
+
+    Parameters
+    ----------
+    image : float Tensor [h, w, C] or [B, h, w, C]
+        Row 0 is the top; any number of channels. Differentiable.
+    uv : float Tensor [B, H, W, 2]
+        (0, 0) is the bottom left corner of the image, (1, 1) its top right one. Differentiable. Coordinates that are
+        not finite, or larger than 1e6, count as 0.
+    derivatives : float Tensor [B, H, W, 4], optional
+        (du/dX, du/dY, dv/dX, dv/dY) per pixel: colours then come from mipmaps, as those of :class:`UVTexture` with
+        ``filter="mipmap"``. Without gradient. By default, colours are bilinear.
+    wrap : "repeat", "clamp" or "mirror"
+        How the image continues outside [0, 1].
+
+    Returns
+    -------
+    Tensor [B, H, W, C]
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes.
+
+    Examples
+    --------
+    >>> nmr.sample_texture(torch.rand(16, 32, 3), torch.rand(1, 8, 8, 2)).shape
+    torch.Size([1, 8, 8, 3])
+    """
+    image = check_values(image, "image", "h, w, C")
+    if is_list(image) or 0 in image.shape[1:]:
+        raise ValueError(f"image must be a tensor [h, w, C] or [B, h, w, C] with texels, got {describe(image)}")
+    for values, name, channels in ((uv, "uv", 2), (derivatives, "derivatives", 4)):
+        if values is None and name == "derivatives":
+            continue
+        if not isinstance(values, Tensor) or not values.is_floating_point():
+            raise TypeError(f"{name} must be a float tensor [B, H, W, {channels}], got {describe(values)}")
+        if values.ndim != 4 or values.shape[:3] != uv.shape[:3] or values.shape[3] != channels:
+            raise ValueError(f"{name} must have shape [B, H, W, {channels}], got {describe(values)}")
+    if len(image) not in (1, len(uv)):
+        raise ValueError(f"image must be one for all {len(uv)} images drawn, or one for each, got {len(image)}")
+    check_choice(wrap, "wrap", ops.WRAPS)
+    height, width = image.shape[1:3]
+    levels = 1 if derivatives is None else max(height, width).bit_length()
+    grids, count = level_grids([(height, width)] * len(image), levels)
+    texels, level = image.reshape(-1, image.shape[-1]), None
+    if derivatives is not None:
+        texels = ops.mipmaps(texels, grids, count)
+        steps = derivatives.detach().to(image).unflatten(-1, (2, 2)) * image.new_tensor([[width], [height]])
+        level = steps.square().sum(-2).amax(-1).clamp(min=1).log2() / 2
+        level = level.nan_to_num(0).clamp(max=levels - 1)
+    return sample_places(texels, grids, level, uv.to(image), wrap)
+
+
+def level_grids(sizes: list[tuple[int, int]], levels: int) -> tuple[Tensor, int]:
+    """Where the levels of images (height, width) lie, as :mod:`nmr.ops` has them, and the number of their texels."""
+    grids, first = [], 0
+    for height, width in sizes:
+        for _ in range(levels):
+            grids.append((first, height, width))
+            first += height * width
+            height, width = max(height // 2, 1), max(width // 2, 1)
+    return torch.tensor(grids, dtype=torch.int64, device="cpu").view(len(sizes), levels, 3), first
+
+
+def sample_places(texels: Tensor, grids: Tensor, level: Tensor | None, uv: Tensor, wrap: str) -> Tensor:
+    """Colours ``[B, H, W, C]`` of checked textures at ``uv [B, H, W, 2]``."""
+    # One face with uv (1, 0), (0, 1) and (0, 0) at its corners: its weights are the coordinates.
+    corners = torch.eye(3, 2, dtype=uv.dtype, device=uv.device).unsqueeze(0)
+    face_index = torch.zeros(uv.shape[:3], dtype=torch.int32, device=uv.device)
+    at = corners, torch.arange(3, device=uv.device).unsqueeze(0), face_index, F.pad(uv, (0, 1)), None
+    return ops.sample_uv(texels, grids, level, *at, ops.WRAPS.index(wrap))
 
 
 class NormalMap(UVTexture):

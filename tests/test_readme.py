@@ -70,6 +70,9 @@ def test_from_nvdiffrast_draws_the_same_picture_three_ways():
     assert image.shape == (1, 256, 256, 3) and 0.1 < (image != 1).any(-1).float().mean() < 0.9
     torch.testing.assert_close(names["same"], image, atol=0, rtol=0)
     assert (names["also"] - image).abs().max(-1).values.gt(1e-3).float().mean() < 1e-3
+    assert names["dr"].__name__ == "nmr.nvdiffrast.torch" and names["pos"].grad.abs().sum() > 0
+    assert names["drawn"][0, 30, 30].argmax() == 0 and names["drawn"][0, 200, 30].argmax() == 2  # row 0 is the bottom
+    assert names["zeros"].device.type == "cpu"
 
 
 def test_from_neural_renderer_maps_of_forks():

@@ -165,6 +165,7 @@ void bind_fragments(py::module_& m);
 void bind_edges(py::module_& m);
 void bind_shade(py::module_& m);
 void bind_texture(py::module_& m);
+void bind_clip_space(py::module_& m);
 void bind_lights(py::module_& m);
 void bind_mesh(py::module_& m);
 

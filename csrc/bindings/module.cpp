@@ -14,6 +14,7 @@ PYBIND11_MODULE(_C, m) {
   nmr::bind_edges(m);
   nmr::bind_shade(m);
   nmr::bind_texture(m);
+  nmr::bind_clip_space(m);
   nmr::bind_lights(m);
   nmr::bind_mesh(m);
 }

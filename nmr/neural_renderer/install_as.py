@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-
-_HERE = __package__  # "nmr.neural_renderer"
+from nmr._drop_in import alias_package
 
 
 def install_as(name: str = "neural_renderer", *, replace: bool = False) -> None:
@@ -33,26 +30,4 @@ def install_as(name: str = "neural_renderer", *, replace: bool = False) -> None:
     >>> nr.install_as()
     >>> from neural_renderer.projection import projection
     """
-    if not isinstance(name, str) or not all(part.isidentifier() for part in name.split(".")):
-        raise ValueError(f"name must be one of a module, like 'neural_renderer', got {name!r}")
-    here = sys.modules[_HERE]
-    if sys.modules.get(name) is not here:
-        if not replace and (found := _find(name)):
-            raise ImportError(
-                f"there is another package {name}, {found}; uninstall it (pip uninstall neural_renderer_pytorch), or "
-                "call install_as(replace=True)"
-            )
-        for module in [key for key in sys.modules if key == name or key.startswith(f"{name}.")]:
-            del sys.modules[module]
-    # With the modules, too: an import of one would otherwise read its file a second time, as part of another package.
-    for key, module in list(sys.modules.items()):
-        if key == _HERE or key.startswith(f"{_HERE}."):
-            sys.modules[name + key.removeprefix(_HERE)] = module
-
-
-def _find(name: str) -> str | None:
-    """Where a module of that name lies, if there is one."""
-    if name in sys.modules:
-        return f"already imported from {getattr(sys.modules[name], '__file__', None) or 'an unknown place'}"
-    spec = importlib.util.find_spec(name)
-    return None if spec is None else spec.origin or ", ".join(spec.submodule_search_locations)
+    alias_package(__package__, name, replace, "neural_renderer", "pip uninstall neural_renderer_pytorch")

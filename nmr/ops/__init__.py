@@ -14,6 +14,7 @@ face index map is int32:
 
 from .camera import pose, pose_backward, project, project_backward
 from .clip import clip_count, clip_faces
+from .clip_space import antialias, antialias_backward, clip_weights, clip_weights_backward
 from .edges import edges_backward, resolve, resolve_backward
 from .fragments import depth_backward, depth_image, fragments, fragments_backward
 from .lights import lit, lit_backward, normals, normals_backward, viewer_of
@@ -32,8 +33,12 @@ from .texture import WRAPS, mipmaps, mipmaps_backward, sample_uv, sample_uv_back
 
 __all__ = [
     "WRAPS",
+    "antialias",
+    "antialias_backward",
     "clip_count",
     "clip_faces",
+    "clip_weights",
+    "clip_weights_backward",
     "depth_backward",
     "depth_image",
     "edges_backward",

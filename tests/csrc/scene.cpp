@@ -65,6 +65,7 @@ struct Run {
     fragments();
     shading();
     texture_images();
+    clip_space();
     lights();
     edges();
     camera();
@@ -188,6 +189,35 @@ struct Run {
                              out("grad_sampled_texels", count * C)};
     sample_uv_forward(sample);
     sample_uv_backward(sample);
+  }
+
+  // The same faces in clip space, image by image, and colours blended at their silhouettes.
+  void clip_space() {
+    T *rast = out("rast", 4 * pixels), *slopes = out("slopes", 4 * pixels), *blended = out("blended", pixels * C);
+    T *grad_clip = out("grad_clip", 4 * rows), *grad_blended_positions = out("grad_blended_positions", 4 * rows);
+    T* grad_blended_colors = out("grad_blended_colors", pixels * C);
+    const T *colors = in("unblended", pixels * C), *grad_rast = in("grad_rast", 4 * pixels);
+    const T *grad_slopes = in_if(!s.no_grad_depth, "grad_slopes", 4 * pixels), *grad = in("grad_blended", pixels * C);
+    std::vector<T>& positions = r.inputs.resize("positions", 4 * rows);
+    for (int64_t n = 0; n < rows; ++n) {
+      const T *v = mesh.vertices + 3 * n, w = s.perspective ? v[2] : T(1), position[] = {v[0] * w, v[1] * w, v[2], w};
+      std::copy_n(position, 4, positions.data() + 4 * n);
+    }
+    for (int64_t b = 0; b < s.batch; ++b) {
+      const int64_t first = b * raster.pixels(), vertex = mesh.vertex_start(b), edges = 3 * mesh.face_count(b);
+      std::vector<int64_t>& twins = r.tables.resize("twins", edges);  // of other edges, too: any in range is allowed
+      for (int64_t n = 0; n < edges; ++n) twins[n] = n % 3 ? n : (5 * n + seed) % edges;
+      const ClipMesh<T> clip{positions.data() + 4 * vertex, 1, mesh.vertex_count(b), mesh.image_faces(b),
+                             mesh.face_count(b), face_index + first, 1, raster, threads};
+      const ClipWeights<T> args{clip, rast + 4 * first, slopes + 4 * first, grad_rast + 4 * first,
+                                grad_slopes ? grad_slopes + 4 * first : nullptr, grad_clip + 4 * vertex};
+      clip_weights_forward(args);
+      clip_weights_backward(args);
+      const Antialias<T> blend{clip, rast + 4 * first, twins.data(), C, colors + C * first, blended + C * first,
+                               grad + C * first, grad_blended_colors + C * first, grad_blended_positions + 4 * vertex};
+      antialias_forward(blend);
+      antialias_backward(blend);
+    }
   }
 
   // Up to two directional and two point lights, shared or one set for each image, with or without highlights; or the
@@ -521,7 +551,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   for (size_t n = 0; n < depth.size(); ++n) {
     if (face_index[n] < 0) {
       check(depth[n] == scene.far, "the background's depth is far");
-      for (const char* name : {"weights", "values", "colors", "sampled", "lit"}) background_is_0(name, n);
+      for (const char* name : {"weights", "values", "colors", "sampled", "lit", "rast", "slopes"}) background_is_0(name, n);
     } else if (tame) {
       const T* w = weights.data() + 3 * n;
       check(std::abs(w[0] + w[1] + w[2] - 1) <= T(1e-4), "the weights of a covered pixel sum to 1");

@@ -9,6 +9,7 @@ import torch
 
 import nmr
 import nmr.neural_renderer as nr
+import nmr.nvdiffrast.torch as dr
 
 
 class _Checker(doctest.OutputChecker):
@@ -31,7 +32,7 @@ EXAMPLES = list(_examples())
 def test_example(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     vertices, faces = nmr.icosphere(1)
-    example.globs.update(torch=torch, nmr=nmr, nr=nr)
+    example.globs.update(torch=torch, nmr=nmr, nr=nr, dr=dr)
     if "neural_renderer" in example.name:
         textures = torch.rand(1, len(faces), 4, 4, 4, 3)
         if "load_obj" in example.name:
