@@ -1,9 +1,13 @@
 // The parallel loop, and the choice of instruction set.
 #pragma once
 
+#include <algorithm>
+#include <atomic>
+#include <chrono>
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
+#include <ctime>
 #include <exception>
 
 #include "scratch.h"
@@ -51,37 +55,84 @@ inline int cpu_level() {
 #endif
 }
 
-// Calls body(i) for i in [0, count), each i on one thread. Iterations must be independent, so that the result does not
-// depend on num_threads. An exception (std::bad_alloc) reaches the caller after all threads have stopped.
+// Decides whether loops use several threads. A loop ends when its last thread has ended, and a thread that has no core,
+// because other programs use them, may need many times as long as the whole loop. A caller that waited in vain
+// therefore works alone for 50 times as long as it waited, so that no more than a fiftieth of the time is lost.
+class Company {
+ public:
+  static Company& shared() {
+    static Company company;
+    return company;
+  }
+
+  static int64_t now() {  // nanoseconds
+    const auto time = std::chrono::steady_clock::now().time_since_epoch();
+    return std::chrono::duration_cast<std::chrono::nanoseconds>(time).count();
+  }
+  // Time for which this thread has had a core; just the time if the system does not tell.
+  static int64_t on_core() {
+#if defined(CLOCK_THREAD_CPUTIME_ID)
+    timespec time;
+    if (clock_gettime(CLOCK_THREAD_CPUTIME_ID, &time) == 0) return time.tv_sec * INT64_C(1000000000) + time.tv_nsec;
+#endif
+    return now();
+  }
+
+  bool wanted() const { return now() >= alone_until_.load(std::memory_order_relaxed); }
+
+  // A caller had nothing left to do at `finished`. worked and stopped: the longest times for which another thread was
+  // at work with and without a core.
+  void judge(int64_t finished, int64_t worked, int64_t stopped) {
+    const int64_t time = now(), waited = time - finished;
+    if (waited < kPatience || (waited < worked + kPatience && stopped < waited / 2)) return;
+    alone_until_.store(time + 50 * waited, std::memory_order_relaxed);
+  }
+
+ private:
+  static constexpr int64_t kPatience = 100000;  // nanoseconds
+  std::atomic<int64_t> alone_until_{0};
+};
+
+// Calls body(i) for i in [0, count), each i on one thread, on up to num_threads threads. Iterations must be independent,
+// so that the result does not depend on the number of threads. An exception (std::bad_alloc) reaches the caller after
+// all threads have stopped.
 template <class Body>
 void parallel_for(int64_t count, int num_threads, const Body& body) {
   const int threads = static_cast<int>(count < num_threads ? count : num_threads);
   const ScratchUse caller;
-  if (threads <= 1) {
+  if (threads <= 1 || !Company::shared().wanted()) {
     for (int64_t i = 0; i < count; ++i) body(i);
     return;
   }
   std::exception_ptr failure;
   ThreadScratch& mine = ThreadScratch::mine();
   int64_t grown = 0;  // scratch that other threads reserved; it may belong to this one (sum_blocks)
+  int64_t finished = 0, worked = 0, stopped = 0;
 #pragma omp parallel num_threads(threads)
   {
     ThreadScratch& scratch = ThreadScratch::mine();
     const ScratchUse use;
-    const int64_t before = scratch.grown();
+    const int64_t before = scratch.grown(), start = Company::now(), start_on_core = Company::on_core();
 #pragma omp for schedule(dynamic, 1) nowait
     for (int64_t i = 0; i < count; ++i) {
       try {
         body(i);
       } catch (...) {
-#pragma omp critical(nmr_failure)
+#pragma omp critical(nmr_thread)
         if (!failure) failure = std::current_exception();
       }
     }
-    const int64_t reserved = &scratch == &mine ? 0 : scratch.grown() - before;
-#pragma omp atomic
-    grown += reserved;
+    const int64_t end = Company::now(), with_core = Company::on_core() - start_on_core;
+#pragma omp critical(nmr_thread)
+    if (&scratch == &mine) {
+      finished = end;
+    } else {
+      grown += scratch.grown() - before;
+      worked = std::max(worked, with_core);
+      stopped = std::max(stopped, end - start - with_core);
+    }
   }
+  Company::shared().judge(finished, worked, stopped);
   mine.count(grown);
   if (failure) std::rethrow_exception(failure);
 }

@@ -453,8 +453,8 @@ struct Resolve {
   int num_threads;
 };
 
-// NMR's gradient of an image with any channels (edges.cpp): pixels pull every visible edge whose motion over them
-// lowers the loss.
+// The gradient of the edges in an image with any channels: NMR's (edges.cpp), in which pixels pull every visible edge
+// whose motion over them lowers the loss, or the local one (local_gradient.cpp).
 template <class T>
 struct EdgesBackward {
   MeshBatch<T> mesh;
@@ -469,6 +469,7 @@ struct EdgesBackward {
   const T* grad_resolved;   // [B, h, w, C]
   T* grad_vertices;         // out, like mesh.vertices; z gets 0
   int num_threads;
+  bool perspective;         // of the cameras; only the local gradient reads it
 };
 
 // Occupancy grids (voxelize.cpp).
@@ -518,6 +519,7 @@ template <class T> void rasterize_layers(const RasterizeLayers<T>& args);
 template <class T> void silhouette_forward(const SilhouetteForward<T>& args);
 template <class T> void silhouette_backward(const SilhouetteBackward<T>& args);
 template <class T> void local_gradient(const SilhouetteBackward<T>& args);
+template <class T> void local_edges_backward(const EdgesBackward<T>& args);
 template <class T> void soft_forward(const SoftForward<T>& args);
 template <class T> void soft_backward(const SoftBackward<T>& args);
 template <class T> void soft_layers(const SoftLayers<T>& args);

@@ -43,6 +43,11 @@ PICTURES = {
     "views.png": Picture(
         "python docs/examples/draw_views.py --output {folder}", "{folder}/views.png", ("docs/examples/draw_views.py",)
     ),
+    "gradients.png": Picture(
+        "python docs/examples/draw_gradients.py --output {folder}",
+        "{folder}/gradients.png",
+        ("docs/examples/draw_gradients.py",),
+    ),
     "fitting.gif": Picture(
         "python docs/examples/draw_fitting.py --output {folder}",
         "{folder}/fitting.gif",

@@ -61,8 +61,10 @@ class Scene(NamedTuple):
         settings = self.settings
         return ops.rasterize_layers(*self.drawn[:3], *settings.raster, layers, *settings[3:6], settings.perspective)
 
-    def silhouette(self, local: bool) -> tuple[Tensor, Tensor]:
-        return ops.silhouette(*self.drawn[:3], *self.settings, local)
+    def silhouette(self, gradient: str) -> tuple[Tensor, Tensor]:
+        vertices, faces, starts = self.drawn[:3]
+        vertices = vertices.detach() if gradient == "none" else vertices
+        return ops.silhouette(vertices, faces, starts, *self.settings, gradient == "local")
 
     def soft_silhouette(self, sigma: Tensor, dist_eps: float) -> Tensor:
         settings, reach = self.settings, math.log(1 / dist_eps - 1)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32, torch.uint64)
 _FLOATS = (torch.float32, torch.float64)
+GRADIENTS = ("nmr", "local", "none")  # of edges
 
 
 def describe(value: object) -> str:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from . import ops
 from ._packing import MeshBatch
-from ._validate import as_floats, cast_under_autocast, check_choice, check_values, describe
-from .cameras.projection import ProjectingCamera
+from ._validate import GRADIENTS, as_floats, cast_under_autocast, check_choice, check_values, describe
+from .cameras.projection import ProjectingCamera, has_perspective
 from .mesh import _unit
 
 if TYPE_CHECKING:
@@ -253,18 +253,20 @@ class Fragments:
         side = -1.0 if getattr(self.camera, "right_handed", False) else 1.0
         return torch.cat([eye, eye.new_tensor([1.0, side]).expand(batch, 2)], dim=1)
 
-    def resolve(self, image: Tensor) -> Tensor:
-        """The image ``[B, h, w, C]`` of a shaded raster ``[B, H, W, C]``, with NMR's gradient.
+    def resolve(self, image: Tensor, gradient: str = "nmr") -> Tensor:
+        """The image ``[B, h, w, C]`` of a shaded raster ``[B, H, W, C]``, with NMR's gradient or another one.
 
         The mean of 2x2 pixels with anti-aliasing, else the image itself. The gradient goes back to the raster and, by
         NMR's definition, to x and y of the vertices: every visible edge is pulled by those pixels whose loss would fall
-        if the edge moved over them. The change of the loss is summed over all C channels. No second derivative.
+        if the edge moved over them. The change of the loss is summed over all C channels. With ``gradient="local"`` or
+        ``"none"``: as in :func:`nmr.render`. No second derivative.
 
         Raises
         ------
         TypeError, ValueError
-            If image is not a float tensor [B, H, W, C] of the dtype of the vertices.
+            If image is not a float tensor [B, H, W, C] of the dtype of the vertices, or for another gradient.
         """
+        check_choice(gradient, "gradient", GRADIENTS)
         image = cast_under_autocast(image)
         if self.layers or self._drawn_face_index is None:
             raise ValueError(
@@ -277,11 +279,14 @@ class Fragments:
             )
         if image.ndim != 4 or image.shape[:3] != self.sided_face_index.shape:
             raise ValueError(f"image must have shape {[*self.sided_face_index.shape, 'C']}, got {describe(image)}")
-        return self._resolve(image, None)
+        return self._resolve(image, None, gradient)
 
-    def _resolve(self, image: Tensor, background: Tensor | None) -> Tensor:
+    def _resolve(self, image: Tensor, background: Tensor | None, gradient: str) -> Tensor:
         """The same; pixels without a face have the colour ``background [B | 1, C]``, if it is given."""
-        return ops.resolve(image, background, *self._drawn[:3], self._drawn_face_index, self.anti_aliasing, self.eps)
+        vertices, faces, starts = self._drawn[:3]
+        vertices = vertices.detach() if gradient == "none" else vertices
+        edges = self.anti_aliasing, self.eps, gradient == "local", has_perspective(self.camera)
+        return ops.resolve(image, background, vertices, faces, starts, self._drawn_face_index, *edges)
 
 
 def _image_axes(intrinsics: Tensor) -> Tensor:

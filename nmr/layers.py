@@ -186,7 +186,7 @@ def render_transparent(
     before = torch.cat([torch.ones_like(clear[..., :1]), clear[..., :-1]], dim=-1)
     image = torch.where(fragments.covered.unsqueeze(-1), image, image.new_zeros(()))
     rgb = ((before * opacity).unsqueeze(-1) * image).sum(-2) + clear[..., -1:] * behind[:, None, None]
-    both = fragments.layer(0)._resolve(torch.cat([rgb, 1 - clear[..., -1:]], dim=-1), None)
+    both = fragments.layer(0)._resolve(torch.cat([rgb, 1 - clear[..., -1:]], dim=-1), None, "nmr")
     return Images({"rgb": both[..., :-1], "alpha": both[..., -1]})
 
 

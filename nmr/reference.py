@@ -230,31 +230,72 @@ def _height(a: Tensor, b: Tensor, n: int) -> float:
 
 
 def local_gradient(
-    vertices: Tensor, faces: Tensor, index: Tensor, grad_alpha: Tensor, anti_aliasing: bool, eps: float = 1e-4
+    vertices: Tensor,
+    faces: Tensor,
+    index: Tensor,
+    grad: Tensor,
+    anti_aliasing: bool,
+    eps: float = 1e-4,
+    image: Tensor | None = None,
+    perspective: bool = True,
 ) -> Tensor:
-    """The silhouette's local gradient ``[V, 3]`` of one image, of Kato and Harada 2019 (:func:`nmr.render_silhouette`).
+    """The local gradient ``[V, 3]`` of one image, of Kato and Harada 2019 (:func:`nmr.render`).
 
-    From the index map ``[H, W]``, row 0 = bottom, and the gradient ``[h, w]`` of alpha, row 0 = top.
+    From the index map ``[H, W]``, row 0 = bottom, and the gradient ``[h, w]`` of alpha, row 0 = top. With colours
+    ``image`` ``[H, W, C]``, row 0 = bottom, their gradient is ``[h, w, C]``.
     """
-    coverage = (index >= 0).to(vertices)
-    grad = _raster_gradient(grad_alpha, anti_aliasing)
-    at_pixels = torch.zeros(*index.shape, 3, dtype=vertices.dtype)
-    at_pixels[..., 0] = _one_pixel_moves(coverage, grad, eps)
-    at_pixels[..., 1] = _one_pixel_moves(coverage.T, grad.T, eps).T
+    corners = vertices[with_back_faces(faces, True)[index.clamp_min(0)]]
+    pulls = [
+        _one_pixel_moves(x, grad, ends, eps)
+        for x, grad, ends in _along_both_axes(index, corners, grad, anti_aliasing, image, perspective)
+    ]
+    at_pixels = torch.stack([pulls[0], pulls[1].T, torch.zeros_like(pulls[0])], dim=-1)
     drawn = index >= 0
-    corners = with_back_faces(faces, True)[index[drawn]]
-    weights = _screen_weights(vertices[with_back_faces(faces, True)[index.clamp_min(0)]])[drawn]
-    shares = weights[:, :, None] * at_pixels[drawn][:, None, :]
-    return torch.zeros_like(vertices).index_add(0, corners.flatten(), shares.flatten(0, 1))
+    shares = _screen_weights(corners)[drawn][:, :, None] * at_pixels[drawn][:, None, :]
+    vertex = with_back_faces(faces, True)[index[drawn]]
+    return torch.zeros_like(vertices).index_add(0, vertex.flatten(), shares.flatten(0, 1))
 
 
-def _one_pixel_moves(image: Tensor, grad: Tensor, eps: float) -> Tensor:
+def _along_both_axes(index, corners, grad, anti_aliasing, image, perspective):
+    """Image, gradient and ends of surfaces along the rows, and the same of the transposed raster."""
+    H, W = index.shape
+    x, y = torch.meshgrid((2 * torch.arange(W) + 1 - W) / W, (2 * torch.arange(H) + 1 - H) / H, indexing="xy")
+    points = torch.stack([x, y, torch.ones_like(x)], dim=-1).double()
+    grad = _raster_gradient(grad, anti_aliasing)
+    if image is None:
+        image, grad = (index >= 0).to(grad)[..., None], grad[..., None]
+        corners = torch.zeros_like(corners)  # all faces are one surface
+    for t in (lambda x: x, lambda x: x.transpose(0, 1)):
+        yield t(image), t(grad), _ends(t(index), t(corners).double(), t(points), perspective)
+
+
+def _ends(index: Tensor, corners: Tensor, points: Tensor, perspective: bool) -> tuple[Tensor, Tensor]:
+    """Whether the surface in a pixel ends before its right neighbour ``[H, W - 1]``, and that in the right one."""
+    planes = torch.linalg.pinv(torch.cat([corners[..., :2], torch.ones_like(corners[..., :1])], dim=-1))
+    z = corners[..., 2:]
+    planes = (planes @ (1 / z if perspective else -z)).squeeze(-1)  # nearness = planes . (x, y, 1)
+    left, right = (slice(None), slice(None, -1)), (slice(None), slice(1, None))
+    one_surface = (corners[left][:, :, :, None] == corners[right][:, :, None]).all(-1).any(-1).any(-1)
+    ends = []
+    for own, other in ((left, right), (right, left)):
+        nearer = [
+            (planes[own] * points[at]).sum(-1) - (planes[other] * points[at]).sum(-1)
+            > 1e-4 * (planes[own] * points[at]).sum(-1).abs()
+            for at in (own, other)
+        ]
+        behind = (index[other] < 0) | (nearer[0] & nearer[1] & ~one_surface)
+        ends.append((index[own] >= 0) & behind)
+    return ends[0], ends[1]
+
+
+def _one_pixel_moves(image: Tensor, grad: Tensor, ends: tuple[Tensor, Tensor], eps: float) -> Tensor:
     """d loss / d (coordinate along the rows) of the point seen in each pixel, ``[H, W]``."""
     per_pixel = image.shape[1] / 2
     step = image[:, 1:] - image[:, :-1]
-    right, left = step * grad[:, 1:] * per_pixel, -step * grad[:, :-1] * per_pixel  # the image moves by a pixel
-    none = torch.zeros_like(image[:, :1])
-    right, left = (torch.cat([none, x], 1) + torch.cat([x, none], 1) for x in (right, left))  # of both pairs
+    right, left = (step * grad[:, 1:]).sum(-1) * per_pixel, -(step * grad[:, :-1]).sum(-1) * per_pixel
+    none = torch.zeros_like(image[:, :1, 0])
+    # of both pairs of a pixel
+    right, left = (torch.cat([none, x * ends[1]], 1) + torch.cat([x * ends[0], none], 1) for x in (right, left))
     moves = torch.where(right > left, -right, left)
     still = (torch.maximum(right, left) <= 0) | ((right - left).abs() < eps)
     return torch.where(still, torch.zeros_like(moves), moves)

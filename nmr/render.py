@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ._packing import is_list
 from ._scene import Meshes, average, background_rows, make_scene, shade
-from ._validate import as_positive, check_choice, check_number, check_size
+from ._validate import GRADIENTS, as_positive, check_choice, check_number, check_size
 from .cameras import Camera
 from .fragments import Fragments
 from .images import OUTPUTS, Images
@@ -42,7 +42,7 @@ def render(
     Parameters
     ----------
     vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps, gradient
-        As :func:`render_silhouette`. The gradient "local" is that of alpha and of white meshes; colours have none.
+        As :func:`render_silhouette`; the notes say what the gradients of edges are for colours.
     outputs : sequence of "rgb", "alpha", "depth", "normals", "fragments"
         What to draw. These are also the names of the attributes of the result.
     colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
@@ -71,11 +71,20 @@ def render(
     over all their channels, as the published renderer does); depth and normals have their true derivatives at fixed
     coverage. Colours, background and the parameters of lights have true derivatives. There are no second derivatives.
 
+    NMR's gradient follows whole lines of the image at every edge of every face. ``gradient="local"`` reaches one pixel
+    and is many times as fast for large meshes and images. It is the definition in :func:`render_silhouette` with
+    products of I and g summed over channels, and it applies to depth and normals, too, beside their true derivatives
+    (their background is ``far`` and 0). A surface ends before the background, and before another surface behind it: a
+    face that has no corner in common with it (by place, so that seams are no ends), and whose plane is farther away at
+    the centres of both pixels, by more than 1e-4 of the depth. Edges on one surface have no gradient then; for
+    textures add ``interpolation_gradient=True``. ``gradient="none"`` leaves all of this out, for example to fit depth
+    or colours alone. The images are the same (depth and normals up to rounding).
+    ``docs/examples/draw_gradients.py`` draws the three.
+
     Raises
     ------
     TypeError, ValueError
-        As :func:`render_silhouette`; for unknown outputs; for colours, lights and backgrounds that do not fit; for the
-        gradient "local" of colours.
+        As :func:`render_silhouette`; for unknown outputs; for colours, lights and backgrounds that do not fit.
 
     Examples
     --------
@@ -86,20 +95,15 @@ def render(
     listed = is_list(outputs) and all(name in OUTPUTS for name in outputs)
     if not listed or not outputs or len(set(outputs)) != len(outputs):
         raise ValueError(f"outputs must be a tuple of one or more different names out of {OUTPUTS}, got {outputs!r}")
-    check_choice(gradient, "gradient", ("nmr", "local"))
+    check_choice(gradient, "gradient", GRADIENTS)
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
     images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the requested order
     white = "rgb" in images and colors is None and lights is None
     if white:
         behind = background_rows(background, 3, scene.mesh.batch, scene.mesh.vertices)
         white = not behind.requires_grad and _finite(behind)  # rgb then follows from alpha
-    if gradient == "local" and "rgb" in images and not white:
-        raise ValueError(
-            "gradient 'local' is that of silhouettes and of white meshes on a finite background without gradient; draw "
-            "other rgb images with gradient 'nmr'"
-        )
     if white or ("alpha" in images and "rgb" not in images):
-        alpha, face_index = scene.silhouette(gradient == "local")
+        alpha, face_index = scene.silhouette(gradient)
         if "alpha" in images:
             images["alpha"] = alpha
         if white:
@@ -107,22 +111,28 @@ def render(
             images["rgb"] = covered + (1 - covered) * behind[:, None, None]
     else:
         face_index = scene.rasterize()
-    if "depth" in images:
+    local = gradient == "local" and ("depth" in images or "normals" in images)
+    if "depth" in images and not local:
         images["depth"] = scene.depth(face_index)
     shaded = "rgb" in images and not white
-    if shaded or "normals" in images or "fragments" in images:
+    if shaded or local or "normals" in images or "fragments" in images:
         fragments = scene.fragments(face_index)
         if shaded:
             image, behind = shade(fragments, colors, lights, background, interpolation_gradient)
             if "alpha" in images:
                 image = torch.cat([image, image.new_ones(1).expand(*image.shape[:3], 1)], dim=-1)
                 behind = torch.cat([behind, behind.new_zeros(len(behind), 1)], dim=-1)
-            image = fragments._resolve(image, behind)
+            image = fragments._resolve(image, behind, gradient)
             if "alpha" in images:
                 image, images["alpha"] = image[..., :-1], image[..., -1]
             images["rgb"] = image
+        if "depth" in images and local:
+            images["depth"] = fragments._resolve(fragments.depth.unsqueeze(-1), None, gradient).squeeze(-1)
         if "normals" in images:
-            images["normals"] = average(fragments.normals(smooth_normals), anti_aliasing)
+            normals = fragments.normals(smooth_normals)
+            images["normals"] = (
+                fragments._resolve(normals, None, gradient) if local else average(normals, anti_aliasing)
+            )
         if "fragments" in images:
             images["fragments"] = fragments
     return Images(images)
@@ -153,6 +163,7 @@ def render_rgb(
     far: float = 100.0,
     clip: bool = True,
     eps: float = 1e-4,
+    gradient: str = "nmr",
     interpolation_gradient: bool = False,
 ) -> Tensor:
     """Colour images of meshes; the arguments, gradients and errors are those of :func:`render`.
@@ -183,6 +194,7 @@ def render_rgb(
         far=far,
         clip=clip,
         eps=eps,
+        gradient=gradient,
         interpolation_gradient=interpolation_gradient,
     ).rgb
 
@@ -234,7 +246,7 @@ def render_silhouette(
         In NMR's gradient, added to the distance between an edge and a pixel (in units of [-1, 1]). In the local one,
         the gradient is 0 if the two directions lower the loss at rates that differ by less than eps. Both as published.
         (It also ends the lookup in :class:`nmr.TextureCubes`.)
-    gradient : "nmr" or "local"
+    gradient : "nmr", "local" or "none"
         The definition of the gradient. The images are the same.
 
     Returns
@@ -282,9 +294,9 @@ def render_silhouette(
     >>> nmr.render_silhouette(0.4 * vertices, faces, camera, image_size=64).shape
     torch.Size([2, 64, 64])
     """
-    check_choice(gradient, "gradient", ("nmr", "local"))
+    check_choice(gradient, "gradient", GRADIENTS)
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
-    alpha, _ = scene.silhouette(gradient == "local")
+    alpha, _ = scene.silhouette(gradient)
     return alpha
 
 

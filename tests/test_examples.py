@@ -55,7 +55,7 @@ def check_movie(path):
 def test_every_example_is_tested_and_short():
     scripts = sorted(path.stem for path in EXAMPLES.glob("*.py"))
     fits = ["fit_lit_vase", "fit_masks", "fit_packed", "fit_silhouette", "fit_texture"]
-    draws = ["draw_fitting", "draw_small_model", "draw_surfaces", "draw_views"]
+    draws = ["draw_fitting", "draw_gradients", "draw_small_model", "draw_surfaces", "draw_views"]
     assert scripts == [*draws, "find_camera", *fits, "make_photo_folder"]
     assert all(len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 80 for name in scripts)
 
@@ -71,6 +71,14 @@ def test_draw_fitting(tmp_path):
     ious = run("draw_fitting", tmp_path, "--frames", "12", "--size", "48", "--steps", "30")
     assert len(ious) == 6 and min(ious.values()) > 0.3 and max(ious.values()) > 0.6
     check_movie(tmp_path / "fitting.gif")
+
+
+def test_draw_gradients(tmp_path):
+    moved = run("draw_gradients", tmp_path, "--image-size", "64")
+    assert moved["nmr"] > 2 * moved["local"] > 100 and moved["none"] == 0
+    panels = np.split(imageio.imread(tmp_path / "gradients.png").astype(int), 5, axis=1)
+    orange, blue = ((panels[3][..., 0] - panels[3][..., 2] > 60), (panels[3][..., 2] - panels[3][..., 0] > 60))
+    assert orange.sum() > 10 and blue.sum() < orange.sum()
 
 
 def test_draw_small_model(tmp_path):

@@ -1,4 +1,4 @@
-// Images of any channels: the mean of 2x2 pixels, and NMR's gradient.
+// Images of any channels: the mean of 2x2 pixels, and the gradients of edges.
 #include "arrays.h"
 
 namespace nmr {
@@ -80,7 +80,8 @@ template <class T>
 void edges_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
                        const Array<int32_t>& face_index, const Array<T>& image,
                        const std::optional<Array<T>>& background, const Array<T>& grad_resolved,
-                       Array<T>& grad_vertices, bool anti_aliasing, double eps, int num_threads) {
+                       Array<T>& grad_vertices, bool anti_aliasing, double eps, bool local, bool perspective,
+                       int num_threads) {
   const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
   const Size raster = require_face_index(face_index, mesh, num_threads),
              size = require_image(face_index, raster, anti_aliasing);
@@ -100,9 +101,10 @@ void edges_backward_py(const Array<T>& vertices, const Indices& faces, const std
                               behind.batch,
                               grad_resolved.data(),
                               grad_vertices.mutable_data(),
-                              num_threads};
+                              num_threads,
+                              perspective};
   py::gil_scoped_release release;
-  edges_backward(args);
+  local ? local_edges_backward(args) : edges_backward(args);
 }
 
 template <class T>
@@ -113,7 +115,7 @@ void define_edges(py::module_& m) {
         array("grad_image"), array("grad_background"), py::arg("anti_aliasing"), py::arg("num_threads"));
   m.def("edges_backward", &edges_backward_py<T>, array("vertices"), array("faces"), array("starts"),
         array("face_index"), array("image"), array("background"), array("grad_resolved"), array("grad_vertices"),
-        py::arg("anti_aliasing"), py::arg("eps"), py::arg("num_threads"));
+        py::arg("anti_aliasing"), py::arg("eps"), py::arg("local"), py::arg("perspective"), py::arg("num_threads"));
 }
 
 }  // namespace

@@ -1,4 +1,4 @@
-"""Operators: from raster pixels to image pixels, with NMR's gradient of the edges."""
+"""Operators: from raster pixels to image pixels, with a gradient of the edges."""
 
 import torch
 from torch import Tensor
@@ -25,11 +25,14 @@ def resolve(
     face_index: Tensor,
     anti_aliasing: bool,
     eps: float,
+    local: bool,
+    perspective: bool,
 ) -> Tensor:
     """The image ``[B, h, w, C]`` of raster pixels ``[B, H, W, C]``: the mean of 2x2 with anti-aliasing, else a copy.
 
     Pixels without a face have the colour ``background [B or 1, C]``; without it that in ``image``. The gradients in
-    ``image`` and ``background`` are those of the mean. That in x and y of ``vertices`` is NMR's, summed over channels.
+    ``image`` and ``background`` are those of the mean. That in x and y of ``vertices`` is that of the edges, summed
+    over channels: NMR's, or the local one, which needs to know whether the camera has ``perspective``.
     """
     resolved = host_empty(_image_shape(image, anti_aliasing), dtype=image.dtype)
     arrays = map(host_array, (image, background, face_index))
@@ -38,13 +41,13 @@ def resolve(
 
 
 @torch.library.register_fake(resolve.op)
-def _(image, background, vertices, faces, starts, face_index, anti_aliasing, eps):
+def _(image, background, vertices, faces, starts, face_index, anti_aliasing, eps, local, perspective):
     return image.new_empty(_image_shape(image, anti_aliasing))
 
 
 def _resolve_setup(ctx, inputs, output):
-    *tensors, ctx.anti_aliasing, ctx.eps = inputs
-    ctx.save_for_backward(*tensors)
+    ctx.save_for_backward(*inputs[:6])
+    ctx.settings = inputs[6:]
 
 
 def _resolve_backward(ctx, grad_resolved):
@@ -52,15 +55,15 @@ def _resolve_backward(ctx, grad_resolved):
     of_image, of_background, of_vertices = ctx.needs_input_grad[:3]
     grad_image = grad_background = grad_vertices = None
     if of_image or of_background:
-        wanted = ctx.anti_aliasing, of_image, of_background
+        wanted = ctx.settings[0], of_image, of_background
         grad_image, grad_background = resolve_backward(grad_resolved, background, face_index, *wanted)
     if of_background and background.shape[0] == 1:
         grad_background = grad_background.sum(0, keepdim=True)
     if of_vertices:
         mesh = vertices, faces, starts, face_index
-        grad_vertices = edges_backward(*mesh, image, background, grad_resolved, ctx.anti_aliasing, ctx.eps)
+        grad_vertices = edges_backward(*mesh, image, background, grad_resolved, *ctx.settings)
     grads = grad_image if of_image else None, grad_background if of_background else None, grad_vertices
-    return *grads, None, None, None, None, None
+    return *grads, *(None,) * 7
 
 
 register_autograd(resolve, _resolve_backward, _resolve_setup)
@@ -113,19 +116,21 @@ def edges_backward(
     grad_resolved: Tensor,
     anti_aliasing: bool,
     eps: float,
+    local: bool,
+    perspective: bool,
 ) -> Tensor:
-    """NMR's gradient of raster pixels ``[B, H, W, C]``, per vertex, of the shape of ``vertices``; zero in z.
+    """The gradient of the edges from raster pixels ``[B, H, W, C]``, of the shape of ``vertices``; zero in z.
 
-    If an upstream gradient of an image is not finite, those of all its visible faces are NaN.
+    NMR's: if an upstream gradient of an image is not finite, those of all its visible faces are NaN.
     """
     grad_vertices = host_empty(vertices.shape, dtype=vertices.dtype)
     arrays = map(host_array, (vertices, faces, starts, face_index, image, background, grad_resolved))
-    _C.edges_backward(*arrays, grad_vertices.numpy(), anti_aliasing, eps, num_threads())
+    _C.edges_backward(*arrays, grad_vertices.numpy(), anti_aliasing, eps, local, perspective, num_threads())
     return grad_vertices.to(vertices.device)
 
 
 @torch.library.register_fake(edges_backward.op)
-def _(vertices, faces, starts, face_index, image, background, grad_resolved, anti_aliasing, eps):
+def _(vertices, faces, starts, face_index, image, background, grad_resolved, anti_aliasing, eps, local, perspective):
     return vertices.new_empty(vertices.shape)
 
 

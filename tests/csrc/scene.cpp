@@ -276,8 +276,11 @@ struct Run {
     const int64_t size = image_pixels * C, backgrounds = s.per_image_values ? s.batch : 1;
     const T *image = in("image", pixels * C), *grad = in("grad_resolved", size);
     const T* background = in_if(s.fill_back, "background", backgrounds * C);
-    edges_backward(EdgesBackward<T>{mesh, s.image, s.anti_aliasing, s.eps, face_index, image, C, background, backgrounds, grad,
-                                    out("grad_edges", 3 * rows), threads});
+    EdgesBackward<T> edges{mesh, s.image, s.anti_aliasing, s.eps, face_index, image, C, background, backgrounds, grad,
+                           out("grad_edges", 3 * rows), threads, s.perspective};
+    edges_backward(edges);
+    edges.grad_vertices = out("grad_local_edges", 3 * rows);
+    local_edges_backward(edges);
     const Resolve<T> resolve{s.batch, s.image, s.anti_aliasing, C, face_index, image, background, backgrounds,
                              out("resolved", size), grad, out("grad_image", pixels * C), out("grad_background", s.batch * C),
                              threads};
@@ -541,7 +544,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     check(n % 3 == 2 ? std::isfinite(points[n]) : !std::isnan(points[n]), "a projected vertex has a depth and a place, or is at infinity");
   for (size_t n = 0; n < pose.size(); ++n)
     check(std::isfinite(pose[n]) == std::isfinite(pose[n - n % 12]) && !std::isinf(pose[n]), "a pose is finite or all NaN");
-  for (const char* name : {"grad_silhouette", "grad_local", "grad_edges", "grad_soft"})
+  for (const char* name : {"grad_silhouette", "grad_local", "grad_edges", "grad_local_edges", "grad_soft"})
     for (size_t n = 2; n < r.get(name).size(); n += 3) check(r.get(name)[n] == 0, "the gradients of silhouettes and edges have no z");
   const auto background_is_0 = [&](const char* name, size_t n) {
     const size_t channels = r.get(name).size() / depth.size();

@@ -44,6 +44,20 @@ TEST(parallel_for_exceptions_reach_the_caller) {
   }
 }
 
+TEST(a_caller_that_waited_in_vain_works_alone_for_a_while) {
+  const int64_t ms = 1000000;
+  const auto wants = [&](int64_t waited, int64_t worked, int64_t stopped) {
+    Company company;
+    CHECK(company.wanted());
+    company.judge(Company::now() - waited, worked, stopped);
+    return company.wanted();
+  };
+  CHECK(!wants(20 * ms, 0, 0));                // the other thread had no core to begin on
+  CHECK(!wants(20 * ms, 30 * ms, 15 * ms));    // it lost its core
+  CHECK(wants(20 * ms, 1000 * ms, 0));         // it had a longer iteration
+  CHECK(wants(0, 0, 0));
+}
+
 TEST(scratch_belongs_to_a_thread_and_grows) {
   struct Scratch {
     std::vector<double> values;

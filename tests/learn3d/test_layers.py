@@ -21,7 +21,7 @@ FLOORS = (
     {"evaluation"},
     {"make_data", "runs"},
     {"config"},
-    {"presets", "fitting"},
+    {"presets", "fitting", "poses"},
     {"methods"},
     {"networks", "losses"},
     {"distributed", "pictures"},

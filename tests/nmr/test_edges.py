@@ -26,7 +26,7 @@ def random_image(face_index, channels, dtype=torch.float64, seed=0):
 def resolve_with_gradient(image, vertices, faces, starts, face_index, anti_aliasing=False, zeros=0.3):
     """The resolved image and both gradients of a random upstream, of which a part is zero."""
     vertices, image = vertices.clone().requires_grad_(), image.clone().requires_grad_()
-    resolved = nmr.ops.resolve(image, None, vertices, faces, starts, face_index, anti_aliasing, EPS)
+    resolved = nmr.ops.resolve(image, None, vertices, faces, starts, face_index, anti_aliasing, EPS, False, True)
     g = torch.Generator().manual_seed(1)
     upstream = torch.randn(resolved.shape[1:], generator=g, dtype=resolved.dtype)
     upstream[torch.rand(upstream.shape[:2], generator=g) < zeros] = 0
@@ -59,7 +59,9 @@ def test_coverage_as_a_channel_has_the_gradient_of_the_silhouette(name):
     settings = size, size, bool(v["fill_back"]), float(v["near"]), far, True
     face_index = nmr.ops.rasterize(vertices.detach(), faces, None, *settings)
     image = (face_index >= 0).float()[..., None]
-    alpha = nmr.ops.resolve(image, None, vertices, faces, None, face_index, anti_aliasing, float(v["eps"]))[..., 0]
+    alpha = nmr.ops.resolve(
+        image, None, vertices, faces, None, face_index, anti_aliasing, float(v["eps"]), False, True
+    )[..., 0]
     alpha.backward(torch.from_numpy(v["grad_alpha"]))
     assert np.array_equal(alpha.detach().numpy(), v["alpha"])
     difference = np.linalg.norm(vertices.grad.numpy() - v["grad_vertices"])
@@ -74,7 +76,7 @@ def test_gradient_in_the_image_is_the_mean_s(anti_aliasing):
     image = random_image(face_index, 2).requires_grad_()
 
     def resolve(image):
-        return nmr.ops.resolve(image, None, vertices, faces, None, face_index, anti_aliasing, EPS)
+        return nmr.ops.resolve(image, None, vertices, faces, None, face_index, anti_aliasing, EPS, False, True)
 
     assert torch.autograd.gradcheck(resolve, image)
 
@@ -106,7 +108,7 @@ def test_background_is_the_colour_of_pixels_without_a_face(threads, per_image):
             else torch.where(face_index[..., None] >= 0, leaves[0], leaves[2][:, None, None])
         )
         mesh = leaves[1], faces, None, face_index
-        resolved = nmr.ops.resolve(pixels, None if background is None else leaves[2], *mesh, True, EPS)
+        resolved = nmr.ops.resolve(pixels, None if background is None else leaves[2], *mesh, True, EPS, False, True)
         resolved.backward(upstream)
         results.append([resolved.detach(), *(leaf.grad for leaf in leaves)])
     torch.testing.assert_close(*results)

@@ -1,4 +1,4 @@
-"""render_silhouette(gradient="local"): against the slow definition, by hand, its reach, what descent does with it."""
+"""gradient="local" of silhouettes and colours: against the slow definition, by hand, its reach, ends of surfaces."""
 
 import pytest
 import torch
@@ -172,6 +172,145 @@ def test_together_with_other_images():
         (got,) = torch.autograd.grad((image * ramp).sum(), vertices)
         torch.testing.assert_close(got, wanted)
     assert wanted.any()
-    with pytest.raises(ValueError, match="gradient 'local' is that of silhouettes"):
-        colors = nmr.VertexColors(torch.rand(len(vertices), 3))
-        nmr.render(vertices, faces, colors=colors, image_size=16, gradient="local")
+
+
+# --- colours
+
+
+def scene_of(name):
+    """Vertices in renderer space [B, V, 3] (of a pair of meshes if packed), faces, and whether depth is perspective."""
+    vertices, faces = random_soup(3)
+    if name == "spheres":  # one behind the other, without perspective, with faces smaller than a pixel
+        ball, faces = nmr.icosphere(5)
+        pair = [0.6 * ball.double() + torch.tensor(at) for at in ([-0.2, 0.1, 2.0], [0.3, -0.1, 3.5])]
+        vertices, faces = torch.cat(pair)[None], torch.cat([faces, faces + len(ball)])
+    return vertices, faces, name != "spheres"
+
+
+def colors_gradient(vertices, faces, index, image, upstream, anti_aliasing=False, perspective=True, background=None):
+    leaf = vertices.clone().requires_grad_()
+    settings = anti_aliasing, 1e-4, True, perspective
+    nmr.ops.resolve(image, background, leaf, faces, None, index, *settings).backward(upstream)
+    return leaf.grad
+
+
+@pytest.mark.parametrize("name", ["soup", "spheres"])
+@pytest.mark.parametrize("anti_aliasing", [False, True])
+@pytest.mark.parametrize("own_background", [False, True])
+def test_colors_equal_the_slow_definition(name, anti_aliasing, own_background):
+    vertices, faces, perspective = scene_of(name)
+    size, batch = (10, 14) if perspective else (100, 140), len(vertices)  # in one block of rows, and in several
+    raster = tuple(n * (1 + anti_aliasing) for n in size)
+    index = nmr.ops.rasterize(vertices, faces, None, *raster, True, 0.1, 100.0, perspective)
+    image, upstream = noise(batch, *raster, 3), noise(batch, *size, 3, seed=1)
+    background = noise(batch, 3, seed=2) if own_background else None
+    args = vertices, faces, index, image, upstream, anti_aliasing, perspective, background
+    grad = colors_gradient(*args)
+    if own_background:
+        image = torch.where(index[..., None] >= 0, image, background[:, None, None])
+    for b in range(batch):
+        from_below = index[b].long().flip(0), upstream[b], anti_aliasing, 1e-4, image[b].flip(0), perspective
+        expected = reference.local_gradient(vertices[b], faces, *from_below)
+        torch.testing.assert_close(grad[b], expected, rtol=1e-9, atol=1e-9)
+    assert grad[..., :2].any() and not grad[..., 2].any()
+    before = torch.get_num_threads()
+    for threads in (2, 5):
+        torch.set_num_threads(threads)
+        assert torch.equal(colors_gradient(*args), grad)
+    torch.set_num_threads(before)
+
+
+def test_coverage_as_a_colour_has_the_gradient_of_the_silhouette():
+    vertices, faces = random_soup(1)
+    index = nmr.ops.rasterize(vertices, faces, None, 20, 20, True, 0.1, 100.0, True)
+    upstream = noise(2, 20, 20)
+    grad = colors_gradient(vertices, faces, index, (index >= 0).double()[..., None], upstream[..., None])
+    assert torch.equal(grad, nmr.ops.local_gradient(vertices, faces, None, index, upstream, False, 1e-4))
+
+
+def in_front(distance):
+    """BLOCK at depth 1 before a wall."""
+    block, faces = square(*BLOCK)
+    wall = square(-2.0, -2.0, 2.0, 2.0)[0] + torch.tensor([0.0, 0.0, distance])
+    return torch.cat([block, wall], dim=1), torch.cat([faces, faces + 4])
+
+
+@pytest.mark.parametrize("distance, moves", [(1.0, True), (1e-3, True), (1e-6, False)])
+def test_only_the_surface_in_front_moves(distance, moves):
+    """The pixel behind its right end should be as bright as the block, so it moves right; the wall stays."""
+    vertices, faces = in_front(distance)
+    colors = torch.tensor([1.0] * 4 + [0.25] * 4, dtype=torch.float64)[:, None]
+    leaf = vertices.requires_grad_()
+    image = nmr.render_rgb(
+        leaf, faces, colors=nmr.VertexColors(colors), image_size=8, anti_aliasing=False, gradient="local"
+    )
+    assert image[0, 2, 4] == 1 and image[0, 2, 5] == 0.25
+    (image[..., 0] * one_pixel({(2, 5): -1.0})).sum().backward()
+    expected = [[-0.75 * 4 if moves else 0.0, 0.0, 0.0], [0.0] * 3]
+    got = torch.stack([leaf.grad[0, :4].sum(0), leaf.grad[0, 4:].sum(0)])
+    torch.testing.assert_close(got, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("subdivisions", [0, 2, 5])
+@pytest.mark.parametrize("doubled", [False, True])
+def test_a_surface_has_no_end_within(subdivisions, doubled):
+    """Neither at seams, where every face has corners of its own, nor if its faces are smaller than pixels."""
+    vertices, faces = nmr.icosphere(subdivisions)
+    if doubled:
+        vertices, faces = vertices[faces].flatten(0, 1), torch.arange(3 * len(faces)).view(-1, 3)
+    leaf = (0.9 * vertices + torch.tensor([0.0, 0.0, 2.0]))[None].requires_grad_()
+    colors = nmr.VertexColors(noise(len(vertices), 3, dtype=torch.float32))
+    images = nmr.render(leaf, faces, outputs=("rgb", "alpha"), colors=colors, image_size=48, gradient="local")
+    inside = torch.nn.functional.avg_pool2d(images.alpha[None].detach(), 3, 1, 1)[0] == 1
+    assert inside.any()
+    (images.rgb * inside[..., None] * noise(48, 48, 3, dtype=torch.float32)).sum().backward()
+    assert not leaf.grad.any()
+
+
+@pytest.mark.parametrize("anti_aliasing", [False, True])
+def test_gradients_of_all_outputs(anti_aliasing):
+    """ "none" is the true derivative alone, "local" adds its own to that of each output; the images are the same."""
+    ball, faces = nmr.icosphere(2)
+    vertices = (0.5 * ball.double() + torch.tensor([0.1, 0.0, 2.0]))[None]
+    colors = nmr.VertexColors(noise(len(ball), 3))
+
+    def grads(gradient):
+        leaf, result = vertices.clone().requires_grad_(), {}
+        settings = {"colors": colors, "image_size": 16, "anti_aliasing": anti_aliasing, "gradient": gradient}
+        images = nmr.render(leaf, faces, outputs=("rgb", "depth", "normals"), far=3.0, **settings)
+        for name in ("rgb", "depth", "normals"):
+            image = getattr(images, name)
+            if image.requires_grad:
+                upstream = noise(*image.shape)
+                (result[name],) = torch.autograd.grad(image, leaf, upstream, retain_graph=True)
+        return images, result
+
+    (images, local), (same, none), (_, published) = map(grads, ("local", "none", "nmr"))
+    fragments = nmr.render(
+        vertices, faces, outputs=("fragments",), image_size=16, anti_aliasing=anti_aliasing
+    ).fragments
+    rasters = {"depth": torch.where(fragments.depth == 100, 3.0, fragments.depth)[..., None]}
+    rasters["normals"] = fragments.normals()
+    for name in ("rgb", "depth", "normals"):
+        torch.testing.assert_close(getattr(images, name), getattr(same, name))
+    assert "rgb" not in none and local["rgb"].any()
+    index = fragments.sided_face_index
+    for name, raster in rasters.items():
+        assert torch.equal(none[name], published[name])
+        upstream = noise(*getattr(images, name).shape).view(1, 16, 16, -1)
+        edges = colors_gradient(vertices, faces, index, raster, upstream, anti_aliasing)
+        torch.testing.assert_close(local[name] - none[name], edges)
+        assert edges.any()
+
+
+def test_packed_meshes_are_drawn_as_if_alone():
+    meshes = [nmr.icosphere(1), nmr.icosphere(2)]
+    places = [torch.tensor([-0.1, 0.0, 2.0]), torch.tensor([0.2, 0.1, 3.0])]
+    leaves = [(0.6 * v + place).double().requires_grad_() for (v, _), place in zip(meshes, places, strict=True)]
+    faces, colors = [f for _, f in meshes], [noise(len(v), 3) for v, _ in meshes]
+    upstream = noise(2, 16, 16, 3)
+    together = nmr.render_rgb(leaves, faces, colors=nmr.VertexColors(colors), image_size=16, gradient="local")
+    got = torch.autograd.grad(together, leaves, upstream)
+    for b, leaf in enumerate(leaves):
+        alone = nmr.render_rgb(leaf, faces[b], colors=nmr.VertexColors(colors[b]), image_size=16, gradient="local")
+        assert torch.equal(got[b], torch.autograd.grad(alone, leaf, upstream[b : b + 1])[0]) and got[b].any()

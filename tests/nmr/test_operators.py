@@ -19,8 +19,9 @@ COLORS = torch.linspace(0, 1, SPHERE.numel()).view_as(SPHERE)
 RAMP = torch.linspace(-1, 1, 256).view(16, 16)
 
 
-def rgb(vertices):
-    image = nmr.render_rgb(vertices, FACES, CAMERA, colors=nmr.VertexColors(COLORS), **SIZE)
+def rgb(vertices, gradient="nmr"):
+    colors = nmr.VertexColors(COLORS)
+    image = nmr.render_rgb(vertices, FACES, CAMERA, colors=colors, gradient=gradient, **SIZE)
     return (image * RAMP.unsqueeze(-1)).sum()
 
 
@@ -30,6 +31,7 @@ FUNCTIONS = {
     "local": lambda v: (nmr.render_silhouette(v, FACES, CAMERA, gradient="local", **SIZE) * RAMP).sum(),
     "depth": lambda v: (nmr.render_depth(v, FACES, CAMERA, **SIZE) * RAMP).sum(),
     "rgb": rgb,
+    "local rgb": lambda v: rgb(v, "local"),
     "smoothness": lambda v: nmr.losses.smoothness_loss(v, EDGES),
 }
 
