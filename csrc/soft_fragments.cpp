@@ -92,8 +92,9 @@ void fragment_backward(const SoftFragment<T>& f, bool perspective, const T* grad
   const T strength = (inside(weights) ? 2 : -2) * grad_distance;
   for (int k = 0; k < 3; ++k) {
     const T share = k == nearest.side ? 1 - nearest.share : k == (nearest.side + 1) % 3 ? nearest.share : T(0);
-    grads[3 * k] += (strength * share * nearest.away_x - weights.w[k] * by_x) * f.scale_x;
-    grads[3 * k + 1] += (strength * share * nearest.away_y - weights.w[k] * by_y) * f.scale_y;
+    const T w = std::isfinite(weights.w[k]) ? weights.w[k] : T(0);  // not finite if the face has no area
+    grads[3 * k] += (strength * share * nearest.away_x - w * by_x) * f.scale_x;
+    grads[3 * k + 1] += (strength * share * nearest.away_y - w * by_y) * f.scale_y;
   }
 }
 

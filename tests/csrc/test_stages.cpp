@@ -162,7 +162,7 @@ TEST_REAL(an_upstream_gradient_that_is_not_finite_is_seen_in_its_image_alone) {
       {"grad_blended", {"grad_blended_colors", "grad_blended_positions"}},
       {"grad_normals", {"grad_normals_vertices"}},
       {"grad_lit", {"grad_lit_colors", "grad_lit_normals", "grad_lit_vertices", "grad_lit_weights"}},
-      {"grad_resolved", {"grad_edges", "grad_image", "grad_background"}},
+      {"grad_resolved", {"grad_edges", "grad_local_edges", "grad_image", "grad_background"}},
       {"grad_points", {"grad_world", "grad_matrix", "grad_intrinsics", "grad_distortion"}},
       {"grad_pose", {"grad_forward", "grad_up"}},
       {"grad_loss", {"grad_loss_vertices"}},

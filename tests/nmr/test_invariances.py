@@ -13,6 +13,7 @@ from scenes import for_threads
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import nmr
+import nmr.nvdiffrast.torch as dr
 from nmr import _C
 
 
@@ -344,6 +345,9 @@ def call_everything(dtype, packed):
     loss = nmr.losses.smoothness_loss(vertices, nmr.edge_table(faces)) + nmr.losses.soft_iou_loss(*images)
     (loss + pinhole.transform(vertices).sum() + angles.transform(vertices).sum()).backward()
     nmr.voxelize(vertices, faces, 4)
+    positions, triangles = torch.cat([vertices, vertices[..., :1] + 3], dim=-1), faces.int()  # in clip space
+    rast, slopes = dr.rasterize(dr.RasterizeCudaContext(), positions, triangles, (6, 7))
+    (dr.antialias(rast, rast, positions, triangles).sum() + slopes.sum()).backward()
 
 
 class Recorder(TorchDispatchMode):

@@ -339,19 +339,6 @@ def test_threads_and_second_derivatives():
         torch.autograd.grad(pipeline(*inputs, tri).sum(), pos, create_graph=True)[0].sum().backward()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_opcheck(dtype):
-    pos, tri = sphere()
-    pos = pos.to(dtype)
-    rast, _ = dr.rasterize(CONTEXT, pos, tri, (6, 7))
-    ids, color = (rast[..., 3] - 1).int(), torch.rand(1, 6, 7, 2, dtype=dtype)
-    twins = dr.antialias_construct_topology_hash(tri).twins
-    pos.requires_grad_()
-    color.requires_grad_()
-    torch.library.opcheck(nmr.ops.clip_weights.op, (pos, tri, ids))
-    torch.library.opcheck(nmr.ops.antialias.op, (color, rast, pos, tri, ids, twins))
-
-
 def test_install_as(monkeypatch):
     for key in [key for key in sys.modules if key.partition(".")[0] == "nvdiffrast"]:
         monkeypatch.delitem(sys.modules, key)
