@@ -29,8 +29,10 @@ NOTES = (
 )
 
 
-def make_report(request: Request, runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> tuple[Cells, str]:
-    """The main table and the whole report as Markdown, from the results of runs by folder.
+def make_report(
+    request: Request, runs: Sequence[PlannedRun], results: Mapping[Path, Result]
+) -> tuple[dict[str, Cells], str]:
+    """The tables "main", "differences" and "runs", and the whole report as Markdown, from results by folder.
 
     Commands have DATA and OUTPUT in place of folders, so that no path gets in.
     """
@@ -76,7 +78,7 @@ def make_report(request: Request, runs: Sequence[PlannedRun], results: Mapping[P
     parts = [f"## {table.title}", _markdown(main), NOTES, *([f"Missing: {', '.join(missing)}."] if missing else [])]
     parts += [f"Differences to {table.baseline}, paired by seed and by object:", _markdown(differences)]
     parts += ["What was run:", _markdown(trained), "\n".join(["```sh", *dict.fromkeys(commands), "```"])]
-    return main, "\n\n".join(parts) + "\n"
+    return {"main": main, "differences": differences, "runs": trained}, "\n\n".join(parts) + "\n"
 
 
 def _format_printed(row: Row, column: str, categories: Sequence[str]) -> str:

@@ -61,12 +61,13 @@ def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = tra
         tasks = [Task(run.name, work, (run,), run.folder / LOG_FILE) for run in missing]
         failed = run_tasks(tasks, jobs=request.jobs, cluster=request.cluster)
         results = read_results(runs)
-    table, text = make_report(request, runs, results)
+    tables, text = make_report(request, runs, results)
     path = request.output / f"{request.table}.md"
     path.parent.mkdir(parents=True, exist_ok=True)
     writing.write_bytes(path, text.encode())
-    say(align(table))
-    note(f"report: {path}")
+    writing.write_json(path.with_suffix(".json"), tables)
+    say(align(tables["main"]))
+    note(f"report: {path}; its tables for other programs: {path.with_suffix('.json').name}")
     for name, tail in failed.items():
         note(f"\nFAILED {name}; the end of its log:\n{tail}")
     if failed:
