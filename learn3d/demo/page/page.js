@@ -4,6 +4,11 @@
 const $ = (id) => document.getElementById(id);
 const picture = $("picture");
 const WORDS = { camera: "Finding the camera …", shape: "Fitting the shape …", surface: "Fitting the surface …", done: "Adding the colours …" };
+const HINTS = {
+  box: "Drag a box around the object.",
+  add: "Paint over the missing part.",
+  remove: "Paint over the part that does not belong to it.",
+};
 const OBJECT = 1, BACKGROUND = 2, OPEN = 3; // as learn3d.fitting.cutting has them
 const BRUSH = 12, REACH = 34; // pixels of the picture: of a stroke, and within which the outline may move with it
 let side = 512, name = "picture", colors = null, given = null, mask = null, tool = null, drag = null, current = null;
@@ -129,6 +134,7 @@ function strokesOf(points, value) {
 function choose(which) {
   tool = which;
   picture.classList.toggle("tool", Boolean(tool));
+  $("hint").textContent = HINTS[tool] || "Outline wrong? Correct it on the picture:";
   for (const button of document.querySelectorAll("[data-tool]")) button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
 }
 
@@ -157,6 +163,8 @@ picture.onpointerup = () => {
 
 function say(text, wrong = false) {
   $("words").textContent = text;
+  const empty = document.querySelector(".view.empty p");
+  if (empty && !wrong) empty.textContent = text;
   $("status").classList.toggle("error", wrong);
   if (wrong) busy(false);
 }
@@ -238,10 +246,10 @@ function present(meshes) {
     view.append(title);
     const glb = bytes(made.glb), mesh = readGlb(glb.buffer);
     new Viewer(canvas, mesh, made.yaw);
-    offer(`GLB${label}`, `${name}${label}.glb`, () => new Blob([glb], { type: "model/gltf-binary" }));
+    offer(`GLB${label} (3D viewers, Blender)`, `${name}${label}.glb`, () => new Blob([glb], { type: "model/gltf-binary" }));
     offer(`OBJ${label}`, `${name}${label}.obj`, () => new Blob([toObj(mesh)], { type: "model/obj" }));
   }
-  offer("Cut-out", `${name}.png`, cutout);
+  offer("Cut-out (PNG)", `${name}.png`, cutout);
 }
 
 /** The picture with the mask as transparency, which this page and `learn3d reconstruct` read. */

@@ -191,11 +191,13 @@ class Viewer {
     for (let i = w + 1; i < w * h - w - 1; i++) {
       let sum = 0;
       for (const d of [0, 0, 1, -1, w, -w, w + 1, w - 1, -w - 1, 1 - w]) sum += Math.min(16, dark[i + d]);
-      image.data[4 * i + 3] = Math.min(80, 2.2 * sum);
+      image.data[4 * i + 3] = Math.min(64, 1.8 * sum);
     }
     Object.assign(small, { width: w, height: h });
     small.getContext("2d").putImageData(image, 0, 0);
     context.imageSmoothingQuality = "high";
+    context.filter = `blur(${cell}px)`; // browsers without filters show it a little coarser
     context.drawImage(small, 0, 0, w * cell, h * cell);
+    context.filter = "none";
   }
 }
