@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import socket
@@ -34,6 +35,10 @@ PATIENCE = 30  # seconds in which a picture must have arrived
 _TICK = 0.05  # seconds
 
 
+class _Closed(Exception):
+    """The page ends, and nobody waits for the rest of a job."""
+
+
 class Desk:
     """Does one job at a time, in the order of arrival."""
 
@@ -47,6 +52,16 @@ class Desk:
         A visitor who leaves gives up the place.
         """
         ticket, told, place = object(), deque(), 0
+
+        def tell(message: dict) -> None:
+            if self.closed():
+                raise _Closed
+            told.append(message)
+
+        def work_on() -> None:
+            with contextlib.suppress(_Closed):
+                job(tell)
+
         self._line.append(ticket)
         try:
             while (ahead := self._line.index(ticket)) and not self.closed():
@@ -54,7 +69,7 @@ class Desk:
                     yield _line({"place": ahead})
                 place = ahead
                 await asyncio.sleep(_TICK)
-            work = asyncio.get_running_loop().run_in_executor(self._thread, job, told.append)
+            work = asyncio.get_running_loop().run_in_executor(self._thread, work_on)
             while not (self.closed() or (work.done() and not told)):
                 while told:
                     yield _line(told.popleft())
