@@ -85,25 +85,21 @@ def evaluate(
 
     max_images: use only that many images, always the same ones (see `spread_samples`).
     detailed: add the voxel IoU by kato19, the MMD as the paper prints it, and Chamfer-L1 and F-score between 2,000
-    points on each surface, in one process only. If the data set has no points, the truth is the surface of its voxels,
+    points on each surface. If the data set has no points, the truth is the surface of its voxels,
     which limits distances to about 1/32.
     align: a function of the predicted shapes, the batch and the data set that returns the shapes to be compared, for
     methods whose shapes may be turned or moved against the true ones.
-
-    If several processes train the method, all of them call this, share the work, and return the same result.
     """
-    group = method.group
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
     samples = spread_samples(dataset.object_ids, dataset.view_ids, count)
     others = _other_images(dataset.object_ids)
     generator = torch.Generator().manual_seed(0)
     surfaces = _true_surfaces(dataset, generator) if detailed else None
-    rows = torch.arange(count).split(batch_size)[group.rank :: group.world_size]
     codes, values = [], []
     was_training = method.training
     method.set_training(False)
     try:
-        for chosen in (samples[numbers] for numbers in rows):
+        for chosen in samples.split(batch_size):
             batch = dataset.batch(chosen)
             code = method.encode(batch.images)
             shapes = method.decode(code)
@@ -121,11 +117,10 @@ def evaluate(
             codes.append(code.float().cpu())
     finally:
         method.set_training(was_training)
-    own = torch.cat(rows) if rows else torch.empty(0, dtype=torch.int64)
     object_ids, view_ids = (torch.from_numpy(ids[samples.numpy()]) for ids in (dataset.object_ids, dataset.view_ids))
-    figures = dict(zip(MEASURED, group.all_gather(values, own, count).T, strict=True))
+    figures = dict(zip(MEASURED, torch.cat(values).T, strict=True))
     means = {name: float(v.nanmean()) for name, v in figures.items() if not v.isnan().all()}
-    mmds = mean_mmd(group.all_gather(codes, own, count), view_ids, ("mmd", "mmd_paper") if detailed else ("mmd",))
+    mmds = mean_mmd(torch.cat(codes).double(), view_ids, ("mmd", "mmd_paper") if detailed else ("mmd",))
     return Evaluation(object_ids.long(), view_ids.long(), figures, means | mmds)
 
 

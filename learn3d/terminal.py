@@ -8,7 +8,6 @@ import functools
 import os
 import re
 import signal
-import socket
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -24,8 +23,8 @@ _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\u
 def without_traceback(*errors: type[Exception]) -> Callable[[Callable[P, int]], Callable[P, int]]:
     """Decorator of the main function of a command, which returns an exit status: errors become one line on stderr.
 
-    ValueError, OSError and the given errors end it with status 1 and the line "error: ", `rank_label()`, the message.
-    Ctrl-C ends it with status 130. Any other error is a bug and keeps its traceback.
+    ValueError, OSError and the given errors end it with status 1 and the line "error: " and the message. Ctrl-C ends it
+    with status 130. Any other error is a bug and keeps its traceback.
     """
 
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
@@ -34,7 +33,7 @@ def without_traceback(*errors: type[Exception]) -> Callable[[Callable[P, int]], 
             try:
                 return main(*arguments, **options)
             except (ValueError, OSError, *errors) as error:
-                note(f"error: {rank_label()}{error}")
+                note(f"error: {error}")
                 return 1
             except KeyboardInterrupt:
                 note("interrupted; what was saved before is as it was")
@@ -43,13 +42,6 @@ def without_traceback(*errors: type[Exception]) -> Callable[[Callable[P, int]], 
         return run
 
     return decorate
-
-
-def rank_label() -> str:
-    """The beginning of a message of this process: "rank 1 on <host>: ", or "" without torchrun."""
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return ""
-    return f"rank {os.environ.get('RANK')} on {socket.gethostname()}: "
 
 
 def plain(text: str) -> str:

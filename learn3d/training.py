@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import time
@@ -11,12 +10,11 @@ from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
-from learn3d.data.sampling import VIEWS_OF_OBJECT, batches
+from learn3d.data.sampling import batches
 from learn3d.device import keep_freed_memory, resolve_precision
-from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.methods import create_method
 from learn3d.runs import folder as run_folder
-from learn3d.runs.log import open_log
+from learn3d.runs.log import RunLog
 from learn3d.runs.state import Run, describe_images
 from learn3d.runs.summary import Summary, describe_run
 from learn3d.runs.threads import ThreadTuner
@@ -24,16 +22,12 @@ from learn3d.terminal import is_watched, stop_on_signal
 from learn3d.validation import draw, validate
 
 
-def train(
-    config: TrainConfig, *, resume: bool = False, overwrite: bool = False, group: ProcessGroup = SINGLE_PROCESS
-) -> Summary:
+def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False) -> Summary:
     """Train one model and leave everything in `config.output`.
 
     What the folder holds afterwards is listed in `runs.folder`. SIGINT, SIGTERM and SIGHUP end the current step, save
-    and return. With `resume` the run continues from its last checkpoint (bit for bit on a CPU: same machine, numbers of
-    threads and processes), or from the start if it was stopped before its first one. A finished run stays as it is.
-
-    Several processes, each with its own `group`, train one model together; rank 0 writes.
+    and return. With `resume` the run continues from its last checkpoint (bit for bit on a CPU: same machine, number of
+    threads), or from the start if it was stopped before its first one. A finished run stays as it is.
 
     Raises ValueError for a folder in use, options or training data that conflict with the resumed run or data that do
     not fit, FloatingPointError if a loss is no longer finite (the last checkpoint is from before that), OSError if
@@ -42,18 +36,17 @@ def train(
     started, folder = time.monotonic(), config.output
     config = dataclasses.replace(config, precision=resolve_precision(config.precision, config.device))
     keep_freed_memory()
-    threads = ThreadTuner(config.threads, processes=group.world_size)
-    with run_folder.lock_folder(folder) if group.is_main else contextlib.nullcontext():
-        if group.is_main and not resume:
+    threads = ThreadTuner(config.threads)
+    with run_folder.lock_folder(folder):
+        if not resume:
             run_folder.check_can_start(folder, overwrite)  # an older run is removed when all else is well
-        group = group.split_batch(config.batch_size, VIEWS_OF_OBJECT[config.sampling])
-        train_set, val_set = load_splits(config, progress=group.is_main)
+        train_set, val_set = load_splits(config, progress=is_watched())
         info = train_set.info(find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None)
         options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
         method = create_method(config.settings, info, **options)
-        method.check_batch(next(batches(train_set, config, rows=group.rows)))  # before an older run is removed
-        run = Run(config, method, info, describe_images(train_set), group)
-        progress, notes = run.begin(train_set, val_set, resume=resume, overwrite=overwrite)
+        method.check_batch(next(batches(train_set, config)))  # before an older run is removed
+        run = Run(config, method, info, describe_images(train_set))
+        progress, notes = run.begin(train_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:  # finished, or killed between the last save and the end
             return Summary.of(config, progress, started)
         before, start = progress.seconds, progress.step + 1
@@ -62,12 +55,12 @@ def train(
         with (
             run_folder.advice_on_errors(folder),
             stop_on_signal() as stop,
-            open_log(config, progress, group.is_main) as log,
+            RunLog(folder, start=progress.step, total=config.iterations) as log,
         ):
             for warning in filter(None, (*notes, train_set.check_masks())):
                 log.say(f"warning: {warning}")
             log.say(describe_run(run, progress, train_set, val_set, threads))
-            for step, batch in enumerate(batches(train_set, config, start, group.rows), start):
+            for step, batch in enumerate(batches(train_set, config, start), start):
                 step_began = time.monotonic()
                 losses = method.take_step(batch, step)
                 if chosen := threads.after_step(time.monotonic() - step_began):
@@ -78,12 +71,12 @@ def train(
                 progress = dataclasses.replace(progress, **state, seconds=before + time.monotonic() - started)
                 log.step(step, losses)
 
-                last, stopped_by = step == config.iterations, group.stopped_by(stop)
+                last, stopped_by = step == config.iterations, stop.name
                 if last or step % config.log_every == 0:
                     log.metrics(step, "train", recent)
                 if last or step % config.validate_every == 0:
                     progress = validate(run, val_set, progress, log)
-                if group.is_main and (last or step % config.pictures_every == 0):
+                if last or step % config.pictures_every == 0:
                     draw(config, method, val_set, step, log)
                 if last or stopped_by or step % config.checkpoint_every == 0:
                     run.save(progress, log)
@@ -97,10 +90,9 @@ def train(
 def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDataset, ViewDataset]:
     """The training and the validation split of a run. Both have the same view classes.
 
-    progress: show a bar on a terminal if many files are read.
+    progress: show a bar if many files are read.
     """
     options = {"image_size": config.settings.image_size, "view_bins": config.view_bins, "poses": config.poses}
     load = functools.partial(load_dataset, config.layout, config.data, config.category, **options)
-    progress = progress and is_watched()
     train_set = load("train", views_per_object=config.views_per_object, progress=progress)
     return train_set, load(config.val_split)

@@ -12,13 +12,13 @@ from learn3d.methods import Method
 from learn3d.pictures.sheets import save_png
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.folder import PICTURES
-from learn3d.runs.log import RunLog, SilentLog
+from learn3d.runs.log import RunLog
 from learn3d.runs.state import Run
 
 PICTURE_ROWS = 8
 
 
-def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog | SilentLog) -> Progress:
+def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) -> Progress:
     """Measure IoU and MMD on the validation images; keep the networks if their IoU is the best so far.
 
     It is the IoU of voxels or, if no true shapes are known, of silhouettes at novel views. Returns the progress with

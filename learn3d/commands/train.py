@@ -11,10 +11,8 @@ import tyro
 
 from learn3d.commands.command import Command
 from learn3d.config import DEFAULT_PRESET, FROM_PRESET, TrainConfig, load_config
-from learn3d.distributed.launch import init_process_group
-from learn3d.distributed.process_group import LostPeerError
 from learn3d.presets import METHODS, PRESETS, full_name
-from learn3d.terminal import INTERRUPTED, say, without_traceback
+from learn3d.terminal import INTERRUPTED, say
 from learn3d.training import train
 
 
@@ -34,7 +32,6 @@ class Train(Command):
     Examples:
       learn3d train --data DATA --category airplane,car --output runs/airplane --preset vanilla
       learn3d train --resume --output runs/airplane
-      torchrun --nproc-per-node 2 -m learn3d train --data DATA --category airplane --output runs/airplane
     """
 
     config: TrainConfig
@@ -67,13 +64,10 @@ class Train(Command):
             raise ValueError(f"{origin.output} was started with the preset {saved.preset}, got {preset}")
         return vars(saved)
 
-    @without_traceback(LostPeerError)
     def run(self) -> int:
-        """Train, and say how it ended; the exit status is 130 if a signal stopped the only process."""
+        """Train, and say how it ended; the exit status is 130 if a signal stopped it."""
         if self.resume and self.overwrite:
             raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
-        with init_process_group(self.config.device) as group:  # the first Ctrl-C in it saves
-            summary = train(self.config, resume=self.resume, overwrite=self.overwrite, group=group)
-        if group.is_main:
-            say(str(summary))
-        return 0 if summary.finished or group.world_size > 1 else INTERRUPTED  # torchrun would take it for a failure
+        summary = train(self.config, resume=self.resume, overwrite=self.overwrite)
+        say(str(summary))
+        return 0 if summary.finished else INTERRUPTED

@@ -32,8 +32,7 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *
     Raises ValueError for an unknown name, and for "crop" if it is not first or there are no original images.
     """
     rng = np.random.default_rng([seed, step, 1])
-    views = batch.step_views
-    count, rows = len(views), views.rows
+    count = len(batch)
     for position, name in enumerate(names):
         if name not in get_args(Augmentation):
             raise ValueError(f"augmentation must be {', '.join(get_args(Augmentation))}, got {name!r}")
@@ -44,20 +43,20 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *
             if batch.crops is None:
                 where = "only the layout pascal3d has, and not in shards"
                 raise ValueError(f"the augmentation crop needs the original images, which {where}; leave it out")
-            colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))[rows.numpy()]))
+            colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))))
         elif name in ("channels", "colors"):
-            order = torch.from_numpy(np.argsort(rng.random((count, 3)), axis=1))[rows]
+            order = torch.from_numpy(np.argsort(rng.random((count, 3)), axis=1))
             colors = torch.gather(colors, 1, order[:, :, None, None].expand_as(colors))
             if name == "colors":
                 gain = rng.uniform(1 - COLOR_GAIN, 1 + COLOR_GAIN, (count, 3))
                 gain[rng.random(count) < WITHOUT_COLOR] = 0
-                gain = torch.from_numpy(gain.astype(np.float32))[rows][:, :, None, None]
+                gain = torch.from_numpy(gain.astype(np.float32))[:, :, None, None]
                 darkness = colors if inverted else 255 - colors
                 darkness = (darkness * gain).round_().clamp_(max=255).to(torch.uint8)
                 colors = darkness if inverted else 255 - darkness
         else:
             mirrored = torch.from_numpy(rng.random(count) < 0.5)
-            chosen = mirrored[rows][:, None, None, None]
+            chosen = mirrored[:, None, None, None]
             colors = torch.where(chosen, colors.flip(3), colors)
             if name == "flip":
                 images = torch.where(chosen, images.flip(3), images)
@@ -65,6 +64,6 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *
                 depth = None if batch.depth is None else torch.where(chosen[:, 0], batch.depth.flip(2), batch.depth)
                 batch = dataclasses.replace(batch, masks=masks, depth=depth)
                 if batch.poses is not None:
-                    batch = batch.with_poses(batch.step_views.poses.mirrored(mirrored))
+                    batch = dataclasses.replace(batch, poses=batch.poses.mirrored(mirrored))
         batch = dataclasses.replace(batch, images=torch.cat([colors, images[:, 3:]], dim=1))
     return batch

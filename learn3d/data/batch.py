@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -10,19 +9,6 @@ import torch
 import nmr
 from learn3d.data.crops import Crops
 from learn3d.data.poses import Poses
-
-
-@dataclass(frozen=True, eq=False)
-class StepViews:
-    """Poses and classes of all B views of a training step. If processes share the step, each knows all of them."""
-
-    rows: torch.Tensor  # int64 [b]: which of the B views are in this process's batch
-    poses: Poses | None  # of the B cameras; None if unknown
-    view_ids: torch.Tensor  # int64 [B]
-    class_ids: torch.Tensor  # int64 [B]
-
-    def __len__(self) -> int:
-        return len(self.view_ids)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +24,6 @@ class Batch:
     voxels: torch.Tensor | None  # bool [B, 32, 32, 32] ground truth in the data set's axes; None if there is none
     crops: Crops | None = None  # the original images, which the augmentation "crop" cuts colours from; None: unknown
     depth: torch.Tensor | None = None  # float32 [B, 64, 64]: distance along the axis, 0: no surface; None: unknown
-    part_of: StepViews | None = None  # all views of the step, if other processes have the rest
 
     def __len__(self) -> int:
         return len(self.images)
@@ -47,15 +32,3 @@ class Batch:
     def cameras(self) -> nmr.cameras.Camera:
         """The B cameras that saw the images; their poses must be known."""
         return self.poses.cameras()
-
-    @property
-    def step_views(self) -> StepViews:
-        """All views of the step; this batch holds some of them or all."""
-        if self.part_of is not None:
-            return self.part_of
-        return StepViews(torch.arange(len(self)), self.poses, self.view_ids, self.class_ids)
-
-    def with_poses(self, poses: Poses) -> Batch:
-        """The same batch with `poses` for all views of the step."""
-        part = None if self.part_of is None else dataclasses.replace(self.part_of, poses=poses)
-        return dataclasses.replace(self, poses=poses if part is None else poses[part.rows], part_of=part)

@@ -32,7 +32,5 @@ class PoseCandidates:
         drawn = np.random.default_rng([seed, step, 2]).random(len(indices))
         limits = self.weights[indices].cumsum(axis=1)[:, :-1]
         chosen = indices * self.weights.shape[1] + torch.from_numpy((drawn[:, None] >= limits).sum(axis=1))
-        view_ids, part = torch.from_numpy(self.view_ids[chosen]), batch.part_of
-        if part is not None:
-            part, view_ids = dataclasses.replace(part, view_ids=view_ids), view_ids[part.rows]
-        return dataclasses.replace(batch, view_ids=view_ids, part_of=part).with_poses(self.poses[chosen])
+        view_ids = torch.from_numpy(self.view_ids[chosen])
+        return dataclasses.replace(batch, view_ids=view_ids, poses=self.poses[chosen])

@@ -13,7 +13,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from learn3d.data.batch import Batch, StepViews
+from learn3d.data.batch import Batch
 from learn3d.data.candidates import PoseCandidates
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
 from learn3d.data.crops import Crops, join_crops
@@ -118,11 +118,10 @@ class ViewDataset:
         cube_side = None if self.voxels is None else self.convention.cube_side
         return DatasetInfo(self.num_views, self.num_classes, features, self.inverted, mirror_plane_deg, cube_side)
 
-    def batch(self, indices: Tensor, rows: Tensor | None = None, *, voxels: bool = True) -> Batch:
+    def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:
         """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU.
 
-        rows: int64 [b], which of them this process needs; None: all. voxels: training needs none, and they are twice as
-        large as the images.
+        voxels: training needs none, and they are twice as large as the images.
         """
         indices = torch.as_tensor(indices, dtype=torch.int64)
         samples = indices.numpy()
@@ -132,19 +131,15 @@ class ViewDataset:
         poses = None if self.poses is None else self.poses[indices]
         view_ids, objects = (array[samples].astype(np.int64) for array in (self.view_ids, self.object_ids))
         classes = np.zeros_like(objects) if self.class_ids is None else self.class_ids[objects]
-        view_ids, classes = torch.from_numpy(view_ids), torch.from_numpy(classes)
-        if rows is not None:
-            views = StepViews(rows, poses, view_ids, classes)
-            return dataclasses.replace(self.batch(indices[rows], voxels=voxels), part_of=views)
         images = torch.from_numpy(self.images[samples])
         masks = images[:, 3] if self.masks is None else torch.from_numpy(self.masks[samples])
         return Batch(
             images=images,
             masks=masks.to(torch.float32) / 255,
             poses=poses,
-            view_ids=view_ids,
+            view_ids=torch.from_numpy(view_ids),
             object_ids=torch.from_numpy(objects),
-            class_ids=classes,
+            class_ids=torch.from_numpy(classes),
             voxels=torch.from_numpy(self.voxels[objects]) if voxels and self.voxels is not None else None,
             crops=None if self.crops is None else self.crops[samples],
             depth=None if self.depth is None else depth_of_levels(torch.from_numpy(self.depth[samples]), poses),
@@ -154,11 +149,11 @@ class ViewDataset:
         """Occupancy bool [B, 32, 32, 32] of predictions in the data set's voxel axes; see `VoxelConvention`."""
         return self.convention.voxelize(vertices, faces, definition)
 
-    def prepare(self, indices: Tensor, rows: Tensor | None = None) -> None:
+    def prepare(self, indices: Tensor) -> None:
         """Begin to read what `batch` will be asked for next, if it is on disk."""
         for array in (self.images, self.masks, self.depth):
             if isinstance(array, DiskArray):
-                array.prepare((indices if rows is None else indices[rows]).numpy())
+                array.prepare(indices.numpy())
 
     def digest(self, *, voxels: bool = True) -> int:
         """CRC-32 of images, masks, poses and classes, and of the voxels if wanted; of arrays on disk, of checksums."""

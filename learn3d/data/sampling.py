@@ -30,20 +30,19 @@ class BatchOptions(Protocol):
     iterations: int
 
 
-def batches(dataset: ViewDataset, options: BatchOptions, start: int = 1, rows: Tensor | None = None) -> Iterator[Batch]:
+def batches(dataset: ViewDataset, options: BatchOptions, start: int = 1) -> Iterator[Batch]:
     """The batches of the training steps `start` .. `options.iterations`, sampled and augmented, without voxels.
 
-    While a step uses a batch, a thread reads the next one from the disk, if the data set is there. With `rows`, int64
-    [b], a batch has only these rows of the step's batch: those of one of several processes.
+    While a step uses a batch, a thread reads the next one from the disk, if the data set is there.
     """
     indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, start)
     for step in range(start, options.iterations + 1):
-        batch = dataset.batch(indices, rows, voxels=False)
+        batch = dataset.batch(indices, voxels=False)
         if dataset.candidates is not None:
             batch = dataset.candidates.draw(batch, indices, options.seed, step)
         if step < options.iterations:
             indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, step + 1)
-            dataset.prepare(indices, rows)
+            dataset.prepare(indices)
         yield augment(batch, options.augment, options.seed, step, inverted=dataset.inverted)
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import torch
 
 from learn3d.config import differences, load_config
-from learn3d.distributed.tasks import Task, run_tasks
 from learn3d.experiments.comparison import make_report
 from learn3d.experiments.measurement import Result, measure
 from learn3d.experiments.plan import PlannedRun, Request, plan_runs
@@ -18,6 +17,7 @@ from learn3d.files import limits, writing
 from learn3d.files.reading import read_bytes
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
+from learn3d.runs.tasks import Task, run_tasks
 from learn3d.terminal import INTERRUPTED, align, note, say
 from learn3d.training import train
 
@@ -54,12 +54,11 @@ def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = tra
         raise ValueError("\n  ".join([*conflicts, advice]))
     results = read_results(runs)
     if not request.report_only:
-        where = f"on the cluster {request.cluster}" if request.cluster else f"{request.jobs} at a time"
         logs = request.output / "runs/*/*" / LOG_FILE
-        note(f"{request.table}: {len(runs)} runs, {len(results)} of them done; {where}; logs: {logs}")
+        note(f"{request.table}: {len(runs)} runs, {len(results)} of them done; {request.jobs} at a time; logs: {logs}")
         missing = [run for run in runs if run.folder not in results]
         tasks = [Task(run.name, work, (run,), run.folder / LOG_FILE) for run in missing]
-        failed = run_tasks(tasks, jobs=request.jobs, cluster=request.cluster)
+        failed = run_tasks(tasks, jobs=request.jobs)
         results = read_results(runs)
     tables, text = make_report(request, runs, results)
     path = request.output / f"{request.table}.md"

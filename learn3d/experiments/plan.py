@@ -52,8 +52,6 @@ class Request:
     one (default: none)."""
     jobs: int = 1
     """Runs at a time, each in a process of its own with its share of the cores."""
-    cluster: Rare[str | None] = None
-    """Address or scheduler file of the Dask cluster that runs them, see docs/scale.md (default: they run here)."""
     report_only: bool = False
     """Train nothing: report the runs that are complete."""
 

@@ -94,10 +94,8 @@ def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
 
 
 def cores() -> int:
-    """The number of workers of this process: its cores, shared with the processes that were started beside it."""
-    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    beside = os.environ.get("LOCAL_WORLD_SIZE") or os.environ.get("PYTEST_XDIST_WORKER_COUNT") or "1"
-    return max(1, own // max(1, int(beside)))
+    """The number of workers: the cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Task:

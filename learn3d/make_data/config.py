@@ -15,7 +15,7 @@ from learn3d.settings import Count, FilePath, Rare, Weight, checked
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Amount = Annotated[int, Field(ge=0)]
-NOT_SETTINGS = {"output", "overwrite", "shards", "jobs", "cluster"}  # options on which no file depends
+NOT_SETTINGS = {"output", "overwrite", "shards", "jobs"}  # options on which no file depends
 
 
 @checked
@@ -56,8 +56,6 @@ class DatasetConfig:
     Only for the layouts kato and around. The same command continues an interrupted one."""
     jobs: Count = 1
     """Shards that are made at a time, each in a process of its own."""
-    cluster: Rare[str | None] = None
-    """Address or scheduler file of the Dask cluster that makes the shards (default: they are made here)."""
 
     def __post_init__(self) -> None:
         if (self.source is None) == (self.procedural == 0):
@@ -71,8 +69,8 @@ class DatasetConfig:
                 f"shards are made in the layouts kato and around, not {self.layout}; make the data set without "
                 "--shards, and convert it (learn3d convert-dataset)"
             )
-        if not self.shards and (self.jobs > 1 or self.cluster):
-            raise ValueError("--jobs and --cluster are for shards: add --shards")
+        if not self.shards and self.jobs > 1:
+            raise ValueError("--jobs is for shards: add --shards")
         synset_of(self.category)
         conventions.mesh_to_object(self.up, self.facing)
         writer = WRITERS[self.layout]

@@ -1,7 +1,7 @@
 """Data sets of any size: meshes -> shards (`learn3d.data.shards`), each made by a process of its own.
 
-A shard depends on the settings and its meshes alone. So it does not matter which process or machine makes it, and the
-shards that a killed call has made are kept by the next one.
+A shard depends on the settings and its meshes alone. So it does not matter which process makes it, and the shards
+ that a killed call has made are kept by the next one.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import torch
 from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS
 from learn3d.data.shards import finish_set, remove, shard_path, write_shard
-from learn3d.distributed.tasks import Task, run_tasks
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.files.writing import write_json
 from learn3d.make_data.config import DatasetConfig
@@ -23,6 +22,7 @@ from learn3d.make_data.folders import publishing
 from learn3d.make_data.render import DatasetReport, Item, contact_row, render_meshes, report_files, split_items
 from learn3d.make_data.writers import WRITERS
 from learn3d.pictures.contact_sheet import ROWS
+from learn3d.runs.tasks import Task, run_tasks
 from learn3d.terminal import INTERRUPTED, note, say, stop_on_signal
 
 OBJECTS_PER_SHARD = 512  # 201 MB of images
@@ -37,7 +37,7 @@ def make_shards(config: DatasetConfig) -> int:
     1 then, 130 if a signal stopped it.
 
     Raises ValueError (no usable mesh, settings that do not fit, shards of other settings in the folder), OSError (the
-    folder cannot be written, no such cluster).
+    folder cannot be written).
     """
     folder, splits = config.output / synset_of(config.category), split_items(config)
     _prepare(config, folder, splits)
@@ -51,7 +51,7 @@ def make_shards(config: DatasetConfig) -> int:
             tasks[path] = Task(f"{split} {number}", make_shard, given, folder / f"{split}-{number:05d}.log")
     missing = [task for path, task in tasks.items() if not path.is_file()]
     note(f"{config.category}: {len(tasks)} shards, {len(missing)} to be made; logs: {folder / '*.log'}")
-    failed = run_tasks(missing, jobs=config.jobs, cluster=config.cluster)
+    failed = run_tasks(missing, jobs=config.jobs)
     for name, tail in failed.items():
         note(f"\nFAILED {name}; the end of the log:\n{tail}")
     if count := sum(not path.is_file() for path in tasks):

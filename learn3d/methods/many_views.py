@@ -87,7 +87,7 @@ class ManyViews(MeshMethod):
         """
         count = check_groups(batch, GROUP_SIZE, "groups")
         images = batch.images[:count]
-        flipped = (batch.step_views.rows[:count] % 2 == 1) & (self.generator.mirror is not None)
+        flipped = (torch.arange(count) % 2 == 1) & (self.generator.mirror is not None)
         codes, vertices = self.predict(torch.where(flipped[:, None, None, None], images.flip(3), images))
         losses = {"prior": gaussian_prior_loss(codes, "squared")} if self.settings.lambda_prior > 0 else {}
         if self.settings.lambda_view > 0:

@@ -16,8 +16,6 @@ from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE, DatasetInfo
 from learn3d.data.poses import Poses
 from learn3d.device import autocast
-from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup, all_reduce_gradients
-from learn3d.distributed.sync_batch_norm import convert_sync_batchnorm
 from learn3d.methods.optimization import CONSTANT_LR, EMA, TrainingSchedule, adam, backpropagate
 from learn3d.methods.settings import MeshSettings, MethodSettings
 from learn3d.methods.surfaces import Grids, Meshes
@@ -42,7 +40,6 @@ class Method(abc.ABC):
     networks: dict[str, nn.Module]  # each is also an attribute: networks["encoder"] is self.encoder
     optimizers: dict[str, torch.optim.Optimizer]
     ema: EMA | None = None  # moving average of the weights, if the run asks for it
-    group: ProcessGroup = SINGLE_PROCESS  # processes that train it together; set by `distribute`
     image_size: int  # side of the images that `encode` takes; also a property of the method's settings
 
     def __init__(
@@ -120,7 +117,7 @@ class Method(abc.ABC):
     def backward_and_step(self, losses: Mapping[str, Tensor], step: int, *names: str) -> dict[str, float]:
         """Backpropagate the weighted sum of the losses and let the optimizers `names` step; see `backpropagate`."""
         self._clear_gradients()
-        values = backpropagate(losses, self.weights_at(step), step, self.group)
+        values = backpropagate(losses, self.weights_at(step), step)
         for name in names:
             self.optimizers[name].step()
         return values
@@ -128,16 +125,6 @@ class Method(abc.ABC):
     def _clear_gradients(self) -> None:
         for optimizer in self.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
-
-    def distribute(self, group: ProcessGroup) -> None:
-        """Train in several processes: gradients are summed over the processes, batch norms see the rows of all."""
-        self.group = group
-        if group.world_size == 1:
-            return
-        for network in self.networks.values():
-            convert_sync_batchnorm(network, group)
-        for optimizer in self.optimizers.values():
-            optimizer.register_step_pre_hook(all_reduce_gradients)
 
     def ema_weights(self) -> contextlib.AbstractContextManager[None]:
         """Context in which the networks have their averaged weights, if the run keeps an average."""

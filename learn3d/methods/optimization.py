@@ -11,8 +11,6 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
-
 LRSchedule = Literal["constant", "cosine", "linear", "step"]
 
 
@@ -160,12 +158,9 @@ def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
     return torch.func.functional_call(network, state, inputs)
 
 
-def backpropagate(
-    losses: Mapping[str, Tensor], weights: Mapping[str, float], step: int, group: ProcessGroup = SINGLE_PROCESS
-) -> dict[str, float]:
+def backpropagate(losses: Mapping[str, Tensor], weights: Mapping[str, float], step: int) -> dict[str, float]:
     """Backpropagate the sum of the losses, each times its weight; return the losses and "total".
 
-    Losses are means over this process's rows; returned values and the summed gradients are those of the whole batch.
     Losses may lie on the CPU and on the networks' device; there is one sum for each of the two.
     Raises ValueError if a loss has no weight. Raises FloatingPointError, before any gradient, if a loss is not finite.
     """
@@ -176,14 +171,12 @@ def backpropagate(
         weight = weights[name]
         term = loss if weight == 1.0 else weight * loss
         totals[loss.device] = totals[loss.device] + term if loss.device in totals else term
-    values = group.all_reduce_mean(read_back(losses))
+    values = read_back(losses)
     values["total"] = sum(weights[name] * value for name, value in values.items())
     if not all(math.isfinite(value) for value in values.values()):
         listed = ", ".join(f"{name} {value:g}" for name, value in values.items())
         raise FloatingPointError(f"the loss is not finite at iteration {step} ({listed})")
-    torch.autograd.backward(
-        [total if group.world_size == 1 else group.batch_share * total for total in totals.values()]
-    )
+    torch.autograd.backward(list(totals.values()))
     return values
 
 

@@ -115,7 +115,7 @@ class Plus(PoseInvariant):
 
     def _flipped(self, batch: Batch) -> Tensor:
         # Batches are in random order already.
-        return (batch.step_views.rows % 2 == 1) & (self.generator.mirror is not None)
+        return (torch.arange(len(batch)) % 2 == 1) & (self.generator.mirror is not None)
 
     def _silhouette_losses(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
         losses = super()._silhouette_losses(vertices, batch)
@@ -125,15 +125,12 @@ class Plus(PoseInvariant):
         """All shapes of the batch are rendered at one of its cameras. The loss is the energy distance between these
         silhouettes and the masks of this view in the mask bank, mostly of other objects.
         """
-        views = batch.step_views
-        masks = self.group.all_gather_rows(_reduced(batch.masks), views.rows, len(views))
-        self.mask_bank.add(masks, views.view_ids)
-        seen_by = int(torch.randint(len(views), ()))
+        self.mask_bank.add(_reduced(batch.masks), batch.view_ids)
+        seen_by = int(torch.randint(len(batch), ()))
         if not self.mask_bank.full:
             return {}
-        silhouettes = self.render(vertices, views.poses[torch.full((len(vertices),), seen_by)])
-        drawn = self.group.all_gather_rows(_reduced(silhouettes), views.rows, len(views))
-        real = self.mask_bank.of_view(int(views.view_ids[seen_by])).to(drawn.device)
+        drawn = _reduced(self.render(vertices, batch.poses[torch.full((len(vertices),), seen_by)]))
+        real = self.mask_bank.of_view(int(batch.view_ids[seen_by])).to(drawn.device)
         return {"novel_view": silhouette_energy_distance(drawn, real)}
 
 

@@ -11,10 +11,9 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from learn3d.data.batch import Batch, StepViews
+from learn3d.data.batch import Batch
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
 from learn3d.device import autocast, upload
-from learn3d.distributed.process_group import SINGLE_PROCESS, ProcessGroup
 from learn3d.methods.method import Method
 from learn3d.methods.optimization import adam, frozen
 from learn3d.methods.settings import MethodSettings
@@ -151,11 +150,9 @@ class PrGAN(Method):
         Raises ValueError if the batch's cameras are not those of the K views.
         """
         check_views(batch.poses, batch.view_ids, self.views)
-        views = batch.step_views
         if step >= self.settings.encoder_from_step:
-            return self._encoder_step(views, step)
-        z = self.sample_z(len(views))[views.rows]
-        return self._gan_step(upload(batch.masks, self.device), z, step)
+            return self._encoder_step(len(batch), step)
+        return self._gan_step(upload(batch.masks, self.device), self.sample_z(len(batch)), step)
 
     def _gan_step(self, real: Tensor, z: Tensor, step: int) -> dict[str, float]:
         """Train the discriminator, if its accuracy at the start is at most 0.8, then the generator, then the generator
@@ -180,21 +177,20 @@ class PrGAN(Method):
         with self.autocast():
             first = self.discriminator.first
             of_real, of_fake = (frozen(first, images[:, None]).float() for images in (real, self.generate(z)))
-        backward_and_step("generator_statistics", statistics_loss(of_real, of_fake, self.group))
+        backward_and_step("generator_statistics", statistics_loss(of_real, of_fake))
         values["total"] = sum(values.get(name, 0.0) for name in self.optimizers)
         return values
 
-    def _encoder_step(self, views: StepViews, step: int) -> dict[str, float]:
-        """The encoder learns z of fresh samples of the generator, which stays as it is (evaluation mode)."""
+    def _encoder_step(self, count: int, step: int) -> dict[str, float]:
+        """The encoder learns z of `count` fresh samples of the generator, which stays as it is (evaluation mode)."""
         self.set_training(False)
-        z = self.sample_z(len(views))[views.rows]
+        z = self.sample_z(count)
         with torch.no_grad():
             images = self.generate(z)
         with self.autocast():
             estimate = self.encoder(images)
         difference = estimate.float() - upload(z, self.device)
-        # A sum over the batch, not a mean: this process has only its share of it.
-        return self.backward_and_step({"encoder": difference.square().sum() / self.group.batch_share}, step, "encoder")
+        return self.backward_and_step({"encoder": difference.square().sum()}, step, "encoder")
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> float:
@@ -202,18 +198,16 @@ class PrGAN(Method):
         self.set_training(False)
         with self.autocast():
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
-        accuracy = float((of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2)
-        return self.group.all_reduce_mean({"accuracy": accuracy})["accuracy"]
+        return float((of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2)
 
 
-def statistics_loss(of_real: Tensor, of_fake: Tensor, group: ProcessGroup = SINGLE_PROCESS) -> Tensor:
+def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
     """Squared distances of batch means and of batch variances of features [B, ...], summed over all features."""
     means, variances = [], []  # not by torch's var, which takes ten times as long over the first axis
     for features in (of_real, of_fake):
         mean = features.mean(0)
-        mean, variance = group.all_reduce_moments(mean, (features - mean).square().mean(0))
         means.append(mean)
-        variances.append(variance)
+        variances.append((features - mean).square().mean(0))
     return torch.sub(*means).square().sum() + torch.sub(*variances).square().sum()
 
 

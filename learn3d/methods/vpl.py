@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 import nmr
-from learn3d.data.batch import Batch, StepViews
+from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
 from learn3d.device import upload
@@ -109,7 +109,7 @@ class VPL(MeshMethod):
     settings: VPLSettings
 
     def check_batch(self, batch: Batch) -> None:
-        if self.settings.lambda_discriminator > 0 and len(batch.step_views) < 2:
+        if self.settings.lambda_discriminator > 0 and len(batch) < 2:
             raise ValueError("view prior learning needs another view for each image: batches of at least 2, got 1")
 
     def create_networks(self) -> dict[str, nn.Module]:
@@ -156,21 +156,20 @@ class VPL(MeshMethod):
             losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
             return self.backward_and_step(losses, step, "encoder", "generator")
 
-        views = batch.step_views
-        others = other_views(views, settings.other_views)[views.rows]
+        others = other_views(batch, settings.other_views)
         vertices = self._vertices(batch)
-        both = views.poses[torch.cat([views.rows, others])]  # both views of each shape in one call
+        both = batch.poses[torch.cat([torch.arange(len(batch)), others])]  # both views of each shape in one call
         silhouettes, elsewhere = self.render(torch.cat([vertices, vertices]), both).chunk(2)
         losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
         if settings.adversary == "reversal":
             reverse = settings.lambda_discriminator
             real, fake = reverse_gradient(silhouettes, reverse), reverse_gradient(elsewhere, reverse)
-            losses["discrimination"] = self._discrimination_loss(real, fake, others, views)
+            losses["discrimination"] = self._discrimination_loss(real, fake, others, batch)
         elif step % 2 == 1:
             real, fake = silhouettes.detach(), elsewhere.detach()
-            losses["discrimination"] = self._discrimination_loss(real, fake, others, views)
+            losses["discrimination"] = self._discrimination_loss(real, fake, others, batch)
         else:
-            logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, views)
+            logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, batch)
             losses["adversarial"] = F.softplus(-logits).mean()
         trained = ["encoder", "generator"] + ["discriminator"] * ("discrimination" in losses)
         return self.backward_and_step(losses, step, *trained)
@@ -198,28 +197,28 @@ class VPL(MeshMethod):
             return silhouette_pyramid_loss(silhouettes, masks)
         return nmr.losses.soft_iou_loss(silhouettes, masks)
 
-    def _discrimination_loss(self, real: Tensor, fake: Tensor, others: Tensor, views: StepViews) -> Tensor:
+    def _discrimination_loss(self, real: Tensor, fake: Tensor, others: Tensor, batch: Batch) -> Tensor:
         """Binary cross-entropy of logits x: softplus(-x) for the target 1, softplus(x) for 0; scalar."""
-        real_logits = self._discriminate(self.discriminator, real, views.rows, views)
-        fake_logits = self._discriminate(self.discriminator, fake, others, views)
+        real_logits = self._discriminate(self.discriminator, real, torch.arange(len(batch)), batch)
+        fake_logits = self._discriminate(self.discriminator, fake, others, batch)
         return F.softplus(-real_logits).mean() + F.softplus(fake_logits).mean()
 
     def _discriminate(
-        self, network: Callable[..., Tensor], silhouettes: Tensor, seen_at: Tensor, views: StepViews
+        self, network: Callable[..., Tensor], silhouettes: Tensor, seen_at: Tensor, batch: Batch
     ) -> Tensor:
-        """Logits for silhouettes [b,S,S] of this process's shapes, seen at the views `seen_at`."""
+        """Logits for silhouettes [B,S,S] of the batch's shapes, seen at the views `seen_at`."""
         silhouettes = upload(silhouettes, self.device)
         if self.settings.discriminator == "dcgan":
             with self.autocast():
-                return network(silhouettes, upload(views.view_ids[seen_at], self.device)).float()
+                return network(silhouettes, upload(batch.view_ids[seen_at], self.device)).float()
         # In float32: spectral normalisation mixes types otherwise.
-        conditions = [upload(views.poses[seen_at].features(), self.device)]
+        conditions = [upload(batch.poses[seen_at].features(), self.device)]
         if self.settings.class_conditional:
-            conditions.append(upload(views.class_ids[views.rows], self.device))
+            conditions.append(upload(batch.class_ids, self.device))
         return network(silhouettes, *conditions)
 
 
-def other_views(batch: Batch | StepViews, choice: Literal["random", "reversed", "next"]) -> Tensor:
+def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> Tensor:
     """Index of the sample whose view is the other view of each sample, int64 [B]; see VPLSettings.other_views.
 
     "random" uses torch's global generator, and takes any sample if all have one view class. If all views are equally

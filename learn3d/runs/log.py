@@ -8,16 +8,14 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from learn3d.config import TrainConfig
 from learn3d.files import writing
-from learn3d.runs.checkpoint import Progress
 from learn3d.runs.folder import METRICS, TENSORBOARD
 from learn3d.terminal import is_watched, note
 
@@ -105,24 +103,6 @@ class RunLog:
         os.fsync(self._metrics.fileno())
         if self._tensorboard is not None:
             self._tensorboard.flush()
-
-
-def open_log(config: TrainConfig, progress: Progress, is_main: bool) -> RunLog | SilentLog:
-    """The log of a run that goes on at `progress`; processes other than rank 0 report nothing."""
-    return RunLog(config.output, start=progress.step, total=config.iterations) if is_main else SilentLog()
-
-
-class SilentLog:
-    """The log of a process that does not report: every call does nothing."""
-
-    def __enter__(self) -> SilentLog:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def __getattr__(self, name: str) -> Callable[..., None]:
-        return lambda *arguments, **options: None
 
 
 def _drop_after(path: Path, step: int) -> None:

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from learn3d.config import TrainConfig, check_resume, config_to_dict, load_config
 from learn3d.data.dataset import ViewDataset
-from learn3d.distributed.process_group import ProcessGroup, weights_checksum
 from learn3d.files import writing
 from learn3d.methods import DatasetInfo, Method
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Metadata, Progress
 from learn3d.runs.folder import BEST, CONFIG, LAST, PREVIOUS
-from learn3d.runs.log import RunLog, SilentLog
+from learn3d.runs.log import RunLog
 from learn3d.runs.versions import versions
 
 
@@ -35,51 +33,31 @@ class Run:
     method: Method
     info: DatasetInfo
     data: str  # `describe_images` of the training images
-    group: ProcessGroup
     versions: dict[str, str | None] = field(default_factory=versions)  # of the code that runs
 
-    def begin(
-        self, train_set: ViewDataset, val_set: ViewDataset, *, resume: bool, overwrite: bool
-    ) -> tuple[Progress, tuple[str, ...]]:
+    def begin(self, train_set: ViewDataset, *, resume: bool, overwrite: bool) -> tuple[Progress, tuple[str, ...]]:
         """Bring networks, optimizers and random numbers to where the run stands: its start, or its last checkpoint.
 
-        Then take the folder, and let all processes learn together. Returns where the run stands, and warnings. A
-        finished run stays as it is.
+        Then take the folder. Returns where the run stands, and warnings. A finished run stays as it is.
         """
         config, folder = self.config, self.config.output
         progress, notes, saved = Progress(object_share=train_set.object_share()), (), None
         if resume:
-            with self.group.main_process_first():  # it may have to put the previous checkpoint in place
-                saved, notes = load_last(config)
+            saved, notes = load_last(config)
         if saved is not None:
             progress = self._restore(*saved)
         else:
             self.method.start_from_pretrained()
         if progress.step > config.iterations:
             raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
-        if self.group.is_main and resume:
+        if resume:
             run_folder.remove_partials(folder)
         if progress.step == config.iterations:
             return progress, notes
-        self.method.distribute(self.group)
-        self._compare_processes(train_set, val_set)
-        if self.group.is_main:
-            if not resume:
-                run_folder.remove_old_run(folder, overwrite)
-            writing.write_json(folder / CONFIG, config_to_dict(config), sync=True)
+        if not resume:
+            run_folder.remove_old_run(folder, overwrite)
+        writing.write_json(folder / CONFIG, config_to_dict(config), sync=True)
         return progress, notes
-
-    def _compare_processes(self, train_set: ViewDataset, val_set: ViewDataset) -> None:
-        """Raise a ValueError naming the things that differ between the processes of the run."""
-        if self.group.world_size > 1:
-            options = dataclasses.replace(self.config, data=Path("-"), output=Path("-"), threads=None)
-            same = {
-                "options": config_to_dict(options),
-                "training data": train_set.digest(),
-                "validation data": val_set.digest(),
-                "weights": weights_checksum(self.method.networks),
-            }
-            self.group.check_equal(**same)
 
     def _restore(self, tensors: dict[str, Tensor], metadata: Metadata) -> Progress:
         """Bring everything back to its state at `save_last`. A ValueError names options or data that differ."""
@@ -107,12 +85,10 @@ class Run:
             return dataclasses.replace(metadata.progress, best_iou=-1.0, best_step=0)  # it is of other images
         return metadata.progress
 
-    def save(self, progress: Progress, log: RunLog | SilentLog) -> None:
-        """Write the metrics so far and last.safetensors, by rank 0. Weights that differ between ranks are refused."""
-        self.group.check_equal(weights=0 if self.group.world_size == 1 else weights_checksum(self.method.networks))
-        if self.group.is_main:
-            log.sync()
-            self.save_last(progress)
+    def save(self, progress: Progress, log: RunLog) -> None:
+        """Write the metrics so far and last.safetensors."""
+        log.sync()
+        self.save_last(progress)
 
     def save_last(self, progress: Progress) -> None:
         """Write last.safetensors: networks, optimizers, random state, and all of `Metadata`.
@@ -133,11 +109,10 @@ class Run:
         checkpoint.save(folder / LAST, tensors, self._metadata(progress))
 
     def save_best(self, progress: Progress) -> None:
-        """Write best.safetensors by the first process: the networks, or their averages, for use."""
-        if self.group.is_main:
-            with self.method.ema_weights():
-                networks = checkpoint.network_tensors(self.method)
-                checkpoint.save(self.config.output / BEST, networks, self._metadata(progress))
+        """Write best.safetensors: the networks, or their averages, for use."""
+        with self.method.ema_weights():
+            networks = checkpoint.network_tensors(self.method)
+            checkpoint.save(self.config.output / BEST, networks, self._metadata(progress))
 
     def _metadata(self, progress: Progress) -> Metadata:
         return Metadata(self.config, self.info, progress, self.data, self.versions)

@@ -18,9 +18,8 @@ def describe_run(
     run: Run, progress: Progress, train_set: ViewDataset, val_set: ViewDataset, threads: ThreadTuner
 ) -> str:
     """Lines about a run that begins or goes on: method, data, device, and the mirror plane if it was looked for."""
-    config, group = run.config, run.group
-    processes = f" in each of {group.world_size} processes ({group.backend})" if group.world_size > 1 else ""
-    where = f"{config.device}, {config.precision}, {threads}{processes}"
+    config = run.config
+    where = f"{config.device}, {config.precision}, {threads}"
     data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
     verb = f"resuming at step {progress.step}" if progress.step else "training"
     name = f"{PRESETS[config.preset].label} ({config.preset})"

@@ -22,19 +22,13 @@ REST = 1000  # steps with one thread after which all are tried again; then after
 class ThreadTuner:
     """Chooses between one thread and all by the duration of training steps.
 
-    It does nothing if the number is fixed: by `threads`, by the environment (OMP_NUM_THREADS), because there is only
-    one core, or because several `processes` train together, which wait for the slowest.
+    It does nothing if the number is fixed: by `threads`, by the environment (OMP_NUM_THREADS), or because there is only
+    one core.
     """
 
-    def __init__(
-        self,
-        threads: int | None,
-        *,
-        processes: int = 1,
-        set_num_threads: Callable[[int], None] = torch.set_num_threads,
-    ) -> None:
+    def __init__(self, threads: int | None, *, set_num_threads: Callable[[int], None] = torch.set_num_threads) -> None:
         self.all = threads or torch.get_num_threads()
-        self.fixed = threads is not None or "OMP_NUM_THREADS" in os.environ or self.all == 1 or processes > 1
+        self.fixed = threads is not None or "OMP_NUM_THREADS" in os.environ or self.all == 1
         self._set_num_threads = set_num_threads
         self._seconds: deque[float] = deque(maxlen=WINDOW)  # of the last steps with this number of threads
         self._best = float("inf")  # the least median of WINDOW steps

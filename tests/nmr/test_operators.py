@@ -126,7 +126,7 @@ print("torch._dynamo" in sys.modules)
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 def test_a_forked_process_renders_with_one_thread():
-    """As docs/multi-process.md says: with more threads it would wait for those of its parent, in torch, too."""
+    """As docs/performance.md says: with more threads it would wait for those of its parent, in torch, too."""
     program = """
 import os, torch, nmr
 vertices, faces = nmr.icosphere(2)

@@ -239,20 +239,6 @@ def test_what_is_read_ahead_is_what_was_asked_for(stored) -> None:
         dataset.images[:, 3]
 
 
-def test_each_of_several_processes_reads_its_own_rows(stored, tiny_folder, monkeypatch) -> None:
-    dataset, indices = load_dataset("kato", stored, "airplane", "train"), torch.tensor([5, 60, 33, 2, 41])
-    whole = load_dataset("kato", tiny_folder, "airplane", "train").batch(indices)
-    read, original = [], DiskArray._read
-    monkeypatch.setattr(DiskArray, "_read", lambda array, rows: (read.extend(rows.tolist()), original(array, rows))[1])
-    for rank, rows in enumerate((torch.tensor([0, 1, 2]), torch.tensor([3, 4]))):
-        dataset.prepare(indices, rows)
-        part = dataset.batch(indices, rows, voxels=False)
-        assert torch.equal(part.images, whole.images[rows])
-        assert torch.equal(part.step_views.view_ids, whole.view_ids)
-        assert read == indices[rows].tolist(), f"once, by process {rank}"
-        read.clear()
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is measured on Linux only")
 def test_memory_does_not_grow_with_the_data(tmp_path) -> None:
     """200 MB of images, of which batches are read, take a few megabytes."""
