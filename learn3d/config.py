@@ -10,9 +10,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, SkipValidation
 
-from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import LAYOUTS, Layout, check_options
-from learn3d.data.sampling import VIEWS_OF_OBJECT, Sampling
+from learn3d.data.sampling import VIEWS_OF_OBJECT, Augmentation, Sampling
 from learn3d.files import limits
 from learn3d.files.reading import parse_json, read_bytes
 from learn3d.methods import LRSchedule, MethodSettings, TrainingSchedule

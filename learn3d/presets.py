@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from learn3d.data.augment import Augmentation
 from learn3d.data.layouts import Layout
-from learn3d.data.sampling import Sampling
+from learn3d.data.sampling import Augmentation, Sampling
 from learn3d.methods import LRSchedule, MethodSettings
 from learn3d.methods.many_views import ManyViewsSettings
 from learn3d.methods.multi_view import MultiViewSettings

@@ -22,7 +22,7 @@ COMMANDS = {
     "convert-dataset": ("data:ConvertDataset", "train", "keep a data set in shards, for data larger than memory"),
     "check-dataset": ("data:CheckDataset", "train", "list everything that is wrong with a data set"),
     "estimate-poses": ("poses:EstimatePoses", "train", "find the poses of images from their masks"),
-    "experiment": ("experiment:Experiment", "train", "make a table of the paper: train, measure, report"),
+    "experiment": ("train:Experiment", "train", "make a table of the paper: train, measure, report"),
     "figures": ("pages:Figures", "figures", "draw the paper's figures from trained models"),
     "report": ("pages:Report", "report", "write a page about trained models, with shapes to turn"),
     "fetch-debian-models": ("data:FetchDebianModels", "data", "get meshes out of Debian packages"),

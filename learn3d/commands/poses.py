@@ -15,7 +15,7 @@ from tqdm import tqdm
 from learn3d.commands.command import Command
 from learn3d.data.layouts import Layout, load_dataset
 from learn3d.data.poses import wrap_deg
-from learn3d.files.findings import MissingFile
+from learn3d.files.reading import MissingFile
 from learn3d.files.writing import check_target
 from learn3d.pictures.sheets import save_png
 from learn3d.poses.estimate import PoseOptions

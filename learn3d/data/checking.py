@@ -15,7 +15,7 @@ from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS
 from learn3d.data.layouts import LAYOUTS, Layout, layouts_in
 from learn3d.data.readers import READERS
-from learn3d.files.findings import Findings, Problem
+from learn3d.files.reading import Findings, Problem
 
 
 @dataclass(frozen=True)

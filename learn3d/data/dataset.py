@@ -13,8 +13,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from learn3d.data.batch import Batch
-from learn3d.data.candidates import PoseCandidates
+from learn3d.data.batch import Batch, PoseCandidates
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
 from learn3d.data.crops import Crops, join_crops
 from learn3d.data.disk_array import DiskArray

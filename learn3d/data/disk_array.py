@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.files.findings import DamagedFile
-from learn3d.files.reading import open_file
+from learn3d.files.reading import DamagedFile, open_file
 
 MOST_BYTES = 2**45  # of a file
 WANTED = "a shard of a data set"

@@ -13,9 +13,8 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from learn3d.files import limits, sandbox
-from learn3d.files.findings import DamagedFile
-from learn3d.files.images import PHOTOGRAPHS, open_image
-from learn3d.files.renderings import MASK_SIZE, area_weights
+from learn3d.files.reading import DamagedFile
+from learn3d.files.renderings import MASK_SIZE, PHOTOGRAPHS, area_weights, open_image
 
 OBJECT_SHARE = 0.65  # of the side of the square that the object takes in Kato's renderings, about
 TOLERANCE = 0.12  # of colours, for `threshold_mask`

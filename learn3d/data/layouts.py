@@ -13,7 +13,7 @@ from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.pose_table import PoseTable
 from learn3d.data.readers import READERS
 from learn3d.data.view_bins import AngleBins
-from learn3d.files.findings import DamagedFile, MissingFile
+from learn3d.files.reading import DamagedFile, MissingFile
 
 Layout = Literal[tuple(READERS)]
 LAYOUTS: dict[str, LayoutProperties] = {name: reader.PROPERTIES for name, reader in READERS.items()}

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.data.candidates import PoseCandidates
+from learn3d.data.batch import PoseCandidates
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers.photos import view_classes
 from learn3d.files import npz
-from learn3d.files.findings import DamagedFile
+from learn3d.files.reading import DamagedFile
 from learn3d.files.sandbox import read
 from learn3d.files.writing import replacing
 

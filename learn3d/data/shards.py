@@ -40,8 +40,7 @@ from learn3d.data.disk_array import MOST_BYTES, WANTED, DiskArray
 from learn3d.data.poses import LookAtPoses, Poses, RotationPoses
 from learn3d.data.readers import READERS
 from learn3d.files import limits
-from learn3d.files.findings import STRICT, DamagedFile, Findings
-from learn3d.files.reading import open_file, parse_json, read_bytes
+from learn3d.files.reading import STRICT, DamagedFile, Findings, open_file, parse_json, read_bytes
 from learn3d.files.writing import replacing, write_json
 from learn3d.settings import checked
 

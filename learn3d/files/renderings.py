@@ -1,21 +1,48 @@
-"""Renderings and tables of cameras of one object: functions for the sandbox.
-
-A view comes back as the network's image, uint8 [4, size, size], the mask to be matched, uint8 [64, 64], and the
-brightest value of its mask at full size, which is 0 if the mask is empty.
-"""
+"""Untrusted image files, decoded by Pillow in the sandbox, and the renderings of data sets made of them."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
-from learn3d.files import limits
-from learn3d.files.findings import FETCH_AGAIN, DamagedFile, MissingFile
-from learn3d.files.images import RENDERINGS, open_image
-from learn3d.files.reading import read_text
+from learn3d.files import limits, sandbox
+from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile, open_file, read_text
+
+# TIFF is no format here: its tables may name millions of strips, each an object before the first pixel.
+RENDERINGS = ("PNG", "JPEG")
+PHOTOGRAPHS = ("PNG", "JPEG", "WEBP", "BMP")
+_MEMORY_PER_PIXEL = 16  # bytes; two copies of four channels, and one to work with
+_PIXELS_PER_SECOND = 2e7
+
+
+def open_image(path: Path, formats: Sequence[str], most_side: int) -> Image.Image:
+    """A decoded image in its own mode, of one of the formats (Pillow's names) and at most `most_side` pixels a side.
+
+    For functions that run in the sandbox. Raises MissingFile, and DamagedFile for a file of another kind or above 256
+    MiB, and for more than 64 million pixels.
+    """
+    with open_file(path, limits.IMAGE_FILE_BYTES, "an image") as file:
+        try:
+            image = Image.open(file, formats=formats)
+            pixels = image.width * image.height
+            if max(image.size) <= most_side and pixels <= limits.IMAGE_PIXELS:
+                sandbox.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
+                image.load()
+                return image
+            fault = f"is {image.width}x{image.height} pixels; at most {most_side} a side and {limits.IMAGE_PIXELS} in "
+            fault += "all are read: make it smaller"
+        except UnidentifiedImageError:
+            fault = f"cannot be decoded as an image of the kind {', '.join(formats)}. Convert it if it is of another"
+        except MemoryError:
+            raise
+        except Exception as error:  # Pillow's decoders raise whatever a damaged file leads them to
+            fault = f"cannot be decoded as an image ({sandbox.reason(error)}). {FETCH_AGAIN}"
+    raise DamagedFile(path, fault)
+
 
 MASK_SIZE = 64
 View = tuple[np.ndarray, np.ndarray, int]

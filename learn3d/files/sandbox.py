@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from learn3d.files.findings import FETCH_AGAIN, DamagedFile, MissingFile
+from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile
 
 MEMORY = 256 * 2**20  # bytes that a call may add to its worker; arrays made by `empty` do not count
 SECONDS = 5.0  # processor time of a call

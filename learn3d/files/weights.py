@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from learn3d.files import limits, sandbox
-from learn3d.files.findings import DamagedFile
-from learn3d.files.reading import check_file
+from learn3d.files.reading import DamagedFile, check_file
 
 MEMORY = 2**30  # bytes that importing torch may add, beside four times the file's size
 SECONDS = 30.0

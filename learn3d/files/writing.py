@@ -1,4 +1,4 @@
-"""Files that appear under their names only when complete: an interrupted write leaves the old file as it was."""
+"""Files and folders that appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+from learn3d.terminal import stop_on_signal
 
 
 @contextlib.contextmanager
@@ -97,3 +99,23 @@ def write_bytes(path: Path, content: bytes, *, sync: bool = False) -> None:
 def write_json(path: Path, value: Any, *, sync: bool = False) -> None:
     """Write a value as indented JSON with a line break at the end."""
     write_bytes(path, (json.dumps(value, indent=2) + "\n").encode(), sync=sync)
+
+
+@contextlib.contextmanager
+def publishing(folder: Path, paths: Sequence[str]) -> Iterator[Path]:
+    """Give a temporary folder in `folder`; its files and folders `paths` replace those of `folder` in the end.
+
+    What is missing there is removed here; all other files stay. After an exception nothing changes. It is all on one
+    file system, so nothing is copied, and an interruption waits until all is in place: files of two data sets do not go
+    together.
+    """
+    with tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=folder) as temporary:
+        new, old = Path(temporary) / "new", Path(temporary) / "old"
+        new.mkdir()
+        yield new
+        with stop_on_signal():
+            for source, target in ((folder, old), (new, folder)):
+                for path in paths:
+                    if (source / path).exists():
+                        (target / path).parent.mkdir(parents=True, exist_ok=True)
+                        os.replace(source / path, target / path)

@@ -16,13 +16,12 @@ from tqdm import tqdm
 from learn3d.data import conventions
 from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS
-from learn3d.files.writing import write_json
+from learn3d.files.writing import publishing, write_json
 from learn3d.make_data import meshes
 from learn3d.make_data.config import DatasetConfig
-from learn3d.make_data.folders import publishing
 from learn3d.make_data.writers import WRITERS, RenderedObject, Writer
 from learn3d.make_data.writers.writer import write_png
-from learn3d.pictures.contact_sheet import LEGEND, ROWS, draw_sheet, make_row
+from learn3d.pictures.sheets import LEGEND, ROWS, draw_sheet, make_row
 from learn3d.pictures.studio import photograph
 
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
@@ -97,7 +96,7 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
     """Make the data set that `config` describes and return a report; meshes that cannot be used are skipped.
 
     Writes the files of the layout (see its class in `learn3d.make_data.writers`) for every split that is not empty,
-    `{synset}_card.json` (settings, splits, skipped meshes) and `{synset}_contact.png` (see `contact_sheet.LEGEND`).
+    `{synset}_card.json` (settings, splits, skipped meshes) and `{synset}_contact.png` (see `sheets.LEGEND`).
     Files appear under their names only when all of them are complete.
 
     Raises ValueError (no usable mesh), FileNotFoundError (no such source), FileExistsError (files of the category are

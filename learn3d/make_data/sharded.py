@@ -16,12 +16,11 @@ from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS
 from learn3d.data.shards import finish_set, remove, shard_path, write_shard
 from learn3d.files.reading import parse_json, read_bytes
-from learn3d.files.writing import write_json
+from learn3d.files.writing import publishing, write_json
 from learn3d.make_data.config import DatasetConfig
-from learn3d.make_data.folders import publishing
 from learn3d.make_data.render import DatasetReport, Item, contact_row, render_meshes, report_files, split_items
 from learn3d.make_data.writers import WRITERS
-from learn3d.pictures.contact_sheet import ROWS
+from learn3d.pictures.sheets import ROWS
 from learn3d.runs.tasks import Task, run_tasks
 from learn3d.terminal import INTERRUPTED, note, say, stop_on_signal
 

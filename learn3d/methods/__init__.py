@@ -8,13 +8,12 @@ import torch
 
 from learn3d.device import check_device
 from learn3d.methods.many_views import ManyViews, ManyViewsSettings
-from learn3d.methods.method import DatasetInfo, MeshMethod, Method
+from learn3d.methods.method import DatasetInfo, MeshMethod, Method, MethodSettings
 from learn3d.methods.multi_view import MultiView, MultiViewSettings
 from learn3d.methods.optimization import CONSTANT_LR, LRSchedule, TrainingSchedule
 from learn3d.methods.plus import Plus, PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.prgan import PrGAN, PrGANSettings
-from learn3d.methods.settings import MethodSettings
 from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.methods.vpl import VPL, VPLSettings
 

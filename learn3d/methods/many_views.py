@@ -14,8 +14,7 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.sampling import GROUP_SIZE
 from learn3d.device import upload
 from learn3d.losses import depth_loss, gaussian_prior_loss, pose_classification_loss
-from learn3d.methods.method import MeshMethod, check_groups
-from learn3d.methods.settings import MeshSettings
+from learn3d.methods.method import MeshMethod, MeshSettings, check_groups
 from learn3d.methods.surfaces import Meshes
 from learn3d.networks import EncoderName, SymmetryOption, network_input
 from learn3d.networks.encoders import ViewClassifier

@@ -6,9 +6,8 @@ import torch
 
 import nmr
 from learn3d.data.batch import Batch
-from learn3d.methods.method import MeshMethod, check_groups
+from learn3d.methods.method import MeshMethod, MeshSettings, check_groups
 from learn3d.methods.optimization import SparseGradientAdam
-from learn3d.methods.settings import MeshSettings
 from learn3d.networks import EncoderName, GeneratorName
 from learn3d.settings import Weight, checked
 

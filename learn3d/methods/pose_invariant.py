@@ -10,9 +10,8 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.device import upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
-from learn3d.methods.method import MeshMethod
+from learn3d.methods.method import MeshMethod, MeshSettings
 from learn3d.methods.optimization import frozen
-from learn3d.methods.settings import MeshSettings
 from learn3d.methods.surfaces import Meshes
 from learn3d.networks import PoseDiscriminator
 from learn3d.networks.resnet import check_pretrained, load_pretrained

@@ -14,12 +14,10 @@ from torch import Tensor, nn
 from learn3d.data.batch import Batch
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
 from learn3d.device import autocast, upload
-from learn3d.methods.method import Method
+from learn3d.methods.method import Method, MethodSettings
 from learn3d.methods.optimization import adam, frozen
-from learn3d.methods.settings import MethodSettings
 from learn3d.methods.surfaces import Grids
 from learn3d.networks import network_input
-from learn3d.networks.projection import ViewCircle, project
 from learn3d.networks.voxel_gan import (
     DISCRIMINATOR_CHANNELS,
     GENERATOR_CHANNELS,
@@ -28,7 +26,9 @@ from learn3d.networks.voxel_gan import (
     TAU,
     InverseEncoder,
     SilhouetteDiscriminator,
+    ViewCircle,
     VoxelGenerator,
+    project,
 )
 from learn3d.settings import Items, LayerChannels, Positive, Share, Step, checked
 

@@ -21,13 +21,12 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
 from learn3d.device import upload
 from learn3d.losses import silhouette_pyramid_loss
-from learn3d.methods.method import DatasetInfo, MeshMethod, plane_of
+from learn3d.methods.method import DatasetInfo, MeshMethod, MeshSettings, plane_of
 from learn3d.methods.optimization import adam, frozen
-from learn3d.methods.settings import MeshSettings
 from learn3d.networks import ENCODERS, GENERATORS, MeshGenerator
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
+from learn3d.networks.encoders import PreactResNet18
 from learn3d.networks.layers import reverse_gradient
-from learn3d.networks.preact_resnet import PreactResNet18
 from learn3d.networks.resnet import FlatResNet18, check_pretrained, load_pretrained
 from learn3d.settings import Channels, FilePath, Pixels, Positive, Weight, checked
 

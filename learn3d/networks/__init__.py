@@ -2,10 +2,15 @@
 
 from typing import Literal
 
-from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
 from learn3d.networks.discriminators import PoseDiscriminator
 from learn3d.networks.encoders import CODE_SIZE, ENCODERS, EncoderName, create_encoder, network_input
-from learn3d.networks.generators import BoundedGenerator, SmallSphereGenerator, SphereGenerator
+from learn3d.networks.generators import (
+    BoundedGenerator,
+    ConvCubeGenerator,
+    LinearCubeGenerator,
+    SmallSphereGenerator,
+    SphereGenerator,
+)
 from learn3d.networks.mesh_generator import MeshGenerator, Symmetry, SymmetryOption
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Mesh generators that deform a sphere: shape codes -> vertices of an icosphere."""
+"""Mesh generators that deform a sphere or a cube: shape codes -> vertices."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 import nmr
 from learn3d.networks.encoders import CODE_SIZE
-from learn3d.networks.layers import linear_layers
+from learn3d.networks.layers import initialize_he, linear_layers
 from learn3d.networks.mesh_generator import MeshGenerator, Symmetry
 
 OBJECT_SCALE = 0.5
@@ -112,3 +112,130 @@ class BoundedGenerator(MeshGenerator):
         vertices = deform_bounded_sphere(self.sphere, bias, torch.stack([x, y, torch.zeros_like(x)], dim=1))
         mirrored = torch.cat([vertices[..., :2], -vertices[..., 2:]], dim=2)[:, self.mirror]
         return self.place(torch.where(self.sphere[:, 2:] < 0, mirrored, vertices))
+
+
+GRID_SIZE = 16  # vertices along an edge of the cube
+INITIAL_RADIUS = 0.5
+BOUND = 1.2  # coordinates lie between -BOUND and BOUND
+BATCH_NORM_EPS = 2e-5  # published code
+
+
+def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
+    """The surface of a grid of size^3 points: (points int64 [V,3], patches int64 [6,size,size], faces int64 [F,3]).
+
+    patches[f, i, j] is the vertex at (i, j) of side f of the cube; vertices at edges belong to two sides, at corners to
+    three. Faces are counter-clockwise seen from outside. size = 16 gives V = 1352 and F = 2700.
+    """
+    grid = torch.cartesian_prod(*[torch.arange(size)] * 3)
+    outside = ((grid == 0) | (grid == size - 1)).any(1)
+    points = grid[outside]
+    vertex = torch.full((size**3,), -1)
+    vertex[outside] = torch.arange(len(points))
+    vertex = vertex.view(size, size, size)
+    patches = torch.stack([vertex.select(axis, end) for axis in range(3) for end in (0, size - 1)])
+    faces = []
+    for side, patch in enumerate(patches):
+        a, b, c, d = patch[:-1, :-1], patch[1:, :-1], patch[1:, 1:], patch[:-1, 1:]
+        # (first axis) x (second axis) of the patch is the third axis for x and z and its opposite for y.
+        outwards = (side % 2 == 1) != (side // 2 == 1)
+        corners = (a, b, c, a, c, d) if outwards else (a, c, b, a, d, c)
+        faces.append(torch.stack(corners, dim=-1).view(-1, 3))
+    return points, patches, torch.cat(faces)
+
+
+class CubeGenerator(MeshGenerator):
+    """Base of both: vertices = object_scale * 1.2 * tanh(base + scale * bias), float32 [B,1352,3].
+
+    `base`, learned, starts as the sphere of radius 0.5 (times object_scale); a subclass computes `bias` from the codes.
+    With `symmetry`, as published: z becomes |z|, each vertex the mean of itself and its mirror image, and z gets back
+    the sign that the vertex has on the cube. The vertices are then exactly symmetric; the diagonals that divide the
+    cube's squares into faces are not.
+    """
+
+    signs: Tensor  # float32 [V,3]: (1, 1, -1) if z < 0 on the cube, else 1
+
+    def __init__(self, scale: float, object_scale: float, symmetry: Symmetry | None) -> None:
+        points, patches, faces = cube_surface()
+        super().__init__(2 * points - (GRID_SIZE - 1), faces, symmetry)
+        self.patches, self.scale, self.object_scale = patches, scale, object_scale
+        centred = 2 * points.double() / (GRID_SIZE - 1) - 1
+        sphere = centred / centred.norm(dim=1, keepdim=True)
+        self.base = nn.Parameter(torch.atanh(INITIAL_RADIUS * sphere / BOUND).float())
+        signs = torch.ones(len(points), 3)
+        signs[points[:, 2] < GRID_SIZE / 2, 2] = -1
+        self.register_buffer("signs", signs, persistent=False)
+
+    def bias(self, codes: Tensor) -> Tensor:
+        """Change of the base by codes [B,512], [B,V,3]."""
+        raise NotImplementedError
+
+    def forward(self, codes: Tensor) -> Tensor:
+        points = self.base + self.scale * self.bias(codes).float()
+        if self.mirror is not None:
+            points = torch.cat([points[..., :2], points[..., 2:].abs()], dim=-1)
+            points = (points + points[:, self.mirror]) / 2
+        vertices = self.object_scale * BOUND * torch.tanh(points)
+        return vertices if self.mirror is None else self.place(vertices * self.signs)
+
+
+class ConvCubeGenerator(CubeGenerator):
+    """One stack of transposed convolutions per side of the cube; at shared vertices the mean of the sides (ShapeNet).
+
+    Each: linear to 512@2x2, three 3x3 transposed convolutions of stride 2 to 256, 128, 64 channels, batch norm and ReLU
+    after each of the four; 3x3 convolution to 3@16x16.
+    """
+
+    positions: Tensor  # int64 [V,3]: places of a vertex among the 6 * 16 * 16 outputs (filled up with the first)
+    shares: Tensor  # float32 [V,3,1]: their weights: 1, 1/2 or 1/3, and 0 for the filling
+
+    def __init__(
+        self, symmetry: Symmetry | None = None, scale: float = 0.01, object_scale: float = 0.5, channels: int = 512
+    ) -> None:
+        super().__init__(scale, object_scale, symmetry)
+        self.sides = nn.ModuleList(_side_decoder(channels) for _ in self.patches)
+        places: list[list[int]] = [[] for _ in self.base]
+        for place, vertex in enumerate(self.patches.flatten().tolist()):
+            places[vertex].append(place)
+        filled = [[*p, *[p[0]] * (3 - len(p))] for p in places]
+        shares = [[1 / len(p)] * len(p) + [0.0] * (3 - len(p)) for p in places]
+        self.register_buffer("positions", torch.tensor(filled), persistent=False)
+        self.register_buffer("shares", torch.tensor(shares)[:, :, None], persistent=False)
+
+    def bias(self, codes: Tensor) -> Tensor:
+        sides = torch.stack([side(codes) for side in self.sides], dim=1)  # [B,6,3,16,16]
+        outputs = sides.float().permute(0, 1, 3, 4, 2).flatten(1, 3)
+        # A gather, not a scatter: its sums have a fixed order on every device.
+        return (outputs[:, self.positions] * self.shares).sum(2)
+
+
+def _side_decoder(channels: int) -> nn.Sequential:
+    layers: list[nn.Module] = [
+        nn.Linear(CODE_SIZE, 4 * channels, bias=False),
+        nn.Unflatten(1, (channels, 2, 2)),
+        nn.BatchNorm2d(channels, eps=BATCH_NORM_EPS),
+        nn.ReLU(),
+    ]
+    for _ in range(3):
+        layers += [
+            nn.ConvTranspose2d(channels, channels // 2, 3, stride=2, padding=1, output_padding=1, bias=False),
+            nn.BatchNorm2d(channels // 2, eps=BATCH_NORM_EPS),
+            nn.ReLU(),
+        ]
+        channels //= 2
+    decoder = nn.Sequential(*layers, nn.Conv2d(channels, 3, 3, padding=1))
+    initialize_he(decoder)
+    return decoder
+
+
+class LinearCubeGenerator(CubeGenerator):
+    """Linear layers 512-4096-4096-1352*3 with ReLU (Pascal3D+)."""
+
+    def __init__(
+        self, symmetry: Symmetry | None = None, scale: float = 0.1, object_scale: float = 1.0, channels: int = 4096
+    ) -> None:
+        super().__init__(scale, object_scale, symmetry)
+        self.layers = linear_layers(CODE_SIZE, channels, channels, self.base.numel())
+        initialize_he(self)
+
+    def bias(self, codes: Tensor) -> Tensor:
+        return self.layers(codes).unflatten(1, (-1, 3))

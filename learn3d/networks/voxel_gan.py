@@ -1,18 +1,27 @@
-"""PrGAN's networks (Gadelha et al. 2017): voxel generator, silhouette discriminator, inverse encoder.
+"""PrGAN's networks (Gadelha et al. 2017): voxel generator, projection, silhouette discriminator, inverse encoder.
 
 Layers, sizes and initial weights are those of the published TensorFlow code: weights of fully connected layers from
 N(0, 0.1), of convolutions from N(0, 0.02), biases 0. TensorFlow's momentum of 0.9 in batch norms is torch's 0.1.
 `channels` are four numbers.
+
+The published code turns the 64^3 volume into the view by trilinear resampling and sums along the depth. For a fixed
+view that is a linear map from voxels to pixels, so it is kept as a table: forward and backward take a fifth of the time
+of `grid_sample` on one core (40 ms for a batch of 16 instead of 200).
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+import nmr
 
 SHAPE_CODE = 200  # number of entries of z for the shape; one more decides the view
 IMAGE_SIZE = 64
@@ -137,3 +146,117 @@ def _initialise(module: nn.Module) -> None:
     else:
         return
     nn.init.zeros_(module.bias)
+
+
+@dataclass(frozen=True)
+class ViewCircle:
+    """K views at equal steps of azimuth, as in Kato's protocol: view k stands at azimuth -360 k / K degrees.
+
+    Rays are parallel, as PrGAN's are, or meet in the eye. In both cases the image is `half_width` wide, to each side,
+    in the plane through the origin, so that objects have the size that they have in the data set's images.
+    """
+
+    count: int = 24
+    elevation_deg: float = 30.0
+    distance: float = 2.732
+    half_fov_deg: float = 15.0
+    perspective: bool = False
+
+    @property
+    def half_width(self) -> float:
+        """Half of the image's side, in units of the object frame: 0.732 for Kato's camera."""
+        return self.distance * math.tan(math.radians(self.half_fov_deg))
+
+    def azimuth_deg(self, view_ids: Tensor) -> Tensor:
+        """Azimuths of the views `view_ids`, float32, in degrees."""
+        return view_ids.float() * (-360.0 / self.count)
+
+    def sample_points(self, azimuth_deg: float, size: int) -> Tensor:
+        """Sample points on the rays of one view, float32 [size, size, D, 3] in the object frame; row 0 is the top.
+
+        Samples are as far apart as pixels, and D of them are as long as the box's diagonal.
+        """
+        eye = nmr.cameras.points_from_angles(self.distance, self.elevation_deg, azimuth_deg).double().reshape(3)
+        z_axis = -F.normalize(eye, dim=0)
+        x_axis = F.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), z_axis), dim=0)
+        y_axis = torch.linalg.cross(z_axis, x_axis)
+        step = 2 * self.half_width / size
+        across = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * step
+        samples = math.ceil(math.sqrt(3.0) / step)
+        along = (torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * step
+        in_plane = across[None, :, None] * x_axis - across[:, None, None] * y_axis
+        direction = F.normalize(in_plane - eye, dim=2) if self.perspective else z_axis
+        start = eye + self.distance * direction if self.perspective else in_plane
+        return (start[:, :, None] + along[:, None] * direction.expand_as(in_plane)[:, :, None]).float()
+
+
+def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) -> Tensor:
+    """Soft silhouettes P = 1 - exp(-tau * integral of the density along the ray), float32 [B, S, S], row 0 = top.
+
+    density float32 [B, S, S, S] at the voxel centres of the box [-0.5, 0.5]^3, axes (x, y, z) of the object frame, zero
+    outside; trilinear between the centres. view_ids int64 [B] in 0 .. K-1, best on the CPU, as they choose tables. The
+    integral is measured in voxels: a solid of density 1 and a thickness of n voxels gives 1 - exp(-tau n).
+    Differentiable in the density.
+    """
+    size = density.shape[-1]
+    # A quarter turn only renumbers the voxels, so the tables of a quarter of the circle serve all views.
+    quarter = views.count // 4 if views.count % 4 == 0 else views.count
+    view_ids = view_ids.cpu()
+    volumes, parts, order = density.unbind(), [], []
+    for base in (view_ids % quarter).unique().tolist():
+        members = (view_ids % quarter == base).nonzero()[:, 0]
+        turned = [volumes[i].rot90(int(view_ids[i]) // quarter, (0, 2)).reshape(-1) for i in members.tolist()]
+        forward, backward = ray_table(views, base, size, density.device)
+        parts.append(_Integrate.apply(torch.stack(turned, dim=1), *forward, *backward).T)
+        order.append(members)
+    thickness = torch.cat(parts)[torch.cat(order).argsort().to(density.device)]
+    return 1 - torch.exp(-tau * thickness).reshape(-1, size, size)
+
+
+Table = tuple[Tensor, Tensor, Tensor]  # sparse matrix: columns int32, start of each row int32, values float32
+
+
+@functools.lru_cache(maxsize=64)
+def ray_table(views: ViewCircle, view_id: int, size: int, device: torch.device) -> tuple[Table, Table]:
+    """The linear map of one view as a sparse matrix [S^2 pixels, S^3 voxels], and its transpose, by rows."""
+    points = views.sample_points(float(views.azimuth_deg(torch.tensor(view_id))), size)
+    position = (points + 0.5) * size - 0.5  # in voxels; whole numbers are centres
+    low = position.floor()
+    above, low = position - low, low.long()
+    pixel = torch.arange(size * size).reshape(size, size, 1).expand(points.shape[:3])
+    pixels, voxels, values = [], [], []
+    for corner in ((i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)):
+        x, y, z = (low[..., axis] + corner[axis] for axis in range(3))
+        weight = math.prod(above[..., axis] if corner[axis] else 1 - above[..., axis] for axis in range(3))
+        inside = (weight > 0) & (x >= 0) & (x < size) & (y >= 0) & (y < size) & (z >= 0) & (z < size)
+        pixels.append(pixel[inside])
+        voxels.append(((x * size + y) * size + z)[inside])
+        values.append(weight[inside])
+    step = 2 * views.half_width  # length of a sample in voxels: (2 half_width / size) / (1 / size)
+    indices, weights = torch.stack([torch.cat(pixels), torch.cat(voxels)]), torch.cat(values) * step
+    matrix = torch.sparse_coo_tensor(indices, weights, (size**2, size**3), check_invariants=False).coalesce()
+    return _by_rows(matrix, device), _by_rows(matrix.t().coalesce(), device)
+
+
+def _by_rows(matrix: Tensor, device: torch.device) -> Table:
+    rows, columns = matrix.indices()
+    starts = torch.searchsorted(rows, torch.arange(matrix.shape[0]))
+    return columns.int().to(device), starts.int().to(device), matrix.values().to(device)
+
+
+class _Integrate(torch.autograd.Function):
+    """Sparse matrix times dense [columns, n]; `embedding_bag` is the one such product that is fast on every device."""
+
+    @staticmethod
+    def forward(ctx, dense: Tensor, *tables: Tensor) -> Tensor:
+        ctx.save_for_backward(*tables[3:])
+        return _multiply(tables[:3], dense)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return _multiply(ctx.saved_tensors, grad.contiguous()), *(None,) * 6
+
+
+def _multiply(table: Table, dense: Tensor) -> Tensor:
+    columns, starts, values = table
+    return F.embedding_bag(columns, dense, starts, mode="sum", per_sample_weights=values)

@@ -14,10 +14,9 @@ from learn3d.files import writing
 from learn3d.methods import DatasetInfo, Method
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
-from learn3d.runs.checkpoint import Metadata, Progress
+from learn3d.runs.checkpoint import Metadata, Progress, versions
 from learn3d.runs.folder import BEST, CONFIG, LAST, PREVIOUS
 from learn3d.runs.log import RunLog
-from learn3d.runs.versions import versions
 
 
 def describe_images(dataset: ViewDataset) -> str:

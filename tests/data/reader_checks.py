@@ -10,7 +10,7 @@ import nmr
 from learn3d.data.checking import check_folder
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import READERS
-from learn3d.files.findings import Problem
+from learn3d.files.reading import Problem
 
 
 def problems(layout: str, folder: Path, split: str, category: str = "chair") -> tuple[Problem, ...]:

@@ -58,7 +58,7 @@ def serve() -> None:
 
     from learn3d import training, validation
     from learn3d.config import config_from_dict
-    from learn3d.runs.versions import versions
+    from learn3d.runs.checkpoint import versions
 
     versions()  # once for all runs, so that a commit made during the tests does not tell them apart
     tiny_networks.put_in_place()

@@ -10,10 +10,9 @@ from torch import nn
 
 from learn3d.methods import vpl
 from learn3d.networks import ENCODERS, GENERATORS, Symmetry
-from learn3d.networks.encoders import CODE_SIZE, SmallConvEncoder
+from learn3d.networks.encoders import CODE_SIZE, PreactResNet18, SmallConvEncoder
 from learn3d.networks.generators import SmallSphereGenerator
 from learn3d.networks.layers import linear_layers
-from learn3d.networks.preact_resnet import PreactResNet18
 
 
 class TinyEncoder(SmallConvEncoder):

@@ -27,8 +27,9 @@ FLOORS = (
     {"networks", "losses"},
     {"pictures"},
     {"data"},
-    {"device", "settings", "terminal"},
+    {"device", "settings"},
     {"files"},
+    {"terminal"},
 )
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 

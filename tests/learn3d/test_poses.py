@@ -12,14 +12,14 @@ import torch
 
 import nmr
 from learn3d.config import TrainConfig
-from learn3d.data.candidates import PoseCandidates
+from learn3d.data.batch import PoseCandidates
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
 from learn3d.data.pose_table import PoseTable, fingerprints
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import kato
 from learn3d.data.sampling import batches
-from learn3d.files.findings import DamagedFile
+from learn3d.files.reading import DamagedFile
 from learn3d.poses.estimate import PoseOptions
 from learn3d.poses.sheet import draw_sheet
 from learn3d.poses.views import CameraOptions, EstimatedViews, compare, estimate_views

@@ -12,7 +12,7 @@ from pathlib import Path
 from learn3d.data.conventions import KATO, LayoutProperties
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.view_bins import AngleBins
-from learn3d.files.findings import STRICT, Findings, MissingFile
+from learn3d.files.reading import STRICT, Findings, MissingFile
 
 PROPERTIES = LayoutProperties(voxels=True, convention=KATO, inverted=True)
 BINS = AngleBins.parse("15x70:-10:60")

@@ -27,8 +27,7 @@ from learn3d.data.dataset import SPLITS, ViewDataset
 from learn3d.data.readers import kato
 from learn3d.data.readers.renderings import ObjectFiles, category_folder, check_lists, read_objects
 from learn3d.files import limits, npz, renderings
-from learn3d.files.findings import STRICT, DamagedFile, Findings, MissingFile
-from learn3d.files.reading import read_text
+from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile, read_text
 from learn3d.files.sandbox import Call
 
 PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("progress",))

@@ -31,9 +31,8 @@ from learn3d.data.categories import synset_of
 from learn3d.data.conventions import INNER, VOXEL_SIZE, LayoutProperties, VoxelConvention
 from learn3d.data.dataset import SPLITS, ViewDataset
 from learn3d.data.readers.renderings import ObjectFiles, check_lists, check_poses, join_objects, read_objects
-from learn3d.files import limits, renderings, volumes
-from learn3d.files.findings import FETCH_AGAIN, STRICT, DamagedFile, Findings
-from learn3d.files.reading import parse_json, read_bytes
+from learn3d.files import limits, meshes, renderings
+from learn3d.files.reading import FETCH_AGAIN, STRICT, DamagedFile, Findings, parse_json, read_bytes
 from learn3d.files.sandbox import Call
 
 #: The .mat volumes, as the paper's code reads them: axes (-z, y, x) of the object frame.
@@ -86,7 +85,7 @@ def load(
         return ObjectFiles(
             root / name,
             Call(renderings.read_table, root / name / "view.txt", (views, 4, _TABLE), _TABLE),
-            Call(volumes.read_matlab, grid, ("Volume", VOXEL_SIZE)),
+            Call(meshes.read_matlab, grid, ("Volume", VOXEL_SIZE)),
             [Call(renderings.read_with_depth, path, (depth, image_size), "a rendering") for path, depth in paths],
         )
 

@@ -29,7 +29,7 @@ from learn3d.data.conventions import (
 )
 from learn3d.data.dataset import SPLITS, ViewDataset
 from learn3d.files import npz
-from learn3d.files.findings import STRICT, DamagedFile, Findings, MissingFile
+from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile
 from learn3d.files.sandbox import Call, read_all
 
 PROPERTIES = LayoutProperties(voxels=True, convention=KATO, inverted=True)

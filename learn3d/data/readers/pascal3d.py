@@ -31,7 +31,7 @@ from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import RotationPoses
 from learn3d.data.view_bins import training_classes
 from learn3d.files import npz
-from learn3d.files.findings import STRICT, DamagedFile, Findings
+from learn3d.files.reading import STRICT, DamagedFile, Findings
 from learn3d.files.sandbox import Call, read, read_all
 
 #: The grid spans [-1, 1]; axes (-x, -z, -y) of the object frame.

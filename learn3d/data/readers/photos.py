@@ -30,8 +30,7 @@ from learn3d.data.framing import Framed, read_framed
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import AngleBins, training_classes
 from learn3d.files import limits
-from learn3d.files.findings import STRICT, DamagedFile, Findings
-from learn3d.files.reading import read_text
+from learn3d.files.reading import STRICT, DamagedFile, Findings, read_text
 from learn3d.files.sandbox import Call, read_all
 from learn3d.settings import checked
 

@@ -17,7 +17,7 @@ from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import AngleBins
 from learn3d.files import limits
-from learn3d.files.findings import DamagedFile, Findings, MissingFile
+from learn3d.files.reading import DamagedFile, Findings, MissingFile
 from learn3d.files.sandbox import Call, read_all
 
 

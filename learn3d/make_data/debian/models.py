@@ -19,10 +19,10 @@ import trimesh
 from tqdm import tqdm
 
 from learn3d import settings
+from learn3d.files.writing import publishing
 from learn3d.make_data.debian.aircraft import AIRCRAFT_PACKAGE, aircraft_models
 from learn3d.make_data.debian.furniture import FURNITURE_PACKAGES, furniture_models
 from learn3d.make_data.debian.packages import Candidate, get_package, read_package
-from learn3d.make_data.folders import publishing
 from learn3d.make_data.meshes import RawMesh, checked, fit_to_box
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")

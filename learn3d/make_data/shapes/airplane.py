@@ -6,7 +6,7 @@ import numpy as np
 
 from .airplane_parts import Planform, canopy, fin, fuselage, gear, nacelle, nozzle, pod, propeller, tail, tail_engines
 from .draw import Draw
-from .parts import Part, bar, box, ellipse, ellipsoid, loft, rectangle, revolve, tube, wing
+from .parts import Part, bar, box, ellipsoid, loft, rectangle, wing
 
 
 def airliner(draw: Draw) -> Part:
@@ -127,46 +127,6 @@ def _stores(draw: Draw, plan: Planform) -> Part:
         pylon = Part() if at_tip else box((0.01, 0.03, 0.06), (x, y - 0.012, z - 0.45 * chord))
         part += (store + pylon).both_sides()
     return part
-
-
-def supersonic(draw: Draw) -> Part:
-    """A supersonic transport or delta bomber: a needle on a long delta, engine boxes below."""
-    radius = draw(0.024, 0.036)
-    plane = fuselage(radius, nose=draw(0.2, 0.3), nose_power=1.15, tail_start=0.72, droop=0.3)
-    half, root = draw(0.2, 0.3), draw(0.5, 0.62)
-    z, y = 0.2, -0.6 * radius
-    t = np.linspace(0, 1, 7)
-    lead = z - root * (0.95 - draw(0.0, 0.12) * (1 - t)) * t ** draw(0.7, 1.05)
-    chord = np.maximum(lead - (z - root - 0.03 * t), 0.03)
-    plane += wing([(half * s, y, a, c, 0.035) for s, a, c in zip(t, lead, chord, strict=True)], whole=True)
-    for x in (0.3, 0.45) if draw.maybe(0.6) else (0.4,):
-        plane += box((0.035, 0.035, 0.22), (x * half, y - 0.018, z - root + 0.08), 0.006).both_sides()
-    plane += fin(draw(0.1, 0.16), 0.26, 0.07, 55, z=-0.2)
-    if draw.maybe(0.4):  # canards
-        plane += Planform(0.1, 0.08, 0.03, 45, 0, 0.33, 0.3 * radius, thickness=0.05).wing()
-    return plane
-
-
-def flying_wing(draw: Draw) -> Part:
-    """A flying wing with a faired body; jets, buried intakes or pusher propellers; perhaps fins."""
-    sweep, half, root, tip = draw(22, 40), draw(0.55, 0.8), draw(0.34, 0.5), draw(0.05, 0.14)
-    plan = Planform(half, root, tip, sweep, draw(0, 4), 0.2, 0.0, draw(0.25, 0.4), thickness=0.13)
-    plane = plan.wing()
-    plane += ellipsoid((draw(0.12, 0.2), draw(0.1, 0.15), 1.15 * root), (0, 0.015, 0.2 - 0.48 * root))
-    kind = draw.pick(("humps", "props", "pods"))
-    for share in (0.2,) if draw.maybe(0.5) else (0.17, 0.33):
-        x, y, z, chord = plan.at(share)
-        if kind == "humps":
-            plane += ellipsoid((0.09, 0.07, 0.8 * chord), (x, y + 0.02, z - 0.45 * chord)).both_sides()
-        elif kind == "pods":
-            plane += nacelle(0.03, 0.14).moved(x, y + 0.045, z - 0.6 * chord).both_sides()
-        else:
-            body = pod(0.022, 0.2).rotated("y", 180).moved(x, y, z - chord + 0.05)
-            plane += (body + propeller(draw, 0.09, 3, hub=0.014).moved(x, y, z - chord - 0.05)).both_sides()
-    if draw.maybe(0.4):
-        x, y, z, chord = plan.at(0.97)
-        plane += fin(draw(0.08, 0.14), max(chord, 0.09), 0.05, 35, z=z).moved(x, y - 0.02).both_sides()
-    return plane
 
 
 def turboprop(draw: Draw) -> Part:
@@ -298,30 +258,5 @@ def biplane(draw: Draw) -> Part:
     return plane + gear(radius, 2.6 * radius, main_x=0.11, main_z=0.27, other_z=-0.46)
 
 
-def twin_boom(draw: Draw) -> Part:
-    """A central pod between two booms that carry the tail."""
-    radius, x = draw(0.05, 0.07), draw(0.14, 0.22)
-    pod = fuselage(radius, 1.15, 0.2, 1.8, tail_start=0.5, tail_radius=0.35, length=draw(0.42, 0.6))
-    size = draw.measures(half=(0.55, 0.75), root=(0.16, 0.21), tip=(0.06, 0.11), sweep_deg=(0, 6), dihedral_deg=(1, 5))
-    plan = Planform(**size, z=0.14, y=0.0)
-    plane = pod.moved(z=0.12) + plan.wing() + canopy(1.1 * radius, 1.4 * radius, 0.24, 0.8 * radius, 0.16)
-    _, y, z, _ = plan.at(x / plan.half)
-    thick = draw(0.024, 0.036)
-    front = z + (0.1 if draw.maybe(0.7) else 0.0)
-    path = [(x, y, front - s * (front + 0.5)) for s in (0, 0.04, 0.12, 0.3, 0.6, 1)]
-    boom = tube(path, np.array([0.3, 0.7, 1.0, 1.0, 0.6, 0.4]) * thick, ellipse(2, 2, 10))
-    if front > z:
-        boom += propeller(draw, min(0.12, 0.75 * x), 3, hub=0.02).moved(x, y, front)
-    else:
-        plane += propeller(draw, min(0.1, 0.7 * x), 3, hub=0.03).moved(z=-0.2)
-        plane += revolve([(0.03, -0.1), (0.03, 0.1)], 10).rotated("x", 90).moved(z=-0.11)
-    height = draw(0.12, 0.18)
-    boom += fin(height, 0.12, 0.07, draw(5, 30), z=-0.38).moved(x, y - 0.02)
-    level = y + draw(0.0, 0.95) * height - 0.02
-    drift = 0.35 * (level - y)
-    plane += wing([(side * 1.1 * x, level, -0.39 - drift, 0.09, 0.1) for side in (-1, 1)])
-    return plane + boom.both_sides()
-
-
 KINDS = {airliner: 4.0, business_jet: 1.5, turboprop: 2.0, light_plane: 3.0, glider: 1.0, fighter: 3.0, warbird: 1.5}
-KINDS |= {biplane: 0.8, supersonic: 0.6, flying_wing: 0.6, twin_boom: 0.7}
+KINDS |= {biplane: 0.8}

@@ -10,11 +10,10 @@ import pytest
 import torch
 
 import nmr
-from learn3d.data.augment import augment
 from learn3d.data.conventions import KATO
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.poses import LookAtPoses, RotationPoses
-from learn3d.data.sampling import batches, sample_indices
+from learn3d.data.sampling import augment, batches, sample_indices
 from learn3d.data.view_bins import AngleBins
 from learn3d.methods import DatasetInfo, create_method
 from learn3d.presets import PRESETS

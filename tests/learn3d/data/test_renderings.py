@@ -30,7 +30,7 @@ from learn3d.data.readers import READERS, dvr, kar, r2n2
 from learn3d.data.readers.kar import KAR
 from learn3d.data.readers.r2n2 import R2N2
 from learn3d.data.readers.renderings import check_poses
-from learn3d.files.findings import DamagedFile
+from learn3d.files.reading import DamagedFile
 from nmr.metrics import voxel_iou
 
 LISTS = {"train": ["b1"], "val": ["c2"], "test": ["a0"]}

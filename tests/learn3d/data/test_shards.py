@@ -24,7 +24,7 @@ from learn3d.data.checking import check_folder
 from learn3d.data.disk_array import DiskArray
 from learn3d.data.layouts import load_dataset
 from learn3d.data.readers import kato
-from learn3d.files.findings import DamagedFile
+from learn3d.files.reading import DamagedFile
 from learn3d.runs import checkpoint
 from learn3d.training import train
 

@@ -12,9 +12,9 @@ import pytest
 import stub_work
 
 from learn3d.experiments import comparison
+from learn3d.experiments.comparison import percentile_interval, resampled_means
 from learn3d.experiments.experiment import describe_tables, run_experiment
 from learn3d.experiments.plan import plan_runs
-from learn3d.experiments.statistics import percentile_interval, resampled_means
 from learn3d.experiments.tables import MEAN, TABLES, VARIANTS
 from learn3d.presets import PRESETS
 

@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 import nmr
-from learn3d.figures import curves, grids
+from learn3d.figures import grids
 from learn3d.figures.grids import comparison_grid, interpolate, picture_grid
 from learn3d.figures.runs import Run
 from learn3d.files import limits
@@ -27,6 +27,7 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("sklearn")
 
 from learn3d.figures import paper, tsne
+from learn3d.pages import report
 
 STEP = TILE + MARGIN
 TURNS = (0, 60, 120, 180, 240, 300)
@@ -148,10 +149,10 @@ def records(offset: float, steps: int = 4) -> list[dict]:
 
 
 def test_metrics_become_curves(tmp_path) -> None:
-    read = curves.read_metrics(write_metrics(tmp_path / "run", records(0.25), tail='{"step": 200, "spl'))
+    read = report.read_metrics(write_metrics(tmp_path / "run", records(0.25), tail='{"step": 200, "spl'))
     assert set(read) == {("train", "projection"), ("train", "total"), ("val", "voxel_iou")}
     assert read["train", "projection"] == pytest.approx({50: 1.25, 100: 0.75, 150: 1 / 3 + 0.25})
-    assert curves.panels([read]) == [("val", "voxel_iou"), ("train", "projection"), ("train", "total")]
+    assert report.panels([read]) == [("val", "voxel_iou"), ("train", "projection"), ("train", "total")]
 
 
 NO_RECORD = "line 1 is no record with a step and a split"
@@ -178,16 +179,16 @@ def test_hostile_logs_are_refused(tmp_path, monkeypatch, line, message) -> None:
     content = (folder / "metrics.jsonl").read_bytes()
     (folder / "metrics.jsonl").write_bytes(line.encode("utf-8", "surrogateescape") + b"\n" + content)
     with pytest.raises(ValueError, match=message):
-        curves.read_metrics(folder)
+        report.read_metrics(folder)
 
 
 def test_numbers_of_a_run_have_titles(finished_run) -> None:
-    names = {name for _, name in curves.read_metrics(finished_run)}
-    assert {"voxel_iou", "projection"} <= names <= curves.TITLES.keys()
+    names = {name for _, name in report.read_metrics(finished_run)}
+    assert {"voxel_iou", "projection"} <= names <= report.TITLES.keys()
 
 
 def test_means_by_azimuth_are_those_of_views_or_sectors() -> None:
-    azimuths, means = curves.mean_by_azimuth(
+    azimuths, means = report.mean_by_azimuth(
         np.array([-15.0, 345.0, 359.999, -7.0, 0.0]), np.array([1, 3, 5, 7, np.nan])
     )
     assert azimuths.tolist() == [0.0, 345.0] and means.tolist() == [6.0, 2.0]

@@ -23,7 +23,7 @@ from python2_pickles import npy
 
 import nmr.neural_renderer as nr
 from learn3d.data.framing import read_photo
-from learn3d.files import meshes, npz, renderings, sandbox, volumes
+from learn3d.files import meshes, npz, renderings, sandbox
 
 SECONDS, BYTES = 10.0, 700e6
 if sys.gettrace() is not None:  # the coverage of lines is measured, which slows Python down
@@ -61,7 +61,7 @@ def bounded() -> Iterator[None]:
 
 
 def read_mat(path: Path) -> np.ndarray:
-    return sandbox.read(volumes.read_matlab, path, "Volume", 32)
+    return sandbox.read(meshes.read_matlab, path, "Volume", 32)
 
 
 def read_image(path: Path, seconds: float = sandbox.SECONDS) -> object:

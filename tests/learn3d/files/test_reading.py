@@ -1,17 +1,17 @@
-"""Untrusted files are opened if they are plain and of a bounded size; JSON is only JSON."""
+"""Reading and writing whole files."""
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
 import pytest
 
-from learn3d.files import npz, sandbox
-from learn3d.files.images import PHOTOGRAPHS, open_image
-from learn3d.files.meshes import read_mesh
+from learn3d.files import npz, sandbox, writing
+from learn3d.files.meshes import read_binvox, read_matlab, read_mesh
 from learn3d.files.reading import check_file, parse_json, read_bytes, read_text
-from learn3d.files.volumes import read_binvox, read_matlab
+from learn3d.files.renderings import PHOTOGRAPHS, open_image
 from learn3d.files.weights import read_state_dict
 
 
@@ -69,3 +69,79 @@ def test_json():
             parse_json(text)
     with pytest.raises(ValueError, match="utf-8"):
         parse_json(b'"\xff"')
+
+
+def test_files_are_replaced_whole(tmp_path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("a much longer content than the new one")
+    writing.write_json(path, {"name": [1, None]})
+    assert json.loads(path.read_text()) == {"name": [1, None]}
+    path.with_name("earlier").write_bytes(b"old")
+    (tmp_path / ".a.json.partial").hardlink_to(tmp_path / "earlier")  # left behind by a killed process
+    writing.write_bytes(path, b"x")
+    assert path.read_bytes() == b"x" and (tmp_path / "earlier").read_bytes() == b"old"
+    assert {p.name for p in tmp_path.iterdir()} == {"a.json", "earlier"}
+
+
+@pytest.mark.parametrize("sync", [False, True])
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path, sync: bool) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+    with pytest.raises(OSError, match="disk full"), writing.replacing(path, sync=sync) as temporary:
+        temporary.write_bytes(b"ne")
+        raise OSError("disk full")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_disk_without_room_names_the_file(tmp_path) -> None:
+    full = pytest.raises(OSError, match=r"No space left on device: '.*/a\.json'")
+    with full, writing.replacing(tmp_path / "a.json") as temporary:
+        temporary.symlink_to("/dev/full")
+        temporary.write_bytes(b"{}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sync_comes_before_the_new_name(tmp_path, monkeypatch) -> None:
+    calls = []
+    replace = os.replace
+    monkeypatch.setattr(os, "fsync", lambda number: calls.append("fsync"))
+    monkeypatch.setattr(os, "replace", lambda a, b: (calls.append("replace"), replace(a, b)))
+    writing.write_bytes(tmp_path / "a", b"x", sync=True)
+    assert calls == ["fsync", "replace", "fsync"], "the content, the name, the folder that holds the name"
+
+
+def test_what_is_no_plain_file_is_not_replaced(tmp_path) -> None:
+    """Never with a path in /dev: should the check be broken, the test would break the machine."""
+    fifo, folder, link, output = (tmp_path / name for name in ("fifo", "folder", "link", "output"))
+    os.mkfifo(fifo)
+    folder.mkdir()
+    link.symlink_to(fifo)
+    with open(tmp_path / "file", "wb") as file:
+        output.symlink_to(f"/proc/self/fd/{file.fileno()}")  # as /dev/stdout is one
+        before = {path.name: path.lstat().st_ino for path in tmp_path.iterdir()}
+        for path in (fifo, folder, link, output):
+            with pytest.raises(OSError, match="is no plain file and is not replaced"):
+                writing.write_json(path, {})
+            with pytest.raises(OSError, match="it is no plain file"):
+                writing.check_target(path, "--json")
+    assert {path.name: path.lstat().st_ino for path in tmp_path.iterdir()} == before
+
+
+def test_a_target_is_checked_before_the_work(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for path in (tmp_path, Path()):
+        writing.check_target(path / "t.json", "--json")
+        writing.check_target(path / "a" / "b", "--output", folder=True)
+    assert list(tmp_path.iterdir()) == [], "nothing is made"
+    (tmp_path / "file").touch()
+    for name, folder, why in (
+        ("a/t.json", False, "No such file or directory"),
+        (".", False, "no plain file"),
+        ("file/t.json", False, "Not a directory"),
+        ("file", True, "Not a directory"),
+        ("file/a/b", True, "Not a directory"),
+    ):
+        with pytest.raises(OSError, match=rf"^cannot write .*{why}.* give another --x$"):
+            writing.check_target(tmp_path / name, "--x", folder=folder)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import strange_functions as strange
 
-from learn3d.files.findings import DamagedFile, MissingFile
+from learn3d.files.reading import DamagedFile, MissingFile
 from learn3d.files.sandbox import Call, cores, read, read_all
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")

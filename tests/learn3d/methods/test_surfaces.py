@@ -1,9 +1,18 @@
-"""Marching cubes: where the surface lies and which way its faces look."""
+"""Predicted shapes: the surface of a grid, and the fit to a mask."""
 
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
 import torch
 
 import nmr
+from learn3d.methods import DatasetInfo, create_method
+from learn3d.methods.refinement import refine
 from learn3d.methods.surfaces import grid_surface
+from learn3d.presets import PRESETS
+from learn3d.reconstruction import reconstruct, reconstruct_dataset
 
 
 def test_surface_of_a_ball_is_where_the_ball_is() -> None:
@@ -27,3 +36,55 @@ def test_full_and_empty_grids() -> None:
     assert (vertices.shape, faces.shape) == ((0, 3), (0, 3))
     vertices, *_ = grid_surface(torch.ones(8, 8, 8))
     assert vertices.abs().max() == torch.tensor(0.5)
+
+
+def make(plane: float | None):
+    settings = dataclasses.replace(PRESETS["plus-kato"].settings, encoder="conv-small", lambda_novel_view=0.0)
+    return create_method(settings, DatasetInfo(24, mirror_plane_deg=plane), device="cpu", precision="fp32", seed=0)
+
+
+@pytest.mark.parametrize("steps", [(60, 0), (0, 30), (15, 15)])
+def test_the_silhouette_comes_closer(tiny_set, steps: tuple[int, int]) -> None:
+    method, batch = make(None), tiny_set.batch(torch.tensor([0, 30]))
+
+    def loss(vertices: torch.Tensor) -> float:
+        return float(nmr.losses.soft_iou_loss(method.render(vertices, batch.poses), batch.masks))
+
+    with torch.no_grad():
+        before = method.decode(method.encode(batch.images)).vertices
+        after = refine(method, batch.images, batch.masks, batch.poses, code_steps=steps[0], vertex_steps=steps[1])
+    assert loss(after.vertices) < loss(before) - 0.02
+
+
+def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set) -> None:
+    method = create_method(PRESETS["kato2019-kar"].settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
+    batch = tiny_set.batch(torch.tensor([0]))
+    images = torch.zeros(1, 4, method.image_size, method.image_size, dtype=torch.uint8)
+    shapes = refine(method, images, batch.masks, batch.poses, code_steps=1, vertex_steps=1)
+    assert shapes.vertices.shape == (1, 1352, 3) and shapes.vertices.isfinite().all()
+
+
+def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(tiny_set) -> None:
+    method, batch = make(37.5), tiny_set.batch(torch.tensor([0, 30]))
+    both = refine(method, batch.images, batch.masks, batch.poses, code_steps=0, vertex_steps=5).vertices
+    first = tiny_set.batch(torch.tensor([0]))
+    alone = refine(method, first.images, first.masks, first.poses, code_steps=0, vertex_steps=5).vertices
+    torch.testing.assert_close(both[:1], alone, atol=5e-5, rtol=0)
+    torch.testing.assert_close(method.generator.symmetrized(both), both)
+
+
+def test_shapes_of_a_data_set_are_refined(finished_run, tiny_folder, tmp_path) -> None:
+    options = {"data": tiny_folder, "indices": [3], "mesh_format": "obj"}
+    plain = reconstruct_dataset(finished_run, tmp_path / "plain", **options)
+    fitted = reconstruct_dataset(finished_run, tmp_path / "fitted", refined=True, **options)
+    assert plain[0].read_text() != fitted[0].read_text()
+
+
+def test_voxels_cannot_be_fitted(tiny_set) -> None:
+    settings = dataclasses.replace(
+        PRESETS["gadelha2017-kato"].settings, generator_channels=(4, 4, 2, 1), discriminator_channels=(4, 8, 8, 8)
+    )
+    method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
+    batch = tiny_set.batch(torch.tensor([0]))
+    with pytest.raises(ValueError, match="leave out --refine"):
+        reconstruct(method, batch.images.numpy(), batch.masks, batch.poses)

@@ -15,12 +15,10 @@ from learn3d import device as precision_module
 from learn3d.device import autocast, resolve_precision
 from learn3d.methods import DatasetInfo, Method, create_method
 from learn3d.networks import ENCODERS, GENERATORS, PoseDiscriminator, create_encoder, network_input
-from learn3d.networks.cube_generators import ConvCubeGenerator, LinearCubeGenerator
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
-from learn3d.networks.encoders import CENTRED_SHARE, EncoderName, centre
-from learn3d.networks.generators import deform_sphere
+from learn3d.networks.encoders import CENTRED_SHARE, EncoderName, PreactResNet18, centre, grey_background
+from learn3d.networks.generators import ConvCubeGenerator, LinearCubeGenerator, deform_sphere
 from learn3d.networks.layers import reverse_gradient
-from learn3d.networks.preact_resnet import PreactResNet18, grey_background
 from learn3d.networks.resnet import FlatResNet18
 from learn3d.networks.voxel_gan import InverseEncoder, SilhouetteDiscriminator, VoxelGenerator
 from learn3d.presets import PRESETS

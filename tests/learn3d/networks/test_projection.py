@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 
 import nmr
-from learn3d.networks.projection import ViewCircle, project
+from learn3d.networks.voxel_gan import ViewCircle, project
 
 SIZE = 12
 TAU = 0.5

@@ -13,8 +13,18 @@ import nmr
 from learn3d.data.conventions import view_poses
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.methods import Grids, Meshes
-from learn3d.pictures.contact_sheet import draw_sheet, make_row
-from learn3d.pictures.sheets import HEADER, MARGIN, magnify, natural_colors, save_gif, save_png, stack, tile
+from learn3d.pictures.sheets import (
+    HEADER,
+    MARGIN,
+    draw_sheet,
+    magnify,
+    make_row,
+    natural_colors,
+    save_gif,
+    save_png,
+    stack,
+    tile,
+)
 from learn3d.pictures.studio import BACK_LIGHT, photograph, studio_lights
 from learn3d.pictures.surfaces import Surface, azimuths_deg, common_zoom, draw_surface, orbit, turntable
 

@@ -1,9 +1,12 @@
-"""Checkpoint files: they give back everything that was saved, and any other content is refused by name."""
+"""Checkpoints: what they hold, damage, and export."""
 
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
+import math
+import shutil
 import struct
 import zlib
 from pathlib import Path
@@ -11,10 +14,16 @@ from pathlib import Path
 import pytest
 import torch
 from memory_checks import at_most
-from runs import metadata, same_bits
+from runs import check_same, metadata, same_bits
 from safetensors.torch import save_file
 
+from learn3d.data.layouts import load_dataset
+from learn3d.evaluation import evaluate
+from learn3d.make_data.render import DatasetConfig, make_dataset
+from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.runs import checkpoint
+from learn3d.runs.export import SMALL_MODEL, export
+from learn3d.training import train
 
 
 def test_round_trip_keeps_bits_names_and_metadata(tmp_path) -> None:
@@ -155,3 +164,129 @@ def test_any_optimizer_goes_on_as_if_it_had_not_been_saved(tmp_path, make) -> No
     other.load_state_dict(network.state_dict())
     checkpoint.restore_optimizer("encoder", resumed, loaded)
     assert all(torch.equal(a, b) for a, b in zip(steps(network, optimizer), steps(other, resumed), strict=True))
+
+
+@pytest.fixture(scope="module")
+def stopped(tiny_run, tmp_path_factory) -> Path:
+    """The folder of a run that was stopped after four of six steps, with checkpoints of steps 4 and 2."""
+    folder = tmp_path_factory.mktemp("stopped") / "run"
+    train(tiny_run(folder, iterations=4))
+    return folder
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) * 2 // 3] ^= 16
+    path.write_bytes(content)
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*.safetensors")}
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (cut, "is damaged or was cut short"),
+        (lambda path: path.write_bytes(b""), "is damaged or was cut short"),
+        (lambda path: torch.save({"x": torch.zeros(1)}, path), "is damaged or was cut short"),
+        (flip, "has changed since it was written (another CRC-32)"),
+        (lambda path: save_file({"x": torch.zeros(1)}, path), "is a safetensors file, but not a checkpoint of learn3d"),
+        (Path.unlink, "going on from the checkpoint before it"),
+    ],
+)
+def test_the_checkpoint_before_is_used(tiny_run, undisturbed, stopped, run_folder, capsys, damage, said: str) -> None:
+    shutil.copytree(stopped, run_folder)
+    damage(run_folder / "last.safetensors")
+    assert train(tiny_run(run_folder), resume=True).finished
+    shown = capsys.readouterr().err
+    assert all(text in shown for text in (said, "the steps since then are repeated", "resuming at step 2"))
+    check_same(run_folder, undisturbed)
+
+
+def test_a_checkpoint_that_cannot_be_reached_is_no_damage(tiny_run, stopped, run_folder, monkeypatch) -> None:
+    def away(*_, **__):
+        raise OSError(errno.ESTALE, "Stale file handle")
+
+    before = contents(shutil.copytree(stopped, run_folder))
+    monkeypatch.setattr(checkpoint, "safe_open", away)
+    with pytest.raises(OSError, match="Stale file handle"):
+        train(tiny_run(run_folder), resume=True)
+    assert contents(run_folder) == before
+
+
+def test_when_none_is_whole_the_run_says_so_and_leaves_all_as_it_is(tiny_run, stopped, run_folder) -> None:
+    for path in shutil.copytree(stopped, run_folder).glob("*.safetensors"):
+        cut(path)
+    before = contents(run_folder)
+    with pytest.raises(ValueError, match=r"last.safetensors is damaged .*previous.safetensors is .*no checkpoint is"):
+        train(tiny_run(run_folder), resume=True)
+    assert contents(run_folder) == before
+
+
+@pytest.mark.parametrize("kind", ["weights", "moments"])
+def test_values_that_are_not_finite_are_not_saved(tiny_run, stopped, run_folder, monkeypatch, kind: str) -> None:
+    """Adam's second moment overflows long before a weight does: its square is 1e42 for a gradient of 1e21."""
+    before = (shutil.copytree(stopped, run_folder) / "last.safetensors").read_bytes()
+    real = PoseInvariant.take_step
+
+    def explode(method, batch, step):
+        losses, parameter = real(method, batch, step), next(method.encoder.parameters())
+        target = parameter.data if kind == "weights" else method.optimizers["encoder"].state[parameter]["exp_avg_sq"]
+        if step == 6:
+            target.fill_(math.inf)
+        return losses
+
+    monkeypatch.setattr(PoseInvariant, "take_step", explode)
+    with pytest.raises(FloatingPointError, match=r"encoder.* not finite.*the last good checkpoint is"):
+        train(tiny_run(run_folder, validate_every=100), resume=True)
+    assert (run_folder / "last.safetensors").read_bytes() == before
+    monkeypatch.undo()
+    assert train(tiny_run(run_folder), resume=True).finished
+
+
+@pytest.mark.parametrize("preset", ["peng2020-kato", "plus-kato"])
+def test_an_exported_model_gives_the_shapes_of_the_run(tiny_config, tiny_set, run_folder, tmp_path, preset) -> None:
+    train(tiny_config(run_folder, preset=preset, ema_decay=0.5))
+    size = export(run_folder, tmp_path / "small.safetensors")
+    assert size == (tmp_path / "small.safetensors").stat().st_size
+    assert size < 0.6 * (run_folder / "best.safetensors").stat().st_size
+    images, shapes = torch.from_numpy(tiny_set.images[:5]), []
+    for path in (run_folder, tmp_path / "small.safetensors"):
+        method, *_ = checkpoint.load_method(path)
+        with torch.no_grad():
+            shapes.append(method.decode(method.encode(images)).vertices)
+    torch.testing.assert_close(shapes[0], shapes[1], atol=2e-3, rtol=0)
+    assert set(method.networks) == {"encoder", "generator"}
+
+
+def test_no_path_of_the_maker_is_in_the_file(finished_run, tmp_path, monkeypatch) -> None:
+    load = checkpoint.load_method
+
+    def with_weights(*arguments, **options):
+        method, config, metadata = load(*arguments, **options)
+        object.__setattr__(config.settings, "pretrained", tmp_path / "resnet18.pth")
+        return method, config, metadata
+
+    monkeypatch.setattr(checkpoint, "load_method", with_weights)
+    export(finished_run, tmp_path / "small.safetensors")
+    content = (tmp_path / "small.safetensors").read_bytes()
+    assert not [path for path in (tmp_path, finished_run) if str(path).encode() in content]
+
+
+def test_other_methods_are_refused(tiny_config, run_folder, tmp_path) -> None:
+    train(tiny_config(run_folder, preset="kato2018-kato", encoder="conv-small", iterations=1))
+    with pytest.raises(ValueError, match="proposed, vanilla, plus and many-views"):
+        export(run_folder, tmp_path / "small.safetensors")
+
+
+@pytest.mark.parametrize(("category", "iou"), [("airplane", 0.5), ("car", 0.75), ("sofa", 0.55)])
+def test_the_small_model_of_the_package_knows_generated_objects(category: str, iou: float, tmp_path) -> None:
+    assert SMALL_MODEL.stat().st_size < 10e6
+    make_dataset(DatasetConfig(tmp_path, category, procedural=8, test=6, val=1, seed=99))
+    method, *_ = checkpoint.load_method(SMALL_MODEL)
+    assert evaluate(method, load_dataset("kato", tmp_path, category, "test")).voxel_iou > iou

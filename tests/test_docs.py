@@ -1,10 +1,15 @@
-"""The code of the README and of the pages in docs runs, and the files that they name exist.
+"""The pages: their code runs, what they name exists, and what they show is made by the code.
 
 Our own code is in blocks marked ``python``. Code of other libraries is not run; its blocks are marked ``py``.
 """
 
+from __future__ import annotations
+
+import importlib.util
+import json
 import re
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -125,3 +130,63 @@ def test_documented_commands_are_understood(words, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["learn3d"])
     with pytest.raises(Understood):
         main(*words)
+
+
+def test_every_promise_has_a_test() -> None:
+    page = (ROOT / "docs" / "guarantees.md").read_text()
+    lines = [line for line in page.splitlines() if line.startswith("|") and not line.startswith(("|---", "| fault"))]
+    assert len(lines) > 20
+    for line in lines:
+        named = re.findall(r"`((?:\w+/)?test_\w+\.py)::(\w+)`", line.split("|")[3])
+        assert named, line
+        for file, name in named:
+            source = (ROOT / "tests" / "learn3d" / file).read_text()
+            assert f"\ndef {name}(" in source, f"{file}::{name}"
+
+
+def test_the_page_has_the_tables_of_the_files():
+    command = [sys.executable, ROOT / "docs" / "make_results.py", "--check"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_results_in_the_readme_are_in_the_files():
+    cells = [path.read_text() for path in (ROOT / "docs" / "results").glob("*.json")]
+    assert all(json.loads(text)["main"] for text in cells)
+    readme = (ROOT / "README.md").read_text()
+    section = readme[readme.index("## 3. ") : readme.index("## Documentation")]
+    figures = re.findall(r"\b0\.\d{3}\b", section)
+    assert len(figures) >= 11 and not [figure for figure in figures if not any(figure in text for text in cells)]
+
+
+_spec = importlib.util.spec_from_file_location("make_pictures", ROOT / "docs" / "make_pictures.py")
+make_pictures = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(make_pictures)
+
+
+def test_every_picture_has_a_command_and_a_record() -> None:
+    pictures = {path.name for path in make_pictures.IMAGES.iterdir() if path.suffix != ".json"}
+    assert pictures == set(make_pictures.PICTURES) == set(make_pictures.records())
+
+
+def test_every_picture_is_shown() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    shown = {name for page in pages for name in re.findall(r"images/([\w-]+\.\w+)\)", page.read_text())}
+    assert shown == set(make_pictures.PICTURES)
+
+
+def test_no_picture_is_older_than_the_code_that_draws_it() -> None:
+    old = make_pictures.out_of_date()
+    assert not old, f"draw them again: python docs/make_pictures.py {' '.join(old)}"
+
+
+def test_a_changed_source_is_noticed(monkeypatch, tmp_path) -> None:
+    source = tmp_path / "draw.py"
+    source.write_text("1")
+    picture = make_pictures.Picture("", "", (str(source),))
+    monkeypatch.setattr(make_pictures, "PICTURES", {"a.png": picture})
+    made = {"a.png": {"sources": make_pictures.digest(picture)}}
+    monkeypatch.setattr(make_pictures, "records", lambda: made)
+    assert make_pictures.out_of_date() == []
+    source.write_text("2")
+    assert make_pictures.out_of_date() == ["a.png"]

@@ -1,0 +1,235 @@
+"""Images, meshes and voxel grids: what is read, and what is refused."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+import trimesh
+from PIL import Image
+from shapenet_files import binvox_bytes
+from trimesh.exchange.binvox import load_binvox
+
+from learn3d.data.framing import read_photo
+from learn3d.files import limits, meshes, renderings, sandbox
+from learn3d.files.meshes import read_mesh
+from learn3d.files.reading import DamagedFile
+from learn3d.files.renderings import PHOTOGRAPHS, RENDERINGS, open_image, read_table, shrink, split_alpha
+
+
+def png(width: int, height: int) -> bytes:
+    """A grey PNG whose header promises so many pixels; its data hold none."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")]
+    body = (struct.pack(">I", len(c)) + kind + c + struct.pack(">I", zlib.crc32(kind + c)) for kind, c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(body)
+
+
+@pytest.mark.parametrize("size", [(60_000, 60_000), (10_001, 1), (9000, 9000), (2**31 - 1, 2**31 - 1)])
+def test_images_that_promise_too_many_pixels_are_not_decoded(tmp_path, size):
+    (tmp_path / "a.png").write_bytes(png(*size))
+    for read in (read_photo, lambda path: sandbox.read(renderings.read_with_alpha, path, 64)):
+        with pytest.raises(ValueError, match=r"a\.png: .*(make it smaller|DecompressionBomb)"):
+            read(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("kind", ["GIF", "EPS", "TIFF"])
+def test_decoders_of_other_formats_are_never_tried(tmp_path, kind):
+    content = io.BytesIO()
+    Image.new("RGB", (16, 16)).save(content, kind)
+    (tmp_path / "a.png").write_bytes(content.getvalue())
+    for formats in (RENDERINGS, PHOTOGRAPHS):
+        with pytest.raises(ValueError, match=r"a\.png: cannot be decoded as an image of the kind PNG, JPEG"):
+            open_image(tmp_path / "a.png", formats, 100)
+
+
+def test_damaged_exif_data_do_not_cost_the_photograph(tmp_path):
+    Image.fromarray(np.full((9, 6), 255, np.uint8)).save(tmp_path / "m.png")
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\xff\xff\xff\x7f\xff\xff\xff\xff"
+    Image.fromarray(np.full((9, 6, 3), 7, np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_photo(tmp_path / "a.jpg", tmp_path / "m.png")[0].shape == (9, 6, 3)
+
+
+def test_shrinking_takes_the_mean_over_each_pixels_area():
+    rng = np.random.default_rng(0)
+    color, mask = rng.integers(0, 256, (128, 128, 3), np.uint8), rng.integers(0, 256, (128, 128), np.uint8)
+    image, small = shrink(color, mask, 64)
+    blocks = np.dstack([color, mask]).reshape(64, 2, 64, 2, 4).mean((1, 3)).transpose(2, 0, 1)
+    assert image.dtype == np.uint8 and np.abs(image - blocks).max() <= 0.51
+    np.testing.assert_array_equal(small, image[3])
+
+
+def test_shrinking_by_three_and_a_half_keeps_the_covered_area():
+    mask = np.zeros((224, 224), np.uint8)
+    mask[10:101, 50:171] = 255
+    image, small = shrink(np.dstack([mask] * 3), mask, 224)
+    np.testing.assert_array_equal(image[3], mask)
+    assert small.sum() * 3.5**2 == pytest.approx(mask.sum(), rel=1e-3)
+    assert small[:, 10].max() == 0 and small[20, 20] == 255
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])
+def test_transparent_pixels_become_white(tmp_path, mode):
+    pixels = np.zeros((4, 4, 4), np.uint8)
+    pixels[1, 2] = (90, 90, 90, 255)
+    image = Image.fromarray(pixels)
+    if mode == "P":
+        image = image.convert("RGB").quantize(2)
+        image.info["transparency"] = image.getpixel((0, 0))
+    image = image.convert(mode) if mode == "LA" else image
+    image.save(tmp_path / "image.png", transparency=image.info.get("transparency"))
+    image = open_image(tmp_path / "image.png", RENDERINGS, 64)
+    assert image.mode == mode
+    color, alpha = split_alpha(image)
+    assert color[1, 2].tolist() == [90] * 3 and color[0, 0].tolist() == [255] * 3
+    assert alpha[1, 2] == 255 and alpha.sum() == 255
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB"])
+def test_images_without_transparency_have_no_alpha(tmp_path, mode):
+    Image.fromarray(np.full((4, 4), 255, np.uint8)).convert(mode).save(tmp_path / "image.png")
+    color, alpha = split_alpha(open_image(tmp_path / "image.png", RENDERINGS, 64))
+    assert alpha is None and color.shape == (4, 4, 3) and (color == 255).all()
+
+
+def test_rows_that_are_cut_short_are_damage(tmp_path):
+    path = tmp_path / "view.txt"
+    path.write_text("10 20 0 1.5\n33.2 20 0 1.5 9")
+    np.testing.assert_array_equal(read_table(path, 2, 4, "a table"), [[10, 20, 0, 1.5], [33.2, 20, 0, 1.5]])
+    path.write_text("10 20 0 1.5\n33.2")
+    with pytest.raises(DamagedFile, match=r"row 1 is '33\.2'; expected a table"):
+        read_table(path, 2, 4, "a table")
+
+
+TRIANGLE = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n%%EOF\n"
+
+
+@pytest.mark.parametrize("kind", ["obj", "glb"])
+def test_textures_run_no_programs(tmp_path, kind):
+    """Ghostscript is played by a shell script."""
+    ran, program = tmp_path / "ran", tmp_path / "bin" / "gs"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\ntouch {ran}\n")
+    program.chmod(0o755)
+    path, texture = tmp_path / "a.obj", tmp_path / "t.png"
+    path.write_text(TRIANGLE)
+    path.with_suffix(".mtl").write_text("newmtl m\nmap_Kd t.png\n")
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(texture)
+    if kind == "glb":
+        content = trimesh.load(path, force="scene", process=False).export(file_type="glb")
+        start = content.index(b"\x89PNG")
+        length = content.index(b"IEND") + 8 - start
+        path = path.with_suffix(".glb")
+        path.write_bytes(content[:start] + EPS.ljust(length) + content[start + length :])
+    texture.write_bytes(EPS)
+    code = "import sys; from pathlib import Path; from learn3d.files.meshes import read_mesh\n"
+    command = [sys.executable, "-c", code + "print(len(read_mesh(Path(sys.argv[1])).faces))", str(path)]
+    environment = os.environ | {"PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout == "1\n" and done.stderr == "" and not ran.exists()
+
+
+def test_buffers_from_elsewhere_are_refused(tmp_path):
+    (tmp_path / "in").mkdir()
+    for name, content in trimesh.Scene(trimesh.creation.box()).export(file_type="gltf").items():
+        (tmp_path / "in" / name).write_bytes(content)
+    path = tmp_path / "in" / "model.gltf"
+    assert len(read_mesh(path).faces) == 12
+    model = json.loads(path.read_text())
+    for buffer in model["buffers"]:
+        (tmp_path / "in" / buffer["uri"]).rename(tmp_path / buffer["uri"])
+    with pytest.raises(ValueError, match="is missing"):
+        read_mesh(path)
+    for buffer in model["buffers"]:
+        buffer["uri"] = "../" + buffer["uri"]
+    path.write_text(json.dumps(model))
+    with pytest.raises(ValueError, match="outside of"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("kind", ["obj", "off"])
+def test_a_letter_that_is_not_utf8_costs_nothing(tmp_path, kind):
+    content = trimesh.creation.box().export(file_type=kind).encode()
+    (tmp_path / f"a.{kind}").write_bytes(content.replace(b"\n", b"\n# " + "größe".encode("latin-1") + b"\n", 1))
+    assert len(read_mesh(tmp_path / f"a.{kind}").faces) == 12
+
+
+def test_files_that_are_none(tmp_path):
+    with pytest.raises(ValueError, match="is missing"):
+        read_mesh(tmp_path / "a.off")
+    (tmp_path / "a.off").write_text("OFF\n8 12 0\n")
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_mesh(tmp_path / "a.off")
+
+
+CELLS = np.random.default_rng(0).random((8, 8, 8)) < 0.3
+
+
+def saved(compressed: bool = False, **arrays: object) -> bytes:
+    content = io.BytesIO()
+    scipy.io.savemat(content, arrays, do_compression=compressed)
+    return content.getvalue()
+
+
+def matlab(folder: Path, content: bytes, name: str = "Volume", size: int = 8) -> np.ndarray:
+    (folder / "a.mat").write_bytes(content)
+    return sandbox.read(meshes.read_matlab, folder / "a.mat", name, size)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("dtype", ["u1", "?", "f8"])
+def test_the_array_is_found_among_others(tmp_path, compressed, dtype):
+    cell = np.array([np.zeros(2), "a"], object)
+    content = saved(compressed, other=CELLS + 1, Volume=CELLS.astype(dtype), text="abc", cell=cell)
+    np.testing.assert_array_equal(matlab(tmp_path, content), CELLS)
+    for name, size in (("missing", 8), ("text", 8), ("cell", 8), ("Volume", 5)):
+        with pytest.raises(ValueError, match=rf"a\.mat: has .*; expected .*{name}"):
+            matlab(tmp_path, content, name, size)
+
+
+def test_matlab_files_that_are_none(tmp_path):
+    for content in (b"MATLAB", saved(Volume=CELLS)[:-5], b"", bytes(limits.VOLUME_BYTES + 1)):
+        with pytest.raises(ValueError, match=r"a\.mat: "):
+            matlab(tmp_path, content)
+
+
+def binvox(path: Path, content: bytes, size: int = 8) -> meshes.Binvox:
+    path.write_bytes(content)
+    return sandbox.read(meshes.read_binvox, path, size)
+
+
+def test_reads_the_axes_of_the_mesh_and_where_the_grid_lies(tmp_path):
+    content = binvox_bytes(CELLS, scale=0.7, translate=-0.3)
+    grid = binvox(tmp_path / "model.binvox", content)
+    np.testing.assert_array_equal(grid.voxels, CELLS)
+    assert grid.voxels.dtype == bool and grid.scale == 0.7 and grid.translate.tolist() == [-0.3] * 3
+    np.testing.assert_array_equal(np.asarray(load_binvox(io.BytesIO(content)).matrix), CELLS)  # trimesh agrees
+    assert binvox(tmp_path / "full", binvox_bytes(np.ones((32, 32, 32), bool)), 32).voxels.all()  # runs above 255
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"\ndata\n", b"\n", "its runs fill"),
+        (b"dim 8 8 8", b"dim 8 8 9", "has another header; expected a binvox file of 8x8x8"),
+        (b"scale 1.0", b"", "has another header"),
+        (b"-0.5 -0.5 -0.5", b"-0.5 -0.5", "has another header"),
+        (b"scale 1.0", b"scale nan", "and scale nan; expected"),
+        (b"data\n", b"data\n\x01\x05", "cells; expected 512. Perhaps"),
+    ],
+)
+def test_damaged_files_are_named(tmp_path, old: bytes, new: bytes, message: str):
+    path = tmp_path / "model.binvox"
+    with pytest.raises(ValueError) as error:
+        binvox(path, binvox_bytes(CELLS).replace(old, new))
+    assert str(error.value).startswith(str(path)) and message in str(error.value)
