@@ -17,9 +17,8 @@ from torch import Tensor, nn
 import nmr
 from learn3d.config import TrainConfig
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
-from learn3d.data.crops import Crops
 from learn3d.data.dataset import MASK_SIZE
-from learn3d.data.framing import OBJECT_SHARE, check_mask, mask_box, read_photo, read_picture, threshold_mask
+from learn3d.data.framing import OBJECT_SHARE, Crops, check_mask, mask_box, read_photo, read_picture, threshold_mask
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
 from learn3d.data.poses import Poses
 from learn3d.files import limits, writing
@@ -168,7 +167,7 @@ def prepare_image(
     The object is laid over white and, with `crop`, centred in a square so that its larger side takes `object_share` of
     it, as in the data set; without, the image must be framed like that already and is only made square and scaled.
     Colours are inverted if the layout inverts them. If images are stretched (Pascal3D+), the background stays, and
-    `crop` takes the mask's box, padded and stretched as the reader does it (`learn3d.data.crops`).
+    `crop` takes the mask's box, padded and stretched as the reader does it (`learn3d.data.framing`).
 
     Raises ValueError if the mask has no pixel above half.
     """

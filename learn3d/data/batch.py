@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 import nmr
-from learn3d.data.crops import Crops
+from learn3d.data.framing import Crops
 from learn3d.data.poses import LookAtPoses, Poses
 
 

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from learn3d.data.batch import Batch, PoseCandidates
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
-from learn3d.data.crops import Crops, join_crops
 from learn3d.data.disk_array import DiskArray
+from learn3d.data.framing import Crops, join_crops
 from learn3d.data.poses import LookAtPoses, Poses, join_poses
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.renderings import MASK_SIZE

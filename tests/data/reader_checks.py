@@ -1,5 +1,11 @@
-"""Questions that the tests of every reader ask: checking and loading must tell of the same faults."""
+"""Checks of what readers do: the problems they find, the memory they take."""
 
+from __future__ import annotations
+
+import contextlib
+import threading
+import tracemalloc
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -44,3 +50,28 @@ def silhouette_iou(dataset: ViewDataset, vertices: np.ndarray, faces: np.ndarray
 def cut_short(path: Path) -> None:
     """Keep the first half of a file."""
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+_threads_at_start: set[threading.Thread] = set()  # of the tracing
+
+
+@contextlib.contextmanager
+def at_most(limit: int) -> Iterator[None]:
+    """Fail where the block holds more than `limit` bytes at a time, beside what was held before.
+
+    Where the block leaves threads behind, tracing goes on until a later block finds them gone: Python 3.11 crashes
+    where a thread allocates memory while tracing stops (python/cpython, issue 128679).
+    """
+    if not tracemalloc.is_tracing():
+        _threads_at_start.clear()
+        _threads_at_start.update(threading.enumerate())
+        tracemalloc.start()
+    tracemalloc.reset_peak()
+    held = tracemalloc.get_traced_memory()[0]
+    try:
+        yield
+    finally:  # after an error, too
+        taken = tracemalloc.get_traced_memory()[1] - held
+        if _threads_at_start.issuperset(threading.enumerate()):
+            tracemalloc.stop()
+        assert taken < limit, f"it took {taken} bytes, wanted less than {limit}"

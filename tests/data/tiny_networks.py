@@ -1,4 +1,4 @@
-"""The smallest encoder and generator that fit the training loop, for tests of the loop: a step takes milliseconds."""
+"""The smallest encoder and generator that fit the training loop (milliseconds a step); a method without networks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from learn3d.methods import vpl
+from learn3d.methods import Method, vpl
 from learn3d.networks import ENCODERS, GENERATORS, Symmetry
 from learn3d.networks.encoders import CODE_SIZE, PreactResNet18, SmallConvEncoder
 from learn3d.networks.generators import SmallSphereGenerator
@@ -41,3 +41,17 @@ def put_in_place(patch: pytest.MonkeyPatch | None = None) -> None:
     patch.setitem(ENCODERS, "conv-small", TinyEncoder)
     patch.setitem(GENERATORS, "sphere-small", TinyGenerator)
     patch.setattr(vpl, "PreactResNet18", partial(PreactResNet18, channels=4))
+
+
+class FixedMethod(Method):
+    """A subclass encodes and decodes; nothing is trained."""
+
+    image_size = 64
+
+    def __init__(self) -> None:
+        self.networks, self.optimizers, self.device, self.precision = {}, {}, torch.device("cpu"), "fp32"
+
+    def create_networks(self):
+        raise NotImplementedError
+
+    create_optimizers = training_step = create_networks

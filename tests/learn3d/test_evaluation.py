@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import stub_work
 import torch
-from fixed_method import FixedMethod
+from tiny_networks import FixedMethod
 from vectors import load_vector
 
 import nmr

@@ -12,8 +12,7 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
-from learn3d.data.crops import Crops
-from learn3d.data.framing import threshold_mask
+from learn3d.data.framing import Crops, threshold_mask
 from learn3d.pictures.surfaces import Surface
 from learn3d.reconstruction import _read, export_mesh, prepare_image, reconstruct_dataset, reconstruct_files
 

@@ -26,8 +26,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from learn3d.data.conventions import VOXEL_SIZE, LayoutProperties, VoxelConvention
-from learn3d.data.crops import SMALLEST, Crops, bounds
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
+from learn3d.data.framing import SMALLEST, Crops, bounds
 from learn3d.data.poses import RotationPoses
 from learn3d.data.view_bins import training_classes
 from learn3d.files import npz

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from fuzz_targets import ERRORS, SETTINGS, TARGETS, Target, layout_target
-from memory_checks import at_most
+from reader_checks import at_most
 
 from learn3d.config import TrainConfig
 from learn3d.data.checking import check_folder

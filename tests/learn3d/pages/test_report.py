@@ -19,8 +19,7 @@ from plotly.offline import get_plotlyjs
 from learn3d.evaluation import evaluate
 from learn3d.experiments.measurement import evaluate_runs
 from learn3d.pages import report
-from learn3d.pages.report import write_report
-from learn3d.pages.shapes import UNIT
+from learn3d.pages.report import UNIT, write_report
 from learn3d.runs import checkpoint
 
 

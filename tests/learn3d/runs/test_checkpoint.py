@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from memory_checks import at_most
+from reader_checks import at_most
 from runs import check_same, metadata, same_bits
 from safetensors.torch import save_file
 

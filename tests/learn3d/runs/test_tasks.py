@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import stub_tasks
+import stub_work
 
 from learn3d.runs.tasks import Task, run_tasks
 
@@ -20,12 +20,12 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 
 
 def tasks(folder: Path, *names: str, seconds: float = 0.0) -> list[Task]:
-    return [Task(name, stub_tasks.steps, (folder, name, seconds), folder / f"{name}.log") for name in names]
+    return [Task(name, stub_work.steps, (folder, name, seconds), folder / f"{name}.log") for name in names]
 
 
 def finished(folder: Path, *names: str) -> bool:
     """Every step of the tasks was taken, and none twice."""
-    wanted = [str(step) for step in range(stub_tasks.STEPS)]
+    wanted = [str(step) for step in range(stub_work.STEPS)]
     return all((folder / f"{name}.txt").read_text().split() == wanted for name in names)
 
 
@@ -71,10 +71,10 @@ def test_tasks_stop_when_their_parent_is_killed(tmp_path) -> None:
 import sys
 sys.path[:0] = {sys.path!r}
 from pathlib import Path
-import stub_tasks
+import stub_work
 from learn3d.runs.tasks import Task, run_tasks
 folder = Path({str(tmp_path)!r})
-run_tasks([Task("a", stub_tasks.steps, (folder, "a", 0.3), folder / "a.log")])
+run_tasks([Task("a", stub_work.steps, (folder, "a", 0.3), folder / "a.log")])
 """
     with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL) as parent:
         wait_for(lambda: begun(tmp_path, "a"), "the task")

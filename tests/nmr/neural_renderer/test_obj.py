@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from memory_checks import at_most
+from reader_checks import at_most
 from vectors import load_vector, vector_names
 
 import nmr
