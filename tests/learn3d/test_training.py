@@ -13,11 +13,10 @@ import torch
 
 import nmr
 from learn3d import training
-from learn3d.config import TrainConfig, check_resume, config_from_dict, config_to_dict
+from learn3d.config import TrainConfig, config_to_dict
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.sampling import shuffled_epochs
 from learn3d.methods import DatasetInfo, create_method
-from learn3d.methods.plus import PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
@@ -88,36 +87,6 @@ def test_printed_losses_differ_from_those_of_the_published_code(tiny_config, tin
     assert a["prior"] != b["prior"]
 
 
-def test_preset_fills_in_what_is_not_given(tmp_path) -> None:
-    where = {"data": tmp_path, "category": "airplane", "output": tmp_path}
-    config = TrainConfig(**where, preset="peng2020-kato")
-    assert (config.settings.lambda_smooth, config.settings.lambda_adversarial) == (0.001, 1)
-    assert (config.iterations, config.batch_size, config.settings.learning_rate) == (20_000, 128, 1e-4)
-    assert TrainConfig(**where, preset=VANILLA).settings.lambda_adversarial == 0
-    given = TrainConfig(**where, iterations=7, view_bins="15x20")
-    assert (given.preset, given.iterations, given.batch_size, given.view_bins) == ("plus-kato", 7, 32, "15x20")
-
-
-def test_config_survives_json(tmp_path) -> None:
-    config = TrainConfig(
-        data=tmp_path,
-        category="chair",
-        output=tmp_path / "run",
-        settings=PlusSettings(lambda_prior=0.5),
-        threads=2,
-        augment=("channels",),
-    )
-    values = json.loads(json.dumps(config_to_dict(config)))
-    assert config_from_dict(values) == config
-
-
-def test_resume_may_change_only_what_does_not_matter(tiny_config, tmp_path) -> None:
-    saved = tiny_config(tmp_path)
-    check_resume(tiny_config(tmp_path, iterations=9, threads=1, validate_every=3), saved)
-    with pytest.raises(ValueError, match="batch_size: 4 in the run, 8 asked for; seed: 0 in the run, 1 asked for"):
-        check_resume(tiny_config(tmp_path, batch_size=8, seed=1), saved)
-
-
 @pytest.mark.parametrize(("samples", "batch"), [(24, 5), (24, 24), (7, 20)])
 def test_batches_go_through_every_epoch_completely(samples: int, batch: int) -> None:
     steps = 3 * samples
@@ -143,21 +112,6 @@ def test_a_finished_run_leaves_everything(finished_run, read_metrics) -> None:
     assert list((finished_run / "tensorboard").iterdir())
 
 
-TRAIN_STEP = PoseInvariant.take_step
-
-
-def signal_after(number: int, step: int):
-    """The training step, with a signal to this process at the end of one of them."""
-
-    def step_and_signal(self, batch, now: int):
-        losses = TRAIN_STEP(self, batch, now)
-        if now == step:
-            signal.raise_signal(number)
-        return losses
-
-    return step_and_signal
-
-
 def test_a_second_interrupt_does_not_wait(tiny_config, run_folder, monkeypatch) -> None:
     def twice(*arguments):
         signal.raise_signal(signal.SIGINT)
@@ -166,31 +120,6 @@ def test_a_second_interrupt_does_not_wait(tiny_config, run_folder, monkeypatch) 
     monkeypatch.setattr(PoseInvariant, "take_step", twice)
     with pytest.raises(KeyboardInterrupt):
         train(tiny_config(run_folder, preset=VANILLA))
-
-
-def test_interrupted_run_resumes_bit_for_bit(
-    tiny_config, finished_run, run_folder, monkeypatch, capsys, read_metrics
-) -> None:
-    monkeypatch.setattr(PoseInvariant, "take_step", signal_after(signal.SIGINT, 2))
-    summary = train(tiny_config(run_folder))
-    assert (summary.step, summary.finished) == (2, False)
-    assert f"--output {run_folder} --resume" in capsys.readouterr().err
-
-    torch.manual_seed(99)  # whatever the new process does before
-    monkeypatch.setattr(PoseInvariant, "take_step", TRAIN_STEP)
-    with open(run_folder / "metrics.jsonl", "a") as file:
-        file.write('{"step": 3, "split": "train"}\n{"step": 4, "spl')  # as a crash after the checkpoint would leave it
-    summary = train(tiny_config(run_folder), resume=True)
-    assert (summary.step, summary.finished) == (4, True)
-    assert read_metrics(run_folder) == read_metrics(finished_run)
-    for name in ("last", "best"):
-        ours, about = checkpoint.load(run_folder / f"{name}.safetensors")
-        theirs, about_theirs = checkpoint.load(finished_run / f"{name}.safetensors")
-        assert ours.keys() == theirs.keys()
-        assert all(torch.equal(ours[key], theirs[key]) for key in ours)
-        assert (about.data, about.info) == (about_theirs.data, about_theirs.info)
-        assert dataclasses.replace(about.progress, seconds=about_theirs.progress.seconds) == about_theirs.progress
-        assert about.progress.seconds > 0
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
-"""Every layout against its description: masks and voxels are those of the TRUE mesh under the numbers in its files.
+"""Layouts against their descriptions: masks and voxels are those of the TRUE mesh under the numbers in the files.
 
-Nothing here goes through our readers. If the description is in right-handed world coordinates, so is the test: cameras
-are OpenCV's, the object frame and LookAt do not occur.
+Nothing here goes through our readers: `data/test_round_trip.py` compares what these read with the meshes. If the
+description is in right-handed world coordinates, so is the test: cameras are OpenCV's.
 """
 
 from __future__ import annotations
@@ -94,33 +94,6 @@ def views(layout: str, radius: float, count: int, seed: int) -> Poses:
     return writer.views(np.array([[radius, 0.0, 0.0]]), count, np.random.default_rng(seed))
 
 
-def test_dvr(tmp_path, folder):
-    make(tmp_path, folder, "dvr", test=1)
-    root = tmp_path / SYNSET
-    train, (name,) = ((root / f"softras_{split}.lst").read_text().split() for split in ("train", "test"))
-    assert len(train) == 4 and not (root / "softras_val.lst").exists()
-    vertices, faces = true_mesh(folder, name)
-    cameras = np.load(root / name / "cameras.npz")
-    to_pixels = np.array([[32, 0, 32], [0, 32, 32], [0, 0, 1.0]])
-    for k in (0, 5, 23):
-        world, camera = cameras[f"world_mat_{k}"], cameras[f"camera_mat_{k}"]
-        assert np.linalg.det(world[:3, :3]) == pytest.approx(1) and world.shape == (4, 4)
-        opencv = nmr.cameras.from_opencv(
-            to_pixels @ camera[:3, :3], world[:3, :3], world[:3, 3], height=64, width=64, pixel_center=0.5
-        )
-        mask = read_image(root / name / "mask" / f"{k:04d}.png")
-        assert_same_mask(mask, silhouette(vertices, faces, opencv, 64))
-        image = read_image(root / name / "image" / f"{k:04d}.png")
-        assert image.shape == (64, 64, 3) and (image[mask == 0] == 255).all() and (image[mask == 255] < 255).any()
-    # file k is at azimuth 15 k of Kato's Blender scene: from the front, x, at 0, and seen from -z at 90 degrees
-    eye = -cameras["world_mat_6"][:3, :3].T @ cameras["world_mat_6"][:3, 3]
-    np.testing.assert_allclose(eye, 2.732 * np.array([0, 0.5, np.sqrt(0.75)]), atol=1e-5)
-    cloud = np.load(root / name / "pointcloud.npz")
-    mesh = trimesh.Trimesh(vertices.numpy(), faces.numpy())
-    _, distance, _ = trimesh.proximity.closest_point_naive(mesh, cloud["points"][:200])
-    assert cloud["points"].shape == cloud["normals"].shape == (10_000, 3) and distance.max() < 1e-5
-
-
 def test_kar(tmp_path, folder):
     make(tmp_path, folder, "kar", test=1, val=1, views=3)
     splits = json.loads((tmp_path / "splits.json").read_text())[SYNSET]
@@ -152,37 +125,6 @@ def test_kar(tmp_path, folder):
         np.testing.assert_allclose(quaternion.as_matrix(), rotation, atol=1e-6)
 
 
-def read_binvox(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
-    """Grid [x, y, z], translate and scale of a binvox file, by the letter of its specification."""
-    head, _, runs = path.read_bytes().partition(b"data\n")
-    lines = dict(line.split(maxsplit=1) for line in head.decode().splitlines()[1:])
-    values = np.repeat(list(runs[::2]), list(runs[1::2]))
-    grid = np.zeros((32,) * 3, dtype=bool)
-    for number in np.flatnonzero(values):  # index = x * 32 * 32 + z * 32 + y
-        grid[number // 1024, number % 32, number // 32 % 32] = True
-    return grid, np.array(lines["translate"].split(), dtype=float), float(lines["scale"])
-
-
-def test_r2n2(tmp_path, folder):
-    report = make(tmp_path, folder, "r2n2", views=3, test=None, val=None)
-    assert report.counts == {"train": 4, "test": 1}
-    name = min(path.name for path in (tmp_path / "ShapeNetRendering" / SYNSET).iterdir())
-    vertices, faces = true_mesh(folder, name)
-    side = 1 / np.linalg.norm(np.ptp(vertices.numpy(), axis=0))  # ShapeNet's: the diagonal is 1
-    grid, translate, scale = read_binvox(tmp_path / "ShapeNetVox32" / SYNSET / name / "model.binvox")
-    assert scale == pytest.approx(side) and translate == pytest.approx([-side / 2] * 3)
-    assert_oriented(grid, vertices, faces, span=1)  # axes x, y, z of the mesh, the cube around it
-    root = tmp_path / "ShapeNetRendering" / SYNSET / name / "rendering"
-    rows = np.loadtxt(root / "rendering_metadata.txt")
-    assert rows.shape == (3, 5)
-    for k, (azimuth, elevation, yaw, ratio, fov) in enumerate(rows):
-        assert 0 <= azimuth < 360 and yaw == 0 and fov == 25
-        a, e = np.deg2rad([azimuth, elevation])
-        eye = 1.75 * ratio * np.array([np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)])
-        mask = read_image(root / f"{k:02d}.png")[..., 3]
-        assert_same_mask(mask, silhouette(vertices * side, faces, opencv_camera(eye, 2.1875 * 137 / 2, 137), 137))
-
-
 def test_colours_are_unmixed_from_white_and_mixed_with_backgrounds():
     rng = np.random.default_rng(0)
     color, alpha = rng.integers(0, 256, (2, 8, 8, 3)), rng.choice([0, 64, 128, 191, 255], (2, 8, 8)).astype(np.uint8)
@@ -196,33 +138,6 @@ def test_colours_are_unmixed_from_white_and_mixed_with_backgrounds():
     wanted = color * share + background * (1 - share)
     assert np.abs(over(item, background) - wanted).max() <= 1.01
     np.testing.assert_array_equal(over(item, np.full_like(rgb, 255)), rgb)
-
-
-def test_pascal3d(tmp_path, folder):
-    report = make(tmp_path, folder, "pascal3d", views=3, test=None, val=1)
-    assert report.counts == {"train": 4, "val": 1}
-    files = {name: np.load(tmp_path / f"chair_{name}.npz", allow_pickle=True) for name in ("train", "imagenet", "val")}
-    assert [len(files[name]["images_ref"]) for name in files] == [6, 6, 3]
-    val, card = files["val"], json.loads((tmp_path / f"{SYNSET}_card.json").read_text())
-    vertices, faces = true_mesh(folder, card["splits"]["val"][0].replace(" ", "_"))
-    vertices = vertices * (2 / torch.linalg.vector_norm(vertices.amax(0) - vertices.amin(0)))
-    for photo, reference, rotation, (left, top, width, height) in zip(
-        *(val[key] for key in ("images", "images_ref", "rotation_matrices", "bounding_boxes")), strict=True
-    ):
-        rotation = rotation.astype(np.float64)
-        assert np.linalg.det(rotation) == pytest.approx(1) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
-        x, y, z = torch.from_numpy(rotation) @ vertices.T
-        seen = torch.stack([-x, y, z + 2], dim=1)  # x' points left in the image, and depth moves nothing
-        mask = reference[..., 3].astype(float)
-        assert_same_mask(mask, silhouette(seen, faces, None, 224))
-        # the box of the photograph holds what the mask of the reference holds
-        rows, columns = (np.flatnonzero((mask > 127).any(axis=axis)) for axis in (1, 0))
-        parts = [Image.fromarray(reference[..., :3]).crop((columns[0], rows[0], columns[-1] + 1, rows[-1] + 1))]
-        parts.append(Image.fromarray(photo[top : top + height, left : left + width]))
-        small = [np.asarray(part.resize((24, 24), Image.Resampling.BOX)).astype(float) for part in parts]
-        assert np.abs(small[0] - small[1]).mean() < 10 and photo[: max(1, top)].std() > 3  # a background, not paper
-    x, y, z = vertices.T
-    assert_oriented(val["voxels"][0], torch.stack([-x, -z, -y], dim=1), faces, span=2)
 
 
 def test_photos(tmp_path, folder):
