@@ -167,28 +167,6 @@ def test_every_row_is_trained_measured_and_reported(
         assert f"{results[0]['chamfer_l1']:.4f}" in in_list
 
 
-def test_a_second_call_trains_nothing(laboratory: Laboratory, outcomes: dict[str, Outcome]) -> None:
-    def times() -> dict[Path, int]:
-        return {path: path.stat().st_mtime_ns for path in laboratory.runs.rglob("*") if path.is_file()}
-
-    before = times()
-    for name, first in outcomes.items():
-        again = laboratory.call(name)
-        assert (again.status, again.text) == (0, first.text)
-        count = re.search(rf"{name}: (\d+) runs, (\d+) of them done;", again.said)
-        assert count[1] == count[2]
-    assert times() == before
-
-
-def test_tables_share_their_runs(laboratory: Laboratory, outcomes: dict[str, Outcome]) -> None:
-    pascal = {row.variant for row in TABLES["pascal"].rows.values()}
-    folders = {f"{v}-seed{seed}" for v in VARIANTS for seed in range(PASCAL_SEEDS if v in pascal else 1)}
-    assert {path.name for path in laboratory.runs.iterdir()} == folders
-    assert all((path / "log.txt").read_text().count("training: ") == 1 for path in laboratory.runs.iterdir())
-    rows = [outcomes[name].rows("Proposed")["here (kato18)"] for name in ("kato", "prgan", "ablation")]
-    assert all(row == rows[0] for row in rows)
-
-
 def test_settings_of_rows_reach_their_runs(laboratory: Laboratory, outcomes: dict[str, Outcome]) -> None:
     def metadata(variant: str, name: str) -> checkpoint.Metadata:
         return checkpoint.load_metadata(laboratory.runs / f"{variant}-seed0" / f"{name}.safetensors")
