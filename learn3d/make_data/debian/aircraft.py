@@ -10,8 +10,7 @@ from pathlib import PurePosixPath
 import numpy as np
 import trimesh
 
-from learn3d.make_data.debian.mesh_text import Part, read_ac3d
-from learn3d.make_data.debian.packages import Candidate
+from learn3d.make_data.debian.packages import Candidate, Part, read_ac3d
 
 AIRCRAFT_PACKAGE = "flightgear-data-ai"
 FOLDER = "usr/share/games/flightgear/AI/Aircraft/"

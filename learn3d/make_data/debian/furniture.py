@@ -15,8 +15,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from learn3d.make_data.debian.mesh_text import Part, read_obj
-from learn3d.make_data.debian.packages import Candidate
+from learn3d.make_data.debian.packages import Candidate, Part, read_obj
 
 FURNITURE_PACKAGES = ("sweethome3d-furniture", "sweethome3d-furniture-nonfree")  # the second is optional
 

@@ -1,10 +1,16 @@
-"""Files out of Debian packages, without installing them: from .deb files that are there, or by apt-get download."""
+"""Files out of Debian packages, without installing them, and readers of their two mesh formats: OBJ and AC3D.
+
+Of the meshes only the geometry is read: positions and polygons, the latter cut into triangles. trimesh reads OBJ, too,
+but makes a fan of every polygon, which covers the gaps of concave ones (the backs of some chairs). It does not know
+AC3D.
+"""
 
 from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,3 +55,126 @@ def read_package(package: Path, suffixes: tuple[str, ...]) -> dict[str, bytes]:
         found = [path for path in Path(folder).rglob("*") if path.as_posix().endswith(suffixes)]
         plain = [path for path in found if path.is_file() and not path.is_symlink()]
         return {path.relative_to(folder).as_posix(): path.read_bytes() for path in plain}
+
+
+class Part(NamedTuple):
+    """One object of an AC3D file, in the frame of the file."""
+
+    vertices: np.ndarray  # float64 [V, 3]
+    faces: np.ndarray  # int64 [F, 3]
+
+
+def read_obj(text: str) -> Part:
+    """Vertices and triangles of a Wavefront OBJ text; ValueError if it is malformed."""
+    rows, polygons = [], []
+    for line in text.splitlines():
+        fields = line.split() or [""]
+        if fields[0] == "v":
+            rows.append(fields[1:4])
+        elif fields[0] == "f" and len(fields) > 3:
+            indices = [int(field.split("/", 1)[0]) for field in fields[1:]]
+            polygons.append([i - 1 if i > 0 else len(rows) + i for i in indices])
+    vertices = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return Part(vertices, triangulate(polygons, vertices))
+
+
+def read_ac3d(text: str, skip: Callable[[str], object]) -> list[Part]:
+    """Objects of an AC3D text with at least one polygon, placed by the `loc` and `rot` of their ancestors.
+
+    An object whose name `skip` accepts is left out with its children; so are lines (surface types 1 and 2).
+    Convention of FlightGear's models: nose towards -x, y up, left wing towards +z.
+    Raises ValueError if the text is not AC3D or ends too early.
+    """
+    lines = (line for line in map(str.strip, text.splitlines()) if line)  # some exporters scatter blank ones
+    if not next(lines, "").startswith("AC3D"):
+        raise ValueError("an AC3D file starts with AC3D")
+    try:
+        return list(_read_objects(lines, 1, np.eye(3), np.zeros(3), skip))
+    except (RuntimeError, IndexError) as error:  # a generator turns StopIteration into a RuntimeError
+        raise ValueError("the AC3D file ends in the middle of an object") from error
+
+
+def _read_objects(
+    lines: Iterator[str], count: int, rotation: np.ndarray, translation: np.ndarray, skip: Callable[[str], object]
+) -> Iterator[Part]:
+    """The next `count` objects with their children; rotation [3, 3] (of row vectors) is that of their parent."""
+    for _ in range(count):
+        if not any(line.startswith("OBJECT") for line in lines):
+            return
+        name, vertices, polygons, kind, key = "", np.zeros((0, 3)), [], -1, ""
+        turn, shift = np.eye(3), np.zeros(3)
+        while key != "kids":
+            key, _, value = next(lines).partition(" ")
+            if key == "name":
+                name = value.strip('"')
+            elif key == "data":
+                next(lines)  # free text, which may look like anything
+            elif key == "loc":
+                shift = np.array(value.split(), dtype=np.float64)
+            elif key == "rot":
+                turn = np.array(value.split(), dtype=np.float64).reshape(3, 3)
+            elif key == "numvert":
+                rows = [next(lines).split()[:3] for _ in range(int(value))]
+                vertices = np.array(rows, dtype=np.float64).reshape(-1, 3)
+            elif key == "SURF":
+                kind = int(value, 16) & 0xF
+            elif key == "refs":
+                polygon = [int(next(lines).split()[0]) for _ in range(int(value))]
+                if kind == 0 and len(polygon) > 2:
+                    polygons.append(polygon)
+        turn, shift = turn @ rotation, shift @ rotation + translation
+        children = list(_read_objects(lines, int(value), turn, shift, skip))
+        if not skip(name):
+            placed = vertices @ turn + shift
+            yield from [Part(placed, triangulate(polygons, placed))] if polygons else []
+            yield from children
+
+
+def triangulate(polygons: Sequence[Sequence[int]], vertices: np.ndarray) -> np.ndarray:
+    """Triangles int64 [F, 3] of simple polygons, convex or not; ValueError if an index is outside of `vertices`.
+
+    A polygon is cut into a fan from its first corner if that does not fold over, else by its ears.
+    """
+    by_size: dict[int, list[Sequence[int]]] = {}
+    for polygon in polygons:
+        if min(polygon) < 0 or max(polygon) >= len(vertices):
+            raise ValueError(f"a polygon {polygon} names a vertex that is not there")
+        by_size.setdefault(len(polygon), []).append(polygon)
+    triangles = [np.empty((0, 3), dtype=np.int64)]
+    for size in sorted(by_size):
+        corners = np.array(by_size[size], dtype=np.int64)  # [P, size]
+        points = vertices[corners]
+        points = points - points[:, :1]
+        normals = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)  # Newell's: the area's, of any polygon
+        fan = np.stack([np.zeros(size - 2, dtype=np.int64), np.arange(1, size - 1), np.arange(2, size)], axis=1)
+        areas = np.cross(points[:, 1:-1], points[:, 2:])
+        folded = ((areas * normals[:, None]).sum(axis=2) < 0).any(axis=1)
+        triangles.append(corners[~folded][:, fan].reshape(-1, 3))
+        triangles += [corners[i][np.array(_cut_ears(points[i], normals[i]))] for i in np.flatnonzero(folded)]
+    return np.concatenate(triangles)
+
+
+def _cut_ears(points: np.ndarray, normal: np.ndarray) -> list[tuple[int, int, int]]:
+    """Triangles of one polygon [N, 3], cut in the coordinate plane that sees most of it; all N corners are used."""
+    axis = int(np.abs(normal).argmax())
+    u, v = (axis + 1) % 3, (axis + 2) % 3
+    flat = points[:, [u, v] if normal[axis] >= 0 else [v, u]]  # counter-clockwise
+
+    def left_of(a: int, b: int, others: int | list[int]) -> np.ndarray:
+        """Twice the area of the triangle from a to b to each of the others: above 0 on the left."""
+        (x, y), to = flat[b] - flat[a], flat[others] - flat[a]
+        return x * to[..., 1] - y * to[..., 0]
+
+    corners, triangles = list(range(len(points))), []
+    while len(corners) > 3:
+        for at, j in enumerate(corners):
+            i, k = corners[at - 1], corners[(at + 1) % len(corners)]
+            inside = (left_of(i, j, corners) >= 0) & (left_of(j, k, corners) >= 0) & (left_of(k, i, corners) >= 0)
+            own = (flat[corners][:, None] == flat[[i, j, k]]).all(axis=2).any(axis=1)
+            if left_of(i, j, k) > 0 and not (inside & ~own).any():
+                triangles.append((i, j, k))
+                del corners[at]
+                break
+        else:
+            break  # nothing can be cut off (the polygon crosses itself): the rest becomes a fan
+    return triangles + [(corners[0], *pair) for pair in pairwise(corners[1:])]

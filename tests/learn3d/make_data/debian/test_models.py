@@ -15,8 +15,8 @@ from small_packages import AIRCRAFT, AIRPLANE, CHAIR, TABLE, ac_object, ac_text,
 from learn3d.make_data.debian import packages
 from learn3d.make_data.debian.aircraft import is_airplane_file, without_effects
 from learn3d.make_data.debian.furniture import furniture_category, place_furniture, read_catalogue
-from learn3d.make_data.debian.mesh_text import Part, read_ac3d, read_obj, triangulate
 from learn3d.make_data.debian.models import clean_mesh, surface_grid
+from learn3d.make_data.debian.packages import Part, read_ac3d, read_obj, triangulate
 
 
 @pytest.fixture
