@@ -10,7 +10,7 @@ each run. `learn3d experiment TABLE` writes such a file beside its report; copy 
 import json
 import re
 import sys
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 
 DOCS = Path(__file__).parent
@@ -18,12 +18,37 @@ PAGE = DOCS / "results.md"
 BLOCK = re.compile(r"(<!-- results: ([\w-]+) (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
+def rows(name: str, part: str) -> list[list[str]]:
+    """The header and the rows of a table. The second voxelizer stays in the file.
+
+    part: a table of the file, or one made of "main" and "differences": "both" puts the difference under each method,
+    "side" puts paper, here and difference of a single category side by side.
+    """
+    tables = json.loads((DOCS / "results" / f"{name}.json").read_text())
+    if part not in ("both", "side"):
+        return [row for row in tables[part] if row[1] != "here (kato19)"]
+    header, *main = [row for row in tables["main"] if row[1] != "here (kato19)"]
+    baseline = next(row[0] for row in main if row[0] not in {row[0] for row in tables["differences"]})
+    differences = {row[0]: row[2:] for row in tables["differences"]}
+    groups = [list(group) for _, group in groupby(main, key=lambda row: row[0])]
+    if part == "both":
+        named = [[*group, [group[0][0], f"minus {baseline}", *differences.get(group[0][0], [])]] for group in groups]
+        return [header, *(row for group in named for row in group if len(row) == len(header))]
+    lines = [["method", "paper", "here", f"minus {baseline}"]]
+    for group in groups:
+        cells = {"paper": "-", "here": "-"}
+        for _, source, value, mean in group:
+            note = " (kato19)" if "kato19" in source else ""
+            cells[re.match(r"\w+", source)[0]] = (mean if value == "-" else value) + note
+        lines.append([group[0][0], cells["paper"], cells["here"], differences.get(group[0][0], [""])[0]])
+    return lines
+
+
 def table(name: str, part: str) -> str:
-    """One table of a file as Markdown. Repeated names are shown once; the second voxelizer stays in the file."""
-    header, *rows = json.loads((DOCS / "results" / f"{name}.json").read_text())[part]
-    rows = [row for row in rows if row[1] != "here (kato19)"]
-    firsts = [rows[0][0], *("" if a[0] == b[0] else b[0] for a, b in pairwise(rows))]
-    lines = [header, ["---"] * len(header), *([first, *row[1:]] for first, row in zip(firsts, rows, strict=True))]
+    """One table as Markdown. Repeated names in the first column are shown once."""
+    header, *body = rows(name, part)
+    firsts = [body[0][0], *("" if a[0] == b[0] else b[0] for a, b in pairwise(body))]
+    lines = [header, ["---"] * len(header), *([first, *row[1:]] for first, row in zip(firsts, body, strict=True))]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
