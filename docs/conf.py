@@ -16,7 +16,7 @@ release = nmr.__version__
 html_title = f"nmr + learn3d {release}"
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "examples/README.md"]  # show_gallery has the latter
 default_role = "literal"  # `name` in a docstring
 
 highlight_language = "none"  # blocks without a language are drawings and tables
@@ -37,12 +37,17 @@ html_show_copyright = False
 html_show_sphinx = False
 
 
-def start_with_readme(app: Sphinx, page: str, text: list[str]) -> None:
-    """Put the README on the start page. Its links are relative to the folder above docs."""
+def show_gallery(app: Sphinx, page: str, text: list[str]) -> None:
+    """Put docs/examples/README.md, whose links are relative to its folder, on the start page in place of the link."""
     if page == "index":
-        readme = Path(app.srcdir).parent / "README.md"
-        app.env.note_dependency(readme)
-        text[0] = re.sub(r"\]\((?!\w+:|#)", "](../", readme.read_text()) + "\n" + text[0]
+        gallery = Path(app.srcdir) / "examples" / "README.md"
+        app.env.note_dependency(gallery)
+        body = re.sub(r"\]\((?!\w+:|#)", "](examples/", "#" + gallery.read_text())
+        text[0] = text[0].replace("[Gallery](examples/README.md)", body)
+    else:
+        text[0] = re.sub(
+            r"\]\((?:\.\./)?examples/README\.md\)", f"]({'../' * page.count('/')}index.md#gallery)", text[0]
+        )
 
 
 def hand_out_files(app: Sphinx, doctree: nodes.document) -> None:
@@ -55,5 +60,5 @@ def hand_out_files(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def setup(app: Sphinx) -> None:
-    app.connect("source-read", start_with_readme)
+    app.connect("source-read", show_gallery)
     app.connect("doctree-read", hand_out_files, priority=400)  # before Sphinx collects the downloads

@@ -31,6 +31,8 @@ class Picture:
     result: str  # what it leaves there: a path in {folder} or in the repository, the last match of a pattern; or
     # NOTEBOOK#K: picture K of its outputs, made small
     sources: tuple[str, ...]  # files that decide what it shows
+    box: tuple[float, float, float, float] = (0, 0, 1, 1)  # left, top, right and bottom of the part that is kept
+    small: bool = False  # made to fit into 320 x 240 pixels
 
 
 _QUICKSTART = ("tools/quickstart.sh", "learn3d/figures/grids.py")
@@ -39,6 +41,16 @@ _RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
 _RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
 _THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
 _NOTEBOOKS = {"quick_tour": 5, "shape_from_silhouettes": 4, "texture_and_light": 4, "photographs_to_glb": 1}
+_SCRIPTS = {  # picture that a script draws, and the part of it that the gallery shows
+    "fit_masks": ("fit_masks.png", (0, 0, 1 / 3, 1)),
+    "fit_packed": ("fit_packed.png", (0, 0, 1, 1)),
+    "fit_silhouette": ("fit_silhouette.png", (0, 0, 1, 1)),
+    "fit_texture": ("fit_texture.png", (0, 0, 1, 1)),
+    "fit_lit_vase": ("fit_lit_vase.png", (0, 0, 1, 1)),
+    "find_camera": ("find_camera.png", (0, 0.25, 1, 0.75)),
+    "draw_surfaces": ("room.png", (0, 0, 1, 1)),
+    "make_photo_folder": ("chair/images/chair000_0.jpg", (0, 0, 1, 1)),
+}
 PICTURES = {
     "views.png": Picture(
         "python docs/examples/draw_views.py --output {folder}", "{folder}/views.png", ("docs/examples/draw_views.py",)
@@ -67,6 +79,22 @@ PICTURES = {
         )
         for name, number in _NOTEBOOKS.items()
     },
+    **{
+        f"gallery-{name.replace('_', '-')}.png": Picture(
+            f"python docs/examples/{name}.py --output {{folder}}",
+            f"{{folder}}/{drawn}",
+            (f"docs/examples/{name}.py",),
+            box,
+            small=True,
+        )
+        for name, (drawn, box) in _SCRIPTS.items()
+    },
+    "door-mesh.png": Picture(
+        "true", "docs/images/small-model.png", ("docs/images/small-model.png",), (0.055, 0.22, 0.595, 0.66), True
+    ),
+    "door-paper.png": Picture(
+        "true", "docs/images/results-grid.png", ("docs/images/results-grid.png",), (0, 0, 1, 0.34), True
+    ),
     "results-grid.png": Picture(
         f"learn3d figures grid --truth --images 3 --runs {_THREE} --output {{folder}}/grid.png",
         "{folder}/grid.png",
@@ -102,21 +130,31 @@ def make(name: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run(picture.command.format(folder=folder), shell=True, cwd=ROOT, check=True)
         if "#" in picture.result:
-            picture_of_notebook(*picture.result.split("#")).save(IMAGES / name)
+            small(picture_of_notebook(*picture.result.split("#"))).save(IMAGES / name)
             return
         found = Path(picture.result.format(folder=folder))
         last = max((ROOT / found.parent).glob(found.name), key=lambda path: path.stat().st_mtime)
-        shutil.copyfile(last, IMAGES / name)
+        if picture.small:
+            image = Image.open(last).convert("RGB")
+            small(image.crop([round(x * side) for x, side in zip(picture.box, 2 * image.size, strict=True)])).save(
+                IMAGES / name
+            )
+        else:
+            shutil.copyfile(last, IMAGES / name)
+
+
+def small(image: Image.Image) -> Image.Image:
+    """The picture, at most 320 pixels wide and 240 high."""
+    image.thumbnail((320, 240))
+    return image
 
 
 def picture_of_notebook(notebook: str, number: str) -> Image.Image:
-    """Picture `number` (from 1) among the outputs of a notebook, at most 320 pixels wide."""
+    """Picture `number` (from 1) among the outputs of a notebook."""
     cells = json.loads((ROOT / notebook).read_text())["cells"]
     data = [output.get("data", {}).get("image/png") for cell in cells for output in cell.get("outputs", [])]
     pictures = ["".join(text) for text in data if text]
-    image = Image.open(io.BytesIO(base64.b64decode(pictures[int(number) - 1]))).convert("RGB")
-    image.thumbnail((320, 240))
-    return image
+    return Image.open(io.BytesIO(base64.b64decode(pictures[int(number) - 1]))).convert("RGB")
 
 
 def record(name: str) -> None:
