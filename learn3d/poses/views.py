@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,8 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
+from learn3d.data.layouts import Layout, load_dataset
 from learn3d.data.pose_table import PoseTable, fingerprints, masks_of
 from learn3d.data.poses import LookAtPoses, wrap_deg
+from learn3d.files.findings import MissingFile
 from learn3d.poses.estimate import FEWEST, NEAR_DEG, SIZE, Candidates, Estimate, Masks, PoseOptions, estimate
 
 ELEVATION_STEP_DEG = 15.0  # between candidates, at most
@@ -62,6 +66,15 @@ class EstimatedViews:
     def is_sure(self) -> bool:
         """Whether the poses can be told at all."""
         return float(self.result.confidence.mean()) >= SURE
+
+
+def load_views(layout: Layout, data: Path, category: str, views_per_object: int | None = None) -> list[ViewDataset]:
+    """The training split of a data set, and the others that are there."""
+    datasets = [load_dataset(layout, data, category, "train", views_per_object=views_per_object)]
+    for split in ("val", "test"):
+        with contextlib.suppress(MissingFile):
+            datasets.append(load_dataset(layout, data, category, split))
+    return datasets
 
 
 def estimate_views(
