@@ -240,9 +240,11 @@ def reconstruct_picture(
 def view_probabilities(model: Model, image: Tensor) -> Tensor | None:
     """How probable each azimuth cell of `fit` is for a stored image uint8 [4, S, S]; None if that was not learnt."""
     method, config = model.method, model.config
-    if not isinstance(method, ManyViews) or config.layout != "around" or config.view_bins is not None:
+    other_cells = config.layout != "around" or config.view_bins is not None
+    if not isinstance(method, MeshMethod) or (isinstance(method, ManyViews) and other_cells):
         return None
-    return method.view_probabilities(image[None])
+    probabilities = method.view_probabilities(image[None])
+    return None if probabilities is None else probabilities[0]
 
 
 def doubt(model: Model, image: Tensor) -> str | None:
