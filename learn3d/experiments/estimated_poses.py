@@ -54,7 +54,8 @@ def pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> lis
         values = [*(errors[name] for name in names), *ious, ious[1] / ious[0]]
         rows.append([run.config.category, str(run.config.seed), *_format(values)])
         means.setdefault(run.config.category, []).append(values)
-    rows += [[category, "mean", *_format(np.mean(values, axis=0))] for category, values in means.items()]
+    several = {category: values for category, values in means.items() if len(values) > 1}
+    rows += [[category, "mean", *_format(np.mean(values, axis=0))] for category, values in several.items()]
     return [_HEADER, *rows] if rows else []
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from learn3d.config import differences, load_config
+from learn3d.device import resolve_precision
 from learn3d.distributed.tasks import Task, run_tasks
 from learn3d.experiments.comparison import make_report
 from learn3d.experiments.estimated_poses import estimate_poses
@@ -107,7 +108,9 @@ def find_conflict(run: PlannedRun) -> str:
     """The options in which the run in the folder differs from the planned one, as a sentence; "" if it can go on."""
     if not (run.folder / run_folder.CONFIG).is_file():
         return ""
-    changed = differences(run.config, load_config(run.folder / run_folder.CONFIG))
+    precision = resolve_precision(run.config.precision, run.config.device)  # a run saves the one that "auto" stands for
+    asked = dataclasses.replace(run.config, precision=precision)
+    changed = differences(asked, load_config(run.folder / run_folder.CONFIG))
     return f"{run.folder} has a run with other options: " + "; ".join(changed) if changed else ""
 
 
