@@ -25,7 +25,7 @@ from learn3d.files import limits, writing
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, cut_out
 from learn3d.fitting.familiarity import MOST, distance
-from learn3d.fitting.fit import SHARE, Progress, fit
+from learn3d.fitting.fit import SHARE, Progress, belief, fit
 from learn3d.methods import MeshMethod, Method
 from learn3d.methods.many_views import ManyViews
 from learn3d.methods.refinement import refine
@@ -221,15 +221,16 @@ def reconstruct_picture(
     meshes predicts them alone. progress: told what is done and which part of it.
     """
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
+    image = torch.from_numpy(stored)
+    probabilities = view_probabilities(model, image)
     if not refined or not isinstance(method, MeshMethod):
         (surface,) = reconstruct(method, stored[None])
-        return Reconstruction(surface, stored, input_azimuth_deg(surface, stored[3]), None, None)
-    image = torch.from_numpy(stored)
+        return Reconstruction(surface, stored, input_azimuth_deg(surface, stored[3], probabilities), None, None)
     fine = prepare_image(colors, mask, object_share=SHARE, size=_COLORED, layout="kar")  # colours as they are
     small = nn.functional.interpolate(
         torch.from_numpy(fine[None, 3:]).float() / 255, (MASK_SIZE, MASK_SIZE), mode="area"
     )
-    fitted = fit(method, image, small[0, 0], view_probabilities=view_probabilities(model, image), progress=progress)
+    fitted = fit(method, image, small[0, 0], view_probabilities=probabilities, progress=progress)
     surface = color_mesh(
         fitted.vertices, method.faces, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], method.generator.reflection
     )
@@ -239,9 +240,11 @@ def reconstruct_picture(
 def view_probabilities(model: Model, image: Tensor) -> Tensor | None:
     """How probable each azimuth cell of `fit` is for a stored image uint8 [4, S, S]; None if that was not learnt."""
     method, config = model.method, model.config
-    if not isinstance(method, ManyViews) or config.layout != "around" or config.view_bins is not None:
+    other_cells = config.layout != "around" or config.view_bins is not None
+    if not isinstance(method, MeshMethod) or (isinstance(method, ManyViews) and other_cells):
         return None
-    return method.view_probabilities(image[None])
+    probabilities = method.view_probabilities(image[None])
+    return None if probabilities is None else probabilities[0]
 
 
 def doubt(model: Model, image: Tensor) -> str | None:
@@ -273,11 +276,11 @@ def reconstruct(
 
 
 @torch.no_grad()
-def input_azimuth_deg(surface: Surface, mask: np.ndarray) -> float:
+def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor | None = None) -> float:
     """Azimuth from which the shape's silhouette agrees best with the mask uint8 [S,S] of its image; a multiple of 15.
 
     The camera of an image is not known: this is a guess for pictures. Azimuths are compared at four elevations, and
-    outlines at one size, as the distance is not known either.
+    outlines at one size, as the distance is not known either. probabilities: see `fitting.fit.find_view`.
     """
     small = nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, (64, 64), mode="area")
     target, azimuths, losses = centre(small)[0], [15.0 * k for k in range(24)], []
@@ -285,7 +288,8 @@ def input_azimuth_deg(surface: Surface, mask: np.ndarray) -> float:
         cameras = nmr.LookAt.from_angles(DISTANCE, elevation, azimuths, half_fov_deg=HALF_FOV_DEG)
         seen = centre(nmr.render_silhouette(surface.vertices, surface.faces, cameras, image_size=64)[:, None])
         losses += [nmr.losses.soft_iou_loss(silhouette, target) for silhouette in seen]
-    return azimuths[int(torch.stack(losses).argmin()) % len(azimuths)]
+    losses = torch.stack(losses).view(-1, len(azimuths)) - belief(torch.tensor(azimuths), probabilities)
+    return azimuths[int(losses.argmin()) % len(azimuths)]
 
 
 def export_mesh(path: Path, surface: Surface) -> None:

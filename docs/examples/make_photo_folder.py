@@ -30,7 +30,14 @@ def take_photo(vertices: np.ndarray, faces: np.ndarray, color: np.ndarray, camer
     return picture.clip(0, 255).round().astype(np.uint8), alpha
 
 
-def main(output: Path = Path("photos"), category: str = "chair", objects: int = 60, photos: int = 4, seed: int = 0):
+def main(
+    output: Path = Path("photos"),
+    category: str = "chair",
+    objects: int = 60,
+    photos: int = 4,
+    seed: int = 0,
+    elevation_deg: tuple[float, float] = (5.0, 45.0),
+):
     """Writes OUTPUT/CATEGORY/images, masks and poses.csv: some photographs of each object from random sides."""
     make_shape(category, np.random.default_rng(seed))  # raises ValueError for an unknown category
     folder = output / category
@@ -45,7 +52,7 @@ def main(output: Path = Path("photos"), category: str = "chair", objects: int = 
             vertices = (mesh.vertices - mesh.bounds.mean(axis=0)) / mesh.extents.max() @ FROM_MESH
             color = rng.uniform(0.3, 0.9, 3)
             for photo in range(photos):
-                azimuth, elevation = rng.uniform(-180, 180), rng.uniform(5, 45)
+                azimuth, elevation = rng.uniform(-180, 180), rng.uniform(*elevation_deg)
                 distance = rng.uniform(2.8, 3.3)
                 camera = nmr.LookAt.from_angles([distance], [elevation], [azimuth], half_fov_deg=FOV_DEG / 2)
                 picture, mask = take_photo(vertices, mesh.faces, color, camera, rng.uniform(80, 230, 3))

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import tyro
 from tqdm import tqdm
 
 from learn3d.commands.command import Command
-from learn3d.data.layouts import Layout, load_dataset
-from learn3d.data.poses import wrap_deg
-from learn3d.files.reading import MissingFile
+from learn3d.data.layouts import Layout
 from learn3d.files.writing import check_target
 from learn3d.pictures.sheets import save_png
 from learn3d.poses.estimate import PoseOptions
 from learn3d.poses.sheet import LEGEND, draw_sheet
-from learn3d.poses.views import SURE, CameraOptions, compare, estimate_views
+from learn3d.poses.views import SURE, CameraOptions, compare, estimate_views, load_views
 from learn3d.settings import Count
 from learn3d.terminal import is_watched, note, say
 
@@ -58,12 +53,7 @@ class EstimatePoses(Command):
         if not 1 <= self.candidates <= 64:
             raise ValueError(f"candidates must lie in 1 .. 64, got {self.candidates}")
         check_target(self.output, "--output")
-        datasets = [
-            load_dataset(self.layout, self.data, self.category, "train", views_per_object=self.views_per_object)
-        ]
-        for split in ("val", "test"):
-            with contextlib.suppress(MissingFile):
-                datasets.append(load_dataset(self.layout, self.data, self.category, split))
+        datasets = load_views(self.layout, self.data, self.category, self.views_per_object)
         with tqdm(total=self.options.all_steps, desc="poses", unit="step", disable=not is_watched()) as bar:
             views = estimate_views(datasets, self.cameras, self.options, self.candidates, bar.update)
         table = views.table
@@ -72,8 +62,7 @@ class EstimatePoses(Command):
         if self.compare:
             comparison = compare(views)
             say(comparison.text())
-            turned = wrap_deg(torch.from_numpy(table.azimuth_deg) + comparison.offset_deg).numpy()
-            table = dataclasses.replace(table, azimuth_deg=turned)
+            table = table.turned(comparison.offset_deg)
         for warning in views.warnings:
             note(f"warning: {warning}")
         table.write(self.output)

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from learn3d.data.batch import PoseCandidates
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.poses import LookAtPoses
+from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.data.readers.photos import view_classes
 from learn3d.files import npz
 from learn3d.files.reading import DamagedFile
@@ -64,6 +65,11 @@ class PoseTable:
         last = 1 if best else self.azimuth_deg.shape[1]
         angles = (values[rows, :last].reshape(-1) for values in (self.azimuth_deg, self.elevation_deg))
         return LookAtPoses(*angles, *(values[rows].repeat(last) for values in (self.distance, self.half_fov_deg)))
+
+    def turned(self, offset_deg: float) -> PoseTable:
+        """The table with this angle added to all azimuths."""
+        azimuth = wrap_deg(torch.from_numpy(self.azimuth_deg) + offset_deg).numpy()
+        return dataclasses.replace(self, azimuth_deg=azimuth)
 
     def write(self, path: Path) -> None:
         """Write the table; the same table gives the same bytes."""

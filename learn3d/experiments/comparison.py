@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from learn3d.experiments.estimated_poses import pose_rows
 from learn3d.experiments.measurement import MEASURES, Result, figures
 from learn3d.experiments.plan import PlannedRun, Request, command_line, select_rows
 from learn3d.experiments.tables import CATEGORIES, MEAN, TABLES, Row
@@ -60,7 +61,9 @@ NOTES = (
 def make_report(
     request: Request, runs: Sequence[PlannedRun], results: Mapping[Path, Result]
 ) -> tuple[dict[str, Cells], str]:
-    """The tables "main", "differences" and "runs", and the whole report as Markdown, from results by folder.
+    """The tables "main", "differences", "runs" and, if there are any, "poses", and the report as Markdown.
+
+    results: by folder.
 
     Commands have DATA and OUTPUT in place of folders, so that no path gets in.
     """
@@ -99,14 +102,19 @@ def make_report(
             category="CATEGORY",
             seed="SEED",
             output=f"OUTPUT/runs/CATEGORY/{run.variant}-seedSEED",
+            **({"poses": "OUTPUT/poses/CATEGORY-seedSEED.npz"} if run.config.poses else {}),
         )
         for run in done
     )
     missing = [run.name for run in runs if run not in done]
     parts = [f"## {table.title}", _markdown(main), NOTES, *([f"Missing: {', '.join(missing)}."] if missing else [])]
     parts += [f"Differences to {table.baseline}, paired by seed and by object:", _markdown(differences)]
+    tables = {"main": main, "differences": differences, "runs": trained}
+    if poses := pose_rows(runs, results):
+        tables["poses"] = poses
+        parts += ["Estimated azimuths of all images, and voxel IoU (kato18) of the trainings:", _markdown(poses)]
     parts += ["What was run:", _markdown(trained), "\n".join(["```sh", *dict.fromkeys(commands), "```"])]
-    return {"main": main, "differences": differences, "runs": trained}, "\n\n".join(parts) + "\n"
+    return tables, "\n\n".join(parts) + "\n"
 
 
 def _format_printed(row: Row, column: str, categories: Sequence[str]) -> str:

@@ -9,7 +9,9 @@ from pathlib import Path
 import torch
 
 from learn3d.config import differences, load_config
+from learn3d.device import resolve_precision
 from learn3d.experiments.comparison import make_report
+from learn3d.experiments.estimated_poses import estimate_poses
 from learn3d.experiments.measurement import Result, measure
 from learn3d.experiments.plan import PlannedRun, Request, plan_runs
 from learn3d.experiments.tables import TABLES, VARIANTS
@@ -26,10 +28,13 @@ LOG_FILE, RESULT_FILE = "log.txt", "test.json"  # files in a run's folder
 
 def train_and_test(run: PlannedRun) -> bool:
     """Train, measure and write test.json; False if a signal stopped the training. Raises as `train` and `measure` do.
+    A table of poses that the run needs is made first.
 
     An existing run goes on. If it only needs measuring, `train` checks that it is complete and of the same options and
     data.
     """
+    if run.config.poses is not None:
+        estimate_poses(run.config)
     resume = run_folder.is_run(run.folder)
     if not train(run.config, resume=resume, overwrite=not resume).finished:  # its log lies in the folder already
         return False
@@ -102,7 +107,11 @@ def find_conflict(run: PlannedRun) -> str:
     """The options in which the run in the folder differs from the planned one, as a sentence; "" if it can go on."""
     if not (run.folder / run_folder.CONFIG).is_file():
         return ""
-    changed = differences(run.config, load_config(run.folder / run_folder.CONFIG))
+    asked, saved = (  # a run saves the precision that "auto" stands for
+        dataclasses.replace(config, precision=resolve_precision(config.precision, config.device))
+        for config in (run.config, load_config(run.folder / run_folder.CONFIG))
+    )
+    changed = differences(asked, saved)
     return f"{run.folder} has a run with other options: " + "; ".join(changed) if changed else ""
 
 

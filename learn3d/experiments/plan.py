@@ -18,7 +18,7 @@ from learn3d.settings import Rare, split_names
 from learn3d.terminal import unknown_name
 
 _FIRST = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")  # options of every command line
-_FIXED = (*_FIRST, "layout", "device", "threads")  # the request or the table decides these, --set cannot
+_FIXED = (*_FIRST, "layout", "device", "threads", "poses")  # the request or the table decides these, --set cannot
 
 
 @dataclass(frozen=True)
@@ -136,6 +136,7 @@ def _configure(
         data=request.data,
         category=category,
         output=request.output / "runs" / category / f"{name}-seed{seed}",
+        poses=request.output / "poses" / f"{category}-seed{seed}.npz" if variant.estimates_poses else None,
         preset=variant.preset,
         settings=dataclasses.replace(preset.settings.for_iterations(iterations), **settings),
         layout=layout,

@@ -16,7 +16,7 @@ from learn3d.device import upload
 from learn3d.losses import depth_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod, MeshSettings, check_groups
 from learn3d.methods.surfaces import Meshes
-from learn3d.networks import EncoderName, SymmetryOption, network_input
+from learn3d.networks import EncoderName, SymmetryOption
 from learn3d.networks.encoders import ViewClassifier
 from learn3d.settings import Positive, Weight, checked
 
@@ -68,14 +68,6 @@ class ManyViews(MeshMethod):
     def decode(self, codes: Tensor) -> Meshes:
         return self.clamp_to_cube(super().decode(codes))
 
-    def view_probabilities(self, image: Tensor) -> Tensor | None:
-        """How probable each view class is for a stored image uint8 [1,4,S,S]: float32 [K]; None if not learnt."""
-        return self._view_logits(image).softmax(1)[0].cpu() if self.settings.lambda_view > 0 else None
-
-    def _view_logits(self, images: Tensor) -> Tensor:
-        with self.autocast():
-            return self.view_classifier(network_input(images, self.device, self.image_size)).float()
-
     def check_batch(self, batch: Batch) -> None:
         check_groups(batch, GROUP_SIZE, "groups")
 
@@ -91,7 +83,7 @@ class ManyViews(MeshMethod):
         losses = {"prior": gaussian_prior_loss(codes, "squared")} if self.settings.lambda_prior > 0 else {}
         if self.settings.lambda_view > 0:
             views = upload(batch.view_ids[:count], self.device)
-            losses["view"] = pose_classification_loss(self._view_logits(images), views)
+            losses["view"] = pose_classification_loss(self.view_logits(images), views)
         vertices = vertices.cpu()
         uses_depth = batch.depth is not None and self.settings.lambda_depth > 0
         seen = nmr.render(

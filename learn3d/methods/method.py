@@ -269,6 +269,16 @@ class MeshMethod(Method):
             vertices = self.generator(codes)
         return codes.float(), vertices
 
+    @torch.no_grad()
+    def view_probabilities(self, images: Tensor) -> Tensor | None:
+        """How probable each view is for stored images uint8 [B, 4, S, S]: float32 [B, K]; None if not learnt."""
+        return self.view_logits(images).softmax(1).cpu() if "view_classifier" in self.networks else None
+
+    def view_logits(self, images: Tensor) -> Tensor:
+        """Logits float32 [B, K] of the network "view_classifier"."""
+        with self.autocast():
+            return self.networks["view_classifier"](network_input(images, self.device, self.image_size)).float()
+
     def render(self, vertices: Tensor, poses: Poses) -> Tensor:
         """Silhouettes float32 [B, 64, 64] of vertices [B, V, 3]. Rendering runs on the CPU."""
         return nmr.render_silhouette(vertices, self.faces, poses.cameras(), image_size=MASK_SIZE)

@@ -112,6 +112,7 @@ class PoseInvariant(MeshMethod):
         vertices = vertices.cpu()
         losses = self._silhouette_losses(vertices, batch) | self.surface_losses(vertices) | on_codes
         trained = ["encoder", "generator"] + ["discriminator"] * ("classification" in losses)
+        trained += ["view_classifier"] * ("view" in losses)
         return self.backward_and_step(losses, step, *trained)
 
     def _silhouette_losses(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,8 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
+from learn3d.data.layouts import Layout, load_dataset
 from learn3d.data.pose_table import PoseTable, fingerprints, masks_of
 from learn3d.data.poses import LookAtPoses, wrap_deg
+from learn3d.files.reading import MissingFile
 from learn3d.poses.estimate import FEWEST, NEAR_DEG, SIZE, Candidates, Estimate, Masks, PoseOptions, estimate
 
 ELEVATION_STEP_DEG = 15.0  # between candidates, at most
@@ -64,6 +68,15 @@ class EstimatedViews:
         return float(self.result.confidence.mean()) >= SURE
 
 
+def load_views(layout: Layout, data: Path, category: str, views_per_object: int | None = None) -> list[ViewDataset]:
+    """The training split of a data set, and the others that are there."""
+    datasets = [load_dataset(layout, data, category, "train", views_per_object=views_per_object)]
+    for split in ("val", "test"):
+        with contextlib.suppress(MissingFile):
+            datasets.append(load_dataset(layout, data, category, split))
+    return datasets
+
+
 def estimate_views(
     datasets: Sequence[ViewDataset],
     cameras: CameraOptions,
@@ -76,9 +89,12 @@ def estimate_views(
     kept: number of candidates of each image in the table. Raises ValueError if all masks are empty, or cameras are
     rotations.
     """
-    masks = torch.cat([_masks(dataset) for dataset in datasets])
-    elevation, distance, half_fov = _cameras(datasets, cameras, masks)
-    shown = torch.nonzero(masks.sum((1, 2)) > 1)[:, 0]
+    elevation, distance, half_fov = _cameras(datasets, cameras)
+    size = distance * torch.tan(half_fov.deg2rad())
+    magnified = size / (distance.median() * torch.tan(half_fov.median().deg2rad()))
+    parts = magnified.split([len(dataset) for dataset in datasets])
+    masks = torch.cat([_masks(dataset, part) for dataset, part in zip(datasets, parts, strict=True)])
+    shown = torch.nonzero(masks.sum(1) > 0.25)[:, 0]
     training = shown[shown < len(datasets[0])]
     if not len(training):
         raise ValueError("all training masks are empty, so that no pose can be told; look at the data")
@@ -86,15 +102,13 @@ def estimate_views(
     grid = torch.linspace(*span, 1 + int(np.ceil((span[1] - span[0]) / ELEVATION_STEP_DEG)))
     azimuths = torch.arange(options.azimuths) * (360 / options.azimuths)
     candidates = Candidates(azimuths, grid, float(distance.median()), float(half_fov.median()))
-    size = distance * torch.tan(half_fov.deg2rad())
-    masks = _scaled(masks, size / (candidates.distance * np.tan(np.radians(candidates.half_fov_deg))))
     allowed = torch.ones(len(masks), len(grid), dtype=torch.bool)
     if cameras.elevation is None:
         nearest = (elevation[:, None] - grid).abs().argmin(1)
         allowed = nearest[:, None] == torch.arange(len(grid))
     starts = np.cumsum([0, *(dataset.num_objects for dataset in datasets)])
     objects = torch.from_numpy(np.concatenate([d.object_ids + s for d, s in zip(datasets, starts, strict=False)]))
-    data = Masks(F.avg_pool2d(masks[:, None], MASK_SIZE // SIZE).flatten(1), allowed, objects.long())[shown]
+    data = Masks(masks, allowed, objects.long())[shown]
     result = estimate(data, torch.searchsorted(shown, training), candidates, options, tick)
 
     posterior = torch.full((len(masks), len(azimuths) * len(grid)), 1 / (len(azimuths) * len(grid)))
@@ -127,15 +141,19 @@ def _warnings(views: EstimatedViews, training: int) -> list[str]:
     return warnings
 
 
-def _masks(dataset: ViewDataset) -> Tensor:
-    """Float32 [M, 64, 64] in 0 .. 1."""
-    return torch.from_numpy(masks_of(dataset, np.arange(len(dataset)))).float() / 255
+def _masks(dataset: ViewDataset, factor: Tensor) -> Tensor:
+    """Float32 [M, SIZE^2] in 0 .. 1, magnified by a factor each; read in parts, as the images may not fit in memory."""
+    reduced = []
+    for rows in torch.arange(len(dataset)).split(1024):
+        masks = _scaled(torch.from_numpy(masks_of(dataset, rows.numpy())).float() / 255, factor[rows])
+        reduced.append(F.avg_pool2d(masks[:, None], MASK_SIZE // SIZE).flatten(1))
+    return torch.cat(reduced)
 
 
-def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions, masks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions) -> tuple[Tensor, Tensor, Tensor]:
     """Elevation, distance and half field of view of every image: given, or the data's own, or a guess."""
     given = cameras.elevations() or (DEFAULT_ELEVATION_DEG,) * 2
-    half_fov = torch.full((len(masks),), (cameras.fov_deg or DEFAULT_FOV_DEG) / 2)
+    half_fov = torch.full((sum(map(len, datasets)),), (cameras.fov_deg or DEFAULT_FOV_DEG) / 2)
     share = max(float(dataset.object_sides().max()) for dataset in datasets)
     guess = 0.5 / (max(share, 0.01) * np.tan(np.radians(float(half_fov[0]))))
     distance, elevation = torch.full_like(half_fov, guess), torch.full_like(half_fov, sum(given) / 2)

@@ -14,7 +14,14 @@ import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.framing import Crops, threshold_mask
 from learn3d.pictures.surfaces import Surface
-from learn3d.reconstruction import _read, export_mesh, prepare_image, reconstruct_dataset, reconstruct_files
+from learn3d.reconstruction import (
+    _read,
+    export_mesh,
+    input_azimuth_deg,
+    prepare_image,
+    reconstruct_dataset,
+    reconstruct_files,
+)
 
 
 @pytest.fixture
@@ -214,3 +221,9 @@ def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_p
     assert [p.name for p in files[::3]] == ["000_photo.ply", "001_photo.ply"]
     with pytest.raises(ValueError, match="2 images but 1 masks"):
         reconstruct_files(finished_run, tmp_path / "d", twins, [tmp_path / "photo.png"])
+
+
+def test_a_learnt_azimuth_decides_if_outlines_do_not() -> None:
+    mask, probabilities = np.zeros((64, 64), np.uint8), torch.full((24,), 1e-3)
+    mask[16:48, 16:48], probabilities[5] = 255, 1.0  # the cell of -105 .. -90 degrees
+    assert input_azimuth_deg(Surface(*nmr.icosphere(2)), mask, probabilities) in (255, 270)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import shlex
@@ -17,11 +18,13 @@ import stub_work
 
 from learn3d.commands.train import Train
 from learn3d.config import config_to_dict
-from learn3d.experiments import experiment
+from learn3d.device import resolve_precision
+from learn3d.experiments import estimated_poses, experiment
 from learn3d.experiments.experiment import find_conflict, read_results, run_experiment, train_and_test
 from learn3d.experiments.plan import Request, command_line, plan_runs
 from learn3d.experiments.tables import BINS, TABLES, VARIANTS
 from learn3d.files.writing import write_json
+from learn3d.poses.estimate import PoseOptions
 from learn3d.presets import PRESETS
 from learn3d.runs.summary import Summary
 
@@ -131,7 +134,8 @@ def test_runs_made_by_hand_are_adopted_and_others_are_named(make, request_for) -
     (run,) = plan_runs(request_for(methods=("proposed",)))
     assert find_conflict(run) == ""
     run.folder.mkdir(parents=True)
-    config = dataclasses.replace(run.config, threads=7, iterations=3, val_split="test")
+    precision = resolve_precision("auto", "cpu")
+    config = dataclasses.replace(run.config, threads=7, iterations=3, val_split="test", precision=precision)
     write_json(run.folder / "config.json", config_to_dict(config))
     assert find_conflict(run) == "", "these options do not decide the result"
     with pytest.raises(ValueError, match=r"batch_size: 4 in the run, 5 asked for(.|\n)*choose another --output"):
@@ -194,6 +198,25 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, read_report) 
     moved = dataclasses.replace(run, config=dataclasses.replace(run.config, data=tmp_path))
     with pytest.raises(ValueError, match="other training data"):
         train_and_test(moved)
+
+
+def test_poses_are_estimated_for_the_runs_that_need_them(tmp_path, tiny_folder, monkeypatch) -> None:
+    """Once; a report without training has their errors, and the IoUs of both runs."""
+    quick = functools.partial(PoseOptions, steps=1, restarts=1, prototypes=2)
+    monkeypatch.setattr(estimated_poses, "PoseOptions", quick)
+    given = Request("poses", tiny_folder, tmp_path / "out", "airplane", (), 1, 8, seeds=1, set=SMALL, threads=1)
+    runs = plan_runs(given)
+    assert all(map(train_and_test, runs))
+    table, poses = tmp_path / "out/poses/airplane-seed0.npz", [run.config.poses for run in runs]
+    assert poses == [None, table]
+    monkeypatch.setattr(estimated_poses, "PoseOptions", None)
+    estimated_poses.estimate_poses(runs[1].config)
+    assert run_experiment(dataclasses.replace(given, report_only=True)) == 0
+    _, row = json.loads((tmp_path / "out/poses.json").read_text())["poses"]
+    known, estimated = (json.loads((run.folder / "test.json").read_text())["voxel_iou"] for run in runs)
+    assert row[-3:] == [f"{value:.3f}" for value in (known, estimated, estimated / known)]
+    assert row[2] == f"{json.loads(table.with_suffix('.json').read_text())['accuracy']:.3f}"
+    assert "--poses OUTPUT/poses/CATEGORY-seedSEED.npz" in (tmp_path / "out/poses.md").read_text()
 
 
 def test_a_run_goes_on_or_starts(finished_run, tiny_folder, request_for, tmp_path, monkeypatch) -> None:

@@ -66,6 +66,18 @@ def test_losses(batch) -> None:
         assert losses["total"] == pytest.approx(total, rel=1e-5)
 
 
+def test_azimuths_are_learnt_beside_the_shapes(batch) -> None:
+    method, without = make(lambda_view=1.0), make()
+    assert without.view_probabilities(batch.images) is None
+    for step in range(1, 41):
+        method.take_step(batch, step)
+    found = method.view_probabilities(batch.images).argmax(1)
+    assert torch.equal(found, ((batch.poses.azimuth_deg + 180) % 360 / 15).long())
+    rotations = dataclasses.replace(batch, poses=None)
+    with pytest.raises(ValueError, match="--lambda-view needs azimuths"):
+        method.check_batch(rotations)
+
+
 def test_the_weight_of_the_smoothness_falls_over_the_run() -> None:
     settings = dataclasses.replace(SMALL, lambda_smooth=1e-2, lambda_smooth_end=1e-4)
     method = create_method(
