@@ -33,7 +33,7 @@ class PlusSettings(PoseInvariantSettings):
     lambda_novel_view: Weight = 0.5
     """Weight of the loss at novel views."""
     bank_size: Count = 2048
-    """Number of training masks in the mask bank, from which that loss draws."""
+    """Number of training masks in the mask bank of the loss at novel views."""
 
     @property
     def reads_view_ids(self) -> bool:
