@@ -13,7 +13,7 @@
 
 namespace nmr {
 
-// The rows of one image, in blocks. Each has an even number of rows, so that every 2x2 mean lies in one block.
+// The rows of one image, in blocks. Each has an even number of rows, so that every 2x2 mean is within one block.
 struct RowBlocks {
   Size raster;
   int64_t rows;         // per block
@@ -107,7 +107,7 @@ void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& b
   flush();
 }
 
-// Gradients per visible face of a block, in the vertex order in which the face is drawn.
+// Gradients per visible face of a block, in drawing order.
 template <class T>
 struct FaceGradients {
   std::vector<int32_t> ids;  // [count] face indices

@@ -25,7 +25,7 @@ template <> constexpr float kLimit<float> = 1e30f;
 template <class T>
 struct Lens {
   T a[12], k[6], d[kMostCoefficients], o[3], extent, inverse_extent;
-  T reach2;                           // r^2 up to which the distortion is that of a lens
+  T reach2;                           // largest r^2 at which the distortion is that of a lens
   T largest_a, largest_k, largest_d;  // largest |a|, |k / extent|, |d|; the first and the last at least 1
   bool usable;                        // all of it is finite, and extent is not 0
 

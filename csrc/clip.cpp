@@ -1,5 +1,5 @@
 // Near-plane clipping: which faces are drawn in place of those that cross the plane z = near. Only the topology is
-// decided here; the new vertices are computed where the camera is known (nmr/_clip.py).
+// decided here; nmr/_clip.py, which knows the camera, computes the new vertices.
 //
 // A face with one corner in front becomes one triangle, a face with two becomes two triangles. The new vertices lie on
 // the two edges that cross the plane. Faces wholly in front stay as they are, faces wholly behind are left out. A mesh
@@ -16,7 +16,7 @@ namespace {
 
 constexpr int64_t kLanes = 16;
 
-// Whether a depth lies behind the plane. NaN does not: such a face is not drawn anyway.
+// Whether a depth is behind the plane; false for NaN, because such a face is not drawn anyway.
 template <class T>
 bool any_behind(const T* vertices, int64_t count, T near) {
   int32_t behind[kLanes] = {};
@@ -30,7 +30,7 @@ bool any_behind(const T* vertices, int64_t count, T near) {
 // Triangles that are left of a face with 0, 1, 2, 3 corners behind the plane.
 constexpr int64_t kPieces[4] = {1, 2, 1, 0};
 
-// The corners of a face that lie behind the plane.
+// The corners of a face that are behind the plane.
 struct Sides {
   bool behind[3];
   int count;  // 0 if a depth is NaN
@@ -51,7 +51,7 @@ NMR_INLINE Sides sides_of(const T* vertices, const int64_t* face, T near) {
   return ordered ? sides : Sides{};
 }
 
-// Whether a face lies wholly behind the plane, but on both sides of the plane of the eye, or touches it: its depths
+// Whether a face is wholly behind the plane, but on both sides of the plane of the eye, or touches it: its depths
 // between the corners mean nothing, and could pass for some in front.
 template <class T>
 bool any_around_eye(const MeshBatch<T>& mesh, int64_t b, T near) {

@@ -1,7 +1,7 @@
 // Barycentric weights of faces in clip space, with their derivatives on the screen, and the blending of pixels at
 // silhouette edges (Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering).
 //
-// Seen from a pixel centre P = (X, Y) in [-1, 1]^2, a vertex (x, y, z, w) lies at q = (x - X w, y - Y w). With e_k = q_i x
+// From a pixel centre P = (X, Y) in [-1, 1]^2, a vertex (x, y, z, w) is at q = (x - X w, y - Y w). With e_k = q_i x
 // q_j over the other two corners and S = e_0 + e_1 + e_2, the weights are b_k = e_k / S, whatever the signs of w. All
 // geometry is computed in double.
 #include <algorithm>
@@ -188,7 +188,7 @@ struct EdgePair {
   int64_t front, other;  // pixels; the face is that of `front`
   double share;          // distance of the edge from the centre of `front`, minus half a pixel; 0: no edge
   int edge;              // opposite to this corner
-  bool vertical;         // whether the pixels lie one above the other
+  bool vertical;         // whether the pixels are one above the other
 
   int64_t blended() const { return share > 0 ? other : front; }  // the pixel that gets |share| of the other's colour
   int64_t source() const { return share > 0 ? front : other; }
@@ -230,7 +230,7 @@ NMR_INLINE EdgePair pair_of(const ClipImage<T>& image, const T* rast, const int6
     const Corner j = along(image.corner(face, (k + 2) % 3, X, Y), vertical);
     if ((i.y < 0) == (j.y < 0)) continue;
     const double at = i.y / (i.y - j.y);
-    if (!(i.w + at * (j.w - i.w) > 0)) continue;  // the crossing lies behind the eye
+    if (!(i.w + at * (j.w - i.w) > 0)) continue;  // the crossing is behind the eye
     const double distance = (i.x * j.y - j.x * i.y) / (i.w * j.y - j.w * i.y) * size / 2 * (pair.front == n ? 1 : -1);
     if (!(distance >= 0 && distance <= 1)) continue;
     const double steep = std::abs(i.y * j.w - i.w * j.y) / size, flat = std::abs(i.w * j.x - i.x * j.w) / across;

@@ -145,7 +145,7 @@ NMR_INLINE Lanes<T> color_gains(const T* block, int64_t channels, const T* refer
   return gain;
 }
 
-// Adds the pulls of eight pixels at these offsets from the crossing where the mask is set. The quotients w / h_p
+// Adds the pulls of eight pixels at these offsets from the crossing, if the mask is set. The quotients w / h_p
 // and w / h_q share one division: w / (h_p h_q) times h_q and h_p.
 template <class T>
 NMR_INLINE void pull_lanes(LaneMask<T> mask, Lanes<T> weight, Lanes<T> offset, const EdgeDerivative<T>& derivative,
@@ -332,7 +332,7 @@ void sweep_crossings(const ColorImage<T>& image, int axis, SweepScratch<T>& bloc
   const auto pulls_of = [&](int32_t i) { return block.pulls[axis][crossings.edge[i]]; };
   for (int64_t k = 0; k < placed.num_outer; ++k) {
     const int32_t i = crossings.outer[k];
-    const T* reference = image.pixels + placed.pixel_at[i] * image.channels;  // of the face
+    const T* reference = image.pixels + placed.pixel_at[i] * image.channels;  // colour of the face
     const int64_t blocks = kUp ? (placed.count_at[i] + 7) / 8 - placed.outer_at[i] / 8 : (placed.outer_at[i] + 7) / 8;
     pull_outside<kUp, kChannels>(lines, crossings.line[i], blocks, reference, derivative_of(i), pulls_of(i));
   }

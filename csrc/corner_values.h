@@ -45,7 +45,7 @@ void with_channels(int64_t channels, const Body& body) {
 // The attribute rows and corners of image b.
 template <class T>
 struct ImageAttributes {
-  int64_t first_row;       // of attributes
+  int64_t first_row;       // first row of attributes
   const int64_t* corners;  // [F, 3]
   int64_t num_faces;
 };

@@ -121,7 +121,7 @@ NMR_INLINE void cross_edges(const Image& image, int axis, int k, int64_t first, 
                                                          of(slope_qo) * (n - of(qs_at)) + of(qt_at)));
         }
         store_lanes(crossings.edge + count, splat(edge_at.lane[lane]));
-        count += std::min<int64_t>(last - start + 1, kLanes);  // what is written beyond is overwritten, or ignored
+        count += std::min<int64_t>(last - start + 1, kLanes);  // lanes beyond the count are overwritten or ignored
       }
     }
     crossings.count = count;
@@ -157,7 +157,7 @@ NMR_INLINE void sweep_block(const Image& image, const int32_t* ids, int64_t coun
   }
   for (int axis = 0; axis < 2; ++axis) {
     for (Crossings<T>& crossings : block.crossings[axis]) crossings.count = 0;
-    // A crossing lies between two pixels of its line.
+    // A crossing is between two pixels of its line.
     const bool crossable = (axis == 0 ? image.raster.height : image.raster.width) > 1;
     for (int64_t n = 0; crossable && n < padded; n += kLanes)
       for (int k = 0; k < 3; ++k) cross_edges(image, axis, k, n, block, run);

@@ -70,12 +70,12 @@ NMR_INLINE void resolve_row_backward(const int32_t* face_index, const T* grad, i
 
 }  // namespace
 
-// The mean of 2x2 pixels, or a copy; pixels without a face have the background's colour, where there is one.
+// The mean of 2x2 pixels, or a copy; pixels without a face have the background's colour, if it is given.
 template <class T>
 void resolve_forward(const Resolve<T>& args) {
   const int64_t h = args.image.height, w = args.image.width, C = args.channels, scale = args.anti_aliasing ? 2 : 1,
                 W = scale * w;
-  std::vector<T> behind;  // of each background, as resolve_row takes it
+  std::vector<T> behind;  // colour of each background, as resolve_row takes it
   for (int64_t b = 0; args.background && b < args.background_batch; ++b) {
     const T* color = args.background + b * C;
     behind.insert(behind.end(), color, color + C);

@@ -2,7 +2,7 @@
 
 static_assert(kLanes == kTogether, "a vector holds the faces of a block and a row of a block of pixels");
 
-// a where b is not set.
+// a & ~b: lanes of a that are not set in b.
 template <class M>
 NMR_INLINE M without(M a, M b) {
   if constexpr (IsHalves<M>::value)
@@ -65,7 +65,7 @@ struct DepthBound {
 // first order, the errors are:
 // - of the determinant 12 u M L, with L <= 2 M the longest side, the same for all three weights; of each weight
 //   32 u M^2 / D more;
-// - a pixel that passes the edge test may lie outside by 48 u M^2 / D in terms of weights;
+// - a pixel that passes the edge test may be outside by 48 u M^2 / D in terms of weights;
 // - so each weight before normalisation is off by at most E = 110 u M^2 / D, and all weights together after it by
 //   7.1 E (if E is small);
 // - q' is off by half of that times the range of q at the corners, and by 8 u q for its own rounding;
@@ -250,7 +250,7 @@ LaneMask<T> contest(const Image<T>& image, int32_t id, uint32_t contested_bits, 
   const Lanes<T> z = exact_depths(face_plane(image, id), column, row, perspective);
   const Lanes32 bit = load_lanes<Lanes32>(kBits), among = splat(static_cast<int32_t>(contested_bits)) & bit;
   const LaneMask<T> contested = widen_mask<T>(among > splat(int32_t(0))) & (z > splat(image.settings.near)) &
-                                (z < splat(image.settings.far));  // not NaN either
+                                (z < splat(image.settings.far));  // false for NaN
   const Lanes32 face_index = load_lanes<Lanes32>(face_index_at);
   LaneMask<T> wins = contested & widen_mask<T>(face_index < splat(int32_t(0))), open = without(contested, wins);
   for (uint32_t bits = lane_bits(open); bits; bits = lane_bits(open)) {
@@ -400,7 +400,7 @@ NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& b
   return true;
 }
 
-// Fills all faces into one band of rows, and copies what they can reach to the image's face index map.
+// Fills all faces into one band of rows, and copies the reached pixels to the image's face index map.
 template <class T>
 void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* block_least, int32_t* face_index) {
   const Band<T> band = args;  // a copy that no store of pixels can change

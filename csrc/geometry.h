@@ -22,7 +22,7 @@ NMR_INLINE T to_pixel(T x, T size) {
   return (x * size + size - 1) / 2;
 }
 
-// One face on the screen: corners in [-1, 1] and depths, in the vertex order in which it is drawn.
+// One face on the screen: corners in [-1, 1] and depths, in drawing order.
 template <class T>
 struct Triangle {
   T x[3], y[3], z[3];
@@ -84,7 +84,7 @@ NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
   return (bt - at) / (bs - as) * (n - as) + at;
 }
 
-// The last pixel of a sweep into a face: where it leaves the face, in the direction of t = -infinity if d > 0 and of
+// The last pixel of a sweep into a face, at which it leaves the face, in the direction of t = -infinity if d > 0 and of
 // +infinity if d < 0; at most one pixel outside [0, R). Rounded and converted as published: truncated, saturated, NaN
 // to 0.
 template <class T>

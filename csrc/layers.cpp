@@ -26,8 +26,8 @@ struct LayerBand {
   int64_t num_faces;
   RasterSettings<T> settings;
   int64_t layers, first, last;
-  const T* centres;  // of the columns, padded to whole groups
-  T* depth;          // [rows, W, K], sorted; `far` where there is no face
+  const T* centres;  // centres of the columns, padded to whole groups
+  T* depth;          // [rows, W, K], sorted; `far` without a face
   int32_t* face_index;  // [H, W, K] of the image, row 0 = top
 };
 

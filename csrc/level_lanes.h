@@ -62,7 +62,7 @@ struct LaneType<E, N, false> {
 };
 
 #if defined(__clang__)
-typedef long long Mask64;  // what comparing vectors of double gives
+typedef long long Mask64;  // result of comparing vectors of double
 #else
 typedef int64_t Mask64;
 #endif
@@ -151,7 +151,7 @@ NMR_INLINE Lanes32 lane_numbers() {
   return load_lanes<Lanes32>(numbers);
 }
 
-// The lanes of `yes` where the mask is set, else those of `no`.
+// The lanes of `yes` if the mask is set, else those of `no`.
 template <class M, class V>
 NMR_INLINE V select(M mask, V yes, V no) {
   if constexpr (IsHalves<V>::value)
@@ -164,7 +164,7 @@ NMR_INLINE V select(M mask, V yes, V no) {
 #endif
 }
 
-// The values where the mask is set, else +0: of any value, also of NaN.
+// The values if the mask is set, else +0, for NaN as well.
 template <class M, class V>
 NMR_INLINE V keep(M mask, V v) {
   if constexpr (IsHalves<V>::value)
@@ -177,7 +177,7 @@ NMR_INLINE V keep(M mask, V v) {
 #endif
 }
 
-// a < b ? a : b and a > b ? a : b, as one instruction where there is one.
+// a < b ? a : b and a > b ? a : b, as one instruction if the processor has it.
 template <class V>
 NMR_INLINE V min_of(V a, V b) {
 #if defined(__AVX2__) || NMR_AVX2
@@ -269,7 +269,7 @@ constexpr int lane_count() {
 #endif
 }
 
-// Bit k is set where lane k of the mask is.
+// Bit k is set if lane k of the mask is.
 template <class M>
 NMR_INLINE uint32_t lane_bits(M mask) {
   if constexpr (IsHalves<M>::value) {

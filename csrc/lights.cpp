@@ -1,4 +1,4 @@
-// Lights on the faces that are seen, and their normals. The definition stands at struct Lit in stages.h.
+// Lights on the visible faces, and their normals. struct Lit in stages.h has the definition.
 //
 // Where the light depends only on the face (flat, no point lights, no highlights) it is computed once per visible face.
 #include <algorithm>
@@ -124,7 +124,7 @@ Lamps<T> lamps_of(const Lit<T>& args, int64_t b) {
   return lamps;
 }
 
-// Whether the light depends on where on the face a pixel lies.
+// Whether the light varies over a face.
 template <class T>
 bool uses_position(const Lit<T>& args) {
   return args.parameters && (light_count(args, Light::point, 4) > 0 || light_count(args, Light::specular, 2) > 0);
@@ -246,13 +246,13 @@ void light_backward(const Lamps<T>& lamps, const Spot<T>& spot, const PixelLight
 
 constexpr double kShortest = 1e-5;  // an interpolated normal that is shorter stays short: its gradient is finite
 
-// Where the values of image b lie.
+// Offset of the values of image b.
 template <class T>
 struct View {
   ImageAttributes<T> image;
   const T *vertices, *normals, *viewer;
   int64_t first_normal;  // row of normals
-  T side;                // normals are multiplied by this where a face is seen from its front
+  T side;                // factor of normals of faces that are seen from their front
 
   View(const Lit<T>& args, int64_t b)
       : image(image_attributes(args.at, b)), viewer(args.viewer + 5 * b), side(viewer[4]) {
@@ -271,7 +271,7 @@ struct Pixel {
   int64_t face;
   T sign;
   Vec3<T> mean;
-  T length;  // of the mean, at least 1e-5; smooth only
+  T length;  // length of the mean normal, at least 1e-5; smooth only
   Unit<T> to_eye{Vec3<T>::Zero()};
   Spot<T> spot;
 };
@@ -314,7 +314,7 @@ struct LitSums {
   Lamps<T> lamps;
 };
 
-// The gradients of one pixel, or of one face where all its pixels are lit alike (weights: nullptr).
+// The gradients of one pixel, or of one face if all its pixels are lit alike (weights: nullptr).
 template <class T>
 NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps, const Pixel<T>& p,
                                const T* weights, const PixelLight<T>& grad, bool position, Lamps<T>& grad_lamps,
@@ -365,7 +365,7 @@ void find_visible(const Lit<T>& args, const View<T>& view, const RowBlocks& bloc
   sums.visible.find(args.at.face_index + begin, end - begin, view.image.num_faces);
 }
 
-// Pixels [begin, end) where the light depends only on the face. kColors: channels of colours, 0: none, white.
+// Pixels [begin, end) if the light depends only on the face. kColors: channels of colours; 0 means white.
 template <int64_t kColors, class T>
 void lit_faces_forward(const Lit<T>& args, int64_t begin, int64_t end, const LitSums<T>& sums) {
   const int32_t *face_index = args.at.face_index, *slots = sums.visible.slots.data() + 1;

@@ -1,4 +1,4 @@
-// The gradient of Kato and Harada 2019, which reaches one pixel: where a surface ends between two pixels, the loss
+// The gradient of Kato and Harada 2019, which reaches one pixel: if a surface ends between two pixels, the loss
 // decides whether its border should move, and the point seen in the pixel of the surface moves.
 //
 // I is the coverage (0 or 1) or a colour [C] (products are sums over its channels), g the gradient of the loss with
@@ -69,7 +69,7 @@ double nearness(const Triangle<T>& t, double x, double y, bool perspective) {
 
 // Whether face f, seen in pixel (row, column), ends in front of face g, seen in the neighbour (r, c). Faces with a
 // common corner (by place: a seam may have doubled its vertices) belong to one surface. Other faces may, too, if
-// whole faces lie between the two pixels; their planes then cross between the pixels, or almost coincide.
+// whole faces are between the two pixels; their planes then cross between the pixels, or almost coincide.
 template <class T>
 bool is_in_front(const LocalRaster<T>& image, const Triangle<T>& f, const Triangle<T>& g, int64_t row, int64_t column,
                  int64_t r, int64_t c) {
@@ -135,7 +135,7 @@ struct Rates {
   }
 };
 
-// Screen weights of a face's corners at the centre of a pixel, in the order in which it is drawn, computed as in the
+// Screen weights of a face's corners at the centre of a pixel, in drawing order, computed as in the
 // rasterizer. False if they are not defined; the rasterizer never draws such a face.
 template <class T>
 bool screen_weights(const Triangle<T>& t, int64_t row, int64_t column, Size raster, T (&w)[3]) {

@@ -24,7 +24,7 @@ template <> constexpr double kShortest<float> = std::numeric_limits<float>::min(
 
 struct Direction {
   Vec3 unit;
-  double length;  // 0: there is no direction
+  double length;  // 0 without a direction
 };
 
 template <class T>

@@ -69,7 +69,7 @@ class Company {
     const auto time = std::chrono::steady_clock::now().time_since_epoch();
     return std::chrono::duration_cast<std::chrono::nanoseconds>(time).count();
   }
-  // Time for which this thread has had a core; just the time if the system does not tell.
+  // Time for which this thread has had a core; wall-clock time if the system does not report it.
   static int64_t on_core() {
 #if defined(CLOCK_THREAD_CPUTIME_ID)
     timespec time;

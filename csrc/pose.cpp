@@ -97,11 +97,11 @@ void pose_backward(const Pose<T>& args) {
           grad_matrix.template leftCols<3>().transpose().template cast<double>();
       Vec3<double> grad_x = grad_rows.col(0), grad_z = grad_rows.col(2);
       const Vec3<double> grad_upright =
-          normalized_backward(axes.upright.template cast<double>(), -grad_rows.col(1));  // of z x x
+          normalized_backward(axes.upright.template cast<double>(), -grad_rows.col(1));  // gradient of z x x
       grad_x += cross(grad_upright, z);
       grad_z += cross(x, grad_upright);
       const Vec3<double> grad_sideways =
-          normalized_backward(axes.sideways.template cast<double>(), grad_x);  // of up x z
+          normalized_backward(axes.sideways.template cast<double>(), grad_x);  // gradient of up x z
       grad_z += cross(grad_sideways, up);
       grad_up = cross(z, grad_sideways);
       grad_forward = normalized_backward(axes.forward.template cast<double>(), grad_z);

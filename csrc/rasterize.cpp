@@ -3,7 +3,7 @@
 // Three steps per image. Set-up: for each face, the vertex orders that face the camera, its box of pixels, bounds of
 // its depth. Fill: for each face (all originals, then all reversed copies), mark the pixels inside. Copy: to the face
 // index map. The published depth needs sixteen divisions per pixel, and its rounding decides which face is nearer; it
-// is computed only where the bounds do not decide. Several threads can share one image: set-up by chunks of faces, fill
+// is computed only if the bounds do not decide. Several threads can share one image: set-up by chunks of faces, fill
 // by bands of rows.
 //
 // The bounds are those of q = 1 / depth, or -depth without perspective, which is linear on the screen: at a pixel (i, j)
@@ -29,7 +29,7 @@ constexpr int64_t kChunk = 2048;  // faces that one thread sets up together
 template <class T>
 struct FaceBlock {
   T x[3][kTogether], y[3][kTogether];                                // corners, in the face's own order
-  T slope_x[kTogether], slope_y[kTogether], level[kTogether];        // of q
+  T slope_x[kTogether], slope_y[kTogether], level[kTogether];        // coefficients of q
   T margin[kTogether];                                               // infinity: no bounds
   T nearest[kTogether];                                              // largest q at any pixel
   // Pixels inside the box.
@@ -67,7 +67,7 @@ struct BandScratch {
   // [rows, W + 8] bounds of the nearest face's q; -infinity on background; 8 more at the end.
   std::vector<T> most, least;
   std::vector<int32_t> face_index;  // the nearest face
-  // [rows / 8, W / 8] the smallest of `least` in a block: the second pass skips what lies behind.
+  // [rows / 8, W / 8] the smallest of `least` in a block: the second pass skips faces behind it.
   std::vector<T> block_least;
 };
 
@@ -91,7 +91,7 @@ struct Band {
   int32_t* face_index;
 };
 
-// The numbers from which the depth of a face is computed at any pixel.
+// Coefficients of the depth of a face at any pixel.
 template <class T>
 struct FacePlane {
   BarycentricMatrix<T> weights;

@@ -15,7 +15,7 @@ namespace nmr {
 template <class T>
 struct ScanlineColors {
   // [N, blocks, 1 + 2 C, 8] position on the line in pixels, ascending; colour; gradient. What belongs to eight
-  // pixels lies together. The last block is filled with zeros, which have no effect.
+  // pixels is contiguous. The last block is filled with zeros, which have no effect.
   std::vector<T> values;
   std::vector<int32_t> face_index;  // [N, blocks, 8]
   std::vector<int32_t> count;       // [N + pad] number of listed pixels
@@ -25,9 +25,9 @@ struct ScanlineColors {
       outer_end[2];  // [N + pad] by direction: a crossing before this has a listed pixel beyond its outer one
   std::vector<T> inner_start[2];  // [N + pad] by direction: a crossing before this has no listed pixel of a face inside
   int64_t stride, channels;       // stride: 8 blocks
-  int64_t step_n, step_m;         // of before
+  int64_t step_n, step_m;         // steps of `before`
 
-  // axis 0: columns, whose numbers lie side by side; 1: rows, each with room for eight numbers from any pixel on.
+  // axis 0: columns, whose numbers are contiguous; 1: rows, each with room for eight numbers from any pixel on.
   void reserve_lines(int axis, int64_t N, int64_t M, int64_t C) {
     stride = (M + kPad - 1) / kPad * kPad + kPad;
     channels = C;

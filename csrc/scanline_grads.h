@@ -73,7 +73,7 @@ struct Crossings {
   // Crossing, and the entries of its line in ScanlineGrads, in the coordinate of the direction.
   T at[kCrossings + kPad], outer_end[kCrossings + kPad], inner_start[kCrossings + kPad];
   int32_t line[kCrossings + kPad];
-  // Colours only: coordinate on the line where it leaves the face on the other side, as an infinite line.
+  // Colours only: coordinate of the line's exit from the face on the other side, as an infinite line.
   T far_side[kCrossings + kPad];
   int32_t edge[kCrossings + kPad];  // k * kSweptFaces + face: edge k, k + 1 of a face of the block
   // Numbers of the crossings that have something to sweep: outside the face, and inside.
@@ -84,7 +84,7 @@ struct Crossings {
 template <class T>
 struct SweepScratch {
   int32_t id[kSweptFaces];  // in the face index map
-  // x (0) and y (1) of the corners in pixels, in the order in which the face is drawn.
+  // x (0) and y (1) of the corners in pixels, in drawing order.
   T corner[2][3][kSweptFaces];
   // Of edge P-Q = corners k, k + 1 and the lines of an axis: scan coordinates, and 2 / M (Qs - Ps), the numerator of
   // EdgeDerivative's factors.

@@ -47,7 +47,7 @@ class ThreadScratch {
     busy_.unlock();
   }
 
-  // Frees what all threads keep that are not at work.
+  // Frees the memory of all threads that are not at work.
   static void free_all() {
     Registry& all = registry();
     const std::lock_guard<std::mutex> lock(all.mutex);
@@ -95,7 +95,7 @@ class ThreadScratch {
   }
 
   std::mutex busy_;
-  int depth_ = 0;      // of parallel loops
+  int depth_ = 0;      // number of nested parallel loops
   int64_t grown_ = 0;  // bytes
   std::vector<std::unique_ptr<AnyKept>> objects_;
 };

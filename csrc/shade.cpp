@@ -13,7 +13,7 @@ namespace {
 // b_k (ts - 1) clamped to [0, ts - 1 - eps].
 template <class T>
 struct Texels {
-  int64_t offset[8];  // of texels, within one face's cube
+  int64_t offset[8];  // offsets of texels within one face's cube
   T weight[8];
 };
 
@@ -25,7 +25,7 @@ NMR_INLINE Texels<T> texels_of(const T* weights, int64_t texture_size, T eps) {
   T fraction[3];
   for (int k = 0; k < 3; ++k) {
     T t = weights[k] * last;
-    t = t > 0 ? t : T(0);  // also NaN
+    t = t > 0 ? t : T(0);  // NaN becomes 0
     t = t < limit ? t : limit;
     cell[k] = std::max(std::min(static_cast<int64_t>(t), ts - 2), int64_t(0));  // ts - 1 - eps may round to ts - 1
     fraction[k] = t - static_cast<T>(cell[k]);
@@ -93,7 +93,7 @@ void texture_cubes_forward(const TextureCubes<T>& args) {
 
 namespace {
 
-// Adds the gradients of the pixels of image b whose face lies in [first_face, last_face) to its cubes.
+// Adds the gradients of the pixels of image b whose face is in [first_face, last_face) to its cubes.
 template <int64_t kChannels, class T>
 void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first_face, int64_t last_face) {
   const int64_t C = kChannels ? kChannels : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
@@ -101,7 +101,7 @@ void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first
   T* grad_textures = args.grad_textures + first_cube(args, b) * cube;
   for (int64_t n = b * pixels; n < (b + 1) * pixels; ++n) {
     const int64_t id = args.face_index[n], f = id < F ? id : id - F;
-    if (f < first_face || f >= last_face) continue;  // also background
+    if (f < first_face || f >= last_face) continue;  // background as well
     const Texels<T> texels = texels_of(args.weights + 3 * n, ts, args.eps);
     const T* grad = args.grad_colors + n * C;
     T* texture = grad_textures + f * cube;

@@ -1,4 +1,4 @@
-// Smoothness loss: sum over edges of (1 + cos(theta))^2, where theta is the angle between the two faces at the edge
+// Smoothness loss: sum over edges of (1 + cos(theta))^2; theta is the angle between the two faces at the edge
 // (cos = -1 when flat), with Kato's guards against division by zero. theta is the angle between the heights of the two
 // faces over the edge.
 //

@@ -2,10 +2,10 @@
 //
 // At pixel centre p, face j has the probability D_j = 1 / (1 + exp(-x_j)) with x_j = +-d^2 / sigma: d is the distance
 // from p to the border of the triangle, + inside and - outside. Faces outside with d^2 >= reach are left out. alpha =
-// 1 - clear, where clear = prod_j (1 - D_j). The derivative needs no division: d alpha / d x_j = clear D_j. That of
+// 1 - clear with clear = prod_j (1 - D_j). The derivative needs no division: d alpha / d x_j = clear D_j. That of
 // sigma is the sum of -x_j / sigma times this.
 //
-// Distances are measured in units of half the shorter side of the raster. The nearest point of the border lies on one
+// Distances are measured in units of half the shorter side of the raster. The nearest point of the border is on one
 // of the three sides, at p_a + t (p_b - p_a); the derivative of d^2 with respect to p_a is -2 (1 - t) (p - nearest),
 // and with respect to p_b -2 t (p - nearest), because the nearest point itself is stationary.
 #include <algorithm>
@@ -49,7 +49,7 @@ struct SoftImage {
   NMR_INLINE T row(int64_t j) const { return pixel_centre<T>(j, settings.raster.height) * scale_y; }
 };
 
-// Pixels whose centres lie in [lo, hi] (in [-1, 1] across `size` pixels), or one more at each end.
+// Pixels with centres in [lo, hi] (in [-1, 1] across `size` pixels), or one more at each end.
 template <class T>
 NMR_INLINE void reached(T lo, T hi, int64_t size, int64_t& first, int64_t& last) {
   const T n = static_cast<T>(size), from = to_pixel(lo, n), to = to_pixel(hi, n);
@@ -73,7 +73,7 @@ NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& f
     beyond_near = beyond_near || v[2] > image.settings.near;
     before_far = before_far || v[2] < image.settings.far;
   }
-  const bool listed = face.corner[0] != face.corner[1] || face.corner[1] != face.corner[2];  // not the padding of a list
+  const bool listed = face.corner[0] != face.corner[1] || face.corner[1] != face.corner[2];  // else padding
   if (!listed || !usable || !beyond_near || !before_far) return false;
   T *x = face.x, *y = face.y;
   face.back = (y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0]);  // clockwise
@@ -100,7 +100,7 @@ NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& f
 template <class T>
 struct SoftBand {
   int64_t layers, first, last;
-  T* depth;             // [rows, W, K]; `far` where there is no face
+  T* depth;             // [rows, W, K]; `far` without a face
   int32_t* face_index;  // [H, W, K] of the image, row 0 = top
 };
 
@@ -154,7 +154,7 @@ void soft_backward(const SoftBackward<T>& args) {
   const std::vector<T> columns = scaled_columns<T>(raster);
   std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
   std::vector<T> pull(mesh.batch * raster.pixels());
-  std::vector<int64_t> chunks{0};  // of faces, before each image
+  std::vector<int64_t> chunks{0};  // number of chunks of faces before each image
   std::vector<int64_t> first_face{0};
   for (int64_t b = 0; b < mesh.batch; ++b) {
     chunks.push_back(chunks[b] + (mesh.face_count(b) + kFaceChunk - 1) / kFaceChunk);

@@ -2,7 +2,7 @@
 //
 // With v_k of SoftWeights and q = sum_k v_k / z_k: depth z = 1 / q and weights b_k = z v_k / z_k; without perspective z
 // = sum_k v_k z_k and b_k = v_k. A clamped weight has no derivative. Moving corner k by e changes the weight w_m on the
-// screen by -w_k (gradient of w_m at the pixel) . e. The derivative of the distance stands in soft.cpp.
+// screen by -w_k (gradient of w_m at the pixel) . e. soft.cpp has the derivative of the distance.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -80,7 +80,7 @@ void fragment_backward(const SoftFragment<T>& f, bool perspective, const T* grad
     }
   }
   for (int k = 0; k < 3; ++k) mean += grad_v[k] * v[k];
-  T by_x = 0, by_y = 0;  // of the pixel, through the weights on the screen
+  T by_x = 0, by_y = 0;  // gradient of the pixel, through the weights on the screen
   for (int k = 0; k < 3; ++k) {
     if (!(weights.w[k] > 0 && weights.w[k] < 1)) continue;
     const int q = (k + 1) % 3, r = (k + 2) % 3;

@@ -1,4 +1,4 @@
-// Barycentric weights of a pixel that may lie outside of its face, as SoftRas takes them.
+// Barycentric weights of a pixel that may be outside its face, as SoftRas takes them.
 #pragma once
 
 #include "geometry.h"
@@ -6,7 +6,7 @@
 namespace nmr {
 
 // w_k are the weights on the screen, v_k these clamped to [0, 1] and divided by their sum (at least 1): those of the
-// pixel if it lies inside, and of a point of the border if not. NaN if the face has no area.
+// pixel if it is inside, and of a point of the border if not. NaN if the face has no area.
 template <class T>
 struct SoftWeights {
   T w[3], v[3], sum, area;

@@ -60,7 +60,7 @@ struct Pose {
 //                  u_z), K = intrinsics
 //   orthographic:  the same with p = (u_x, u_y), without distortion.
 // Origin and extent are separate arguments so that look-at cameras round as the published ones: images and gradients
-// then have the same bits. A vertex has no finite image if it is not finite itself, if it lies in the plane of the
+// then have the same bits. A vertex has no finite image if it is not finite itself, if it is in the plane of the
 // eye, if x / z^2 overflows, or if the camera is not finite. It then gets out = (inf, inf, any finite number), so that
 // its faces are not drawn, and gradient 0.
 template <class T>
@@ -106,7 +106,7 @@ struct ClipFaces {
   int64_t* faces;         // out [M, 3]: vertices of the mesh; its new vertices are numbered after its own
   int32_t* source;        // out [M]: the face of the mesh that a drawn face is part of
   int64_t* corners;       // out [M, 3]: k < 3: corner k of that face; 3 + p: new vertex p of the mesh
-  int64_t* ends;          // out [P, 4]: a new vertex lies between two rows of `vertices`, which are these two corners
+  int64_t* ends;          // out [P, 4]: a new vertex is between two rows of `vertices`, which are these two corners
                           // of its face
   int num_threads;
 };
@@ -115,7 +115,7 @@ struct ClipFaces {
 template <class T>
 struct RasterSettings {
   Size raster;          // pixels of the raster: H x W
-  bool fill_back;       // also draw every face with its vertex order reversed
+  bool fill_back;       // draws every face also with its vertex order reversed
   T near;               // pixels with depth <= near are not drawn
   T far;                // nor those with depth >= far
   bool perspective = true;  // see Fragments
@@ -387,12 +387,12 @@ struct Antialias {
 };
 
 // Unit normals of meshes in world space (normals.cpp): n((v0 - v1) x (v2 - v1)) of faces, or of vertices the direction
-// of the sum of these products over the faces around them. 0 where there is no area. A vertex that is not finite, or
+// of the sum of these products over the faces around them. 0 without an area. A vertex that is not finite, or
 // beyond 1e12, counts as the origin and gets no gradient.
 template <class T>
 struct Normals {
   MeshBatch<T> mesh;
-  bool smooth;            // of vertices, else of faces
+  bool smooth;            // normals of vertices, else of faces
   T* normals;             // forward out [B or 1, F, 3], packed [M, 3]; smooth: like mesh.vertices
   const T* grad_normals;  // backward in
   T* grad_vertices;       // backward out, like mesh.vertices
@@ -424,7 +424,7 @@ struct Lit {
   const T* viewer;           // [B, 5]: place of the eye, 1; or direction towards the viewer, 0; then -1 if the camera
                              // sees a right-handed world (Pinhole), else 1
   const T* parameters;       // all lights, or nullptr: the result is the normal
-  const int64_t* layout;     // [Light::count, 3]: first value, rows (1 or B), lights (0: there are none)
+  const int64_t* layout;     // [Light::count, 3]: first value, rows (1 or B), lights (may be 0)
   int64_t num_parameters;
   const T* colors;           // [B, H, W, C], or nullptr: white
   int64_t channels;          // C: 1 or 3
@@ -448,12 +448,12 @@ struct Resolve {
   int64_t background_batch; // 1 or B
   T* resolved;              // forward out [B, h, w, C]
   const T* grad_resolved;   // backward in
-  T* grad_pixels;           // backward out [B, H, W, C], 0 where the background is seen; or nullptr
+  T* grad_pixels;           // backward out [B, H, W, C], 0 at background pixels; or nullptr
   T* grad_background;       // backward out [B, C], or nullptr
   int num_threads;
 };
 
-// The gradient of the edges in an image with any channels: NMR's (edges.cpp), in which pixels pull every visible edge
+// The gradient of the edges in an image with any channels: NMR's (edges.cpp): pixels pull every visible edge
 // whose motion over them lowers the loss, or the local one (local_gradient.cpp).
 template <class T>
 struct EdgesBackward {
@@ -469,7 +469,7 @@ struct EdgesBackward {
   const T* grad_resolved;   // [B, h, w, C]
   T* grad_vertices;         // out, like mesh.vertices; z gets 0
   int num_threads;
-  bool perspective;         // of the cameras; only the local gradient reads it
+  bool perspective;         // kind of the cameras; only the local gradient reads it
 };
 
 // Occupancy grids (voxelize.cpp).

@@ -18,7 +18,7 @@ template <class T>
 struct SweptFaces {
   std::vector<uint8_t> seen;  // [2 F + 1 + pad]
   std::vector<int32_t> ids;   // [visible faces + pad] their face indices
-  std::vector<T> grad;        // [visible faces, 3, 2] of x and y of their corners, in the order in which they are drawn
+  std::vector<T> grad;        // [visible faces, 3, 2] gradients of x and y of their corners, in drawing order
 };
 
 // Memory for one task.

@@ -59,7 +59,7 @@ void for_pairs(const Grid& fine, const Grid& coarse, const Body& body) {
   }
 }
 
-// First texel of image i where the images lie end to end without their other levels.
+// First texel of image i in the concatenated images without their other levels.
 template <class T>
 int64_t first_texel(const Mipmaps<T>& args, int64_t i) {
   int64_t first = 0;
@@ -89,7 +89,7 @@ void mipmaps_forward(const Mipmaps<T>& args) {
   });
 }
 
-// The gradient of a level is its own and what the coarser level passes on.
+// The gradient of a level is its own plus that passed on by the coarser level.
 template <class T>
 void mipmaps_backward(const Mipmaps<T>& args) {
   const int64_t C = args.channels;
@@ -165,7 +165,7 @@ NMR_INLINE T level_of(const Slopes<T>& s, const Place<T>& place, const T* weight
     const T y = z * (s.v[axis] - place.v * s.one[axis]) * static_cast<T>(grid.height);
     largest = std::max(largest, x * x + y * y);
   }
-  if (!(largest > 1)) return 0;  // also NaN: a corner in the plane of the eye
+  if (!(largest > 1)) return 0;  // NaN as well: a corner in the plane of the eye
   const double level = largest <= std::numeric_limits<T>::max() ? log2_of(static_cast<double>(largest)) / 2 : levels;
   return static_cast<T>(std::min(level, static_cast<double>(levels - 1)));
 }

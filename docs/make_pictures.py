@@ -40,6 +40,8 @@ _QUICKSTART += ("learn3d/methods/plus.py", "learn3d/networks/encoders.py")
 _RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
 _RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
 _THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
+_FUNCTIONS = ("silhouette", "rgb", "depth", "normals", "face_index", "soft_silhouette", "soft_rgb", "transparent")
+_FUNCTIONS = (*(f"render_{name}" for name in _FUNCTIONS), "icosphere", "voxelize", "colors", "lights", "look_at")
 _NOTEBOOKS = {"quick_tour": 5, "shape_from_silhouettes": 4, "texture_and_light": 4, "photographs_to_glb": 1}
 _SCRIPTS = {  # picture that a script draws, and the part of it that the gallery shows
     "fit_masks": ("fit_masks.png", (0, 0, 1 / 3, 1)),
@@ -95,6 +97,12 @@ PICTURES = {
     "door-paper.png": Picture(
         "true", "docs/images/results-grid.png", ("docs/images/results-grid.png",), (0, 0, 1, 0.34), True
     ),
+    **{
+        f"api-{name.replace('_', '-')}.png": Picture(
+            "python docs/draw_api.py --output {folder}", f"{{folder}}/{name}.png", ("docs/draw_api.py",)
+        )
+        for name in _FUNCTIONS
+    },
     "results-grid.png": Picture(
         f"learn3d figures grid --truth --images 3 --runs {_THREE} --output {{folder}}/grid.png",
         "{folder}/grid.png",

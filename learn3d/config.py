@@ -33,40 +33,40 @@ class TrainConfig:
     """One training run. It is saved with the run (config.json and in every checkpoint)."""
 
     data: MayDiffer[FilePath]
-    """Folder of the data set: its files are called 02691156_train_images.npz and so on in the layout kato."""
+    """Folder of the data set. In the layout kato its files are 02691156_train_images.npz and so on."""
     category: Annotated[str, Field(min_length=1)]
     """Categories to train on together, separated by commas: names (chair), synset ids, or names of your own."""
     output: MayDiffer[FilePath]
-    """Folder of this run: checkpoints, metrics, pictures. It must be new or empty, or see --resume, --overwrite."""
+    """Folder of this run: checkpoints, metrics, pictures. It must be new or empty without --resume or --overwrite."""
     preset: Annotated[str, AfterValidator(full_name)] = DEFAULT_PRESET
-    """Method, or preset of a method for other data: decides the defaults of the other options."""
+    """Method, or preset of a method for other data. It sets the defaults of the other options."""
     settings: Rare[Annotated[MethodSettings | None, SkipValidation]] = None
     """Settings of the method (default: from the preset)."""
     layout: Layout | None = None
     """Arrangement of the files of the data set, see docs/data-sets.md."""
     view_bins: Rare[str | None] = None
-    """View classes as cells of azimuth and elevation in degrees (default: 15x20 for kar; a class for each camera if
+    """Size of the view classes, azimuth x elevation in degrees (default: 15x20 for kar; a class for each camera if
     cameras are fixed)."""
     views_per_object: Rare[Count | None] = None
-    """Number of views of each object to train on: the first ones for kar and r2n2, else the same random ones in every
-    run (default: one for kar, else all)."""
+    """Number of training views of each object: the first ones for kar and r2n2, else the same random ones in every run
+    (default: one for kar, else all)."""
     poses: MayDiffer[FilePath | None] = None
-    """Table of poses that learn3d estimate-poses made from these data, which replaces their own (default: none)."""
+    """Table of poses by learn3d estimate-poses; it replaces the poses of the data set (default: none)."""
     sampling: Rare[Sampling | None] = None
-    """Draw views (each on its own), pairs (two views of an object), groups (five of them) or classes (categories drawn
-    uniformly)."""
+    """How batches are drawn. views: single images. pairs: two views of an object. groups: five views of an object.
+    classes: single images, categories uniformly."""
     augment: Rare[Annotated[tuple[Augmentation, ...], Items] | None] = None
-    """Random changes of the training images (--augment without a name: none)."""
+    """Random augmentations of the training images (--augment without a name: none)."""
     iterations: MayDiffer[Step | None] = None
     """Number of training steps."""
     batch_size: Annotated[int, Field(ge=1, le=65_536)] | None = None
     """Images per training step."""
     lr_schedule: Rare[LRSchedule | None] = None
-    """Course of the learning rate. linear, cosine: it falls to 0. step: it is a tenth in the last 5 % of all steps."""
+    """Learning-rate schedule. linear, cosine: decay to 0. step: a tenth in the last 5 % of all steps."""
     warmup_steps: Rare[Annotated[int, Field(ge=0, le=10**9)] | None] = None
     """Steps over which the learning rate ramps up from 0 (default: from the preset, at most a tenth of the run)."""
     ema_decay: Rare[Annotated[float, Field(ge=0, lt=1)] | None] = None
-    """Decay a step of the EMA of all weights, which evaluation and reconstruction use. 0: they use the weights."""
+    """Decay per step of the EMA of all weights; evaluation and reconstruction use the EMA. 0: no EMA."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial weights and of the order of the images."""
     device: MayDiffer[Literal["cpu", "cuda"]] = "cpu"
@@ -74,7 +74,11 @@ class TrainConfig:
     precision: Rare[Literal["auto", "bf16", "fp32"]] = "auto"
     """Arithmetic of the networks. auto: bf16 if it is faster (CUDA, CPUs with bf16 instructions), else fp32."""
     threads: MayDiffer[Annotated[int, Field(ge=1, le=4096)] | None] = None
-    """Number of CPU threads (default: one or all, as is faster; tried at the beginning and when steps become slow)."""
+    """Number of CPU threads (default: one or all, whichever is faster; measured at the start and when steps slow
+    down)."""
+    log: Rare[MayDiffer[Literal["csv", "tensorboard", "wandb"]]] = "tensorboard"
+    """Program that shows the metrics besides metrics.jsonl: csv (metrics.csv), tensorboard, or wandb (pip install
+    wandb; it sends them to your account there)."""
     val_split: Rare[MayDiffer[Literal["val", "test"]]] = "val"
     """Split for validation during training, and for choosing the best checkpoint."""
     validate_every: MayDiffer[Step] = 2000

@@ -49,9 +49,11 @@ METHODS = {
     "plus": NamedMethod("plus-kato", "the default: proposed, with mirror symmetry and a loss at novel views"),
     "proposed": NamedMethod("peng2020-kato", "pose-invariant codes from single views (Peng et al. 2020)"),
     "vanilla": NamedMethod("peng2020-kato-vanilla", "encoder and mesh generator alone, on single views"),
-    "multi-view": NamedMethod("kato2018-kato", "the same on pairs of views of an object (Kato et al. 2018)"),
-    "many-views": NamedMethod("many-views-kato", "a shape must explain five views of its object (the package's model)"),
-    "vpl": NamedMethod("peng2020-kato-vpl", "novel views must look as plausible as the input's (Kato and Harada 2019)"),
+    "multi-view": NamedMethod("kato2018-kato", "vanilla on pairs of views of an object (Kato et al. 2018)"),
+    "many-views": NamedMethod(
+        "many-views-kato", "multi-view supervision: a shape must explain five views of its object"
+    ),
+    "vpl": NamedMethod("peng2020-kato-vpl", "view prior learning: novel views must look real (Kato and Harada 2019)"),
     "prgan": NamedMethod("gadelha2017-kato", "a GAN of voxel grids, then an encoder (PrGAN, Gadelha et al. 2017)"),
 }
 

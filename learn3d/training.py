@@ -14,7 +14,7 @@ from learn3d.data.sampling import batches
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.methods import create_method
 from learn3d.runs import folder as run_folder
-from learn3d.runs.log import RunLog
+from learn3d.runs.log import RunLog, check_log
 from learn3d.runs.state import Run, describe_images
 from learn3d.runs.summary import Summary, describe_run
 from learn3d.runs.threads import ThreadTuner
@@ -35,6 +35,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     """
     started, folder = time.monotonic(), config.output
     config = dataclasses.replace(config, precision=resolve_precision(config.precision, config.device))
+    check_log(config)
     keep_freed_memory()
     threads = ThreadTuner(config.threads)
     with run_folder.lock_folder(folder):
@@ -55,7 +56,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         with (
             run_folder.advice_on_errors(folder),
             stop_on_signal() as stop,
-            RunLog(folder, start=progress.step, total=config.iterations) as log,
+            RunLog(folder, start=progress.step, total=config.iterations, config=config) as log,
         ):
             for warning in filter(None, (*notes, train_set.check_masks())):
                 log.say(f"warning: {warning}")

@@ -17,19 +17,19 @@ from ._packing import MeshBatch, packed_starts
 from .cameras import Camera
 from .cameras.projection import ProjectingCamera
 
-# Parts of far at which faces are cut: with near = 0 (the image of a point in the plane of the eye is infinitely large),
-# and with a positive near that is smaller than the second part (nearer new vertices are too large for float32).
+# Faces are cut at these shares of far: the first with near = 0 (the image of a point in the plane of the eye is
+# infinitely large), the second with a positive near below it (nearer new vertices are too large for float32).
 _NEAREST, _SMALLEST = 1e-5, 1e-8
 # Beyond this a new vertex counts as not finite: products with gradients could overflow.
 _LARGEST = 1e12
 
 
 class Clipped(NamedTuple):
-    """The drawn meshes, packed, and where each drawn face lies on the face that it is part of."""
+    """The drawn meshes, packed, and the place of each drawn face on the face that it is part of."""
 
     mesh: MeshBatch
     source: Tensor  # int32 [M + 1]: face of the user's mesh; the last row is -1
-    num_faces: int | Tensor  # of the user's meshes, as MeshBatch.num_faces
+    num_faces: int | Tensor  # faces of the user's meshes, as MeshBatch.num_faces
     corners: Tensor  # [M, 3]: rows of places
     places: Tensor  # packed [3 B + P, 3]: barycentric coordinates on the source
     place_starts: Tensor  # [B + 1, 2]: first of the places and first face of each mesh
@@ -47,14 +47,14 @@ class Clipped(NamedTuple):
     def weights(self, face_index: Tensor, weights: Tensor) -> Tensor:
         """Weights on the drawn faces ``[B, H, W, 3]`` (of their face index map) as weights on the user's faces.
 
-        Both are linear in space: a point with weights b_k on a face whose corners lie at B_k has the weights
+        Both are linear in space: a point with weights b_k on a face with its corners at B_k has the weights
         sum_k b_k B_k.
         """
         return ops.interpolate(self.places, self.corners, face_index, weights, self.place_starts)
 
 
 def clip_plane(near: float, far: float) -> float:
-    """The depth at which faces are cut, and from which on pixels are drawn."""
+    """The depth of the clipping plane: faces are cut there, and nothing nearer is drawn."""
     return max(float(near), (_SMALLEST if near else _NEAREST) * float(far))
 
 

@@ -28,7 +28,7 @@ def alias_package(here: str, name: object, replace: bool, example: str, remedy: 
 
 
 def _find(name: str) -> str | None:
-    """Where a module of that name lies, if there is one."""
+    """Place of the module of that name, None if it is missing."""
     if name in sys.modules:
         return f"already imported from {getattr(sys.modules[name], '__file__', None) or 'an unknown place'}"
     spec = importlib.util.find_spec(name)

@@ -157,9 +157,9 @@ def shade(
     background: float | Sequence[float] | Tensor,
     interpolation_gradient: bool,
 ) -> tuple[Tensor, Tensor]:
-    """The shaded raster ``[B, H, W, C]``, undefined where there is no face, and the background ``[B | 1, C]``.
+    """The shaded raster ``[B, H, W, C]``, undefined at pixels without a face, and the background ``[B | 1, C]``.
 
-    Of layers ``[B, H, W, K, C]``.
+    With layers the raster is ``[B, H, W, K, C]``.
     """
     if not interpolation_gradient:
         fragments = replace(fragments, weights=fragments.weights.detach())

@@ -1,4 +1,4 @@
-"""Checks shared by the public functions. Each error says what was wanted, what came and what to do."""
+"""Checks shared by the public functions. Each error names the expected value, the given one, and a remedy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32, torch.uint64)
 _FLOATS = (torch.float32, torch.float64)
-GRADIENTS = ("nmr", "local", "none")  # of edges
+GRADIENTS = ("nmr", "local", "none")  # definitions of the gradient at edges
 
 
 def describe(value: object) -> str:
@@ -40,9 +40,9 @@ def cast_under_autocast(tensor: object) -> object:
 
 
 def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
-    """``vertices`` as ``[B, V, 3]`` float32 or float64; ``otherwise``: what else is accepted, for the error."""
+    """``vertices`` as ``[B, V, 3]`` float32 or float64; ``otherwise``: other accepted types, for the error."""
     if not isinstance(vertices, Tensor):
-        remedy = ", or one call for each mesh where their sizes differ" if isinstance(vertices, (list, tuple)) else ""
+        remedy = ", or one call for each mesh if their sizes differ" if isinstance(vertices, (list, tuple)) else ""
         raise TypeError(
             f"vertices must be a float tensor [B, V, 3] or [V, 3]{otherwise}, got {describe(vertices)}; "
             f"use torch.as_tensor(){remedy}"

@@ -1,4 +1,4 @@
-"""Fragments: the nearest face at each pixel, with what is needed to shade it."""
+"""Fragments: the nearest face at each pixel, with all that shading needs."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Fragments:
         return self.sided_face_index.shape[3] if self.sided_face_index.ndim == 4 else None
 
     def layer(self, k: int) -> Fragments:
-        """The k-th nearest surfaces, without the axis for K: 0 is what is seen.
+        """The k-th nearest surfaces, without the axis for K; 0 is the visible one.
 
         Everything can be done with it, except that only layer 0 can be resolved: NMR's gradient is that of the edges
         that are seen.
@@ -118,7 +118,7 @@ class Fragments:
 
     @property
     def face_index(self) -> Tensor:
-        """int32 ``[B, H, W]``: f where face f is nearest, seen from either side; -1 is background."""
+        """int32 ``[B, H, W]``: index of the nearest face, seen from either side; -1 is background."""
         return torch.where(self.is_back, self.sided_face_index - self._num_faces, self.sided_face_index)
 
     @property
@@ -178,7 +178,7 @@ class Fragments:
         Differentiable in the world-space vertices and, if smooth, in weights.
 
         With ``space="camera"`` the axes are those of renderer space: x to the right of the image, y up, z away from the
-        viewer (so z is negative where a face looks at the viewer). It needs one of nmr's cameras, or none, and is
+        viewer (so z is negative if a face looks at the viewer). It needs one of nmr's cameras, or none, and is
         differentiable in its rotation, too.
         """
         check_choice(space, "space", ("world", "camera"))
@@ -208,7 +208,7 @@ class Fragments:
     ) -> Tensor:
         """Lit colours ``[B, H, W, 3]`` (:func:`nmr.ops.lit`); without parameters the normals.
 
-        ``positions``: the light depends on where a point lies; ``highlights``: also on where the eye is; ``own``:
+        ``positions``: the light depends on the position of a point; ``highlights``: also on that of the eye; ``own``:
         outward normals of the vertices in the layout of the meshes, or of the pixels ``[B, H, W, 3]``.
         """
         viewer = self._viewer(highlights)
@@ -233,7 +233,7 @@ class Fragments:
         return self.sided_face_index, self.weights, self.mesh.starts
 
     def _viewer(self, needs_eye: bool) -> Tensor:
-        """From where each image is seen, ``[B, 5]``: see :func:`nmr.ops.viewer_of`."""
+        """Viewers of the images, ``[B, 5]``: see :func:`nmr.ops.viewer_of`."""
         batch = self.mesh.batch
         if self.camera is None:  # renderer space itself, seen along z
             return self.weights.new_tensor([0.0, 0.0, -1.0, 0.0, 1.0]).expand(batch, 5)

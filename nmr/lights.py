@@ -79,7 +79,7 @@ class Lights:
     directional_color : [3], [L, 3] or [B, L, 3]
     smooth : bool
     position : [3], [L, 3] or [B, L, 3], optional; keyword only, as all that follow
-        World-space positions of point lights. Without it there are none. Other numbers of lights than of directional
+        World-space positions of point lights (default: no point lights). Other numbers of lights than of directional
         ones are possible.
     point : number, or Tensor [], [L] or [B, L]
         Intensity of each point light.

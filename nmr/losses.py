@@ -291,8 +291,8 @@ def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
 def volume_loss(vertices: Tensor, faces: Tensor) -> Tensor:
     """The volume that closed surfaces enclose: mean over meshes of ``sum over faces v0 . (v1 x v2) / 6``.
 
-    Of the shapes that agree with given silhouettes, the visual hull is the largest. A small weight on the volume takes
-    away what no silhouette asks for, such as the filling between a seat and its legs.
+    Of the shapes that agree with given silhouettes, the visual hull is the largest. A small weight on the volume
+    removes parts that no silhouette needs, such as the filling between a seat and its legs.
 
     Parameters
     ----------
@@ -302,7 +302,7 @@ def volume_loss(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     scalar Tensor
-        Differentiable in ``vertices``. Negative where a surface is turned inside out. It does not depend on the place
+        Differentiable in ``vertices``. Negative if a surface is turned inside out. It does not depend on the place
         of a mesh if the surface is closed.
 
     Raises
@@ -331,7 +331,7 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _length(vectors: Tensor) -> Tensor:
-    """Lengths [N, B] of vectors [N, 3, B]; where it is 0, so is the gradient."""
+    """Lengths [N, B] of vectors [N, 3, B]; the gradient of a length 0 is 0."""
     square = vectors.square().sum(1)
     zero = square == 0
     return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())

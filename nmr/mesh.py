@@ -227,7 +227,7 @@ def _face_cross(corners: Tensor) -> Tensor:
 
 
 def _unit(vectors: Tensor) -> Tensor:
-    """Vectors over their lengths; 0, with gradient 0, where the length is 0."""
+    """Vectors over their lengths; 0, with gradient 0, if the length is 0."""
     # Scaled to a largest coordinate of 1 first, so that the squares neither under- nor overflow. The result does not
     # depend on the scale, so neither does its derivative.
     scale = vectors.detach().abs().amax(-1, keepdim=True)
@@ -250,7 +250,7 @@ def _sides(faces: Tensor) -> Tensor:
 
 
 def _check_indices(indices: Tensor, num_vertices: int, name: str = "faces") -> None:
-    """Every index must lie in 0..V-1. (When compiled or under vmap values are unknown; there gathering raises it.)"""
+    """Raise a ValueError if an index is outside 0..V-1. (Values are unknown when compiled or under vmap.)"""
     if torch.compiler.is_compiling() or indices.numel() == 0:
         return
     try:

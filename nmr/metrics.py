@@ -1,6 +1,6 @@
 """How close two shapes are: points on surfaces, Chamfer distance, F-score, IoU of grids.
 
-Nearest points are found by SciPy's k-d tree if SciPy is installed and the points lie in host memory, otherwise by
+Nearest points are found by SciPy's k-d tree if SciPy is installed and the points are in host memory, otherwise by
 comparing all pairs in chunks. Both are exact. They differ in speed (7 ms and 0.3 s for 10,000 and 10,000 points on two
 cores), and may choose different points among equally near ones.
 """
@@ -30,8 +30,8 @@ class SurfacePoints(NamedTuple):
     """Points on the surfaces of meshes; without the leading B for vertices [V, 3]."""
 
     points: Tensor  # [B, N, 3], differentiable in the vertices
-    normals: Tensor  # [B, N, 3], of the faces they lie on; differentiable
-    face_index: Tensor  # int64 [B, N], the faces they lie on
+    normals: Tensor  # [B, N, 3], normals of their faces; differentiable
+    face_index: Tensor  # int64 [B, N], their faces
 
 
 def sample_surface(
@@ -54,7 +54,7 @@ def sample_surface(
     Returns
     -------
     SurfacePoints (points, normals, face_index)
-        ``points[b, n]`` lies on face ``face_index[b, n]`` of mesh b, whose unit normal is ``normals[b, n]``. points and
+        ``points[b, n]`` is on face ``face_index[b, n]`` of mesh b, whose unit normal is ``normals[b, n]``. points and
         normals are differentiable in ``vertices``; which faces are drawn is not.
 
     Raises
@@ -180,7 +180,7 @@ def voxel_iou(prediction: Tensor, target: Tensor) -> Tensor:
     Returns
     -------
     float64 Tensor [B]
-        NaN where both grids are empty.
+        NaN if both grids are empty.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def voxel_iou(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def voxel_precision_recall(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """What part of a predicted grid is in the true one, and what part of the true one it covers.
+    """Precision and recall of predicted grids: the share of A that is in B, and the share of B that is in A.
 
     Shapes that are too full have a low precision, those that lack parts a low recall.
 
@@ -210,7 +210,7 @@ def voxel_precision_recall(prediction: Tensor, target: Tensor) -> tuple[Tensor, 
     Returns
     -------
     precision, recall : float64 Tensor [B] each
-        ``|A & B| / |A|`` and ``|A & B| / |B|`` of prediction A and target B; NaN where A, or B, is empty.
+        ``|A & B| / |A|`` and ``|A & B| / |B|`` of prediction A and target B; NaN if A, or B, is empty.
 
     Raises
     ------
@@ -295,7 +295,7 @@ def _search_tree(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _search_all(a: Tensor, b: Tensor) -> Tensor:
-    # Not the fast formula |x|^2 - 2 x.y + |y|^2: it is too inexact to tell near points apart.
+    # Not the fast formula |x|^2 - 2 x.y + |y|^2: it is too inexact to separate near points.
     exact = "donot_use_mm_for_euclid_dist"
     chunks = a.split(max(1, _CHUNK // len(b)))
     return torch.cat([torch.cdist(chunk, b, compute_mode=exact).argmin(1) for chunk in chunks])

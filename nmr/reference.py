@@ -19,7 +19,7 @@ def with_back_faces(faces: Tensor, fill_back: bool) -> Tensor:
 
 
 def _cross(p: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Two products; which one is larger tells on which side of the line a -> b the points p lie."""
+    """Two products; the larger one shows on which side of the line a -> b the points p are."""
     return (p[..., 1] - a[1]) * (b[0] - a[0]), (p[..., 0] - a[0]) * (b[1] - a[1])
 
 
@@ -294,7 +294,7 @@ def _one_pixel_moves(image: Tensor, grad: Tensor, ends: tuple[Tensor, Tensor], e
     step = image[:, 1:] - image[:, :-1]
     right, left = (step * grad[:, 1:]).sum(-1) * per_pixel, -(step * grad[:, :-1]).sum(-1) * per_pixel
     none = torch.zeros_like(image[:, :1, 0])
-    # of both pairs of a pixel
+    # sums over both pairs of a pixel
     right, left = (torch.cat([none, x * ends[1]], 1) + torch.cat([x * ends[0], none], 1) for x in (right, left))
     moves = torch.where(right > left, -right, left)
     still = (torch.maximum(right, left) <= 0) | ((right - left).abs() < eps)

@@ -237,7 +237,7 @@ class UVTexture:
         return ops.sample_uv(texels, grids, level, *at, ops.WRAPS.index(self.wrap))
 
     def _texels(self, fragments: Fragments) -> tuple[Tensor, Tensor, int]:
-        """All texels ``[., C]``, where each level of each image lies (or will lie), and the number of their texels."""
+        """All texels ``[., C]``, the place of each level of each image among them, and the number of texels."""
         image, batch = check_values(self.image, "image", "H, W, C"), fragments.mesh.batch
         if len(image) not in (1, batch):
             raise ValueError(f"image must be one for all {batch} images drawn, or one for each, got {len(image)}")
@@ -312,7 +312,7 @@ def sample_texture(
 
 
 def level_grids(sizes: list[tuple[int, int]], levels: int) -> tuple[Tensor, int]:
-    """Where the levels of images (height, width) lie, as :mod:`nmr.ops` has them, and the number of their texels."""
+    """Places of the levels of images (height, width), as :mod:`nmr.ops` has them, and the number of their texels."""
     grids, first = [], 0
     for height, width in sizes:
         for _ in range(levels):

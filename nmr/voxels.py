@@ -19,7 +19,7 @@ def voxelize(
     6-connected cells that do not. A shape that reaches beyond the grid is open there, and its inside stays empty. The
     definitions differ in which cells belong to the surface:
 
-    - "kato18" (Kato et al. 2018): cells that contain a vertex, and cells of which an edge meets a face (tested by rays
+    - "kato18" (Kato et al. 2018): cells that contain a vertex, and cells with an edge that meets a face (tested by rays
       along the three axes through integer coordinates);
     - "kato19" (Kato and Harada 2019): every cell that a face touches. A face in the plane between two cells touches
       both. This is a separating axis test of triangle and cube; cells are enlarged by 1e-9 on each side, so that the

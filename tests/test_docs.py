@@ -180,8 +180,8 @@ def test_every_picture_has_a_command_and_a_record() -> None:
 
 
 def test_every_picture_is_shown() -> None:
-    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
-    shown = {name for page in pages for name in re.findall(r"images/([\w-]+\.\w+)\)", page.read_text())}
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs" / "api").glob("*.rst")]
+    shown = {name for page in pages for name in re.findall(r"images/([\w-]+\.\w+)[)\n]", page.read_text())}
     assert shown == set(make_pictures.PICTURES)
 
 

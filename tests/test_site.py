@@ -1,5 +1,7 @@
 """The site builds without a warning, its links lead somewhere, and a page asks no other server for anything."""
 
+import inspect
+import os
 import re
 import subprocess
 import sys
@@ -13,6 +15,7 @@ import nmr
 
 pytest.importorskip("sphinx", reason='needs the extra "site"')
 pytest.importorskip("myst_nb", reason='needs the extra "site"')
+pytest.importorskip("sphinx_copybutton", reason='needs the extra "site"')
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -39,7 +42,8 @@ def site(tmp_path_factory):
     """The folder of the built site. In a folder of its own, so that the installed package is described."""
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet", DOCS, folder / "html"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    environment = os.environ | {"GITHUB_REPOSITORY": "somebody/nmr"}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return folder / "html"
 
@@ -83,3 +87,18 @@ def test_every_public_name_is_described(pages):
     for module in (nmr.cameras, nmr.losses, nmr.metrics):
         public |= {f"{module.__name__}.{name}" for name in module.__all__ if name not in nmr.__all__}
     assert sorted(public - described) == []
+
+
+def test_every_parameter_of_a_drawing_function_is_explained_at_it(site):
+    page = (site / "api" / "rendering.html").read_text()
+    for name in [name for name in nmr.__all__ if name.startswith("render")]:
+        section = page[page.index(f'id="nmr.{name}"') :].partition("</section>")[0]
+        section = section[section.index('<dl class="field-list') :]  # after the signature
+        for parameter in inspect.signature(getattr(nmr, name)).parameters:
+            assert re.search(rf"<strong>[^<]*\b{parameter}\b", section), (name, parameter)
+
+
+def test_notebooks_lead_to_colab(site):
+    for notebook in (DOCS / "examples").glob("*.ipynb"):
+        page = (site / "examples" / f"{notebook.stem}.html").read_text()
+        assert f"colab.research.google.com/github/somebody/nmr/blob/main/docs/examples/{notebook.name}" in page

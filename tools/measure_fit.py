@@ -1,4 +1,4 @@
-"""Measures what the fit of camera and shape makes of the images of a data set, as if their cameras were unknown.
+"""Measures the fit of camera and shape on the images of a data set, as if their cameras were unknown.
 
 python tools/measure_fit.py --data data --category chair,sofa --images 20
 """

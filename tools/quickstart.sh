@@ -7,11 +7,11 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . tools/setup.sh
 
 category=${1:-airplane}
-steps=${STEPS:-1600} # of 32 images; Vanilla-AE takes a quarter of the steps, of 128 images, as published
+steps=${STEPS:-1600} # steps of 32 images; Vanilla-AE takes a quarter of the steps, of 128 images, as published
 objects=${OBJECTS:-250}
 out=$PWD/quickstart
 [ -z "${OUT:-}" ] || case $OUT in /*) out=$OUT ;; *) out=$here/$OUT ;; esac
-trap 'echo; echo "stopped; what is finished is in $out"; exit 130' INT
+trap 'echo; echo "stopped; the finished part is in $out"; exit 130' INT
 
 setup report
 learn3d=$PWD/.venv/bin/learn3d

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Makes the model that comes with the package, learn3d/models/small.safetensors: one network for 2,000 generated objects of each of six categories,
 # seen from 12 random sides and heights. Its encoder scales every object to one size, because nobody knows how far away the camera of a
-# picture stood. It continues where it was stopped. Usage: bash tools/small_model.sh. Settings: STEPS, OBJECTS, OUT (environment).
+# picture stood. A stopped run continues. Usage: bash tools/small_model.sh. Settings: STEPS, OBJECTS, OUT (environment).
 # An hour and a half on two cores.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs the package with everything its tests need into .venv and runs the tests.
 # Usage: bash tools/test.sh [--all] [PYTEST ARGUMENTS]
-#   --all   also the slow tests: trainings of minutes, sanitizers, long kills; and the coverage (what CI runs)
+#   --all   the slow tests as well: trainings of minutes, sanitizers, long kills; and the coverage (what CI runs)
 # JOBS: number of processes (default one per core; 0: in this one).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."

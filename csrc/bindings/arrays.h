@@ -70,7 +70,7 @@ T* optional_like(std::optional<Array<T>>& grad, const char* name, const Array<T>
   return grad->mutable_data();
 }
 
-// Every index must lie in 0..limit-1. Callers release the GIL.
+// Throws if an index is outside 0..limit-1. Callers release the GIL.
 inline void require_indices(const int64_t* index, int64_t count, int64_t limit, const char* name, const char* what,
                             const char* plural) {
   if (are_indices(index, count, limit)) return;

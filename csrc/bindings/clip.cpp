@@ -4,7 +4,7 @@
 namespace nmr {
 namespace {
 
-// Leaves the counts alone if no vertex lies behind the plane.
+// Leaves the counts alone if no vertex is behind the plane.
 template <class T>
 void clip_count_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts, double near,
                    Indices& counts, int num_threads) {

@@ -1,4 +1,4 @@
-// Checks of what the bindings of several stages take: fragments, and values at the corners of faces.
+// Checks of arguments that several stages have: fragments, and values at the corners of faces.
 #pragma once
 
 #include "arrays.h"

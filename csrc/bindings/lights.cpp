@@ -46,7 +46,7 @@ void normals_backward_py(const Array<T>& vertices, const Indices& faces, const s
 
 constexpr int64_t kWidths[] = {1, 3, 1, 3, 3, 1, 3, 3, 1, 1, 1};  // numbers of each parameter, in the order of Light
 
-// Every parameter lies inside the array; of those that belong together, all have one light or the same number.
+// Every parameter must be inside the array. Those that belong together have one light or the same number.
 inline void require_layout(const Indices& layout, int64_t num_parameters, int64_t batch) {
   const int64_t count = static_cast<int64_t>(Light::count);
   require_shape(layout, "layout", {count, 3});

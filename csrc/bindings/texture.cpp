@@ -4,7 +4,7 @@
 namespace nmr {
 namespace {
 
-// [I, L, 3]: every level lies inside the array of texels.
+// [I, L, 3]: every level must be inside the array of texels.
 int64_t require_grids(const Indices& grids, int64_t num_texels) {
   require(grids.ndim() == 3 && grids.shape(1) >= 1 && grids.shape(2) == 3,
           "grids must have shape [I, L, 3], got " + shape_of(grids));

@@ -5,9 +5,11 @@ torch takes seconds to import, and Ctrl-C may come in the middle of it.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import sys
 from importlib import metadata
+from typing import Annotated, Any, Union
 
 from learn3d.terminal import note, say, unknown_name, without_traceback
 
@@ -31,7 +33,11 @@ HELP = """usage: learn3d COMMAND [OPTIONS]
 
 {commands}
 
-Options of a command: learn3d COMMAND --help (the common ones), --help-all (all)"""
+Options of a command: learn3d COMMAND --help (the common ones), --help-all (all)
+Tab completion in new shells:
+  mkdir -p ~/.local/share/bash-completion/completions
+  learn3d --completion bash > ~/.local/share/bash-completion/completions/learn3d
+or, with zsh and a folder in its $fpath: learn3d --completion zsh > FOLDER/_learn3d"""
 
 
 @without_traceback(MemoryError, FloatingPointError)
@@ -44,16 +50,38 @@ def main(*given: str) -> int:
     if name == "--version":
         say(metadata.version("nmr-learn3d"))
         return 0
+    if name == "--completion":
+        return print_completion(*(arguments or ["bash"]))
     if name not in COMMANDS:
         raise ValueError(unknown_name("command", name, COMMANDS))
-    place, extra, _ = COMMANDS[name]
-    module, _, kind = place.partition(":")
     try:
-        command = getattr(importlib.import_module(f"learn3d.commands.{module}"), kind)
-        return command.parse(name, arguments).run() or 0
+        return _load(name).parse(name, arguments).run() or 0
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in ("", "learn3d", "nmr"):
             raise
+        extra = COMMANDS[name][1]
         install = f"pip install '.[{extra}]' in a clone, 'FILE.whl[{extra}]' of a wheel"
         note(f"error: learn3d {name} needs the package {error.name}, which is not installed; install all: {install}")
         return 1
+
+
+def _load(name: str) -> Any:
+    """The class of a command."""
+    module, _, kind = COMMANDS[name][0].partition(":")
+    return getattr(importlib.import_module(f"learn3d.commands.{module}"), kind)
+
+
+def print_completion(shell: str, *others: str) -> int:
+    """Print the script that completes commands and options in a shell; commands that lack a package are left out."""
+    import tyro
+
+    if shell not in ("bash", "zsh", "tcsh") or others:
+        raise ValueError(f"--completion takes bash, zsh or tcsh, got {' '.join((shell, *others))!r}")
+    kinds = []
+    for name in COMMANDS:
+        with contextlib.suppress(ModuleNotFoundError):
+            kind = _load(name)
+            kinds.append(Annotated[kind.flat(kind.defaults([])), tyro.conf.subcommand(name)])
+    with contextlib.suppress(SystemExit):
+        tyro.cli(Union[tuple(kinds)], prog="learn3d", args=["--tyro-print-completion", shell])  # noqa: UP007
+    return 0

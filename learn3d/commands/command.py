@@ -12,10 +12,11 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import docstring_parser
 import tyro
+from typing_extensions import Self  # of typing from Python 3.11 on
 
 from learn3d.settings import RARE
 
@@ -43,15 +44,20 @@ class Command:
         """The command with the options that are given. Prints the help and ends if that is asked for."""
         defaults, everything = cls.defaults(arguments), "--help-all" in arguments
         brief = bool({"-h", "--help"} & set(arguments)) and not everything
-        options = list(_options(cls, defaults))
         about = cls.about(everything) if brief or everything else ""
-        if brief and any(rare for *_, rare in options):
+        if brief and any(rare for *_, rare in _options(cls, defaults)):
             about += f"\n\nlearn3d {name} --help-all shows more options."
-        fields = [(n, tyro.conf.Suppress[hint] if brief and rare else hint, field) for n, hint, field, rare in options]
         # The command is built afterwards: tyro would catch the ValueError of a value that is refused.
-        flat = dataclasses.make_dataclass(cls.__name__, fields, kw_only=True)
+        flat = cls.flat(defaults, brief)
         words = ["--help"] if everything else arguments
         return _build(cls, defaults, vars(tyro.cli(flat, args=words, prog=f"learn3d {name}", description=about)))
+
+    @classmethod
+    def flat(cls, defaults: Mapping[str, Any], brief: bool = False) -> type:
+        """A dataclass of all options, for tyro; if `brief`, it hides the rare ones."""
+        options = _options(cls, defaults)
+        fields = [(n, tyro.conf.Suppress[hint] if brief and rare else hint, field) for n, hint, field, rare in options]
+        return dataclasses.make_dataclass(cls.__name__, fields, kw_only=True)
 
     def run(self) -> int | None:
         """Do the work; returns the exit status if that is not 0."""
@@ -63,13 +69,13 @@ class OnDataset(Command):
     """Options of commands that take trained networks to a data set."""
 
     data: Path | None = None
-    """Folder of the data set (default: the one that each run was trained on)."""
+    """Folder of the data set (default: the run's training data)."""
     category: str | None = None
-    """Categories, separated by commas (default: those that each run was trained on)."""
+    """Categories, separated by commas (default: the run's)."""
     split: Split = "test"
     """Part of the data set."""
     which: Which = "last"
-    """Networks of a run to use: the last ones, or those with the best validation IoU."""
+    """Checkpoint of a run: the last one, or the one with the best validation IoU."""
 
     @property
     def source(self) -> dict[str, Any]:

@@ -47,7 +47,7 @@ class MakeDataset(Command):
 
 @dataclass(frozen=True)
 class FetchDebianModels(Command):
-    """Take airplanes, chairs, tables, cabinets, sofas and lamps out of Debian packages, into a folder of PLY meshes.
+    """Extract airplanes, chairs, tables, cabinets, sofas and lamps from Debian packages into a folder of PLY meshes.
 
     Example:
       learn3d fetch-debian-models --output models
@@ -75,11 +75,11 @@ class CheckDataset(Command):
     layout: Layout = "kato"
     """Arrangement of its files, see docs/data-sets.md."""
     category: str = ""
-    """Categories to read, by name or synset id, separated by commas (default: all that are there)."""
+    """Categories to read, by name or synset id, separated by commas (default: all)."""
     split: tuple[Split, ...] = ()
-    """Splits to read (default: all that are there)."""
+    """Splits to read (default: all)."""
     json: Path | None = None
-    """Write the report to this file, too (default: to none)."""
+    """JSON file for the report (default: none)."""
 
     def run(self) -> int:
         if self.json is not None:
@@ -110,11 +110,11 @@ class ConvertDataset(Command):
     output: Path
     """Folder for the shards. Each category and split gets a folder in it."""
     category: str = ""
-    """Categories, separated by commas (default: all that are there)."""
+    """Categories, separated by commas (default: all)."""
     layout: Layout = "kato"
     """Arrangement of the files of the data set, see docs/data-sets.md."""
     image_size: int = IMAGE_SIZE
-    """Side of the images in pixels, for layouts that keep larger ones: the size that the method's encoder takes."""
+    """Side of the images in pixels, as the method's encoder takes them; larger ones are made smaller."""
     views_per_object: Count | None = None
     """Number of training images to keep of each object (default: the layout's protocol, one for kar, else all)."""
 

@@ -24,11 +24,11 @@ class Evaluate(OnDataset):
     runs: Runs
     """Run folders, or checkpoint files."""
     layout: str | None = None
-    """Arrangement of the files of the data set (default: that of the data which each run was trained on)."""
+    """Arrangement of the files of the data set (default: from the run)."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Device on which the networks run."""
     json: Path | None = None
-    """Write the figures, with protocol and versions, to this file, too (default: to none)."""
+    """JSON file for the figures, with protocol and versions (default: none)."""
 
     @classmethod
     def about(cls, everything: bool) -> str:
@@ -62,18 +62,18 @@ class Reconstruct(OnDataset):
     """
 
     output: Path
-    """Folder for the results: of each image a mesh, a turntable GIF and a PNG strip."""
+    """Folder for the results: a mesh, a turntable GIF and a PNG strip of each image."""
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """Run folder (or checkpoint file) of the trained model (default: the small model of the package)."""
     images: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]] = ()
-    """Images of any size, with a transparent background, --masks or --plain-background (default: those of --data)."""
+    """Images of any size, with a transparent background, --masks or --plain-background (default: images of --data)."""
     masks: tuple[Path, ...] = ()
     """Mask images (white = object), one for each image (default: the transparency of the images)."""
     plain_background: bool = False
-    """The background has one colour: the object is all that differs from the colour of the border."""
+    """The background has one colour: pixels that differ from the border belong to the object."""
     box: tuple[int, int, int, int] | None = None
-    """Box around the object in the photograph, if it is a single one: X Y WIDTH HEIGHT in pixels, from the upper left.
-    The object is cut out of it (needs the extra photos)."""
+    """Box around the object in a single photograph: X Y WIDTH HEIGHT in pixels, from the upper left. The object is cut
+    out of it (needs the extra photos)."""
     crop: bool = True
     """Centre and scale the object in each image as in the data set, or leave the images as they are."""
     data: Path | None = None
@@ -81,8 +81,8 @@ class Reconstruct(OnDataset):
     indices: tuple[int, ...] = (0,)
     """Images of the data set: object * V + view, if each object has V views (Kato's: 24, Kar's: 20)."""
     refine: bool | None = None
-    """Fit shapes to the masks after the prediction: with the cameras of a data set, or with cameras that are searched,
-    which also gives image files their colours (default: image files, yes; --data, no)."""
+    """Fit the predicted shapes to the masks, with the cameras of a data set or, for image files, with estimated cameras
+    and colours (default: yes for image files, no for --data)."""
     format: Literal["glb", "obj", "ply"] = "glb"
     """Format of the mesh files."""
 

@@ -30,9 +30,9 @@ class Figures(OnDataset):
     figure: tyro.conf.Positional[Annotated[Literal["grid", "tsne", "interpolation"], tyro.conf.arg(metavar="FIGURE")]]
     """One of the figures above."""
     runs: tuple[Path, ...]
-    """Folders of training runs (or checkpoint files), in the order in which they are shown."""
+    """Run folders (or checkpoint files), in the order of the figure."""
     output: Path
-    """File to write; its ending is replaced by those of the files that the figure consists of."""
+    """File to write; the figure's own file endings replace this one."""
     labels: tuple[str, ...] = ()
     """Names of the runs (default: those of their presets)."""
     images: int | None = None
@@ -40,7 +40,7 @@ class Figures(OnDataset):
     indices: tuple[int, ...] = ()
     """Samples of the data set in a grid or an interpolation (default: as many as --images says, chosen to differ)."""
     truth: bool = False
-    """Show the true voxels in a grid, too."""
+    """Show the ground-truth voxels in a grid as well."""
 
     def run(self) -> None:
         from learn3d.figures import paper
@@ -72,7 +72,7 @@ class Report(OnDataset):
     labels: tuple[str, ...] = ()
     """Names of the runs (default: those of their presets)."""
     objects: int = 12
-    """Number of objects whose shapes are shown, spread from the best IoU to the worst."""
+    """Number of objects to show, spread from the best IoU to the worst."""
     indices: tuple[int, ...] = ()
     """Numbers of the images to show (default: as --objects says). With V views of each object, image n * V + k is view
     k of object n."""

@@ -22,7 +22,7 @@ from learn3d.terminal import is_watched, note, say
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatePoses(Command):
-    """Find out from which side each image of a data set was taken, from the masks alone, for `learn3d train --poses`.
+    """Estimate the pose of each image of a data set from the masks alone, for `learn3d train --poses`.
 
     Examples:
       learn3d estimate-poses photos --layout photos --category mug --elevation 20 --output mug-poses.npz

@@ -20,7 +20,10 @@ from learn3d.terminal import align
 
 #: Header of each measure in tables, and its definition. A measure is a mean over images, then over classes.
 MEASURES = {
-    "voxel_iou": ("voxel IoU", "of predicted and true 32^3 grids, by Kato et al. 2018 (kato18), as in the paper"),
+    "voxel_iou": (
+        "voxel IoU",
+        "IoU of predicted and true 32^3 grids, voxelizer of Kato et al. 2018 (kato18), as in the paper",
+    ),
     "voxel_iou_kato19": ("IoU (kato19)", "by Kato and Harada 2019: every cell that a face touches; not comparable"),
     "precision": ("precision", "part of the predicted voxels that is true: low if shapes are too full"),
     "recall": ("recall", "part of the true voxels that is predicted: low if parts are missing"),

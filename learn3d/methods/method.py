@@ -70,17 +70,16 @@ class MeshSettings(MethodSettings):
 
     encoder: EncoderName = "conv"
     """Network from images to codes. conv: three convolutions on 64-pixel RGB and mask. conv-light: half the channels,
-    and a fourth convolution (1x1) to 32 channels. conv-small: a fifteenth of the weights. conv-centred: a tenth, for
-    images in which every object is scaled to one size (cameras at unknown distances). conv-relu: conv with a ReLU on
+    and a fourth convolution (1x1) to 32 channels. conv-small: a fifteenth of the weights. conv-centred: a tenth of the
+    weights, for objects that are all scaled to one size (cameras at unknown distances). conv-relu: conv with a ReLU on
     the code (Kato et al. 2018). resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "sphere"
-    """Network from codes to vertices. sphere: 642 free vertices. sphere-small: the same from half the weights. bounded:
-    that of Kato et al. 2018. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or from linear
-    layers (Kato and Harada 2019)."""
+    """Network from codes to vertices. sphere: 642 free vertices. sphere-small: the same with half the weights. bounded:
+    the generator of Kato et al. 2018. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or from
+    linear layers (Kato and Harada 2019)."""
     symmetry: SymmetryOption = None
-    """Vertical plane at which shapes are mirrored: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that
-    looks along it (0 is x = 0). auto: the plane at which the training masks mirror each other, if they do. Shapes are
-    not mirrored if it is None."""
+    """Vertical mirror plane of all shapes: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
+    it (0 is x = 0). auto: found from the training masks, if they have one. Shapes are not mirrored if it is None."""
     learning_rate: Positive = 1e-4
     """Adam's learning rate, the same for all networks."""
 

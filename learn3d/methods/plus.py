@@ -38,10 +38,10 @@ class PlusSettings(PoseInvariantSettings):
     lambda_novel_view: Weight = 0.5
     """Weight of the loss at novel views."""
     bank_size: Count = 2048
-    """Number of training masks in the mask bank, from which that loss draws."""
+    """Number of training masks in the mask bank of the loss at novel views."""
     lambda_view: Weight = 0.0
-    """Weight of the loss of a network on its own that tells the azimuth of an image, from which reconstruction places
-    the camera of a picture. 0: there is none."""
+    """Weight of the loss of a small network that learns the azimuth of an image, from which reconstruction places the
+    camera of a picture. 0: there is no such network."""
 
     @property
     def reads_view_ids(self) -> bool:

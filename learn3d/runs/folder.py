@@ -5,7 +5,7 @@ last.safetensors      all that a resumption needs; a complete file at every mome
 previous.safetensors  the checkpoint before it
 best.safetensors      the networks with the best validation IoU
 metrics.jsonl         losses and measurements
-tensorboard/, pictures/
+tensorboard/ or metrics.csv or wandb.txt (the run's id there), as --log says; pictures/
 .lock                 held by the process that works here; .<name>.partial: a file being written
 """
 
@@ -23,12 +23,12 @@ import filelock
 
 from learn3d.files import writing
 
-CONFIG, METRICS = "config.json", "metrics.jsonl"
+CONFIG, METRICS, METRICS_CSV, WANDB_ID = "config.json", "metrics.jsonl", "metrics.csv", "wandb.txt"
 LAST, PREVIOUS, BEST = "last.safetensors", "previous.safetensors", "best.safetensors"
 PICTURES, TENSORBOARD, LOCK = "pictures", "tensorboard", ".lock"
 #: The files of a run in the order of their removal. The options are last: without them it is no run any more.
 WRITTEN = (LAST, PREVIOUS, BEST, METRICS, f"{PICTURES}/{'[0-9]' * 6}*.png", f"{TENSORBOARD}/events.out.tfevents.*")
-WRITTEN += (CONFIG,)
+WRITTEN += (METRICS_CSV, WANDB_ID, CONFIG)
 
 
 @contextlib.contextmanager

@@ -1,22 +1,25 @@
-"""The record of a run: progress on the terminal, metrics.jsonl, TensorBoard."""
+"""The record of a run: progress on the terminal, metrics.jsonl, and CSV, TensorBoard or Weights & Biases."""
 
 from __future__ import annotations
 
 import datetime
+import importlib.util
 import json
 import os
 import sys
 import time
+import uuid
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from tqdm import tqdm
 
+from learn3d.config import TrainConfig, config_to_dict
 from learn3d.files import writing
-from learn3d.runs.folder import METRICS, TENSORBOARD
+from learn3d.runs.folder import METRICS, METRICS_CSV, TENSORBOARD, WANDB_ID
 from learn3d.terminal import is_watched, note
 
 SECONDS_BETWEEN_LINES = 30.0
@@ -31,23 +34,22 @@ class RunLog:
     OSError if a file cannot be written.
     """
 
-    def __init__(self, folder: Path, *, start: int, total: int) -> None:
+    def __init__(self, folder: Path, *, start: int, total: int, config: TrainConfig | None = None) -> None:
         self.start, self.total = start, total
         self._recent: dict[str, deque[float]] = {}
         _drop_after(folder / METRICS, start)
         self._metrics = open(folder / METRICS, "ab")
         self._bar = tqdm(total=total, initial=start, unit="step", dynamic_ncols=True) if is_watched() else None
-        self._tensorboard: Any = None
+        self._writer: Writer | None = None
         try:
-            from torch.utils.tensorboard import SummaryWriter
-
-            self._tensorboard = SummaryWriter(str(folder / TENSORBOARD), purge_step=start + 1)
+            self._writer = _open_writer(folder, start, config)
         except (
             ImportError,
             TypeError,
             AttributeError,
-        ) as error:  # not installed, or beside packages that do not fit it
-            self.say(f"warning: tensorboard does not work ({error}); metrics go to {METRICS} only")
+        ) as error:  # not installed, or other packages do not fit
+            kind = "tensorboard" if config is None else config.log
+            self.say(f"warning: {kind} does not work ({error}); metrics go to {METRICS} only")
         self._started = self._last_line = time.monotonic()
 
     def __enter__(self) -> RunLog:
@@ -57,8 +59,8 @@ class RunLog:
         if self._bar is not None:
             self._bar.close()
         self._metrics.close()
-        if self._tensorboard is not None:
-            self._tensorboard.close()
+        if self._writer is not None:
+            self._writer.close()
 
     def step(self, step: int, losses: Mapping[str, float]) -> None:
         """Show that a step is done."""
@@ -81,17 +83,17 @@ class RunLog:
         return "  ".join(f"{name} {sum(self._recent[name]) / len(self._recent[name]):.3g}" for name in names)
 
     def metrics(self, step: int, split: str, values: Mapping[str, Any]) -> None:
-        """Append one line to metrics.jsonl and the same numbers to TensorBoard, under `split`/."""
+        """Append one line to metrics.jsonl, and give the numbers to the writer as <split>/<name>."""
         self._metrics.write(json.dumps({"step": step, "split": split, **values}).encode() + b"\n")
         self._metrics.flush()
-        for name, value in values.items():
-            if self._tensorboard is not None and isinstance(value, (int, float)):
-                self._tensorboard.add_scalar(f"{split}/{name}", value, step)
+        if self._writer is not None:
+            numbers = {name: value for name, value in values.items() if isinstance(value, (int, float))}
+            self._writer.add_numbers(step, {f"{split}/{name}": value for name, value in numbers.items()})
 
     def picture(self, step: int, name: str, rgb: np.ndarray) -> None:
-        """Add a picture uint8 [H,W,3] to TensorBoard."""
-        if self._tensorboard is not None:
-            self._tensorboard.add_image(name, rgb, step, dataformats="HWC")
+        """Give a picture uint8 [H,W,3] to the writer."""
+        if self._writer is not None:
+            self._writer.add_picture(step, name, rgb)
 
     def say(self, text: str) -> None:
         """Print a line without breaking the progress bar."""
@@ -101,8 +103,108 @@ class RunLog:
     def sync(self) -> None:
         """Put the reports so far on the disk, so that a checkpoint never lacks the metrics of its steps."""
         os.fsync(self._metrics.fileno())
-        if self._tensorboard is not None:
-            self._tensorboard.flush()
+        if self._writer is not None:
+            self._writer.flush()
+
+
+def check_log(config: TrainConfig) -> None:
+    """Raise a ValueError if the option log needs a package that is not installed. For the beginning of a run."""
+    if config.log == "wandb" and importlib.util.find_spec("wandb") is None:
+        raise ValueError("log 'wandb' needs the package wandb: pip install wandb, or choose csv or tensorboard")
+
+
+class Writer(Protocol):
+    """A second place for the metrics of a run. A resumed run repeats steps; each must be shown once."""
+
+    def add_numbers(self, step: int, values: Mapping[str, float]) -> None: ...
+
+    def add_picture(self, step: int, name: str, rgb: np.ndarray) -> None: ...
+
+    def flush(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def _open_writer(folder: Path, start: int, config: TrainConfig | None) -> Writer:
+    """The writer that the option log names. Steps after `start` of an earlier attempt are dropped."""
+    kind = "tensorboard" if config is None else config.log
+    if kind == "wandb":
+        return _Wandb(folder, config)
+    return {"csv": _Csv, "tensorboard": _TensorBoard}[kind](folder, start)
+
+
+class _Csv:
+    """metrics.csv: a row for each number, with the columns step, name, value."""
+
+    def __init__(self, folder: Path, start: int) -> None:
+        path, kept = folder / METRICS_CSV, ["step,name,value"]
+        for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:
+            step, *rest = line.split(",")
+            if step.isdecimal() and int(step) <= start and len(rest) == 2:
+                kept.append(line)
+        writing.write_bytes(path, "".join(line + "\n" for line in kept).encode(), sync=True)
+        self._file = open(path, "a")
+
+    def add_numbers(self, step: int, values: Mapping[str, float]) -> None:
+        self._file.writelines(f"{step},{name},{value}\n" for name, value in values.items())
+
+    def add_picture(self, step: int, name: str, rgb: np.ndarray) -> None:
+        """A table holds no pictures."""
+
+    def flush(self) -> None:
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class _TensorBoard:
+    """The folder tensorboard/ of the run."""
+
+    def __init__(self, folder: Path, start: int) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer = SummaryWriter(str(folder / TENSORBOARD), purge_step=start + 1)
+        self.flush, self.close = self._writer.flush, self._writer.close
+
+    def add_numbers(self, step: int, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+
+    def add_picture(self, step: int, name: str, rgb: np.ndarray) -> None:
+        self._writer.add_image(name, rgb, step, dataformats="HWC")
+
+
+class _Wandb:
+    """A run of Weights & Biases in the project learn3d. It ignores steps that it already has."""
+
+    def __init__(self, folder: Path, config: TrainConfig) -> None:
+        import wandb
+
+        path = folder / WANDB_ID
+        if not path.is_file():
+            writing.write_bytes(path, uuid.uuid4().hex[:8].encode())
+        self._image = wandb.Image
+        self._run = wandb.init(
+            project="learn3d",
+            name=folder.name,
+            id=path.read_text(),
+            resume="allow",
+            config=config_to_dict(config),
+        )
+
+    def add_numbers(self, step: int, values: Mapping[str, float]) -> None:
+        self._run.log(dict(values), step=step)
+
+    def add_picture(self, step: int, name: str, rgb: np.ndarray) -> None:
+        self._run.log({name: self._image(rgb)}, step=step)
+
+    def flush(self) -> None:
+        """Its own process writes."""
+
+    def close(self) -> None:
+        self._run.finish()
 
 
 def _drop_after(path: Path, step: int) -> None:

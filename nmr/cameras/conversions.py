@@ -2,9 +2,9 @@
 
 The worlds of these libraries are right-handed. Their cameras, converted to nmr, show the same picture.
 :class:`nmr.LookAt`, :class:`nmr.Look` and :class:`nmr.Orthographic` treat the world as left-handed, as the published
-renderer does: they show the mirror image of what a right-handed look-at camera shows, which they are with
-``right_handed=True``. Converted to another library, they put every vertex on the same pixel, so that the rotation of a
-left-handed one has determinant -1. If you need a proper rotation for it, give the other renderer mirrored vertices
+renderer does, and show a mirror image of it; with ``right_handed=True`` they are ordinary right-handed cameras.
+Converted to another library, both put every vertex on the same pixel. The rotation of a left-handed one then has
+determinant -1. If you need a proper rotation for it, give the other renderer mirrored vertices
 ``v * (1, 1, -1)`` and ``R @ diag(1, 1, -1)`` (PyTorch3D: ``diag(1, 1, -1) @ R``).
 """
 
@@ -27,7 +27,7 @@ from .projection import (
 )
 
 # Camera axes here: x right, y down, z away (OpenCV). OpenGL: right, up, towards the viewer; PyTorch3D: left, up, away.
-_HOST = {"dtype": torch.float64, "device": "cpu"}  # where cameras are computed, whatever the default device is
+_HOST = {"dtype": torch.float64, "device": "cpu"}  # cameras are computed there, whatever the default device is
 _OPENGL_AXES = torch.tensor([[1.0], [-1.0], [-1.0]], **_HOST)
 _PYTORCH3D_AXES = torch.tensor([[-1.0], [-1.0], [1.0]], **_HOST)
 
@@ -88,7 +88,7 @@ def from_opencv(
     height, width : number
         The image that K belongs to. The rendered image shows all of it, stretched if it has another shape.
     pixel_center : float
-        Coordinate of the centre of the first pixel: 0 in OpenCV, 0.5 where pixel coordinates begin at its corner
+        Coordinate of the centre of the first pixel: 0 in OpenCV, 0.5 if pixel coordinates begin at its corner
         (COLMAP; :class:`nmr.Pinhole` itself).
     fisheye : bool
         dist_coeffs are the k1, k2, k3, k4 of ``cv2.fisheye``.
@@ -96,7 +96,7 @@ def from_opencv(
     Returns
     -------
     Pinhole
-        At ``image_size=(height, width)``, a vertex that OpenCV projects to (u, v) lies in row v, column u.
+        At ``image_size=(height, width)``, a vertex that OpenCV projects to (u, v) is drawn in row v, column u.
 
     Raises
     ------

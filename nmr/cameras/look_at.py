@@ -117,7 +117,7 @@ def _between(eye: Tensor, at: Tensor) -> Tensor:
 def _posed(
     eye: Tensor, forward: Tensor, up: Tensor, right_handed: bool, dtype: torch.dtype, **rest: Tensor | bool | None
 ) -> Projection:
-    """The projection of a camera at ``eye`` with the axes of :class:`LookAt`; NaN where they are not finite."""
+    """The projection of a camera at ``eye`` with the axes of :class:`LookAt`; NaN if they are not finite."""
     eye, forward, up = (batched(x, dtype, 3) for x in (eye, forward, up))
     batch = common_batch(forward=forward, up=up)
     matrix = ops.pose(forward.expand(batch, 3), up.expand(batch, 3))
@@ -235,9 +235,9 @@ class Look(SquarePixels):
 class Orthographic(SquarePixels):
     """A camera without perspective, posed as :class:`LookAt`: ``(scale u_x, scale u_y, u_z)``.
 
-    ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half of what is seen across the shorter side of
-    the image, in world units. The published renderer's ``perspective=False`` has scale 1. Differentiable in every
-    parameter given as a tensor. ``right_handed`` as in :class:`LookAt`.
+    ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half the extent of the view across the shorter
+    side of the image, in world units. The published renderer's ``perspective=False`` has scale 1. Differentiable in
+    every parameter given as a tensor. ``right_handed`` as in :class:`LookAt`.
 
     Raises
     ------

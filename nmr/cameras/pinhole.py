@@ -28,7 +28,7 @@ class Pinhole(ProjectingCamera):
 
     ``c = R v + t``; ``p = (c_x, c_y) / c_z``, distorted; pixel ``(u, v) = K (p_x, p_y, 1)``, u right and v DOWN; then
     ``x = 2 u / width - 1``, ``y = 1 - 2 v / height``, depth ``c_z``. Pixels are counted from the corner of the first
-    one, whose centre is (0.5, 0.5); :func:`nmr.cameras.from_opencv` converts from OpenCV's, where it is (0, 0).
+    one, whose centre is (0.5, 0.5); :func:`nmr.cameras.from_opencv` converts from OpenCV's, which has it at (0, 0).
     Camera axes are x right, y down, z away: a right-handed world is not mirrored.
 
     Parameters

@@ -29,9 +29,9 @@ class Camera(Protocol):
     """
 
     def transform(self, vertices: Tensor, starts: Tensor | None = None) -> Tensor:
-        """World to renderer coordinates: ``[B, V, 3]`` to the same, where a B of 1 may grow to the camera's batch.
+        """World to renderer coordinates: ``[B, V, 3]`` to the same; a B of 1 grows to the camera's batch.
 
-        Packed vertices ``[N, 3]`` come with ``starts [B + 1, 2]``, whose first column says where each mesh begins.
+        Packed vertices ``[N, 3]`` come with ``starts [B + 1, 2]``, with the first vertex of each mesh in column 0.
         """
         ...
 
@@ -109,7 +109,7 @@ class Projection(ProjectingCamera):
         Maps p to renderer space. Its second row usually changes the sign of y, which is up there.
     distortion : Tensor [B, 4], [B, 5] or [B, 8], optional
         OpenCV's k1, k2, p1, p2, k3; with 8 also k4, k5, k6; with 4 the k1, k2, k3, k4 of a fisheye. Not used without
-        perspective. See :class:`nmr.Pinhole` for what lies beyond the reach of the formula.
+        perspective. See :class:`nmr.Pinhole` about points beyond the reach of the formula.
     perspective : bool
         False: ``p = (u_x, u_y)``.
     origin : Tensor [B, 3], optional
@@ -246,7 +246,7 @@ def as_parameter(value: Numbers, name: str, *shape: int) -> Tensor:
 
 
 def batched(tensor: Tensor, dtype: torch.dtype, *shape: int) -> Tensor:
-    """A parameter as ``[B, *shape]`` in host memory, where cameras are computed."""
+    """A parameter as ``[B, *shape]`` in host memory: cameras are computed there."""
     return tensor.to("cpu", dtype).reshape(-1, *shape)
 
 

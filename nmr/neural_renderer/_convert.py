@@ -1,4 +1,4 @@
-"""Converts what scripts pass as points, colours, sizes and faces to tensors and numbers."""
+"""Converts arguments of scripts (points, colours, sizes, faces) to tensors and numbers."""
 
 from __future__ import annotations
 

@@ -14,11 +14,11 @@ def install_as(name: str = "neural_renderer", *, replace: bool = False) -> None:
     Parameters
     ----------
     name : str
-        The name under which that code imports the package; with dots if it lies in a package of theirs
+        The name under which that code imports the package; with dots if it is part of a package of theirs
         ("external.neural_renderer").
     replace : bool
-        Take the name also if a package of that name is installed or already imported. Code that has imported it keeps
-        what it has.
+        Take the name also if a package of that name is installed or already imported. Code that has imported it
+        keeps the other one.
 
     Raises
     ------

@@ -17,7 +17,7 @@ from nmr.neural_renderer._images import read_image
 texture_wrapping_dict = {"REPEAT": 0, "MIRRORED_REPEAT": 1, "CLAMP_TO_EDGE": 2, "CLAMP_TO_BORDER": 3}
 _GREY = 0.5  # colour of faces without a material
 _LARGEST = float(np.finfo(np.float32).max)
-_MOST_BYTES = 2**30  # of an .obj or .mtl file; reading one takes some 30 times its size
+_MOST_BYTES = 2**30  # limit of an .obj or .mtl file; reading one takes some 30 times its size
 
 
 @dataclass
@@ -64,7 +64,7 @@ def load_obj(
     vertices : float32 Tensor [V, 3]
     faces : int32 Tensor [F, 3]
     textures : float32 Tensor [F, ts, ts, ts, 3]
-        Only with ``load_texture``: the image where a material has one, else its colour ``Kd``, else grey.
+        Only with ``load_texture``: the image of a material, or else its colour ``Kd``, or else grey.
 
     Raises
     ------
@@ -235,7 +235,7 @@ def _libraries(folder: str, obj: _Obj) -> Iterator[str]:
 
 
 def _image(folder: str, line: str) -> str:
-    """The file of a line ``map_Kd``, in which options may come before the name and a comment after it."""
+    """The file of a line ``map_Kd``. Options may come before the name, and a comment after it."""
     short = _without_comment(line)
     names = (line, short, (short.split() or [""])[-1])
     paths = [os.path.join(folder, name) for name in names]

@@ -35,7 +35,7 @@ def projection(
     dist_coeffs : [5] or [B, 5], or None
         k1, k2, p1, p2, k3.
     orig_size : number, (height, width), or Tensor or array [B] or [B, 1]
-        Pixels of the image that K describes. An array of two numbers is a pair where K has one matrix.
+        Pixels of the image that K describes. An array of two numbers is a pair if K has one matrix.
     eps : float
         Not used; the published one was added to the depth. A vertex in the plane of the eye gets x = y = inf here, so
         that its faces are not drawn.

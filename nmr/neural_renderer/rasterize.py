@@ -118,7 +118,7 @@ def rasterize_rgbad(
     anti_aliasing : bool
         Average 2x2 pixels of a raster of 2h x 2w.
     near, far : float
-        A pixel is covered only where near < depth < far; depth is ``far`` elsewhere.
+        A pixel is covered only if near < depth < far; depth is ``far`` elsewhere.
     eps : float
         Added to distances in the gradient; texture coordinates are clamped to at most ts - 1 - eps.
     background_color : [3] or [B, 3]
@@ -128,7 +128,7 @@ def rasterize_rgbad(
     Returns
     -------
     dict
-        "rgb" ``[B, 3, h, w]``, "alpha" ``[B, h, w]``, "depth" ``[B, h, w]``, row 0 = top, or None where not wanted.
+        "rgb" ``[B, 3, h, w]``, "alpha" ``[B, h, w]``, "depth" ``[B, h, w]``, row 0 = top, or None if not requested.
 
     Notes
     -----

@@ -47,7 +47,7 @@ class Renderer(torch.nn.Module):
     camera_direction : [3] or [B, 3]
         With "look".
     near, far : float
-        A pixel of an RGB image is covered only where near < depth < far. As published, :meth:`render_silhouettes` and
+        A pixel of an RGB image is covered only if near < depth < far. As published, :meth:`render_silhouettes` and
         :meth:`render_depth` always take 0.1, 100 and eps 1e-4; :meth:`render` and :meth:`render_rgb` take near, far and
         ``rasterizer_eps`` of the renderer.
     light_intensity_ambient, light_intensity_directional, light_color_ambient, light_color_directional, light_direction
@@ -70,7 +70,7 @@ class Renderer(torch.nn.Module):
     >>> rgb, depth, alpha = renderer(vertices, faces, textures)
     """
 
-    camera_up = (0, 1, 0)  # of the class: renderers saved whole by the published code do not have it
+    camera_up = (0, 1, 0)  # an attribute of the class: renderers saved whole by the published code lack it
 
     def __init__(
         self,

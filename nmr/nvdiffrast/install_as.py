@@ -15,8 +15,8 @@ def install_as(name: str = "nvdiffrast", *, replace: bool = False) -> None:
     name : str
         The name under which that code imports the package.
     replace : bool
-        Take the name also if a package of that name is installed or already imported. Code that has imported it keeps
-        what it has.
+        Take the name also if a package of that name is installed or already imported. Code that has imported it
+        keeps the other one.
 
     Raises
     ------

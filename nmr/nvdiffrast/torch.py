@@ -45,7 +45,7 @@ def get_log_level() -> int:
 
 
 def set_log_level(level: int) -> None:
-    """Keeps the number; there are no messages."""
+    """Keeps the number, for code that sets it; nothing is printed at any level."""
     global _log_level
     _log_level = level
 
@@ -85,7 +85,7 @@ def rasterize(
 
     ``pos [B, V, 4]`` (or ``[V, 4]`` with integer ``ranges [B, 2]``: first face and number of faces of each image) are
     clip-space positions, ``tri`` integers ``[F, 3]``, ``resolution`` is (height, width). Points with z / w outside
-    [-1, 1] are not drawn. rast is (u, v, z / w, face + 1), where u and v are the weights of the face's vertices 0 and
+    [-1, 1] are not drawn. rast is (u, v, z / w, face + 1); u and v are the weights of the face's vertices 0 and
     1; rast_db is (du/dX, du/dY, dv/dX, dv/dY) per pixel. u, v and (with ``grad_db``) rast_db are differentiable in pos
     at fixed faces per pixel. Raises TypeError and ValueError for wrong types and shapes, and RuntimeError inside of a
     :class:`DepthPeeler` of the same context.
@@ -317,7 +317,7 @@ def texture(
     """Colours ``[B, H, W, C]`` of a texture image or a cube map at coordinates of each pixel.
 
     ``tex [B or 1, h, w, C]`` has row 0 at v = 0. Cube maps are ``[B or 1, 6, h, h, C]`` with OpenGL's faces (+x, -x,
-    +y, -y, +z, -z), sampled at directions ``uv [B, H, W, 3]`` and 0 where these are 0 or not finite. ``uv_da`` are the
+    +y, -y, +z, -z), sampled at directions ``uv [B, H, W, 3]`` and 0 if these are 0 or not finite. ``uv_da`` are the
     derivatives of uv from :func:`interpolate`: the mipmap level is log2 of the longer half axis of the ellipse of
     texels that a pixel covers. ``mip_level_bias [B, H, W]`` is added, or without uv_da is the level. ``mip`` is from
     :func:`texture_construct_mip`, or a list of tensors like tex, each with half the sides of the one before, rounded

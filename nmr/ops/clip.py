@@ -40,7 +40,7 @@ def clip_faces(
     ``new_starts [B + 1, 2]`` in host memory are first new vertex and first drawn face of each mesh, then P = num_new
     and M = num_drawn. New vertices are numbered after the V of their mesh. ``source`` is the face that a drawn face is
     part of; ``corners`` says which of its corners are those of the source (0, 1, 2) or new vertices (3 + number);
-    ``ends`` are the two rows of ``vertices.reshape(-1, 3)`` that a new vertex lies between, and which corners of the
+    ``ends`` are the two rows of ``vertices.reshape(-1, 3)`` that a new vertex is between, and which corners of the
     source these are. Room that is left over is filled with faces without area.
     """
     drawn = host_empty((num_drawn, 3), dtype=torch.int64)

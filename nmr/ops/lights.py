@@ -1,4 +1,4 @@
-"""Operators: normals of meshes, lit colours, and where a camera looks from."""
+"""Operators: normals of meshes, lit colours, and the viewers of images."""
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ def _normals_shape(vertices, faces, smooth):
 def normals(vertices: Tensor, faces: Tensor, starts: Tensor | None, smooth: bool) -> Tensor:
     """Unit normals ``n((v0 - v1) x (v2 - v1))`` of faces, ``[B or 1, F, 3]`` or packed ``[M, 3]``.
 
-    smooth: of vertices, like ``vertices``: the direction of the sum of these products. 0 where there is no area.
+    smooth: normals of vertices, like ``vertices``: the direction of the sum of these products. 0 without an area.
     """
     result = host_empty(_normals_shape(vertices, faces, smooth), dtype=vertices.dtype)
     _C.normals_forward(*map(host_array, (vertices, faces, starts)), smooth, result.numpy(), num_threads())
@@ -81,7 +81,7 @@ def lit(
     """Lit colours ``[B, H, W, 3]``; 0 on background. Without parameters, the normals.
 
     colors are ``[B, H, W, 1 or 3]``, None is white; normals those of :func:`normals`; parameters ``[P]`` all values of
-    lights, and layout int64 ``[11, 3]`` where each lies: first value, rows (1 or B), lights; viewer ``[B, 5]``: see
+    lights, and layout int64 ``[11, 3]`` the place of each: first value, rows (1 or B), lights; viewer ``[B, 5]``: see
     :func:`viewer_of`; vertices and faces the meshes in world space.
     """
     result = host_empty((*face_index.shape, 3), dtype=weights.dtype)
@@ -156,10 +156,10 @@ register_autograd(lit_backward, no_second_derivative("render_rgb with lights"))
 
 @operator
 def viewer_of(matrix: Tensor, intrinsics: Tensor, origin: Tensor | None, perspective: bool) -> Tensor:
-    """From where cameras look, ``[B, 5]``; the arguments are those of a :class:`nmr.cameras.Projection`.
+    """Viewers of images, ``[B, 5]``; the arguments are those of a :class:`nmr.cameras.Projection`.
 
     Three numbers and 1: the place of the eye; or three numbers and 0: the direction towards the viewer. Then -1 if the
-    camera sees a right-handed world, else 1. 0 instead of what is not finite. Computed in float64, in single
+    camera sees a right-handed world, else 1. Values that are not finite become 0. Computed in float64, in single
     operations, which round alike on every processor. No gradient.
     """
     A = host_array(matrix).astype(np.float64)
@@ -173,7 +173,7 @@ def viewer_of(matrix: Tensor, intrinsics: Tensor, origin: Tensor | None, perspec
 
     with np.errstate(all="ignore"):
         determinant = dot(cross(x, y), z)[:, None]
-        columns = [column / determinant for column in (cross(y, z), cross(z, x), cross(x, y))]  # of the inverse
+        columns = [column / determinant for column in (cross(y, z), cross(z, x), cross(x, y))]  # columns of the inverse
         K = host_array(intrinsics).astype(np.float64)
         flip = (K[:, 0, 0] * K[:, 1, 1] - K[:, 0, 1] * K[:, 1, 0])[:, None]
         if perspective:

@@ -53,7 +53,7 @@ def soft_iou_backward(
     of_prediction: bool,
     of_target: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Gradients of :func:`soft_iou` in prediction and target; 0 where U = 0. One that is not requested is empty."""
+    """Gradients of :func:`soft_iou` in prediction and target; 0 if U = 0. One that is not requested is empty."""
     wanted = (prediction, of_prediction), (target, of_target)
     grads = [host_empty(x.shape if want else 0, dtype=x.dtype) for x, want in wanted]
     arrays = map(host_array, (prediction, target, areas, grad_iou))

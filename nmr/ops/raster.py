@@ -10,9 +10,9 @@ from ._register import operator, register_autograd
 
 
 class RasterSettings(NamedTuple):
-    """The settings of a render, in the order in which the operators take them."""
+    """The settings of a render, in the order of the operators' arguments."""
 
-    height: int  # of the image
+    height: int  # rows of the image
     width: int
     anti_aliasing: bool
     fill_back: bool

@@ -1,6 +1,6 @@
 """Operators: texture images at uv coordinates, their mipmaps, and the level of each pixel.
 
-Texels of several images, or of all levels of their mipmaps, lie end to end: ``[N, C]``. ``grids`` is int64
+Texels of several images, or of all levels of their mipmaps, are concatenated: ``[N, C]``. ``grids`` is int64
 ``[I, L, 3]`` in host memory: first texel, height and width of each level of each image; I is 1 or B.
 """
 
@@ -17,7 +17,7 @@ WRAPS = ("repeat", "clamp", "mirror")  # in the order of the kernel's numbers
 
 @operator
 def mipmaps(texels: Tensor, grids: Tensor, count: int) -> Tensor:
-    """All levels ``[count, C]`` of images ``[., C]`` that lie end to end; each texel is the mean of what it covers."""
+    """All levels ``[count, C]`` of concatenated images ``[., C]``; each texel is the mean of those that it covers."""
     pyramid = host_empty((count, texels.shape[1]), dtype=texels.dtype)
     _C.mipmaps_forward(host_array(texels), host_array(grids), pyramid.numpy(), num_threads())
     return pyramid.to(texels.device)

@@ -77,7 +77,7 @@ def renderer(**how):
 TYPES = [
     # meshes
     ("vertices must be a float tensor .* got list; use torch.as_tensor", lambda: nmr.face_normals([V], F)),
-    ("got list; .* one call for each mesh where their sizes differ", lambda: nmr.voxelize([V, V[:12]], F)),
+    ("got list; .* one call for each mesh if their sizes differ", lambda: nmr.voxelize([V, V[:12]], F)),
     (r"vertices must be float32 or float64, got float16 .*call vertices.float\(\)", lambda: render(V.half())),
     ("faces must be an integer tensor .* got ndarray; use torch.as_tensor", lambda: render(faces=F.numpy())),
     (r"integer tensor.*got float32 .* call faces.long\(\)", lambda: render(faces=F.float())),

@@ -1,4 +1,4 @@
-"""Measure the renderer and what belongs to it, beside deodr if it is installed (compare within one run only).
+"""Measure the renderer and its losses and metrics, beside deodr if it is installed (compare within one run only).
 
   bench.py all: everything below
   bench.py w1: 64 spheres, 64x64 anti-aliased

@@ -49,7 +49,7 @@ class Workload:
         return tuple(getattr(images, name) for name in self.outputs)
 
     def targets(self) -> tuple[Tensor, ...]:
-        """Images of the neighbour in the batch (of an ellipsoid if there is none)."""
+        """Images of the neighbour in the batch, or of an ellipsoid in a batch of one."""
         alone = len(self.vertices) == 1
         with torch.no_grad():
             return self.images(self.vertices * torch.tensor([1.1, 0.7, 0.9]) if alone else self.vertices.roll(1, 0))
@@ -125,7 +125,7 @@ def measure(programs: dict[str, Program], repeats: int) -> dict[str, tuple[float
 
 
 def report(title: str, programs: dict[str, Program], repeats: int) -> None:
-    """Measure and print one workload, and what its figures depend on besides the programs.
+    """Measure and print one workload, and the conditions that its figures depend on besides the programs.
 
     A load far above 0 means that the machine was busy.
     """

@@ -62,6 +62,21 @@ def test_the_program_lists_its_commands(command) -> None:
     assert command("--version")[1].strip()
 
 
+def test_tab_completes_commands_options_and_values_in_bash(command, tmp_path) -> None:
+    status, script, _ = command("--completion", "bash")
+    assert status == 0 and command("--completion", "fish")[0] == 1
+    (tmp_path / "learn3d").write_text(script)
+    ask = 'source ./learn3d; COMP_WORDS=($0 "$@"); COMP_CWORD=$#; '
+    ask += "$(complete -p learn3d | sed 's/.*-F //; s/ .*//')"
+    for words, wanted in {
+        ("rec",): "reconstruct",
+        ("train", "--log", ""): "csv tensorboard wandb",
+        ("evaluate", "--cat"): "--category",
+    }.items():
+        bash = ["bash", "-c", f"{ask}; echo ${{COMPREPLY[*]}}", "learn3d", *words]
+        assert subprocess.run(bash, cwd=tmp_path, capture_output=True, text=True).stdout.strip() == wanted
+
+
 @pytest.mark.parametrize(
     ("words", "near"),
     [

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -167,3 +169,42 @@ def test_metrics_can_be_read_back_and_later_or_damaged_ones_are_dropped(tmp_path
         pass
     assert [(m["step"], m["split"]) for m in read_metrics(tmp_path)] == [(1, "train"), (2, "train"), (3, "val")]
     assert read_metrics(tmp_path)[1]["total"] == 1.5
+
+
+@pytest.mark.usefixtures("tiny_names")
+def test_csv_has_every_number_once_after_a_resumption(tiny_run, run_folder) -> None:
+    assert train(tiny_run(run_folder, log="csv", iterations=2)).finished
+    with open(run_folder / "metrics.csv", "a") as file:
+        file.write("3,train/total,1.0\n1,tra")  # of a process that was killed after step 3
+    assert train(tiny_run(run_folder, log="csv", iterations=4), resume=True).finished
+    rows = list(csv.DictReader((run_folder / "metrics.csv").open()))
+    assert [int(row["step"]) for row in rows if row["name"] == "train/total"] == [1, 2, 3, 4]
+    assert [int(row["step"]) for row in rows if row["name"] == "val/voxel_iou"] == [2, 4]
+    assert all(float(row["value"]) >= 0 for row in rows)
+    assert not (run_folder / "tensorboard").exists()
+
+
+@pytest.mark.usefixtures("tiny_names")
+def test_wandb_is_one_run_with_the_options_numbers_and_pictures(tiny_run, run_folder, monkeypatch) -> None:
+    started, shown, finished = [], [], []
+    run = types.SimpleNamespace(
+        log=lambda values, step: shown.append((step, values)), finish=lambda: finished.append(1)
+    )
+    fake = types.ModuleType("wandb")
+    fake.init = lambda **options: started.append(options) or run
+    fake.Image = lambda rgb: rgb.shape
+    fake.__spec__ = types.SimpleNamespace()
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    for steps in (2, 4):
+        assert train(tiny_run(run_folder, log="wandb", iterations=steps), resume=steps > 2).finished
+    assert len(finished) == 2 and started[0]["id"] == started[1]["id"] and started[1]["resume"] == "allow"
+    assert started[0]["config"]["batch_size"] == 2 and started[0]["name"] == "run"
+    assert [step for step, values in shown if "train/total" in values] == [1, 2, 3, 4]
+    assert [(step, values["val"][2]) for step, values in shown if "val" in values] == [(2, 3), (4, 3)]
+
+
+def test_wandb_that_is_not_installed_is_an_error_before_anything_is_written(tiny_run, run_folder, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ValueError, match="log 'wandb' needs the package wandb: pip install wandb, or choose csv or"):
+        train(tiny_run(run_folder, log="wandb"))
+    assert not run_folder.exists()
