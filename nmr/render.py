@@ -82,7 +82,7 @@ def render(
     or colours alone. The images are the same (depth and normals up to rounding).
     ``docs/examples/draw_gradients.py`` draws the three.
 
-    Batches in colour of 8 million raster pixels or more are shaded a few images at a time, and once more for the
+    Batches in colour of 33 million raster pixels or more are shaded a few images at a time, and once more for the
     gradients, to save memory. This needs nmr's own colours and cameras; not in ``torch.compile`` and ``torch.func``.
 
     Raises
