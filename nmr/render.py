@@ -274,7 +274,8 @@ def render_silhouette(
         mirrored on the image, and the whole face is drawn wrongly. Scenes in front of the plane are the same. With near
         = 0 the plane lies at far / 1e5, with a smaller near than far / 1e8 there: nothing nearer is drawn. Without a
         camera, x and y are taken as divided by z (perspective). In float32, a near of less than a thousandth of a
-        scene around the eye can leave single pixels open where cut faces meet; take float64 or a larger near.
+        scene around the eye can leave single pixels open where cut faces meet; take float64 or a larger near
+        (a warning says so).
     eps : float
         In NMR's gradient, added to the distance between an edge and a pixel (in units of [-1, 1]). In the local one,
         the gradient is 0 if the two directions lower the loss at rates that differ by less than eps. Both as published.
