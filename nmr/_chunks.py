@@ -78,14 +78,16 @@ class _Unfit(Exception):
 def make_chunks(arguments: tuple, image_size: tuple[int, int], anti_aliasing: bool) -> Chunks | None:
     """Chunks of (vertices, faces, camera, background, colors, lights), or None if all images are drawn at once.
 
-    Colours and cameras of one's own are not cut, nor is anything in torch.compile and torch.func. Values of a wrong
-    size are left to the checks of the whole batch.
+    Colours and cameras of one's own are not cut, nor is anything in torch.compile, torch.func and torch.autocast.
+    Values of a wrong size are left to the checks of the whole batch.
     """
     vertices, faces, camera, background, *shading = arguments
     first = vertices[0] if is_list(vertices) and vertices else vertices
     if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():
         return None
     if not isinstance(first, Tensor) or first.dtype not in (torch.float32, torch.float64):
+        return None
+    if torch.is_autocast_enabled(first.device.type):  # the second shading lies outside of it
         return None
     if isinstance(camera, ProjectingCamera):
         camera = camera.for_image(*image_size).projection(first.dtype)
@@ -163,14 +165,17 @@ class _Chunked(torch.autograd.Function):
 
             with torch.enable_grad():
                 images = ctx.draw(*ctx.chunks.take(rows, leaf), face_index)
-            outputs = [
+            grads_of = [
                 (images[name], grad[rows])
                 for name, grad in zip(ctx.names, grad_images, strict=True)
                 if grad is not None
             ]
-            drawn, of_drawn = zip(*(pair for pair in outputs if pair[0].requires_grad), strict=True)
-            found = torch.autograd.grad(drawn, [x for *_, x in leaves], of_drawn, allow_unused=True)
-            del images, outputs, drawn
+            grads_of = [(image, grad) for image, grad in grads_of if image.requires_grad]
+            if not grads_of:
+                continue
+            outputs, of_outputs = zip(*grads_of, strict=True)
+            found = torch.autograd.grad(outputs, [x for *_, x in leaves], of_outputs, allow_unused=True)
+            del images, grads_of, outputs
             for (k, at, _), grad in zip(leaves, found, strict=True):
                 if grad is not None and at is None:
                     grads[k] = grad if grads[k] is None else grads[k] + grad

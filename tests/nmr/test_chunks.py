@@ -90,6 +90,19 @@ def test_chunks_draw_the_whole_batch(case, gradient, monkeypatch):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12 * float(one.abs().max()))
 
 
+def test_images_without_a_gradient_add_nothing(monkeypatch):
+    monkeypatch.setattr(_chunks, "RASTER_AT_ONCE", 4 * 8 * 8)
+    monkeypatch.setattr(_chunks, "FEWEST_CHUNKS", 2)
+    x = VERTICES.clone().requires_grad_()
+    how = dict(colors=nmr.VertexColors(VERTICES), image_size=8, gradient="none")
+    rgb = nmr.render_rgb(x, FACES, nmr.LookAt(EYES), **how)
+    assert torch.equal(rgb, nmr.render_rgb(VERTICES, FACES, nmr.LookAt(EYES), **how))
+    (rgb.sum() + x.sum()).backward()
+    assert torch.equal(x.grad, torch.ones_like(x))
+    with pytest.raises(ValueError, match="must have batch size 1 or 5"):  # not 1 or 1, as in a chunk
+        nmr.render_rgb(x, FACES, nmr.LookAt(EYES), **how | dict(colors=nmr.VertexColors(VERTICES[:3])))
+
+
 MEMORY = """
 import resource, torch, nmr
 
