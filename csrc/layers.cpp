@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "geometry.h"
+#include "insert_sorted.h"
 #include "parallel.h"
 #include "stages.h"
 

@@ -14,6 +14,7 @@
 #include <limits>
 #include <vector>
 
+#include "insert_sorted.h"
 #include "parallel.h"
 #include "soft_weights.h"
 #include "stages.h"

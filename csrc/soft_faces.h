@@ -120,13 +120,7 @@ void soft_layers_band(const SoftImage<T>& image, const SoftBand<T>& band) {
           T* depths = band.depth + ((j - band.first) * raster.width + i + n) * K;
           if (!reaches[n] || !(depth[n] < depths[K - 1])) continue;
           int32_t* face_indices = band.face_index + ((raster.height - 1 - j) * raster.width + i + n) * K;
-          int64_t k = K - 1;
-          for (; k > 0 && depth[n] < depths[k - 1]; --k) {
-            depths[k] = depths[k - 1];
-            face_indices[k] = face_indices[k - 1];
-          }
-          depths[k] = depth[n];
-          face_indices[k] = id;
+          insert_sorted(depth[n], id, K, depths, face_indices);
         }
       }
     }

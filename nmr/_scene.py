@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -15,6 +16,7 @@ from ._clip import Clipped, clip_near, clip_plane
 from ._packing import MeshBatch, is_list, pack_meshes
 from ._validate import (
     as_floats,
+    callers_level,
     check_camera,
     check_depth_range,
     check_eps,
@@ -24,6 +26,7 @@ from ._validate import (
     check_transformed,
     check_vertices,
     describe,
+    holds_for_all,
 )
 from .cameras import Camera
 from .cameras.projection import ProjectingCamera, has_perspective
@@ -33,6 +36,7 @@ from .ops.raster import RasterSettings
 from .textures import Colors
 
 LARGEST_IMAGE = 8192
+_NARROWEST = 1e-3  # part of the scene: faces that are cut nearer have images too large for float32
 
 Meshes = Tensor | Sequence[Tensor]
 
@@ -145,6 +149,14 @@ def make_scene(
     check_eps(eps, mesh.vertices.dtype)
     near = clip_plane(near, far) if check_flag(clip, "clip") else float(near)
     clipped = clip_near(world, mesh, camera, near) if clip else None
+    if clipped is not None and mesh.vertices.dtype == torch.float32 and has_perspective(camera):
+        depth = mesh.vertices.detach()[..., 2]
+        if not holds_for_all(~depth.isfinite() | (depth * _NARROWEST < near)):
+            warnings.warn(
+                f"faces are cut at depth {near:g}, less than a thousandth of the scene: in float32 single pixels may "
+                "stay open where they meet; take a larger near, or float64",
+                stacklevel=callers_level(),
+            )
     how = check_flag(anti_aliasing, "anti_aliasing"), check_flag(fill_back, "fill_back"), near, float(far), float(eps)
     settings = RasterSettings(height, width, *how, has_perspective(camera))
     return Scene(world, mesh, camera, settings, clipped)

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ._chunks import draw_chunks, make_chunks
 from ._packing import is_list
-from ._scene import Meshes, average, background_rows, make_scene, shade
-from ._validate import GRADIENTS, as_positive, check_choice, check_number, check_size
+from ._scene import LARGEST_IMAGE, Meshes, Scene, average, background_rows, make_scene, shade
+from ._validate import GRADIENTS, as_positive, check_choice, check_flag, check_image_size, check_number, check_size
 from .cameras import Camera
 from .fragments import Fragments
 from .images import OUTPUTS, Images
@@ -81,6 +82,9 @@ def render(
     or colours alone. The images are the same (depth and normals up to rounding).
     ``docs/examples/draw_gradients.py`` draws the three.
 
+    Batches in colour of 33 million raster pixels or more are shaded a few images at a time, and once more for the
+    gradients, to save memory. This needs nmr's own colours and cameras; not in ``torch.compile`` and ``torch.func``.
+
     Raises
     ------
     TypeError, ValueError
@@ -96,8 +100,37 @@ def render(
     if not listed or not outputs or len(set(outputs)) != len(outputs):
         raise ValueError(f"outputs must be a tuple of one or more different names out of {OUTPUTS}, got {outputs!r}")
     check_choice(gradient, "gradient", GRADIENTS)
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
+
+    def scene_of(vertices, faces, camera, *shading):
+        return make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
+
+    def draw(vertices, faces, camera, background, colors, lights, face_index=None):
+        how = interpolation_gradient, gradient, smooth_normals
+        return _draw(scene_of(vertices, faces, camera), face_index, outputs, background, colors, lights, *how)
+
+    arguments, chunks = (vertices, faces, camera, background, colors, lights), None
+    if "rgb" in outputs and "fragments" not in outputs and not (colors is None and lights is None):
+        size = check_image_size(image_size, LARGEST_IMAGE)
+        chunks = make_chunks(arguments, size, check_flag(anti_aliasing, "anti_aliasing"))
+    if chunks is None:
+        return Images(draw(*arguments))
+    return Images(draw_chunks(chunks, lambda *some: scene_of(*some).rasterize(), draw))
+
+
+def _draw(
+    scene: Scene,
+    face_index: Tensor | None,
+    outputs: Sequence[str],
+    background: float | Sequence[float] | Tensor,
+    colors: Colors | None,
+    lights: Lights | None,
+    interpolation_gradient: bool,
+    gradient: str,
+    smooth_normals: bool,
+) -> dict[str, Tensor | Fragments]:
+    """The outputs of :func:`render`. If the face index map is known, it is not drawn again."""
     images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the requested order
+    anti_aliasing = scene.settings.anti_aliasing
     white = "rgb" in images and colors is None and lights is None
     if white:
         behind = background_rows(background, 3, scene.mesh.batch, scene.mesh.vertices)
@@ -109,7 +142,7 @@ def render(
         if white:
             covered = alpha.unsqueeze(-1)
             images["rgb"] = covered + (1 - covered) * behind[:, None, None]
-    else:
+    elif face_index is None:
         face_index = scene.rasterize()
     local = gradient == "local" and ("depth" in images or "normals" in images)
     if "depth" in images and not local:
@@ -135,7 +168,7 @@ def render(
             )
         if "fragments" in images:
             images["fragments"] = fragments
-    return Images(images)
+    return images
 
 
 def _finite(values: Tensor) -> bool:
@@ -241,7 +274,8 @@ def render_silhouette(
         mirrored on the image, and the whole face is drawn wrongly. Scenes in front of the plane are the same. With near
         = 0 the plane lies at far / 1e5, with a smaller near than far / 1e8 there: nothing nearer is drawn. Without a
         camera, x and y are taken as divided by z (perspective). In float32, a near of less than a thousandth of a
-        scene around the eye can leave single pixels open where cut faces meet; take float64 or a larger near.
+        scene around the eye can leave single pixels open where cut faces meet; take float64 or a larger near
+        (a warning says so).
     eps : float
         In NMR's gradient, added to the distance between an edge and a pixel (in units of [-1, 1]). In the local one,
         the gradient is 0 if the two directions lower the loss at rates that differ by less than eps. Both as published.

@@ -1,6 +1,7 @@
 """tools/bench/bench.py: every program does the same work, and each workload runs."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,21 @@ def test_every_program_of_a_workload_is_timed(command, capsys, workload, rows):
     for line in lines:
         forward, total, fastest, ratio = map(float, line.split()[-4:])
         assert 0 <= forward <= total == fastest < 10_000 and ratio > 0
+
+
+def test_the_table_of_peers_names_all_and_measures_those_that_are_there(monkeypatch, capsys):
+    def blurred(work):
+        row = bench_peers._depth(work, "none", lambda: torch.zeros(1, work.size, work.size))
+        return replace(row, theirs=lambda v: row.ours(v) + shift)
+
+    monkeypatch.setattr(bench_peers, "PEERS", (*((make, 2, 64) for make, *_ in bench_peers.PEERS), (blurred, 1, 16)))
+    shift = 0.0
+    bench_peers.print_table(1)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 7 and "depth, 80 faces, 16 px | none" in lines[-1] and all(x.count("|") >= 5 for x in lines)
+    shift = 0.01
+    with pytest.raises(SystemExit, match="nmr and none draw different images"):
+        bench_peers.print_table(1)
 
 
 def test_unknown_workloads_are_named(command, capsys):

@@ -1,5 +1,6 @@
 """Faces that cross the near plane: what is seen of them is what finer meshes show, with gradients to their corners."""
 
+import warnings
 from dataclasses import replace
 
 import pytest
@@ -189,6 +190,20 @@ def test_near_zero():
     assert torch.equal(alpha, nmr.render_silhouette(*floor(150), CAMERA, image_size=SIZE, near=0.0))
     tiny = [nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=near) for near in (1e-6, 1e-7, 1e-12)]
     assert torch.equal(tiny[0], tiny[1]) and torch.equal(tiny[0], tiny[2]) and (tiny[0] >= alpha).all()
+
+
+@pytest.mark.parametrize(
+    ("near", "dtype", "warned"),
+    [(1e-4, torch.float32, True), (0.05, torch.float32, False), (1e-4, torch.float64, False)],
+)
+def test_a_near_too_small_for_float32_is_warned_of(near, dtype, warned):
+    vertices, faces = nmr.icosphere(1)
+    how = dict(camera=nmr.Look([0.0, 0.0, 0.0], [0.0, 0.0, 1.0]), image_size=8, near=near)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        nmr.render_silhouette(2 * vertices.to(dtype), faces, **how)
+    assert [str(w.message)[:24] for w in caught] == ["faces are cut at depth 0"] * warned
+    assert all(w.filename == __file__ for w in caught)
 
 
 @pytest.mark.parametrize("camera", [CAMERA, nmr.Orthographic([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])])

@@ -7,6 +7,7 @@
   bench.py w4: w1 with depth instead of silhouettes
   bench.py colors: w1 in colour, with one thread: white, vertex colours, texture images, lights
   bench.py voxels: voxel IoU of 1000 predictions
+  bench.py peers: one thread of ours beside deodr, PyTorch3D, Open3D and Mesa, as a table in Markdown
   bench.py step: a whole training step in bf16 and in fp32, and the time of its networks alone
 
 Medians over repeats that alternate between the programs, and the fastest, in milliseconds. Freed memory is kept for
@@ -101,6 +102,11 @@ def bench_voxels(options: Options) -> None:
     report("voxels: voxel IoU of 1000 meshes of 1280 faces at 32^3", programs, min(options.repeats, 5))
 
 
+def bench_peers(options: Options) -> None:
+    """Each peer that is installed."""
+    peers.print_table(options.repeats)
+
+
 def bench_step(options: Options) -> None:
     """The difference of a step and of its networks is small beside both: distrust it if two calls disagree."""
     torch.set_num_threads(options.threads)
@@ -109,7 +115,7 @@ def bench_step(options: Options) -> None:
 
 
 BENCHES = {name: partial(bench_render, name) for name in ("w1", "w2", "w3", "w4")}
-BENCHES |= {"colors": bench_colors, "voxels": bench_voxels, "step": bench_step}
+BENCHES |= {"colors": bench_colors, "voxels": bench_voxels, "peers": bench_peers, "step": bench_step}
 
 
 @without_traceback()

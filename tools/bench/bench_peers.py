@@ -1,16 +1,24 @@
-"""deodr for the same work: a 2.5-D renderer with derivatives, one mesh at a time on one thread."""
+"""Other renderers for the same work: deodr, PyTorch3D, Open3D and OSMesa, each if it is installed.
+
+deodr is a 2.5-D renderer with derivatives, for one mesh at a time on one thread. OSMesa is called by pyrender.
+"""
 
 from __future__ import annotations
 
 import importlib.util
+import math
+import os
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
 import torch
-from bench_work import Program, Timing, Workload
+from bench_work import Program, Timing, Workload, deformed_spheres, measure
 from torch import Tensor
 
 import nmr
@@ -123,3 +131,137 @@ def deodr_programs(
         return max(forward for forward, _ in times), max(total for _, total in times)  # the slowest counts
 
     return programs | {f"deodr, {processes} processes": run_parts}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One row of the table: ``ours`` and ``theirs`` draw images of the same vertices ``[1, V, 3]``."""
+
+    title: str
+    peer: str
+    vertices: Tensor
+    ours: Callable[[Tensor], Tensor]
+    theirs: Callable[[Tensor], Tensor]
+    gradient: bool = True
+
+    def run(self, draw: Callable[[Tensor], Tensor]) -> Timing:
+        leaf = self.vertices.clone().requires_grad_(self.gradient)
+        start = time.perf_counter()
+        image = draw(leaf)
+        forward = time.perf_counter()
+        if self.gradient:
+            (image - 0.5).square().mean().backward()
+        return forward - start, time.perf_counter() - start
+
+    def check(self) -> None:
+        with torch.no_grad():
+            ours, theirs = self.ours(self.vertices), self.theirs(self.vertices)
+        background = FAR if ours.max() > 1 else 0.0
+        wrong = (ours - theirs)[(ours != background) | (theirs != background)].abs().median()
+        if not wrong < 5e-3:  # pyrender's depth is that of a sample beside the centre
+            raise SystemExit(f"{self.title}: nmr and {self.peer} draw different images (median {float(wrong):.1e})")
+
+
+def against_deodr(work: Workload) -> Comparison:
+    mesh, place = deodr_mesh(work.faces), work.camera.transform
+    return Comparison(
+        f"silhouette with gradient, {work.faces_and_size}",
+        "deodr",
+        work.vertices,
+        lambda v: nmr.render_silhouette(place(v), work.faces, image_size=work.size, anti_aliasing=False),
+        lambda v: DeodrImages.apply(place(v), work.size, mesh, "alpha"),
+    )
+
+
+def against_pytorch3d(work: Workload) -> Comparison:
+    """The vertices are in renderer space; PyTorch3D's x points to the left."""
+    from pytorch3d.renderer.mesh.rasterize_meshes import rasterize_meshes
+    from pytorch3d.structures import Meshes
+
+    sigma, faces_per_pixel = 1e-4, 50
+    blur, flip = math.log(1 / 1e-4 - 1) * sigma, torch.tensor([-1.0, 1.0, 1.0])
+
+    def theirs(vertices: Tensor) -> Tensor:
+        meshes = Meshes(vertices * flip, work.faces.expand(len(vertices), -1, -1))
+        found, _, _, distances = rasterize_meshes(meshes, work.size, blur, faces_per_pixel)
+        return 1 - (1 - torch.sigmoid(-distances / sigma) * (found >= 0)).prod(-1)
+
+    return Comparison(
+        f"soft silhouette with gradient, {work.faces_and_size}",
+        "PyTorch3D",
+        work.camera.transform(work.vertices),
+        lambda v: nmr.render_soft_silhouette(v, work.faces, sigma=sigma, image_size=work.size),
+        theirs,
+    )
+
+
+def _depth(work: Workload, peer: str, theirs: Callable[[], Tensor]) -> Comparison:
+    how = dict(image_size=work.size, anti_aliasing=False)
+    title = f"depth, {work.faces_and_size}"
+    ours = lambda v: nmr.render_depth(v, work.faces, work.camera, **how)  # noqa: E731
+    return Comparison(title, peer, work.vertices, ours, lambda v: theirs(), gradient=False)
+
+
+def _in_camera(work: Workload) -> tuple[np.ndarray, float]:
+    """Vertices in camera axes (x right, y up, z away), and the tangent of half the field of view."""
+    tangent = math.tan(math.radians(float(work.camera.half_fov_deg)))
+    points = work.camera.transform(work.vertices)[0].double()
+    points[:, :2] *= points[:, 2:] * tangent
+    return points.float().numpy(), tangent
+
+
+def against_open3d(work: Workload) -> Comparison:
+    """Open3D's ray caster; the mesh and its tree of boxes are kept."""
+    import open3d
+
+    points, tangent = _in_camera(work)
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(points, work.faces.numpy().astype(np.uint32))
+    centres = ((np.arange(work.size) + 0.5) * 2 / work.size - 1) * tangent
+    rays = np.zeros((work.size, work.size, 6), dtype=np.float32)
+    rays[..., 3], rays[..., 4], rays[..., 5] = centres[None], -centres[:, None], 1
+
+    def theirs() -> Tensor:
+        hits = scene.cast_rays(open3d.core.Tensor(rays), nthreads=torch.get_num_threads())["t_hit"]
+        return torch.from_numpy(hits.numpy()).clamp(max=FAR)[None]
+
+    return _depth(work, "Open3D", theirs)
+
+
+def against_osmesa(work: Workload) -> Comparison:
+    """OSMesa behind pyrender (or Mesa's EGL, with PYOPENGL_PLATFORM=egl); the mesh is kept."""
+    os.environ.setdefault("PYOPENGL_PLATFORM", "osmesa")
+    import pyrender
+
+    points, tangent = _in_camera(work)
+    mesh = pyrender.Primitive(positions=points * np.float32([1, 1, -1]), indices=work.faces.flip(1).numpy())
+    scene = pyrender.Scene()
+    scene.add(pyrender.Mesh([mesh]))
+    scene.add(pyrender.PerspectiveCamera(2 * math.atan(tangent), znear=0.1, zfar=FAR, aspectRatio=1.0))
+    renderer = pyrender.OffscreenRenderer(work.size, work.size)
+
+    def theirs() -> Tensor:
+        depth = torch.from_numpy(renderer.render(scene, flags=pyrender.RenderFlags.DEPTH_ONLY).copy())
+        return torch.where(depth > 0, depth, FAR)[None]
+
+    return _depth(work, "Mesa", theirs)
+
+
+# Each with the subdivisions of its sphere and the size of its images.
+PEERS = ((against_deodr, 3, 256), (against_pytorch3d, 3, 64), (against_open3d, 4, 512), (against_osmesa, 4, 512))
+
+
+def print_table(repeats: int, size: int | None = None) -> None:
+    """A table in Markdown of those peers that are installed, one thread each."""
+    torch.set_num_threads(1)
+    print("| one thread, milliseconds | peer | nmr | |\n|---|---|---|---|")
+    for against, subdivisions, pixels in PEERS:
+        try:
+            row = against(deformed_spheres(1, subdivisions, size or pixels, anti_aliasing=False))
+        except Exception as error:  # libraries behind bindings fail in their own ways
+            print(f"| ({against.__name__}: {type(error).__name__}, {str(error).splitlines()[0]}) | | | |")
+            continue
+        row.check()
+        times = measure({"theirs": partial(row.run, row.theirs), "ours": partial(row.run, row.ours)}, repeats)
+        theirs, ours = (times[name][1] for name in ("theirs", "ours"))
+        print(f"| {row.title} | {row.peer} {theirs:.1f} | {ours:.1f} | {theirs / ours:.1f} times |", flush=True)

@@ -35,6 +35,10 @@ class Workload:
         size = f"{self.size}x{self.size}" + " anti-aliased" * self.anti_aliasing
         return f"{', '.join(self.outputs)}, {len(self.vertices)} meshes of {len(self.faces)} faces, {size}"
 
+    @property
+    def faces_and_size(self) -> str:
+        return f"{len(self.faces):,} faces, {self.size} px"
+
     def images(self, vertices: Tensor, values: Tensor | None = None) -> tuple[Tensor, ...]:
         """Our images of ``vertices`` with the colours ``values``, in the order of ``outputs``."""
         options = {"image_size": self.size, "anti_aliasing": self.anti_aliasing}
