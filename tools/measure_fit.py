@@ -35,12 +35,10 @@ def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = 
             batch = dataset.batch(torch.tensor([index]))
             (image,), mask = batch.images, centre(batch.masks[:, None])[0, 0]
             fitted = fit(model.method, image, mask, view_probabilities=view_probabilities(model, image))
+            code = model.method.encode(batch.images)
             ious = [
                 float(nmr.metrics.voxel_iou(dataset.voxelize(shape, model.method.faces), batch.voxels))
-                for shape in (
-                    model.method.decode(model.method.encode(batch.images)).vertices,
-                    fitted.vertices[None].clamp(-0.499, 0.499),
-                )
+                for shape in (model.method.decode(code).vertices, fitted.vertices[None].clamp(-0.499, 0.499))
             ]
             apart = wrap_deg(fitted.view.azimuth_deg - azimuths_deg(batch.poses))
             warned = recognize(model, image)[1] is not None
