@@ -18,13 +18,22 @@ import nmr
 from learn3d.config import TrainConfig
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.dataset import MASK_SIZE
-from learn3d.data.framing import OBJECT_SHARE, Crops, check_mask, mask_box, read_photo, read_picture, threshold_mask
+from learn3d.data.framing import (
+    OBJECT_SHARE,
+    Crops,
+    check_mask,
+    largest_region,
+    mask_box,
+    read_photo,
+    read_picture,
+    threshold_mask,
+)
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
 from learn3d.data.poses import Poses
 from learn3d.files import limits, writing
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, cut_out
-from learn3d.fitting.familiarity import MOST, distance
+from learn3d.fitting.familiarity import KnownCodes
 from learn3d.fitting.fit import SHARE, Progress, belief, fit
 from learn3d.methods import MeshMethod, Method
 from learn3d.methods.many_views import ManyViews
@@ -33,11 +42,12 @@ from learn3d.networks.encoders import centre
 from learn3d.pictures.sheets import natural_colors, save_gif, save_png, tile
 from learn3d.pictures.surfaces import Surface, azimuths_deg, draw_around, turntable
 from learn3d.runs import checkpoint
-from learn3d.runs.export import KNOWN_CODES, SMALL_MODEL
 from learn3d.terminal import note
 
 MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 
+SMALL_MODEL = Path(__file__).with_name("models") / "small.safetensors"  # the one that comes with the package
+KNOWN_CODES = "known_codes", "other_codes", "code_weights"  # names of the tensors of `KnownCodes`
 STRIP_SIZE = 192  # pixels
 _FINE = 4  # pixels, per side, that are averaged to one of a prepared image, or more
 _LARGE = 1024  # pixels a side in which an object before a plain background is searched for
@@ -51,7 +61,7 @@ class Model(NamedTuple):
     method: Method
     config: TrainConfig
     object_share: float  # of the side of its training images that objects take
-    known_codes: Tensor | None = None  # of `fitting.familiarity`; None: not said in its file
+    known_codes: KnownCodes | None = None  # None: not said in its file
 
     def prepare(self, colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
         """`prepare_image` for these networks."""
@@ -63,7 +73,8 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     """The model of a run folder or checkpoint file; None: the small one that comes with the package."""
     path = checkpoint.find(run or SMALL_MODEL, which)
     method, config, metadata = checkpoint.load_method(path)
-    known_codes = checkpoint.load(path)[0].get(KNOWN_CODES)
+    known = list(map(checkpoint.load(path)[0].get, KNOWN_CODES))
+    known_codes = None if known[0] is None else KnownCodes(*known)
     return Model(method, config, metadata.progress.object_share or OBJECT_SHARE, known_codes)
 
 
@@ -144,7 +155,9 @@ def _read(
     side = _LARGE if find is threshold_mask else limits.IMAGE_SIDE  # a box counts the file's own pixels
     colors, mask = read_picture(path, side) if searched else read_photo(path, mask_path)
     if searched and (mask is None or find is not threshold_mask):  # a box is to be cut out, transparent or not
-        mask = find(colors)
+        mask, more = largest_region(find(colors))
+        if more:
+            note(f"note: {path}: several parts were found, and only the largest is used")
     try:
         check_mask(mask, cropped=not searched)
     except ValueError as error:
@@ -203,6 +216,7 @@ class Reconstruction(NamedTuple):
     stored: np.ndarray  # uint8 [4, S, S]: the image that the network saw
     azimuth_deg: float  # from which the shape looks like the picture
     silhouette_iou: float | None  # IoU of the fitted shape's silhouette and the mask; None: it was not fitted
+    kind: str | None  # category that the model takes it for; None: it knows only one, or was not asked
     warning: str | None  # why the shape is to be doubted
 
 
@@ -225,7 +239,8 @@ def reconstruct_picture(
     probabilities = view_probabilities(model, image)
     if not refined or not isinstance(method, MeshMethod):
         (surface,) = reconstruct(method, stored[None])
-        return Reconstruction(surface, stored, input_azimuth_deg(surface, stored[3], probabilities), None, None)
+        azimuth_deg = input_azimuth_deg(surface, stored[3], probabilities)
+        return Reconstruction(surface, stored, azimuth_deg, None, None, None)
     fine = prepare_image(colors, mask, object_share=SHARE, size=_COLORED, layout="kar")  # colours as they are
     small = nn.functional.interpolate(
         torch.from_numpy(fine[None, 3:]).float() / 255, (MASK_SIZE, MASK_SIZE), mode="area"
@@ -234,7 +249,7 @@ def reconstruct_picture(
     surface = color_mesh(
         fitted.vertices, method.faces, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], method.generator.reflection
     )
-    return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, doubt(model, image))
+    return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, *recognize(model, image))
 
 
 def view_probabilities(model: Model, image: Tensor) -> Tensor | None:
@@ -247,15 +262,19 @@ def view_probabilities(model: Model, image: Tensor) -> Tensor | None:
     return None if probabilities is None else probabilities[0]
 
 
-def doubt(model: Model, image: Tensor) -> str | None:
-    """A warning if a stored image uint8 [4, S, S] shows something that the model does not know."""
+def recognize(model: Model, image: Tensor) -> tuple[str | None, str | None]:
+    """The category for which a stored image uint8 [4, S, S] is taken, if there are several, and a warning if it shows
+    something that the model does not know.
+    """
     if model.known_codes is None:
-        return None
+        return None, None
     (code,) = model.method.encode(image[None]).float().cpu()
-    if distance(code, model.known_codes) <= MOST:
-        return None
-    kinds = model.config.category.replace(",", ", ")
-    return f"this looks like nothing that the model was trained on ({kinds}), so its shape is a guess"
+    kinds = [kind.strip() for kind in model.config.category.split(",")]
+    kind = kinds[model.known_codes.nearest_kind(code)] if len(kinds) > 1 else None
+    if not model.known_codes.is_strange(code):
+        return kind, None
+    known = ", ".join(kinds)
+    return kind, f"this looks like nothing that the model was trained on ({known}), so its shape is a guess"
 
 
 @torch.no_grad()

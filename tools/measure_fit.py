@@ -12,11 +12,10 @@ import tyro
 import nmr
 from learn3d.data.layouts import Layout, load_dataset
 from learn3d.data.poses import wrap_deg
-from learn3d.fitting.familiarity import MOST, distance
 from learn3d.fitting.fit import fit
 from learn3d.networks.encoders import centre
 from learn3d.pictures.surfaces import azimuths_deg
-from learn3d.reconstruction import load_model, view_probabilities
+from learn3d.reconstruction import load_model, recognize, view_probabilities
 
 COLUMNS = ("predicted", "code fitted", "vertices fitted", "voxels predicted", "voxels fitted", "azimuth", "warned")
 
@@ -42,7 +41,7 @@ def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = 
                 for shape in (model.method.decode(code).vertices, fitted.vertices[None].clamp(-0.499, 0.499))
             ]
             apart = wrap_deg(fitted.view.azimuth_deg - azimuths_deg(batch.poses))
-            warned = model.known_codes is not None and distance(code[0], model.known_codes) > MOST
+            warned = recognize(model, image)[1] is not None
             row = (fitted.predicted_iou, fitted.code_iou, fitted.iou, *ious, float(apart.abs()) < 20, warned)
             rows.append(row)
         print(f"{name:12}", *(f"{value:16.3f}" for value in np.mean(rows, axis=0)), flush=True)

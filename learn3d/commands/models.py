@@ -131,10 +131,13 @@ class Export(Command):
     """File to write, .safetensors."""
     which: Which = "last"
     """Networks of a run to use: the last ones, or those with the best validation IoU."""
+    others: Path | None = None
+    """Folder of PNG files with transparency that show other things: `reconstruct` warns of their like (default: it
+    warns of all that is far from the training images)."""
 
     def run(self) -> None:
         from learn3d.runs.export import export
 
         check_target(self.output, "--output")
-        size = export(self.source, self.output, which=self.which)
+        size = export(self.source, self.output, which=self.which, others=self.others)
         say(f"{self.output} ({size / 1e6:.1f} MB)")

@@ -104,7 +104,7 @@ def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
 
 
 def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-    """The largest region, without its holes, whose colour is not that of the picture's border: uint8 [H,W], 0 or 255.
+    """All that has not the colour of the picture's border, without holes: uint8 [H,W], 0 or 255.
 
     colors: uint8 [H,W,3]. The background's colour is the median of the border; what differs from it by less than
     `tolerance` (0 .. 1, of the largest difference in any channel) is background.
@@ -113,11 +113,19 @@ def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarr
 
     border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]])
     difference = np.abs(colors - np.median(border, axis=0)).max(axis=2)
-    regions, count = ndimage.label(difference > 255 * tolerance)
-    if count == 0:
-        return np.zeros(colors.shape[:2], np.uint8)
-    largest = regions == 1 + np.bincount(regions.ravel())[1:].argmax()
-    return 255 * ndimage.binary_fill_holes(largest).astype(np.uint8)
+    return 255 * ndimage.binary_fill_holes(difference > 255 * tolerance).astype(np.uint8)
+
+
+def largest_region(mask: np.ndarray) -> tuple[np.ndarray, bool]:
+    """The largest connected region of a mask uint8 [H,W]; whether another one has a tenth of its pixels or more."""
+    from scipy import ndimage
+
+    regions, count = ndimage.label(mask > 127)
+    if count < 2:
+        return mask, False
+    sizes = np.bincount(regions.ravel())[1:]
+    second, first = np.sort(sizes)[-2:]
+    return np.where(regions == 1 + sizes.argmax(), mask, np.uint8(0)), bool(10 * second >= first)
 
 
 def mask_box(mask: np.ndarray) -> tuple[int, int, int, int]:

@@ -12,7 +12,7 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
-from learn3d.data.framing import check_mask, mask_box
+from learn3d.data.framing import check_mask, largest_region, mask_box
 from learn3d.fitting.cutting import Box, correct, cut_out, find_mask
 from learn3d.make_data.shapes import make_shape
 from learn3d.make_data.writers.around import natural_look
@@ -49,20 +49,22 @@ def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> P
     return Picture(np.ascontiguousarray(planes[..., :3]), planes[..., 3].copy(), strokes, box)
 
 
-def find_object(picture: Picture) -> np.ndarray:
-    """The object's mask uint8 [H, W]: within the box, by the strokes, as given, or else looked for."""
+def find_object(picture: Picture) -> tuple[np.ndarray, bool]:
+    """The object's mask uint8 [H, W]: by the strokes, as given, or the largest part of what is found in box or picture;
+    whether there were other large parts.
+    """
     if picture.box is not None:
-        return cut_out(picture.colors, picture.box)
+        return largest_region(cut_out(picture.colors, picture.box))
     if picture.strokes is not None:
-        return correct(picture.colors, picture.mask, picture.strokes)
-    return find_mask(picture.colors) if picture.mask.min() == 255 else picture.mask
+        return correct(picture.colors, picture.mask, picture.strokes), False
+    return largest_region(find_mask(picture.colors)) if picture.mask.min() == 255 else (picture.mask, False)
 
 
 def make_meshes(models: Mapping[str, Model], picture: Picture, tell: Tell) -> None:
     """Tell the mask, the progress, and in the end the meshes of all models, or an error as a sentence."""
     try:
-        mask = find_object(picture)
-        tell({"mask": _base64(np.packbits(mask > 127).tobytes())})
+        mask, more = find_object(picture)
+        tell({"mask": _base64(np.packbits(mask > 127).tobytes()), "more": more})
         try:
             check_mask(mask, cropped=True)
         except ValueError:
@@ -79,7 +81,13 @@ def _mesh(label: str, model: Model, colors: np.ndarray, mask: np.ndarray, tell: 
     angle = np.radians(made.azimuth_deg)
     x, _, z = np.array([np.sin(angle), 0.0, -np.cos(angle)]) @ mesh_to_object()
     glb = mesh_bytes(made.surface, "glb", "object")
-    return {"label": label, "glb": _base64(glb), "yaw": float(np.arctan2(x, z)), "warning": made.warning}
+    return {
+        "label": label,
+        "glb": _base64(glb),
+        "yaw": float(np.arctan2(x, z)),
+        "kind": made.kind,
+        "warning": made.warning,
+    }
 
 
 def example(category: str) -> bytes:

@@ -43,8 +43,8 @@ def cut_out(colors: np.ndarray, box: Box | None = None) -> np.ndarray:
     """GrabCut (Rother et al. 2004): the mask uint8 [H, W], 0 or 255, of the object within a box of a photograph.
 
     colors: uint8 [H, W, 3]. What lies outside of the box is background, and teaches its colours. Without a box it is
-    the picture without a narrow border. Only the largest region is kept, without its holes. Raises ValueError
-    without OpenCV and for a box that does not lie in the picture or has no room around it.
+    the picture without a narrow border. Holes are filled. Raises ValueError without OpenCV, and for a
+    box that does not lie in the picture or has no room around it.
     """
     cv2 = _opencv()
     height, width = colors.shape[:2]
@@ -65,11 +65,8 @@ def cut_out(colors: np.ndarray, box: Box | None = None) -> np.ndarray:
         cv2.setRNGSeed(0)
         models = np.zeros((1, 65)), np.zeros((1, 65))
         cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), labels, None, *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
-    regions, count = ndimage.label((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
-    if count == 0:
-        return np.zeros((height, width), np.uint8)
-    largest = ndimage.binary_fill_holes(regions == 1 + np.bincount(regions.ravel())[1:].argmax())
-    mask = Image.fromarray(255 * largest.astype(np.uint8)).resize((width, height), Image.Resampling.BILINEAR)
+    inside = ndimage.binary_fill_holes((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
+    mask = Image.fromarray(255 * inside.astype(np.uint8)).resize((width, height), Image.Resampling.BILINEAR)
     return 255 * (np.asarray(mask) > 127).astype(np.uint8)
 
 

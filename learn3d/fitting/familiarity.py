@@ -1,6 +1,9 @@
-"""Whether a model has seen the like of a picture: how far its code lies from those of the training images."""
+"""For what a model takes a picture, and whether it has seen the like: by known codes near the picture's code."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,23 +14,75 @@ from torch import Tensor
 from learn3d.data.dataset import ViewDataset
 from learn3d.methods import MeshMethod
 
-CENTRES = 240  # that stand for all codes
+CENTRES = 120  # that stand for all codes of the training images, and as many for other things
 IMAGES = 4000  # training images whose codes are clustered
-MOST = 0.7  # distance above which a picture is called unknown
+MOST = 0.82  # distance above which a picture is called unknown if no other things were learnt
+OTHER = 0.54  # score of `KnownCodes.resemblance` above which it is called unknown
 _NEAREST = 3
+_SHARPNESS, _RIDGE = 4.0, 0.5  # of the radial functions, and of their ridge regression
+
+
+class KnownCodes(NamedTuple):
+    """Directions of codes: centres of clusters (k-means)."""
+
+    kinds: Tensor  # float [N, K, C], of the training images of N categories
+    others: Tensor | None = None  # float [M, C], of pictures of other things
+    weights: Tensor | None = None  # float [N K + M], of all centres in `resemblance`
+
+    def nearest_kind(self, code: Tensor) -> int:
+        """The category whose codes are nearest to a code [C]."""
+        return int(torch.stack([_distance(code, centres) for centres in self.kinds]).argmin())
+
+    def resemblance(self, code: Tensor) -> float:
+        """How much a code [C] is like those of other things: 1 for their like, -1 for the like of training images."""
+        centres = torch.cat([self.kinds.flatten(0, 1), self.others]).float()
+        return float(_radial(F.normalize(code[None], dim=1), centres)[0] @ self.weights.float())
+
+    def is_strange(self, code: Tensor) -> bool:
+        """Whether a code [C] is like those of other things or, if none were learnt, far from the training images'."""
+        if self.others is not None:
+            return self.resemblance(code) > OTHER
+        return float(_distance(code, self.kinds.flatten(0, 1))) > MOST
+
+
+def _radial(points: Tensor, centres: Tensor) -> Tensor:
+    return torch.exp(-_SHARPNESS * torch.cdist(points, centres).square())
+
+
+def _distance(code: Tensor, centres: Tensor) -> Tensor:
+    apart = torch.cdist(F.normalize(code[None], dim=1), centres.float())[0]
+    return apart.topk(min(_NEAREST, len(apart)), largest=False).values.mean()
+
+
+def known_codes(method: MeshMethod, dataset: ViewDataset, others: Tensor | None = None) -> KnownCodes:
+    """The codes of a training set and of stored images of other things, uint8 [M, 4, S, S]."""
+    chosen = torch.from_numpy(np.linspace(0, len(dataset) - 1, min(IMAGES, len(dataset))).astype(np.int64))
+    batches = [dataset.batch(part, voxels=False) for part in chosen.split(128)]
+    classes, codes = torch.cat([b.class_ids for b in batches]), _directions(method, (b.images for b in batches))
+    count = min(CENTRES // dataset.num_classes, int(classes.bincount(minlength=dataset.num_classes).min()))
+    kinds = torch.stack([_centres(codes[classes == kind], count) for kind in range(dataset.num_classes)])
+    return KnownCodes(kinds) if others is None else learn_others(kinds, _directions(method, others.split(128)))
+
+
+def learn_others(kinds: Tensor, others: Tensor) -> KnownCodes:
+    """Known codes of N categories [N, K, C] with those of other things [M, C], told apart by ridge regression.
+
+    Its functions are radial, about all centres; both classes count alike.
+    """
+    known, centres = kinds.flatten(0, 1), _centres(others, CENTRES)
+    samples, middles = torch.cat([known, others]), torch.cat([known, centres])
+    wanted = torch.cat([-torch.ones(len(known)), torch.ones(len(others))])
+    share = torch.where(wanted < 0, len(samples) / 2 / len(known), len(samples) / 2 / len(others))
+    values = _radial(samples, middles)
+    system = values.T @ (share[:, None] * values) + _RIDGE * _radial(middles, middles) + 1e-4 * torch.eye(len(middles))
+    return KnownCodes(kinds, centres, torch.linalg.solve(system, values.T @ (share * wanted)))
 
 
 @torch.no_grad()
-def known_codes(method: MeshMethod, dataset: ViewDataset) -> Tensor:
-    """Centres float32 [K, C] of the directions of the codes of training images (k-means), K = 240 or fewer."""
-    chosen = torch.from_numpy(np.linspace(0, len(dataset) - 1, min(IMAGES, len(dataset))).astype(np.int64))
-    codes = [method.encode(dataset.batch(part, voxels=False).images).float().cpu() for part in chosen.split(128)]
-    directions = F.normalize(torch.cat(codes), dim=1).numpy()
-    centres, _ = kmeans2(directions, min(CENTRES, len(directions)), minit="points", rng=np.random.default_rng(0))
-    return torch.from_numpy(centres)
+def _directions(method: MeshMethod, images: Iterable[Tensor]) -> Tensor:
+    return F.normalize(torch.cat([method.encode(part).float().cpu() for part in images]), dim=1)
 
 
-def distance(code: Tensor, known: Tensor) -> float:
-    """Mean distance of the direction of a code [C] from the three nearest of the known ones [K, C]: 0 .. 2."""
-    apart = torch.cdist(F.normalize(code[None], dim=1), known.float())[0]
-    return float(apart.topk(min(_NEAREST, len(apart)), largest=False).values.mean())
+def _centres(directions: Tensor, count: int) -> Tensor:
+    rng = np.random.default_rng(0)
+    return torch.from_numpy(kmeans2(directions.numpy(), min(count, len(directions)), minit="points", rng=rng)[0])

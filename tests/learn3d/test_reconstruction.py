@@ -49,7 +49,7 @@ def test_data_set_image_survives_the_way_out_and_back(tiny_set) -> None:
     assert np.array_equal(again, stored)
 
 
-def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables) -> None:
+def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables, capsys) -> None:
     picture = np.full((120, 160, 3), 240, np.uint8)
     picture[30:90, 50:110] = (180, 40, 30)
     Image.fromarray(picture).save(tmp_path / "box.png")
@@ -61,8 +61,11 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
     Image.fromarray(np.full((40, 40, 3), 9, np.uint8)).save(tmp_path / "plain.png")
     with pytest.raises(ValueError, match=r"plain.png: its mask is empty.* or give --masks"):
         _read(tmp_path / "plain.png", None, threshold_mask)
-    mask = _read(tmp_path / "box.png", None, threshold_mask)[1]
-    assert mask[30:90, 50:110].all() and mask.sum() == 255 * 60 * 60
+    picture[40:80, 120:150] = 0
+    Image.fromarray(picture).save(tmp_path / "two.png")
+    for name, said in (("box.png", ""), ("two.png", "several parts were found, and only the largest is used")):
+        mask = _read(tmp_path / name, None, threshold_mask)[1]
+        assert mask[30:90, 50:110].all() and mask.sum() == 255 * 60 * 60 and said in capsys.readouterr().err
 
 
 def test_results_never_replace_the_images(finished_run, tmp_path) -> None:

@@ -4,6 +4,7 @@
 const $ = (id) => document.getElementById(id);
 const picture = $("picture");
 const WORDS = { camera: "Finding the camera …", shape: "Fitting the shape …", surface: "Fitting the surface …", done: "Adding the colours …" };
+const HINT = "Outline wrong? Correct it on the picture:";
 const HINTS = {
   box: "Drag a box around the object.",
   add: "Paint over the missing part.",
@@ -45,6 +46,8 @@ async function take(source, title) {
   $("choose").textContent = "Another picture";
   $("choose").classList.remove("primary");
   choose(null);
+  for (const button of $("examples").children) button.setAttribute("aria-pressed", String(button.firstChild.src === source));
+  scrollTo(0, 0); // on a phone the examples are below
   mask = null;
   show();
   send(given);
@@ -134,7 +137,7 @@ function strokesOf(points, value) {
 function choose(which) {
   tool = which;
   picture.classList.toggle("tool", Boolean(tool));
-  $("hint").textContent = HINTS[tool] || "Outline wrong? Correct it on the picture:";
+  $("hint").textContent = HINTS[tool] || HINT;
   for (const button of document.querySelectorAll("[data-tool]")) button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
 }
 
@@ -216,6 +219,7 @@ function hear(message, pixels) {
   if (message.mask) {
     const bits = bytes(message.mask);
     mask = Uint8ClampedArray.from({ length: pixels }, (_, i) => (bits[i >> 3] >> (7 - (i & 7))) & 1 ? 255 : 0);
+    $("hint").textContent = message.more ? "Several things were found, and only the largest is used. Add the others:" : HINT;
     show();
   }
   if (message.progress) { say(WORDS[message.progress]); busy(0.1 + 0.85 * message.part); }
@@ -242,7 +246,7 @@ function present(meshes) {
     view.append(canvas);
     $("views").append(view);
     const title = document.createElement("b"), label = meshes.length > 1 ? ` ${made.label}` : "";
-    title.textContent = label;
+    title.textContent = [label, made.kind && `Taken for: ${made.kind}${made.warning ? "?" : ""}`].filter(Boolean).join(" · ");
     view.append(title);
     const glb = bytes(made.glb), mesh = readGlb(glb.buffer);
     new Viewer(canvas, mesh, made.yaw);

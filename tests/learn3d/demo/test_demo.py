@@ -14,7 +14,7 @@ from PIL import Image
 
 import nmr
 from learn3d import reconstruction
-from learn3d.data.framing import threshold_mask
+from learn3d.data.framing import largest_region, threshold_mask
 from learn3d.demo import picture as pictures
 from learn3d.pictures.surfaces import Surface
 from learn3d.reconstruction import input_azimuth_deg, load_model
@@ -33,11 +33,13 @@ def photo() -> np.ndarray:
 
 
 def test_the_mask_is_the_largest_region_without_holes(photo) -> None:
-    mask = threshold_mask(photo, 0.2)
+    mask, more = largest_region(threshold_mask(photo, 0.2))
     rows, columns = np.ogrid[:100, :160]
     assert mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}
     assert np.array_equal(mask > 0, np.hypot(rows - 50, columns - 80) < 30)
-    assert not threshold_mask(photo, 0.9).any()
+    assert not more and not threshold_mask(photo, 0.9).any()
+    photo[5:40, 5:40] = 0
+    assert largest_region(threshold_mask(photo, 0.2))[1], "a second thing"
 
 
 def test_pixels_are_unpacked_as_the_page_packs_them() -> None:
@@ -52,14 +54,14 @@ def test_pixels_are_unpacked_as_the_page_packs_them() -> None:
 def test_the_object_is_given_or_found_or_corrected(photo) -> None:
     unknown, given = np.full((100, 160), 255, np.uint8), np.zeros((100, 160), np.uint8)
     given[20:40, 20:40] = 200
-    ring = threshold_mask(photo)
-    assert np.array_equal(pictures.find_object(pictures.Picture(photo, unknown)), ring)
-    assert np.array_equal(pictures.find_object(pictures.Picture(photo, given)), given)
+    ring, _ = largest_region(threshold_mask(photo))
+    assert np.array_equal(pictures.find_object(pictures.Picture(photo, unknown))[0], ring)
+    assert np.array_equal(pictures.find_object(pictures.Picture(photo, given))[0], given)
     strokes = np.zeros_like(given)
     strokes[10:20, 20:40] = 1
-    corrected = pictures.find_object(pictures.Picture(photo, given, strokes))
+    corrected, _ = pictures.find_object(pictures.Picture(photo, given, strokes))
     assert np.flatnonzero(corrected.any(axis=1)).tolist() == list(range(10, 40))
-    assert (pictures.find_object(pictures.Picture(photo, unknown, None, (40, 10, 80, 80))) != ring).mean() < 0.02
+    assert (pictures.find_object(pictures.Picture(photo, unknown, None, (40, 10, 80, 80)))[0] != ring).mean() < 0.02
 
 
 def test_a_picture_becomes_a_mesh(finished_run) -> None:
@@ -69,7 +71,7 @@ def test_a_picture_becomes_a_mesh(finished_run) -> None:
     told: list[dict] = []
     models = {"my run": load_model(finished_run)}
     pictures.make_meshes(models, pictures.Picture(colors.copy(), alpha[..., 0]), told.append)
-    assert "mask" in told[0] and [each["part"] for each in told[1:-1]] == [0.0, 0.3, 0.7, 1.0]
+    assert "mask" in told[0] and not told[0]["more"] and [each["part"] for each in told[1:-1]] == [0.0, 0.3, 0.7, 1.0]
     (made,) = told[-1]["meshes"]
     mesh = trimesh.load(io.BytesIO(base64.b64decode(made["glb"])), "glb", force="mesh")
     assert made["label"] == "my run" and len(mesh.faces) > 100

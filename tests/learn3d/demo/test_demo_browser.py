@@ -129,6 +129,11 @@ def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(page, box, tm
     Image.fromarray(np.full((50, 50, 3), 90, np.uint8)).save(tmp_path / "grey.png")
     page.locator("#file").set_input_files(tmp_path / "grey.png")
     page.get_by_text("No object was found").wait_for()
+    with Image.open(box) as image:
+        image.paste((0, 0, 0), (240, 60, 290, 140))
+        image.save(tmp_path / "two.png")
+    page.locator("#file").set_input_files(tmp_path / "two.png")
+    page.get_by_text("only the largest is used").wait_for()
     content = base64.b64encode(box.read_bytes()).decode()
     page.evaluate(
         """text => { const data = new DataTransfer(), bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
@@ -157,6 +162,7 @@ def test_an_interrupt_ends_it_while_the_page_is_open_and_busy(browser, server) -
     page.goto(address)
     page.get_by_role("button", name="sofa").click()
     page.locator(".view canvas").first.wait_for(timeout=PATIENCE)
+    assert page.get_by_role("button", name="sofa").get_attribute("aria-pressed") == "true"
     page.get_by_role("button", name="chair").click()
     start = time.monotonic()
     process.send_signal(signal.SIGINT)

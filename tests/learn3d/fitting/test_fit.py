@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 import nmr
 from learn3d.data.dataset import DatasetInfo
 from learn3d.data.layouts import load_dataset
 from learn3d.fitting.coloring import color_mesh
-from learn3d.fitting.familiarity import MOST, distance
+from learn3d.fitting.familiarity import KnownCodes, known_codes, learn_others
 from learn3d.fitting.fit import AZIMUTHS, SHARE, View, find_view, fit, frame_view
 from learn3d.fitting.smoothing import smooth
 from learn3d.methods import create_method
@@ -21,7 +22,7 @@ from learn3d.methods.method import MeshMethod
 from learn3d.networks.encoders import centre
 from learn3d.pictures.studio import photograph
 from learn3d.presets import PRESETS
-from learn3d.reconstruction import Reconstruction, doubt, load_model, reconstruct_picture
+from learn3d.reconstruction import Reconstruction, load_model, recognize, reconstruct_picture
 from learn3d.runs.export import export
 
 
@@ -144,7 +145,7 @@ def test_a_picture_is_reconstructed_with_and_without_the_fit(finished_run) -> No
     fitted, plain = (reconstruct_picture(model, colors, mask, refined=refined) for refined in (True, False))
     assert isinstance(fitted, Reconstruction) and fitted.silhouette_iou > 0.6
     assert torch.allclose(fitted.surface.colors.mean(0), torch.tensor([200, 120, 40]) / 255, atol=0.03)
-    assert plain.surface.colors is None and plain.silhouette_iou is None and plain.warning is None
+    assert plain.surface.colors is None and plain.silhouette_iou is None and plain.kind is plain.warning is None
 
 
 def test_unknown_things_are_warned_of(finished_run, tiny_folder, tmp_path) -> None:
@@ -153,9 +154,37 @@ def test_unknown_things_are_warned_of(finished_run, tiny_folder, tmp_path) -> No
     model = load_model(tmp_path / "small.safetensors")
     images = load_dataset("kato", tiny_folder, "airplane", "train").batch(torch.arange(20)).images
     codes = model.method.encode(images)
-    near = [distance(code, model.known_codes) for code in codes]
-    far = [distance(code, model.known_codes) for code in -codes]
-    assert max(near) < min(far) and min(far) > MOST
-    assert doubt(model, images[0]) is None
-    other = model._replace(known_codes=-model.known_codes)
-    assert doubt(other, images[0]).startswith("this looks like nothing that the model was trained on (airplane)")
+    assert not any(model.known_codes.is_strange(code) for code in codes)
+    assert all(model.known_codes.is_strange(code) for code in -codes)
+    assert recognize(model, images[0]) == (None, None), "it knows only one category"
+    other = model._replace(known_codes=KnownCodes(-model.known_codes.kinds))
+    assert recognize(other, images[0])[1].startswith("this looks like nothing that the model was trained on (airplane)")
+
+
+def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, tmp_path) -> None:
+    torch.manual_seed(0)
+    first, second, other = torch.nn.functional.normalize(
+        torch.eye(3, 16)[:, None] + 0.05 * torch.randn(3, 40, 16), dim=2
+    )
+    known = learn_others(torch.stack([first[:20], second[:20]]), other[:20])
+    assert all(known.is_strange(7 * code) for code in other[20:])
+    assert not any(known.is_strange(7 * code) for code in (*first[20:], *second[20:]))
+    with pytest.raises(ValueError, match="no PNG file in"):
+        export(finished_run, tmp_path / "small.safetensors", others=tmp_path)
+    image = tiny_set.images[0]
+    Image.fromarray(np.concatenate([255 - image[:3], image[3:]]).transpose(1, 2, 0)).save(tmp_path / "other.png")
+    export(finished_run, tmp_path / "small.safetensors", others=tmp_path)
+    known = load_model(tmp_path / "small.safetensors").known_codes
+    assert len(known.others) == 1 and len(known.weights) == known.kinds[..., 0].numel() + 1
+
+
+def test_a_picture_is_taken_for_the_nearest_kind(finished_run, tiny_folder) -> None:
+    method = load_model(finished_run).method
+    dataset = load_dataset("kato", tiny_folder, "airplane", "train")
+    kinds = np.arange(dataset.num_objects)  # each object one kind
+    dataset = dataclasses.replace(dataset, class_ids=kinds, class_names=tuple("abc"))
+    known = known_codes(method, dataset)
+    assert len(known.kinds) == 3 and known.others is None
+    batch = dataset.batch(torch.arange(len(dataset)))
+    found = [known.nearest_kind(code) for code in method.encode(batch.images)]
+    assert np.mean(np.equal(found, batch.class_ids.numpy())) > 0.9

@@ -8,8 +8,9 @@ import torch
 from learn3d.data.layouts import load_dataset
 from learn3d.evaluation import evaluate
 from learn3d.make_data.render import DatasetConfig, make_dataset
+from learn3d.reconstruction import SMALL_MODEL
 from learn3d.runs import checkpoint
-from learn3d.runs.export import SMALL_MODEL, export
+from learn3d.runs.export import export
 from learn3d.training import train
 
 
