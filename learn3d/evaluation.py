@@ -37,7 +37,7 @@ MEASURED = (
     "hollow",  # 1 if the mesh reaches beyond the grid, so that kato18 finds no inside
     "chamfer_l1",  # NaN if a surface is empty
     "f_score",  # 0 if the prediction alone is empty
-    "silhouette_iou",  # for data without voxels
+    "silhouette_iou",  # with the mask of another image of the object
 )
 NO_MMD = "no MMD: it takes two images of each of two views"
 
@@ -62,8 +62,15 @@ class Evaluation:
         return self.means.get("mmd")
 
     @property
+    def main_metric(self) -> Literal["voxel_iou", "silhouette_iou"]:
+        """Name of the metric that is shown first: the IoU of silhouettes if no voxels are known."""
+        return "silhouette_iou" if "voxel_iou" not in self.means and "silhouette_iou" in self.means else "voxel_iou"
+
+    @property
     def selection_metric(self) -> Literal["voxel_iou", "silhouette_iou"]:
-        """Name of the metric that selects the best networks: the IoU of silhouettes if no voxels are known."""
+        """Name of the metric that selects the best networks. It needs no 3D data: the IoU of silhouettes at novel views,
+        if it is known.
+        """
         return "silhouette_iou" if "silhouette_iou" in self.means else "voxel_iou"
 
 
@@ -79,9 +86,9 @@ def evaluate(
 ) -> Evaluation:
     """Measure the shape of every image of a split, and the mean MMD over all pairs of view classes.
 
-    Shapes are voxelised in the data set's convention and compared with the object's voxels. If the data set has none,
-    meshes are seen by the camera of another image of the object (of the only one if there is no other) and compared
-    with that image's mask: the IoU of silhouettes. Without voxels and poses nothing is compared.
+    Shapes are voxelised in the data set's convention and compared with the object's voxels. Meshes are also seen by the
+    camera of another image of the object and compared with that image's mask: the IoU of silhouettes. If there are no
+    other images, the image itself takes their place, but only without voxels. Without poses silhouettes are unknown.
 
     max_images: use only that many images, always the same ones (see `spread_samples`).
     detailed: add the voxel IoU by kato19, the MMD as the paper prints it, and Chamfer-L1 and F-score between 2,000
@@ -93,6 +100,7 @@ def evaluate(
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
     samples = spread_samples(dataset.object_ids, dataset.view_ids, count)
     others = _other_images(dataset.object_ids)
+    novel_views = bool((others != torch.arange(len(others))).any())
     generator = torch.Generator().manual_seed(0)
     surfaces = _true_surfaces(dataset, generator) if detailed else None
     codes, values = [], []
@@ -108,8 +116,8 @@ def evaluate(
             measured = {}
             if dataset.voxels is not None:
                 measured = _compare_voxels(shapes, batch, dataset, detailed)
-            elif dataset.poses is not None and isinstance(shapes, Meshes):
-                measured = _compare_silhouettes(shapes, dataset.batch(others[chosen]))
+            if (novel_views or not measured) and dataset.poses is not None and isinstance(shapes, Meshes):
+                measured |= _compare_silhouettes(shapes, dataset.batch(others[chosen]))
             if surfaces is not None:
                 measured |= _compare_surfaces(shapes, [surfaces[k] for k in batch.object_ids.tolist()], generator)
             unknown = torch.full((len(chosen),), math.nan)

@@ -21,8 +21,8 @@ PICTURE_ROWS = 8
 def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) -> Progress:
     """Measure IoU and MMD on the validation images; keep the networks if their IoU is the best so far.
 
-    It is the IoU of voxels or, if no true shapes are known, of silhouettes at novel views. Returns the progress with
-    the best IoU and its step.
+    It is the IoU of silhouettes at novel views, which needs no true shapes, or, if there are none, of voxels. Returns
+    the progress with the best IoU and its step.
     """
     config, step = run.config, progress.step
     with run.method.ema_weights():
@@ -36,6 +36,8 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) ->
         shown += " (best so far)"
         progress = dataclasses.replace(progress, best_iou=iou, best_step=step)
         run.save_best(progress)
+    if metric != result.main_metric:
+        mmd = f"{result.main_metric.replace('_iou', ' IoU')} {result.means[result.main_metric]:.4f}, {mmd}"
     log.say(f"step {step}: {config.val_split} {metric.replace('_iou', ' IoU')} {shown}, {mmd}")
     return progress
 

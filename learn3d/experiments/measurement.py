@@ -35,7 +35,7 @@ MEASURES = {
         "F-score",
         f"harmonic mean of the shares of these points within {F_SCORE_DISTANCE} of the other surface",
     ),
-    "silhouette_iou": ("silhouette IoU", "for data without voxels: with the mask of another image of the object"),
+    "silhouette_iou": ("silhouette IoU", "with the mask of another image of the object"),
     "mmd": (
         "MMD",
         f"between the shape codes of two views, up to {CODES_PER_VIEW} each, mean over all pairs of views, by the "

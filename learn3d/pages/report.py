@@ -242,7 +242,7 @@ def _fill(
     ids, names, truth = dataset.object_ids, dataset.object_names, dataset.voxels is not None
     ious = np.full((len(runs), len(ids)), np.nan)  # run by image
     for row, result in zip(ious, results, strict=True):
-        row[:] = result.values[result.selection_metric].numpy()
+        row[:] = result.values[result.main_metric].numpy()
     sums = np.stack([np.bincount(ids, np.nan_to_num(row), len(names)) for row in ious])
     counts = np.stack([np.bincount(ids, ~np.isnan(row), len(names)) for row in ious])
     means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)  # run by object
@@ -269,7 +269,7 @@ def _fill(
     rows = []
     for run, result, look, samples in zip(runs, results, looks, resampled, strict=True):
         row = look | {"about": run.metadata, "method": PRESETS[run.metadata.config.preset].label, "mmd": result.mmd}
-        row |= {"iou": result.means.get(result.selection_metric), "interval": percentile_interval(samples)}
+        row |= {"iou": result.means.get(result.main_metric), "interval": percentile_interval(samples)}
         row["command"] = command_line(run.metadata.config, data="DATA", output="OUTPUT", pretrained="WEIGHTS")
         if rows and None not in (row["iou"], rows[0]["iou"]):
             row["difference"] = row["iou"] - rows[0]["iou"]

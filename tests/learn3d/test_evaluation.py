@@ -124,10 +124,19 @@ def test_without_voxels_silhouettes_at_other_cameras_are_compared(tiny_set) -> N
     assert (nothing.selection_metric, nothing.voxel_iou) == ("voxel_iou", None)
 
 
+def test_novel_views_select_networks_even_if_voxels_are_known(tiny_set) -> None:
+    flat, facing = egg(flat=0.1), with_truth(tiny_set, egg())
+    result = evaluate(Constant(flat), facing)
+    assert (result.main_metric, result.selection_metric) == ("voxel_iou", "silhouette_iou")
+    single = evaluate(Constant(flat), facing.select(np.flatnonzero(facing.view_ids == 0)))
+    assert (single.selection_metric, single.means.get("silhouette_iou")) == ("voxel_iou", None), "no novel views"
+
+
 def test_without_poses_voxels_are_compared_and_silhouettes_are_not(tiny_set) -> None:
     known = with_truth(tiny_set, egg())
     unknown = dataclasses.replace(known, poses=None)
-    assert evaluate(Constant(egg()), unknown).means == evaluate(Constant(egg()), known).means
+    means = evaluate(Constant(egg()), known).means
+    assert evaluate(Constant(egg()), unknown).means == {k: v for k, v in means.items() if k != "silhouette_iou"}
     nothing = evaluate(Constant(egg()), dataclasses.replace(unknown, voxels=None))
     assert nothing.means.keys() == {"mmd"}
 
