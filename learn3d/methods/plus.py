@@ -17,7 +17,7 @@ from learn3d.device import upload
 from learn3d.losses import pose_classification_loss, silhouette_energy_distance
 from learn3d.methods.optimization import adam
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
-from learn3d.networks import EncoderName, PoseDiscriminator, SymmetryOption
+from learn3d.networks import EncoderName, GeneratorName, PoseDiscriminator, SymmetryOption
 from learn3d.networks.encoders import ViewClassifier
 from learn3d.settings import Count, Positive, Weight, checked
 
@@ -30,6 +30,7 @@ class PlusSettings(PoseInvariantSettings):
     """Networks, weights and forms of the terms of the loss; a weight of 0 means that the term is not computed."""
 
     encoder: EncoderName = "conv-light"
+    generator: GeneratorName = "sphere-smooth"
     symmetry: SymmetryOption = "auto"
     clamp_to_cube: bool = True
     learning_rate: Positive = 4e-4

@@ -9,6 +9,7 @@ from learn3d.networks.generators import (
     ConvCubeGenerator,
     LinearCubeGenerator,
     SmallSphereGenerator,
+    SmoothSphereGenerator,
     SphereGenerator,
 )
 from learn3d.networks.mesh_generator import MeshGenerator, Symmetry, SymmetryOption
@@ -27,9 +28,10 @@ __all__ = [
     "network_input",
 ]
 
-GeneratorName = Literal["sphere", "sphere-small", "bounded", "cube-conv", "cube-fc"]
+GeneratorName = Literal["sphere", "sphere-smooth", "sphere-small", "bounded", "cube-conv", "cube-fc"]
 GENERATORS: dict[str, type[MeshGenerator]] = {
     "sphere": SphereGenerator,
+    "sphere-smooth": SmoothSphereGenerator,
     "sphere-small": SmallSphereGenerator,
     "bounded": BoundedGenerator,
     "cube-conv": ConvCubeGenerator,

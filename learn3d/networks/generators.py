@@ -11,6 +11,7 @@ from learn3d.networks.layers import initialize_he, linear_layers
 from learn3d.networks.mesh_generator import MeshGenerator, Symmetry
 
 OBJECT_SCALE = 0.5
+STIFFNESS, FREE_SHARE = 10.0, 0.2  # of SmoothSphereGenerator
 
 
 def deform_sphere(sphere: Tensor, displacement: Tensor) -> Tensor:
@@ -54,13 +55,51 @@ class SphereGenerator(MeshGenerator):
         self.register_buffer("source", source, persistent=False)
         self.register_buffer("sign", sign, persistent=False)
 
-    def forward(self, codes: Tensor) -> Tensor:
-        displacement = self.layers(codes).float()
+    def displacements(self, codes: Tensor) -> Tensor:
+        """Displacement float32 [B,642,3] of every vertex of the sphere."""
+        outputs = self.layers(codes).float()
         if self.mirror is None:
-            displacement = displacement.reshape(len(codes), -1, 3)
-        else:
-            displacement = nn.functional.pad(displacement, (0, 1))[:, self.source] * self.sign
-        return self.place(deform_sphere(self.sphere, displacement))
+            return outputs.reshape(len(codes), -1, 3)
+        return nn.functional.pad(outputs, (0, 1))[:, self.source] * self.sign
+
+    def forward(self, codes: Tensor) -> Tensor:
+        return self.place(deform_sphere(self.sphere, self.displacements(codes)))
+
+
+class SmoothSphereGenerator(SphereGenerator):
+    """The same with displacements D = M U of the outputs U, where M = a I + (1 - a) (I + b L)^-1.
+
+    L [642,642] is the graph Laplacian of the sphere, b = 10, a = 0.2. M leaves slow changes over the sphere as they are
+    and takes fast ones to a fifth, so that these are learnt more slowly: whole parts move before single vertices do, and
+    the sphere does not fold at the start of a training (preconditioning after Nicolet et al. 2021, who have a = 0).
+    """
+
+    mixing: Tensor  # float32 [642,642]: M
+
+    def __init__(self, symmetry: Symmetry | None = None) -> None:
+        super().__init__(symmetry)
+        self.register_buffer("mixing", mixing_matrix(self.faces, STIFFNESS, FREE_SHARE), persistent=False)
+
+    def displacements(self, codes: Tensor) -> Tensor:
+        free = super().displacements(codes)
+        with torch.autocast(free.device.type, enabled=False):
+            mixed = torch.einsum("vw,bwc->bvc", self.mixing, free)
+        if self.mirror is None:
+            return mixed
+        side = self.sphere[:, 2:].sign()  # exact symmetry in place of one up to rounding
+        mirrored = mixed[:, self.mirror] * mixed.new_tensor([1.0, 1.0, -1.0])
+        flat = mixed * mixed.new_tensor([1.0, 1.0, 0.0])
+        return torch.where(side > 0, mixed, torch.where(side < 0, mirrored, flat))
+
+
+def mixing_matrix(faces: Tensor, stiffness: float, free_share: float) -> Tensor:
+    """a I + (1 - a) (I + b L)^-1 for a = free_share, b = stiffness and the graph Laplacian L of a mesh: float32 [V,V]."""
+    neighbours = torch.zeros(int(faces.max()) + 1, int(faces.max()) + 1, dtype=torch.float64)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        neighbours[faces[:, i], faces[:, j]] = neighbours[faces[:, j], faces[:, i]] = 1
+    identity = torch.eye(len(neighbours), dtype=torch.float64)
+    laplacian = torch.diag(neighbours.sum(1)) - neighbours
+    return (free_share * identity + (1 - free_share) * torch.linalg.inv(identity + stiffness * laplacian)).float()
 
 
 class SmallSphereGenerator(SphereGenerator):

@@ -66,6 +66,22 @@ def test_the_camera_along_the_plane_sees_a_symmetric_silhouette(name: str) -> No
     assert differences[1] > 5e-3
 
 
+def test_the_smooth_sphere_moves_neighbours_together() -> None:
+    """M keeps the mean and takes the fastest change over the sphere to a fifth; one output moves a neighbourhood."""
+    generator = GENERATORS["sphere-smooth"](None)
+    mixing = generator.mixing.double()
+    torch.testing.assert_close(mixing.sum(1), torch.ones(642).double(), atol=1e-4, rtol=0)
+    assert torch.linalg.eigvalsh(mixing)[0] == pytest.approx(0.2, abs=0.02)
+    bump, neighbours = mixing[:, 0], generator.faces[(generator.faces == 0).any(1)].unique()[1:]
+    assert bump[0] > 10 * bump[neighbours].max() > 0 and bump[neighbours].min() > 10 * bump[-1] > 0
+    with torch.no_grad():
+        generator.layers[-1].weight.zero_(), generator.layers[-1].bias.zero_()
+        generator.layers[-1].bias[1] = 1.0  # y of vertex 0
+        moved = generator(torch.zeros(1, 512))[0] - 0.5 * generator.sphere
+    torch.testing.assert_close(moved[:, 1], 0.5 * generator.mixing[:, 0], atol=1e-6, rtol=0)
+    assert not moved[:, ::2].any()
+
+
 def test_the_symmetric_sphere_is_the_published_one() -> None:
     """Of the 979 outputs 64 move one vertex each, 915 a vertex and its mirror image."""
     generator = GENERATORS["sphere"]("z")
