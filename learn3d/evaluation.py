@@ -68,8 +68,8 @@ class Evaluation:
 
     @property
     def selection_metric(self) -> Literal["voxel_iou", "silhouette_iou"]:
-        """Name of the metric that selects the best networks. It needs no 3D data: the IoU of silhouettes at novel views,
-        if it is known.
+        """Name of the metric that selects the best networks: the IoU of silhouettes at novel views, if it is known. It
+        needs no 3D data.
         """
         return "silhouette_iou" if "silhouette_iou" in self.means else "voxel_iou"
 

@@ -74,8 +74,8 @@ class MeshSettings(MethodSettings):
     weights, for objects that are all scaled to one size (cameras at unknown distances). conv-relu: conv with a ReLU on
     the code (Kato et al. 2018). resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "sphere"
-    """Network from codes to vertices. sphere: 642 free vertices. sphere-smooth: the same; neighbouring vertices learn to
-    move together first. sphere-small: sphere with half the weights. bounded: the generator of Kato et al. 2018.
+    """Network from codes to vertices. sphere: 642 free vertices. sphere-smooth: the same; neighbours learn to move
+    together first. sphere-small: sphere with half the weights. bounded: the generator of Kato et al. 2018.
     cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or from linear layers (Kato and Harada
     2019)."""
     symmetry: SymmetryOption = None

@@ -11,7 +11,7 @@ from learn3d.networks.layers import initialize_he, linear_layers
 from learn3d.networks.mesh_generator import MeshGenerator, Symmetry
 
 OBJECT_SCALE = 0.5
-STIFFNESS, FREE_SHARE = 10.0, 0.2  # of SmoothSphereGenerator
+STIFFNESS, FREE_SHARE = 3.0, 0.2  # of SmoothSphereGenerator
 
 
 def deform_sphere(sphere: Tensor, displacement: Tensor) -> Tensor:
@@ -69,9 +69,9 @@ class SphereGenerator(MeshGenerator):
 class SmoothSphereGenerator(SphereGenerator):
     """The same with displacements D = M U of the outputs U, where M = a I + (1 - a) (I + b L)^-1.
 
-    L [642,642] is the graph Laplacian of the sphere, b = 10, a = 0.2. M leaves slow changes over the sphere as they are
-    and takes fast ones to a fifth, so that these are learnt more slowly: whole parts move before single vertices do, and
-    the sphere does not fold at the start of a training (preconditioning after Nicolet et al. 2021, who have a = 0).
+    L [642,642] is the graph Laplacian of the sphere, b = 3, a = 0.2. M leaves slow changes over the sphere as they are
+    and takes fast ones to a fifth, so that they are learnt more slowly: whole parts move before single vertices do, and
+    the sphere hardly folds at the start of a training (preconditioning after Nicolet et al. 2021, who have a = 0).
     """
 
     mixing: Tensor  # float32 [642,642]: M
@@ -93,7 +93,7 @@ class SmoothSphereGenerator(SphereGenerator):
 
 
 def mixing_matrix(faces: Tensor, stiffness: float, free_share: float) -> Tensor:
-    """a I + (1 - a) (I + b L)^-1 for a = free_share, b = stiffness and the graph Laplacian L of a mesh: float32 [V,V]."""
+    """a I + (1 - a) (I + b L)^-1 for a = free_share, b = stiffness and a mesh's graph Laplacian L: float32 [V,V]."""
     neighbours = torch.zeros(int(faces.max()) + 1, int(faces.max()) + 1, dtype=torch.float64)
     for i, j in ((0, 1), (1, 2), (2, 0)):
         neighbours[faces[:, i], faces[:, j]] = neighbours[faces[:, j], faces[:, i]] = 1

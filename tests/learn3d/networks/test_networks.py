@@ -107,7 +107,7 @@ def narrow_encoder(name: str) -> nn.Module:
 SMALL: dict[str, tuple[Callable[[], nn.Module], list, tuple[int, ...]]] = {
     **{name: (lambda name=name: narrow_encoder(name), [(2, 4, 64, 64)], (2, 512)) for name in ENCODERS},
     **{name: (lambda name=name: narrow_encoder(name), [(2, 4, 96, 96)], (2, 512)) for name in ("preact", "flat")},
-    **{name: (GENERATORS[name], [(2, 512)], (2, 642, 3)) for name in ("sphere", "sphere-smooth", "sphere-small", "bounded")},
+    **{name: (GENERATORS[name], [(2, 512)], (2, 642, 3)) for name in GENERATORS if not name.startswith("cube")},
     "symmetric": (lambda: GENERATORS["sphere-small"](30.0), [(2, 512)], (2, 642, 3)),
     "cube-conv": (lambda: ConvCubeGenerator(channels=16), [(2, 512)], (2, 1352, 3)),
     "cube-fc": (lambda: LinearCubeGenerator("z", channels=32), [(2, 512)], (2, 1352, 3)),
