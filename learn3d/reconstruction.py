@@ -33,7 +33,7 @@ from learn3d.data.poses import Poses
 from learn3d.files import limits, writing
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, cut_out
-from learn3d.fitting.familiarity import KnownCodes
+from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.fitting.fit import SHARE, Progress, belief, fit
 from learn3d.methods import MeshMethod, Method
 from learn3d.methods.many_views import ManyViews
@@ -47,7 +47,6 @@ from learn3d.terminal import note
 MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 
 SMALL_MODEL = Path(__file__).with_name("models") / "small.safetensors"  # the one that comes with the package
-KNOWN_CODES = "known_codes", "other_codes", "code_weights"  # names of the tensors of `KnownCodes`
 STRIP_SIZE = 192  # pixels
 _FINE = 4  # pixels, per side, that are averaged to one of a prepared image, or more
 _LARGE = 1024  # pixels a side in which an object before a plain background is searched for
@@ -76,6 +75,14 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     known = list(map(checkpoint.load(path)[0].get, KNOWN_CODES))
     known_codes = None if known[0] is None else KnownCodes(*known)
     return Model(method, config, metadata.progress.object_share or OBJECT_SHARE, known_codes)
+
+
+def cut_out_pictures(model: Model, folder: Path) -> Tensor:
+    """All PNG files with transparency in a folder as stored images uint8 [M, 4, S, S]. Raises ValueError if none is."""
+    files = sorted(folder.rglob("*.png"))
+    if not files:
+        raise ValueError(f"there is no PNG file in {folder}")
+    return torch.from_numpy(np.stack([model.prepare(*read_photo(path)) for path in files]))
 
 
 def reconstruct_files(

@@ -136,8 +136,10 @@ class Export(Command):
     warns of all that is far from the training images)."""
 
     def run(self) -> None:
+        from learn3d.reconstruction import cut_out_pictures, load_model
         from learn3d.runs.export import export
 
         check_target(self.output, "--output")
-        size = export(self.source, self.output, which=self.which, others=self.others)
+        others = None if self.others is None else cut_out_pictures(load_model(self.source, self.which), self.others)
+        size = export(self.source, self.output, which=self.which, others=others)
         say(f"{self.output} ({size / 1e6:.1f} MB)")

@@ -18,6 +18,7 @@ CENTRES = 120  # that stand for all codes of the training images, and as many fo
 IMAGES = 4000  # training images whose codes are clustered
 MOST = 0.82  # distance above which a picture is called unknown if no other things were learnt
 OTHER = 0.54  # score of `KnownCodes.resemblance` above which it is called unknown
+KNOWN_CODES = "known_codes", "other_codes", "code_weights"  # names of the tensors of `KnownCodes` in a checkpoint
 _NEAREST = 3
 _SHARPNESS, _RIDGE = 4.0, 0.5  # of the radial functions, and of their ridge regression
 

@@ -5,28 +5,26 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-import numpy as np
 import torch
+from torch import Tensor
 
-from learn3d.data.framing import read_photo
-from learn3d.fitting.familiarity import known_codes
+from learn3d.fitting.familiarity import KNOWN_CODES, known_codes
 from learn3d.methods import MeshMethod
 from learn3d.methods.many_views import ManyViewsSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
-from learn3d.reconstruction import KNOWN_CODES, load_model
 from learn3d.runs import checkpoint
 from learn3d.terminal import note
 
 _TRAINING_ONLY = ("lambda_classification", "lambda_adversarial", "lambda_novel_view")  # weights of further networks
 
 
-def export(source: Path, target: Path, *, which: str = "last", others: Path | None = None) -> int:
+def export(source: Path, target: Path, *, which: str = "last", others: Tensor | None = None) -> int:
     """Write the networks of a run or checkpoint file that turn images into meshes, at half precision.
 
     Returns the size in bytes. The file is a checkpoint that `evaluate` and `reconstruct` take. Numbers are rounded to
     float16 (three digits); folders of the run are left out. If the training data are still there, the file also says
     which codes are known (`learn3d.fitting.familiarity`), so that reconstruction can warn of pictures of other things.
-    others: a folder of PNG files with transparency that show other things; the warnings are better with them.
+    others: stored images uint8 [M, 4, S, S] that show other things; the warnings are better with them.
     Raises ValueError for methods other than the pose-invariant ones, Plus and Many views.
     """
     method, config, metadata = checkpoint.load_method(source, which)
@@ -46,13 +44,7 @@ def export(source: Path, target: Path, *, which: str = "last", others: Path | No
     if not data.is_dir():
         note(f"note: {data} is not there, so the file does not say which codes are known, and nothing is warned of")
     elif isinstance(method, MeshMethod):
-        images = None
-        if others is not None:
-            model, files = load_model(source, which), sorted(others.rglob("*.png"))
-            if not files:
-                raise ValueError(f"there is no PNG file in {others}")
-            images = torch.from_numpy(np.stack([model.prepare(*read_photo(path)) for path in files]))
-        known = known_codes(method, checkpoint.load_data(trained_on, "train"), images)
+        known = known_codes(method, checkpoint.load_data(trained_on, "train"), others)
         tensors |= {name: codes.half() for name, codes in zip(KNOWN_CODES, known, strict=True) if codes is not None}
     checkpoint.save(target, tensors, dataclasses.replace(metadata, config=config))
     return target.stat().st_size

