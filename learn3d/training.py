@@ -42,7 +42,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         if not resume:
             run_folder.check_can_start(folder, overwrite)  # an older run is removed when all else is well
         train_set, val_set = load_splits(config, progress=is_watched())
-        info = train_set.info(find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None)
+        plane = find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None
+        info = train_set.info(plane, train_set.solidity() if config.settings.wants_solidity else None)
         options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
         method = create_method(config.settings, info, **options)
         method.check_batch(next(batches(train_set, config)))  # before an older run is removed

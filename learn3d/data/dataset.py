@@ -36,6 +36,7 @@ class DatasetInfo:
     inverted: bool = False  # colours are stored as 255 - colour
     mirror_plane_deg: float | None = None  # result of `data.mirror_plane`; None: no plane, or it was not asked for
     cube_side: float | None = None  # side of the cube, centred at the origin, that holds all objects; None: unknown
+    solidity: float | None = None  # result of `ViewDataset.solidity`; None: it was not asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +112,12 @@ class ViewDataset:
         """S: side of the images in pixels."""
         return self.images.shape[2]
 
-    def info(self, mirror_plane_deg: float | None = None) -> DatasetInfo:
-        """The facts that a method needs, with the mirror plane of the objects, if it is known."""
+    def info(self, mirror_plane_deg: float | None = None, solidity: float | None = None) -> DatasetInfo:
+        """The facts that a method needs, with the mirror plane and the solidity of the objects, if they are known."""
         features = 0 if self.poses is None else self.poses.num_features
         cube_side = None if self.voxels is None else self.convention.cube_side
-        return DatasetInfo(self.num_views, self.num_classes, features, self.inverted, mirror_plane_deg, cube_side)
+        facts = self.num_views, self.num_classes, features, self.inverted, mirror_plane_deg, cube_side
+        return DatasetInfo(*facts, solidity)
 
     def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:
         """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU.
@@ -179,6 +181,15 @@ class ViewDataset:
     def object_share(self) -> float:
         """Mean of `object_sides`, by which photographs are framed like the images that the networks know."""
         return float(self.object_sides().mean(dtype=np.float64))
+
+    def solidity(self) -> float:
+        """The share of its convex hull that a mask fills, mean over up to 256 images; 0 if all masks are empty."""
+        from skimage.morphology import convex_hull_image  # takes half a second to import
+
+        stored = self.images if self.masks is None else self.masks
+        some = np.linspace(0, len(self) - 1, min(len(self), 256)).astype(int)
+        masks = stored[some].reshape(len(some), -1, *stored.shape[-2:])[:, -1] > 127
+        return float(np.mean([mask.sum() / convex_hull_image(mask).sum() for mask in masks if mask.any()] or 0.0))
 
     def object_sides(self) -> np.ndarray:
         """The larger side of each mask's bounding box, as a share of the picture's side: floats [M], 0 if empty."""

@@ -52,6 +52,11 @@ class MethodSettings:
         return False
 
     @property
+    def wants_solidity(self) -> bool:
+        """Whether the solidity of the training data must be known before the networks are built."""
+        return False
+
+    @property
     def varies_over_run(self) -> str | None:
         """Name of the setting whose value depends on the number of iterations, None if there is none."""
         return None
@@ -75,9 +80,9 @@ class MeshSettings(MethodSettings):
     the code (Kato et al. 2018). resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "sphere"
     """Network from codes to vertices. sphere: 642 free vertices. sphere-smooth: the same; neighbours learn to move
-    together first. sphere-small: sphere with half the weights. bounded: the generator of Kato et al. 2018.
-    cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or from linear layers (Kato and Harada
-    2019)."""
+    together first. auto: sphere-smooth if the training masks are compact, else sphere. sphere-small: sphere with half
+    the weights. bounded: the generator of Kato et al. 2018. cube-conv, cube-fc: 1352 vertices of a cube's surface, from
+    convolutions or from linear layers (Kato and Harada 2019)."""
     symmetry: SymmetryOption = None
     """Vertical mirror plane of all shapes: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
     it (0 is x = 0). auto: found from the training masks, if they have one. Shapes are not mirrored if it is None."""
@@ -92,13 +97,25 @@ class MeshSettings(MethodSettings):
     def wants_mirror_plane(self) -> bool:
         return self.symmetry == "auto"
 
+    @property
+    def wants_solidity(self) -> bool:
+        return self.generator == "auto"
 
+
+COMPACT = 0.85  # solidity of objects from which folds of the surface cost more than thin parts gain by them
 INSIDE = 0.499  # share of the cube's side; the voxelizer kato18 takes a face on the border (0.5) for outside
 
 
 def plane_of(symmetry: SymmetryOption, info: DatasetInfo) -> Symmetry | None:
     """The mirror plane of the shapes: that of the settings, or with "auto" that of the data."""
     return info.mirror_plane_deg if symmetry == "auto" else symmetry
+
+
+def generator_of(name: GeneratorName, info: DatasetInfo) -> type[MeshGenerator]:
+    """The generator of the settings, or with "auto" the sphere that suits the masks of the data."""
+    if name == "auto":
+        name = "sphere-smooth" if info.solidity is not None and info.solidity >= COMPACT else "sphere"
+    return GENERATORS[name]
 
 
 class Method(abc.ABC):
@@ -233,7 +250,8 @@ class MeshMethod(Method):
 
     def create_networks(self) -> dict[str, nn.Module]:
         encoder = create_encoder(self.settings.encoder, inverted=self.info.inverted)
-        generator = GENERATORS[self.settings.generator](symmetry=plane_of(self.settings.symmetry, self.info))
+        plane = plane_of(self.settings.symmetry, self.info)
+        generator = generator_of(self.settings.generator, self.info)(symmetry=plane)
         return {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:

@@ -30,7 +30,7 @@ class PlusSettings(PoseInvariantSettings):
     """Networks, weights and forms of the terms of the loss; a weight of 0 means that the term is not computed."""
 
     encoder: EncoderName = "conv-light"
-    generator: GeneratorName = "sphere-smooth"
+    generator: GeneratorName = "auto"
     symmetry: SymmetryOption = "auto"
     clamp_to_cube: bool = True
     learning_rate: Positive = 4e-4

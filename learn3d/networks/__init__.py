@@ -28,7 +28,7 @@ __all__ = [
     "network_input",
 ]
 
-GeneratorName = Literal["sphere", "sphere-smooth", "sphere-small", "bounded", "cube-conv", "cube-fc"]
+GeneratorName = Literal["auto", "sphere", "sphere-smooth", "sphere-small", "bounded", "cube-conv", "cube-fc"]
 GENERATORS: dict[str, type[MeshGenerator]] = {
     "sphere": SphereGenerator,
     "sphere-smooth": SmoothSphereGenerator,

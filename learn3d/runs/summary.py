@@ -8,6 +8,7 @@ from pathlib import Path
 
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
+from learn3d.methods.method import COMPACT
 from learn3d.presets import PRESETS
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.state import Run
@@ -28,6 +29,9 @@ def describe_run(
         text += "\nno mirror plane: the masks show none (it takes some 150 of them); --symmetry names one"
     elif config.settings.wants_mirror_plane:
         text += f"\nmirror plane: a camera of azimuth {run.info.mirror_plane_deg:g} looks along it, as the masks show"
+    if config.settings.wants_solidity:
+        kind = "compact: neighbouring vertices move together" if run.info.solidity >= COMPACT else "not compact"
+        text += f"\nmasks fill {run.info.solidity:.2f} of their convex hulls, so shapes are {kind}"
     return text
 
 

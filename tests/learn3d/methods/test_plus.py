@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,6 +13,7 @@ from learn3d.data.conventions import KATO
 from learn3d.methods import DatasetInfo, create_method
 from learn3d.methods.optimization import TrainingSchedule
 from learn3d.methods.plus import MaskBank, Plus, PlusSettings
+from learn3d.networks.generators import SmoothSphereGenerator, SphereGenerator
 from learn3d.presets import PRESETS
 
 SMALL = PlusSettings(encoder="conv-small", generator="sphere-small", bank_size=4)
@@ -135,3 +137,19 @@ def test_the_length_of_a_run_whose_smoothness_falls_is_kept(tiny_config, tmp_pat
     assert differences(dataclasses.replace(config, iterations=7), config) == [
         "iterations: 6 in the run, 7 asked for (lambda_smooth_end depends on it)"
     ]
+
+
+def test_compact_objects_get_the_smooth_sphere(tiny_set) -> None:
+    """A square fills its hull, a cross two thirds or less; empty masks say nothing."""
+    images = np.zeros((3, 4, 64, 64), np.uint8)
+    images[0, 3, 10:50, 10:50] = 255
+    square = dataclasses.replace(tiny_set.select(np.arange(3)), images=images)
+    assert square.solidity() == 1.0
+    images[0, 3] = 0
+    assert square.solidity() == 0.0
+    images[0, 3, 28:36, 4:60] = images[0, 3, 4:60, 28:36] = 255
+    assert 0.3 < square.solidity() < 0.67
+    settings = dataclasses.replace(SMALL, generator="auto")
+    for solidity, kind in ((0.9, SmoothSphereGenerator), (0.6, SphereGenerator), (None, SphereGenerator)):
+        info = DatasetInfo(24, solidity=solidity)
+        assert type(create_method(settings, info, device="cpu", precision="fp32", seed=0).generator) is kind
