@@ -163,16 +163,6 @@ def test_gradcheck_in_all_parameters(name):
     )
 
 
-def test_there_is_no_second_derivative():
-    for x, make in (
-        (parameter([0.3, 1.0, -3.0]), lambda x: nmr.LookAt(x).transform(torch.ones(1, 2, 3).double())),
-        (parameter([[[0.3, 1.0, 0.4]]]), nmr.LookAt([0.0, 0.0, -2.0]).transform),
-    ):
-        (grad,) = torch.autograd.grad(make(x).square().sum(), x, create_graph=True)
-        with pytest.raises(RuntimeError, match="a camera's transform has no second derivative"):
-            grad.sum().backward()
-
-
 # --- batches
 
 
