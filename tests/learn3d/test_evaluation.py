@@ -267,12 +267,6 @@ def test_iou_after_the_axis_rule_is_the_published_one(convention, published):
         assert abs(float(other) - v[published][0]) > 1e-4  # the rule matters here
 
 
-@pytest.mark.parametrize("convention", ALL, ids=lambda convention: convention.name)
-def test_stored_axes_and_the_object_frame_are_inverse(convention):
-    grid = torch.rand(2, 4, 4, 4, generator=torch.Generator().manual_seed(0)) < 0.5
-    assert torch.equal(convention.to_object(convention.to_axes(grid)), grid)
-
-
 @pytest.mark.parametrize(
     ("convention", "axes"),
     [
@@ -289,4 +283,6 @@ def test_axes_are_those_that_are_documented(convention, axes):
     grid = torch.zeros(1, 4, 4, 4, dtype=torch.bool)
     grid[(0, *cell)] = True
     centred = np.array(axes) @ (np.array(cell) - 1.5)
-    assert convention.to_axes(grid)[0].nonzero()[0].tolist() == (centred + 1.5).tolist()
+    stored = convention.to_axes(grid)
+    assert stored[0].nonzero()[0].tolist() == (centred + 1.5).tolist()
+    assert torch.equal(convention.to_object(stored), grid)

@@ -117,32 +117,6 @@ def test_masks_that_show_nothing_are_refused(layout: str) -> None:
         prepare_image(np.zeros((4, 4, 3), np.uint8), np.full((4, 4), 9, np.uint8), layout=layout)
 
 
-def test_read_image_with_transparency_or_mask(tmp_path) -> None:
-    rgba = np.zeros((6, 8, 4), np.uint8)
-    rgba[2:4, 3:5] = (200, 100, 50, 255)
-    Image.fromarray(rgba).save(tmp_path / "a.png")
-    Image.fromarray(rgba[..., :3]).save(tmp_path / "b.png")
-    Image.fromarray(rgba[..., 3]).save(tmp_path / "mask.png")
-    for colors, mask in (
-        _read(tmp_path / "a.png", None, None),
-        _read(tmp_path / "b.png", tmp_path / "mask.png", None),
-    ):
-        assert np.array_equal(colors, rgba[..., :3])
-        assert np.array_equal(mask, rgba[..., 3])
-    Image.fromarray(np.zeros((3, 3), np.uint8)).save(tmp_path / "black.png")
-    Image.fromarray(np.zeros((6, 8), np.uint8)).save(tmp_path / "empty.png")
-    (tmp_path / "text.png").write_text("no image")
-    for arguments, message in (
-        (("b.png",), "has no transparency"),
-        (("b.png", "black.png"), r"b.png.*8x6.*black.png.*3x3"),
-        (("b.png", "empty.png"), "mask is empty"),
-        (("c.png",), r"c\.png"),
-        (("text.png",), r"text.png.* image"),
-    ):
-        with pytest.raises((ValueError, FileNotFoundError), match=message):
-            _read(*(tmp_path / name for name in arguments), *[None] * (3 - len(arguments)))
-
-
 @pytest.mark.parametrize("kind", ["obj", "glb", "ply"])
 def test_mesh_files_are_right_handed_with_normals_outwards(tmp_path, kind: str) -> None:
     sphere, faces = nmr.icosphere(2)

@@ -107,15 +107,6 @@ def test_the_border_of_the_image_is_no_end():
     assert not gradient_of(vertices, faces, noise(8, 8)).any()
 
 
-def test_anti_aliasing_acts_at_the_resolution_of_the_raster():
-    """Each of the 2x2 gets a quarter of the gradient, and a pixel of the raster is half as wide."""
-    vertices, faces = square(-0.75, -0.25, 0.25, 0.75)  # ends between image pixels of 8 x 8
-    upstream = one_pixel({(2, 5): -1.0})
-    grad = gradient_of(vertices, faces, upstream, anti_aliasing=True)
-    # two raster rows, -1/4 each, times R / 2 = 8
-    torch.testing.assert_close(float(grad[0, :, 0].sum()), -4.0, rtol=0, atol=1e-9)
-
-
 def test_one_pixel_is_its_reach():
     vertices, faces = square(-0.6, -0.4, -0.1, 0.4)
     upstream = torch.zeros(16, 16, dtype=torch.float64)
