@@ -189,11 +189,6 @@ def test_spread_samples_meet_views_and_objects_evenly(objects: int, count: int) 
     assert torch.equal(spread_samples(object_ids, view_ids, objects * 24), torch.arange(objects * 24))
 
 
-def test_part_of_the_images_is_of_every_view(tiny_set) -> None:
-    result = evaluate(Constant(egg()), tiny_set, max_images=25)  # of 72, three objects
-    assert len(result.view_ids.unique()) == 24
-
-
 def test_mean_mmd_is_the_mean_over_pairs() -> None:
     codes = torch.randn(40, 16, generator=torch.Generator().manual_seed(0))
     views = torch.arange(40) % 4
@@ -272,12 +267,6 @@ def test_iou_after_the_axis_rule_is_the_published_one(convention, published):
         assert abs(float(other) - v[published][0]) > 1e-4  # the rule matters here
 
 
-@pytest.mark.parametrize("convention", ALL, ids=lambda convention: convention.name)
-def test_stored_axes_and_the_object_frame_are_inverse(convention):
-    grid = torch.rand(2, 4, 4, 4, generator=torch.Generator().manual_seed(0)) < 0.5
-    assert torch.equal(convention.to_object(convention.to_axes(grid)), grid)
-
-
 @pytest.mark.parametrize(
     ("convention", "axes"),
     [
@@ -294,4 +283,6 @@ def test_axes_are_those_that_are_documented(convention, axes):
     grid = torch.zeros(1, 4, 4, 4, dtype=torch.bool)
     grid[(0, *cell)] = True
     centred = np.array(axes) @ (np.array(cell) - 1.5)
-    assert convention.to_axes(grid)[0].nonzero()[0].tolist() == (centred + 1.5).tolist()
+    stored = convention.to_axes(grid)
+    assert stored[0].nonzero()[0].tolist() == (centred + 1.5).tolist()
+    assert torch.equal(convention.to_object(stored), grid)

@@ -29,20 +29,6 @@ def short_turntables(monkeypatch) -> None:
     monkeypatch.setattr("learn3d.reconstruction.turntable", lambda _: np.zeros((2, 32, 32, 3), np.uint8))
 
 
-def test_stored_form_is_inverted_on_black() -> None:
-    colors = np.full((64, 64, 3), (255, 0, 10), np.uint8)
-    mask = np.zeros((64, 64), np.uint8)
-    mask[10:20, 30:40] = 255
-    mask[20, 30:40] = 51  # a fifth
-    stored = prepare_image(colors, mask, crop=False)
-    assert stored.shape == (4, 64, 64)
-    assert stored.dtype == np.uint8
-    assert np.array_equal(stored[3], mask)
-    assert stored[:, 15, 35].tolist() == [0, 255, 245, 255]
-    assert stored[:, 20, 35].tolist() == [0, 51, 49, 51]
-    assert not stored[:, 0, 0].any()
-
-
 def test_data_set_image_survives_the_way_out_and_back(tiny_set) -> None:
     stored = tiny_set.images[3]
     again = prepare_image(255 - stored[:3].transpose(1, 2, 0), stored[3], crop=False)
@@ -129,48 +115,6 @@ def test_photographs_are_cut_as_pascals_reader_does() -> None:
 def test_masks_that_show_nothing_are_refused(layout: str) -> None:
     with pytest.raises(ValueError, match="no pixel above half strength"):
         prepare_image(np.zeros((4, 4, 3), np.uint8), np.full((4, 4), 9, np.uint8), layout=layout)
-
-
-@pytest.mark.parametrize("turned", ["image", "mask", "both"])
-def test_pictures_are_turned_upright(tmp_path, turned: str) -> None:
-    colors = np.zeros((6, 8, 3), np.uint8)
-    colors[1, 2] = (200, 100, 50)
-    mask = colors.max(axis=2)
-    for name, pixels in (("image", colors), ("mask", mask)):
-        exif = Image.Exif()
-        if turned in (name, "both"):
-            exif[0x0112] = 6  # stored lying on its left side: a viewer turns it by 90 degrees clockwise
-            pixels = np.rot90(pixels)
-        Image.fromarray(np.ascontiguousarray(pixels)).save(tmp_path / f"{name}.png", exif=exif)
-    read, read_mask = _read(tmp_path / "image.png", tmp_path / "mask.png", None)
-    assert np.array_equal(read, colors)
-    assert np.array_equal(read_mask, mask)
-
-
-def test_read_image_with_transparency_or_mask(tmp_path) -> None:
-    rgba = np.zeros((6, 8, 4), np.uint8)
-    rgba[2:4, 3:5] = (200, 100, 50, 255)
-    Image.fromarray(rgba).save(tmp_path / "a.png")
-    Image.fromarray(rgba[..., :3]).save(tmp_path / "b.png")
-    Image.fromarray(rgba[..., 3]).save(tmp_path / "mask.png")
-    for colors, mask in (
-        _read(tmp_path / "a.png", None, None),
-        _read(tmp_path / "b.png", tmp_path / "mask.png", None),
-    ):
-        assert np.array_equal(colors, rgba[..., :3])
-        assert np.array_equal(mask, rgba[..., 3])
-    Image.fromarray(np.zeros((3, 3), np.uint8)).save(tmp_path / "black.png")
-    Image.fromarray(np.zeros((6, 8), np.uint8)).save(tmp_path / "empty.png")
-    (tmp_path / "text.png").write_text("no image")
-    for arguments, message in (
-        (("b.png",), "has no transparency"),
-        (("b.png", "black.png"), r"b.png.*8x6.*black.png.*3x3"),
-        (("b.png", "empty.png"), "mask is empty"),
-        (("c.png",), r"c\.png"),
-        (("text.png",), r"text.png.* image"),
-    ):
-        with pytest.raises((ValueError, FileNotFoundError), match=message):
-            _read(*(tmp_path / name for name in arguments), *[None] * (3 - len(arguments)))
 
 
 @pytest.mark.parametrize("kind", ["obj", "glb", "ply"])

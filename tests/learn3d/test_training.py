@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 import signal
 
@@ -13,7 +12,7 @@ import torch
 
 import nmr
 from learn3d import training
-from learn3d.config import TrainConfig, config_to_dict
+from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.sampling import shuffled_epochs
 from learn3d.methods import DatasetInfo, create_method
@@ -184,21 +183,6 @@ def test_the_best_of_other_validation_images_is_forgotten(tiny_config, finished_
 def test_resume_without_a_checkpoint(tiny_config, run_folder) -> None:
     with pytest.raises(ValueError, match="no checkpoint"):
         train(tiny_config(run_folder), resume=True)
-
-
-def test_used_folder_is_refused_and_overwrite_keeps_foreign_files(
-    tiny_config, run_folder, monkeypatch, read_metrics
-) -> None:
-    run_folder.mkdir()
-    (run_folder / "notes.txt").write_text("mine")
-    (run_folder / "config.json").write_text(json.dumps(config_to_dict(tiny_config(run_folder))))
-    (run_folder / "metrics.jsonl").write_text('{"step": 0, "split": "train"}\n')
-    with pytest.raises(ValueError, match="has a run; continue it"):
-        train(tiny_config(run_folder))
-    monkeypatch.setattr(training, "draw", lambda *arguments: None)
-    train(tiny_config(run_folder, iterations=1, preset=VANILLA), overwrite=True)
-    assert (run_folder / "notes.txt").read_text() == "mine"
-    assert read_metrics(run_folder)[0]["step"] == 1
 
 
 @pytest.mark.parametrize(

@@ -36,14 +36,6 @@ def test_flat_light_is_that_of_the_face():
     torch.testing.assert_close(rgb, torch.where((index >= 0)[..., None], expected[index.clamp_min(0)], 0.0))
 
 
-def test_grey_colours_take_the_colour_of_light():
-    mesh = bumpy_sphere()
-    grey = nmr.VertexColors(torch.full((162, 1), 0.5))
-    lights = nmr.Lights(1.0, 0.0, ambient_color=(0.2, 0.4, 0.6))
-    rgb = nmr.render_rgb(*mesh, CAMERA, colors=grey, lights=lights, **SIZE)
-    torch.testing.assert_close(rgb[0, 10, 10], torch.tensor([0.1, 0.2, 0.3]).double(), rtol=1e-6, atol=0)
-
-
 def slow_light(normal, point, eye, lamps, specular, shininess):
     """The light on white at points [..., 3], written out; lamps are (kind, color, direction or position, falloff)."""
     unit = torch.nn.functional.normalize

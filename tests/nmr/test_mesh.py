@@ -55,8 +55,6 @@ def test_unique_edges():
     fan = torch.tensor([[1, 0, 2], [1, 0, 3], [0, 1, 4], [5, 5, 0]])  # three faces at one edge; no face at all
     expected = [[0, 1], [0, 2], [0, 3], [0, 4], [0, 5], [1, 2], [1, 3], [1, 4]]
     assert nmr.unique_edges(fan.int()).tolist() == expected
-    with pytest.raises(ValueError, match="faces of one mesh"):
-        nmr.unique_edges(faces[None])
 
 
 def test_normals_of_a_sphere_point_outwards():

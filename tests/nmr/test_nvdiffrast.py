@@ -299,20 +299,6 @@ def test_antialias(scene):
     torch.testing.assert_close(twice, 2 * once)
 
 
-def test_antialiased_area():
-    """The sum over a mask is the area of a rectangle, and its derivative that of the area."""
-    pos = torch.tensor([[-0.59, -0.5], [0.41, -0.5], [0.41, 0.5], [-0.59, 0.5]], dtype=torch.float64)
-    pos = torch.cat([pos, torch.tensor([[0.1, 1.0]]).expand(4, 2)], dim=1)
-    pos = (pos * torch.tensor([[1.0], [2.0], [1.0], [3.0]])).requires_grad_()  # any w
-    tri = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    rast, _ = dr.rasterize(CONTEXT, pos[None], tri, (16, 20))
-    mask = dr.antialias((rast[..., 3:] > 0).double(), rast, pos[None], tri)
-    assert mask.sum().item() == pytest.approx(1.0 * 10 * 8)
-    (grad,) = torch.autograd.grad(mask.sum(), pos)
-    assert (grad[[1, 2], 0] * torch.tensor([2.0, 1.0])).sum().item() == pytest.approx(10 * 8)
-    assert (grad[:, 0] * pos.detach()[:, 3]).sum().item() == pytest.approx(0, abs=1e-9)
-
-
 # --- everything
 
 

@@ -85,22 +85,6 @@ def test_kernels_round_as_the_definition(seed, dtype) -> None:
     torch.testing.assert_close(depth[0].flip(0), slow_depth, **tight)
 
 
-def test_crossing_faces_change_places_where_they_cross() -> None:
-    corners = [
-        [-0.9, -0.9, 1.0],
-        [-0.9, 0.9, 1.0],
-        [0.9, 0.0, 6.0],
-        [0.9, 0.9, 1.0],
-        [0.9, -0.9, 1.0],
-        [-0.9, 0.0, 6.0],
-    ]
-    vertices, faces = torch.tensor(corners), torch.tensor([[0, 1, 2], [3, 4, 5]])
-    parallel = nmr.cameras.Projection(torch.eye(3, 4)[None], torch.eye(2, 3)[None], perspective=False)
-    index = nmr.render_fragments(vertices, faces, parallel, image_size=64, anti_aliasing=False).face_index[0]
-    middle = index[32]
-    assert (middle[4:32] == 0).all() and (middle[32:60] == 1).all(), "they cross in the plane x = 0"
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_gradients_are_those_of_the_definition_and_of_finite_differences(seed) -> None:
     vertices, faces = soup(seed)

@@ -291,17 +291,3 @@ def test_a_background_that_is_not_finite_stays_behind():
     white = nmr.render_rgb(vertices, faces, CAMERA, background=float("nan"), image_size=16)
     alpha = nmr.render_silhouette(vertices, faces, CAMERA, image_size=16)
     assert torch.equal(white[..., 0].isnan(), alpha < 1) and (white[alpha == 1] == 1).all()
-
-
-def test_background_gradient_is_the_uncovered_share():
-    vertices, faces = bumpy_sphere()
-    background = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
-    images = nmr.render(vertices, faces, CAMERA, outputs=("rgb", "alpha"), background=background, image_size=16)
-    images.rgb.sum().backward()
-    torch.testing.assert_close(background.grad, (1 - images.alpha).sum((1, 2))[:, None].expand(2, 3))
-
-
-# --- torch
-
-
-# --- errors

@@ -112,6 +112,3 @@ def test_interpolate_computes_only_the_gradients_asked_for(of_attributes, of_wei
     output.backward(upstream.expand_as(output))
     for leaf, asked, expected in zip((attributes, weights), (of_attributes, of_weights), both, strict=True):
         assert torch.equal(leaf.grad, expected) if asked else leaf.grad is None
-
-
-# --- both

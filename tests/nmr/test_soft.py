@@ -160,16 +160,6 @@ def test_a_face_shows_its_colour_beyond_its_border_and_the_background_behind():
     assert (soft[0, 50, near_border, 2].diff() > 0).all() and soft[0, 50, 25, 2] < 0.3
 
 
-@pytest.mark.parametrize("anti_aliasing", [False, True])
-def test_small_sigma_and_gamma_show_what_is_seen(anti_aliasing):
-    vertices, faces = nmr.icosphere(3)
-    camera, colors = nmr.LookAt.from_angles(2.732, 30.0, [0.0, 70.0]), nmr.VertexColors((vertices.double() + 1) / 2)
-    how = dict(colors=colors, background=0.2, near=1.0, image_size=40, anti_aliasing=anti_aliasing)
-    hard = nmr.render_rgb(vertices.double(), faces, camera, **how)
-    soft, _ = nmr.render_soft_rgb(vertices.double(), faces, camera, sigma=1e-10, gamma=1e-5, **how)
-    assert ((hard - soft).abs().amax(-1) < 1e-3).double().mean() > 0.995
-
-
 def test_fragments_of_a_blur_know_the_distance():
     vertices, faces = random_soup(2, 1)
     fragments = nmr.render_fragments(vertices, faces, image_size=16, blur_radius=0.05, faces_per_pixel=30, clip=False)

@@ -152,16 +152,6 @@ def slow_level(fragments, uv, size, most):
     return torch.where(fragments.covered, torch.stack(images), 0.0)
 
 
-def test_the_level_is_that_of_opengl():
-    fragments, _, uv = textured_fragments()
-    grids = torch.tensor([[[0, 7, 12], [84, 3, 6], [102, 1, 3], [105, 1, 1]]])
-    at = uv.unsqueeze(0), fragments.faces, fragments.sided_face_index, fragments.weights, None
-    level = nmr.ops.uv_levels(*fragments.mesh[:3], *at, grids)
-    torch.testing.assert_close(level, slow_level(fragments, uv.expand(2, -1, -1), (7, 12), 3), rtol=1e-4, atol=1e-4)
-    covered = level[fragments.covered]
-    assert covered.max() == 3 and (covered == 0).sum() > 10 and (covered > 0).sum() > 100
-
-
 def test_a_mipmap_shows_the_mean_of_what_a_pixel_covers():
     """A picture of noise, drawn eight times smaller: its 8 x 8 means, where bilinear sampling shows single texels."""
     noise = uniform(64, 64, 1)

@@ -76,9 +76,6 @@ def test_one_set_of_faces_may_have_a_batch_axis():
     assert torch.equal(*drawn)
 
 
-# --- near and far
-
-
 # --- arrays
 
 

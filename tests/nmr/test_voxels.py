@@ -142,15 +142,6 @@ def test_a_box_that_fills_the_grid_is_open_in_kato18():
     assert thick.all() and not thin[4, 4, 4]
 
 
-def test_kato19_of_points_and_segments():
-    faces = torch.tensor([[0, 0, 0]])
-    assert nmr.voxelize(torch.full((1, 3), 0.3), faces, 8, definition="kato19").sum() == 1
-    assert nmr.voxelize(torch.full((1, 3), 0.5), faces, 8, definition="kato19").sum() == 8
-    diagonal = torch.tensor([[0.01, 0.01, 0.01], [0.49, 0.49, 0.49], [0.99, 0.99, 0.99]])
-    grid = nmr.voxelize(diagonal, torch.tensor([[0, 1, 2]]), 8, definition="kato19")[0]
-    assert grid[range(8), range(8), range(8)].all() and grid.sum() == 8 + 7 * 6  # through seven corners of cells
-
-
 NOT_NUMBERS = [float("nan"), float("inf"), -float("inf"), 3e38, -1e30, 1e10]
 
 

@@ -97,6 +97,9 @@ def test_photos_are_turned_upright(tmp_path: Path) -> None:
     path = save(tmp_path / "a.jpg", np.rot90(colors).copy(), exif=exif, quality=100)
     got, _ = read_photo(path, save(tmp_path / "m.png", mask))
     assert got.shape == (8, 6, 3) and got[0].min() > 200 and got[4:].max() < 60
+    mask[0] = 255
+    _, turned = read_photo(path, save(tmp_path / "turned.png", np.rot90(mask).copy(), exif=exif))
+    np.testing.assert_array_equal(turned, mask)
     with pytest.raises(ValueError, match=r"has 6x8 pixels, its mask .*m.png 8x6 pixels; does one of them lie on its"):
         read_photo(path, save(tmp_path / "m.png", np.rot90(mask).copy()))
 

@@ -263,16 +263,12 @@ def test_categories_stand_below_each_other(tiny_set, tmp_path) -> None:
         paper.save_grid(runs[:1], tmp_path / "four.png", indices=[72])
 
 
-pytest.importorskip("matplotlib")
-
-
 @pytest.fixture
 def call(command):
     return lambda *words: command("figures", *words)
 
 
 def test_a_figure_from_a_run_to_a_file(call, finished_run, tmp_path) -> None:
-    pytest.importorskip("sklearn")
     code, out, err = call("tsne", "--runs", finished_run, "--output", tmp_path / "out" / "a", "--split", "train")
     assert code == 0, err
     assert out.split() == [str(tmp_path / "out" / f"a.{kind}") for kind in ("png", "svg")]

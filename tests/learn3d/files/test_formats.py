@@ -164,14 +164,6 @@ def test_a_letter_that_is_not_utf8_costs_nothing(tmp_path, kind):
     assert len(read_mesh(tmp_path / f"a.{kind}").faces) == 12
 
 
-def test_files_that_are_none(tmp_path):
-    with pytest.raises(ValueError, match="is missing"):
-        read_mesh(tmp_path / "a.off")
-    (tmp_path / "a.off").write_text("OFF\n8 12 0\n")
-    with pytest.raises(ValueError, match="cannot be read"):
-        read_mesh(tmp_path / "a.off")
-
-
 CELLS = np.random.default_rng(0).random((8, 8, 8)) < 0.3
 
 

@@ -143,35 +143,6 @@ def mesh(tmp_path):
     return str(tmp_path / "mesh.obj")
 
 
-def test_optimize_vertices(mesh):
-    class Model(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            vertices, faces = nr.load_obj(mesh)
-            self.vertices = torch.nn.Parameter(vertices[None, :, :])
-            self.register_buffer("faces", faces[None, :, :])
-            reference = np.zeros((32, 32), dtype=np.float32)
-            reference[8:24, 6:26] = 1
-            self.register_buffer("image_ref", torch.from_numpy(reference)[None])
-            self.renderer = nr.Renderer(camera_mode="look_at", image_size=32)
-
-        def forward(self):
-            self.renderer.eye = nr.get_points_from_angles(2.732, 0, 90)
-            image = self.renderer(self.vertices, self.faces, mode="silhouettes")
-            return torch.sum((image - self.image_ref[None, :, :]) ** 2)
-
-    model = Model()
-    optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=0.01)
-    losses = []
-    for _ in range(60):
-        optimizer.zero_grad()
-        loss = model()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.15 * losses[0]
-
-
 def test_find_the_camera(mesh):
     vertices, faces = (x[None] for x in nr.load_obj(mesh))
     renderer = nr.Renderer(camera_mode="look_at", image_size=32)

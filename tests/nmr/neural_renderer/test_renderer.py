@@ -229,14 +229,6 @@ def test_silhouettes_and_depth_have_their_own_range_as_published():
     assert not alpha.any() and torch.all(depth == 1.5)
 
 
-def test_light_without_direction_leaves_flat_colours():
-    vertices, faces = sphere()
-    renderer = nr.Renderer(camera_mode="look_at", image_size=16, anti_aliasing=False)
-    renderer.light_intensity_directional, renderer.light_intensity_ambient = 0, 1
-    rgb, _, alpha = renderer(vertices, faces, torch.full((2, 80, 2, 2, 2, 3), 0.25))
-    torch.testing.assert_close(rgb, 0.25 * alpha[:, None].expand(-1, 3, -1, -1))
-
-
 def test_renderers_can_be_copied_and_nested():
     class Model(torch.nn.Module):
         def __init__(self):
