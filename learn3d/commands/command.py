@@ -75,7 +75,8 @@ class OnDataset(Command):
     split: Split = "test"
     """Part of the data set."""
     which: Which = "last"
-    """Checkpoint of a run: the last one, or the one with the best validation IoU."""
+    """Checkpoint of a run: the last one, or the one with the best validation IoU (of silhouettes at novel views, if
+    there are any)."""
 
     @property
     def source(self) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 config.json           the options; the first file of a run
 last.safetensors      all that a resumption needs; a complete file at every moment after the first save
 previous.safetensors  the checkpoint before it
-best.safetensors      the networks with the best validation IoU
+best.safetensors      the networks with the best IoU on validation images, see `validation.validate`
 metrics.jsonl         losses and measurements
 tensorboard/ or metrics.csv or wandb.txt (the run's id there), as --log says; pictures/
 .lock                 held by the process that works here; .<name>.partial: a file being written
