@@ -26,7 +26,7 @@ def draw(vertices: Tensor, faces: Tensor, azimuths_deg: list[float], color: list
     return (torch.cat(list(images), dim=1).clamp(0, 1) * 255).round().byte()
 
 
-def main(output: Path = Path("output"), steps: int = 200, image_size: int = 96, seed: int = 7) -> tuple[float, float]:
+def main(output: Path = Path("output"), steps: int = 200, image_size: int = 96, seed: int = 5) -> tuple[float, float]:
     """Writes OUTPUT/fit_silhouette.gif (the progress) and fit_silhouette.png (the target; below it the result).
 
     Returns 1 - IoU of the silhouettes, before and after.

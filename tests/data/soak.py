@@ -44,5 +44,5 @@ if __name__ == "__main__":
     Soaked.every = int(sys.argv[2])
     tiny_networks.put_in_place()
     validation.PICTURE_ROWS = 1
-    log.RunLog = Soaked
+    training.RunLog = Soaked
     training.train(config)

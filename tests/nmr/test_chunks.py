@@ -120,7 +120,7 @@ print((-peak_after(4) + peak_after(128)) / (128 * 256 * 256))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is in KiB on Linux")
-def test_lit_batches_take_a_third_of_the_memory():
+def test_lit_batches_take_a_third_of_the_memory(tmp_path):
     """Bytes for each pixel of the raster: 60 if everything is kept."""
-    run = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True, check=True)
+    run = subprocess.run([sys.executable, "-c", MEMORY], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert float(run.stdout) < 25
