@@ -124,7 +124,7 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
         gpy = gpy + cross * x + 4 * gqy * c.d[2] * y + 2 * g_r2 * y;
       }
       const bool within = s.share == T(1);
-      // Beyond the reach q = q(c) + p - c; c = share p has the constant length of the reach.
+      // Beyond the reach: q = q(c) + p - c, with c = share p. The length of c is the reach, a constant.
       const T length2 = within ? T(1) : s.px * s.px + s.py * s.py, length = std::sqrt(keep ? length2 : T(1));
       const T nx = s.px / length, ny = s.py / length, vx = gpx - gqx, vy = gpy - gqy, out = vx * nx + vy * ny;
       gpx = within ? gpx : gqx + s.share * (vx - nx * out);

@@ -92,8 +92,8 @@ def evaluate(
 
     max_images: use only that many images, always the same ones (see `spread_samples`).
     detailed: add the voxel IoU by kato19, the MMD as the paper prints it, and Chamfer-L1 and F-score between 2,000
-    points on each surface. If the data set has no points, the truth is the surface of its voxels,
-    which limits distances to about 1/32.
+    points on each surface. If the data set has no points, the truth is the surface of its voxels, which limits
+    distances to about 1/32.
     align: a function of the predicted shapes, the batch and the data set that returns the shapes to be compared, for
     methods whose shapes may be turned or moved against the true ones.
     """

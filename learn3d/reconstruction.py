@@ -222,8 +222,8 @@ class Reconstruction(NamedTuple):
     surface: Surface  # object frame; in the picture's colours if it was fitted
     stored: np.ndarray  # uint8 [4, S, S]: the image that the network saw
     azimuth_deg: float  # from which the shape looks like the picture
-    silhouette_iou: float | None  # IoU of the fitted shape's silhouette and the mask; None: it was not fitted
-    kind: str | None  # category that the model takes it for; None: it knows only one, or was not asked
+    silhouette_iou: float | None  # IoU of the fitted shape's silhouette and the mask; None without a fit
+    kind: str | None  # category that the model takes it for; None if it knows only one, or no shape was fitted
     warning: str | None  # why the shape is to be doubted
 
 

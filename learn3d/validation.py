@@ -36,9 +36,10 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) ->
         shown += " (best so far)"
         progress = dataclasses.replace(progress, best_iou=iou, best_step=step)
         run.save_best(progress)
-    if metric != result.main_metric:
-        mmd = f"{result.main_metric.replace('_iou', ' IoU')} {result.means[result.main_metric]:.4f}, {mmd}"
-    log.say(f"step {step}: {config.val_split} {metric.replace('_iou', ' IoU')} {shown}, {mmd}")
+    shown = f"{metric.replace('_iou', ' IoU')} {shown}"
+    if metric != "voxel_iou" and result.voxel_iou is not None:
+        shown += f", voxel IoU {result.voxel_iou:.4f}"
+    log.say(f"step {step}: {config.val_split} {shown}, {mmd}")
     return progress
 
 

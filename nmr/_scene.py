@@ -153,8 +153,8 @@ def make_scene(
         depth = mesh.vertices.detach()[..., 2]
         if not holds_for_all(~depth.isfinite() | (depth * _NARROWEST < near)):
             warnings.warn(
-                f"faces are cut at depth {near:g}, less than a thousandth of the scene: in float32 single pixels may "
-                "stay open where they meet; take a larger near, or float64",
+                f"faces are cut at depth {near:g}, less than a thousandth of the scene: in float32 the edges between "
+                "them may show single open pixels; take a larger near, or float64",
                 stacklevel=callers_level(),
             )
     how = check_flag(anti_aliasing, "anti_aliasing"), check_flag(fill_back, "fill_back"), near, float(far), float(eps)

@@ -36,7 +36,7 @@ class DatasetInfo:
     inverted: bool = False  # colours are stored as 255 - colour
     mirror_plane_deg: float | None = None  # result of `data.mirror_plane`; None: no plane, or it was not asked for
     cube_side: float | None = None  # side of the cube, centred at the origin, that holds all objects; None: unknown
-    solidity: float | None = None  # result of `ViewDataset.solidity`; None: it was not asked for
+    solidity: float | None = None  # result of `ViewDataset.solidity`; None: not computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +183,7 @@ class ViewDataset:
         return float(self.object_sides().mean(dtype=np.float64))
 
     def solidity(self) -> float:
-        """The share of its convex hull that a mask fills, mean over up to 256 images; 0 if all masks are empty."""
+        """Mean of the masks' areas over those of their convex hulls, for at most 256 images; 0 if all are empty."""
         from skimage.morphology import convex_hull_image  # takes half a second to import
 
         stored = self.images if self.masks is None else self.masks

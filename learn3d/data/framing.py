@@ -20,6 +20,9 @@ from learn3d.files.renderings import MASK_SIZE, PHOTOGRAPHS, area_weights, open_
 
 OBJECT_SHARE = 0.65  # of the side of the square that the object takes in Kato's renderings, about
 TOLERANCE = 0.12  # of colours, for `threshold_mask`
+PADDING = 0.15  # of the box, on each side
+JITTER = 0.15  # of the box: how far each side moves, at most, in training
+SMALLEST, LARGEST = np.full(4, -1.0), np.ones(4)  # shifts of the smallest crop (the box) and of the largest
 _MEMORY_PER_PIXEL = 40  # bytes, for masking and framing
 _PIXELS_PER_SECOND = 2e7
 
@@ -175,11 +178,6 @@ def _transparency(image: Image.Image) -> np.ndarray | None:
         return None
     alpha = np.asarray(image.convert("RGBA"))[..., 3]
     return None if alpha.min() == 255 else alpha
-
-
-PADDING = 0.15  # of the box, on each side
-JITTER = 0.15  # of the box: how far each side moves, at most, in training
-SMALLEST, LARGEST = np.full(4, -1.0), np.ones(4)  # shifts of the smallest crop (the box) and of the largest
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from learn3d.files.reading import parse_json, read_bytes
 from learn3d.files.writing import write_json
 from learn3d.poses.estimate import PoseOptions
 from learn3d.poses.views import CameraOptions, compare, estimate_views, load_views
+from learn3d.terminal import note
 
 _CANDIDATES = 4
 _HEADER = ["category", "seed", "Acc@30", "median error, degrees", "flips", "objects flipped"]
@@ -32,7 +33,7 @@ def estimate_poses(config: TrainConfig) -> None:
     datasets = load_views(config.layout, config.data, config.category, config.views_per_object)
     views = estimate_views(datasets, CameraOptions(), PoseOptions(seed=config.seed), _CANDIDATES)
     comparison = compare(views)
-    print(comparison.text(), flush=True)
+    note(comparison.text())
     config.poses.parent.mkdir(parents=True, exist_ok=True)
     confidence = {"confidence": float(views.table.confidence.mean())}
     write_json(config.poses.with_suffix(".json"), dataclasses.asdict(comparison) | confidence)

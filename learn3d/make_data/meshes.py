@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from learn3d.files import npz, sandbox
-from learn3d.files.meshes import EXTENSIONS, RawMesh, read_mesh
+from learn3d.files.geometry import EXTENSIONS, RawMesh, read_mesh
 from learn3d.make_data.shapes import CATEGORIES, make_shape
 
 MOST_FACES = 1_000_000

@@ -102,7 +102,7 @@ class MeshSettings(MethodSettings):
         return self.generator == "auto"
 
 
-COMPACT = 0.85  # solidity of objects from which folds of the surface cost more than thin parts gain by them
+COMPACT = 0.85  # least solidity of objects for which "auto" takes sphere-smooth
 INSIDE = 0.499  # share of the cube's side; the voxelizer kato18 takes a face on the border (0.5) for outside
 
 
@@ -111,11 +111,11 @@ def plane_of(symmetry: SymmetryOption, info: DatasetInfo) -> Symmetry | None:
     return info.mirror_plane_deg if symmetry == "auto" else symmetry
 
 
-def generator_of(name: GeneratorName, info: DatasetInfo) -> type[MeshGenerator]:
+def generator_name(name: GeneratorName, info: DatasetInfo) -> GeneratorName:
     """The generator of the settings, or with "auto" the sphere that suits the masks of the data."""
-    if name == "auto":
-        name = "sphere-smooth" if info.solidity is not None and info.solidity >= COMPACT else "sphere"
-    return GENERATORS[name]
+    if name != "auto":
+        return name
+    return "sphere-smooth" if info.solidity is not None and info.solidity >= COMPACT else "sphere"
 
 
 class Method(abc.ABC):
@@ -251,7 +251,7 @@ class MeshMethod(Method):
     def create_networks(self) -> dict[str, nn.Module]:
         encoder = create_encoder(self.settings.encoder, inverted=self.info.inverted)
         plane = plane_of(self.settings.symmetry, self.info)
-        generator = generator_of(self.settings.generator, self.info)(symmetry=plane)
+        generator = GENERATORS[generator_name(self.settings.generator, self.info)](symmetry=plane)
         return {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:

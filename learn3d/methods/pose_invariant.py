@@ -31,8 +31,8 @@ class PoseInvariantSettings(MeshSettings):
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1)."""
     lambda_smooth_end: Positive | None = None
-    """Weight of the smoothness loss at the end of the run, reached by exponential decay. It stays
-    lambda_smooth if this is None."""
+    """Weight of the smoothness loss at the end of the run, reached by exponential decay. If it is None the weight stays
+    lambda_smooth."""
     lambda_classification: Weight = 1.0
     """Weight of the discriminator's own loss (lambda_2)."""
     lambda_adversarial: Weight = 1.0

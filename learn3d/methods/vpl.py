@@ -21,9 +21,9 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
 from learn3d.device import upload
 from learn3d.losses import silhouette_pyramid_loss
-from learn3d.methods.method import DatasetInfo, MeshMethod, MeshSettings, generator_of, plane_of
+from learn3d.methods.method import DatasetInfo, MeshMethod, MeshSettings, generator_name, plane_of
 from learn3d.methods.optimization import adam, frozen
-from learn3d.networks import ENCODERS, MeshGenerator
+from learn3d.networks import ENCODERS, GENERATORS, MeshGenerator
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
 from learn3d.networks.encoders import PreactResNet18
 from learn3d.networks.layers import reverse_gradient
@@ -250,7 +250,7 @@ def _create_generator(settings: VPLSettings, info: DatasetInfo) -> MeshGenerator
     scales = {}
     if settings.generator.startswith("cube"):
         scales = {"scale": settings.vertex_scale, "object_scale": settings.object_scale}
-    return generator_of(settings.generator, info)(symmetry=plane_of(settings.symmetry, info), **scales)
+    return GENERATORS[generator_name(settings.generator, info)](symmetry=plane_of(settings.symmetry, info), **scales)
 
 
 def _create_discriminator(settings: VPLSettings, info: DatasetInfo) -> nn.Module:

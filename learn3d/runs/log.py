@@ -41,14 +41,10 @@ class RunLog:
         self._metrics = open(folder / METRICS, "ab")
         self._bar = tqdm(total=total, initial=start, unit="step", dynamic_ncols=True) if is_watched() else None
         self._writer: Writer | None = None
+        kind = "tensorboard" if config is None else config.log
         try:
-            self._writer = _open_writer(folder, start, config)
-        except (
-            ImportError,
-            TypeError,
-            AttributeError,
-        ) as error:  # not installed, or other packages do not fit
-            kind = "tensorboard" if config is None else config.log
+            self._writer = _Wandb(folder, config) if kind == "wandb" else _WRITERS[kind](folder, start)
+        except (ImportError, TypeError, AttributeError) as error:  # not installed, or other packages do not fit
             self.say(f"warning: {kind} does not work ({error}); metrics go to {METRICS} only")
         self._started = self._last_line = time.monotonic()
 
@@ -125,16 +121,8 @@ class Writer(Protocol):
     def close(self) -> None: ...
 
 
-def _open_writer(folder: Path, start: int, config: TrainConfig | None) -> Writer:
-    """The writer that the option log names. Steps after `start` of an earlier attempt are dropped."""
-    kind = "tensorboard" if config is None else config.log
-    if kind == "wandb":
-        return _Wandb(folder, config)
-    return {"csv": _Csv, "tensorboard": _TensorBoard}[kind](folder, start)
-
-
 class _Csv:
-    """metrics.csv: a row for each number, with the columns step, name, value."""
+    """metrics.csv: a row for each number, with the columns step, name, value. Steps after `start` are dropped."""
 
     def __init__(self, folder: Path, start: int) -> None:
         path, kept = folder / METRICS_CSV, ["step,name,value"]
@@ -176,6 +164,9 @@ class _TensorBoard:
         self._writer.add_image(name, rgb, step, dataformats="HWC")
 
 
+_WRITERS = {"csv": _Csv, "tensorboard": _TensorBoard}
+
+
 class _Wandb:
     """A run of Weights & Biases in the project learn3d. It ignores steps that it already has."""
 
@@ -186,13 +177,12 @@ class _Wandb:
         if not path.is_file():
             writing.write_bytes(path, uuid.uuid4().hex[:8].encode())
         self._image = wandb.Image
-        self._run = wandb.init(
-            project="learn3d",
-            name=folder.name,
-            id=path.read_text(),
-            resume="allow",
-            config=config_to_dict(config),
-        )
+        options = {"id": path.read_text(), "resume": "allow", "config": config_to_dict(config)}
+        try:
+            self._run = wandb.init(project="learn3d", name=folder.name, **options)
+        except wandb.Error as error:
+            advice = "call `wandb login`, or choose csv or tensorboard"
+            raise ValueError(f"log 'wandb' cannot begin a run ({error}); {advice}") from None
 
     def add_numbers(self, step: int, values: Mapping[str, float]) -> None:
         self._run.log(dict(values), step=step)

@@ -35,9 +35,9 @@ class Run:
     versions: dict[str, str | None] = field(default_factory=versions)  # of the code that runs
 
     def begin(self, train_set: ViewDataset, *, resume: bool, overwrite: bool) -> tuple[Progress, tuple[str, ...]]:
-        """Bring networks, optimizers and random numbers to where the run stands: its start, or its last checkpoint.
+        """Bring networks, optimizers and random numbers to the start of the run or to its last checkpoint.
 
-        Then take the folder. Returns where the run stands, and warnings. A finished run stays as it is.
+        Then take the folder. Returns the progress of the run, and warnings. A finished run stays as it is.
         """
         config, folder = self.config, self.config.output
         progress, notes, saved = Progress(object_share=train_set.object_share()), (), None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
-from learn3d.methods.method import COMPACT
+from learn3d.methods.method import generator_name
 from learn3d.presets import PRESETS
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.state import Run
@@ -18,7 +18,7 @@ from learn3d.runs.threads import ThreadTuner
 def describe_run(
     run: Run, progress: Progress, train_set: ViewDataset, val_set: ViewDataset, threads: ThreadTuner
 ) -> str:
-    """Lines about a run that begins or goes on: method, data, device, and the mirror plane if it was looked for."""
+    """Lines about a run that begins or goes on: method, data, device; mirror plane, generator if masks decide them."""
     config = run.config
     where = f"{config.device}, {config.precision}, {threads}"
     data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
@@ -30,8 +30,8 @@ def describe_run(
     elif config.settings.wants_mirror_plane:
         text += f"\nmirror plane: a camera of azimuth {run.info.mirror_plane_deg:g} looks along it, as the masks show"
     if config.settings.wants_solidity:
-        kind = "compact: neighbouring vertices move together" if run.info.solidity >= COMPACT else "not compact"
-        text += f"\nmasks fill {run.info.solidity:.2f} of their convex hulls, so shapes are {kind}"
+        chosen = generator_name(config.settings.generator, run.info)
+        text += f"\ngenerator: {chosen}, as masks fill {run.info.solidity:.2f} of their convex hulls"
     return text
 
 

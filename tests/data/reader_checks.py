@@ -57,10 +57,10 @@ _threads_at_start: set[threading.Thread] = set()  # of the tracing
 
 @contextlib.contextmanager
 def at_most(limit: int) -> Iterator[None]:
-    """Fail where the block holds more than `limit` bytes at a time, beside what was held before.
+    """Fail if the block holds more than `limit` bytes at a time, beside what was held before.
 
-    Where the block leaves threads behind, tracing goes on until a later block finds them gone: Python 3.11 crashes
-    where a thread allocates memory while tracing stops (python/cpython, issue 128679).
+    If the block leaves threads behind, tracing goes on until a later block finds them gone: Python 3.11 crashes when a
+    thread allocates memory while tracing stops (python/cpython, issue 128679).
     """
     if not tracemalloc.is_tracing():
         _threads_at_start.clear()

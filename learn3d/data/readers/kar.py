@@ -31,7 +31,7 @@ from learn3d.data.categories import synset_of
 from learn3d.data.conventions import INNER, VOXEL_SIZE, LayoutProperties, VoxelConvention
 from learn3d.data.dataset import SPLITS, ViewDataset
 from learn3d.data.readers.renderings import ObjectFiles, check_lists, check_poses, join_objects, read_objects
-from learn3d.files import limits, meshes, renderings
+from learn3d.files import geometry, limits, renderings
 from learn3d.files.reading import FETCH_AGAIN, STRICT, DamagedFile, Findings, parse_json, read_bytes
 from learn3d.files.sandbox import Call
 
@@ -85,7 +85,7 @@ def load(
         return ObjectFiles(
             root / name,
             Call(renderings.read_table, root / name / "view.txt", (views, 4, _TABLE), _TABLE),
-            Call(meshes.read_matlab, grid, ("Volume", VOXEL_SIZE)),
+            Call(geometry.read_matlab, grid, ("Volume", VOXEL_SIZE)),
             [Call(renderings.read_with_depth, path, (depth, image_size), "a rendering") for path, depth in paths],
         )
 

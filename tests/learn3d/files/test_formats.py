@@ -20,8 +20,8 @@ from shapenet_files import binvox_bytes
 from trimesh.exchange.binvox import load_binvox
 
 from learn3d.data.framing import read_photo
-from learn3d.files import limits, meshes, renderings, sandbox
-from learn3d.files.meshes import read_mesh
+from learn3d.files import geometry, limits, renderings, sandbox
+from learn3d.files.geometry import read_mesh
 from learn3d.files.reading import DamagedFile
 from learn3d.files.renderings import PHOTOGRAPHS, RENDERINGS, open_image, read_table, shrink, split_alpha
 
@@ -132,7 +132,7 @@ def test_textures_run_no_programs(tmp_path, kind):
         path = path.with_suffix(".glb")
         path.write_bytes(content[:start] + EPS.ljust(length) + content[start + length :])
     texture.write_bytes(EPS)
-    code = "import sys; from pathlib import Path; from learn3d.files.meshes import read_mesh\n"
+    code = "import sys; from pathlib import Path; from learn3d.files.geometry import read_mesh\n"
     command = [sys.executable, "-c", code + "print(len(read_mesh(Path(sys.argv[1])).faces))", str(path)]
     environment = os.environ | {"PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}"}
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
@@ -175,7 +175,7 @@ def saved(compressed: bool = False, **arrays: object) -> bytes:
 
 def matlab(folder: Path, content: bytes, name: str = "Volume", size: int = 8) -> np.ndarray:
     (folder / "a.mat").write_bytes(content)
-    return sandbox.read(meshes.read_matlab, folder / "a.mat", name, size)
+    return sandbox.read(geometry.read_matlab, folder / "a.mat", name, size)
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -195,9 +195,9 @@ def test_matlab_files_that_are_none(tmp_path):
             matlab(tmp_path, content)
 
 
-def binvox(path: Path, content: bytes, size: int = 8) -> meshes.Binvox:
+def binvox(path: Path, content: bytes, size: int = 8) -> geometry.Binvox:
     path.write_bytes(content)
-    return sandbox.read(meshes.read_binvox, path, size)
+    return sandbox.read(geometry.read_binvox, path, size)
 
 
 def test_reads_the_axes_of_the_mesh_and_where_the_grid_lies(tmp_path):

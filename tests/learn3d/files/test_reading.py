@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from learn3d.files import npz, sandbox, writing
-from learn3d.files.meshes import read_binvox, read_matlab, read_mesh
+from learn3d.files.geometry import read_binvox, read_matlab, read_mesh
 from learn3d.files.reading import check_file, parse_json, read_bytes, read_text
 from learn3d.files.renderings import PHOTOGRAPHS, open_image
 from learn3d.files.weights import read_state_dict

@@ -192,7 +192,7 @@ def test_wandb_is_one_run_with_the_options_numbers_and_pictures(tiny_run, run_fo
     )
     fake = types.ModuleType("wandb")
     fake.init = lambda **options: started.append(options) or run
-    fake.Image = lambda rgb: rgb.shape
+    fake.Image, fake.Error = lambda rgb: rgb.shape, RuntimeError
     fake.__spec__ = types.SimpleNamespace()
     monkeypatch.setitem(sys.modules, "wandb", fake)
     for steps in (2, 4):
@@ -201,6 +201,9 @@ def test_wandb_is_one_run_with_the_options_numbers_and_pictures(tiny_run, run_fo
     assert started[0]["config"]["batch_size"] == 2 and started[0]["name"] == "run"
     assert [step for step, values in shown if "train/total" in values] == [1, 2, 3, 4]
     assert [(step, values["val"][2]) for step, values in shown if "val" in values] == [(2, 3), (4, 3)]
+    fake.init = lambda **options: (_ for _ in ()).throw(RuntimeError("no API key"))
+    with pytest.raises(ValueError, match=r"log 'wandb' cannot begin a run \(no API key\); call `wandb login`, or"):
+        train(tiny_run(run_folder, log="wandb", iterations=6), resume=True)
 
 
 def test_wandb_that_is_not_installed_is_an_error_before_anything_is_written(tiny_run, run_folder, monkeypatch) -> None:
