@@ -138,7 +138,7 @@ def read_metrics(folder: Path) -> Log:
             if type(value) in (int, float) and name not in _NOT_CURVES:
                 if not (title := f"{split} {name}").isprintable() or len(title) > limits.CURVE_NAME:
                     wrong = title[: limits.CURVE_NAME]
-                    raise ValueError(f"{file}, line {number} has a number whose name is none: {wrong!r}")
+                    raise ValueError(f"{file}, line {number} has a metric with an invalid name: {wrong!r}")
                 curves.setdefault((split, name), {})[step] = float(value)
     if not 0 < len(curves) <= limits.CURVES:
         raise ValueError(f"{file} holds {len(curves)} different numbers; from 1 to {limits.CURVES} are drawn")
