@@ -17,6 +17,7 @@ from ._validate import check_number, check_vertices, describe
 from .mesh import _check_indices, face_normals, face_vertices
 
 __all__ = [
+    "area_loss",
     "edge_length_loss",
     "inflation_loss",
     "laplacian_loss",
@@ -286,6 +287,36 @@ def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
     corners = face_vertices(vertices, faces)
     moved = corners.detach() + face_normals(vertices.detach(), faces).unsqueeze(2)
     return torch.linalg.vector_norm(moved - corners, dim=-1).sum((1, 2)).mean()
+
+
+def area_loss(vertices: Tensor, faces: Tensor) -> Tensor:
+    """The area of surfaces: mean over meshes of ``sum over faces |(v1 - v0) x (v2 - v0)| / 2``.
+
+    Of the shapes that agree with given silhouettes, a small weight on the area takes one without folds, whose sides
+    that no camera sees are flat.
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
+    faces : integer Tensor [F, 3] or [B, F, 3]
+
+    Returns
+    -------
+    scalar Tensor
+        Differentiable in ``vertices``; the gradient of a face without area is 0.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types and shapes, and for faces that refer to missing vertices.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> nmr.losses.area_loss(vertices, faces)  # 12.51, the unit sphere has 12.57
+    """
+    v0, v1, v2 = face_vertices(_check_meshes(vertices), faces).unbind(2)
+    return torch.linalg.vector_norm(torch.linalg.cross(v1 - v0, v2 - v0), dim=-1).sum(1).mean() / 2
 
 
 def volume_loss(vertices: Tensor, faces: Tensor) -> Tensor:

@@ -67,7 +67,7 @@ _PLUS = PlusSettings()
 _BATCH_DIVISOR = 4  # a step of Plus sees a quarter of the other methods' images, and Plus takes four times the steps
 _SCHEDULE = {"lr_schedule": "cosine", "warmup_steps": 100, "ema_decay": 0.99, "learning_rate": _PLUS.learning_rate}
 _SYMMETRY = {"symmetry": "auto"}
-_SHARED_NAMES = ("encoder", "clamp_to_cube", "lambda_smooth", "lambda_smooth_end")
+_SHARED_NAMES = ("encoder", "generator", "lambda_area", "clamp_to_cube", "lambda_smooth", "lambda_smooth_end")
 _SHARED = _SCHEDULE | _SYMMETRY | {name: getattr(_PLUS, name) for name in _SHARED_NAMES}
 #: Table 5: mean voxel IoU over the categories of Kar's data, by widths of the view bins in azimuth and elevation.
 BINS = {"60x60": 0.497, "30x30": 0.499, "20x20": 0.501, "20x15": 0.500, "15x20": 0.504, "15x15": 0.498, "10x10": 0.490}

@@ -102,7 +102,7 @@ class MeshSettings(MethodSettings):
         return self.generator == "auto"
 
 
-COMPACT = 0.85  # least solidity of objects for which "auto" takes sphere-smooth
+COMPACT = 0.8  # least solidity of objects that "auto" takes for compact
 INSIDE = 0.499  # share of the cube's side; the voxelizer kato18 takes a face on the border (0.5) for outside
 
 
@@ -115,7 +115,12 @@ def generator_name(name: GeneratorName, info: DatasetInfo) -> GeneratorName:
     """The generator of the settings, or with "auto" the sphere that suits the masks of the data."""
     if name != "auto":
         return name
-    return "sphere-smooth" if info.solidity is not None and info.solidity >= COMPACT else "sphere"
+    return "sphere-smooth" if is_compact(info) else "sphere"
+
+
+def is_compact(info: DatasetInfo) -> bool:
+    """Whether the training masks nearly fill their convex hulls; False if that is not known."""
+    return info.solidity is not None and info.solidity >= COMPACT
 
 
 class Method(abc.ABC):
@@ -302,12 +307,14 @@ class MeshMethod(Method):
         return nmr.render_silhouette(vertices, self.faces, poses.cameras(), image_size=MASK_SIZE)
 
     def surface_losses(self, vertices: Tensor) -> dict[str, Tensor]:
-        """Those of the losses smoothness and inflation that have a weight above 0."""
+        """Those of the losses smoothness, inflation and area that have a weight above 0."""
         losses = {}
         if self.weights.get("smoothness", 0.0) > 0:
             losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.edges)
         if self.weights.get("inflation", 0.0) > 0:
             losses["inflation"] = nmr.losses.inflation_loss(vertices, self.faces)
+        if self.weights.get("area", 0.0) > 0:
+            losses["area"] = nmr.losses.area_loss(vertices, self.faces)
         return losses
 
 

@@ -5,6 +5,8 @@ The supervision is that of Peng et al. 2020: images taken singly, each with its 
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -36,6 +38,7 @@ class PlusSettings(PoseInvariantSettings):
     learning_rate: Positive = 4e-4
     lambda_smooth: Weight = 5e-4
     lambda_smooth_end: Positive | None = 1e-4
+    lambda_area: Weight | Literal["auto"] = "auto"
     lambda_novel_view: Weight = 0.5
     """Weight of the loss at novel views."""
     bank_size: Count = 2048

@@ -8,14 +8,17 @@ from torch import Tensor, nn
 
 import nmr
 from learn3d.data.batch import Batch
+from learn3d.data.dataset import DatasetInfo
 from learn3d.device import upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
-from learn3d.methods.method import MeshMethod, MeshSettings
+from learn3d.methods.method import MeshMethod, MeshSettings, is_compact
 from learn3d.methods.optimization import frozen
 from learn3d.methods.surfaces import Meshes
 from learn3d.networks import PoseDiscriminator
 from learn3d.networks.resnet import check_pretrained, load_pretrained
 from learn3d.settings import FilePath, Positive, Weight, checked
+
+COMPACT_AREA_WEIGHT = 0.03
 
 
 @checked
@@ -33,6 +36,9 @@ class PoseInvariantSettings(MeshSettings):
     lambda_smooth_end: Positive | None = None
     """Weight of the smoothness loss at the end of the run, reached by exponential decay. If it is None the weight stays
     lambda_smooth."""
+    lambda_area: Weight | Literal["auto"] = 0.0
+    """Weight of the area of the surface, which keeps it free of folds and makes sides that no camera sees flat. auto:
+    0.03 if the training masks are compact, else 0."""
     lambda_classification: Weight = 1.0
     """Weight of the discriminator's own loss (lambda_2)."""
     lambda_adversarial: Weight = 1.0
@@ -52,6 +58,10 @@ class PoseInvariantSettings(MeshSettings):
         return self.uses_discriminator
 
     @property
+    def wants_solidity(self) -> bool:
+        return super().wants_solidity or self.lambda_area == "auto"
+
+    @property
     def varies_over_run(self) -> str | None:
         return "lambda_smooth_end" if self.lambda_smooth_end is not None and self.lambda_smooth > 0 else None
 
@@ -59,6 +69,13 @@ class PoseInvariantSettings(MeshSettings):
     def uses_discriminator(self) -> bool:
         """Whether there is a pose discriminator; Vanilla-AE has none."""
         return self.lambda_classification > 0 or self.lambda_adversarial > 0
+
+
+def area_weight(settings: PoseInvariantSettings, info: DatasetInfo) -> float:
+    """The weight of the area of the surface, for the objects of the data if the settings say "auto"."""
+    if settings.lambda_area != "auto":
+        return settings.lambda_area
+    return COMPACT_AREA_WEIGHT if is_compact(info) else 0.0
 
 
 class PoseInvariant(MeshMethod):
@@ -78,6 +95,7 @@ class PoseInvariant(MeshMethod):
         return {
             "projection": 1.0,
             "smoothness": settings.lambda_smooth,
+            "area": area_weight(settings, self.info),
             "classification": settings.lambda_classification,
             "confusion": settings.lambda_adversarial,
             "prior": settings.lambda_prior,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
-from learn3d.methods.method import generator_name
+from learn3d.methods.method import is_compact
 from learn3d.presets import PRESETS
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.state import Run
@@ -30,8 +30,8 @@ def describe_run(
     elif config.settings.wants_mirror_plane:
         text += f"\nmirror plane: a camera of azimuth {run.info.mirror_plane_deg:g} looks along it, as the masks show"
     if config.settings.wants_solidity:
-        chosen = generator_name(config.settings.generator, run.info)
-        text += f"\ngenerator: {chosen}, as masks fill {run.info.solidity:.2f} of their convex hulls"
+        kind = "compact" if is_compact(run.info) else "not compact"
+        text += f"\nobjects: {kind}, as masks fill {run.info.solidity:.2f} of their convex hulls"
     return text
 
 

@@ -1,5 +1,7 @@
 """The losses: published values and gradients, closed forms, true derivatives, errors."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from vectors import load_vector, vector_names
 
 import nmr
 from nmr.losses import (
+    area_loss,
     edge_length_loss,
     inflation_loss,
     laplacian_loss,
@@ -226,6 +229,7 @@ def test_batches_are_means_over_their_meshes():
         edge_length_loss: edges,
         inflation_loss: faces,
         volume_loss: faces,
+        area_loss: faces,
     }
     for loss, table in tables.items():
         mean = sum(loss(x, table) for x in batch) / 3
@@ -262,13 +266,23 @@ def test_volume_of_boxes():
     torch.autograd.gradcheck(lambda x: volume_loss(x, faces), boxes)
 
 
+def test_area_of_octahedra():
+    """A regular octahedron of half axis a has the area 4 sqrt(3) a^2."""
+    vertices, faces = octahedron()
+    pair = torch.stack([vertices, 2 * vertices + 5]).double().requires_grad_()
+    loss = area_loss(pair, faces)
+    assert loss.item() == pytest.approx(4 * math.sqrt(3) * (1 + 4) / 2)
+    assert area_loss(pair[0], faces.flip(1)).item() == pytest.approx(4 * math.sqrt(3))
+    torch.autograd.gradcheck(lambda x: area_loss(x, faces), pair)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_collapsed_meshes_have_finite_gradients(dtype):
     vertices, faces = nmr.icosphere(0)
     edges = nmr.edge_table(faces)
     for x in (0 * vertices, vertices * torch.tensor([1.0, 0, 0])):
         x = x.to(dtype).requires_grad_()
-        total = inflation_loss(x, faces) + volume_loss(x, faces)
+        total = inflation_loss(x, faces) + volume_loss(x, faces) + area_loss(x, faces)
         for loss in (laplacian_loss, edge_length_loss, normal_consistency_loss, smoothness_loss):
             total = total + loss(x, edges)
         total.backward()

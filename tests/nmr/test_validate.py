@@ -123,6 +123,7 @@ DRAWN = {
     "consistency": lambda: nmr.losses.normal_consistency_loss(SPHERE, nmr.edge_table(FACES)),
     "inflation": lambda: nmr.losses.inflation_loss(SPHERE, FACES),
     "volume": lambda: nmr.losses.volume_loss(SPHERE, FACES),
+    "area": lambda: nmr.losses.area_loss(SPHERE, FACES),
     "look_at": lambda: nmr.LookAt.from_angles(2.0, 30.0, [0.0, 90.0]).transform(SPHERE),
     "look": lambda: nmr.Look([0.0, 0.0, -3.0], half_fov_deg=torch.tensor(20.0, device="cpu")).transform(SPHERE),
     "orthographic": lambda: nmr.Orthographic([0.0, 0.0, -2.0], scale=0.5).transform(SPHERE),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import nmr
 from learn3d.config import differences
 from learn3d.data.conventions import KATO
 from learn3d.methods import DatasetInfo, create_method
@@ -139,7 +140,7 @@ def test_the_length_of_a_run_whose_smoothness_falls_is_kept(tiny_config, tmp_pat
     ]
 
 
-def test_compact_objects_get_the_smooth_sphere(tiny_set) -> None:
+def test_compact_objects_get_the_smooth_sphere_and_a_small_area(tiny_set) -> None:
     """A square fills its hull, a cross two thirds or less; empty masks say nothing."""
     images = np.zeros((3, 4, 64, 64), np.uint8)
     images[0, 3, 10:50, 10:50] = 255
@@ -150,6 +151,11 @@ def test_compact_objects_get_the_smooth_sphere(tiny_set) -> None:
     images[0, 3, 28:36, 4:60] = images[0, 3, 4:60, 28:36] = 255
     assert 0.3 < square.solidity() < 0.67
     settings = dataclasses.replace(SMALL, generator="auto")
-    for solidity, kind in ((0.9, SmoothSphereGenerator), (0.6, SphereGenerator), (None, SphereGenerator)):
-        info = DatasetInfo(24, solidity=solidity)
-        assert type(create_method(settings, info, device="cpu", precision="fp32", seed=0).generator) is kind
+    cases = ((0.9, SmoothSphereGenerator, 0.03), (0.6, SphereGenerator, 0.0), (None, SphereGenerator, 0.0))
+    for solidity, kind, weight in cases:
+        method = create_method(settings, DatasetInfo(24, solidity=solidity), device="cpu", precision="fp32", seed=0)
+        assert type(method.generator) is kind and method.weights["area"] == weight
+    settings = dataclasses.replace(settings, lambda_area=0.5)
+    method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
+    vertices = method.generator(torch.zeros(2, 512))
+    torch.testing.assert_close(method.surface_losses(vertices)["area"], nmr.losses.area_loss(vertices, method.faces))
