@@ -29,7 +29,7 @@ def rows(name: str, part: str) -> list[list[str]]:
         return [row for row in tables[part] if row[1] != "here (kato19)"]
     header, *main = [row for row in tables["main"] if row[1] != "here (kato19)"]
     baseline = next(row[0] for row in main if row[0] not in {row[0] for row in tables["differences"]})
-    differences = {row[0]: row[2:] for row in tables["differences"]}
+    differences = {row[0]: row[2 - len(header) :] for row in tables["differences"]}
     groups = [list(group) for _, group in groupby(main, key=lambda row: row[0])]
     if part == "both":
         named = [[*group, [group[0][0], f"minus {baseline}", *differences.get(group[0][0], [])]] for group in groups]
