@@ -1,4 +1,4 @@
-"""The options of a training run: a frozen dataclass, filled in from a preset, with its checks and its JSON form."""
+"""The options of a training run: a frozen dataclass with defaults from a preset, its checks and its JSON form."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from learn3d.settings import Count, FilePath, Items, Rare, Step, checked
 
 DEFAULT_PRESET = "plus-kato"
 
-#: Options that the preset decides if they are None.
+#: Options whose default is the preset's.
 FROM_PRESET = tuple(field.name for field in dataclasses.fields(Preset) if field.name not in ("label", "source"))
 
 T = TypeVar("T")
-_MAY_DIFFER = "a resumed run may have another value"  # the option decides how to compute or report, not the result
-MayDiffer = Annotated[T, _MAY_DIFFER]
+_MAY_DIFFER = "a resumed run may have another value"
+MayDiffer = Annotated[T, _MAY_DIFFER]  # an option that changes how a run computes or reports, not its result
 
 
 @checked
 class TrainConfig:
-    """One training run. It is saved with the run (config.json and in every checkpoint)."""
+    """One training run. config.json and every checkpoint hold it."""
 
     data: MayDiffer[FilePath]
     """Folder of the data set. In the layout kato its files are 02691156_train_images.npz and so on."""
@@ -45,16 +45,16 @@ class TrainConfig:
     layout: Layout | None = None
     """Arrangement of the files of the data set, see docs/data-sets.md."""
     view_bins: Rare[str | None] = None
-    """Size of the view classes, azimuth x elevation in degrees (default: 15x20 for kar; a class for each camera if
-    cameras are fixed)."""
+    """Size of the view classes, azimuth x elevation in degrees (default: 15x20 for kar; one class for each fixed
+    camera)."""
     views_per_object: Rare[Count | None] = None
-    """Number of training views of each object: the first ones for kar and r2n2, else the same random ones in every run
+    """Number of training views of each object: the first ones for kar and r2n2, else random ones, the same in every run
     (default: one for kar, else all)."""
     poses: MayDiffer[FilePath | None] = None
-    """Table of poses by learn3d estimate-poses; it replaces the poses of the data set (default: none)."""
+    """Table of poses from learn3d estimate-poses, instead of the poses of the data set (default: none)."""
     sampling: Rare[Sampling | None] = None
-    """How batches are drawn. views: single images. pairs: two views of an object. groups: five views of an object.
-    classes: single images, categories uniformly."""
+    """How batches are drawn. views: single images. pairs: two views of each object. groups: five views of each object.
+    classes: single images, every category equally often."""
     augment: Rare[Annotated[tuple[Augmentation, ...], Items] | None] = None
     """Random augmentations of the training images (--augment without a name: none)."""
     iterations: MayDiffer[Step | None] = None
@@ -77,14 +77,14 @@ class TrainConfig:
     """Number of CPU threads (default: one or all, whichever is faster; measured at the start and when steps slow
     down)."""
     log: Rare[MayDiffer[Literal["csv", "tensorboard", "wandb"]]] = "tensorboard"
-    """Program that shows the metrics besides metrics.jsonl: csv (metrics.csv), tensorboard, or wandb (pip install
-    wandb; it sends them to your account there)."""
+    """Second log besides metrics.jsonl: csv (metrics.csv), tensorboard, or wandb (pip install wandb; it sends the
+    metrics to your account there)."""
     val_split: Rare[MayDiffer[Literal["val", "test"]]] = "val"
-    """Split for validation during training, and for choosing the best checkpoint."""
+    """Split for validation during training and for choosing the best checkpoint."""
     validate_every: MayDiffer[Step] = 2000
     """Steps between validations (voxel IoU and MMD); the last step is always validated."""
     max_val_images: Rare[MayDiffer[Count | None]] = None
-    """Number of images to validate on, spread evenly over the objects and views of the split (default: all)."""
+    """Number of images to validate on, evenly from all objects and views of the split (default: all)."""
     pictures_every: Rare[MayDiffer[Step]] = 1000
     """Steps between picture grids."""
     checkpoint_every: Rare[MayDiffer[Step]] = 1000
@@ -97,7 +97,7 @@ class TrainConfig:
         chosen = {name: getattr(preset, name) for name in FROM_PRESET if getattr(self, name) is None}
         for name, value in chosen.items():
             object.__setattr__(self, name, value)
-        if "warmup_steps" in chosen:
+        if "warmup_steps" in chosen:  # the preset's warm-up may be longer than a short run
             object.__setattr__(self, "warmup_steps", min(self.warmup_steps, self.iterations // 10))
         wanted, given = type(preset.settings).__name__, type(self.settings).__name__
         if wanted != given:
@@ -115,11 +115,11 @@ class TrainConfig:
                 f"with sampling {self.sampling!r} batch_size must be a multiple of {size}, got {self.batch_size}"
             )
         self.settings.check_run(iterations=self.iterations, batch_size=self.batch_size)
-        self.schedule  # noqa: B018 (it checks itself)
+        self.schedule  # noqa: B018 (raises if warmup_steps is too large)
 
     @property
     def schedule(self) -> TrainingSchedule:
-        """Course of the training, which the method follows."""
+        """Length, learning-rate schedule and EMA of the training."""
         return TrainingSchedule(self.iterations, self.lr_schedule, self.warmup_steps, self.ema_decay)
 
 
@@ -129,7 +129,7 @@ def config_to_dict(config: TrainConfig) -> dict[str, Any]:
 
 
 def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
-    """Build a TrainConfig from plain values. Raises ValueErrors that name `source` and the option that is wrong."""
+    """Build a TrainConfig from plain values. Raises a ValueError that names `source` and the wrong option."""
     try:
         if not isinstance(values, dict):
             raise ValueError(f"must hold options by name ({{...}}), got {type(values).__name__}")
@@ -142,7 +142,7 @@ def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Read the config.json of a run. Raises ValueError if there is none, or if it is damaged."""
+    """Read the config.json of a run. Raises ValueError if it is missing or damaged."""
     try:
         content = read_bytes(path, limits.CONFIG_BYTES, "the options of a run")
     except FileNotFoundError:
@@ -162,7 +162,7 @@ _MAY_DIFFER_NAMES = {
 
 
 def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
-    """Reasons why `config` is another run than `saved`: a line for each option that must not differ."""
+    """A line for each option of `config` that differs from the run `saved` and must not."""
     old, new = (_flat(c) for c in (saved, config))
     schedule = f"the schedule {config.lr_schedule}" if config.lr_schedule != "constant" else ""
     varies = schedule or config.settings.varies_over_run
@@ -176,13 +176,13 @@ def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
 
 
 def check_resume(config: TrainConfig, saved: TrainConfig) -> None:
-    """Raise a ValueError naming every option whose change would make the resumed run a different one."""
+    """Raise a ValueError that names every option that must not change when a run is resumed."""
     if changed := differences(config, saved):
         raise ValueError("cannot resume with different options (" + "; ".join(changed) + "); start a new run for that")
 
 
 def _flat(config: TrainConfig) -> dict[str, Any]:
-    """Options by name, those of the method among them. The preset does not count: it only sets the others."""
+    """All options by name, with those of the method. The preset is left out: it only sets defaults."""
     values = {"method": type(config.settings).__name__.removesuffix("Settings"), **vars(config)}
     del values["preset"], values["settings"]
     return values | dataclasses.asdict(config.settings)

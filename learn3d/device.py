@@ -1,4 +1,4 @@
-"""The device and the precision of the networks, and the memory of a step."""
+"""Device and precision of the networks, and memory allocation."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-CPUINFO = "/proc/cpuinfo"  # Linux lists the instructions of the CPU in it
+CPUINFO = "/proc/cpuinfo"  # Linux lists the CPU's instruction sets here
 
 
 def resolve_precision(precision: Literal["auto", "bf16", "fp32"], device: str) -> Literal["bf16", "fp32"]:
-    """Turn 'auto' into the faster arithmetic: bf16 on CUDA and on x86 CPUs with bf16 instructions, fp32 elsewhere.
+    """Turn 'auto' into the faster precision: bf16 on CUDA and on x86 CPUs with bf16 instructions, else fp32.
 
-    With the instructions a step of the networks takes half the time; without them bf16 is emulated, and slower.
+    bf16 instructions halve the time of the networks; without them bf16 is emulated and slower than fp32.
     """
     if precision != "auto":
         return precision
@@ -34,13 +34,13 @@ def autocast(device: torch.device | str, precision: Literal["bf16", "fp32"]) -> 
 
 
 def check_device(device: str) -> None:
-    """Raise a ValueError when CUDA is asked for and absent."""
+    """Raise a ValueError if CUDA is asked for and missing."""
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device 'cuda' was asked for, but this PyTorch sees no CUDA device; use device 'cpu'")
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
-    """Queue the copy of a tensor on the CPU to `device`; on the CPU the tensor itself. Gradients go to the original."""
+    """Copy a CPU tensor to `device` without waiting (the tensor itself if that is the CPU). Differentiable."""
     return tensor.to(device, non_blocking=True)
 
 
@@ -48,10 +48,10 @@ _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # <malloc.h>
 
 
 def keep_freed_memory() -> bool:
-    """Let this process reuse freed memory instead of returning it; True if that could be set (Linux with glibc).
+    """Let this process reuse freed memory instead of returning it; True if that worked (Linux with glibc).
 
-    Every large tensor is otherwise mapped, page by page, and unmapped again in each step: a quarter of the step's CPU
-    time at batch 128 (LOG.md). Resident memory stays at its peak.
+    By default each step maps and unmaps the pages of every large tensor, a quarter of its CPU time at batch 128.
+    Resident memory stays at its peak.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

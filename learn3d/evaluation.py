@@ -1,4 +1,4 @@
-"""Voxel IoU, distance between surfaces and pose invariance (MMD) of a trained method on one split of a data set."""
+"""Voxel IoU, silhouette IoU, surface distances and pose invariance (MMD) of a trained method on one split."""
 
 from __future__ import annotations
 
@@ -21,35 +21,35 @@ from learn3d.methods import Grids, Meshes, Method
 from learn3d.methods.surfaces import grid_surface
 from learn3d.pictures.surfaces import Surface
 
-#: A function that brings the predicted shapes of a batch to the true ones before they are compared; see `evaluate`.
+#: A function that aligns the predicted shapes of a batch with the true ones; see `evaluate`.
 Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]
 
 CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
 F_SCORE_DISTANCE = 0.05  # units of the object frame: objects are 1 long (Pascal3D+: up to 2)
 
-#: Figures of each image.
+#: Metrics of each image. kato18 and kato19 are voxelizers (`data.conventions`).
 MEASURED = (
     "voxel_iou",  # kato18; NaN if prediction and truth are empty
     "voxel_iou_kato19",
-    "precision",  # part of the predicted voxels that is true (kato18)
-    "recall",  # part of the true voxels that is predicted
-    "hollow",  # 1 if the mesh reaches beyond the grid, so that kato18 finds no inside
+    "precision",  # share of the predicted voxels that are true (kato18)
+    "recall",  # share of the true voxels that are predicted (kato18)
+    "hollow",  # 1 if the mesh exceeds the grid: kato18 then fills no inside
     "chamfer_l1",  # NaN if a surface is empty
-    "f_score",  # 0 if the prediction alone is empty
-    "silhouette_iou",  # with the mask of another image of the object
+    "f_score",  # 0 if only the prediction is empty
+    "silhouette_iou",  # at the camera of another image of the object
 )
 NO_MMD = "no MMD: it takes two images of each of two views"
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Figures of each image of one class, and their means."""
+    """Metrics of each image of one class, and their means."""
 
     object_ids: Tensor  # int64 [M]
     view_ids: Tensor  # int64 [M]
-    values: dict[str, Tensor]  # float64 [M] for each name of `MEASURED`; NaN if undefined or not asked for
-    means: dict[str, float]  # over the images that have a value, and "mmd", "mmd_paper"; no entry if undefined
+    values: dict[str, Tensor]  # float64 [M] by the names of `MEASURED`; NaN if undefined or not asked for
+    means: dict[str, float]  # means without NaN, and "mmd", "mmd_paper"; undefined ones are left out
 
     @property
     def voxel_iou(self) -> float | None:
@@ -58,19 +58,17 @@ class Evaluation:
 
     @property
     def mmd(self) -> float | None:
-        """MMD by the published code."""
+        """Mean MMD, as the published code has it."""
         return self.means.get("mmd")
 
     @property
     def main_metric(self) -> Literal["voxel_iou", "silhouette_iou"]:
-        """Name of the metric that is shown first: the IoU of silhouettes if no voxels are known."""
+        """Metric that is shown first: the IoU of silhouettes if no voxels are known."""
         return "silhouette_iou" if "voxel_iou" not in self.means and "silhouette_iou" in self.means else "voxel_iou"
 
     @property
     def selection_metric(self) -> Literal["voxel_iou", "silhouette_iou"]:
-        """Name of the metric that selects the best networks: the IoU of silhouettes at novel views, if it is known. It
-        needs no 3D data.
-        """
+        """Metric that selects the best checkpoint: the IoU of silhouettes, which needs no 3D data, if it is known."""
         return "silhouette_iou" if "silhouette_iou" in self.means else "voxel_iou"
 
 
@@ -86,16 +84,15 @@ def evaluate(
 ) -> Evaluation:
     """Measure the shape of every image of a split, and the mean MMD over all pairs of view classes.
 
-    Shapes are voxelised in the data set's convention and compared with the object's voxels. Meshes are also seen by the
-    camera of another image of the object and compared with that image's mask: the IoU of silhouettes. If there are no
-    other images, the image itself takes their place, but only without voxels. Without poses silhouettes are unknown.
+    Shapes are voxelized in the data set's convention and compared with the object's voxels. If poses are known, the
+    silhouette of a mesh at the camera of another image of the object is compared with that image's mask. Without
+    voxels, an object's only image is compared with its own mask.
 
     max_images: use only that many images, always the same ones (see `spread_samples`).
-    detailed: add the voxel IoU by kato19, the MMD as the paper prints it, and Chamfer-L1 and F-score between 2,000
+    detailed: add the voxel IoU with kato19, the MMD as the paper prints it, and Chamfer-L1 and F-score between 2,000
     points on each surface. If the data set has no points, the truth is the surface of its voxels, which limits
     distances to about 1/32.
-    align: a function of the predicted shapes, the batch and the data set that returns the shapes to be compared, for
-    methods whose shapes may be turned or moved against the true ones.
+    align: turns or moves the predicted shapes of a batch before they are compared.
     """
     count = len(dataset) if max_images is None else min(max_images, len(dataset))
     samples = spread_samples(dataset.object_ids, dataset.view_ids, count)
@@ -133,7 +130,7 @@ def evaluate(
 
 
 def occupancy(shapes: Meshes | Grids, dataset: ViewDataset, definition: Definition) -> Tensor:
-    """Predictions as bool [B, 32, 32, 32] in the data set's voxel axes. A voxeliser makes no difference to grids."""
+    """Predictions as bool [B, 32, 32, 32] in the data set's voxel axes. definition: voxelizer of meshes."""
     if isinstance(shapes, Meshes):
         return dataset.voxelize(shapes.vertices, shapes.faces, definition)
     if dataset.convention.cube_side != 1.0:
@@ -153,10 +150,7 @@ def _compare_voxels(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, 
 
 
 def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
-    """IoU of silhouettes at the cameras of a batch with its masks: sum of the smaller over sum of the larger value.
-
-    1 if they are equal, soft borders included; NaN if both are empty.
-    """
+    """IoU of a batch's masks and the silhouettes at its cameras: sum of minima over sum of maxima (NaN: both empty)."""
     size = batch.masks.shape[-1]
     seen = nmr.render_silhouette(shapes.vertices, shapes.faces, batch.cameras, image_size=size).flatten(1)
     masks = batch.masks.flatten(1)
@@ -164,10 +158,7 @@ def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
 
 
 def _compare_surfaces(shapes: Meshes | Grids, truth: list[Tensor], generator: torch.Generator) -> dict[str, Tensor]:
-    """Chamfer-L1 and F-score with the true points [P, 3] of each object.
-
-    An empty surface has no distance (NaN). If only one of the two is empty, the F-score is 0.
-    """
+    """Chamfer-L1 and F-score with the true points [P, 3] of each object; see `MEASURED` for empty surfaces."""
     found = []
     for surface, theirs in zip(shapes.surfaces(), truth, strict=True):
         ours = _sample(surface, generator)
@@ -181,7 +172,7 @@ def _compare_surfaces(shapes: Meshes | Grids, truth: list[Tensor], generator: to
 
 
 def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Tensor] | None:
-    """Points [P, 3] on the true surface of every object, in the object frame; None if nothing is known."""
+    """Points [P, 3] on the true surface of every object, in the object frame; None if unknown."""
     convention = dataset.convention
     parts = np.split(np.arange(dataset.num_objects), range(256, dataset.num_objects, 256))
     if dataset.points is not None:
@@ -202,7 +193,7 @@ def _sample(surface: Surface, generator: torch.Generator) -> Tensor:
 def _other_images(object_ids: np.ndarray) -> Tensor:
     """For each sample another one of its object, int64 [M]: a quarter of the object's images further on.
 
-    That is a quarter turn if the views go around the object. After half a turn the outline is the same, mirrored.
+    If views go around the object, that is a quarter turn. Half a turn would show the same outline, mirrored.
     """
     order = np.argsort(object_ids, kind="stable")
     others = np.empty_like(order)
@@ -212,10 +203,9 @@ def _other_images(object_ids: np.ndarray) -> Tensor:
 
 
 def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> Tensor:
-    """`count` different samples, int64 [count], ascending; a function of its arguments alone.
+    """`count` different samples, int64 [count], ascending, spread evenly over views and objects; always the same ones.
 
-    Every view is among them about as often as any other, and so is every object: samples are taken one after the other
-    in a shuffled order, each time from those whose view and object have been taken least.
+    Samples are taken one by one in a shuffled order, each time from the views and objects that were taken least.
     """
     total = len(object_ids)
     if count >= total:
@@ -233,19 +223,19 @@ def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> 
 
 
 def mean_mmd(codes: Tensor, view_ids: Tensor, forms: Sequence[str] = ("mmd",)) -> dict[str, float]:
-    """Mean MMD over all pairs of views (276 for 24) between the codes [N,C] of their images, by name of the form.
+    """Mean MMD over all pairs of views between the codes [N,C] of their images, by name of the form.
 
-    Of each view the first 512 codes count, and no more than the view with the fewest has: with n codes the MMD has a
-    bias of 1 / n. Views with one code are left out: between two single codes the MMD is a constant (6.19). {} if fewer
-    than two views are left.
+    The MMD of n codes has a bias of 1 / n, so every view has the same number of codes: that of the view with the
+    fewest, at most 512. Views with one code are left out, as the MMD between two single codes is a constant. The result
+    is {} if fewer than two views are left.
     """
-    of_views = [codes[view_ids == view] for view in view_ids.unique()]
-    of_views = [codes_of_view for codes_of_view in of_views if len(codes_of_view) > 1]
-    if len(of_views) < 2:
+    groups = [codes[view_ids == view].double() for view in view_ids.unique()]
+    groups = [group for group in groups if len(group) > 1]
+    if len(groups) < 2:
         return {}
-    size = min(CODES_PER_VIEW, *map(len, of_views))
-    groups = [codes_of_view[:size].double() for codes_of_view in of_views]
-    norms = [codes_of_view.square().sum(1) for codes_of_view in groups]
+    size = min(CODES_PER_VIEW, *map(len, groups))
+    groups = [group[:size] for group in groups]
+    norms = [group.square().sum(1) for group in groups]
 
     def distances(i: int, j: int) -> Tensor:
         squared = torch.addmm(norms[j].expand(size, size), groups[i], groups[j].T, alpha=-2)

@@ -1,7 +1,4 @@
-"""Losses on shape codes, pose logits, silhouettes and depth, and the MMD between sets of codes, all in float32.
-
-The losses of IoU and smoothness are in nmr.losses.
-"""
+"""Losses on shape codes, pose logits, silhouettes and depth, and the MMD, all in float32. See also nmr.losses."""
 
 from __future__ import annotations
 
@@ -22,10 +19,10 @@ def pose_classification_loss(logits: Tensor, view_ids: Tensor) -> Tensor:
 
 
 def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -> Tensor:
-    """L_adv: distance of the discriminator's output from the uniform distribution over K views (eq. 4), batch mean.
+    """L_adv: batch mean of the distance between predicted and uniform probabilities of K views (eq. 4).
 
     "probability", as printed: sum_k (p_k - 1/K)^2. "log", as in the published code: sum_k (log(1/K) - log p_k)^2, which
-    is unbounded and much stronger if the discriminator is sure of itself. logits [B,K]; differentiable.
+    is unbounded and much stronger for a confident discriminator. logits [B,K]; differentiable.
     """
     views = logits.shape[1]
     if form == "log":
@@ -38,7 +35,7 @@ def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -
 def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
     """Mean distance between depth maps [B, S, S] over the pixels in which both show a surface.
 
-    A rendered pixel without a surface has nmr's `far`, 100, and a pixel of the target 0. Differentiable in depth.
+    Pixels without a surface are 100 (nmr's `far`) in `depth` and 0 in `target`. Differentiable in depth.
     """
     both = (target > 0) & (depth.detach() < 2 * target)
     return ((depth - target).abs() * both).sum() / both.sum().clamp(min=1)
@@ -47,7 +44,7 @@ def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
 def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tensor:
     """L_prior: batch mean of the length of the codes (eq. 5, "norm") or of its square (published code, "squared").
 
-    codes [B,C]; differentiable (the gradient of the norm at a zero code is zero).
+    codes [B,C]; differentiable; the gradient at a zero code is zero.
     """
     codes = codes.float()
     if form == "squared":
@@ -56,10 +53,10 @@ def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tens
 
 
 def silhouette_pyramid_loss(prediction: Tensor, target: Tensor) -> Tensor:
-    """Distance of silhouettes at five resolutions (published code of Kato and Harada 2019).
+    """Distance between silhouettes at five resolutions (published code of Kato and Harada 2019).
 
-    sum over levels l of the batch mean of |p_l / |p_l| - t_l / |t_l||^2, with p_0 = prediction and p_(l+1) = p_l halved
-    by the mean of 2x2 pixels. An empty silhouette has p / |p| = 0. prediction, target float [B,S,S], S >= 16;
+    The sum over levels l of the batch mean of |p_l / |p_l| - t_l / |t_l||^2. p_0 is the prediction, and p_(l+1) has the
+    means of 2x2 pixels of p_l. An empty silhouette has p / |p| = 0. prediction, target: float [B,S,S], S >= 16;
     differentiable in both.
     """
     pair = torch.stack([prediction.float(), target.float()])
@@ -73,12 +70,13 @@ def silhouette_pyramid_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def silhouette_energy_distance(drawn: Tensor, real: Tensor) -> Tensor:
-    """Energy distance of the distributions of two sets of silhouettes (Szekely and Rizzo 2013).
+    """Energy distance between the distributions of rendered silhouettes p and real ones t (Szekely and Rizzo 2013).
 
-    2 mean_ij d(p_i, t_j) - mean_(i != k) d(p_i, p_k), with d(a, b) = 1 - a.b / (a.a + b.b - a.b). For silhouettes of 0
-    and 1 this d is 1 - IoU (Tanimoto's similarity, a positive definite kernel: Ralaivola et al. 2005). The third term,
-    which has only real silhouettes, is constant and left out. Differentiable in drawn, float [N,D] with N >= 2; real
-    is float [M,D] with M >= 1. Two empty silhouettes are alike: d = 0.
+    2 mean_ij d(p_i, t_j) - mean_(i != k) d(p_i, p_k); the third term is constant and left out. The distance
+    d(a, b) = 1 - a.b / (a.a + b.b - a.b) is 1 - IoU for silhouettes of 0 and 1 (Tanimoto's similarity, a positive
+    definite kernel: Ralaivola et al. 2005), and 0 for two empty ones.
+
+    drawn: float [N,D], N >= 2, differentiable; real: float [M,D], M >= 1.
     """
     across, within = _tanimoto_distances(drawn, real), _tanimoto_distances(drawn, drawn)
     pairs = len(drawn) * (len(drawn) - 1)
@@ -93,13 +91,12 @@ def _tanimoto_distances(x: Tensor, y: Tensor) -> Tensor:
 
 
 def mmd(x: Tensor, y: Tensor, form: Literal["released", "paper"] = "released") -> Tensor:
-    """Maximum mean discrepancy between two sets of codes: 0 when they are alike, differentiable.
+    """Maximum mean discrepancy between two sets of codes, 0 for equal sets. x, y: float [N,C]; differentiable.
 
-    x, y float [N,C]. With b the mean squared distance over all pairs of different rows of x and y together (a constant
-    for the gradient):
-    "released", the published code's quantity and the one in the paper's table: mean(XX + YY - XY - YX) with the sum of
-    the five kernels exp(-d^2 / (b * 2^i)), i = -2..2, and no root.
-    "paper", as printed: the square root of it with one kernel; the text gives no bandwidth, so i = 0 is taken.
+    b is the mean squared distance over all pairs of different rows of x and y together, a constant for the gradient.
+    "released", as in the published code and the paper's table: mean(XX + YY - XY - YX) of the sum of five kernels
+    exp(-d^2 / (b * 2^i)), i = -2..2. "paper", as printed: the square root of that mean for one kernel. The paper
+    gives no bandwidth for it; here i = 0.
     """
     xx, yy, xy = (_squared_distances(a, b) for a, b in ((x, x), (y, y), (x, y)))
     return mmd_from_distances(xx, yy, xy, form)
@@ -118,8 +115,8 @@ def mmd_from_distances(xx: Tensor, yy: Tensor, xy: Tensor, form: Literal["releas
 
 
 def _five_kernels(distances: Tensor, bandwidth: Tensor) -> Tensor:
-    """sum_i exp(-d / (b 2^i)), i = -2..2: each kernel is the square of the next wider one."""
-    kernel = torch.exp(-distances / (4 * bandwidth))
+    """sum_i exp(-d / (b 2^i)), i = -2..2, of squared distances d."""
+    kernel = torch.exp(-distances / (4 * bandwidth))  # the widest; squaring it gives the next
     total = kernel
     for _ in range(4):
         kernel = kernel.square()

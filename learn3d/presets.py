@@ -1,7 +1,4 @@
-"""Presets: the options of an experiment, named <source>-<data set>[-<variant>]: a publication, or "plus".
-
-A preset fills in the options that the command line leaves out; every option can be given on its own.
-"""
+"""Presets: default options of each experiment. Names are <publication or method>-<data set>[-<variant>]."""
 
 from __future__ import annotations
 
@@ -22,19 +19,19 @@ from learn3d.terminal import unknown_name
 
 @dataclass(frozen=True)
 class Preset:
-    """Options of one experiment, and their source."""
+    """Options of one experiment and their source; `TrainConfig` explains each option."""
 
-    label: str  # what tables call it
+    label: str  # name of the method in tables
     settings: MethodSettings  # their type decides the method
-    layout: Layout  # layout of the data set of the experiment
+    layout: Layout
     iterations: int
     batch_size: int
-    source: str  # publication or page that the figures are from
+    source: str  # publication or page of these values
     sampling: Sampling = "views"
-    augment: tuple[Augmentation, ...] = ()  # changes of every training batch
+    augment: tuple[Augmentation, ...] = ()
     lr_schedule: LRSchedule = "constant"
-    warmup_steps: int = 0  # steps over which the learning rate ramps up from 0
-    ema_decay: float = 0.0  # decay a step of the exponential moving average of the weights; 0: no average
+    warmup_steps: int = 0
+    ema_decay: float = 0.0
 
 
 class NamedMethod(NamedTuple):
@@ -59,7 +56,7 @@ METHODS = {
 
 
 def full_name(name: str) -> str:
-    """The name of a preset, from that or from the short name of a method. Raises ValueError for any other."""
+    """The name of a preset, given that name or the short name of a method. Raises ValueError for other names."""
     preset = METHODS[name].preset if name in METHODS else name
     if preset not in PRESETS:
         raise ValueError(unknown_name("preset", name, [*METHODS, *PRESETS]))
@@ -72,14 +69,14 @@ _VPL_CODE = "published code of Kato and Harada 2019"
 
 _KATO = Preset("Proposed", PoseInvariantSettings(), "kato", 20_000, 128, f"{_PAPER}; losses: {_CODE}")
 _KAR = replace(_KATO, layout="kar", source=f"{_PAPER}: one image per object, K = 72; losses: {_CODE}")
-# ResNet-18 starts from random weights in the published code; `pretrained` gives it ImageNet's.
+# ResNet-18 starts from random weights in the published code; the setting `pretrained` starts it from ImageNet's.
 _ON_PASCAL: dict[str, Any] = {
     "encoder": "resnet18",
     "symmetry": "z",
     "lambda_adversarial": 0.01,
     "lambda_prior": 0.01,
 }
-# The paper is silent about iterations and batch size: 40,000 is the published training script's, 128 its default.
+# The paper gives neither iterations nor batch size: 40,000 is the published training script's, 128 its default.
 _PASCAL = replace(
     _KATO,
     settings=PoseInvariantSettings(**_ON_PASCAL),
@@ -110,7 +107,7 @@ _MANY_VIEWS = replace(
     ema_decay=0.995,
     iterations=20_000,
 )
-#: What Kato and Harada 2019 use on both data sets.
+#: Settings of Kato and Harada 2019 on both data sets.
 _VPL: dict[str, Any] = {
     "image_size": 224,
     "silhouette_size": 224,
@@ -120,7 +117,7 @@ _VPL: dict[str, Any] = {
     "adam_beta1": 0.5,
     "lambda_smooth": 0.0,
 }
-#: On Kar's data: one view of each object, silhouettes only, with lambda_D = 0.1.
+#: Kar's data: one view of each object, silhouettes only, with lambda_D = 0.1.
 _KAR_VPL = VPLSettings(
     **_VPL,
     encoder="preact-resnet18",
@@ -135,7 +132,7 @@ _KAR_VPL = VPLSettings(
     lambda_inflation=1e-4,
     lambda_discriminator=0.1,
 )
-#: On Pascal3D+, without their perceptual loss of colours.
+#: Pascal3D+, without the published perceptual loss of colours.
 _PASCAL_VPL = VPLSettings(
     **_VPL,
     encoder="resnet18",
@@ -154,17 +151,14 @@ _PASCAL_VPL = VPLSettings(
 
 
 def _vanilla(preset: Preset) -> Preset:
-    """The baseline: the same without the losses on codes."""
+    """The baseline Vanilla-AE: a preset without its losses on codes."""
     none = dict.fromkeys(("lambda_classification", "lambda_adversarial", "lambda_prior"), 0.0)
     settings = replace(preset.settings, **none)
     return replace(preset, label="Vanilla-AE", settings=settings, source=f"baseline; otherwise {preset.source}")
 
 
-#: "peng2020-kato" is what the published code computes, and what the paper's tables were made with. The equations as
-#: printed (with the sign slip of the projection loss corrected) need adversarial_form "probability" and prior_form
-#: "norm". Both place the vertices at 0.5 * (unit sphere + displacement), as the published code does: the text's unit
-#: sphere is larger than the image at the data set's camera, so that no edge is visible and the silhouette gives no
-#: gradient.
+#: "peng2020-kato" has the losses of the published code, which made the paper's tables. The printed equations (with the
+#: sign slip of the projection loss corrected) need adversarial_form "probability" and prior_form "norm".
 PRESETS: dict[str, Preset] = {
     "peng2020-kato": _KATO,
     "peng2020-kato-vanilla": _vanilla(_KATO),
@@ -174,16 +168,16 @@ PRESETS: dict[str, Preset] = {
     # Cameras differ within a view class, so the class's masks say little about a single camera: docs/methods/plus.md.
     "plus-kar": replace(_PLUS, layout="kar", settings=PlusSettings(lambda_novel_view=0.0)),
     "many-views-kato": _MANY_VIEWS,
-    # The package's model: cameras at unknown distances.
+    # The model in the package: cameras at unknown distances.
     "many-views-around": replace(
         _MANY_VIEWS,
         settings=ManyViewsSettings(encoder="conv-centred", generator="sphere-small", symmetry="x", lambda_view=1.0),
         layout="around",
     ),
-    "plus-pascal": replace(  # it flips images itself; resnet18 ignores the mask, so no image loses its colours
+    "plus-pascal": replace(  # without "colors", which blanks some images, as resnet18 does not see the mask
         _PLUS, settings=PlusSettings(**_ON_PASCAL), layout="pascal3d", iterations=160_000, augment=("crop", "channels")
     ),
-    # The figures are those of airplanes: docs/methods/vanilla-ae.md has the other categories.
+    # The values for airplanes; docs/methods/vanilla-ae.md has the other categories.
     "kato2018-kato": replace(
         _KATO,
         label="Vanilla-AE (multi-view)",
@@ -193,7 +187,7 @@ PRESETS: dict[str, Preset] = {
         sampling="pairs",
         lr_schedule="step",
     ),
-    # 50 epochs for the GAN and as many for the encoder, of the 2,831 x 24 training images of airplanes.
+    # 50 epochs of the 2,831 x 24 training images of airplanes for the GAN, then 50 for the encoder.
     "gadelha2017-kato": replace(
         _KATO,
         label="PrGAN",

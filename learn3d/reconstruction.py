@@ -1,4 +1,4 @@
-"""From an image with a mask to a mesh file and pictures of it."""
+"""Reconstruction: from images with masks to mesh files and pictures of them."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ from learn3d.terminal import note
 
 MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 
-SMALL_MODEL = Path(__file__).with_name("models") / "small.safetensors"  # the one that comes with the package
-STRIP_SIZE = 192  # pixels
-_FINE = 4  # pixels, per side, that are averaged to one of a prepared image, or more
-_LARGE = 1024  # pixels a side in which an object before a plain background is searched for
-_COLORED = 256  # pixels a side of the picture from which colours are taken
-_LEAST_SHARE = 0.05  # smallest share of the square's side that an object can take
+SMALL_MODEL = Path(__file__).with_name("models") / "small.safetensors"  # the model in the package
+STRIP_SIZE = 192  # side of each picture in a strip, in pixels
+_OVERSAMPLING = 4  # pixels of a photograph, along each axis, per pixel of the prepared image, at least
+_PLAIN_SIDE = 1024  # side in pixels to which a photograph with a plain background is reduced
+_COLORED = 256  # side in pixels of the picture that gives the colours
+_LEAST_SHARE = 0.05  # smallest share of the image's side that an object can take
 
 
 class Model(NamedTuple):
@@ -59,17 +59,17 @@ class Model(NamedTuple):
 
     method: Method
     config: TrainConfig
-    object_share: float  # of the side of its training images that objects take
-    known_codes: KnownCodes | None = None  # None: not said in its file
+    object_share: float  # mean share of the side of its training images that objects take
+    known_codes: KnownCodes | None = None  # None if its file has none
 
     def prepare(self, colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
-        """`prepare_image` for these networks."""
+        """Call `prepare_image` with the image size, share and layout of these networks."""
         size, layout = self.method.image_size, self.config.layout
         return prepare_image(colors, mask, crop=crop, object_share=self.object_share, size=size, layout=layout)
 
 
 def load_model(run: Path | None, which: str = "last") -> Model:
-    """The model of a run folder or checkpoint file; None: the small one that comes with the package."""
+    """The model of a run folder or checkpoint file, or the model in the package if `run` is None."""
     path = checkpoint.find(run or SMALL_MODEL, which)
     method, config, metadata = checkpoint.load_method(path)
     known = list(map(checkpoint.load(path)[0].get, KNOWN_CODES))
@@ -78,7 +78,7 @@ def load_model(run: Path | None, which: str = "last") -> Model:
 
 
 def cut_out_pictures(model: Model, folder: Path) -> Tensor:
-    """All PNG files with transparency in a folder as stored images uint8 [M, 4, S, S]. Raises ValueError if none is."""
+    """All PNG files with transparency in a folder as stored images uint8 [M, 4, S, S]. ValueError if there are none."""
     files = sorted(folder.rglob("*.png"))
     if not files:
         raise ValueError(f"there is no PNG file in {folder}")
@@ -100,9 +100,10 @@ def reconstruct_files(
 ) -> list[Path]:
     """Reconstruct image files with the networks of a run (see `load_model`) and save the results in `folder`.
 
-    If there are no `masks`, the images have transparency or, with `plain_background`, the object is everything that
-    differs from the border's colour, or it is cut out of the `box` (`learn3d.fitting.cutting`). refined: see
-    `reconstruct_picture`. Returns the files, named after the images (see `save`).
+    masks: a file for each image. Without them images need transparency, except with `plain_background` (the object is
+    everything that differs from the border's colour) or with a `box` (the object is cut out, see
+    `learn3d.fitting.cutting`). refined: see `reconstruct_picture`. Returns the files, named after the images (see
+    `save`). Raises ValueError if a mask is missing or empty, or if a result would replace an input file.
     """
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
@@ -138,8 +139,8 @@ def reconstruct_dataset(
 ) -> list[Path]:
     """Reconstruct images of a data set (indices object * views + view) and save the results in `folder`.
 
-    refined: fit the shapes to the masks, with the data set's poses. Returns the files, named after category, split and
-    index (see `save`).
+    refined: fit the shapes to the masks at the data set's poses; ValueError if it has none. Returns the files, named
+    after category, split and index (see `save`).
     """
     require_folder(data)
     model = load_model(run, which)
@@ -157,11 +158,11 @@ def reconstruct_dataset(
 def _read(
     path: Path, mask_path: Path | None, find: Callable[[np.ndarray], np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colours uint8 [H,W,3] and a mask uint8 [H,W] that can be right: the file's, or the one that `find` finds."""
+    """Colours uint8 [H,W,3] and a checked mask uint8 [H,W]: from the file, from `mask_path` or from `find`."""
     searched = find is not None and mask_path is None
-    side = _LARGE if find is threshold_mask else limits.IMAGE_SIDE  # a box counts the file's own pixels
+    side = _PLAIN_SIDE if find is threshold_mask else limits.IMAGE_SIDE  # a box is in pixels of the file
     colors, mask = read_picture(path, side) if searched else read_photo(path, mask_path)
-    if searched and (mask is None or find is not threshold_mask):  # a box is to be cut out, transparent or not
+    if searched and (mask is None or find is not threshold_mask):  # a box counts even if the file has transparency
         mask, more = largest_region(find(colors))
         if more:
             note(f"note: {path}: several parts were found, and only the largest is used")
@@ -182,12 +183,12 @@ def prepare_image(
     size: int = 64,
     layout: Layout = "kato",
 ) -> np.ndarray:
-    """Bring an image of any size into the form that a data set of the layout has, uint8 [4,size,size]: colours, mask.
+    """Turn colours uint8 [H,W,3] and a mask uint8 [H,W] into a stored image uint8 [4,size,size] of a layout.
 
-    The object is laid over white and, with `crop`, centred in a square so that its larger side takes `object_share` of
-    it, as in the data set; without, the image must be framed like that already and is only made square and scaled.
-    Colours are inverted if the layout inverts them. If images are stretched (Pascal3D+), the background stays, and
-    `crop` takes the mask's box, padded and stretched as the reader does it (`learn3d.data.framing`).
+    The background becomes white. crop: centre the object in a square, so that its larger side takes `object_share` of
+    it; without, the picture must be framed like that already and is only padded to a square and scaled. Colours are
+    inverted if the layout inverts them. Layouts with stretched images (Pascal3D+) keep the background, and `crop` cuts
+    out the mask's box as their reader does (`learn3d.data.framing`).
 
     Raises ValueError if the mask has no pixel above half.
     """
@@ -201,7 +202,7 @@ def prepare_image(
         cut, cut_mask = (Crops.from_images([np.ascontiguousarray(p)], box, size).cut()[0] for p in planes)
         return np.concatenate([cut, cut_mask[:1]])
     side = max(right - left, bottom - top) / (max(object_share, _LEAST_SHARE) if crop else 1)
-    reduction = max(1, int(side / (_FINE * size)))  # photographs are averaged in blocks first, which is much faster
+    reduction = max(1, int(side / (_OVERSAMPLING * size)))  # averaging blocks first is much faster
     alpha = mask.astype(np.float32) / 255
     planes = [(255 - colors[..., channel]) * alpha for channel in range(3)] + [255 * alpha]
     planes = np.stack([np.asarray(Image.fromarray(plane).reduce(reduction)) for plane in planes])
@@ -217,14 +218,14 @@ def prepare_image(
 
 
 class Reconstruction(NamedTuple):
-    """What a model makes of a picture."""
+    """The shape of a picture, and how it was found."""
 
-    surface: Surface  # object frame; in the picture's colours if it was fitted
-    stored: np.ndarray  # uint8 [4, S, S]: the image that the network saw
-    azimuth_deg: float  # from which the shape looks like the picture
+    surface: Surface  # object frame; with the picture's colours if it was fitted
+    stored: np.ndarray  # uint8 [4, S, S]: the input of the network
+    azimuth_deg: float  # estimated azimuth of the picture's camera
     silhouette_iou: float | None  # IoU of the fitted shape's silhouette and the mask; None without a fit
-    kind: str | None  # category that the model takes it for; None if it knows only one, or no shape was fitted
-    warning: str | None  # why the shape is to be doubted
+    kind: str | None  # predicted category; None without a fit, or if the model has one category
+    warning: str | None  # a reason to doubt the shape; None without a fit
 
 
 def reconstruct_picture(
@@ -236,10 +237,10 @@ def reconstruct_picture(
     refined: bool = True,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """The shape of a picture uint8 [H, W, 3] with its mask uint8 [H, W], of which no camera is known.
+    """Reconstruct a picture uint8 [H, W, 3] with its mask uint8 [H, W]; its camera is unknown.
 
-    refined: camera, shape and colours are fitted to the picture (`learn3d.fitting`); a method whose shapes are not
-    meshes predicts them alone. progress: told what is done and which part of it.
+    refined: fit camera, shape and colours to the picture (`learn3d.fitting`); methods with voxels only predict.
+    progress: called with the name of each stage and the share that is done.
     """
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image = torch.from_numpy(stored)
@@ -248,7 +249,7 @@ def reconstruct_picture(
         (surface,) = reconstruct(method, stored[None])
         azimuth_deg = input_azimuth_deg(surface, stored[3], probabilities)
         return Reconstruction(surface, stored, azimuth_deg, None, None, None)
-    fine = prepare_image(colors, mask, object_share=SHARE, size=_COLORED, layout="kar")  # colours as they are
+    fine = prepare_image(colors, mask, object_share=SHARE, size=_COLORED, layout="kar")  # kar: colours not inverted
     small = nn.functional.interpolate(
         torch.from_numpy(fine[None, 3:]).float() / 255, (MASK_SIZE, MASK_SIZE), mode="area"
     )
@@ -260,7 +261,7 @@ def reconstruct_picture(
 
 
 def view_probabilities(model: Model, image: Tensor) -> Tensor | None:
-    """How probable each azimuth cell of `fit` is for a stored image uint8 [4, S, S]; None if that was not learnt."""
+    """Probability of each azimuth cell of `fitting.fit` for a stored image uint8 [4, S, S]; None if not learnt."""
     method, config = model.method, model.config
     other_cells = config.layout != "around" or config.view_bins is not None
     if not isinstance(method, MeshMethod) or (isinstance(method, ManyViews) and other_cells):
@@ -270,8 +271,9 @@ def view_probabilities(model: Model, image: Tensor) -> Tensor | None:
 
 
 def recognize(model: Model, image: Tensor) -> tuple[str | None, str | None]:
-    """The category for which a stored image uint8 [4, S, S] is taken, if there are several, and a warning if it shows
-    something that the model does not know.
+    """Predicted category of a stored image uint8 [4, S, S], and a warning if it shows an unknown kind of object.
+
+    The category is None if the model has only one.
     """
     if model.known_codes is None:
         return None, None
@@ -288,10 +290,10 @@ def recognize(model: Model, image: Tensor) -> tuple[str | None, str | None]:
 def reconstruct(
     method: Method, images: np.ndarray, masks: Tensor | None = None, poses: Poses | None = None
 ) -> list[Surface]:
-    """Meshes, in the object frame, of images uint8 [B,4,S,S] as stored.
+    """Meshes, in the object frame, of stored images uint8 [B,4,S,S].
 
-    With masks float32 [B,64,64] and poses, shapes are fitted to them (`methods.refinement`). Raises ValueError for
-    methods whose shapes are not meshes.
+    With masks float32 [B,64,64] and poses, shapes are fitted to them (`methods.refinement`); ValueError if the method
+    predicts voxels.
     """
     pixels = torch.from_numpy(images)
     if poses is None:
@@ -303,10 +305,10 @@ def reconstruct(
 
 @torch.no_grad()
 def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor | None = None) -> float:
-    """Azimuth from which the shape's silhouette agrees best with the mask uint8 [S,S] of its image; a multiple of 15.
+    """Azimuth from which the shape's silhouette fits the mask uint8 [S,S] of its image best; a multiple of 15.
 
-    The camera of an image is not known: this is a guess for pictures. Azimuths are compared at four elevations, and
-    outlines at one size, as the distance is not known either. probabilities: see `fitting.fit.find_view`.
+    A guess for pictures: elevation and distance are unknown, so four elevations are tried, and all outlines are scaled
+    to one size. probabilities: see `fitting.fit.find_view`.
     """
     small = nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, (64, 64), mode="area")
     target, azimuths, losses = centre(small)[0], [15.0 * k for k in range(24)], []
@@ -324,17 +326,17 @@ def export_mesh(path: Path, surface: Surface) -> None:
 
 
 def mesh_bytes(surface: Surface, kind: str, name: str) -> bytes:
-    """A file of the kind "obj", "glb" or "ply" with a mesh of the object frame, y up, right-handed.
+    """A file of the kind "obj", "glb" or "ply" with a mesh of the object frame, y up, right-handed, normals outwards.
 
-    The object frame is left-handed; the reflection back turns the faces, whose normals point outwards in the file.
-    GLB and PLY keep the colours of the vertices. A GLB's node has the name, and its material shows faces from both
-    sides: learnt surfaces cross themselves, and by glTF's rule a viewer leaves out what is seen from behind.
+    The object frame is left-handed, so the mesh is reflected and the order of each face reversed. GLB and PLY keep
+    the colours of the vertices. `name` is the node's in a GLB. Its material is double-sided: learnt surfaces cross
+    themselves, and viewers would hide the faces that are seen from behind.
     """
     points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
     mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)
     if surface.colors is not None and kind != "obj":
         colors = surface.colors.detach().cpu().clamp(0, 1)
-        colors = colors**2.2 if kind == "glb" else colors  # those of a GLB are linear
+        colors = colors**2.2 if kind == "glb" else colors  # colours in a GLB are linear
         mesh.visual.vertex_colors = (colors * 255).round().to(torch.uint8).numpy()
     if kind == "glb":
         options = {"include_normals": True, "tree_postprocessor": _show_both_sides}
@@ -345,9 +347,9 @@ def mesh_bytes(surface: Surface, kind: str, name: str) -> bytes:
 
 
 def _show_both_sides(tree: dict) -> None:
-    """Give all meshes of a glTF tree a dull material whose faces are seen from both sides."""
+    """Give all meshes of a glTF tree a matt, double-sided material."""
     tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}]
-    for mesh in tree.get("meshes", ()):  # none in an empty shape
+    for mesh in tree.get("meshes", ()):  # an empty shape has none
         for primitive in mesh["primitives"]:
             primitive["material"] = 0
 
@@ -364,8 +366,8 @@ def save(
 ) -> list[Path]:
     """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input, mask, six views) of each shape.
 
-    images: uint8 [B,4,S,S] as the networks read them. azimuths: of their cameras in degrees; None: they are guessed.
-    Returns the paths, three for each name.
+    images: stored images uint8 [B,4,S,S]. azimuths: azimuths of their cameras in degrees; None if unknown, they are
+    then estimated. Returns three paths for each name.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures = natural_colors(images, inverted=LAYOUTS[model.config.layout].inverted)

@@ -1,11 +1,11 @@
-"""Dataclasses that check their fields: each declares at the field what it may hold.
+"""Dataclasses that check their fields against the types in their declarations.
 
     @checked
     class MySettings:
         learning_rate: Positive = 1e-4
         variant: Literal["a", "b"] = "a"
 
-A value of another type is refused, not converted: neither "1" nor true is a number, and none is NaN or infinite.
+Values are never converted: "1" and true are no numbers. NaN and infinity are refused.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ T = TypeVar("T")
 
 
 def checked(cls: type[T]) -> type[T]:
-    """Class decorator: a frozen dataclass. A wrong, missing or unknown field is a ValueError, a sentence that names it.
+    """Class decorator: a frozen dataclass that raises a ValueError naming each wrong, missing or unknown field.
 
-    `__post_init__` checks what several fields have to do with each other, and may raise a ValueError as well.
+    `__post_init__` checks fields against each other; it may raise a ValueError, too.
     """
     cls = dataclass(frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False))(cls)
     check: Callable[..., None] = cls.__init__
@@ -56,15 +56,15 @@ _WORDS = {
 
 
 def _sentence(error: Any, cls: type) -> str:
-    """One error of pydantic's as part of a sentence: the field, what was wanted, what came."""
+    """One of pydantic's errors as part of a sentence: the field, the wanted value, the given value."""
     name = error["loc"][0] if error["loc"] else ""
-    if isinstance(name, int):  # given by position
+    if isinstance(name, int):  # a positional argument
         name = fields(cls)[name].name
     if error["type"] == "missing":
         return f"the option {name} is missing"
     if error["type"] == "unexpected_keyword_argument":
         return f"there is no option {name!r} (but {', '.join(field.name for field in fields(cls))})"
-    if error["type"] == "value_error":  # raised by a validator, which says what came
+    if error["type"] == "value_error":  # a validator's own message names the given value
         message = str(error["ctx"]["error"])
         return message if name in message.split() else f"{name} {message}".strip()
     said = error["msg"]
@@ -74,7 +74,7 @@ def _sentence(error: Any, cls: type) -> str:
 
 
 def split_names(text: str) -> tuple[str, ...]:
-    """The names in a list with commas."""
+    """Split a comma-separated list of names."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
@@ -84,7 +84,7 @@ def _path(value: Any) -> Path:
     return Path(value)
 
 
-MOST = 1e30  # the largest number of a setting: float32 ends at 3e38
+MOST = 1e30  # largest value of a setting; float32 ends at 3e38
 
 Positive = Annotated[float, Field(gt=0, le=MOST)]
 Weight = Annotated[float, Field(ge=0, le=MOST)]
@@ -94,8 +94,8 @@ Count = Annotated[int, Field(ge=1)]
 Pixels = Annotated[int, Field(ge=1, le=1024)]  # side of the networks' images; 224 in the papers
 #: Channels of a network's first layer; its widest layer has eight times as many. 512 take 4.1 GB; 128 in the papers.
 Channels = Annotated[int, Field(ge=1, le=512)]
-LayerChannels = Annotated[int, Field(ge=1, le=1024)]  # channels of a layer that has a setting of its own
-RARE = "shown by --help-all, not by --help"  # marks an option's type
-Rare = Annotated[T, RARE]
+LayerChannels = Annotated[int, Field(ge=1, le=1024)]  # channels of one layer
+RARE = "shown by --help-all, not by --help"
+Rare = Annotated[T, RARE]  # an option that only --help-all shows
 FilePath = Annotated[Path, BeforeValidator(_path)]
-Items = Field(strict=False)  # Annotated[tuple[...], Items]: JSON has lists alone
+Items = Field(strict=False)  # Annotated[tuple[...], Items] accepts a list, as JSON has no tuples

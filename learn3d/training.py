@@ -1,4 +1,4 @@
-"""The training loop: configuration, data, networks, steps, validation, checkpoints. It reads from top to bottom."""
+"""The training loop: configuration, data, networks, steps, validation, checkpoints."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from learn3d.validation import draw, validate
 
 
 def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False) -> Summary:
-    """Train one model and leave everything in `config.output`.
+    """Train one model and save it in `config.output`; `runs.folder` lists the files there.
 
-    What the folder holds afterwards is listed in `runs.folder`. SIGINT, SIGTERM and SIGHUP end the current step, save
-    and return. With `resume` the run continues from its last checkpoint (bit for bit on a CPU: same machine, number of
-    threads), or from the start if it was stopped before its first one. A finished run stays as it is.
+    SIGINT, SIGTERM and SIGHUP end the run after the current step, with a checkpoint. resume: continue from the last
+    checkpoint (bit-identical on the same CPU with the same number of threads), or from the start if there is no
+    checkpoint yet. A finished run is left unchanged. overwrite: replace an older run in the folder.
 
-    Raises ValueError for a folder in use, options or training data that conflict with the resumed run or data that do
-    not fit, FloatingPointError if a loss is no longer finite (the last checkpoint is from before that), OSError if
-    a checkpoint cannot be written or another process works in the folder.
+    Raises ValueError if the folder is in use, if the data set does not fit, or if options or data differ from those of
+    the resumed run; FloatingPointError if a loss is not finite (the last checkpoint is from before); OSError if a
+    checkpoint cannot be written or another process works in the folder.
     """
     started, folder = time.monotonic(), config.output
     config = dataclasses.replace(config, precision=resolve_precision(config.precision, config.device))
@@ -40,16 +40,16 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     threads = ThreadTuner(config.threads)
     with run_folder.lock_folder(folder):
         if not resume:
-            run_folder.check_can_start(folder, overwrite)  # an older run is removed when all else is well
+            run_folder.check_can_start(folder, overwrite)
         train_set, val_set = load_splits(config, progress=is_watched())
         plane = find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None
         info = train_set.info(plane, train_set.solidity() if config.settings.wants_solidity else None)
         options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
         method = create_method(config.settings, info, **options)
-        method.check_batch(next(batches(train_set, config)))  # before an older run is removed
+        method.check_batch(next(batches(train_set, config)))  # before `begin` removes an older run
         run = Run(config, method, info, describe_images(train_set))
         progress, notes = run.begin(train_set, resume=resume, overwrite=overwrite)
-        if progress.step == config.iterations:  # finished, or killed between the last save and the end
+        if progress.step == config.iterations:
             return Summary.of(config, progress, started)
         before, start = progress.seconds, progress.step + 1
         threads.resume(progress.threads)
@@ -67,8 +67,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
                 losses = method.take_step(batch, step)
                 if chosen := threads.after_step(time.monotonic() - step_began):
                     log.say(f"step {step}: {chosen}")
-                # With the losses of the step before: some methods train one network in odd steps, another in even ones.
-                recent = progress.losses | losses
+                recent = progress.losses | losses  # the last two steps: some methods alternate between two networks
                 state = {"step": step, "losses": losses, "threads": threads.chosen}
                 progress = dataclasses.replace(progress, **state, seconds=before + time.monotonic() - started)
                 log.step(step, losses)
@@ -90,10 +89,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
 
 
 def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDataset, ViewDataset]:
-    """The training and the validation split of a run. Both have the same view classes.
-
-    progress: show a bar if many files are read.
-    """
+    """The training and the validation split of a run. progress: show a bar if many files are read."""
     options = {"image_size": config.settings.image_size, "view_bins": config.view_bins, "poses": config.poses}
     load = functools.partial(load_dataset, config.layout, config.data, config.category, **options)
     train_set = load("train", views_per_object=config.views_per_object, progress=progress)

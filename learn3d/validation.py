@@ -1,4 +1,4 @@
-"""Validation of a run while it trains: IoU and MMD of the validation split, pictures of a few images."""
+"""Validation during training: IoU and MMD of the validation split, and pictures of a few images."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ PICTURE_ROWS = 8
 
 
 def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) -> Progress:
-    """Measure IoU and MMD on the validation images; keep the networks if their IoU is the best so far.
+    """Measure IoU and MMD on the validation images; save the networks if their IoU is the best so far.
 
-    It is the IoU of silhouettes at novel views, which needs no true shapes, or, if there are none, of voxels. Returns
-    the progress with the best IoU and its step.
+    `Evaluation.selection_metric` says which IoU. Returns the progress with the best IoU and its step.
     """
     config, step = run.config, progress.step
     with run.method.ema_weights():
@@ -44,7 +43,7 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) ->
 
 
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
-    """Write pictures/<step>.png: the same few validation images every time, of different objects and views."""
+    """Write pictures/<step>.png: the same few validation images of different objects and views each time."""
     with method.ema_weights():
         samples = spread_samples(val_set.object_ids, val_set.view_ids, PICTURE_ROWS)
         grid = picture_grid(method, val_set, samples)

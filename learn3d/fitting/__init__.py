@@ -1,1 +1,1 @@
-"""From a prediction to what a picture shows: its mask, camera, shape and colours."""
+"""Fits predictions to pictures: mask, camera, shape and colours; and detects unknown objects."""

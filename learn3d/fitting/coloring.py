@@ -1,4 +1,4 @@
-"""Colours for a mesh from the picture that it was fitted to: what the picture shows sharp, what is guessed blurred."""
+"""Colours for a mesh from the picture to which it was fitted; hidden parts get blurred colours of their neighbours."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from learn3d.fitting.fit import View
 from learn3d.fitting.smoothing import joined, outer_surface
 from learn3d.pictures.surfaces import Surface
 
-DEPTH_SIZE = 256  # side of the depth map that says which vertices are seen
-BEHIND = 0.02  # distance behind the depth map at which a vertex is hidden, in units of the object frame
-GRAZING = 0.25  # cosine between surface and line of sight below which a colour is not taken
-BORDER = 2  # pixels inside the outline whose colours may be the background's
+DEPTH_SIZE = 256  # side of the depth map that decides which vertices are visible
+BEHIND = 0.02  # distance behind the depth map from which a vertex is hidden, in units of the object frame
+GRAZING = 0.25  # cosine between normal and line of sight below which a colour is not used
+BORDER = 2  # width in pixels of the border inside the outline that may have the background's colours
 
 
 def color_mesh(
     vertices: Tensor, faces: Tensor, view: View, colors: np.ndarray, mask: np.ndarray, mirror: Tensor | None = None
 ) -> Surface:
-    """A smooth surface with the colours of the picture that a view shows.
+    """A smooth surface with the colours of a picture. Hidden vertices get the colours of their mirror images or, if
+    these are hidden, too, blurred colours of their neighbours.
 
-    vertices float32 [V, 3] in the object frame, faces int64 [F, 3]; view: one view, of a picture uint8 [S, S, 3] with
-    its mask uint8 [S, S], framed as `fitting` says; mirror: float32 [3, 3], the reflection that takes the shape to
-    itself, None if there is none. The side that is not seen has the colours of its mirror image and, where that is not
-    seen either, those around it, blurred.
+    vertices float32 [V, 3] in the object frame, faces int64 [F, 3]; view: the picture's camera; colors uint8
+    [S, S, 3] and mask uint8 [S, S]: the picture, framed as in `fitting.fit`; mirror: float32 [3, 3], the reflection
+    that maps the shape to itself, None without symmetry.
     """
     points, triangles = outer_surface(vertices, faces)
     normals = nmr.vertex_normals(points, triangles)
@@ -36,7 +36,7 @@ def color_mesh(
     seen, weight = picture.look_up(points, normals)
     if mirror is not None:
         other, its_weight = picture.look_up(points @ mirror.T, normals @ mirror.T)
-        its_weight = (1 - weight) * its_weight  # own colours first
+        its_weight = (1 - weight) * its_weight  # a vertex's own colour comes first
         seen = weight[:, None] * seen + its_weight[:, None] * other
         weight = weight + its_weight
         seen = seen / weight.clamp(min=1e-6)[:, None]
@@ -55,7 +55,7 @@ class _Picture:
         self.trusted = 1 - F.max_pool2d(1 - inside, 2 * BORDER + 1, 1, BORDER)
 
     def look_up(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours [N, 3] in [0, 1] at points of the surface, and how far they are to be trusted, [N] in [0, 1]."""
+        """Colours [N, 3] in [0, 1] at points of the surface, and their reliability [N] in [0, 1]."""
         placed = self.view.place(points[None])
         x, y, z = self.camera.transform(placed)[0].unbind(1)
         grid = torch.stack([x, -y], 1)[None, None]
@@ -71,15 +71,15 @@ def _sample(image: Tensor, grid: Tensor) -> Tensor:
 
 
 def _spread(colors: Tensor, weight: Tensor, faces: Tensor) -> Tensor:
-    """Colours [V, 3] for all vertices: as given where the weight [V] is 1, and from there on as even as can be.
+    """Spread colours [V, 3] from vertices with a high weight [V] to the others as smoothly as possible.
 
-    The minimum of sum_v w_v |c_v - given_v|^2 + e sum_edges |c_a - c_b|^2.
+    The result minimises sum_v w_v^2 |c_v - given_v|^2 + 0.01 sum_edges |c_a - c_b|^2.
     """
     count = len(colors)
     neighbours = joined(faces.numpy(), count)
     laplacian = diags_array(neighbours.sum(1)) - neighbours
     given = weight.double().numpy() ** 2
-    if not given.any():  # the picture shows no vertex well: its colours there count all the same
+    if not given.any():  # no vertex is clearly visible, so all colours count alike
         given = np.full(count, 1e-3)
     system = (diags_array(given + 1e-9) + 0.01 * laplacian).tocsc()
     right = given[:, None] * colors.double().numpy()

@@ -1,4 +1,4 @@
-"""Masks of photographs that have none: by the colour of a plain background, or by GrabCut within a box (OpenCV)."""
+"""Masks of photographs without one: by the colour of a plain background, or by GrabCut (OpenCV)."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from scipy import ndimage
 
 from learn3d.data.framing import TOLERANCE, threshold_mask
 
-SIDE = 384  # longer side of the picture that GrabCut works on
-INSET = 0.03  # of each side: without a box the object is taken to lie within the rest
-PLAIN = 0.9  # share of the border that has one colour if the background is plain
-KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # what strokes say of a pixel
+SIDE = 384  # longer side in pixels of the picture for GrabCut
+INSET = 0.03  # width of the background border without a box, as a share of the picture's sides
+PLAIN = 0.9  # least share of the border with one colour in pictures with a plain background
+KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # labels of pixels in strokes
 _ROUNDS = 5
-_AROUND = 16  # pixels around the strokes from which GrabCut learns colours
+_AROUND = 16  # width in pixels of the region around the strokes that GrabCut sees
 
-Box = tuple[int, int, int, int]  # x and y of the left upper corner, width, height, in pixels
+Box = tuple[int, int, int, int]  # x and y of the upper left corner, width, height, in pixels
 
 
 def find_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-    """Guess where the object is in a photograph uint8 [H, W, 3]: its mask uint8 [H, W], 0 or 255.
+    """Guess the mask uint8 [H, W], 0 or 255, of the object in a photograph uint8 [H, W, 3].
 
-    If the border has one colour, the object is all that differs from it by `tolerance`. Otherwise GrabCut looks for it
-    in the middle or, without OpenCV, the first rule counts as well.
+    If the background is plain, or without OpenCV, the object is everything that differs from the border's colour by
+    `tolerance`. Otherwise GrabCut separates it from the picture's border.
     """
     if is_plain(colors, tolerance) or importlib.util.find_spec("cv2") is None:
         return threshold_mask(colors, tolerance)
@@ -33,7 +33,7 @@ def find_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
 
 
 def is_plain(colors: np.ndarray, tolerance: float = TOLERANCE) -> bool:
-    """Whether the border of a picture uint8 [H, W, 3] has one colour, but for a tenth."""
+    """Whether the border of a picture uint8 [H, W, 3] has one colour, except for a tenth of its pixels."""
     border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]]).astype(np.float64)
     difference = np.abs(border - np.median(border, axis=0)).max(axis=1)
     return bool((difference < 255 * tolerance).mean() > PLAIN)
@@ -42,9 +42,8 @@ def is_plain(colors: np.ndarray, tolerance: float = TOLERANCE) -> bool:
 def cut_out(colors: np.ndarray, box: Box | None = None) -> np.ndarray:
     """GrabCut (Rother et al. 2004): the mask uint8 [H, W], 0 or 255, of the object within a box of a photograph.
 
-    colors: uint8 [H, W, 3]. What lies outside of the box is background, and teaches its colours. Without a box it is
-    the picture without a narrow border. Holes are filled. Raises ValueError without OpenCV, and for a
-    box that does not lie in the picture or has no room around it.
+    colors: uint8 [H, W, 3]. Pixels outside the box are background (default: the picture but a narrow border). Holes
+    are filled. Raises ValueError without OpenCV, or if the box exceeds or fills the picture.
     """
     cv2 = _opencv()
     height, width = colors.shape[:2]
@@ -71,10 +70,10 @@ def cut_out(colors: np.ndarray, box: Box | None = None) -> np.ndarray:
 
 
 def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.ndarray:
-    """A mask uint8 [H, W], 0 or 255, corrected by hand; GrabCut decides in the neighbourhood of the strokes.
+    """A mask uint8 [H, W], 0 or 255, corrected by strokes uint8 [H, W].
 
-    colors: uint8 [H, W, 3]; strokes: uint8 [H, W], for each pixel KEEP (as the mask has it), OBJECT, BACKGROUND, or
-    OPEN. Raises ValueError without OpenCV.
+    Each pixel of the strokes is KEEP (as in the mask), OBJECT, BACKGROUND or OPEN (GrabCut decides). colors: uint8
+    [H, W, 3]. Raises ValueError without OpenCV.
     """
     cv2 = _opencv()
     inside = np.where(strokes == OBJECT, True, (mask > 127) & (strokes != BACKGROUND))

@@ -1,4 +1,4 @@
-"""For what a model takes a picture, and whether it has seen the like: by known codes near the picture's code."""
+"""Predicts the category of a picture, and whether it is an unknown object, by comparing its code with known ones."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from torch import Tensor
 from learn3d.data.dataset import ViewDataset
 from learn3d.methods import MeshMethod
 
-CENTRES = 120  # that stand for all codes of the training images, and as many for other things
+CENTRES = 120  # clusters of the codes of all training images, and of those of other objects
 IMAGES = 4000  # training images whose codes are clustered
-MOST = 0.82  # distance above which a picture is called unknown if no other things were learnt
-OTHER = 0.54  # score of `KnownCodes.resemblance` above which it is called unknown
+MOST = 0.82  # distance above which a picture is unknown if no other objects were learnt
+OTHER = 0.54  # `KnownCodes.resemblance` above which a picture is unknown
 KNOWN_CODES = "known_codes", "other_codes", "code_weights"  # names of the tensors of `KnownCodes` in a checkpoint
-_NEAREST = 3
-_SHARPNESS, _RIDGE = 4.0, 0.5  # of the radial functions, and of their ridge regression
+_NEAREST = 3  # centres whose mean distance is compared
+_SHARPNESS, _RIDGE = 4.0, 0.5  # of the radial basis functions, and of their ridge regression
 
 
 class KnownCodes(NamedTuple):
-    """Directions of codes: centres of clusters (k-means)."""
+    """Cluster centres (k-means) of normalised codes."""
 
-    kinds: Tensor  # float [N, K, C], of the training images of N categories
-    others: Tensor | None = None  # float [M, C], of pictures of other things
-    weights: Tensor | None = None  # float [N K + M], of all centres in `resemblance`
+    kinds: Tensor  # float [N, K, C]: centres of the training images of N categories
+    others: Tensor | None = None  # float [M, C]: centres of pictures of other objects
+    weights: Tensor | None = None  # float [N K + M]: weights of all centres in `resemblance`
 
     def nearest_kind(self, code: Tensor) -> int:
         """The category whose codes are nearest to a code [C]."""
         return int(torch.stack([_distance(code, centres) for centres in self.kinds]).argmin())
 
     def resemblance(self, code: Tensor) -> float:
-        """How much a code [C] is like those of other things: 1 for their like, -1 for the like of training images."""
+        """Score of a code [C]: near 1 for other objects, near -1 for objects as in the training images."""
         centres = torch.cat([self.kinds.flatten(0, 1), self.others]).float()
         return float(_radial(F.normalize(code[None], dim=1), centres)[0] @ self.weights.float())
 
     def is_strange(self, code: Tensor) -> bool:
-        """Whether a code [C] is like those of other things or, if none were learnt, far from the training images'."""
+        """Whether a code [C] is like those of other objects or, if none were learnt, far from the training images'."""
         if self.others is not None:
             return self.resemblance(code) > OTHER
         return float(_distance(code, self.kinds.flatten(0, 1))) > MOST
@@ -56,7 +56,7 @@ def _distance(code: Tensor, centres: Tensor) -> Tensor:
 
 
 def known_codes(method: MeshMethod, dataset: ViewDataset, others: Tensor | None = None) -> KnownCodes:
-    """The codes of a training set and of stored images of other things, uint8 [M, 4, S, S]."""
+    """Known codes of a training set and, optionally, of stored images uint8 [M, 4, S, S] of other objects."""
     chosen = torch.from_numpy(np.linspace(0, len(dataset) - 1, min(IMAGES, len(dataset))).astype(np.int64))
     batches = [dataset.batch(part, voxels=False) for part in chosen.split(128)]
     classes, codes = torch.cat([b.class_ids for b in batches]), _directions(method, (b.images for b in batches))
@@ -66,9 +66,9 @@ def known_codes(method: MeshMethod, dataset: ViewDataset, others: Tensor | None 
 
 
 def learn_others(kinds: Tensor, others: Tensor) -> KnownCodes:
-    """Known codes of N categories [N, K, C] with those of other things [M, C], told apart by ridge regression.
+    """Known codes of N categories [N, K, C] and of other objects [M, C], separated by ridge regression.
 
-    Its functions are radial, about all centres; both classes count alike.
+    The basis functions are radial around all centres; both classes have the same total weight.
     """
     known, centres = kinds.flatten(0, 1), _centres(others, CENTRES)
     samples, middles = torch.cat([known, others]), torch.cat([known, centres])

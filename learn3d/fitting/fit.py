@@ -1,6 +1,6 @@
-"""Fits a predicted shape to the mask of a picture of an unknown camera: the camera, the code, then the vertices.
+"""Fits a predicted shape to the mask of a picture with an unknown camera: the camera, the code, then the vertices.
 
-The picture is framed so that the box of its mask lies in the middle and the longer side takes `SHARE` of the picture.
+The picture must be framed: the bounding box of its mask is centred, and its longer side takes `SHARE` of the picture.
 """
 
 from __future__ import annotations
@@ -14,30 +14,31 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.poses import wrap_deg
 from learn3d.device import upload
 from learn3d.methods import MeshMethod
 from learn3d.networks.encoders import CENTRED_SHARE as SHARE
 
-HALF_FOV_DEG = 11.0  # half of the field of view: a normal lens; a picture does not tell it
-AZIMUTHS = 24  # that are tried
-ELEVATIONS_DEG = (0.0, 12.0, 25.0, 40.0, 55.0)  # that are tried with each
-STARTS = 6  # best ones of these, from which the camera is searched
+HALF_FOV_DEG = 11.0  # half the field of view of a normal lens; the picture's own is unknown
+AZIMUTHS = 24  # azimuth cells from -180 degrees on, whose centres are tried
+ELEVATIONS_DEG = (0.0, 12.0, 25.0, 40.0, 55.0)  # elevations that are tried with each azimuth
+STARTS = 6  # best of these views, from which the camera is optimised
 CAMERA_STEPS, CODE_STEPS, VERTEX_STEPS = 25, 45, 45
-PULL = 0.1  # weight of the squared distance of the code from the predicted one, in units of its length
-SMOOTHNESS = 3e-4
-STIFFNESS = 10.0  # weight of the Laplacian of the vertices' moves
-BELIEF = 0.05  # weight of the log-probability of a view, against the IoU
+PULL = 0.1  # weight of the squared relative distance between the code and the predicted one
+SMOOTHNESS = 3e-4  # weight of the smoothness loss
+STIFFNESS = 10.0  # weight of the Laplacian loss of the vertices' displacements
+BELIEF = 0.05  # weight of the log-probability of a view, relative to the IoU
 
 Progress = Callable[[str, float], None]
 
 
 class View(NamedTuple):
-    """Cameras that look at the object: N views."""
+    """N cameras that look at the object."""
 
     azimuth_deg: Tensor  # float32 [N]
     elevation_deg: Tensor  # float32 [N]
     log_distance: Tensor  # float32 [N]
-    shift: Tensor  # float32 [N, 2]: of the object to the right and up, in units of the object frame
+    shift: Tensor  # float32 [N, 2]: shift of the object to the right and up, in units of the object frame
 
     def axes(self) -> Tensor:
         """Right, up and forward of each camera in the object frame, float32 [N, 3, 3]."""
@@ -49,17 +50,17 @@ class View(NamedTuple):
         return torch.stack([right, up, forward], 1)
 
     def cameras(self) -> nmr.LookAt:
-        """The cameras, for shapes that `place` has moved."""
+        """The cameras, which look at the origin; `place` shifts shapes for them."""
         return nmr.LookAt.from_angles(
             self.log_distance.exp(), self.elevation_deg, self.azimuth_deg, half_fov_deg=HALF_FOV_DEG
         )
 
     def place(self, vertices: Tensor) -> Tensor:
-        """Vertices [N, V, 3], shifted before the cameras."""
+        """Vertices [N, V, 3], moved by `shift`."""
         return vertices + (self.shift[:, :, None] * self.axes()[:, :2]).sum(1)[:, None]
 
     def silhouettes(self, vertices: Tensor, faces: Tensor, size: int = MASK_SIZE) -> Tensor:
-        """What the cameras see of vertices [N, V, 3]: float32 [N, size, size]."""
+        """Silhouettes float32 [N, size, size] of vertices [N, V, 3]."""
         return nmr.render_silhouette(self.place(vertices), faces, self.cameras(), image_size=size)
 
     def select(self, rows: Tensor) -> View:
@@ -68,17 +69,17 @@ class View(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A shape that was fitted to a picture."""
+    """A shape that was fitted to a picture, and the IoU of its silhouette and the mask at each stage."""
 
     vertices: Tensor  # float32 [V, 3], object frame
     view: View  # one view
-    predicted_iou: float  # IoU of mask and silhouette of the shape as predicted, at the best camera
-    code_iou: float  # with the code fitted
-    iou: float  # in the end
+    predicted_iou: float  # IoU of the predicted shape at the best camera
+    code_iou: float  # IoU with the fitted code
+    iou: float  # IoU with the fitted vertices
 
 
 def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> View:
-    """Cameras in these directions that hold vertices [N, V, 3] as pictures are framed; angles [N]."""
+    """Cameras in these directions, angles [N], at which vertices [N, V, 3] are framed like pictures."""
     zero, tangent = torch.zeros(len(vertices)), math.tan(math.radians(HALF_FOV_DEG))
     view = View(azimuth_deg, elevation_deg, zero, torch.zeros(len(vertices), 2))
     points = vertices @ view.axes().transpose(1, 2)
@@ -103,7 +104,8 @@ def fit(
 ) -> Fit:
     """Fit the shape of a stored image uint8 [4, S, S] to its framed mask float32 [64, 64].
 
-    view_probabilities: as `find_view` has them. progress: told what is done next, and which part is done (0 .. 1).
+    view_probabilities: see `find_view`. progress: called with the name of each stage and the share (0 .. 1) that is
+    done.
     """
     report = progress or (lambda text, part: None)
     code = method.encode(image[None]).float().cpu()
@@ -127,9 +129,9 @@ def fit(
 
 @torch.no_grad()
 def find_view(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None = None) -> tuple[View, float]:
-    """The view from which a shape [V, 3], [F, 3] has the outline of a framed mask [64, 64], and their IoU.
+    """The view at which the silhouette of a shape [V, 3], [F, 3] fits a framed mask [64, 64] best, and their IoU.
 
-    probabilities: float32 [AZIMUTHS], how probable each cell of azimuths is, from -180 degrees on; None: all the same.
+    probabilities: float32 [AZIMUTHS], the probability of each azimuth cell from -180 degrees on; None: uniform.
     """
     view = _fit_camera(_search(vertices[None], faces, mask, probabilities), vertices, faces, mask)
     ious = _ious(view, vertices, faces, mask)
@@ -138,7 +140,7 @@ def find_view(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tens
 
 
 def _search(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None) -> View:
-    """The best views of a shape [1, V, 3], at different azimuths, best first."""
+    """The `STARTS` best views of a shape [1, V, 3] with azimuths more than 20 degrees apart, best first."""
     azimuths = -180 + (torch.arange(AZIMUTHS) + 0.5) * (360 / AZIMUTHS)
     grid = torch.cartesian_prod(azimuths, torch.tensor(ELEVATIONS_DEG))
     many = vertices.expand(len(grid), -1, -1)
@@ -146,26 +148,19 @@ def _search(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor
     scores = _ious(view, many, faces, mask) + belief(view.azimuth_deg, probabilities)
     chosen = []
     for row in scores.argsort(descending=True).tolist():
-        apart = [_apart_deg(grid[row, 0], grid[other, 0]) > 20 for other in chosen]
-        if all(apart):
+        if all(wrap_deg(grid[row, 0] - grid[other, 0]).abs() > 20 for other in chosen):
             chosen.append(row)
-        if len(chosen) == STARTS:
-            break
-    return view.select(torch.tensor(chosen))
+    return view.select(torch.tensor(chosen[:STARTS]))
 
 
 def belief(azimuth_deg: Tensor, probabilities: Tensor | None) -> Tensor:
-    """What the probabilities of `find_view` add to the IoU at azimuths [N]: float32 [N]."""
+    """Bonus float32 [N] to the IoU at azimuths [N] for the probabilities of `find_view`, interpolated between cells."""
     if probabilities is None:
         return torch.zeros_like(azimuth_deg)
     position = (azimuth_deg + 180) / (360 / AZIMUTHS) - 0.5
     low, part = position.floor().long() % AZIMUTHS, position - position.floor()
     log = probabilities.clamp(min=1e-4).log()
     return BELIEF * (log[low] * (1 - part) + log[(low + 1) % AZIMUTHS] * part)
-
-
-def _apart_deg(a: Tensor, b: Tensor) -> float:
-    return float(((a - b + 180) % 360 - 180).abs())
 
 
 def _ious(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> Tensor:
@@ -176,7 +171,7 @@ def _ious(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> Tensor:
 
 
 def _parameters(view: View) -> list[Tensor]:
-    # Scaled so that one step of Adam moves the outline about equally far for each parameter.
+    # With these scales a step of Adam moves the outline about equally far for each parameter.
     scaled = view.azimuth_deg / 60, view.elevation_deg / 60, view.log_distance, view.shift
     return [part.clone().requires_grad_() for part in scaled]
 

@@ -1,4 +1,4 @@
-"""Finer meshes of coarse ones, with rounded edges: flat parts stay flat."""
+"""Finer, smoother meshes: subdivision with rounded edges, and the outer surface of meshes that cross themselves."""
 
 from __future__ import annotations
 
@@ -15,19 +15,18 @@ from torch import Tensor
 
 import nmr
 
-ROUNDS = 4
-CELLS = 112  # of the grid of `outer_surface` along the longest side
-DEPTH_SIDE = 320  # pixels of its depth maps
-_RIM = 4  # cells around the shape
-_GROWTH = 1.0  # cells by which it is thicker than the shape at first, so that thin parts stay whole
-_SHRINK, _GROW = 0.5, -0.53  # of Taubin 1995: smoothing without loss of volume
+ROUNDS = 4  # rounds of Taubin's smoothing
+CELLS = 112  # cells of the grid of `outer_surface` along the longest side
+DEPTH_SIDE = 320  # side of its depth maps in pixels
+_RIM = 4  # empty cells around the shape
+_GROWTH = 1.0  # cells by which the shape is thickened at first, to keep thin parts
+_SHRINK, _GROW = 0.5, -0.53  # weights of Taubin 1995: smoothing without loss of volume
 
 
 def smooth(vertices: Tensor, faces: Tensor, levels: int = 2) -> tuple[Tensor, Tensor]:
     """Vertices float32 [W, 3] and faces int64 [4^levels F, 3] of a finer mesh of [V, 3], [F, 3].
 
-    Every face is cut into 4^levels flat ones; then edges are rounded by Taubin's smoothing, over about the width of one
-    of these.
+    Every face is divided into 4^levels; then Taubin's smoothing rounds edges over about the width of a new face.
     """
     points, triangles = vertices.double().numpy(), faces.numpy()
     for _ in range(levels):
@@ -42,10 +41,10 @@ def smooth(vertices: Tensor, faces: Tensor, levels: int = 2) -> tuple[Tensor, Te
 
 @torch.no_grad()
 def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """The surface that is seen of a shape [V, 3], [F, 3] from all around, without folds and crossings; vertices, faces.
+    """Vertices and faces of the visible surface of a shape [V, 3], [F, 3], without folds and self-intersections.
 
-    Depth maps of 42 orthographic cameras carve it out of a grid: a cell before the shape in any of them is empty
-    (Curless and Levoy 1996); marching cubes and Taubin's smoothing follow. Faces point outwards.
+    A grid is carved by depth maps of 42 orthographic cameras: a cell in front of the shape in any of them is empty
+    (Curless and Levoy 1996). Marching cubes and Taubin's smoothing follow. Normals point outwards.
     """
     low, high = vertices.amin(0), vertices.amax(0)
     centre, cell = (low + high) / 2, float((high - low).max()) / CELLS
@@ -56,12 +55,12 @@ def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     copies = shape.expand(len(eyes), -1, -1)
     depth = nmr.render_depth(copies, faces, cameras, image_size=DEPTH_SIDE, anti_aliasing=False)
     depth = -depth.clamp(max=8 * reach)
-    for kernel, pad in (((7, 1), (3, 0)), ((1, 7), (0, 3))):  # wider by three pixels on all sides, about 1.3 cells
+    for kernel, pad in (((7, 1), (3, 0)), ((1, 7), (0, 3))):  # grow by three pixels, about 1.3 cells
         depth = F.max_pool2d(depth, kernel, 1, pad)
     depth = -depth
     counts = [math.ceil(float(side) / 2 / cell) + _RIM for side in high - low]
     axes = [cell * torch.arange(-count, count + 1) for count in counts]
-    frame = cameras.transform(torch.eye(4, 3).expand(len(eyes), -1, -1)).float()  # images of the axes and of 0
+    frame = cameras.transform(torch.eye(4, 3).expand(len(eyes), -1, -1)).float()  # the axes and the origin
     outside = torch.full([len(axis) for axis in axes], -2.0 * cell)
     for image, (*steps, origin) in zip(depth, frame, strict=True):
         x, y, z = (
@@ -82,7 +81,7 @@ def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def joined(faces: np.ndarray, count: int) -> coo_array:
-    """Which of `count` vertices share an edge of faces [F, 3]: a sparse matrix of zeros and ones, CSR."""
+    """Adjacency of `count` vertices by the edges of faces [F, 3]: a sparse matrix of zeros and ones, CSR."""
     rows, columns = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
     edges = coo_array((np.ones(len(rows)), (rows, columns)), (count, count)).tocsr()
     return ((edges + edges.T) > 0).astype(np.float64)

@@ -48,9 +48,9 @@ def create_method(
     seed: int,
     schedule: TrainingSchedule = CONSTANT_LR,
 ) -> Method:
-    """The method of `settings`, with PyTorch's default initialisation of its networks from `seed`.
+    """The method of `settings`, with networks initialised from `seed`.
 
-    Raises ValueError if the device is absent, or if the method needs poses and the data set has none.
+    Raises ValueError if the device is missing, or if the method needs poses and the data set has none.
     """
     check_device(device)
     if type(settings) not in _METHODS:
@@ -62,6 +62,6 @@ def create_method(
             "a data set with poses, or estimate them from its masks (learn3d estimate-poses, then --poses)"
         )
     if device == "cuda":
-        torch.backends.cudnn.allow_tf32 = False  # fp32 is to mean fp32, in convolutions too
+        torch.backends.cudnn.allow_tf32 = False  # TF32 convolutions would not be fp32
     torch.manual_seed(seed)
     return kind(settings, info, device, precision, schedule)

@@ -1,6 +1,6 @@
-"""Many views: the shape that one image gives must explain other views of the same object, whose cameras are known.
+"""Many views (multi-view supervision): the shape of one image must explain other views of its object.
 
-In the literature: multi-view supervision. It needs several views of every object, and uses their depth if it is known.
+It needs several views of every object with known cameras, and uses their depth if it is known.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from learn3d.settings import Positive, Weight, checked
 
 @checked
 class ManyViewsSettings(MeshSettings):
-    """Networks, and the weight of each term of the loss. A term with weight 0 is not computed."""
+    """Networks and weights of the losses; a loss with weight 0 is not computed."""
 
     encoder: EncoderName = "conv-light"
     symmetry: SymmetryOption = "auto"
@@ -35,8 +35,8 @@ class ManyViewsSettings(MeshSettings):
     lambda_depth: Weight = 3.0
     """Weight of the depth loss, in views whose depth is known."""
     lambda_view: Weight = 0.0
-    """Weight of the loss of a network on its own that tells the view class of an image, from which reconstruction
-    places the camera of a picture. 0: there is none."""
+    """Weight of the loss of a small separate network that classifies the view of an image; reconstruction places the
+    camera of a picture by it. 0: no such network."""
 
 
 class ManyViews(MeshMethod):
@@ -72,11 +72,10 @@ class ManyViews(MeshMethod):
         check_groups(batch, GROUP_SIZE, "groups")
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Shapes of the views a, rendered in all views of their object: projection + lambda_depth depth + lambda_smooth
-        smoothness + lambda_prior prior. Every second image of a symmetric object is flipped before it is encoded.
-        Raises ValueError if the batch is not made of groups.
+        """Render the shapes of the views a in all views of their object; the loss is projection + lambda_depth depth +
+        lambda_smooth smoothness + lambda_prior prior. Every second image of symmetric objects is flipped first.
         """
-        count = check_groups(batch, GROUP_SIZE, "groups")
+        count = len(batch) // GROUP_SIZE
         images = batch.images[:count]
         flipped = (torch.arange(count) % 2 == 1) & (self.generator.mirror is not None)
         codes, vertices = self.predict(torch.where(flipped[:, None, None, None], images.flip(3), images))

@@ -1,4 +1,4 @@
-"""Base classes of the methods: their settings, networks, a training step, and the way from images to shapes."""
+"""Base classes of the methods: settings, networks, training step, and the way from images to shapes."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from learn3d.settings import Positive, checked
 
 @checked
 class MethodSettings:
-    """Questions of a run to its method's settings. A subclass overrides the answers that differ."""
+    """Settings of a method, and what a run asks of them. Subclasses override the properties."""
 
     @property
     def image_size(self) -> int:
-        """Side of the images that the encoder takes, in pixels."""
+        """Side of the encoder's input images in pixels."""
         raise NotImplementedError
 
     @property
@@ -48,24 +48,24 @@ class MethodSettings:
 
     @property
     def wants_mirror_plane(self) -> bool:
-        """Whether the mirror plane of the training data must be known before the networks are built."""
+        """Whether the networks depend on the mirror plane of the training data."""
         return False
 
     @property
     def wants_solidity(self) -> bool:
-        """Whether the solidity of the training data must be known before the networks are built."""
+        """Whether the networks depend on the solidity of the training data."""
         return False
 
     @property
     def varies_over_run(self) -> str | None:
-        """Name of the setting whose value depends on the number of iterations, None if there is none."""
+        """Name of a setting that makes losses depend on the number of iterations, or None."""
         return None
 
     def check_run(self, *, iterations: int, batch_size: int) -> None:
         """Raise ValueError if the settings do not fit a run of this length and batch size."""
 
     def for_iterations(self, iterations: int) -> MethodSettings:
-        """The same settings for a run of this length: phases of the training keep their share of it."""
+        """These settings for a run of another length: phases of the training keep their share of it."""
         return self
 
 
@@ -102,17 +102,17 @@ class MeshSettings(MethodSettings):
         return self.generator == "auto"
 
 
-COMPACT = 0.8  # least solidity of objects that "auto" takes for compact
-INSIDE = 0.499  # share of the cube's side; the voxelizer kato18 takes a face on the border (0.5) for outside
+COMPACT = 0.8  # least solidity of the data that "auto" takes for compact
+INSIDE = 0.499  # share of the cube's side: the voxelizer kato18 counts a face on the border (0.5) as outside
 
 
 def plane_of(symmetry: SymmetryOption, info: DatasetInfo) -> Symmetry | None:
-    """The mirror plane of the shapes: that of the settings, or with "auto" that of the data."""
+    """The mirror plane of the shapes: the one of the settings, or for "auto" the one of the data."""
     return info.mirror_plane_deg if symmetry == "auto" else symmetry
 
 
 def generator_name(name: GeneratorName, info: DatasetInfo) -> GeneratorName:
-    """The generator of the settings, or with "auto" the sphere that suits the masks of the data."""
+    """The generator of the settings, or for "auto" the sphere that suits the masks of the data."""
     if name != "auto":
         return name
     return "sphere-smooth" if is_compact(info) else "sphere"
@@ -124,17 +124,17 @@ def is_compact(info: DatasetInfo) -> bool:
 
 
 class Method(abc.ABC):
-    """One method in training or in use. A subclass creates networks and optimizers and has its own training step.
+    """One method in training or in use. A subclass creates networks and optimizers and defines a training step.
 
-    The next steps depend only on the parameters and buffers of `networks`, on `optimizers`, `ema` and torch's global
-    random state. So a checkpoint of these resumes bit for bit.
+    Training steps depend only on the parameters and buffers of `networks`, on `optimizers`, `ema` and torch's global
+    random state. A run that is resumed from these is bit-identical.
     """
 
     needs_poses: ClassVar[bool] = True  # whether every training image must have a known pose
-    networks: dict[str, nn.Module]  # each is also an attribute: networks["encoder"] is self.encoder
+    networks: dict[str, nn.Module]  # networks["encoder"] is self.encoder, and so on
     optimizers: dict[str, torch.optim.Optimizer]
-    ema: EMA | None = None  # moving average of the weights, if the run asks for it
-    image_size: int  # side of the images that `encode` takes; also a property of the method's settings
+    ema: EMA | None = None  # None if the run keeps no average of the weights
+    image_size: int  # side of the stored images that `encode` takes
 
     def __init__(
         self,
@@ -161,15 +161,15 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Optimizers by name, with their full learning rates."""
+        """Optimizers by name, with the learning rates of the settings; `take_step` applies the schedule."""
 
     @abc.abstractmethod
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """The method's own part of `take_step`: compute losses, then call `backward_and_step`; returns its values."""
+        """The method's part of `take_step`: compute losses, call `backward_and_step` and return its values."""
 
     @abc.abstractmethod
     def encode(self, images: Tensor) -> Tensor:
-        """Shape codes float32 [B, C] of stored images uint8 [B, 4, S, S], on the method's device."""
+        """Shape codes float32 [B, C], on the method's device, of stored images uint8 [B, 4, S, S]."""
 
     @abc.abstractmethod
     def decode(self, codes: Tensor) -> Meshes | Grids:
@@ -177,26 +177,26 @@ class Method(abc.ABC):
 
     @property
     def weights(self) -> Mapping[str, float]:
-        """The weight of every loss that `backward_and_step` is given, by the name of the loss."""
+        """Weights of the losses of `backward_and_step`, by name."""
         return {}
 
     def weights_at(self, step: int) -> Mapping[str, float]:
-        """`weights` in training step `step` (from 1); they may change during a run."""
+        """The weights of the losses in step `step` (from 1), if they change during a run."""
         return self.weights
 
     def start_from_pretrained(self) -> None:  # noqa: B027
-        """Copy the pretrained weights, if the settings name a file, into the encoder; called when a run begins.
+        """Load the file of pretrained weights that the settings name, if any; called at the start of a run.
 
-        Raises as `learn3d.networks.resnet.load_pretrained`.
+        Raises the errors of `learn3d.networks.resnet.load_pretrained`.
         """
 
     def check_batch(self, batch: Batch) -> None:  # noqa: B027
-        """Raise ValueError if the method cannot learn from batches like this one. Called before a run begins."""
+        """Raise ValueError if the method cannot learn from batches like this one; called at the start of a run."""
 
     def take_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Take optimisation step `step` (from 1); return all computed losses, unweighted, and "total".
+        """Take training step `step` (from 1); return all computed losses, unweighted, and "total".
 
-        Raises FloatingPointError if a loss is not finite, before it reaches a weight.
+        Raises FloatingPointError if a loss is not finite; no weight has changed then.
         """
         factor = self.schedule.lr_factor(step)
         for name, optimizer in self.optimizers.items():
@@ -221,7 +221,7 @@ class Method(abc.ABC):
             optimizer.zero_grad(set_to_none=True)
 
     def ema_weights(self) -> contextlib.AbstractContextManager[None]:
-        """Context in which the networks have their averaged weights, if the run keeps an average."""
+        """Context in which the networks have their EMA weights, if the run keeps an EMA."""
         return contextlib.nullcontext() if self.ema is None else self.ema.in_place()
 
     def autocast(self) -> torch.autocast:
@@ -240,10 +240,7 @@ class Method(abc.ABC):
 
 
 class MeshMethod(Method):
-    """A method with an encoder of images and a generator of meshes, which learns from rendered silhouettes.
-
-    By default the settings `encoder`, `generator`, `symmetry` and `learning_rate` decide networks and optimizers.
-    """
+    """A method with an encoder of images and a generator of meshes, which learns from rendered silhouettes."""
 
     settings: MeshSettings
     encoder: nn.Module
@@ -271,14 +268,14 @@ class MeshMethod(Method):
             return Meshes(self.generator(codes).cpu(), self.faces)
 
     def encode_symmetric(self, images: Tensor) -> Tensor:
-        """Shape codes; if shapes are symmetric, the mean of the codes of an image and of its mirror image."""
+        """Shape codes; for symmetric shapes the mean of the codes of an image and its mirror image."""
         codes = MeshMethod.encode(self, images)
         return codes if self.generator.mirror is None else (codes + MeshMethod.encode(self, images.flip(3))) / 2
 
     def clamp_to_cube(self, shapes: Meshes) -> Meshes:
-        """The shapes with their vertices clamped to the cube of the data set, if it has one.
+        """Clamp the vertices to the cube of the data set, if it has one.
 
-        Voxelizers find nothing inside a shape that reaches out of their grid.
+        The voxelizers find no inside in a shape that exceeds their grid.
         """
         if self.info.cube_side is None:
             return shapes
@@ -294,7 +291,7 @@ class MeshMethod(Method):
 
     @torch.no_grad()
     def view_probabilities(self, images: Tensor) -> Tensor | None:
-        """How probable each view is for stored images uint8 [B, 4, S, S]: float32 [B, K]; None if not learnt."""
+        """Probability of each view class, float32 [B, K], for stored images uint8 [B, 4, S, S]; None if not learnt."""
         return self.view_logits(images).softmax(1).cpu() if "view_classifier" in self.networks else None
 
     def view_logits(self, images: Tensor) -> Tensor:
@@ -307,7 +304,7 @@ class MeshMethod(Method):
         return nmr.render_silhouette(vertices, self.faces, poses.cameras(), image_size=MASK_SIZE)
 
     def surface_losses(self, vertices: Tensor) -> dict[str, Tensor]:
-        """Those of the losses smoothness, inflation and area that have a weight above 0."""
+        """The losses smoothness, inflation and area, each only if its weight is above 0."""
         losses = {}
         if self.weights.get("smoothness", 0.0) > 0:
             losses["smoothness"] = nmr.losses.smoothness_loss(vertices, self.edges)
@@ -318,15 +315,11 @@ class MeshMethod(Method):
         return losses
 
 
-def check_groups(batch: Batch, size: int, sampling: Literal["pairs", "groups"]) -> int:
-    """The number n of objects in a batch of `size` views each, [a_1 .. a_n, b_1 .. b_n, ...].
-
-    Raises ValueError for any other batch; `sampling` makes the right ones.
-    """
+def check_groups(batch: Batch, size: int, sampling: Literal["pairs", "groups"]) -> None:
+    """Raise ValueError unless a batch is [a_1 .. a_n, b_1 .. b_n, ...], `size` views of each of n objects."""
     count, rest = divmod(len(batch), size)
     if rest or not torch.equal(batch.object_ids, batch.object_ids[:count].repeat(size)):
         raise ValueError(
             f"the method learns from batches of {size} views of each object, [a_1 .. a_n, b_1 .. b_n, ...], but this "
-            f"batch of {len(batch)} views is not made so; choose sampling {sampling!r}"
+            f"batch of {len(batch)} views has another form; choose sampling {sampling!r}"
         )
-    return count

@@ -1,4 +1,4 @@
-"""Vanilla-AE as Kato et al. 2018 published it: two views of an object must be explained by the shape of either."""
+"""Vanilla-AE as Kato et al. 2018 published it: the shape of each of two views must explain both."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from learn3d.methods.optimization import SparseGradientAdam
 from learn3d.networks import EncoderName, GeneratorName
 from learn3d.settings import Weight, checked
 
-CENTROID_LEARNING_RATE = 0.1  # learning rate of the centroid's layer, relative to all others
+CENTROID_LEARNING_RATE = 0.1  # learning rate of the centroid's layer, relative to the other layers
 
 
 @checked
 class MultiViewSettings(MeshSettings):
-    """Networks and weight of Kato et al. 2018; the defaults are the published code's for one category."""
+    """Networks and loss weight of Kato et al. 2018, with the published code's defaults for one category."""
 
     encoder: EncoderName = "conv-relu"
     generator: GeneratorName = "bounded"
@@ -38,7 +38,7 @@ class MultiView(MeshMethod):
             "encoder": SparseGradientAdam(self.encoder.parameters(), lr=rate),
             "generator": SparseGradientAdam(others, lr=rate),
         }
-        if slow:  # the bounded generator's
+        if slow:  # only the generator "bounded" has this layer
             optimizers["centroid"] = SparseGradientAdam(slow, lr=CENTROID_LEARNING_RATE * rate)
         return optimizers
 
@@ -50,14 +50,13 @@ class MultiView(MeshMethod):
         return {"projection": 1.0, "smoothness": self.settings.lambda_smooth}
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Render the shapes of both views, {a, b}, in both views: the mean of four IoU losses, and lambda_s times the
-        mean smoothness of the shapes. Raises ValueError if the batch is not made of pairs.
+        """Render the shapes of both views, a and b, in both views. The loss is the mean of the four IoU losses plus
+        lambda_smooth times the mean smoothness of the shapes.
         """
-        pairs = check_groups(batch, 2, "pairs")
+        pairs = len(batch) // 2
         vertices = self.predict(batch.images)[1].cpu()
-        # Shapes a, b, a, b in the views a, a, b, b.
+        # shapes a, b, a, b in the views a, a, b, b
         seen = torch.arange(2 * pairs).reshape(2, pairs)[[0, 0, 1, 1]].flatten()
         silhouettes = self.render(torch.cat([vertices, vertices]), batch.poses[seen])
         losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks[seen])}
-        losses |= self.surface_losses(vertices)
-        return self.backward_and_step(losses, step, *self.optimizers)
+        return self.backward_and_step(losses | self.surface_losses(vertices), step, *self.optimizers)

@@ -1,4 +1,4 @@
-"""From losses to weights, the same for every method: gradients, learning rates over a run, averages of the weights."""
+"""Optimization in every method: learning-rate schedules, EMA, Adam, and the step from losses to gradients."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ LRSchedule = Literal["constant", "cosine", "linear", "step"]
 
 @dataclass(frozen=True)
 class TrainingSchedule:
-    """Length, learning-rate schedule and averaging of a run."""
+    """Length, learning-rate schedule and EMA of a run; `TrainConfig` explains the options."""
 
-    iterations: int = 1  # number of steps in the run
-    lr_schedule: LRSchedule = "constant"  # course of the learning rate after the warm-up
-    warmup_steps: int = 0  # steps over which the learning rate ramps up from 0
-    ema_decay: float = 0.0  # decay per step of the exponential moving average of the weights; 0: no average
+    iterations: int = 1
+    lr_schedule: LRSchedule = "constant"
+    warmup_steps: int = 0
+    ema_decay: float = 0.0
 
     def __post_init__(self) -> None:
         if 0 < self.iterations <= self.warmup_steps:
@@ -30,8 +30,8 @@ class TrainingSchedule:
     def lr_factor(self, step: int) -> float:
         """The learning rate of step `step` (from 1), as a share of the full one.
 
-        A warm-up of w steps: 1/w, 2/w .. 1. Then constant: 1. linear: from 1 down towards 0. cosine: the same along
-        half a cosine. step: 1, and 0.1 in the last 5 % of all iterations (Kato et al. 2018).
+        It is 1/w, 2/w .. 1 in a warm-up of w steps. After it, constant: 1. linear, cosine: from 1 towards 0. step: 1,
+        and 0.1 in the last 5 % of all iterations (Kato et al. 2018).
         """
         if step <= self.warmup_steps:
             return step / self.warmup_steps
@@ -43,14 +43,14 @@ class TrainingSchedule:
         return 0.1 if self.lr_schedule == "step" and 20 * step > 19 * self.iterations else 1.0
 
 
-CONSTANT_LR = TrainingSchedule()  # full learning rates, no average
+CONSTANT_LR = TrainingSchedule()  # constant learning rates, no EMA
 
 
 class EMA:
-    """An exponential moving average of all weights of some networks (EMA), and of their batch norms' statistics.
+    """Exponential moving average of all parameters and floating-point buffers of some networks.
 
-    After step t: average = d * average + (1 - d) * weights. d is the `decay`, but at most (1 + t) / (10 + t), so that
-    the initial weights are soon forgotten.
+    After step t: average = d * average + (1 - d) * weights with d = min(decay, (1 + t) / (10 + t)), so that the initial
+    weights are soon forgotten.
     """
 
     def __init__(self, networks: Mapping[str, nn.Module], decay: float) -> None:
@@ -60,17 +60,17 @@ class EMA:
 
     @torch.no_grad()
     def update(self, step: int) -> None:
-        """Take in the weights after step `step` (from 1)."""
+        """Update the average after step `step` (from 1)."""
         new = 1 - min(self.decay, (1 + step) / (10 + step))
         for name, average in self.tensors.items():
             if average.is_floating_point():
                 average.lerp_(self._own[name].detach(), new)
-            else:  # the number of batches that a batch norm has seen
+            else:  # a batch norm's number of batches
                 average.copy_(self._own[name])
 
     @contextlib.contextmanager
     def in_place(self) -> Iterator[None]:
-        """Context in which the networks have the averaged weights. Nothing may be trained in it."""
+        """Context in which the networks have the averaged weights, for evaluation only."""
         self._swap()
         try:
             yield
@@ -83,37 +83,33 @@ class EMA:
 
 
 def adam(network: nn.Module, learning_rate: float, betas: tuple[float, float] = (0.9, 0.999)) -> torch.optim.Adam:
-    """Adam for one network, fused (13 ms a step instead of 91 on two cores), without denormal moments."""
+    """Adam for one network: fused (13 ms a step instead of 91 on two cores), and without denormal moments."""
     parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
     optimizer = torch.optim.Adam(parameters, lr=learning_rate, betas=betas, fused=True)
     optimizer.register_step_post_hook(_drop_vanished)
     return optimizer
 
 
-DROP_EVERY = 20  # steps
-
-
 @torch.no_grad()
 def _drop_vanished(optimizer: torch.optim.Optimizer, *_: object) -> None:
     """Every 20 steps, set moments that are far too small to change a weight to 0.
 
-    The gradient of a unit that is never active is 0, so its moments decay, become denormal and stay so. Some CPUs
-    are many times slower with denormal numbers: Adam took 111 ms a step of Plus instead of 15.
+    The gradient of a dead unit is 0, so its moments decay until they are denormal. Some CPUs are many times slower with
+    denormal numbers: Adam took 111 ms a step of Plus instead of 15.
     """
     for parameter, state in optimizer.state.items():
-        if parameter.device.type == "cpu" and state["step"] % DROP_EVERY == 0:
+        if parameter.device.type == "cpu" and state["step"] % 20 == 0:
             for name, least in (("exp_avg", 1e-20), ("exp_avg_sq", 1e-36)):  # beside eps = 1e-8, and its square
                 torch.hardshrink(state[name], least, out=state[name])
 
 
-CHUNK = 1 << 20  # weights that are updated at once
+CHUNK = 1 << 20  # weights per update
 
 
 class SparseGradientAdam(torch.optim.Adam):
     """Kato et al. 2018's Adam: a weight whose gradient is exactly zero in a step keeps its value and its moments.
 
-    So the weights of a ReLU that is off for a whole batch stay where they are. Torch's Adam would carry them on by
-    their momentum and forget their second moment.
+    So the weights of a ReLU that is off for a whole batch do not move; torch's Adam would move them by their momentum.
     As in Chainer, epsilon is added before the bias correction of the second moment: lr' m / (sqrt(v) + eps), with
     lr' = lr sqrt(1 - beta_2^t) / (1 - beta_1^t), and all weights share the count t. The state is that of torch's Adam.
     """
@@ -133,7 +129,7 @@ class SparseGradientAdam(torch.optim.Adam):
                 self._update(parameter, state, group)
 
     def _update(self, parameter: Tensor, state: dict[str, Tensor], group: dict) -> None:
-        """Update in chunks that share two buffers: allocating more takes five times as long as computing."""
+        """Update in chunks that share two buffers; allocation would take five times as long as computation."""
         (beta1, beta2), count = group["betas"], float(state["step"])
         rate = group["lr"] * math.sqrt(1 - beta2**count) / (1 - beta1**count)
         row = parameter[0].numel()
@@ -152,17 +148,17 @@ class SparseGradientAdam(torch.optim.Adam):
 
 
 def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
-    """Apply a network so that gradients reach its inputs but not its parameters, and its buffers stay as they are."""
+    """Apply a network; gradients reach its inputs but not its parameters, and its buffers do not change."""
     state = {name: parameter.detach() for name, parameter in network.named_parameters()}
     state |= {name: buffer.clone() for name, buffer in network.named_buffers()}
     return torch.func.functional_call(network, state, inputs)
 
 
 def backpropagate(losses: Mapping[str, Tensor], weights: Mapping[str, float], step: int) -> dict[str, float]:
-    """Backpropagate the sum of the losses, each times its weight; return the losses and "total".
+    """Backpropagate the weighted sum of the losses; return the unweighted losses and "total".
 
-    Losses may lie on the CPU and on the networks' device; there is one sum for each of the two.
-    Raises ValueError if a loss has no weight. Raises FloatingPointError, before any gradient, if a loss is not finite.
+    Losses may be on several devices. Raises ValueError if a loss has no weight, FloatingPointError, before any
+    gradient, if a loss is not finite.
     """
     if missing := [name for name in losses if name not in weights]:
         raise ValueError(f"the method's weights lack {', '.join(missing)}; they have {', '.join(weights) or 'none'}")
@@ -181,7 +177,7 @@ def backpropagate(losses: Mapping[str, Tensor], weights: Mapping[str, float], st
 
 
 def read_back(losses: Mapping[str, Tensor]) -> dict[str, float]:
-    """The values of scalar losses; one copy for all that lie on one device."""
+    """The values of scalar losses, with one copy from each device."""
     values: dict[str, float] = dict.fromkeys(losses, 0.0)
     for device in {loss.device for loss in losses.values()}:
         names = [name for name, loss in losses.items() if loss.device == device]

@@ -1,6 +1,6 @@
 """Plus: the pose-invariant method with mirror symmetry and a loss at novel views, from masks of other objects.
 
-The supervision is that of Peng et al. 2020: images taken singly, each with its mask and its pose.
+The supervision is that of Peng et al. 2020: single images, each with its mask and its pose.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from learn3d.networks.encoders import ViewClassifier
 from learn3d.settings import Count, Positive, Weight, checked
 
 REDUCED = MASK_SIZE // 2  # side of the masks in the mask bank
-AZIMUTHS = AngleBins(15.0, 180.0, -90.0, 90.0)  # cells that the view classifier tells apart: those of `fitting.fit`
+AZIMUTHS = AngleBins(15.0, 180.0, -90.0, 90.0)  # classes of the view classifier: the azimuth cells of `fitting.fit`
 
 
 @checked
 class PlusSettings(PoseInvariantSettings):
-    """Networks, weights and forms of the terms of the loss; a weight of 0 means that the term is not computed."""
+    """Networks and weights of the losses; a loss with weight 0 is not computed."""
 
     encoder: EncoderName = "conv-light"
     generator: GeneratorName = "auto"
@@ -44,8 +44,8 @@ class PlusSettings(PoseInvariantSettings):
     bank_size: Count = 2048
     """Number of training masks in the mask bank of the loss at novel views."""
     lambda_view: Weight = 0.0
-    """Weight of the loss of a small network that learns the azimuth of an image, from which reconstruction places the
-    camera of a picture. 0: there is no such network."""
+    """Weight of the loss of a small network that classifies the azimuth of an image; reconstruction places the camera
+    of a picture by it. 0: no such network."""
 
     @property
     def reads_view_ids(self) -> bool:
@@ -61,13 +61,13 @@ class PlusSettings(PoseInvariantSettings):
 
 
 class MaskBank(nn.Module):
-    """The last masks of the training, at half their resolution, with their view classes. It has no weights.
+    """The latest masks of the training, at half their resolution, with their view classes.
 
-    It is a network so that it is saved in checkpoints with them.
+    It has no weights, and is a module so that checkpoints hold it.
     """
 
-    masks: Tensor  # uint8 [N, REDUCED^2], 255 inside
-    view_ids: Tensor  # int64 [N], -1: none yet; the oldest come first
+    masks: Tensor  # uint8 [N, REDUCED^2], 255 inside; the oldest first
+    view_ids: Tensor  # int64 [N]; -1 for empty places
 
     def __init__(self, size: int) -> None:
         super().__init__()
@@ -80,13 +80,13 @@ class MaskBank(nn.Module):
         return bool(self.view_ids[0] >= 0)
 
     def add(self, masks: Tensor, view_ids: Tensor) -> None:
-        """Take in masks float [B, REDUCED^2] of these classes, and forget the B oldest."""
+        """Add masks float [B, REDUCED^2] of these view classes, and drop the B oldest."""
         size = len(self.masks)
         self.masks.copy_(torch.cat([self.masks, (255 * masks).round().to(self.masks)])[-size:])
         self.view_ids.copy_(torch.cat([self.view_ids, view_ids.to(self.view_ids)])[-size:])
 
     def of_view(self, view_id: int) -> Tensor:
-        """The masks of one class, float32 [M, REDUCED^2]."""
+        """The masks of one view class, float32 [M, REDUCED^2]."""
         return self.masks[self.view_ids == view_id] / 255
 
 
@@ -123,17 +123,17 @@ class Plus(PoseInvariant):
         return self.encode_symmetric(images)
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """A step of `PoseInvariant` with lambda_novel_view times the loss at a novel view, once the mask bank is full.
+        """A step of `PoseInvariant`, plus lambda_novel_view times the loss at a novel view once the mask bank is full.
 
-        If shapes are symmetric, every second image is flipped. The flipped image of a symmetric object has the same
-        shape, so its mask and its pose stay as they are. To the discriminator it is of another view, K + k for view k.
+        If shapes are symmetric, every second image is flipped. A flipped image of a symmetric object shows the same
+        shape, so mask and pose stay the same. For the discriminator it has another view class: K + k instead of k.
         """
         flipped = self._flipped(batch)
         images = torch.where(flipped[:, None, None, None], batch.images.flip(3), batch.images)
         return self._train(images, batch.view_ids + self.info.num_views * flipped, batch, step)
 
     def _flipped(self, batch: Batch) -> Tensor:
-        # Batches are in random order already.
+        # every second one: batches are in random order
         return (torch.arange(len(batch)) % 2 == 1) & (self.generator.mirror is not None)
 
     def _silhouette_losses(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
@@ -144,8 +144,8 @@ class Plus(PoseInvariant):
         return losses | self._novel_view_loss(vertices, batch) if self.settings.lambda_novel_view > 0 else losses
 
     def _novel_view_loss(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """All shapes of the batch are rendered at one of its cameras. The loss is the energy distance between these
-        silhouettes and the masks of this view in the mask bank, mostly of other objects.
+        """Render all shapes of the batch at one of its cameras. The loss is the energy distance between these
+        silhouettes and the masks of this view class in the mask bank, mostly of other objects.
         """
         self.mask_bank.add(_reduced(batch.masks), batch.view_ids)
         seen_by = int(torch.randint(len(batch), ()))

@@ -1,4 +1,4 @@
-"""The pose-invariant method (Peng et al. 2020). With three of its weights at 0 it is Vanilla-AE."""
+"""The pose-invariant method (Peng et al. 2020), and Vanilla-AE: the same without the losses on codes."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ COMPACT_AREA_WEIGHT = 0.03
 
 @checked
 class PoseInvariantSettings(MeshSettings):
-    """Networks, weights and forms of the terms of L_tot; a weight of 0 means that the term is not computed."""
+    """Networks, weights and forms of the losses in L_tot; a loss with weight 0 is not computed."""
 
     clamp_to_cube: bool = False
-    """Clamp vertices to the cube of the data set, if it has one, in evaluation and reconstruction. The voxelizers take
-    a shape that exceeds their grid for hollow."""
+    """Clamp vertices to the cube of the data set, if it has one, in evaluation and reconstruction. The voxelizers find
+    no inside in a shape that exceeds their grid."""
     pretrained: FilePath | None = None
-    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's (default: random
-    weights). The encoder gets natural colours, R, G, B, normalised as ImageNet's, however the data set stores them."""
+    """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18 (default: random
+    weights)."""
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1)."""
     lambda_smooth_end: Positive | None = None
-    """Weight of the smoothness loss at the end of the run, reached by exponential decay. If it is None the weight stays
-    lambda_smooth."""
+    """Weight of the smoothness loss at the end of the run, reached by exponential decay (None: it stays
+    lambda_smooth)."""
     lambda_area: Weight | Literal["auto"] = 0.0
-    """Weight of the area of the surface, which keeps it free of folds and makes sides that no camera sees flat. auto:
-    0.03 if the training masks are compact, else 0."""
+    """Weight of the area of the surface. It prevents folds and flattens sides that no camera sees. auto: 0.03 if the
+    training masks are compact, else 0."""
     lambda_classification: Weight = 1.0
     """Weight of the discriminator's own loss (lambda_2)."""
     lambda_adversarial: Weight = 1.0
@@ -46,9 +46,9 @@ class PoseInvariantSettings(MeshSettings):
     lambda_prior: Weight = 1.0
     """Weight of the Gaussian prior on the codes (lambda_4)."""
     adversarial_form: Literal["log", "probability"] = "log"
-    """Confusion loss on squares of log-probability (published code) or of probability differences (eq. 4)."""
+    """Confusion loss: squared differences of log-probabilities (log, published code) or of probabilities (eq. 4)."""
     prior_form: Literal["squared", "norm"] = "squared"
-    """Prior on the squared length of the codes (published code) or on their length (eq. 5)."""
+    """Prior: squared length of the codes (squared, published code) or their length (norm, eq. 5)."""
 
     def __post_init__(self) -> None:
         check_pretrained(self.pretrained, self.encoder)
@@ -117,10 +117,10 @@ class PoseInvariant(MeshMethod):
             load_pretrained(self.encoder, self.settings.pretrained)
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """In every step encoder and generator descend projection + lambda_1 smoothness + lambda_4 prior. Odd steps add
-        lambda_2 classification on detached codes, which trains the discriminator and nothing else. Even steps add
-        lambda_3 confusion, which reaches the encoder through the discriminator. The discriminator itself then gets
-        neither gradient nor step.
+        """Train encoder and generator on projection + lambda_1 smoothness + lambda_4 prior in every step.
+
+        Odd steps add lambda_2 classification on detached codes, which trains the discriminator alone. Even steps add
+        lambda_3 confusion, which trains the encoder through the discriminator; the discriminator itself does not learn.
         """
         return self._train(batch.images, batch.view_ids, batch, step)
 

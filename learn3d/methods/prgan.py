@@ -1,4 +1,4 @@
-"""PrGAN (Gadelha et al. 2017): a GAN of voxel grids that sees only silhouettes, and an encoder learnt afterwards."""
+"""PrGAN (Gadelha et al. 2017): a GAN of voxel grids trained on silhouettes, and an encoder trained afterwards."""
 
 from __future__ import annotations
 
@@ -38,33 +38,31 @@ FourLayers = Annotated[tuple[LayerChannels, LayerChannels, LayerChannels, LayerC
 
 @checked
 class PrGANSettings(MethodSettings):
-    """Learning rates, widths and when each network is trained; defaults: the published code, for airplanes."""
+    """Learning rates, widths, phases and cameras; the defaults are the published code's for airplanes."""
 
     encoder_from_step: Step = 53_051
     """First step that trains the encoder instead of the GAN (published: after 50 epochs)."""
     generator_learning_rate: Positive = 2.5e-3
-    """Adam's learning rate for the generator, in both of its steps."""
+    """Adam's learning rate for both losses of the generator."""
     discriminator_learning_rate: Positive = 1e-4
     """Adam's learning rate for the discriminator."""
     encoder_learning_rate: Positive = 1e-5
     """Adam's learning rate for the inverse encoder."""
     accuracy_margin: Share = 0.8
-    """The discriminator rests in steps that begin with a higher accuracy."""
+    """The discriminator is not trained in steps that begin with a higher accuracy."""
     generator_channels: FourLayers = GENERATOR_CHANNELS
     """Channels at 4^3, 8^3, 16^3 and 32^3; fewer on a small machine."""
     discriminator_channels: FourLayers = DISCRIMINATOR_CHANNELS
     """Channels at 32^2, 16^2, 8^2 and 4^2; fewer on a small machine."""
     occupancy_threshold: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """A predicted voxel is full if its mean is higher. Unpublished; Kato's grids hold every cell that a shape
-    touches, so that even true shapes reach an IoU of .35 at 0.5, but .74 at 0.1."""
+    """Predicted voxels with a higher mean are occupied. Not published; Kato's grids hold every cell that a shape
+    touches, so even true shapes reach an IoU of only .35 at 0.5, but .74 at 0.1."""
     elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 30.0
-    """Elevation of the K views, which stand at equal steps of azimuth."""
+    """Elevation of the K views, whose azimuths are equally spaced."""
     distance: Positive = 2.732
     """Distance of the data set's cameras; with the field of view it gives the size of objects in the images."""
     half_fov_deg: Annotated[float, Field(gt=0, lt=90)] = 15.0
     """Half of the field of view of the data set's cameras."""
-    perspective: bool = False
-    """Rays of the projection that meet in the eye, as the data set's do, instead of PrGAN's parallel ones."""
 
     @property
     def reads_view_ids(self) -> bool:
@@ -77,7 +75,7 @@ class PrGANSettings(MethodSettings):
     def check_run(self, *, iterations: int, batch_size: int) -> None:
         if self.encoder_from_step > iterations:
             raise ValueError(
-                f"encoder_from_step={self.encoder_from_step} lies beyond the {iterations} iterations: "
+                f"encoder_from_step={self.encoder_from_step} is after the last of {iterations} iterations: "
                 f"the encoder would never be trained; give a step such as {iterations // 2 + 1}"
             )
 
@@ -88,8 +86,8 @@ class PrGANSettings(MethodSettings):
 class PrGAN(Method):
     """Generator of voxels from z ~ U(-1, 1)^201, discriminator of silhouettes, inverse encoder.
 
-    The first 200 entries of z decide the shape, the last one v the view: floor((v + 1) K / 2). The view of a training
-    image is never used, only that all K views are equally frequent.
+    The first 200 entries of z decide the shape; the last one, v, decides the view: floor((v + 1) K / 2). Views of
+    training images are not used, but all K views must be equally frequent.
     """
 
     settings: PrGANSettings
@@ -113,13 +111,13 @@ class PrGAN(Method):
 
     @property
     def weights(self) -> dict[str, float]:
-        return dict.fromkeys(self.optimizers, 1.0)  # each optimizer has a loss of its own
+        return dict.fromkeys(self.optimizers, 1.0)  # one loss for each optimizer
 
     @functools.cached_property
     def views(self) -> ViewCircle:
         """The K views of the projected silhouettes."""
-        own = self.settings
-        return ViewCircle(self.info.num_views, own.elevation_deg, own.distance, own.half_fov_deg, own.perspective)
+        settings = self.settings
+        return ViewCircle(self.info.num_views, settings.elevation_deg, settings.distance, settings.half_fov_deg)
 
     def encode(self, images: Tensor) -> Tensor:
         """Shape codes [B, 200] from the mask channel alone."""
@@ -155,8 +153,9 @@ class PrGAN(Method):
         return self._gan_step(upload(batch.masks, self.device), self.sample_z(len(batch)), step)
 
     def _gan_step(self, real: Tensor, z: Tensor, step: int) -> dict[str, float]:
-        """Train the discriminator, if its accuracy at the start is at most 0.8, then the generator, then the generator
-        on the statistics of the discriminator's first layer. One z serves all three, as in the published code.
+        """Train the discriminator, if its accuracy is at most `accuracy_margin`; then the generator on the
+        discriminator's logits; then the generator on statistics of its first layer. All three use the same z, as in the
+        published code.
         """
         values = {"accuracy": self.accuracy(real, z)}
         self.set_training(True)
@@ -182,7 +181,7 @@ class PrGAN(Method):
         return values
 
     def _encoder_step(self, count: int, step: int) -> dict[str, float]:
-        """The encoder learns z of `count` fresh samples of the generator, which stays as it is (evaluation mode)."""
+        """Train the encoder to predict z from `count` new samples of the generator, which is in evaluation mode."""
         self.set_training(False)
         z = self.sample_z(count)
         with torch.no_grad():
@@ -194,7 +193,7 @@ class PrGAN(Method):
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> float:
-        """Mean of D on real silhouettes and of 1 - D on generated ones: probabilities, in evaluation mode."""
+        """Mean probability, in evaluation mode, that the discriminator assigns to the right answers."""
         self.set_training(False)
         with self.autocast():
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
@@ -202,8 +201,8 @@ class PrGAN(Method):
 
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
-    """Squared distances of batch means and of batch variances of features [B, ...], summed over all features."""
-    means, variances = [], []  # not by torch's var, which takes ten times as long over the first axis
+    """Sum over all features [B, ...] of the squared differences of their batch means and batch variances."""
+    means, variances = [], []  # torch.var takes ten times as long over the first axis
     for features in (of_real, of_fake):
         mean = features.mean(0)
         means.append(mean)
@@ -212,9 +211,9 @@ def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
 
 
 def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
-    """Raise a ValueError unless every camera is that of its view class: PrGAN draws from a table of views.
+    """Raise a ValueError unless every camera is that of its view class, as PrGAN has a fixed table of views.
 
-    Tolerances: angles half a degree, distance half a percent, half the field of view a tenth of a degree.
+    Tolerances: half a degree for angles, half a percent for the distance, 0.1 degrees for half the field of view.
     """
     wanted = (
         f"PrGAN needs images from {views.count} fixed views, view k at azimuth {-360 / views.count:g} k and elevation "

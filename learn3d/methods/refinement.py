@@ -1,4 +1,4 @@
-"""Fits a predicted shape to the mask of its image, if the camera is known: first the code, then the vertices."""
+"""Fits predicted shapes to the masks of their images at known cameras: first the codes, then the vertices."""
 
 from __future__ import annotations
 
@@ -13,23 +13,14 @@ from learn3d.device import upload
 from learn3d.methods.method import MeshMethod
 from learn3d.methods.surfaces import Meshes
 
-CODE_STEPS = 40
+CODE_STEPS, VERTEX_STEPS = 40, 40
 CODE_LEARNING_RATE = 0.1  # in units of the root mean square of the codes' entries
-VERTEX_STEPS = 40
 VERTEX_LEARNING_RATE = 0.002  # in units of the object frame
 SMOOTHNESS = 0.001  # weight of the smoothness loss, as in the proposed method
 
 
-def refine(
-    method: MeshMethod,
-    images: Tensor,
-    masks: Tensor,
-    poses: Poses,
-    *,
-    code_steps: int = CODE_STEPS,
-    vertex_steps: int = VERTEX_STEPS,
-) -> Meshes:
-    """Meshes of stored images uint8 [B,4,S,S], fitted to masks float32 [B,64,64] that the B cameras of `poses` see.
+def refine(method: MeshMethod, images: Tensor, masks: Tensor, poses: Poses) -> Meshes:
+    """Meshes of stored images uint8 [B,4,S,S], fitted to masks float32 [B,64,64] at the B cameras of `poses`.
 
     Adam minimises soft IoU loss + 0.001 smoothness over the codes, which keeps shapes plausible, and then over the
     vertices. Symmetric shapes stay symmetric.
@@ -48,11 +39,11 @@ def refine(
     with torch.no_grad():
         codes = method.encode(images).float().cpu()
     learning_rate = CODE_LEARNING_RATE * float(codes.square().mean().sqrt())
-    codes = _descend(lambda codes: loss(decode(codes)), codes, learning_rate, code_steps)
+    codes = _descend(lambda codes: loss(decode(codes)), codes, learning_rate, CODE_STEPS)
     with torch.no_grad():
         vertices = decode(codes).float().cpu()
     symmetrized = method.generator.symmetrized
-    vertices = _descend(lambda vertices: loss(symmetrized(vertices)), vertices, VERTEX_LEARNING_RATE, vertex_steps)
+    vertices = _descend(lambda vertices: loss(symmetrized(vertices)), vertices, VERTEX_LEARNING_RATE, VERTEX_STEPS)
     return Meshes(symmetrized(vertices), method.faces)
 
 

@@ -19,12 +19,10 @@ class Meshes:
 
     vertices: Tensor  # float32 [B, V, 3], object frame
     faces: Tensor  # int64 [F, 3]
-    colors: Tensor | None = None  # float32 [B, V, 3] in [0, 1]: R, G, B of each vertex; None if not predicted
 
     def surfaces(self) -> list[Surface]:
         """The shapes one by one."""
-        colors = [None] * len(self.vertices) if self.colors is None else self.colors
-        return [Surface(vertices, self.faces, color) for vertices, color in zip(self.vertices, colors, strict=True)]
+        return [Surface(vertices, self.faces) for vertices in self.vertices]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +33,13 @@ class Grids:
     threshold: float = 0.5  # cells above it are occupied
 
     def surfaces(self) -> list[Surface]:
-        """The shapes one by one as triangles, by marching cubes at the threshold."""
+        """The shapes one by one, by marching cubes at the threshold."""
         return [grid_surface(grid, level=self.threshold) for grid in self.occupancy]
 
     def occupied(self, size: int) -> Tensor:
-        """Bool [B, size, size, size]: whether the mean over a cell is above the threshold; s is a multiple of size."""
+        """Bool [B, size, size, size]: whether the mean of a larger cell is above the threshold; s must be a multiple of
+        size.
+        """
         factor, rest = divmod(self.occupancy.shape[-1], size)
         if rest or factor < 1:
             raise ValueError(f"a grid of {self.occupancy.shape[-1]} cells cannot be pooled to {size}")
@@ -47,10 +47,10 @@ class Grids:
 
 
 def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> Surface:
-    """Marching cubes: the surface of a grid [s, s, s] with axes (x, y, z) over the cube [-box/2, box/2].
+    """Marching cubes: the surface of a grid [s, s, s] with axes (x, y, z) over the cube [-box/2, box/2]^3.
 
-    The surface is empty if no cell is above `level`. Cells at the border are closed. The faces are wound as
-    `nmr.icosphere`'s (normals outwards by the right-hand rule in these axes).
+    The surface is empty if no cell is above `level`, and closed at the border of the grid. Normals point outwards by
+    the right-hand rule in these axes, as `nmr.icosphere`'s do.
     """
     size = grid.shape[-1]
     padded = np.pad(grid.detach().cpu().float().numpy(), 1)

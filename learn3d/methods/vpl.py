@@ -1,7 +1,7 @@
 """View prior learning (VPL; Kato and Harada 2019), as re-implemented by Peng et al. 2020 and as published.
 
-A discriminator learns to tell silhouettes of predicted shapes at the view of the input image ("real") from silhouettes
-at other views ("fake"); the shapes learn to make the two alike. docs/methods/vpl.md has the equations.
+A discriminator learns to separate silhouettes of predicted shapes at the view of the input image ("real") from those
+at other views ("fake"); the shapes learn to prevent that. docs/methods/vpl.md has the equations.
 """
 
 from __future__ import annotations
@@ -35,52 +35,53 @@ MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object if alpha i
 
 @checked
 class VPLSettings(MeshSettings):
-    """Networks, losses and their weights; a weight of 0 means that the term is not computed.
+    """Networks, losses and their weights; a loss with weight 0 is not computed.
 
-    The defaults are the re-implementation that Peng et al. 2020 compared with on Kato's data.
+    The defaults are those of the re-implementation that Peng et al. 2020 used on Kato's data.
     """
 
     encoder: Literal["conv", "preact-resnet18", "resnet18"] = "conv"
     """Network from images to codes. conv: three convolutions, 64-pixel RGB and mask. preact-resnet18: RGB on grey.
     resnet18: RGB, may be pretrained. The last two take any multiple of 32 pixels (--image-size)."""
     pretrained: FilePath | None = None
-    """File of ImageNet weights for the encoder resnet18 to start from, a state dict of torchvision's (default: random
-    weights); its batch norms stay frozen then. The encoder gets natural colours, however the data set stores them."""
+    """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18 (default: random
+    weights). Batch norms are frozen if it is given."""
     image_size: Pixels = 64
     """Side of the input images in pixels."""
     vertex_scale: Positive = 0.01
-    """Cube generators only: s, the factor of the last layer's output."""
+    """Cube generators only: factor s of the last layer's output."""
     object_scale: Positive = 0.5
     """Cube generators only: factor of the vertices; they start on a sphere of half this radius."""
     discriminator: Literal["dcgan", "spectral-patch", "patch"] = "dcgan"
-    """dcgan: one-hot view planes. spectral-patch, patch: features of the camera's pose (ShapeNet, Pascal3D+)."""
+    """dcgan: reads one-hot view planes. spectral-patch, patch: read the camera's pose (ShapeNet, Pascal3D+)."""
     discriminator_channels: Channels = 128
-    """Channels of the discriminator's first layer; the others follow (published: dcgan 128, spectral-patch 32, patch
-    64). A narrower one costs its square less."""
+    """Channels of the discriminator's first layer; those of later layers are multiples (published: dcgan 128,
+    spectral-patch 32, patch 64)."""
     class_conditional: bool = False
-    """Tell the discriminator the object's category (spectral-patch and data of several categories only)."""
+    """Give the discriminator the object's category (only with spectral-patch and data of several categories)."""
     adversary: Literal["alternating", "reversal"] = "alternating"
     """alternating: odd steps train the discriminator, even ones the shapes against it. reversal: both in one step
     through a gradient reversal layer (as published)."""
     other_views: Literal["random", "reversed", "next"] = "random"
-    """Source of each sample's other view. random: any sample of another view class. reversed: the sample at the same
-    place from the batch's end (published, ShapeNet). next: the next of its category (published, Pascal3D+)."""
+    """Sample of the batch that gives each sample its other view. random: one of another view class. reversed: the one
+    at the same place from the batch's end (published, ShapeNet). next: the next one of its category (published,
+    Pascal3D+)."""
     silhouette_size: Pixels = 64
-    """Side of rendered silhouettes: 64, compared with the data's masks, or image_size, with the input's own mask."""
+    """Side of rendered silhouettes: 64 (compared with the data's masks) or image_size (with the input's own mask)."""
     anti_aliasing: bool = True
-    """Render silhouettes with 2x2 samples a pixel."""
+    """Render silhouettes with 2x2 samples per pixel."""
     renderer_gradient: Literal["nmr", "local"] = "nmr"
     """Gradient of the renderer: Kato et al. 2018's, or the local one of Kato and Harada 2019."""
     silhouette_loss: Literal["iou", "pyramid"] = "iou"
     """iou: 1 - soft IoU. pyramid: squared distance of normalised images at five resolutions."""
     adam_beta1: Annotated[float, Field(ge=0, lt=1)] = 0.9
-    """Adam's decay of the mean gradient (of its square: 0.999)."""
+    """beta_1 of Adam (beta_2 is 0.999)."""
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss."""
     lambda_inflation: Weight = 0.0
-    """Weight of the internal pressure."""
+    """Weight of the inflation loss (internal pressure)."""
     lambda_discriminator: Weight = 1.0
-    """lambda_D: weight of the adversarial loss on the shapes; the discriminator itself always learns with weight 1."""
+    """Weight of the adversarial loss on the shapes (lambda_D); the discriminator's own loss has weight 1."""
 
     @property
     def reads_view_ids(self) -> bool:
@@ -116,7 +117,7 @@ class VPL(MeshMethod):
         if settings.class_conditional and info.num_classes < 2:
             raise ValueError("class_conditional needs data of several categories, got one")
         encoder = _create_encoder(settings, info).to(memory_format=torch.channels_last)
-        networks = {"encoder": encoder, "generator": _create_generator(settings, self.info)}
+        networks = {"encoder": encoder, "generator": _create_generator(settings, info)}
         if settings.lambda_discriminator > 0:
             networks["discriminator"] = _create_discriminator(settings, info)
         return networks
@@ -141,22 +142,22 @@ class VPL(MeshMethod):
             load_pretrained(self.encoder.resnet, self.settings.pretrained)
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """In every step encoder and generator descend projection + smoothness + inflation.
+        """Train encoder and generator on projection + smoothness + inflation in every step.
 
-        With a discriminator D each shape is also rendered at another view. Alternating: in odd steps D descends
-        softplus(-D(input view)) + softplus(D(other view)) on detached silhouettes. In even steps encoder and generator
-        descend lambda_D softplus(-D(other view)); D and its running means stay as they are. Reversal: in every step
-        D descends its loss, and encoder and generator climb it with lambda_D times its gradient.
+        With a discriminator D each shape is also rendered at another view. Alternating: odd steps train D on
+        softplus(-D(input view)) + softplus(D(other view)) of detached silhouettes. Even steps train encoder and
+        generator on lambda_D softplus(-D(other view)); D and its running means do not change. Reversal: every step
+        trains D on its loss, and encoder and generator on -lambda_D times its gradient.
         """
         settings = self.settings
         if settings.lambda_discriminator == 0:
-            vertices = self._vertices(batch)
+            vertices = self.predict(batch.images)[1].cpu()
             silhouettes = self.render(vertices, batch.poses)
             losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
             return self.backward_and_step(losses, step, "encoder", "generator")
 
         others = other_views(batch, settings.other_views)
-        vertices = self._vertices(batch)
+        vertices = self.predict(batch.images)[1].cpu()
         both = batch.poses[torch.cat([torch.arange(len(batch)), others])]  # both views of each shape in one call
         silhouettes, elsewhere = self.render(torch.cat([vertices, vertices]), both).chunk(2)
         losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
@@ -173,11 +174,8 @@ class VPL(MeshMethod):
         trained = ["encoder", "generator"] + ["discriminator"] * ("discrimination" in losses)
         return self.backward_and_step(losses, step, *trained)
 
-    def _vertices(self, batch: Batch) -> Tensor:
-        return self.predict(batch.images)[1].cpu()
-
     def render(self, vertices: Tensor, poses: Poses) -> Tensor:
-        """Silhouettes float32 [B,s,s] with the size, samples and gradient of the settings."""
+        """Silhouettes float32 [B,s,s] with the settings' size, anti-aliasing and gradient."""
         settings = self.settings
         return nmr.render_silhouette(
             vertices,
@@ -210,7 +208,7 @@ class VPL(MeshMethod):
         if self.settings.discriminator == "dcgan":
             with self.autocast():
                 return network(silhouettes, upload(batch.view_ids[seen_at], self.device)).float()
-        # In float32: spectral normalisation mixes types otherwise.
+        # without autocast, under which spectral normalisation mixes dtypes
         conditions = [upload(batch.poses[seen_at].features(), self.device)]
         if self.settings.class_conditional:
             conditions.append(upload(batch.class_ids, self.device))
@@ -218,11 +216,11 @@ class VPL(MeshMethod):
 
 
 def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> Tensor:
-    """Index of the sample whose view is the other view of each sample, int64 [B]; see VPLSettings.other_views.
+    """For each sample the index of the sample whose view is its other view, int64 [B]; see VPLSettings.other_views.
 
-    "random" uses torch's global generator, and takes any sample if all have one view class. If all views are equally
-    frequent it draws uniformly from the other views, as the code of Peng et al. 2020 does. As published, "reversed"
-    gives the middle sample of an odd batch its own view, and "next" a sample that is alone in its category.
+    "random" uses torch's global generator, and takes any sample if the batch has one view class. As published,
+    "reversed" gives the middle sample of an odd batch its own view, and "next" does so for the only sample of a
+    category.
     """
     count = len(batch)
     if choice == "reversed":

@@ -1,4 +1,4 @@
-"""Networks: encoders, generators, discriminators; each file has one kind. Settings choose them by name."""
+"""Networks: encoders, generators, discriminators. Settings choose them by name."""
 
 from typing import Literal
 

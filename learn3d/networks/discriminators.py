@@ -1,7 +1,7 @@
-"""Discriminators: of views from shape codes, and of silhouettes and their views (view prior learning).
+"""Discriminators of shape codes (pose-invariant method) and of silhouettes (view prior learning).
 
-The latter tell whether a silhouette was rendered at the input view of the predicted shape. Each takes silhouettes
-float [B,S,S] and the view, and returns logits: positive for "this is the input view".
+Those of silhouettes take silhouettes float [B,S,S] and their views, and return logits: positive for "rendered at the
+view of the input image".
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ BATCH_NORM_EPS = 2e-5  # published code
 
 
 class PoseDiscriminator(nn.Module):
-    """Shape code [B,512] -> logits [B,K] over the K discrete views."""
+    """Shape code [B,512] -> logits [B,K] over K view classes."""
 
     def __init__(self, num_views: int) -> None:
         super().__init__()
@@ -32,7 +32,7 @@ class PoseDiscriminator(nn.Module):
 
 
 class OneHotViewDiscriminator(nn.Module):
-    """DCGAN's discriminator on a silhouette and K planes, 1 in the plane of its view and 0 in the others -> [B].
+    """DCGAN's discriminator on a silhouette and a one-hot plane for each of K views -> logits [B].
 
     Four 4x4 convolutions of stride 2 with c, 2c, 4c, 8c channels, batch norm on the last three, leaky ReLUs, and a
     linear layer; c = 128 in the published code of Peng et al. 2020 for S = 64.
@@ -57,8 +57,8 @@ class SpectralPatchDiscriminator(nn.Module):
     """ "shapenet_patch" of Kato and Harada 2019: one logit per patch, [B,S/64,S/64] rounded up (4x4 for S = 224).
 
     5x5 convolutions of stride 2 with c, 2c, 4c, 8c, 8c channels (c = 32), each with spectral normalisation, batch norm
-    without gain and leaky ReLU; after the first one the view's features (through a linear layer with the same three)
-    are appended as c more channels; a last 5x5 convolution gives the logits. With `num_classes` the class is told by
+    without gain and leaky ReLU. After the first one, c channels of view features are appended (a linear layer with the
+    same normalisations). A last 5x5 convolution gives the logits. `num_classes` conditions them on the class by
     projection (Miyato and Koyama 2018): the product of a learned vector of the class with the last features.
     """
 
@@ -79,7 +79,7 @@ class SpectralPatchDiscriminator(nn.Module):
             self.classes = spectral_norm(nn.Linear(num_classes, widths[-1], bias=False))
 
     def forward(self, silhouettes: Tensor, views: Tensor, class_ids: Tensor | None = None) -> Tensor:
-        """`views` float [B,C]; `class_ids` int64 [B], wanted if and only if the discriminator knows classes."""
+        """`views` float [B,C]; `class_ids` int64 [B], only with `num_classes`."""
         features = self.layers(_append(self.first(silhouettes.unsqueeze(1)), self.view(views)))
         logits = self.last(features).squeeze(1)
         if self.num_classes is None:
@@ -93,8 +93,8 @@ class SpectralPatchDiscriminator(nn.Module):
 class PatchDiscriminator(nn.Module):
     """ "pascal_patch" of Kato and Harada 2019: one logit per patch, [B,h,w]; no normalisation of any kind.
 
-    4x4 convolutions with c (stride 2), 2c (2), 4c (2), 8c (1) and 1 (1) channels (c = 64), leaky ReLUs; after the first
-    one the view's features (linear layer, leaky ReLU) are appended as c more channels. He's initial weights.
+    4x4 convolutions with c (stride 2), 2c (2), 4c (2), 8c (1) and 1 (1) channels (c = 64), leaky ReLUs. After the first
+    one, c channels of view features are appended (linear layer, leaky ReLU). He's initial weights.
     """
 
     def __init__(self, view_features: int, channels: int = 64) -> None:
@@ -123,7 +123,7 @@ def _spectral_conv(before: int, after: int, bias: bool = False) -> nn.Module:
 
 
 def _norm_without_gain(norm: nn.BatchNorm1d | nn.BatchNorm2d) -> list[nn.Module]:
-    """Batch norm with an offset but no gain (it would undo the spectral normalisation), and leaky ReLU."""
+    """Batch norm without gain, which would undo the spectral normalisation, and leaky ReLU."""
     norm.eps = BATCH_NORM_EPS
     norm.weight.requires_grad_(False)
     return [norm, nn.LeakyReLU(SLOPE)]

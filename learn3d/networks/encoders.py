@@ -1,4 +1,4 @@
-"""Image encoders: stored images -> shape codes."""
+"""Image encoders: images -> shape codes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from learn3d.networks.layers import initialize_he, linear_layers
 from learn3d.networks.resnet import ResNet18Encoder
 
 CODE_SIZE = 512
-CENTRED_SHARE = 0.8  # share of the image's side that the object takes for the encoder conv-centred
+CENTRED_SHARE = 0.8  # share of the image's side that an object takes after `centre`
 
 
 class ConvEncoder(nn.Module):
@@ -28,24 +28,24 @@ class ConvEncoder(nn.Module):
         self.layers = linear_layers(256 * (self.image_size // 8) ** 2, 1024, 1024, CODE_SIZE)
 
     def forward(self, images: Tensor) -> Tensor:
-        # The last ReLU comes after the change of layout; mixed layouts would cost its gradient 9 ms of a 270 ms step.
+        # The last ReLU follows the change of memory layout; before it, its gradient would take 9 ms of a 270 ms step.
         features = self.convolutions[:-1](images).flatten(1)
         return self.layers(self.convolutions[-1](features))
 
 
 class ReluConvEncoder(ConvEncoder):
-    """The same with a ReLU at the end, as in Kato et al. 2018: codes have no negative entries."""
+    """ConvEncoder with a ReLU at the end, as in Kato et al. 2018: codes have no negative entries."""
 
     def forward(self, images: Tensor) -> Tensor:
         return torch.relu(super().forward(images))
 
 
 class LightConvEncoder(ConvEncoder):
-    """ConvEncoder with half the channels and a 1x1 convolution to 32 channels before the linear layers. From no paper.
+    """ConvEncoder with half the channels and a 1x1 convolution to 32 channels before the linear layers. Unpublished.
 
-    3.9 million weights, not 19. Its convolutions start from He's initial weights: with torch's, images hardly change
-    the codes of the first hundred steps, and all shapes may become one. A white background has the same effect, so
-    colours that are not `inverted` (stored as 1 - colour over black) are inverted first.
+    3.9 million weights, not 19. With torch's initial weights the codes of the first hundred steps hardly depend on the
+    image, and modes may collapse, so the convolutions have He's. A white background has the same effect, so colours
+    that are not `inverted` (stored as 1 - colour over black) are inverted first.
     """
 
     hidden_sizes: tuple[int, ...] = (1024, 1024)
@@ -63,9 +63,9 @@ class LightConvEncoder(ConvEncoder):
 
 
 class SmallConvEncoder(ConvEncoder):
-    """The same input and output with a quarter of the channels and one hidden layer: 1.3 million weights, not 19.
+    """ConvEncoder with a quarter of the channels and one hidden layer: 1.3 million weights, not 19. Unpublished.
 
-    For small data sets and quick experiments. From no paper.
+    For small data sets and quick experiments.
     """
 
     def __init__(self) -> None:
@@ -75,11 +75,10 @@ class SmallConvEncoder(ConvEncoder):
 
 
 class CentredConvEncoder(LightConvEncoder):
-    """LightConvEncoder with two more convolutions and one hidden layer. Each image is scaled first, so that every
-    object has the same size in it.
+    """LightConvEncoder with two more convolutions, one hidden layer and scaled input: all objects have one size.
 
-    A cut-out picture does not show the camera's distance. With this encoder, training images do not show it either:
-    the size of an object is learnt from its looks. 2.0 million weights. From no paper.
+    A cut-out picture does not show the camera's distance. With this encoder training images do not show it either, so
+    the size of an object is learnt from its appearance. 2.0 million weights. Unpublished.
     """
 
     hidden_sizes = (576,)
@@ -96,9 +95,9 @@ class CentredConvEncoder(LightConvEncoder):
 
 
 class ViewClassifier(nn.Module):
-    """Images [B,4,64,64], as an encoder gets them -> logits [B,K] over K view classes; each object scaled to one size.
+    """Images [B,4,64,64], as for an encoder -> logits [B,K] over K view classes. Objects are scaled to one size.
 
-    0.2 million weights. From no paper.
+    0.2 million weights. Unpublished.
     """
 
     def __init__(self, num_views: int, *, inverted: bool) -> None:
@@ -114,16 +113,16 @@ class ViewClassifier(nn.Module):
 
 
 def centre(images: Tensor, share: float = CENTRED_SHARE) -> Tensor:
-    """Scale and shift images float [B,C,S,S], the mask last, so that the box of the mask lies in the middle and its
-    longer side takes `share` of the image. Colours continue an image beyond its border, the mask does not. An image
-    with an empty mask stays as it is.
+    """Scale and shift images float [B,C,S,S], the mask last, so that the mask's bounding box is centred and its longer
+    side takes `share` of the image. Beyond the border, colours are repeated and the mask is 0. Images with an empty
+    mask do not change.
     """
     size = images.shape[-1]
     inside = images[:, -1] > 0.5
     extents, middles = [], []
-    for axis in (1, 2):  # over rows: columns that the mask touches; over columns: rows
+    for axis in (1, 2):
         touched = inside.any(axis)
-        first, last = touched.int().argmax(1), size - touched.flip(1).int().argmax(1)  # excluded
+        first, last = touched.int().argmax(1), size - touched.flip(1).int().argmax(1)  # `last` is excluded
         extents.append(last - first)
         middles.append((first + last) / size - 1)
     scale = torch.maximum(*extents) / (size * share)
@@ -141,7 +140,7 @@ def _on_black(images: Tensor) -> Tensor:
 
 
 def _convolutions(*channels: int) -> nn.Sequential:
-    """5x5 convolutions of stride 2 with ReLU, from four channels to those given."""
+    """5x5 convolutions of stride 2, each with ReLU, from four channels to `channels`."""
     layers: list[nn.Module] = []
     for before, after in itertools.pairwise((4, *channels)):
         layers += [nn.Conv2d(before, after, 5, stride=2, padding=2), nn.ReLU()]
@@ -160,10 +159,10 @@ ENCODERS: dict[str, type[nn.Module]] = {
 
 
 def create_encoder(name: EncoderName, *, inverted: bool) -> nn.Module:
-    """The encoder `name` for images whose colours are stored as 255 - colour, or as they are.
+    """The encoder `name`. inverted: whether the data set stores colours as 255 - colour.
 
-    resnet18 turns them into natural colours, as its normalisation and pretrained weights need. conv-light and
-    conv-centred turn them into inverted ones, in which a white background is 0. The others take the stored colours.
+    resnet18 restores natural colours, which its normalisation and pretrained weights need. conv-light and conv-centred
+    invert natural colours, so that a white background is 0. The others take colours as they are stored.
     """
     encoder = ENCODERS[name]
     return encoder(inverted) if issubclass(encoder, (ResNet18Encoder, LightConvEncoder)) else encoder()
@@ -177,7 +176,7 @@ def network_input(images: Tensor, device: torch.device | str, size: int = 64) ->
         )
     images = upload(images, torch.device(device))
     pixels = torch.empty((len(images), size, size, 4), device=images.device)
-    for channel in range(4):  # converts and copies in one pass; torch's own change of layout is slower
+    for channel in range(4):  # one pass converts and copies; torch's own change of layout is slower
         pixels[..., channel].copy_(images[:, channel])
     return pixels.div_(255).permute(0, 3, 1, 2)
 
@@ -186,12 +185,11 @@ BATCH_NORM_EPS = 2e-5  # published code
 
 
 class PreactResNet18(nn.Module):
-    """Images [B,4,S,S] in [0,1], laid over grey -> shape code [B,512], unbounded.
+    """Images [B,4,S,S] in [0,1] -> shape code [B,512], unbounded; S is a multiple of 32 (published: 224).
 
-    As published: 7x7 convolution of stride 2, batch norm, ReLU, 3x3 maximum of stride 2; four stages of two blocks with
-    64, 128, 256, 512 channels, in which batch norm and ReLU come before each convolution; batch norm, ReLU; a linear
-    layer from all 512 * (S/32)^2 features, without pooling. He's initial weights. The published size is S = 224; here
-    any multiple of 32 is possible (S decides the size of the last layer).
+    As published by Kato and Harada 2019: grey background; 7x7 convolution of stride 2, batch norm, ReLU, 3x3 maximum of
+    stride 2; four stages of two blocks with 64, 128, 256, 512 channels, with batch norm and ReLU before each
+    convolution; batch norm, ReLU; a linear layer from all 512 * (S/32)^2 features. He's initial weights.
     """
 
     def __init__(self, image_size: int = 224, channels: int = 64) -> None:
@@ -219,9 +217,8 @@ class PreactResNet18(nn.Module):
 
 
 class _Block(nn.Module):
-    """x + f(x): two 3x3 convolutions, batch norm and ReLU before each (the first block's input has had its own).
-
-    If the number of channels changes, the first convolution and a 1x1 convolution in place of x have stride 2.
+    """x + f(x): f is two 3x3 convolutions, with batch norm and ReLU before each (except at the input of the first
+    block). If the number of channels changes, x passes a 1x1 convolution, and it and the first one have stride 2.
     """
 
     def __init__(self, before: int, after: int, first: bool = False) -> None:
@@ -244,6 +241,6 @@ class _Block(nn.Module):
 def grey_background(images: Tensor) -> Tensor:
     """RGB and mask [B,4,S,S] in [0,1] -> colours [B,3,S,S] in [-1,1], 0 (grey) if the mask is 0.
 
-    Inverted colours (Kato's files) come out with the other sign. To a network trained from scratch that is the same.
+    Inverted colours (Kato's files) get the opposite sign, which makes no difference to training from scratch.
     """
     return (2 * images[:, :3] - 1) * images[:, 3:]

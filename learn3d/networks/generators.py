@@ -1,4 +1,4 @@
-"""Mesh generators that deform a sphere or a cube: shape codes -> vertices."""
+"""Mesh generators, shape codes -> vertices: deformed spheres and cubes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from learn3d.networks.layers import initialize_he, linear_layers
 from learn3d.networks.mesh_generator import MeshGenerator, Symmetry
 
 OBJECT_SCALE = 0.5
-STIFFNESS, FREE_SHARE = 3.0, 0.2  # of SmoothSphereGenerator
+STIFFNESS, FREE_SHARE = 3.0, 0.2  # b and a of SmoothSphereGenerator
 
 
 def deform_sphere(sphere: Tensor, displacement: Tensor) -> Tensor:
@@ -24,7 +24,7 @@ def deform_sphere(sphere: Tensor, displacement: Tensor) -> Tensor:
 
 
 class SphereGenerator(MeshGenerator):
-    """Free vertices float32 [B,642,3]: a displacement for each vertex of the sphere.
+    """Vertices float32 [B,642,3]: a displacement for each vertex of the sphere.
 
     With `symmetry` 979 numbers are predicted instead of 1926 (published code of Peng et al. 2020 for Pascal3D+): x and
     y of the 32 vertices on the plane z = 0, which stay on it, and x, y, z of the 305 with z > 0; the other 305 are
@@ -32,7 +32,7 @@ class SphereGenerator(MeshGenerator):
     """
 
     sphere: Tensor  # float32 [642,3]
-    source: Tensor  # int64 [642,3]: index of the output for each coordinate; the one after the last is 0
+    source: Tensor  # int64 [642,3]: index of each coordinate's output; the index after the last means 0
     sign: Tensor  # float32 [642,3]: -1 if the coordinate is the opposite of the output
 
     def __init__(self, symmetry: Symmetry | None = None) -> None:
@@ -67,11 +67,11 @@ class SphereGenerator(MeshGenerator):
 
 
 class SmoothSphereGenerator(SphereGenerator):
-    """The same with displacements D = M U of the outputs U, where M = a I + (1 - a) (I + b L)^-1.
+    """SphereGenerator with the displacements D = M U of its outputs U, M = a I + (1 - a) (I + b L)^-1.
 
-    L [642,642] is the graph Laplacian of the sphere, b = 3, a = 0.2. M leaves slow changes over the sphere as they are
-    and takes fast ones to a fifth, so that they are learnt more slowly: whole parts move before single vertices do, and
-    the sphere hardly folds at the start of a training (preconditioning after Nicolet et al. 2021, who have a = 0).
+    L [642,642] is the graph Laplacian of the sphere, b = 3, a = 0.2. M keeps low frequencies over the sphere and
+    reduces high ones to a fifth, so they are learnt more slowly: whole parts move before single vertices do, and the
+    sphere hardly folds early in training (preconditioning after Nicolet et al. 2021, who have a = 0).
     """
 
     mixing: Tensor  # float32 [642,642]: M
@@ -86,7 +86,7 @@ class SmoothSphereGenerator(SphereGenerator):
             mixed = torch.einsum("vw,bwc->bvc", self.mixing, free)
         if self.mirror is None:
             return mixed
-        side = self.sphere[:, 2:].sign()  # exact symmetry in place of one up to rounding
+        side = self.sphere[:, 2:].sign()  # exact symmetry, not only up to rounding
         mirrored = mixed[:, self.mirror] * mixed.new_tensor([1.0, 1.0, -1.0])
         flat = mixed * mixed.new_tensor([1.0, 1.0, 0.0])
         return torch.where(side > 0, mixed, torch.where(side < 0, mirrored, flat))
@@ -103,9 +103,7 @@ def mixing_matrix(faces: Tensor, stiffness: float, free_share: float) -> Tensor:
 
 
 class SmallSphereGenerator(SphereGenerator):
-    """The same input and output with hidden layers of 1024: half the weights. For the package's model, small data sets
-    and quick experiments. From no paper.
-    """
+    """SphereGenerator with hidden layers of 1024, half the weights, for the package's model and small data sets."""
 
     def __init__(self, symmetry: Symmetry | None = None) -> None:
         super().__init__(symmetry)
@@ -115,9 +113,9 @@ class SmallSphereGenerator(SphereGenerator):
 def deform_bounded_sphere(sphere: Tensor, bias: Tensor, centroid: Tensor) -> Tensor:
     """Vertices of Kato et al. 2018 (published code): [V,3], [B,V,3] and [B,3] -> [B,V,3] within [-0.5, 0.5].
 
-    With b = 0.5 sphere and c = tanh(centroid): s = sign(b) sigmoid(logit(|b|) + bias) lies in (-1, 1), is stretched to
-    (-1, c) and (c, 1) on its two sides, and halved: 0.5 (c + s (1 - sign(s) c)). So every vertex stays in its octant
-    about c / 2. One on a coordinate plane of the sphere (b = 0) stays on it: logit(0) = -inf, and its gradient is 0.
+    With b = 0.5 sphere and c = tanh(centroid), s = sign(b) sigmoid(logit(|b|) + bias) is in (-1, 1). The vertex is
+    0.5 (c + s (1 - sign(s) c)), which stays in its octant about c / 2. A vertex on a coordinate plane of the sphere
+    (b = 0) stays on it: logit(0) = -inf, and its gradient is 0.
     """
     base, center = OBJECT_SCALE * sphere, torch.tanh(centroid)[:, None]
     stretch = base.sign() * torch.sigmoid(torch.logit(base.abs()) + bias)
@@ -127,8 +125,9 @@ def deform_bounded_sphere(sphere: Tensor, bias: Tensor, centroid: Tensor) -> Ten
 class BoundedGenerator(MeshGenerator):
     """Vertices float32 [B,642,3] in [-0.5, 0.5], each in its octant about a learnt centroid.
 
-    Kato et al. 2018: 512-1024-2048, and from there the bias of every vertex and, times 0.1, the centroid. With
-    `symmetry` the vertices with z < 0 are the mirror images of the others, and the centroid lies on the plane.
+    Kato et al. 2018: layers 512-1024-2048, then a layer for the bias of every vertex and one for the centroid, which is
+    scaled by 0.1. With `symmetry` the vertices with z < 0 are mirror images of the others, and the centroid is on the
+    plane.
     """
 
     sphere: Tensor  # float32 [642,3]
@@ -162,8 +161,8 @@ BATCH_NORM_EPS = 2e-5  # published code
 def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
     """The surface of a grid of size^3 points: (points int64 [V,3], patches int64 [6,size,size], faces int64 [F,3]).
 
-    patches[f, i, j] is the vertex at (i, j) of side f of the cube; vertices at edges belong to two sides, at corners to
-    three. Faces are counter-clockwise seen from outside. size = 16 gives V = 1352 and F = 2700.
+    patches[f, i, j] is the vertex at (i, j) of side f of the cube; sides share the vertices at edges and corners.
+    Faces are counter-clockwise seen from outside. size = 16 gives V = 1352 and F = 2700.
     """
     grid = torch.cartesian_prod(*[torch.arange(size)] * 3)
     outside = ((grid == 0) | (grid == size - 1)).any(1)
@@ -183,12 +182,12 @@ def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class CubeGenerator(MeshGenerator):
-    """Base of both: vertices = object_scale * 1.2 * tanh(base + scale * bias), float32 [B,1352,3].
+    """Base class: vertices = object_scale * 1.2 * tanh(base + scale * bias), float32 [B,1352,3].
 
-    `base`, learned, starts as the sphere of radius 0.5 (times object_scale); a subclass computes `bias` from the codes.
-    With `symmetry`, as published: z becomes |z|, each vertex the mean of itself and its mirror image, and z gets back
-    the sign that the vertex has on the cube. The vertices are then exactly symmetric; the diagonals that divide the
-    cube's squares into faces are not.
+    `base` is a parameter that starts as the sphere of radius 0.5 (times object_scale); a subclass computes `bias` from
+    the codes. With `symmetry`, as published: z becomes |z|, each vertex becomes the mean of itself and its mirror
+    image, and z gets the sign that the vertex has on the cube. The vertices are then exactly symmetric, but the faces'
+    diagonals are not.
     """
 
     signs: Tensor  # float32 [V,3]: (1, 1, -1) if z < 0 on the cube, else 1
@@ -205,7 +204,7 @@ class CubeGenerator(MeshGenerator):
         self.register_buffer("signs", signs, persistent=False)
 
     def bias(self, codes: Tensor) -> Tensor:
-        """Change of the base by codes [B,512], [B,V,3]."""
+        """Offsets [B,V,3] from `base` for codes [B,512]."""
         raise NotImplementedError
 
     def forward(self, codes: Tensor) -> Tensor:
@@ -218,14 +217,14 @@ class CubeGenerator(MeshGenerator):
 
 
 class ConvCubeGenerator(CubeGenerator):
-    """One stack of transposed convolutions per side of the cube; at shared vertices the mean of the sides (ShapeNet).
+    """A stack of transposed convolutions for each side of the cube; shared vertices get the mean (ShapeNet).
 
-    Each: linear to 512@2x2, three 3x3 transposed convolutions of stride 2 to 256, 128, 64 channels, batch norm and ReLU
-    after each of the four; 3x3 convolution to 3@16x16.
+    Each stack: linear to 512@2x2, three 3x3 transposed convolutions of stride 2 to 256, 128, 64 channels, batch norm
+    and ReLU after each of the four; 3x3 convolution to 3@16x16.
     """
 
-    positions: Tensor  # int64 [V,3]: places of a vertex among the 6 * 16 * 16 outputs (filled up with the first)
-    shares: Tensor  # float32 [V,3,1]: their weights: 1, 1/2 or 1/3, and 0 for the filling
+    positions: Tensor  # int64 [V,3]: places of a vertex among the 6 * 16 * 16 outputs, padded with the first
+    shares: Tensor  # float32 [V,3,1]: their weights 1, 1/2 or 1/3; 0 for the padding
 
     def __init__(
         self, symmetry: Symmetry | None = None, scale: float = 0.01, object_scale: float = 0.5, channels: int = 512
@@ -243,7 +242,7 @@ class ConvCubeGenerator(CubeGenerator):
     def bias(self, codes: Tensor) -> Tensor:
         sides = torch.stack([side(codes) for side in self.sides], dim=1)  # [B,6,3,16,16]
         outputs = sides.float().permute(0, 1, 3, 4, 2).flatten(1, 3)
-        # A gather, not a scatter: its sums have a fixed order on every device.
+        # A gather: unlike a scatter's, its sums have a fixed order on every device.
         return (outputs[:, self.positions] * self.shares).sum(2)
 
 

@@ -1,4 +1,4 @@
-"""Small parts that several networks share: linear layers with ReLU, initial weights, the reversal of gradients."""
+"""Parts that several networks share: linear layers with ReLU, initial weights, gradient reversal."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class _ReverseGradient(torch.autograd.Function):
 
 
 def reverse_gradient(values: Tensor, factor: float) -> Tensor:
-    """The values as they are; their gradient times -factor (Ganin and Lempitsky 2015).
+    """The identity, with the gradient times -factor (Ganin and Lempitsky 2015).
 
-    Networks behind it descend a loss; networks in front of it climb the same loss, `factor` times as fast.
+    Networks after it minimise a loss; networks before it maximise the same loss, `factor` times as fast.
     """
     return _ReverseGradient.apply(values, factor)

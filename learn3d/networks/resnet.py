@@ -1,6 +1,6 @@
 """ResNet-18 (He et al. 2016) as an image encoder, with the parameter names of torchvision's resnet18.
 
-It is own code because torchvision has no build for every PyTorch that nmr is built with.
+torchvision itself is no dependency, as it has no build for every PyTorch that nmr supports.
 """
 
 from __future__ import annotations
@@ -39,11 +39,9 @@ class _Block(nn.Module):
 class ResNet18Encoder(nn.Module):
     """Images [B, 4, 224, 224] in [0, 1] -> shape codes [B, 512]: the average-pooled features, which are not negative.
 
-    R, G, B are normalised by ImageNet's mean and deviation; the mask is not looked at. As in the published code of Peng
-    et al. 2020 on Pascal3D+ the pooled features are the code, without a layer behind them.
-
-    `inverted`: the images hold 1 - colour, as Kato's form has it. They are turned back first: ImageNet's mean and
-    weights are those of natural colours.
+    R, G, B are normalised by ImageNet's mean and deviation; the mask is not read. The pooled features are the code, as
+    in the published code of Peng et al. 2020 on Pascal3D+. inverted: images hold 1 - colour (Kato's files); natural
+    colours are restored first.
     """
 
     image_size = 224
@@ -75,14 +73,10 @@ class ResNet18Encoder(nn.Module):
 
 
 class FlatResNet18(nn.Module):
-    """Images [B,4,S,S] in [0,1] -> shape code [B,512]: a linear layer on the 512 * (S/32)^2 features.
+    """Images [B,4,S,S] in [0,1] -> shape code [B,512]: a linear layer on the 512 * (S/32)^2 features of ResNet-18.
 
-    The encoder of Kato and Harada 2019 for Pascal3D+.
-
-    `inverted`: the images hold 1 - colour, see `ResNet18Encoder`.
-
-    `frozen_norms`: statistics, gain and offset of the batch norms stay as they are, as published for weights of
-    ImageNet. In training from scratch, frozen batch norms would normalise nothing.
+    The encoder of Kato and Harada 2019 for Pascal3D+. inverted: see `ResNet18Encoder`. frozen_norms: statistics, gain
+    and offset of the batch norms do not change, as published for ImageNet weights.
     """
 
     def __init__(self, image_size: int = 224, frozen_norms: bool = False, inverted: bool = False) -> None:

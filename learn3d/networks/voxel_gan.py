@@ -2,11 +2,10 @@
 
 Layers, sizes and initial weights are those of the published TensorFlow code: weights of fully connected layers from
 N(0, 0.1), of convolutions from N(0, 0.02), biases 0. TensorFlow's momentum of 0.9 in batch norms is torch's 0.1.
-`channels` are four numbers.
 
-The published code turns the 64^3 volume into the view by trilinear resampling and sums along the depth. For a fixed
-view that is a linear map from voxels to pixels, so it is kept as a table: forward and backward take a fifth of the time
-of `grid_sample` on one core (40 ms for a batch of 16 instead of 200).
+The published code rotates the 64^3 volume to the view by trilinear resampling and sums along the depth. For a fixed
+view that is a linear map from voxels to pixels. Here it is a sparse matrix, five times as fast as `grid_sample` forward
+and backward on one core (40 ms for a batch of 16 instead of 200).
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from torch import Tensor, nn
 
 import nmr
 
-SHAPE_CODE = 200  # number of entries of z for the shape; one more decides the view
+SHAPE_CODE = 200  # entries of z for the shape; one more entry decides the view
 IMAGE_SIZE = 64
-TAU = 0.5  # a full voxel has density 1 / TAU, and the projection multiplies by TAU: exp(-1) passes through it
+TAU = 0.5  # factor of the density in the projection; a full voxel has density 1 / TAU and lets exp(-1) of light pass
 GENERATOR_CHANNELS = (128, 64, 32, 1)
 DISCRIMINATOR_CHANNELS = (128, 256, 512, 1024)
 
 
 class DoublingConvolution(nn.ConvTranspose3d):
-    """[B, C, n, n, n] -> [B, C', 2n, 2n, 2n]: a transposed convolution of 4^3 weights with stride 2.
+    """[B, C, n, n, n] -> [B, C', 2n, 2n, 2n]: a transposed 4^3 convolution of stride 2.
 
-    To a single channel on a CPU, torch's own forward pass takes four times as long as that of `_Double`.
+    With one output channel on a CPU, torch's own forward pass takes four times as long as that of `_Double`.
     """
 
     def __init__(self, before: int, after: int) -> None:
@@ -46,7 +45,7 @@ class DoublingConvolution(nn.ConvTranspose3d):
 
 
 class _Double(torch.autograd.Function):
-    """Each of the eight cells that a cell becomes is a sum over 2^3 neighbours: one convolution with eight outputs.
+    """Each cell becomes eight, each a sum over 2^3 neighbours: a convolution with eight output channels.
 
     Along an axis, cell 2i is w[3] x[i-1] + w[1] x[i], and cell 2i + 1 is w[2] x[i] + w[0] x[i+1].
     """
@@ -55,7 +54,7 @@ class _Double(torch.autograd.Function):
     def forward(ctx, features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         ctx.save_for_backward(features, weight)
         taps, n = torch.tensor([[3, 1], [2, 0]]), features.shape[-1]
-        for axis in (2, 4, 6):  # 4 weights become [cell 0 or 1, neighbour 0 or 1]
+        for axis in (2, 4, 6):  # four weights become [2 cells, 2 neighbours]
             weight = weight.index_select(axis, taps.flatten()).unflatten(axis, (2, 2))
         kernel = weight[:, 0].permute(1, 3, 5, 0, 2, 4, 6).flatten(0, 2)
         cells = F.conv3d(features, kernel.contiguous(), bias.expand(8), padding=1)
@@ -78,8 +77,7 @@ class VoxelGenerator(nn.Module):
 
     A linear layer to `channels[0]` features on 4^3 cells, then transposed convolutions (4^3, stride 2) to the other
     channels at 8^3, 16^3 and 32^3 and to one at 64^3; batch norm and ReLU after all but the last, which has a sigmoid.
-    The published layer list narrows to ONE channel already at 32^3, perhaps a slip: its normalisation there is declared
-    for 16 channels. It stays the default, as in the published runs.
+    The published code has one channel already at 32^3, perhaps by mistake: its batch norm there is declared for 16.
     """
 
     def __init__(self, channels: Sequence[int] = GENERATOR_CHANNELS) -> None:
@@ -99,9 +97,9 @@ class VoxelGenerator(nn.Module):
 
 
 class SilhouetteDiscriminator(nn.Module):
-    """Grey silhouettes [B, 64, 64] in [0, 1] -> logits [B]: positive if they look like those of the data.
+    """Silhouettes [B, 64, 64] in [0, 1] -> logits [B]: positive for silhouettes of the data set.
 
-    Convolutions 5x5 with stride 2 to `channels`, batch norm and LeakyReLU(0.2) after each, then a linear layer.
+    5x5 convolutions of stride 2 to four `channels`, batch norm and LeakyReLU(0.2) after each, then a linear layer.
     """
 
     def __init__(self, channels: Sequence[int] = DISCRIMINATOR_CHANNELS) -> None:
@@ -120,9 +118,9 @@ class SilhouetteDiscriminator(nn.Module):
 
 
 class InverseEncoder(nn.Module):
-    """Silhouettes [B, 64, 64] in [0, 1] -> z [B, 201]: the shape code, then the view's coordinate.
+    """Silhouettes [B, 64, 64] in [0, 1] -> z [B, 201]: the shape code, then the view's entry.
 
-    4096-512-512-201 with a LeakyReLU(0.2) after the first layer only, and the output divided by 201, as published.
+    4096-512-512-201, with LeakyReLU(0.2) after the first layer only and the output divided by 201, as published.
     """
 
     def __init__(self) -> None:
@@ -150,17 +148,16 @@ def _initialise(module: nn.Module) -> None:
 
 @dataclass(frozen=True)
 class ViewCircle:
-    """K views at equal steps of azimuth, as in Kato's protocol: view k stands at azimuth -360 k / K degrees.
+    """K views at equal steps of azimuth, as in Kato's protocol: view k has azimuth -360 k / K degrees.
 
-    Rays are parallel, as PrGAN's are, or meet in the eye. In both cases the image is `half_width` wide, to each side,
-    in the plane through the origin, so that objects have the size that they have in the data set's images.
+    Rays are parallel, as PrGAN's. The image covers `half_width` to each side of the origin, so that objects have the
+    same size as in the data set's perspective images.
     """
 
     count: int = 24
     elevation_deg: float = 30.0
     distance: float = 2.732
     half_fov_deg: float = 15.0
-    perspective: bool = False
 
     @property
     def half_width(self) -> float:
@@ -174,7 +171,7 @@ class ViewCircle:
     def sample_points(self, azimuth_deg: float, size: int) -> Tensor:
         """Sample points on the rays of one view, float32 [size, size, D, 3] in the object frame; row 0 is the top.
 
-        Samples are as far apart as pixels, and D of them are as long as the box's diagonal.
+        Samples are as far apart as pixels; D of them cover the diagonal of the unit cube.
         """
         eye = nmr.cameras.points_from_angles(self.distance, self.elevation_deg, azimuth_deg).double().reshape(3)
         z_axis = -F.normalize(eye, dim=0)
@@ -185,21 +182,18 @@ class ViewCircle:
         samples = math.ceil(math.sqrt(3.0) / step)
         along = (torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * step
         in_plane = across[None, :, None] * x_axis - across[:, None, None] * y_axis
-        direction = F.normalize(in_plane - eye, dim=2) if self.perspective else z_axis
-        start = eye + self.distance * direction if self.perspective else in_plane
-        return (start[:, :, None] + along[:, None] * direction.expand_as(in_plane)[:, :, None]).float()
+        return (in_plane[:, :, None] + along[:, None] * z_axis).float()
 
 
 def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) -> Tensor:
     """Soft silhouettes P = 1 - exp(-tau * integral of the density along the ray), float32 [B, S, S], row 0 = top.
 
-    density float32 [B, S, S, S] at the voxel centres of the box [-0.5, 0.5]^3, axes (x, y, z) of the object frame, zero
-    outside; trilinear between the centres. view_ids int64 [B] in 0 .. K-1, best on the CPU, as they choose tables. The
-    integral is measured in voxels: a solid of density 1 and a thickness of n voxels gives 1 - exp(-tau n).
-    Differentiable in the density.
+    density: float32 [B, S, S, S] at the voxel centres of the box [-0.5, 0.5]^3, axes (x, y, z) of the object frame,
+    trilinear in between, zero outside. view_ids: int64 [B] in 0 .. K-1, on the CPU to avoid a copy. The integral is in
+    voxels: a solid of density 1 and a thickness of n voxels gives 1 - exp(-tau n). Differentiable in the density.
     """
     size = density.shape[-1]
-    # A quarter turn only renumbers the voxels, so the tables of a quarter of the circle serve all views.
+    # A quarter turn permutes the voxels, so a quarter of the views needs a matrix.
     quarter = views.count // 4 if views.count % 4 == 0 else views.count
     view_ids = view_ids.cpu()
     volumes, parts, order = density.unbind(), [], []
@@ -213,14 +207,14 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
     return 1 - torch.exp(-tau * thickness).reshape(-1, size, size)
 
 
-Table = tuple[Tensor, Tensor, Tensor]  # sparse matrix: columns int32, start of each row int32, values float32
+Table = tuple[Tensor, Tensor, Tensor]  # a sparse matrix by rows: columns int32, row starts int32, values float32
 
 
 @functools.lru_cache(maxsize=64)
 def ray_table(views: ViewCircle, view_id: int, size: int, device: torch.device) -> tuple[Table, Table]:
-    """The linear map of one view as a sparse matrix [S^2 pixels, S^3 voxels], and its transpose, by rows."""
+    """The linear map of one view as a sparse matrix [S^2 pixels, S^3 voxels], and its transpose."""
     points = views.sample_points(float(views.azimuth_deg(torch.tensor(view_id))), size)
-    position = (points + 0.5) * size - 0.5  # in voxels; whole numbers are centres
+    position = (points + 0.5) * size - 0.5  # in voxels; centres are whole numbers
     low = position.floor()
     above, low = position - low, low.long()
     pixel = torch.arange(size * size).reshape(size, size, 1).expand(points.shape[:3])
@@ -232,7 +226,7 @@ def ray_table(views: ViewCircle, view_id: int, size: int, device: torch.device) 
         pixels.append(pixel[inside])
         voxels.append(((x * size + y) * size + z)[inside])
         values.append(weight[inside])
-    step = 2 * views.half_width  # length of a sample in voxels: (2 half_width / size) / (1 / size)
+    step = 2 * views.half_width  # distance of samples in voxels: (2 half_width / size) / (1 / size)
     indices, weights = torch.stack([torch.cat(pixels), torch.cat(voxels)]), torch.cat(values) * step
     matrix = torch.sparse_coo_tensor(indices, weights, (size**2, size**3), check_invariants=False).coalesce()
     return _by_rows(matrix, device), _by_rows(matrix.t().coalesce(), device)
@@ -245,7 +239,7 @@ def _by_rows(matrix: Tensor, device: torch.device) -> Table:
 
 
 class _Integrate(torch.autograd.Function):
-    """Sparse matrix times dense [columns, n]; `embedding_bag` is the one such product that is fast on every device."""
+    """Sparse matrix times dense [columns, n], by `embedding_bag`, which is fast on every device."""
 
     @staticmethod
     def forward(ctx, dense: Tensor, *tables: Tensor) -> Tensor:

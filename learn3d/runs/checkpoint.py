@@ -1,7 +1,7 @@
 """Checkpoints: all tensors of a run in one safetensors file, everything else as JSON in its header. No pickle.
 
-The header holds two texts: "learn3d", the JSON of `Metadata`, and "crc32", the CRC-32 of that text and of the names,
-types, shapes and bytes of all tensors.
+The header has two entries: "learn3d", the JSON of `Metadata`, and "crc32", the CRC-32 of that JSON and of the names,
+dtypes, shapes and bytes of all tensors.
 """
 
 from __future__ import annotations
@@ -34,10 +34,7 @@ from learn3d.settings import Count, Share, Weight, checked
 
 @functools.cache
 def versions() -> dict[str, str | None]:
-    """Versions of the package and of torch, and the git commit of the code (None if unknown).
-
-    A process asks once, before it works: a commit made afterwards is not the code that runs.
-    """
+    """Versions of the package and of torch, and the git commit of the code at the first call (None if unknown)."""
     try:
         package = importlib.metadata.version("nmr-learn3d")
     except importlib.metadata.PackageNotFoundError:
@@ -46,7 +43,7 @@ def versions() -> dict[str, str | None]:
 
 
 def _git_commit() -> str | None:
-    """Commit of the checkout that holds this file (with "-dirty" after changes), or that it was installed from."""
+    """Commit of the checkout of this file ("-dirty" if it has changes), or the one that the package was built from."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(Path(__file__).parent), *arguments]
@@ -64,20 +61,20 @@ AnyStep = Annotated[int, Field(ge=0, le=10**9)]
 
 
 class DamagedError(ValueError):
-    """A checkpoint that is cut short or changed, or a file of another kind."""
+    """A checkpoint that is truncated or changed, or a file of another kind."""
 
 
 @checked
 class Progress:
-    """Where a run stands."""
+    """The progress of a run."""
 
-    step: AnyStep = 0  # steps taken
+    step: AnyStep = 0  # last step taken
     best_iou: Annotated[float, Field(ge=-1, le=1)] = -1.0  # best validation IoU so far; -1 before the first validation
-    best_step: AnyStep = 0
-    seconds: Weight = 0.0  # spent in training, over all resumptions
-    object_share: Share = 0.0  # side of the objects' bounding squares over that of the pictures, training mean
-    threads: Count | None = None  # CPU threads that the run has chosen by itself; None: fixed, or not chosen yet
-    losses: dict[str, float] = dataclasses.field(default_factory=dict)  # of the last step, however large
+    best_step: AnyStep = 0  # step of best_iou
+    seconds: Weight = 0.0  # training time, over all resumptions
+    object_share: Share = 0.0  # mean share of the side of the training images that objects take
+    threads: Count | None = None  # CPU threads that the run has chosen; None: fixed, or not chosen yet
+    losses: dict[str, float] = dataclasses.field(default_factory=dict)  # losses of the last step
 
 
 def _from_dict(build: Callable[[dict[str, Any]], Any]) -> BeforeValidator:
@@ -91,14 +88,14 @@ class Metadata:
     config: Annotated[TrainConfig, _from_dict(config_from_dict)]
     info: Annotated[DatasetInfo, _from_dict(lambda values: DatasetInfo(**values))]
     progress: Annotated[Progress, _from_dict(lambda values: Progress(**values))]
-    data: str  # number and checksum of the training images, with their masks, poses and classes
-    versions: dict[str, str | None]  # of the code that wrote it
+    data: str  # `runs.state.describe_images` of the training images
+    versions: dict[str, str | None]  # `versions` of the code that wrote the file
 
 
 def save(path: Path, tensors: dict[str, Tensor], metadata: Metadata) -> None:
-    """Write tensors and metadata; the file appears under its name only when complete and on the disk.
+    """Write tensors and metadata; the file gets its name when it is complete and on the disk.
 
-    Raises OSError if it cannot be written, FloatingPointError if a value is not finite: such a run cannot go on.
+    Raises OSError if it cannot be written, FloatingPointError if a value is not finite.
     """
     for name, tensor in tensors.items():
         if not bool(tensor.isfinite().all()):
@@ -110,8 +107,8 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: Metadata) -> None:
         with writing.replacing(path, sync=True) as temporary:
             temporary.touch()
             mode = temporary.stat().st_mode
-            save_file(flat, temporary, header)  # which gives the file to its owner alone
-            temporary.chmod(mode)
+            save_file(flat, temporary, header)
+            temporary.chmod(mode)  # safetensors lets only the owner read its files
     except (OSError, SafetensorError) as error:
         reason = getattr(error, "strerror", None) or error
         raise OSError(f"cannot write the checkpoint {path}: {reason}") from error
@@ -126,10 +123,10 @@ def _checksum(text: str, tensors: dict[str, Tensor]) -> str:
 
 
 def load(path: Path) -> tuple[dict[str, Tensor], Metadata]:
-    """Read the tensors, on the CPU, and the metadata of a checkpoint, and compare them with their checksum.
+    """Read the tensors, on the CPU, and the metadata of a checkpoint, and verify their checksum.
 
-    Raises DamagedError if the file is cut short, changed or of another kind; another ValueError if it is missing or of
-    another version of learn3d; OSError if it cannot be reached.
+    Raises DamagedError if the file is truncated, changed or of another kind; ValueError if it is missing or from
+    another version of learn3d; OSError if it cannot be read.
     """
     header, tensors = _read(path, with_tensors=True)
     if _checksum(header["learn3d"], tensors) != header.get("crc32"):
@@ -140,9 +137,9 @@ def load(path: Path) -> tuple[dict[str, Tensor], Metadata]:
 
 
 def load_metadata(path: Path, which: str = "last") -> Metadata:
-    """The metadata of a checkpoint file, or of the checkpoint `which` of a run folder. Raises as `load` does.
+    """The metadata of a checkpoint file, or of the checkpoint `which` of a run folder, without reading its tensors.
 
-    The tensors are not read, so nothing is compared with the checksum.
+    The checksum is not verified. Raises the errors of `load`.
     """
     path = find(path, which)
     return _parse(path, _read(path, with_tensors=False)[0]["learn3d"])
@@ -172,17 +169,17 @@ def _read(path: Path, *, with_tensors: bool) -> tuple[dict[str, str], dict[str, 
 def _parse(path: Path, text: str) -> Metadata:
     try:
         return Metadata(**parse_json(text))
-    except (TypeError, ValueError) as error:  # TypeError: it is no JSON object
+    except (TypeError, ValueError) as error:  # TypeError: not a JSON object
         raise ValueError(f"{path} is no checkpoint of this version of learn3d: {error}") from None
 
 
 def load_method(
     path: Path, which: str = "last", *, device: str = "cpu", precision: str = "fp32"
 ) -> tuple[Method, TrainConfig, Metadata]:
-    """Open a run for use: the checkpoint `which` of a run folder, or a checkpoint file.
+    """Open the checkpoint `which` of a run folder, or a checkpoint file, for evaluation or reconstruction.
 
     Returns the method in evaluation mode, with its EMA weights if it has any; its configuration; the metadata. Raises
-    as `load` does.
+    the errors of `load`.
     """
     path = find(path, which)
     tensors, metadata = load(path)
@@ -204,9 +201,9 @@ def load_data(
     category: str | None = None,
     layout: Layout | None = None,
 ) -> ViewDataset:
-    """A split of the data that a run was trained on, or of another folder, category or layout, for its networks.
+    """A split of a run's data, or of another folder, category or layout, in the form that its networks take.
 
-    Raises ValueError for a layout that stores colours in another way than the one of the training.
+    Raises ValueError if the layout inverts colours and the training layout does not, or the other way round.
     """
     layout = layout or config.layout
     if layout in LAYOUTS and LAYOUTS[layout].inverted != LAYOUTS[config.layout].inverted:
@@ -220,10 +217,7 @@ def load_data(
 
 
 def network_tensors(method: Method) -> dict[str, Tensor]:
-    """Parameters and buffers of all networks, named network.<encoder|generator|...>.<parameter>.
-
-    Their averages have the same names with "ema" in place of "network".
-    """
+    """Parameters and buffers of all networks, named network.<encoder|generator|...>.<parameter>."""
     return {
         f"network.{name}.{key}": tensor
         for name, network in method.networks.items()
@@ -232,7 +226,7 @@ def network_tensors(method: Method) -> dict[str, Tensor]:
 
 
 def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path, kind: str = "network") -> None:
-    """Copy the weights of a checkpoint, or with the kind "ema" their averages, into the networks of a method.
+    """Copy the weights of a checkpoint ("network") or their averages ("ema") into the networks of a method.
 
     Raises ValueError if they do not fit.
     """
@@ -244,12 +238,12 @@ def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path, k
 
 
 def starting_with(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors whose names start with a prefix, without it."""
+    """The tensors whose names start with `prefix`, by the rest of their names."""
     return {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
 
 
 def optimizer_tensors(name: str, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """The state of an optimizer, named optimizer.<name>.<parameter's index>.<key>. Learning rates are options."""
+    """The state of an optimizer, named optimizer.<name>.<parameter's index>.<key>, without learning rates."""
     state = optimizer.state_dict()["state"]
     return {f"optimizer.{name}.{index}.{key}": value for index, found in state.items() for key, value in found.items()}
 
@@ -257,10 +251,10 @@ def optimizer_tensors(name: str, optimizer: torch.optim.Optimizer) -> dict[str, 
 def restore_optimizer(
     name: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], source: Path | str = "the checkpoint"
 ) -> None:
-    """Put back the tensors of `optimizer_tensors`. Raises ValueError if they do not fit the parameters.
+    """Restore the tensors of `optimizer_tensors`. Raises ValueError if they do not fit the parameters.
 
-    The fused kernels walk through parameter, gradient and state by position in memory. So each tensor must have its
-    parameter's shape, and takes its memory layout (channels last). It is copied: loaded tensors are the mapped file.
+    Fused kernels index parameter, gradient and state by position in memory, so each tensor must have its parameter's
+    shape, and is copied to its parameter's memory layout.
     """
     parameters = [(p, group.get("fused")) for group in optimizer.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {index: {} for index in range(len(parameters))}

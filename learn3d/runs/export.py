@@ -1,4 +1,4 @@
-"""The networks of a run that turn an image into a mesh, in one small file to give away."""
+"""Export: the encoder and generator of a run in one small file to share."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
 from learn3d.terminal import note
 
-_TRAINING_ONLY = ("lambda_classification", "lambda_adversarial", "lambda_novel_view")  # weights of further networks
+_TRAINING_ONLY = ("lambda_classification", "lambda_adversarial", "lambda_novel_view")  # they need more networks
 
 
 def export(source: Path, target: Path, *, which: str = "last", others: Tensor | None = None) -> int:
-    """Write the networks of a run or checkpoint file that turn images into meshes, at half precision.
+    """Write the encoder and generator of a run or checkpoint file in float16; returns the size in bytes.
 
-    Returns the size in bytes. The file is a checkpoint that `evaluate` and `reconstruct` take. Numbers are rounded to
-    float16 (three digits); folders of the run are left out. If the training data are still there, the file also says
-    which codes are known (`learn3d.fitting.familiarity`), so that reconstruction can warn of pictures of other things.
-    others: stored images uint8 [M, 4, S, S] that show other things; the warnings are better with them.
-    Raises ValueError for methods other than the pose-invariant ones, Plus and Many views.
+    The file is a checkpoint for `evaluate` and `reconstruct`, without the paths of the run. If the training data are
+    still there, it also holds known codes (`learn3d.fitting.familiarity`), with which reconstruction warns of unknown
+    kinds of objects. others: stored images uint8 [M, 4, S, S] of other objects, which improve these warnings.
+    Raises ValueError for methods other than proposed, Vanilla-AE, Plus and Many views.
     """
     method, config, metadata = checkpoint.load_method(source, which)
     trained_on, data = config, config.data
@@ -42,7 +41,7 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
         if name.startswith(("network.encoder.", "network.generator.", "network.view_classifier."))
     }
     if not data.is_dir():
-        note(f"note: {data} is not there, so the file does not say which codes are known, and nothing is warned of")
+        note(f"note: {data} is not there, so the file has no known codes, and reconstruction will not warn")
     elif isinstance(method, MeshMethod):
         known = known_codes(method, checkpoint.load_data(trained_on, "train"), others)
         tensors |= {name: codes.half() for name, codes in zip(KNOWN_CODES, known, strict=True) if codes is not None}

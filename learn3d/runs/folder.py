@@ -1,12 +1,13 @@
-"""The folder of a run: the files in it, and the one process that may work there.
+"""The folder of a run, its files, and the lock of the process that works there.
 
-config.json           the options; the first file of a run
-last.safetensors      all that a resumption needs; a complete file at every moment after the first save
+config.json           options; the first file of a run
+last.safetensors      last checkpoint, with all that --resume needs; never incomplete
 previous.safetensors  the checkpoint before it
-best.safetensors      the networks with the best IoU on validation images, see `validation.validate`
-metrics.jsonl         losses and measurements
-tensorboard/ or metrics.csv or wandb.txt (the run's id there), as --log says; pictures/
-.lock                 held by the process that works here; .<name>.partial: a file being written
+best.safetensors      networks with the best validation IoU, see `validation.validate`
+metrics.jsonl         losses and metrics
+tensorboard/, metrics.csv or wandb.txt (id of the run at Weights & Biases), by --log
+pictures/             picture grids of validation images
+.lock                 lock of the process that works here; .<name>.partial: a file being written
 """
 
 from __future__ import annotations
@@ -26,18 +27,17 @@ from learn3d.files import writing
 CONFIG, METRICS, METRICS_CSV, WANDB_ID = "config.json", "metrics.jsonl", "metrics.csv", "wandb.txt"
 LAST, PREVIOUS, BEST = "last.safetensors", "previous.safetensors", "best.safetensors"
 PICTURES, TENSORBOARD, LOCK = "pictures", "tensorboard", ".lock"
-#: The files of a run in the order of their removal. The options are last: without them it is no run any more.
+#: The files of a run in the order of their removal; config.json is last, as it marks a run.
 WRITTEN = (LAST, PREVIOUS, BEST, METRICS, f"{PICTURES}/{'[0-9]' * 6}*.png", f"{TENSORBOARD}/events.out.tfevents.*")
 WRITTEN += (METRICS_CSV, WANDB_ID, CONFIG)
 
 
 @contextlib.contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Make the folder and keep other processes from working in it while the block runs.
+    """Context that makes the folder and locks it; a folder that is empty at the end is removed.
 
-    The lock is the operating system's: it ends with its process, however that ends. Raises ValueError if `folder` is a
-    file, OSError if another process holds the lock or the folder cannot be written to. A folder that is empty at the
-    end is removed.
+    The operating system releases the lock when the process ends, even if it is killed. Raises ValueError if `folder` is
+    a file, OSError if another process holds the lock or the folder cannot be written to.
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
@@ -54,22 +54,22 @@ def lock_folder(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):  # a full or read-only disk; the folder is gone
+        with contextlib.suppress(OSError):  # a read-only disk, or the folder was removed
             (folder / LOCK).unlink()
         lock.release()
-        with contextlib.suppress(OSError):  # it holds something
+        with contextlib.suppress(OSError):  # not empty
             folder.rmdir()
 
 
 def is_run(folder: Path) -> bool:
-    """Whether the options of a run lie in the folder."""
+    """Whether the folder holds a run."""
     return (folder / CONFIG).is_file()
 
 
 def check_can_start(folder: Path, overwrite: bool) -> None:
-    """Raise a ValueError if a new run may not begin in a folder: it holds other files, or a run (unless `overwrite`).
+    """Raise a ValueError unless a new run may begin in a folder: an empty one, or with `overwrite` any folder.
 
-    With `overwrite` a run may also be put beside other files, but not if these have the names of a run's.
+    Even then no file may have the name of a run's file, unless it belongs to a run.
     """
     if is_run(folder):
         if not overwrite:
@@ -86,31 +86,31 @@ def check_can_start(folder: Path, overwrite: bool) -> None:
 
 
 def remove_old_run(folder: Path, overwrite: bool) -> None:
-    """Take a folder for a new run, if `check_can_start` allows it: the files of an earlier run are removed."""
+    """Remove the files of an older run, if `check_can_start` allows it."""
     check_can_start(folder, overwrite)
     for pattern in WRITTEN:
         for path in folder.glob(pattern):
             path.unlink()
     for name in (PICTURES, TENSORBOARD):
-        with contextlib.suppress(OSError):  # there is none, or something of the user's is in it
+        with contextlib.suppress(OSError):  # missing, or with files of the user
             (folder / name).rmdir()
     remove_partials(folder)
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove the half-written files of a run that was killed; safetensors has names of its own for them."""
+    """Remove the half-written files of a killed run; those of safetensors are named .tmp??????."""
     writing.remove_partials(folder, folder / PICTURES)
     for path in folder.glob(".tmp??????"):
         path.unlink()
 
 
 def checkpoints(folder: Path) -> list[Path]:
-    """The checkpoints that a run can go on from, newest first."""
+    """The checkpoints from which a run can be resumed, newest first."""
     return [path for name in (LAST, PREVIOUS) if (path := folder / name).is_file()]
 
 
 def resume_command(folder: Path) -> str:
-    """The command line that continues the run in `folder`, quoted for a POSIX shell."""
+    """The command that resumes the run in `folder`, quoted for a POSIX shell."""
     started = sys.argv[0]
     program = ["python", started] if os.path.basename(started) == "train.py" else ["learn3d", "train"]
     return shlex.join([*program, "--output", str(folder), "--resume"])
@@ -118,7 +118,7 @@ def resume_command(folder: Path) -> str:
 
 @contextlib.contextmanager
 def advice_on_errors(folder: Path) -> Iterator[None]:
-    """Complete the errors that end a run in `folder`: its last checkpoint, and the command to go on from it."""
+    """Context that adds the last checkpoint and the command to resume to errors that end the run in `folder`."""
     try:
         yield
     except (FloatingPointError, OSError) as error:

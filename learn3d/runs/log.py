@@ -1,4 +1,4 @@
-"""The record of a run: progress on the terminal, metrics.jsonl, and CSV, TensorBoard or Weights & Biases."""
+"""The log of a run: progress on the terminal, metrics.jsonl, and CSV, TensorBoard or Weights & Biases."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import uuid
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -23,15 +23,14 @@ from learn3d.runs.folder import METRICS, METRICS_CSV, TENSORBOARD, WANDB_ID
 from learn3d.terminal import is_watched, note
 
 SECONDS_BETWEEN_LINES = 30.0
-MEAN_OVER = 20  # steps: those of both turns, if a method trains its networks in turns
+MEAN_OVER = 20  # steps over which shown losses are averaged
 
 
 class RunLog:
-    """Writes the reports of a run; use it as a context manager. Steps after `start` of an earlier attempt are dropped.
+    """The log of a run, a context manager. Metrics of steps after `start`, from before an interruption, are dropped.
 
     On a terminal it shows a progress bar with the losses and the time left; elsewhere it prints a line now and then.
-    Each loss that is shown is a mean over the last steps that computed it. A closed terminal does no harm. Raises
-    OSError if a file cannot be written.
+    Shown losses are means over the last steps that computed them. Raises OSError if a file cannot be written.
     """
 
     def __init__(self, folder: Path, *, start: int, total: int, config: TrainConfig | None = None) -> None:
@@ -40,11 +39,11 @@ class RunLog:
         _drop_after(folder / METRICS, start)
         self._metrics = open(folder / METRICS, "ab")
         self._bar = tqdm(total=total, initial=start, unit="step", dynamic_ncols=True) if is_watched() else None
-        self._writer: Writer | None = None
+        self._writer: _Csv | _TensorBoard | _Wandb | None = None
         kind = "tensorboard" if config is None else config.log
         try:
             self._writer = _Wandb(folder, config) if kind == "wandb" else _WRITERS[kind](folder, start)
-        except (ImportError, TypeError, AttributeError) as error:  # not installed, or other packages do not fit
+        except (ImportError, TypeError, AttributeError) as error:  # missing, or in conflict with other packages
             self.say(f"warning: {kind} does not work ({error}); metrics go to {METRICS} only")
         self._started = self._last_line = time.monotonic()
 
@@ -59,7 +58,7 @@ class RunLog:
             self._writer.close()
 
     def step(self, step: int, losses: Mapping[str, float]) -> None:
-        """Show that a step is done."""
+        """Show the progress after a step."""
         for name, value in losses.items():
             self._recent.setdefault(name, deque(maxlen=MEAN_OVER)).append(value)
         if self._bar is not None:
@@ -79,15 +78,14 @@ class RunLog:
         return "  ".join(f"{name} {sum(self._recent[name]) / len(self._recent[name]):.3g}" for name in names)
 
     def metrics(self, step: int, split: str, values: Mapping[str, Any]) -> None:
-        """Append one line to metrics.jsonl, and give the numbers to the writer as <split>/<name>."""
+        """Append one line to metrics.jsonl, and pass the numbers to the writer as <split>/<name>."""
         self._metrics.write(json.dumps({"step": step, "split": split, **values}).encode() + b"\n")
         self._metrics.flush()
         if self._writer is not None:
-            numbers = {name: value for name, value in values.items() if isinstance(value, (int, float))}
-            self._writer.add_numbers(step, {f"{split}/{name}": value for name, value in numbers.items()})
+            self._writer.add_numbers(step, _numbers(step, split, **values))
 
     def picture(self, step: int, name: str, rgb: np.ndarray) -> None:
-        """Give a picture uint8 [H,W,3] to the writer."""
+        """Pass a picture uint8 [H,W,3] to the writer."""
         if self._writer is not None:
             self._writer.add_picture(step, name, rgb)
 
@@ -97,47 +95,37 @@ class RunLog:
             note(text)
 
     def sync(self) -> None:
-        """Put the reports so far on the disk, so that a checkpoint never lacks the metrics of its steps."""
+        """Flush all metrics to the disk, before a checkpoint is saved."""
         os.fsync(self._metrics.fileno())
         if self._writer is not None:
             self._writer.flush()
 
 
 def check_log(config: TrainConfig) -> None:
-    """Raise a ValueError if the option log needs a package that is not installed. For the beginning of a run."""
+    """Raise a ValueError if the option log needs a package that is not installed."""
     if config.log == "wandb" and importlib.util.find_spec("wandb") is None:
         raise ValueError("log 'wandb' needs the package wandb: pip install wandb, or choose csv or tensorboard")
 
 
-class Writer(Protocol):
-    """A second place for the metrics of a run. A resumed run repeats steps; each must be shown once."""
-
-    def add_numbers(self, step: int, values: Mapping[str, float]) -> None: ...
-
-    def add_picture(self, step: int, name: str, rgb: np.ndarray) -> None: ...
-
-    def flush(self) -> None: ...
-
-    def close(self) -> None: ...
+def _numbers(step: int, split: str = "", **values: Any) -> dict[str, float]:
+    """The numbers in a line of metrics.jsonl, named <split>/<name>."""
+    return {f"{split}/{name}": value for name, value in values.items() if isinstance(value, (int, float))}
 
 
 class _Csv:
-    """metrics.csv: a row for each number, with the columns step, name, value. Steps after `start` are dropped."""
+    """metrics.csv: a row for each number, with the columns step, name, value; metrics.jsonl has the earlier rows."""
 
     def __init__(self, folder: Path, start: int) -> None:
-        path, kept = folder / METRICS_CSV, ["step,name,value"]
-        for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:
-            step, *rest = line.split(",")
-            if step.isdecimal() and int(step) <= start and len(rest) == 2:
-                kept.append(line)
-        writing.write_bytes(path, "".join(line + "\n" for line in kept).encode(), sync=True)
-        self._file = open(path, "a")
+        writing.write_bytes(folder / METRICS_CSV, b"step,name,value\n", sync=True)
+        self._file = open(folder / METRICS_CSV, "a")
+        for values in map(json.loads, (folder / METRICS).read_bytes().splitlines()):
+            self.add_numbers(values["step"], _numbers(**values))
 
     def add_numbers(self, step: int, values: Mapping[str, float]) -> None:
         self._file.writelines(f"{step},{name},{value}\n" for name, value in values.items())
 
     def add_picture(self, step: int, name: str, rgb: np.ndarray) -> None:
-        """A table holds no pictures."""
+        """Do nothing: a table holds no pictures."""
 
     def flush(self) -> None:
         self._file.flush()
@@ -168,7 +156,7 @@ _WRITERS = {"csv": _Csv, "tensorboard": _TensorBoard}
 
 
 class _Wandb:
-    """A run of Weights & Biases in the project learn3d. It ignores steps that it already has."""
+    """A run in the project learn3d at Weights & Biases, which ignores steps that it already has."""
 
     def __init__(self, folder: Path, config: TrainConfig) -> None:
         import wandb
@@ -191,22 +179,22 @@ class _Wandb:
         self._run.log({name: self._image(rgb)}, step=step)
 
     def flush(self) -> None:
-        """Its own process writes."""
+        """Do nothing: wandb writes in its own process."""
 
     def close(self) -> None:
         self._run.finish()
 
 
 def _drop_after(path: Path, step: int) -> None:
-    """Write the metrics again without those after `step`, and without a last line that a crash cut short.
+    """Write the metrics again, without steps after `step` and without damaged lines.
 
-    The file is a new one afterwards, so a link of that name leads nowhere.
+    A link of that name is replaced, not followed.
     """
     kept = []
     for line in path.read_bytes().splitlines() if path.is_file() else []:
         try:
             if json.loads(line)["step"] <= step:
                 kept.append(line + b"\n")
-        except (ValueError, KeyError, TypeError, RecursionError):  # not JSON, not UTF-8; JSON of another form
+        except (ValueError, KeyError, TypeError, RecursionError):  # not the JSON of a metric
             continue
     writing.write_bytes(path, b"".join(kept), sync=True)

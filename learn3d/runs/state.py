@@ -1,4 +1,4 @@
-"""A run that goes on: everything that is saved so that it continues bit for bit."""
+"""The state of a run: saved, and restored bit-identically."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from learn3d.runs.log import RunLog
 
 
 def describe_images(dataset: ViewDataset) -> str:
-    """Number and checksum of the images of a data set, with their masks, poses and classes."""
+    """Number of the images of a data set, and a checksum over images, masks, poses and classes."""
     return f"{len(dataset)} images with the CRC-32 {dataset.digest(voxels=False):08x}"
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """The parts of a checkpoint, besides the progress."""
+    """Everything in a checkpoint besides the progress."""
 
-    config: TrainConfig  # with the precision that "auto" stands for
+    config: TrainConfig  # with a resolved precision, bf16 or fp32
     method: Method
     info: DatasetInfo
     data: str  # `describe_images` of the training images
-    versions: dict[str, str | None] = field(default_factory=versions)  # of the code that runs
+    versions: dict[str, str | None] = field(default_factory=versions)
 
     def begin(self, train_set: ViewDataset, *, resume: bool, overwrite: bool) -> tuple[Progress, tuple[str, ...]]:
-        """Bring networks, optimizers and random numbers to the start of the run or to its last checkpoint.
+        """Prepare method and folder for a new run, or restore the last checkpoint.
 
-        Then take the folder. Returns the progress of the run, and warnings. A finished run stays as it is.
+        Returns the progress of the run, and warnings. The folder of a finished run does not change.
         """
         config, folder = self.config, self.config.output
         progress, notes, saved = Progress(object_share=train_set.object_share()), (), None
@@ -59,7 +59,7 @@ class Run:
         return progress, notes
 
     def _restore(self, tensors: dict[str, Tensor], metadata: Metadata) -> Progress:
-        """Bring everything back to its state at `save_last`. A ValueError names options or data that differ."""
+        """Restore the state of a checkpoint. Raises a ValueError that names options or data that differ."""
         config, before, path = self.config, metadata.config, self.config.output / LAST
         check_resume(config, before)
         if self.data != metadata.data:
@@ -81,19 +81,15 @@ class Run:
         if config.device == "cuda" and "random.cuda" in tensors:
             torch.cuda.set_rng_state(tensors["random.cuda"])
         if (before.val_split, before.max_val_images) != (config.val_split, config.max_val_images):
-            return dataclasses.replace(metadata.progress, best_iou=-1.0, best_step=0)  # it is of other images
+            return dataclasses.replace(metadata.progress, best_iou=-1.0, best_step=0)  # measured on other images
         return metadata.progress
 
     def save(self, progress: Progress, log: RunLog) -> None:
-        """Write the metrics so far and last.safetensors."""
-        log.sync()
-        self.save_last(progress)
+        """Write last.safetensors: networks, EMA, optimizers, random state and `Metadata`; first the metrics so far.
 
-    def save_last(self, progress: Progress) -> None:
-        """Write last.safetensors: networks, optimizers, random state, and all of `Metadata`.
-
-        A complete file has that name at every moment, and the one before it becomes previous.safetensors.
+        The checkpoint before it becomes previous.safetensors. Neither file is ever incomplete.
         """
+        log.sync()
         folder = self.config.output
         tensors = checkpoint.network_tensors(self.method)
         if self.method.ema is not None:
@@ -108,7 +104,7 @@ class Run:
         checkpoint.save(folder / LAST, tensors, self._metadata(progress))
 
     def save_best(self, progress: Progress) -> None:
-        """Write best.safetensors: the networks, or their averages, for use."""
+        """Write best.safetensors: the networks, with EMA weights if the run has them."""
         with self.method.ema_weights():
             networks = checkpoint.network_tensors(self.method)
             checkpoint.save(self.config.output / BEST, networks, self._metadata(progress))
@@ -118,10 +114,10 @@ class Run:
 
 
 def load_last(config: TrainConfig) -> tuple[tuple[dict[str, Tensor], Metadata] | None, tuple[str, ...]]:
-    """The newest whole checkpoint of a run, or None if the run was stopped before its first; and warnings.
+    """The newest undamaged checkpoint of a run, or None if it has none yet; and warnings.
 
-    If last.safetensors is damaged or missing, previous.safetensors takes its place. Raises ValueError if there is no
-    run, or one that began with other options; DamagedError if no checkpoint is whole; OSError if one cannot be reached.
+    If last.safetensors is damaged or missing, previous.safetensors replaces it. Raises ValueError if the folder has no
+    run or one with other options; DamagedError if all checkpoints are damaged; OSError if one cannot be read.
     """
     folder, notes = config.output, []
     candidates = run_folder.checkpoints(folder)

@@ -1,4 +1,4 @@
-"""The lines in which a run introduces itself and says how it ended."""
+"""The first and the last lines of a run's log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from learn3d.runs.threads import ThreadTuner
 def describe_run(
     run: Run, progress: Progress, train_set: ViewDataset, val_set: ViewDataset, threads: ThreadTuner
 ) -> str:
-    """Lines about a run that begins or goes on: method, data, device; mirror plane, generator if masks decide them."""
+    """Method, data and device of a run that begins or continues; mirror plane and generator if the masks decide."""
     config = run.config
     where = f"{config.device}, {config.precision}, {threads}"
     data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
@@ -37,15 +37,15 @@ def describe_run(
 
 @dataclass(frozen=True)
 class Summary:
-    """The end of a call of `train`."""
+    """The result of a call of `train`."""
 
     folder: Path
     step: int
     finished: bool  # False if a signal stopped it
     best_iou: float
     best_step: int
-    seconds: float  # of this call
-    total_seconds: float  # of training, over all resumptions
+    seconds: float  # duration of this call
+    total_seconds: float  # training time, over all resumptions
 
     @classmethod
     def of(cls, config: TrainConfig, progress: Progress, started: float) -> Summary:

@@ -1,7 +1,7 @@
-"""Many tasks, each in its own process, some at a time.
+"""Runs tasks, each in its own process, a few at a time.
 
-A task is a function call that leaves files, and goes on from them when it is called again. So nothing is kept here: the
-same call of `run_tasks` runs the rest.
+A task is a function call that writes files and continues from them when it is called again. So an interrupted
+`run_tasks` is resumed by the same call.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 
 from learn3d.terminal import INTERRUPTED, note, stop_on_signal, without_traceback
 
-TAIL_LINES = 5  # of a failed task's log
+TAIL_LINES = 5  # lines of a failed task's log that are shown
 _CHILD = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
 _CHILD += "from learn3d.runs import tasks; sys.exit(tasks._child())"
 
@@ -31,16 +31,16 @@ class Task:
     """A function call in its own process."""
 
     name: str  # for messages
-    function: Callable[..., bool]  # importable; returns False if it was stopped by SIGTERM and can go on
+    function: Callable[..., bool]  # importable; returns False if SIGTERM stopped it and it can be resumed
     arguments: tuple[Any, ...]
-    log: Path  # its output is appended here
+    log: Path  # file to which its output is appended
 
 
 def run_tasks(tasks: Sequence[Task], *, jobs: int = 1) -> dict[str, str]:
-    """Run `tasks`, at most `jobs` at a time.
+    """Run `tasks`, at most `jobs` at a time; return the end of the log of every failed task, by the task's name.
 
-    A failing task does not stop the others. SIGINT, SIGTERM or SIGHUP stop all of them: nothing new is started, and
-    each running task saves its state. Returns the end of the log of every failed task, by the task's name.
+    A failing task does not stop the others. After SIGINT, SIGTERM or SIGHUP no task is started, and each running one
+    saves its state and ends.
     """
     failed: dict[str, str] = {}
     stop = threading.Event()
@@ -61,7 +61,7 @@ def run_tasks(tasks: Sequence[Task], *, jobs: int = 1) -> dict[str, str]:
                         end = "failed" if task.name in failed else "stopped" if status else "done"
                         note(f"[{len(tasks) - len(waiting)}/{len(tasks)}] {task.name}: {end}; {tail.splitlines()[-1]}")
         finally:
-            stop.set()  # after an error no task goes on unseen
+            stop.set()  # after an error, too, no task continues in the background
     return failed
 
 
@@ -75,13 +75,13 @@ def _run_in_process(task: Task, stop: threading.Event) -> int:
         open(task.log, "ab") as output,
         subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=output) as process,
     ):
-        with contextlib.suppress(OSError):  # it has ended already
+        with contextlib.suppress(OSError):  # the process has already ended
             process.stdin.write(pickle.dumps(sys.path) + pickle.dumps(task))
             process.stdin.flush()
         while process.poll() is None and not stop.is_set():
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(0.2)
-        process.terminate()  # not SIGINT: Ctrl-C has sent that already, and a second one ends at once
+        process.terminate()  # not SIGINT: Ctrl-C has sent it already, and a second one would end the task at once
         return process.wait()
 
 
@@ -94,13 +94,13 @@ def _child() -> int:
 
 
 def _stop_with_parent() -> None:
-    """Ask this process to save its state and end if the one that started it ends, for whatever reason."""
+    """Send SIGTERM to this process when its parent has ended for any reason."""
     os.read(sys.stdin.fileno(), 1)  # returns when the pipe is closed
     os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _outcome(task: Task, future: concurrent.futures.Future) -> tuple[int, str]:
-    """Exit status of a task's process, and the end of its log or, if it was lost, the reason."""
+    """Exit status of a task's process, and the end of its log, or the reason if the process could not run."""
     try:
         status = future.result()
     except Exception as error:

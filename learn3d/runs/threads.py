@@ -1,7 +1,7 @@
 """The number of CPU threads of a training: one or all, whichever makes its steps faster.
 
-Threads meet hundreds of times a step, and all of them wait for one that has no core. On a machine whose cores are busy
-a step with all threads takes up to 14 times as long as with one; on a quiet one it takes a fraction. So both are tried.
+Threads synchronise hundreds of times a step. If cores are oversubscribed, a step with all threads takes up to 14 times
+as long as with one; on an idle machine it takes a fraction. So both are measured.
 """
 
 from __future__ import annotations
@@ -13,46 +13,45 @@ from collections.abc import Callable
 
 import torch
 
-WARM_UP, TRIAL = 1, 5  # steps of a trial: the first is not timed, as memory and kernels are prepared in it
-WINDOW = 20  # steps whose median is compared with the best so far
-SLOWER = 3.0  # ratio of the two medians at which both numbers are tried again
-REST = 1000  # steps with one thread after which all are tried again; then after twice as many, and so on
+WARM_UP, TRIAL = 1, 5  # steps of a trial, and those at its start that are not timed
+WINDOW = 20  # steps whose median is compared with the smallest median so far
+SLOWER = 3.0  # ratio of the two medians at which both numbers of threads are measured again
+REST = 1000  # steps with one thread after which both are measured again; it doubles each time
 
 
 class ThreadTuner:
     """Chooses between one thread and all by the duration of training steps.
 
-    It does nothing if the number is fixed: by `threads`, by the environment (OMP_NUM_THREADS), or because there is only
-    one core.
+    The number is fixed if `threads` or the environment (OMP_NUM_THREADS) sets it, or if there is only one core.
     """
 
     def __init__(self, threads: int | None, *, set_num_threads: Callable[[int], None] = torch.set_num_threads) -> None:
         self.all = threads or torch.get_num_threads()
         self.fixed = threads is not None or "OMP_NUM_THREADS" in os.environ or self.all == 1
         self._set_num_threads = set_num_threads
-        self._seconds: deque[float] = deque(maxlen=WINDOW)  # of the last steps with this number of threads
-        self._best = float("inf")  # the least median of WINDOW steps
-        self._medians: dict[int, float] = {}  # of the trial under way, by the number of threads
+        self._seconds: deque[float] = deque(maxlen=WINDOW)  # durations of the last steps
+        self._best = float("inf")  # smallest median of WINDOW steps
+        self._medians: dict[int, float] = {}  # medians of the current trial, by the number of threads
         self._trying, self._rest = not self.fixed, REST
         self._use(self.all)
 
     def resume(self, chosen: int | None) -> None:
-        """Go on with the number that an interrupted run had chosen, if this machine has as many cores."""
+        """Use the number that the run had chosen before it was interrupted, if this machine has as many cores."""
         if not self.fixed and chosen is not None and chosen <= self.all:
             self._trying = False
             self._use(chosen)
 
     @property
     def chosen(self) -> int | None:
-        """The number of threads to go on with after an interruption; None if it is fixed or not chosen yet."""
+        """The chosen number of threads, for `resume`; None if it is fixed or not chosen yet."""
         return None if self.fixed or self._trying else self.threads
 
     def __str__(self) -> str:
-        """The number of threads, for the line in which a run introduces itself."""
+        """The number of threads, for the first line of a run's log."""
         return f"{self.all} threads or 1, whichever is faster" if self._trying else f"{self.threads} threads"
 
     def after_step(self, seconds: float) -> str:
-        """Take in the duration of a step. Returns a line for the log when the number has been chosen, else ""."""
+        """Record the duration of a step. Returns a line for the log when a number is chosen, else ""."""
         if self.fixed:
             return ""
         self._seconds.append(seconds)

@@ -28,7 +28,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "prgan": (
         BASE | {"preset": "gadelha2017-kato", "iterations": 4},
-        "encoder_from_step=53051 lies beyond the 4 iterations: .* such as 3",
+        "encoder_from_step=53051 is after the last of 4 iterations: .* such as 3",
     ),
     "bank": (
         BASE | {"settings": {"bank_size": 3}},

@@ -103,7 +103,7 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> N
 
 @pytest.mark.parametrize("objects", [[0, 1, 1, 0], [0, 1, 0]])
 def test_batches_must_be_pairs(objects: list[int]) -> None:
-    with pytest.raises(ValueError, match="is not made so; choose sampling 'pairs'"):
+    with pytest.raises(ValueError, match="has another form; choose sampling 'pairs'"):
         check_groups(make_batch(objects), 2, "pairs")
 
 
