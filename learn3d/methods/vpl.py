@@ -23,7 +23,7 @@ from learn3d.device import upload
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.method import DatasetInfo, MeshMethod, MeshSettings, generator_name, plane_of
 from learn3d.methods.optimization import adam, frozen
-from learn3d.networks import ENCODERS, GENERATORS, MeshGenerator
+from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
 from learn3d.networks.encoders import PreactResNet18
 from learn3d.networks.layers import reverse_gradient
@@ -116,8 +116,18 @@ class VPL(MeshMethod):
         settings, info = self.settings, self.info
         if settings.class_conditional and info.num_classes < 2:
             raise ValueError("class_conditional needs data of several categories, got one")
-        encoder = _create_encoder(settings, info).to(memory_format=torch.channels_last)
-        networks = {"encoder": encoder, "generator": _create_generator(settings, info)}
+        if settings.encoder == "preact-resnet18":
+            encoder = PreactResNet18(settings.image_size)
+        elif settings.encoder == "resnet18":
+            encoder = FlatResNet18(settings.image_size, settings.pretrained is not None, info.inverted)
+        else:
+            encoder = ENCODERS[settings.encoder]()
+        scales = {}
+        if settings.generator.startswith("cube"):
+            scales = {"scale": settings.vertex_scale, "object_scale": settings.object_scale}
+        kind = GENERATORS[generator_name(settings.generator, info)]
+        generator = kind(symmetry=plane_of(settings.symmetry, info), **scales)
+        networks = {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
         if settings.lambda_discriminator > 0:
             networks["discriminator"] = _create_discriminator(settings, info)
         return networks
@@ -234,21 +244,6 @@ def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> 
     different = (batch.view_ids[:, None] != batch.view_ids).float()
     weights = torch.where(different.any(1, keepdim=True), different, 1.0)
     return torch.multinomial(weights, 1).squeeze(1)
-
-
-def _create_encoder(settings: VPLSettings, info: DatasetInfo) -> nn.Module:
-    if settings.encoder == "preact-resnet18":
-        return PreactResNet18(settings.image_size)
-    if settings.encoder == "resnet18":
-        return FlatResNet18(settings.image_size, settings.pretrained is not None, info.inverted)
-    return ENCODERS[settings.encoder]()
-
-
-def _create_generator(settings: VPLSettings, info: DatasetInfo) -> MeshGenerator:
-    scales = {}
-    if settings.generator.startswith("cube"):
-        scales = {"scale": settings.vertex_scale, "object_scale": settings.object_scale}
-    return GENERATORS[generator_name(settings.generator, info)](symmetry=plane_of(settings.symmetry, info), **scales)
 
 
 def _create_discriminator(settings: VPLSettings, info: DatasetInfo) -> nn.Module:

@@ -40,12 +40,11 @@ class Run:
         Returns the progress of the run, and warnings. The folder of a finished run does not change.
         """
         config, folder = self.config, self.config.output
-        progress, notes, saved = Progress(object_share=train_set.object_share()), (), None
-        if resume:
-            saved, notes = load_last(config)
+        saved, notes = load_last(config) if resume else (None, ())
         if saved is not None:
             progress = self._restore(*saved)
         else:
+            progress = Progress(object_share=train_set.object_share())
             self.method.start_from_pretrained()
         if progress.step > config.iterations:
             raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import statistics
 from collections import deque
-from collections.abc import Callable
 
 import torch
 
@@ -25,10 +24,9 @@ class ThreadTuner:
     The number is fixed if `threads` or the environment (OMP_NUM_THREADS) sets it, or if there is only one core.
     """
 
-    def __init__(self, threads: int | None, *, set_num_threads: Callable[[int], None] = torch.set_num_threads) -> None:
+    def __init__(self, threads: int | None) -> None:
         self.all = threads or torch.get_num_threads()
         self.fixed = threads is not None or "OMP_NUM_THREADS" in os.environ or self.all == 1
-        self._set_num_threads = set_num_threads
         self._seconds: deque[float] = deque(maxlen=WINDOW)  # durations of the last steps
         self._best = float("inf")  # smallest median of WINDOW steps
         self._medians: dict[int, float] = {}  # medians of the current trial, by the number of threads
@@ -85,4 +83,4 @@ class ThreadTuner:
         self.threads = threads
         self._seconds.clear()
         self._steps = 0
-        self._set_num_threads(threads)
+        torch.set_num_threads(threads)

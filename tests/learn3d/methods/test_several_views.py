@@ -63,19 +63,13 @@ def test_bounded_rule() -> None:
     assert np.allclose(deform_bounded_sphere(*arrays), wanted, atol=1e-12)
 
 
-def test_vertices_keep_the_box_and_their_octant() -> None:
+def test_large_biases_keep_vertices_in_the_cube_and_gradients_finite() -> None:
     sphere = nmr.icosphere(3)[0].float()
-    bias = 20 * torch.randn(4, 642, 3, generator=torch.Generator().manual_seed(1))
-    centroid = torch.tensor([[0.0, 0.0, 0.0], [1.0, -2.0, 0.3], [50.0, -50.0, 0.0], [0.1, 0.1, 0.1]])
-    bias.requires_grad_()
-    vertices = deform_bounded_sphere(sphere, bias, centroid)
+    bias = 20 * torch.randn(2, 642, 3, generator=torch.Generator().manual_seed(1))
+    vertices = deform_bounded_sphere(sphere, bias.requires_grad_(), torch.tensor([[1.0, -2.0, 0.3], [50.0, -50.0, 0]]))
     assert vertices.abs().max() <= 0.5
-    offset = vertices - 0.5 * torch.tanh(centroid)[:, None]
-    assert ((offset * sphere) >= -1e-6).all()
-    assert offset[:, sphere == 0].abs().max() < 1e-6
     vertices.sum().backward()
-    assert bias.grad.isfinite().all()
-    assert (bias.grad[:, sphere == 0] == 0).all()
+    assert bias.grad.isfinite().all() and not bias.grad[:, sphere == 0].any()
 
 
 def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> None:
@@ -227,13 +221,7 @@ def test_losses_are_those_written_out(dataset: ViewDataset) -> None:
     assert losses["projection"] == pytest.approx(float(torch.stack(overlap).mean()), rel=1e-4)
     assert losses["depth"] == pytest.approx(float(torch.cat(distances).mean()), rel=0.02)
     assert losses["prior"] == pytest.approx(float(codes.square().sum(1).mean()), rel=1e-4)
-
-
-def test_without_depth_in_the_data_there_is_no_depth_loss(dataset: ViewDataset) -> None:
-    bare = dataclasses.replace(dataset, depth=None)
-    indices = sample_indices(bare, "groups", 10, seed=0, step=1)
-    assert "depth" not in create(bare).take_step(bare.batch(indices), 1)
-    assert "depth" in create(dataset).take_step(dataset.batch(indices), 1)
+    assert "depth" not in method.take_step(dataclasses.replace(batch, depth=None), 1)
 
 
 def test_it_learns_the_shapes(dataset: ViewDataset) -> None:

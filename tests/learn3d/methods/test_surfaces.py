@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import nmr
-from learn3d.methods import DatasetInfo, create_method
+from learn3d.methods import DatasetInfo, create_method, refinement
 from learn3d.methods.refinement import refine
 from learn3d.methods.surfaces import grid_surface
 from learn3d.presets import PRESETS
@@ -43,32 +43,39 @@ def make(plane: float | None):
     return create_method(settings, DatasetInfo(24, mirror_plane_deg=plane), device="cpu", precision="fp32", seed=0)
 
 
+def take_steps(monkeypatch: pytest.MonkeyPatch, code: int, vertices: int) -> None:
+    """Let `refine` take this many steps."""
+    monkeypatch.setattr(refinement, "CODE_STEPS", code)
+    monkeypatch.setattr(refinement, "VERTEX_STEPS", vertices)
+
+
 @pytest.mark.parametrize("steps", [(60, 0), (0, 30), (15, 15)])
-def test_the_silhouette_comes_closer(tiny_set, steps: tuple[int, int]) -> None:
+def test_the_silhouette_comes_closer(tiny_set, monkeypatch, steps: tuple[int, int]) -> None:
     method, batch = make(None), tiny_set.batch(torch.tensor([0, 30]))
+    take_steps(monkeypatch, *steps)
 
     def loss(vertices: torch.Tensor) -> float:
         return float(nmr.losses.soft_iou_loss(method.render(vertices, batch.poses), batch.masks))
 
     with torch.no_grad():
         before = method.decode(method.encode(batch.images)).vertices
-        after = refine(method, batch.images, batch.masks, batch.poses, code_steps=steps[0], vertex_steps=steps[1])
+        after = refine(method, batch.images, batch.masks, batch.poses)
     assert loss(after.vertices) < loss(before) - 0.02
 
 
-def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set) -> None:
+def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set, monkeypatch) -> None:
+    take_steps(monkeypatch, 1, 1)
     method = create_method(PRESETS["kato2019-kar"].settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
     batch = tiny_set.batch(torch.tensor([0]))
     images = torch.zeros(1, 4, method.image_size, method.image_size, dtype=torch.uint8)
-    shapes = refine(method, images, batch.masks, batch.poses, code_steps=1, vertex_steps=1)
+    shapes = refine(method, images, batch.masks, batch.poses)
     assert shapes.vertices.shape == (1, 1352, 3) and shapes.vertices.isfinite().all()
 
 
-def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(tiny_set) -> None:
-    method, batch = make(37.5), tiny_set.batch(torch.tensor([0, 30]))
-    both = refine(method, batch.images, batch.masks, batch.poses, code_steps=0, vertex_steps=5).vertices
-    first = tiny_set.batch(torch.tensor([0]))
-    alone = refine(method, first.images, first.masks, first.poses, code_steps=0, vertex_steps=5).vertices
+def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(tiny_set, monkeypatch) -> None:
+    take_steps(monkeypatch, 0, 5)
+    method, batches = make(37.5), [tiny_set.batch(torch.tensor(chosen)) for chosen in ([0, 30], [0])]
+    both, alone = (refine(method, b.images, b.masks, b.poses).vertices for b in batches)
     torch.testing.assert_close(both[:1], alone, atol=5e-5, rtol=0)
     torch.testing.assert_close(method.generator.symmetrized(both), both)
 

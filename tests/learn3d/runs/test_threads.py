@@ -8,7 +8,6 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from learn3d import training
 from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.runs import checkpoint, threads
 from learn3d.runs.threads import SLOWER, TRIAL, WINDOW, ThreadTuner
@@ -20,20 +19,12 @@ def many_cores(monkeypatch) -> None:
     """A machine of 16 cores on which nothing fixes the number of threads."""
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 16)
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: None)
 
 
-class Machine:
-    """Steps that take as long as `seconds` says for a number of threads."""
-
-    def __init__(self, **options: object) -> None:
-        self.tuner = ThreadTuner(options.pop("threads", None), set_num_threads=self.set_num_threads, **options)
-
-    def set_num_threads(self, count: int) -> None:
-        self.count = count
-
-    def run(self, steps: int, seconds: Callable[[int], float]) -> list[str]:
-        """The lines for the log."""
-        return [line for _ in range(steps) if (line := self.tuner.after_step(seconds(self.count)))]
+def run(tuner: ThreadTuner, steps: int, seconds: Callable[[int], float]) -> list[str]:
+    """Take steps whose duration depends on the number of threads; returns the lines for the log."""
+    return [line for _ in range(steps) if (line := tuner.after_step(seconds(tuner.threads)))]
 
 
 def quiet(count: int) -> float:
@@ -52,38 +43,38 @@ def busy(count: int) -> float:
     ],
 )
 def test_the_faster_of_one_and_all_is_taken(many_cores, seconds, chosen: int, line: str) -> None:
-    machine = Machine()
-    assert (str(machine.tuner), machine.tuner.chosen) == ("16 threads or 1, whichever is faster", None)
-    machine.run(1, lambda count: 60.0)  # the first step, which prepares everything, does not count
-    assert machine.run(2 * TRIAL - 1, seconds) == [line]
-    assert (machine.count, machine.tuner.chosen, str(machine.tuner)) == (chosen, chosen, f"{chosen} threads")
-    assert machine.run(500, seconds) == [], "steps as fast as before change nothing"
+    tuner = ThreadTuner(None)
+    assert (str(tuner), tuner.chosen) == ("16 threads or 1, whichever is faster", None)
+    run(tuner, 1, lambda count: 60.0)  # the first step, which prepares everything, does not count
+    assert run(tuner, 2 * TRIAL - 1, seconds) == [line]
+    assert (tuner.threads, tuner.chosen, str(tuner)) == (chosen, chosen, f"{chosen} threads")
+    assert run(tuner, 500, seconds) == [], "steps as fast as before change nothing"
 
 
 def test_both_are_tried_again_when_steps_become_slow_and_not_before(many_cores) -> None:
-    machine = Machine()
-    machine.run(2 * TRIAL + WINDOW, quiet)
-    assert machine.run(100, lambda count: 0.9 * SLOWER * quiet(count)) == [], "not slow enough"
-    assert machine.run(WINDOW // 2, busy) == [], "a few slow steps change nothing"
-    machine.run(WINDOW, quiet)
-    said = machine.run(WINDOW + 2 * TRIAL, busy)
-    assert machine.count == 1 and len(said) == 1
+    tuner = ThreadTuner(None)
+    run(tuner, 2 * TRIAL + WINDOW, quiet)
+    assert run(tuner, 100, lambda count: 0.9 * SLOWER * quiet(count)) == [], "not slow enough"
+    assert run(tuner, WINDOW // 2, busy) == [], "a few slow steps change nothing"
+    run(tuner, WINDOW, quiet)
+    said = run(tuner, WINDOW + 2 * TRIAL, busy)
+    assert tuner.threads == 1 and len(said) == 1
     free = lambda count: 0.06 / count  # noqa: E731
-    assert machine.run(threads.REST - WINDOW, free) == []
-    assert len(machine.run(WINDOW + 2 * TRIAL, free)) == 1
-    assert machine.count == 16, "one thread gives way when the cores are free again"
+    assert run(tuner, threads.REST - WINDOW, free) == []
+    assert len(run(tuner, WINDOW + 2 * TRIAL, free)) == 1
+    assert tuner.threads == 16, "one thread gives way when the cores are free again"
 
 
-@pytest.mark.parametrize(("fixed", "count"), [({"threads": 4}, 4), ("environment", 16), ("core", 1)])
-def test_a_fixed_number_stays(many_cores, monkeypatch, fixed, count: int) -> None:
+@pytest.mark.parametrize(("fixed", "count"), [("option", 4), ("environment", 16), ("core", 1)])
+def test_a_fixed_number_stays(many_cores, monkeypatch, fixed: str, count: int) -> None:
     if fixed == "environment":
         monkeypatch.setenv("OMP_NUM_THREADS", "16")
     if fixed == "core":
         monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    machine = Machine(**fixed if isinstance(fixed, dict) else {})
-    machine.tuner.resume(2)
-    assert machine.run(100, busy) == []
-    assert (machine.count, machine.tuner.chosen) == (count, None)
+    tuner = ThreadTuner(4 if fixed == "option" else None)
+    tuner.resume(2)
+    assert run(tuner, 100, busy) == []
+    assert (tuner.threads, tuner.chosen) == (count, None)
 
 
 def test_a_resumed_run_keeps_its_number(tiny_run, run_folder, monkeypatch, capsys) -> None:
@@ -92,8 +83,6 @@ def test_a_resumed_run_keeps_its_number(tiny_run, run_folder, monkeypatch, capsy
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     used, take_step = [], PoseInvariant.take_step
     monkeypatch.setattr(torch, "set_num_threads", used.append)
-    tuner = lambda *arguments, **options: ThreadTuner(*arguments, set_num_threads=used.append, **options)  # noqa: E731
-    monkeypatch.setattr(training, "ThreadTuner", tuner)
 
     def slow_with_two(self, batch, step: int):
         time.sleep(0.3 if used[-1] == 2 else 0.0)
