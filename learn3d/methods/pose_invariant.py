@@ -34,8 +34,8 @@ class PoseInvariantSettings(MeshSettings):
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1)."""
     lambda_smooth_end: Positive | None = None
-    """Weight of the smoothness loss at the end of the run, reached by exponential decay (None: it stays
-    lambda_smooth)."""
+    """Weight of the smoothness loss at the end of the run, reached by exponential decay. Without it the weight stays
+    lambda_smooth."""
     lambda_area: Weight | Literal["auto"] = 0.0
     """Weight of the area of the surface. It prevents folds and flattens sides that no camera sees. auto: 0.03 if the
     training masks are compact, else 0."""
