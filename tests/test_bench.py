@@ -1,6 +1,7 @@
 """tools/bench/bench.py: every program does the same work, and each workload runs."""
 
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,13 +9,11 @@ import pytest
 import torch
 
 import nmr
-from learn3d.config import TrainConfig
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools" / "bench"))
 
 import bench
 import bench_peers
-import bench_step
 import bench_work
 
 needs_deodr = pytest.mark.skipif(not bench_peers.has_deodr(), reason="deodr is not installed")
@@ -35,11 +34,14 @@ def command(monkeypatch):
 
 
 @needs_deodr
-def test_deodr_must_draw_what_we_draw():
+def test_deodr_must_draw_what_we_draw(monkeypatch):
     spheres = bench_work.deformed_spheres(2, 3, 64, outputs=("depth",))
-    bench_peers.check_same_image(spheres, bench_peers.deodr_mesh(spheres.faces))
-    with pytest.raises(SystemExit, match="different images"):
-        bench_peers.check_same_image(spheres, bench_peers.deodr_mesh(spheres.faces.flip(1)))  # the far side
+    with ExitStack() as stack:
+        (program,) = bench_peers.deodr_programs(spheres, spheres.targets(), 1, stack).values()
+        assert 0 < program()[0]
+        monkeypatch.setattr(bench_peers, "deodr_mesh", lambda faces, make=bench_peers.deodr_mesh: make(faces.flip(1)))
+        with pytest.raises(SystemExit, match="nmr and deodr draw different images"):  # the far side
+            bench_peers.deodr_programs(spheres, spheres.targets(), 1, stack)
 
 
 @needs_deodr
@@ -59,14 +61,14 @@ def test_deodrs_depth_has_our_gradient():
     assert torch.corrcoef(torch.stack(grads))[0, 1] > 0.98
 
 
-@pytest.mark.parametrize(("workload", "rows"), [("w1", 2), ("w4", 2), ("colors", 7), ("voxels", 1), ("step", 4)])
+@pytest.mark.parametrize(("workload", "rows"), [("w1", 2), ("w4", 2), ("colors", 7), ("voxels", 1)])
 def test_every_program_of_a_workload_is_timed(command, capsys, workload, rows):
     assert command(workload, "--batch", 2, "--repeats", 1) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.count(".") == 4]
     assert len(lines) == rows
     for line in lines:
         forward, total, fastest, ratio = map(float, line.split()[-4:])
-        assert 0 <= forward <= total == fastest < 10_000 and ratio > 0
+        assert 0 <= forward <= total == fastest and ratio > 0
 
 
 def test_the_table_of_peers_names_all_and_measures_those_that_are_there(monkeypatch, capsys):
@@ -80,7 +82,7 @@ def test_the_table_of_peers_names_all_and_measures_those_that_are_there(monkeypa
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 7 and "depth, 80 faces, 16 px | none" in lines[-1] and all(x.count("|") >= 5 for x in lines)
     shift = 0.01
-    with pytest.raises(SystemExit, match="nmr and none draw different images"):
+    with pytest.raises(SystemExit, match="nmr and none .* draw different images"):
         bench_peers.print_table(1)
 
 
@@ -100,12 +102,3 @@ def test_every_kind_of_colour_draws_its_own_image_and_reaches_its_values(kind):
     assert torch.equal(inner, torch.ones_like(inner)) == (kind == "white")
     (unlit,) = bench_work.colored_spheres("uv", 2, 32).images(workload.vertices)
     assert torch.equal(image.detach(), unlit) == (kind == "uv")
-
-
-def test_networks_whose_shapes_are_not_rendered_have_the_same_to_do():
-    dataset = bench_step.sphere_set(num_objects=2)
-    method = bench_step.build(TrainConfig(data="-", category="-", output="-"), dataset, "fp32")
-    bench_step.stop_rendering(method)
-    before = {name: value.clone() for name, value in method.generator.named_parameters()}
-    method.take_step(dataset.batch(torch.tensor([0, 30]), voxels=False), 1)
-    assert all(not torch.equal(value, before[name]) for name, value in method.generator.named_parameters())

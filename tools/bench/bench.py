@@ -1,4 +1,4 @@
-"""Measure the renderer and its losses and metrics, beside deodr if it is installed (compare within one run only).
+"""Measure the renderer, its losses and its metrics. Compare only numbers of one run.
 
   bench.py all: everything below
   bench.py w1: 64 spheres, 64x64 anti-aliased
@@ -8,10 +8,9 @@
   bench.py colors: w1 in colour, with one thread: white, vertex colours, texture images, lights
   bench.py voxels: voxel IoU of 1000 predictions
   bench.py peers: one thread of ours beside deodr, PyTorch3D, Open3D and Mesa, as a table in Markdown
-  bench.py step: a whole training step in bf16 and in fp32, and the time of its networks alone
 
-Medians over repeats that alternate between the programs, and the fastest, in milliseconds. Freed memory is kept for
-all of them, as in training (learn3d/device.py). `pip install deodr` for the comparison.
+Prints the median and the fastest of the repeats in milliseconds; repeats alternate between the programs. Freed memory
+is kept, as in training (learn3d/device.py). w1 to w4 are measured with deodr as well, if it is installed.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from functools import partial
 import bench_peers as peers
 import torch
 import tyro
-from bench_step import step_programs
 from bench_work import Program, Timing, colored_spheres, deformed_spheres, report
 
 import nmr
@@ -44,10 +42,10 @@ COLORS = {
 class Options:
     workload: tyro.conf.Positional[str] = "w1"
     """Name of the workload, from the list above."""
-    batch: int | None = None
-    """Meshes of w1, w4 and colors, by default 64; images of a step, by default 128."""
+    batch: int = 64
+    """Meshes of w1, w4 and colors."""
     threads: int = 2
-    """Threads of ours and of torch (colors takes one). deodr has none: it gets one process, and as many as these."""
+    """Threads of nmr and torch (colors takes one). deodr has no threads: it gets one process, and as many as these."""
     repeats: int = 15
     """Timed runs of each program."""
 
@@ -58,9 +56,9 @@ def with_threads(threads: int, program: Program) -> Timing:
 
 
 def bench_render(name: str, options: Options) -> None:
-    """Ours beside deodr."""
+    """Time nmr, and deodr if it is installed."""
     if name in ("w1", "w4"):
-        work = deformed_spheres(options.batch or 64, 3, 64, outputs=("depth" if name == "w4" else "alpha",))
+        work = deformed_spheres(options.batch, 3, 64, outputs=("depth" if name == "w4" else "alpha",))
     else:
         subdivisions, size = {"w2": (6, 512), "w3": (3, 1024)}[name]
         work = deformed_spheres(1, subdivisions, size, anti_aliasing=False)
@@ -73,21 +71,18 @@ def bench_render(name: str, options: Options) -> None:
 
 
 def bench_colors(options: Options) -> None:
-    """One thread; fixed colours and learned ones take turns."""
+    """Time one thread, without and with gradients of the colours."""
     for kind, about in COLORS.items():
-        work = colored_spheres(kind, options.batch or 64)
+        work = colored_spheres(kind, options.batch)
         learned = [False] if work.values is None else [False, True]
-        programs = {
-            "nmr, 1 thread" + ", colours learned, too" * learn: partial(
-                with_threads, 1, partial(work.run, work.targets(), learn)
-            )
-            for learn in learned
-        }
+        runs = {learn: partial(work.run, work.targets(), learn) for learn in learned}
+        names = {False: "nmr, 1 thread", True: "nmr, 1 thread, gradients of colours"}
+        programs = {names[learn]: partial(with_threads, 1, run) for learn, run in runs.items()}
         report(f"colors: {work}, {about}, forward + backward", programs, options.repeats)
 
 
 def bench_voxels(options: Options) -> None:
-    """Voxels, and in all with the IoU."""
+    """Time the voxelizer (forward) and the voxelizer with the IoU (total)."""
     spheres = deformed_spheres(1000, 3, 64)
     vertices = spheres.vertices * (31 / 32) + 0.5
 
@@ -102,20 +97,8 @@ def bench_voxels(options: Options) -> None:
     report("voxels: voxel IoU of 1000 meshes of 1280 faces at 32^3", programs, min(options.repeats, 5))
 
 
-def bench_peers(options: Options) -> None:
-    """Each peer that is installed."""
-    peers.print_table(options.repeats)
-
-
-def bench_step(options: Options) -> None:
-    """The difference of a step and of its networks is small beside both: distrust it if two calls disagree."""
-    torch.set_num_threads(options.threads)
-    batch = options.batch or 128
-    report(f"step: training step of the default preset, {batch} images", step_programs(batch), options.repeats)
-
-
 BENCHES = {name: partial(bench_render, name) for name in ("w1", "w2", "w3", "w4")}
-BENCHES |= {"colors": bench_colors, "voxels": bench_voxels, "peers": bench_peers, "step": bench_step}
+BENCHES |= {"colors": bench_colors, "voxels": bench_voxels, "peers": lambda options: peers.print_table(options.repeats)}
 
 
 @without_traceback()

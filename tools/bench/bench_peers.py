@@ -1,6 +1,6 @@
-"""Other renderers for the same work: deodr, PyTorch3D, Open3D and OSMesa, each if it is installed.
+"""The same work for other renderers: deodr, PyTorch3D, Open3D and Mesa (through pyrender), each if it is installed.
 
-deodr is a 2.5-D renderer with derivatives, for one mesh at a time on one thread. OSMesa is called by pyrender.
+deodr is a differentiable 2.5-D renderer, which draws one mesh at a time on one thread.
 """
 
 from __future__ import annotations
@@ -27,18 +27,19 @@ FAR = 100.0  # nmr.render_depth's default
 
 
 def has_deodr() -> bool:
+    """Whether deodr is installed."""
     return importlib.util.find_spec("deodr") is not None
 
 
 def deodr_mesh(faces: Tensor):
-    """deodr's mesh, clockwise on the screen: the world is left-handed."""
+    """The faces for deodr, clockwise on the screen because nmr's world is left-handed."""
     from deodr.triangulated_mesh import TriMeshAdjacencies
 
     return TriMeshAdjacencies(faces.numpy().astype(np.uint32), clockwise=True)
 
 
 class DeodrImages(torch.autograd.Function):
-    """Vertices in renderer space to images ``[B, S, S]``: silhouettes, or depths as a colour of the vertices."""
+    """Images [B, S, S] of vertices in renderer space by deodr: silhouettes, or depths as colours of the vertices."""
 
     @staticmethod
     def forward(ctx, vertices: Tensor, size: int, mesh, output: str) -> Tensor:
@@ -84,7 +85,7 @@ class DeodrImages(torch.autograd.Function):
 
 
 def run_deodr(workload: Workload, targets: tuple[Tensor, ...]) -> Timing:
-    """At the size of the image, which is less than we draw: ours has the inner resolution of its anti-aliasing."""
+    """Time deodr on all meshes, one after the other. It draws S x S pixels; nmr draws 2S x 2S to average them."""
     (output,), mesh = workload.outputs, deodr_mesh(workload.faces)
     leaf = workload.vertices.clone().requires_grad_()
     start = time.perf_counter()
@@ -94,31 +95,22 @@ def run_deodr(workload: Workload, targets: tuple[Tensor, ...]) -> Timing:
     return forward - start, time.perf_counter() - start
 
 
-def check_same_image(workload: Workload, mesh) -> str:
-    """Both programs must draw the same thing, or the comparison means nothing."""
-    (output,), size = workload.outputs, workload.size
-    with torch.no_grad():
-        vertices = workload.camera.transform(workload.vertices)
-        theirs = DeodrImages.apply(vertices, size, mesh, output)
-        if output == "alpha":
-            ours = nmr.render_silhouette(vertices, workload.faces, image_size=size)
-            overlap = 1 - float(nmr.losses.soft_iou_loss(ours, theirs))
-            agree, how = overlap >= 0.9, f"to a soft IoU of {overlap:.4f}"
-        else:
-            ours = nmr.render_depth(vertices, workload.faces, image_size=size, anti_aliasing=False)
-            both = (ours < FAR) & (theirs < ours.where(ours < FAR, ours.new_zeros(())).max())
-            difference = float((ours - theirs)[both].abs().median())
-            agree, how = difference < 1e-3, f"to {difference:.1e} in depth (median over covered pixels)"
-    if not agree:
-        raise SystemExit(f"nmr and deodr draw different images (they agree {how}): the comparison is invalid")
-    return how
+def check_same(name: str, ours: Tensor, theirs: Tensor) -> None:
+    """Stop if the images differ, as the comparison would mean nothing. Edges may: the median over the object counts."""
+    background = FAR if ours.max() > 1 else 0.0
+    difference = (ours - theirs)[(ours != background) | (theirs != background)].abs().median()
+    if not difference < 5e-3:  # pyrender's depth is that of a sample beside the centre
+        raise SystemExit(f"nmr and {name} draw different images (median difference {float(difference):.1e})")
 
 
 def deodr_programs(
     workload: Workload, targets: tuple[Tensor, ...], processes: int, stack: ExitStack
 ) -> dict[str, Program]:
-    """deodr in one process, and in several that share the batch, if it is large enough; they end with `stack`."""
-    print(f"images of nmr and deodr agree {check_same_image(workload, deodr_mesh(workload.faces))}")
+    """deodr in one process, and in several that share the batch if it is large enough. `stack` ends the processes."""
+    with torch.no_grad():
+        vertices, mesh = workload.camera.transform(workload.vertices), deodr_mesh(workload.faces)
+        theirs = DeodrImages.apply(vertices, workload.size, mesh, workload.outputs[0])
+        check_same("deodr", workload.images(workload.vertices)[0], theirs)
     programs: dict[str, Program] = {"deodr, 1 process": lambda: run_deodr(workload, targets)}
     if not 1 < processes <= len(workload.vertices):
         return programs
@@ -128,14 +120,14 @@ def deodr_programs(
 
     def run_parts() -> Timing:
         times = list(pool.map(run_deodr, *zip(*tasks, strict=True)))
-        return max(forward for forward, _ in times), max(total for _, total in times)  # the slowest counts
+        return tuple(map(max, zip(*times, strict=True)))  # the slowest process counts
 
     return programs | {f"deodr, {processes} processes": run_parts}
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One row of the table: ``ours`` and ``theirs`` draw images of the same vertices ``[1, V, 3]``."""
+    """One row of the table: `ours` and `theirs` draw images of the same vertices [1, V, 3]."""
 
     title: str
     peer: str
@@ -144,7 +136,7 @@ class Comparison:
     theirs: Callable[[Tensor], Tensor]
     gradient: bool = True
 
-    def run(self, draw: Callable[[Tensor], Tensor]) -> Timing:
+    def time(self, draw: Callable[[Tensor], Tensor]) -> Timing:
         leaf = self.vertices.clone().requires_grad_(self.gradient)
         start = time.perf_counter()
         image = draw(leaf)
@@ -155,26 +147,22 @@ class Comparison:
 
     def check(self) -> None:
         with torch.no_grad():
-            ours, theirs = self.ours(self.vertices), self.theirs(self.vertices)
-        background = FAR if ours.max() > 1 else 0.0
-        wrong = (ours - theirs)[(ours != background) | (theirs != background)].abs().median()
-        if not wrong < 5e-3:  # pyrender's depth is that of a sample beside the centre
-            raise SystemExit(f"{self.title}: nmr and {self.peer} draw different images (median {float(wrong):.1e})")
+            check_same(f"{self.peer} ({self.title})", self.ours(self.vertices), self.theirs(self.vertices))
 
 
 def against_deodr(work: Workload) -> Comparison:
-    mesh, place = deodr_mesh(work.faces), work.camera.transform
+    mesh, transform = deodr_mesh(work.faces), work.camera.transform
     return Comparison(
         f"silhouette with gradient, {work.faces_and_size}",
         "deodr",
         work.vertices,
-        lambda v: nmr.render_silhouette(place(v), work.faces, image_size=work.size, anti_aliasing=False),
-        lambda v: DeodrImages.apply(place(v), work.size, mesh, "alpha"),
+        lambda v: nmr.render_silhouette(transform(v), work.faces, image_size=work.size, anti_aliasing=False),
+        lambda v: DeodrImages.apply(transform(v), work.size, mesh, "alpha"),
     )
 
 
 def against_pytorch3d(work: Workload) -> Comparison:
-    """The vertices are in renderer space; PyTorch3D's x points to the left."""
+    """PyTorch3D's soft silhouettes. Vertices are in renderer space; PyTorch3D's x axis points to the left."""
     from pytorch3d.renderer.mesh.rasterize_meshes import rasterize_meshes
     from pytorch3d.structures import Meshes
 
@@ -196,10 +184,11 @@ def against_pytorch3d(work: Workload) -> Comparison:
 
 
 def _depth(work: Workload, peer: str, theirs: Callable[[], Tensor]) -> Comparison:
-    how = dict(image_size=work.size, anti_aliasing=False)
+    def ours(vertices: Tensor) -> Tensor:
+        return nmr.render_depth(vertices, work.faces, work.camera, image_size=work.size, anti_aliasing=False)
+
     title = f"depth, {work.faces_and_size}"
-    ours = lambda v: nmr.render_depth(v, work.faces, work.camera, **how)  # noqa: E731
-    return Comparison(title, peer, work.vertices, ours, lambda v: theirs(), gradient=False)
+    return Comparison(title, peer, work.vertices, ours, lambda vertices: theirs(), gradient=False)
 
 
 def _in_camera(work: Workload) -> tuple[np.ndarray, float]:
@@ -211,7 +200,7 @@ def _in_camera(work: Workload) -> tuple[np.ndarray, float]:
 
 
 def against_open3d(work: Workload) -> Comparison:
-    """Open3D's ray caster; the mesh and its tree of boxes are kept."""
+    """Open3D's ray caster. Its bounding boxes are built before the measurement."""
     import open3d
 
     points, tangent = _in_camera(work)
@@ -229,7 +218,7 @@ def against_open3d(work: Workload) -> Comparison:
 
 
 def against_osmesa(work: Workload) -> Comparison:
-    """OSMesa behind pyrender (or Mesa's EGL, with PYOPENGL_PLATFORM=egl); the mesh is kept."""
+    """Mesa behind pyrender: OSMesa, or EGL with PYOPENGL_PLATFORM=egl. The mesh is uploaded before the measurement."""
     os.environ.setdefault("PYOPENGL_PLATFORM", "osmesa")
     import pyrender
 
@@ -247,12 +236,12 @@ def against_osmesa(work: Workload) -> Comparison:
     return _depth(work, "Mesa", theirs)
 
 
-# Each with the subdivisions of its sphere and the size of its images.
+# Each peer with the subdivisions of its sphere and the size of its images.
 PEERS = ((against_deodr, 3, 256), (against_pytorch3d, 3, 64), (against_open3d, 4, 512), (against_osmesa, 4, 512))
 
 
 def print_table(repeats: int, size: int | None = None) -> None:
-    """A table in Markdown of those peers that are installed, one thread each."""
+    """Print a table in Markdown: a row per installed peer, one thread each."""
     torch.set_num_threads(1)
     print("| one thread, milliseconds | peer | nmr | |\n|---|---|---|---|")
     for against, subdivisions, pixels in PEERS:
@@ -262,6 +251,6 @@ def print_table(repeats: int, size: int | None = None) -> None:
             print(f"| ({against.__name__}: {type(error).__name__}, {str(error).splitlines()[0]}) | | | |")
             continue
         row.check()
-        times = measure({"theirs": partial(row.run, row.theirs), "ours": partial(row.run, row.ours)}, repeats)
+        times = measure({"theirs": partial(row.time, row.theirs), "ours": partial(row.time, row.ours)}, repeats)
         theirs, ours = (times[name][1] for name in ("theirs", "ours"))
         print(f"| {row.title} | {row.peer} {theirs:.1f} | {ours:.1f} | {theirs / ours:.1f} times |", flush=True)

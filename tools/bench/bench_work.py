@@ -1,4 +1,4 @@
-"""Workloads of tools/bench/bench.py, our renderer on them, and the stopwatch."""
+"""The workloads of tools/bench/bench.py, and the measurement of their times."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TEXELS = 128  # along each side of a texture image
 
 @dataclass(frozen=True)
 class Workload:
-    """Meshes ``[B, V, 3]`` in world space and a camera each; images of ``size``, anti-aliased or not."""
+    """Meshes [B, V, 3] in world space with a camera each, and the images to be drawn of them."""
 
     vertices: Tensor
     faces: Tensor
@@ -28,7 +28,7 @@ class Workload:
     size: int
     anti_aliasing: bool = True
     outputs: tuple[str, ...] = ("alpha",)  # outputs of nmr.render; the loss is the sum over them
-    values: Tensor | None = None  # colours [B, V, 3] of vertices, or texture images [B, 128, 128, 3]; None: white
+    values: Tensor | None = None  # colours of vertices [B, V, 3] or texture images [B, 128, 128, 3]; None: white
     lights: bool = False
 
     def __str__(self) -> str:
@@ -40,38 +40,38 @@ class Workload:
         return f"{len(self.faces):,} faces, {self.size} px"
 
     def images(self, vertices: Tensor, values: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Our images of ``vertices`` with the colours ``values``, in the order of ``outputs``."""
+        """The images that nmr draws of these vertices in these colours, in the order of `outputs`."""
         options = {"image_size": self.size, "anti_aliasing": self.anti_aliasing}
         if "rgb" in self.outputs:
             values = self.values if values is None else values
-            if values is not None:
-                of_vertices = values.ndim == 3
-                uv = sphere_uv(nmr.icosphere(3)[0])
-                options["colors"] = nmr.VertexColors(values) if of_vertices else nmr.UVTexture(values, uv)
+            if values is not None and values.ndim == 3:
+                options["colors"] = nmr.VertexColors(values)
+            elif values is not None:
+                options["colors"] = nmr.UVTexture(values, sphere_uv(nmr.icosphere(3)[0]))
             options["lights"] = nmr.Lights() if self.lights else None
         images = nmr.render(vertices, self.faces, self.camera, outputs=self.outputs, **options)
         return tuple(getattr(images, name) for name in self.outputs)
 
     def targets(self) -> tuple[Tensor, ...]:
-        """Images of the neighbour in the batch, or of an ellipsoid in a batch of one."""
-        alone = len(self.vertices) == 1
+        """Images of the next mesh of the batch, or of an ellipsoid in a batch of one."""
+        other = self.vertices.roll(1, 0) if len(self.vertices) > 1 else self.vertices * torch.tensor([1.1, 0.7, 0.9])
         with torch.no_grad():
-            return self.images(self.vertices * torch.tensor([1.1, 0.7, 0.9]) if alone else self.vertices.roll(1, 0))
+            return self.images(other)
 
     def loss(self, images: tuple[Tensor, ...], targets: tuple[Tensor, ...]) -> Tensor:
-        """1 - soft IoU of silhouettes, mean squared difference of anything else."""
+        """1 - soft IoU of silhouettes, and the mean squared difference of other images."""
         return sum(
             nmr.losses.soft_iou_loss(image, target) if name == "alpha" else (image - target).square().mean()
             for name, image, target in zip(self.outputs, images, targets, strict=True)
         )
 
-    def part(self, some: slice) -> Workload:
-        """Some meshes of the batch."""
-        camera = nmr.LookAt(self.camera.eye[some], half_fov_deg=self.camera.half_fov_deg)
-        return replace(self, vertices=self.vertices[some], camera=camera)
+    def part(self, which: slice) -> Workload:
+        """The workload with these meshes of the batch alone."""
+        camera = nmr.LookAt(self.camera.eye[which], half_fov_deg=self.camera.half_fov_deg)
+        return replace(self, vertices=self.vertices[which], camera=camera)
 
     def run(self, targets: tuple[Tensor, ...], learn_values: bool = False) -> Timing:
-        """From vertices in world space to their gradients and, if they are learned, those of the colours."""
+        """Time forward and backward pass: gradients of the vertices and, with `learn_values`, of the colours."""
         leaf = self.vertices.clone().requires_grad_()
         values = self.values.clone().requires_grad_() if learn_values else self.values
         start = time.perf_counter()
@@ -82,7 +82,7 @@ class Workload:
 
 
 def deformed_spheres(batch: int, subdivisions: int, size: int, **more: object) -> Workload:
-    """Icospheres, axes scaled by 0.4..1.2, noise 0.03, times 0.5; distance 2.732, elevation 30, half fov 15."""
+    """Icospheres scaled by 0.2 .. 0.6 along each axis, with noise, seen from random azimuths."""
     g = torch.Generator().manual_seed(0)
     sphere, faces = nmr.icosphere(subdivisions)
     scale = 0.4 + 0.8 * torch.rand(batch, 1, 3, generator=g)
@@ -93,7 +93,7 @@ def deformed_spheres(batch: int, subdivisions: int, size: int, **more: object) -
 
 
 def colored_spheres(kind: str, batch: int, size: int = 64) -> Workload:
-    """Spheres with colours of a kind, for each mesh its own: white, vertex, uv or uv-lights."""
+    """Spheres of 1,280 faces, each with its own colours. kind: white, vertex, uv or uv-lights."""
     spheres = deformed_spheres(batch, 3, size, outputs=("rgb",), lights=kind == "uv-lights")
     shape = (spheres.vertices.shape[1],) if kind == "vertex" else (TEXELS, TEXELS)
     values = torch.rand(batch, *shape, 3, generator=torch.Generator().manual_seed(1))
@@ -101,20 +101,20 @@ def colored_spheres(kind: str, batch: int, size: int = 64) -> Workload:
 
 
 def sphere_uv(vertices: Tensor) -> Tensor:
-    """Longitude and latitude ``[V, 2]`` of points on the unit sphere ``[V, 3]``, both in [0, 1]."""
+    """Longitude and latitude [V, 2], both in [0, 1], of points on the unit sphere [V, 3]."""
     longitude = torch.atan2(vertices[:, 0], vertices[:, 2]) / (2 * math.pi) + 0.5
     return torch.stack([longitude, torch.asin(vertices[:, 1].clamp(-1, 1)) / math.pi + 0.5], dim=1)
 
 
-Timing = tuple[float, float]  # seconds forward, and in all
+Timing = tuple[float, float]  # seconds: forward pass, total
 Program = Callable[[], Timing]
 
 
 def measure(programs: dict[str, Program], repeats: int) -> dict[str, tuple[float, float, float]]:
-    """Milliseconds of each program: median forward, median in all, fastest in all.
+    """Milliseconds of each program: median of the forward pass, median and minimum of the total.
 
-    Repeats alternate between them; the first call of each turn finds the caches full of another program's data and is
-    not timed.
+    Repeats alternate between the programs. Each turn begins with a call that is not timed, because the caches are full
+    of another program's data.
     """
     times: dict[str, list[Timing]] = {name: [] for name in programs}
     for _ in range(repeats):
@@ -129,10 +129,7 @@ def measure(programs: dict[str, Program], repeats: int) -> dict[str, tuple[float
 
 
 def report(title: str, programs: dict[str, Program], repeats: int) -> None:
-    """Measure and print one workload, and the conditions that its figures depend on besides the programs.
-
-    A load far above 0 means that the machine was busy.
-    """
+    """Measure one workload and print the times, with the load of the machine: far above 0 means that it was busy."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
     rows = measure(programs, repeats)
     print(f"\n{title}\n{repeats} repeats, torch {torch.__version__}, {platform.machine()}, load {load:.1f}")
