@@ -1,4 +1,4 @@
-"""The terminal: the end of a command, the lines that it prints, and the signals that ask it to stop."""
+"""The terminal: errors and lines of a command, and signals that stop it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import ParamSpec, TextIO
 P = ParamSpec("P")
 
 INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
-#: Control characters, those that turn the direction of reading, and halves of characters, which cannot be written.
+#: Control characters, characters that change the direction of text, and surrogates, which cannot be encoded.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -45,21 +45,21 @@ def without_traceback(*errors: type[Exception]) -> Callable[[Callable[P, int]], 
 
 
 def plain(text: str) -> str:
-    r"""The text with control characters but tabs and line ends written out (\x1b): names in it may be a stranger's."""
+    r"""Escape control characters (\x1b) except tabs and line ends: the text may have names from untrusted files."""
     return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 def say(text: str) -> None:
-    """Print a line of the results, by way of `plain`. A reader that has left (`| head`) is no error.
+    """Print a line of the results through `plain`. A closed pipe (`| head`) is no error.
 
-    Raises OSError if it cannot be written for another reason (`> file` on a full disk): the result is lost then.
+    Raises OSError if the line cannot be written for another reason (a full disk), because the result is lost.
     """
     with contextlib.suppress(BrokenPipeError):
         _print(text, sys.stdout)
 
 
 def note(text: str) -> None:
-    """Print a line about the progress on stderr, apart from the results. If that fails, work goes on."""
+    """Print a line about the progress on stderr, apart from the results. Failures are ignored."""
     with contextlib.suppress(OSError, ValueError):  # ValueError: it was closed
         _print(text, sys.stderr)
 
@@ -79,7 +79,7 @@ def _print(text: str, stream: TextIO) -> None:
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """The message about a name that does not exist: the names that it may be meant to be, and all that there are."""
+    """The error message for an unknown name: similar names, and all known ones."""
     known = list(known)
     near = " or ".join(map(repr, difflib.get_close_matches(name, known, n=2)))
     advice = f"did you mean {near}? There are" if near else "choose one of"
@@ -87,7 +87,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
 
 
 def align(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of equally many cells as lines, every column as wide as its widest cell."""
+    """Rows with the same number of cells as lines; each column is as wide as its widest cell."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
     return "\n".join(line.rstrip() for line in lines)
@@ -95,17 +95,17 @@ def align(rows: Sequence[Sequence[str]]) -> str:
 
 @dataclass
 class Stop:
-    """The name of the signal that asked to stop, "" if there was none."""
+    """A request to stop."""
 
-    name: str = ""
+    name: str = ""  # the signal that asked to stop; "" if none did
 
 
 @contextlib.contextmanager
 def stop_on_signal() -> Iterator[Stop]:
     """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop; a second SIGINT interrupts at once.
 
-    SIGHUP comes when the terminal is closed. If it is ignored (nohup) it stays so. Outside the main thread, to which
-    Python gives all signals, nothing happens.
+    SIGHUP comes when the terminal is closed; if it is ignored (nohup), it stays ignored. Does nothing outside the main
+    thread, because only this one can handle signals.
     """
     stop, previous = Stop(), {}
 

@@ -82,7 +82,7 @@ def test_the_table_of_peers_names_all_and_measures_those_that_are_there(monkeypa
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 7 and "depth, 80 faces, 16 px | none" in lines[-1] and all(x.count("|") >= 5 for x in lines)
     shift = 0.01
-    with pytest.raises(SystemExit, match="nmr and none .* draw different images"):
+    with pytest.raises(SystemExit, match=r"nmr and none .* draw different images"):
         bench_peers.print_table(1)
 
 

@@ -1,4 +1,4 @@
-"""Measures the fit of camera and shape on the images of a data set, as if their cameras were unknown.
+"""Measures how well camera and shape are fitted to the images of a data set, with the cameras treated as unknown.
 
 python tools/measure_fit.py --data data --category chair,sofa --images 20
 """
@@ -21,10 +21,10 @@ COLUMNS = ("predicted", "code fitted", "vertices fitted", "voxels predicted", "v
 
 
 def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = None, images: int = 20) -> None:
-    """A line for each category: means over `images` test images, spread evenly over objects and views.
+    """Print a line for each category: means over `images` test images, spread evenly over objects and views.
 
-    The first three columns are the IoU of outline and silhouette, the next two voxel IoU (kato18), then the shares of
-    images whose azimuth is right within 20 degrees and of those that are warned of.
+    Columns: three IoUs of mask and silhouette, two voxel IoUs (kato18), the share of images whose azimuth is right
+    within 20 degrees, the share with a warning.
     """
     model = load_model(run)
     print(f"{'':12}", *(f"{column:>16}" for column in COLUMNS))
@@ -40,9 +40,9 @@ def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = 
                 float(nmr.metrics.voxel_iou(dataset.voxelize(shape, model.method.faces), batch.voxels))
                 for shape in (model.method.decode(code).vertices, fitted.vertices[None].clamp(-0.499, 0.499))
             ]
-            apart = wrap_deg(fitted.view.azimuth_deg - azimuths_deg(batch.poses))
+            error_deg = wrap_deg(fitted.view.azimuth_deg - azimuths_deg(batch.poses))
             warned = recognize(model, image)[1] is not None
-            row = (fitted.predicted_iou, fitted.code_iou, fitted.iou, *ious, float(apart.abs()) < 20, warned)
+            row = (fitted.predicted_iou, fitted.code_iou, fitted.iou, *ious, float(error_deg.abs()) < 20, warned)
             rows.append(row)
         print(f"{name:12}", *(f"{value:16.3f}" for value in np.mean(rows, axis=0)), flush=True)
 

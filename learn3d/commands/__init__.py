@@ -1,6 +1,6 @@
-"""The program `learn3d`: each command is a class, whose module is imported when the command is known.
+"""The program `learn3d`. Each command is a class; its module is imported when the command is called.
 
-torch takes seconds to import, and Ctrl-C may come in the middle of it.
+torch takes seconds to import. So it is imported inside of `main`, which handles Ctrl-C.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from typing import Annotated, Any, Union
 
 from learn3d.terminal import note, say, unknown_name, without_traceback
 
-#: Module and class of each command, the extra that has its packages, and what it does.
+#: For each command: its module and class, the extra that installs its packages, and a description.
 COMMANDS = {
     "train": ("train:Train", "train", "train a model that turns one image into a 3D shape"),
     "evaluate": ("models:Evaluate", "train", "measure trained models on a test set"),
     "reconstruct": ("models:Reconstruct", "train", "turn images into meshes with a trained model"),
     "export": ("models:Export", "train", "write a trained model into one small file"),
-    "demo": ("pages:Demo", "demo", "a page that turns pictures into meshes"),
-    "make-dataset": ("data:MakeDataset", "data", "render a data set from meshes"),
-    "convert-dataset": ("data:ConvertDataset", "train", "keep a data set in shards, for data larger than memory"),
+    "demo": ("pages:Demo", "demo", "open a page that turns pictures into meshes"),
+    "make-dataset": ("data:MakeDataset", "train", "render a data set from meshes"),
+    "convert-dataset": ("data:ConvertDataset", "train", "convert a data set into shards, for data larger than memory"),
     "check-dataset": ("data:CheckDataset", "train", "list everything that is wrong with a data set"),
     "estimate-poses": ("poses:EstimatePoses", "train", "find the poses of images from their masks"),
     "experiment": ("train:Experiment", "train", "make a table of the paper: train, measure, report"),
     "figures": ("pages:Figures", "figures", "draw the paper's figures from trained models"),
     "report": ("pages:Report", "report", "write a page about trained models, with shapes to turn"),
-    "fetch-debian-models": ("data:FetchDebianModels", "data", "get meshes out of Debian packages"),
+    "fetch-debian-models": ("data:FetchDebianModels", "train", "get meshes out of Debian packages"),
 }
 HELP = """usage: learn3d COMMAND [OPTIONS]
 
@@ -42,7 +42,7 @@ or, with zsh and a folder in its $fpath: learn3d --completion zsh > FOLDER/_lear
 
 @without_traceback(MemoryError, FloatingPointError)
 def main(*given: str) -> int:
-    """Run the command that `given`, or else the command line, names; returns the exit status."""
+    """Run the command line, with the words `given` before it; returns the exit status."""
     name, *arguments = [*given, *sys.argv[1:]] or ["--help"]
     if name in ("-h", "--help", "--help-all"):
         say(HELP.format(commands="\n".join(f"  {command:19}  {text}" for command, (*_, text) in COMMANDS.items())))
@@ -72,7 +72,7 @@ def _load(name: str) -> Any:
 
 
 def print_completion(shell: str, *others: str) -> int:
-    """Print the script that completes commands and options in a shell; commands that lack a package are left out."""
+    """Print the shell script of tab completion. Commands whose packages are not installed are left out."""
     import tyro
 
     if shell not in ("bash", "zsh", "tcsh") or others:

@@ -1,7 +1,7 @@
-"""A command is a dataclass: its docstring describes it, its fields are its options, the strings below explain these.
+"""Commands as dataclasses: the docstring describes the command, its fields are options, the texts below them the help.
 
-tyro parses the command line into it and writes the help. A field that holds a dataclass adds the fields of that to the
-options. If a default stands for "not given", its text says what happens then, in parentheses: "(default: ...)".
+tyro parses the command line and writes the help. If a field holds a dataclass, its fields are options, too. If a
+default means "not given", the help text explains it in parentheses: "(default: ...)".
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ class Command:
 
     @classmethod
     def about(cls, everything: bool) -> str:
-        """The text above the options in --help, or, with `everything`, in --help-all."""
+        """The text above the options in --help; with `everything`, in --help-all."""
         return inspect.getdoc(cls) or ""
 
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> Mapping[str, Any]:
-        """Values of options that depend on other options, by name. They replace the defaults of the fields."""
+        """Defaults that depend on other options, by name. They replace the defaults of the fields."""
         return {}
 
     @classmethod
     def parse(cls, name: str, arguments: Sequence[str]) -> Self:
-        """The command with the options that are given. Prints the help and ends if that is asked for."""
+        """The command with the given options. Prints the help and exits if --help is among them."""
         defaults, everything = cls.defaults(arguments), "--help-all" in arguments
         brief = bool({"-h", "--help"} & set(arguments)) and not everything
         about = cls.about(everything) if brief or everything else ""
         if brief and any(rare for *_, rare in _options(cls, defaults)):
             about += f"\n\nlearn3d {name} --help-all shows more options."
-        # The command is built afterwards: tyro would catch the ValueError of a value that is refused.
+        # tyro parses into a flat dataclass without checks, because it would catch the ValueError of a refused value.
         flat = cls.flat(defaults, brief)
         words = ["--help"] if everything else arguments
         return _build(cls, defaults, vars(tyro.cli(flat, args=words, prog=f"learn3d {name}", description=about)))
 
     @classmethod
     def flat(cls, defaults: Mapping[str, Any], brief: bool = False) -> type:
-        """A dataclass of all options, for tyro; if `brief`, it hides the rare ones."""
+        """A dataclass of all options for tyro. With `brief` the rare ones are hidden."""
         options = _options(cls, defaults)
         fields = [(n, tyro.conf.Suppress[hint] if brief and rare else hint, field) for n, hint, field, rare in options]
         return dataclasses.make_dataclass(cls.__name__, fields, kw_only=True)
@@ -66,7 +66,7 @@ class Command:
 
 @dataclass(frozen=True, kw_only=True)
 class OnDataset(Command):
-    """Options of commands that take trained networks to a data set."""
+    """Options of commands that apply trained networks to a data set."""
 
     data: Path | None = None
     """Folder of the data set (default: the run's training data)."""
@@ -75,8 +75,8 @@ class OnDataset(Command):
     split: Split = "test"
     """Part of the data set."""
     which: Which = "last"
-    """Checkpoint of a run: the last one, or the one with the best validation IoU (of silhouettes at novel views, if
-    there are any)."""
+    """Checkpoint of a run: the last one, or the one with the best validation IoU (of silhouettes at novel views, if the
+    data have several views of an object)."""
 
     @property
     def source(self) -> dict[str, Any]:
@@ -87,9 +87,9 @@ class OnDataset(Command):
 def _options(
     kind: type, defaults: Mapping[str, Any], instance: Any = None, rare: bool = False
 ) -> Iterator[tuple[str, Any, Any, bool]]:
-    """Name, type, field and whether it is rare, of each option of a dataclass and of the dataclasses in it.
+    """Name, type, field and rarity of each option of a dataclass and of the dataclasses in it.
 
-    The values of an `instance` go before the defaults of its fields.
+    The values of an `instance` have precedence over the defaults of its fields.
     """
     hints, texts = typing.get_type_hints(kind, include_extras=True), _texts(kind)
     for field in dataclasses.fields(kind):
@@ -112,7 +112,7 @@ def _options(
 
 
 def _build(kind: type, defaults: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
-    """The dataclass of these options."""
+    """An instance of the dataclass, and of those in it, from the values of the options."""
     hints, given = typing.get_type_hints(kind), {}
     for field in dataclasses.fields(kind):
         inner = _inner(hints[field.name], defaults.get(field.name))
@@ -121,12 +121,12 @@ def _build(kind: type, defaults: Mapping[str, Any], values: Mapping[str, Any]) -
 
 
 def _inner(hint: Any, value: Any) -> type | None:
-    """The dataclass that a field holds, None for a field of another type."""
+    """The dataclass that a field holds; None for other types."""
     kind = type(value) if dataclasses.is_dataclass(value) else hint
     return kind if dataclasses.is_dataclass(kind) else None
 
 
 def _texts(kind: type) -> dict[str, str]:
-    """The strings below the fields of a dataclass and of its base classes, each in one line."""
+    """The strings below the fields of a dataclass and of its base classes, without line breaks."""
     bases = [docstring_parser.parse_from_object(base).params for base in reversed(kind.__mro__[:-1])]
     return {text.arg_name: " ".join((text.description or "").split()) for texts in bases for text in texts}

@@ -62,12 +62,12 @@ class FetchDebianModels(Command):
 
 @dataclass(frozen=True)
 class CheckDataset(Command):
-    """Read every file of a data set and list everything that is wrong: missing, cut short, empty, inconsistent.
+    """Read every file of a data set and list all faults: missing, truncated, empty or inconsistent files.
 
     Example:
       learn3d check-dataset DATA --layout kar --category airplane,chair --split train
 
-    The exit status is 1 if training or evaluation would fail (an error), 0 if there are warnings at most.
+    The exit status is 1 if there are errors, with which training or evaluation would fail, and 0 otherwise.
     """
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
@@ -85,8 +85,9 @@ class CheckDataset(Command):
         if self.json is not None:
             check_target(self.json, "--json")
         report = check_folder(self.layout, self.folder, split_names(self.category), self.split, progress=is_watched())
-        for problem in [problem for split in report.splits for problem in split.problems]:
-            say(f"{problem.severity}: {problem.path}: {problem.message}")
+        for split in report.splits:
+            for problem in split.problems:
+                say(f"{problem.severity}: {problem.path}: {problem.message}")
         errors, warnings = report.count("error"), report.count("warning")
         say(f"\n{report.table()}\n\n{errors} errors, {warnings} warnings")
         if self.json is not None:
@@ -96,13 +97,13 @@ class CheckDataset(Command):
 
 @dataclass(frozen=True)
 class ConvertDataset(Command):
-    """Convert a data set into shards, which training reads piece by piece: for data that do not fit into memory.
+    """Convert a data set that is larger than memory into shards, which training reads piece by piece.
 
     Example:
       learn3d convert-dataset --data KAR --layout kar --output SHARDS --category chair,airplane
 
-    Then give SHARDS instead of DATA, with the same layout, to the other commands (docs/scale.md). Splits that are
-    complete already are left as they are.
+    Then give the other commands SHARDS in place of DATA, with the same layout (docs/scale.md). Splits that are complete
+    are skipped.
     """
 
     data: Path
@@ -114,24 +115,24 @@ class ConvertDataset(Command):
     layout: Layout = "kato"
     """Arrangement of the files of the data set, see docs/data-sets.md."""
     image_size: int = IMAGE_SIZE
-    """Side of the images in pixels, as the method's encoder takes them; larger ones are made smaller."""
+    """Side of the images in pixels, for the method's encoder; larger images are scaled down."""
     views_per_object: Count | None = None
     """Number of training images to keep of each object (default: the layout's protocol, one for kar, else all)."""
 
     def run(self) -> None:
         check_target(self.output, "--output", folder=True)
         found = READERS[self.layout].contents(self.data)
-        there = {synset_of(category): splits for category, splits in found.items()}
+        splits_of = {synset_of(category): splits for category, splits in found.items()}
         if not (wanted := split_names(self.category) or found):
             raise ValueError(f"{self.data} holds nothing of the layout {self.layout!r}")
         for category in wanted:
-            splits = there.get(synset_of(category), ("train",))
+            splits = splits_of.get(synset_of(category), ("train",))
             if self.layout == "pascal3d" and "val" in splits:
-                splits = (*splits, "test")  # the same photographs, which evaluation asks for by this name
+                splits = (*splits, "test")  # evaluation reads the val photographs by this name
             for split in splits:
                 folder = shards.split_folder(self.output, category, split)
                 if shards.holds(self.output, category, split):
-                    say(f"{folder}: is there; remove it to convert it again")
+                    say(f"{folder}: exists; remove it to convert it again")
                 else:
                     self._convert(category, split, folder)
 

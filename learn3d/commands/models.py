@@ -1,4 +1,4 @@
-"""Commands on trained models: measure them, take them to images, write them into a small file."""
+"""Commands on trained models: measure them, reconstruct images, export them."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ class Reconstruct(OnDataset):
     indices: tuple[int, ...] = (0,)
     """Images of the data set: object * V + view, if each object has V views (Kato's: 24, Kar's: 20)."""
     refine: bool | None = None
-    """Fit the predicted shapes to the masks, with the cameras of a data set or, for image files, with estimated cameras
-    and colours (default: yes for image files, no for --data)."""
+    """Fit the predicted shapes to the masks. The cameras are those of the data set; for image files cameras and colours
+    are estimated (default: yes for image files, no for --data)."""
     format: Literal["glb", "obj", "ply"] = "glb"
     """Format of the mesh files."""
 
@@ -97,9 +97,8 @@ class Reconstruct(OnDataset):
         else:
             options = {name: getattr(self, name) for name in ("crop", "plain_background", "box", "which")}
             options["refined"] = self.refine is not False
-            paths = reconstruct_files(
-                self.model, self.output, self.images, self.masks, mesh_format=self.format, **options
-            )
+            files = (self.model, self.output, self.images, self.masks)
+            paths = reconstruct_files(*files, mesh_format=self.format, **options)
         say("\n".join(map(str, paths)))
 
     def _check(self) -> None:
@@ -111,15 +110,14 @@ class Reconstruct(OnDataset):
         kind, others = "image files", ("category", "split", "indices")
         if self.data is not None:
             kind, others = "--data", ("masks", "plain_background", "box", "crop")
-        if wrong := [
-            f"--{name.replace('_', '-')}" for name in others if getattr(self, name) != getattr(Reconstruct, name)
-        ]:
-            raise ValueError(f"{', '.join(wrong)} does not go with {kind}; leave it out")
+        if wrong := [name for name in others if getattr(self, name) != getattr(Reconstruct, name)]:
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in wrong)
+            raise ValueError(f"{options} does not go with {kind}; leave it out")
 
 
 @dataclass(frozen=True)
 class Export(Command):
-    """Write the networks of a run into one small file to give away: half precision, nothing that only training needs.
+    """Write the networks of a run into one small file: in half precision, without the parts for training alone.
 
     Example:
       learn3d export --run runs/chair --output chair.safetensors
@@ -130,10 +128,10 @@ class Export(Command):
     output: Path
     """File to write, .safetensors."""
     which: Which = "last"
-    """Networks of a run to use: the last ones, or those with the best validation IoU."""
+    """Checkpoint of a run: the last one, or the one with the best validation IoU."""
     others: Path | None = None
-    """Folder of PNG files with transparency that show other things: `reconstruct` warns of their like (default: it
-    warns of all that is far from the training images)."""
+    """Folder of PNG files with transparency that show other things, so that `reconstruct` warns of such pictures
+    (default: it warns of pictures that are far from all training images)."""
 
     def run(self) -> None:
         from learn3d.reconstruction import cut_out_pictures, load_model

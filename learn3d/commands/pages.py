@@ -1,4 +1,4 @@
-"""Commands that show trained models: figures, a page about runs, a page to try them on."""
+"""Commands that show trained models: figures, a page about runs, and a page that reconstructs pictures."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class Figures(OnDataset):
     runs: tuple[Path, ...]
     """Run folders (or checkpoint files), in the order of the figure."""
     output: Path
-    """File to write; the figure's own file endings replace this one."""
+    """File to write; its ending is replaced by those of the figure's formats."""
     labels: tuple[str, ...] = ()
     """Names of the runs (default: those of their presets)."""
     images: int | None = None
     """Number of images in a grid (default: 6) or an interpolation (default: 3)."""
     indices: tuple[int, ...] = ()
-    """Samples of the data set in a grid or an interpolation (default: as many as --images says, chosen to differ)."""
+    """Samples of the data set in a grid or an interpolation (default: --images of different objects and views)."""
     truth: bool = False
     """Show the ground-truth voxels in a grid as well."""
 
@@ -58,7 +58,7 @@ class Figures(OnDataset):
 
 @dataclass(frozen=True, kw_only=True)
 class Report(OnDataset):
-    """Write one HTML file about trained runs: options, curves, test IoU, and shapes that can be turned by hand.
+    """Write one HTML file about trained runs: options, curves, test IoU, and shapes that one can turn.
 
     Examples:
       learn3d report runs/plus runs/vanilla --output report.html
@@ -74,8 +74,8 @@ class Report(OnDataset):
     objects: int = 12
     """Number of objects to show, spread from the best IoU to the worst."""
     indices: tuple[int, ...] = ()
-    """Numbers of the images to show (default: as --objects says). With V views of each object, image n * V + k is view
-    k of object n."""
+    """Numbers of the images to show (default: from --objects). With V views of each object, image n * V + k is view k
+    of object n."""
 
     def run(self) -> None:
         from learn3d.pages.report import write_report
@@ -100,9 +100,9 @@ class Demo(Command):
     port: int = 7860
     """Port of the page's address, http://HOST:PORT."""
     host: str = "127.0.0.1"
-    """Address to listen on. With 0.0.0.0 anybody in the network can use the page."""
+    """Address to listen on. With 0.0.0.0 everybody in the network can use the page."""
     browser: bool = True
-    """Open a browser, or only print the address."""
+    """Open a browser, or only print the address of the page."""
 
     def run(self) -> None:
         from learn3d.demo.server import serve

@@ -28,14 +28,14 @@ class EstimatePoses(Command):
       learn3d estimate-poses photos --layout photos --category mug --elevation 20 --output mug-poses.npz
       learn3d estimate-poses DATA --category airplane --output poses.npz --compare
 
-    Beside the table it writes a sheet (poses.png). Look at it: the images below each azimuth must all be seen from
-    there. Azimuths are counted from a side that the estimate chooses.
+    It also writes a sheet (poses.png). Look at it: all images below an azimuth must show the object from there.
+    Azimuth 0 is a side that the estimate chooses.
     """
 
     data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
     """Folder of the data set."""
     category: str
-    """Categories, separated by commas. They share their prototypes."""
+    """Categories, separated by commas, which share the prototypes."""
     output: Path
     """File of the table (.npz)."""
     layout: Layout = "kato"
@@ -43,9 +43,9 @@ class EstimatePoses(Command):
     options: PoseOptions
     cameras: CameraOptions
     candidates: Annotated[int, tyro.conf.arg(metavar="INT")] = 4
-    """Number of poses of each image in the table, each with its probability; training draws one in each step."""
+    """Number of poses of each image in the table, with probabilities; each training step draws one."""
     compare: bool = False
-    """Compare with the data set's own azimuths, and turn the table into their frame, so that voxel IoU is measured."""
+    """Compare with the known azimuths, and turn the table into their frame, so that voxel IoU can be measured."""
     views_per_object: Count | None = None
     """Number of training images of each object (default: the layout's protocol, one for kar, else all)."""
 

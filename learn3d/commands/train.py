@@ -21,7 +21,7 @@ from learn3d.training import train
 
 @dataclass(frozen=True)
 class _Origin:
-    """The options that decide which others there are, and their defaults."""
+    """The options that decide the other options and their defaults."""
 
     preset: str | None = None
     resume: bool = False
@@ -68,7 +68,7 @@ class Train(Command):
         return vars(saved)
 
     def run(self) -> int:
-        """Train, and say how it ended; the exit status is 130 if a signal stopped it."""
+        """Train and print a summary. The exit status is 130 if a signal stopped the training."""
         if self.resume and self.overwrite:
             raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
         summary = train(self.config, resume=self.resume, overwrite=self.overwrite)
@@ -78,7 +78,7 @@ class Train(Command):
 
 @dataclass(frozen=True)
 class Experiment(Request, Command):
-    """Make a table of the paper: train its runs, measure them, and put the paper's figures beside ours.
+    """Make a table of the paper: train its runs, measure them, and report the paper's figures beside ours.
 
     Examples:
       learn3d experiment --list
@@ -86,13 +86,13 @@ class Experiment(Request, Command):
       learn3d experiment ablation --data DATA --output OUTPUT --category chair --set precision=fp32
       learn3d experiment mmd --data DATA --output OUTPUT --category airplane,chair --iterations 5000 --report-only
 
-    Tables share their runs: complete runs are skipped, interrupted ones go on, also those that `learn3d train` made in
-    OUTPUT/runs/<category>/<method>-seed<k>. Ctrl-C stops all of them; the same command continues.
+    Tables share their runs in OUTPUT/runs/<category>/<method>-seed<k>, with those that `learn3d train` made there:
+    complete runs are skipped, interrupted ones continue. Ctrl-C stops all of them; the same command continues.
     """
 
     table: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="TABLE")]]
     list: bool = False
-    """Show the tables and their methods, and end."""
+    """Show the tables and their methods, and exit."""
 
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> Mapping[str, Any]:

@@ -1,1 +1,1 @@
-"""The page of `learn3d demo` (extra `demo`): `server` serves it behind `gate`, `picture` computes, `page/` is seen."""
+"""The page of `learn3d demo` (extra `demo`): `server` and `gate` serve the files of `page/`, `picture` makes meshes."""

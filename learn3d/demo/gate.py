@@ -1,4 +1,4 @@
-"""The gate of the page's server: a stranger's web page in the same browser must not be able to use it."""
+"""Access control of the page's server: other web pages in the same browser must not be able to use it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-#: The browser itself refuses whatever is not this server's, and shows the page in no other page's frame.
+#: The browser loads nothing from other servers, and does not show the page in a frame of another page.
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'",
@@ -21,10 +21,10 @@ _HEADERS = {
 
 
 class Gate:
-    """ASGI middleware that refuses requests under another name than this machine's, and those of other pages.
+    """ASGI middleware that refuses requests of other web pages, and those to another host name.
 
-    A stranger's name can lead a browser to this server (DNS rebinding), so the Host must be `host`, an address or a
-    name of this machine.
+    An attacker's host name can point to this server (DNS rebinding). So the Host header must be an IP address, `host`
+    or a name of this machine.
     """
 
     def __init__(self, app: ASGIApp, host: str) -> None:
@@ -32,7 +32,7 @@ class Gate:
         self._app, self._names = app, {host, "localhost", machine, f"{machine}.local"}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def guarded(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 MutableHeaders(scope=message).update(_HEADERS)
             await send(message)
@@ -40,13 +40,13 @@ class Gate:
         headers = Headers(scope=scope)
         host, origin = headers.get("host", ""), headers.get("origin")
         app = self._app
-        if not self._is_here(host):
+        if not self._is_this_machine(host):
             app = PlainTextResponse("open this page by the address of its machine", 403)
         elif origin is not None and urlsplit(origin).netloc != host:
             app = PlainTextResponse("this request comes from another page", 403)
-        await app(scope, receive, guarded)
+        await app(scope, receive, send_with_headers)
 
-    def _is_here(self, host: str) -> bool:
+    def _is_this_machine(self, host: str) -> bool:
         try:
             name = urlsplit(f"//{host}").hostname or ""
             return name in self._names or bool(ipaddress.ip_address(name))

@@ -1,4 +1,4 @@
-"""From pixels that a browser sends to a mask and meshes, one message for each step, and the example pictures."""
+"""Turns the pixels that a browser sends into a mask and meshes, with a message for each step; example pictures."""
 
 from __future__ import annotations
 
@@ -19,39 +19,40 @@ from learn3d.make_data.writers.around import natural_look
 from learn3d.pictures.studio import photograph
 from learn3d.reconstruction import Model, mesh_bytes, reconstruct_picture
 
-SIDE = 512  # pixels that a picture has at most a side; the networks see 64 to 224
-EXAMPLES = {"airplane": 1, "car": 2, "chair": 6, "lamp": 0, "sofa": 3, "table": 7}  # seeds
+SIDE = 512  # largest side of a picture in pixels; the networks see 64 to 224
+EXAMPLES = {"airplane": 1, "car": 2, "chair": 6, "lamp": 0, "sofa": 3, "table": 7}  # category: seed
 _MARGIN = 24  # pixels around the object of an example
 
-Tell = Callable[[dict[str, Any]], None]
+Send = Callable[[dict[str, Any]], None]
 
 
 class Picture(NamedTuple):
-    """A picture, and what is known of its object."""
+    """A picture, and hints about its object."""
 
     colors: np.ndarray  # uint8 [H, W, 3]
-    mask: np.ndarray  # uint8 [H, W], above 127: object; 255 everywhere: not known
-    strokes: np.ndarray | None = None  # uint8 [H, W] as `cutting.correct` has them; None: no corrections
-    box: Box | None = None  # around the object
+    mask: np.ndarray  # uint8 [H, W], above 127: object; 255 everywhere if unknown
+    strokes: np.ndarray | None = None  # corrections of the mask, uint8 [H, W], see `cutting.correct`
+    box: Box | None = None  # box around the object
 
 
 def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> Picture:
-    """The picture that a browser sends: R, G, B, mask for each pixel, then possibly a byte of strokes for each.
+    """Decode a picture that a browser sends: R, G, B, mask for each pixel, then optionally strokes, a byte per pixel.
 
-    Raises ValueError unless it has as many bytes as that.
+    Raises ValueError for a wrong size or number of bytes.
     """
     pixels = width * height
     if not (0 < width <= SIDE and 0 < height <= SIDE) or len(content) not in (4 * pixels, 5 * pixels):
         raise ValueError(f"a picture of {width} x {height} pixels came in {len(content)} bytes; at most {SIDE} a side")
-    given = np.frombuffer(content, np.uint8)
-    planes = given[: 4 * pixels].reshape(height, width, 4)
-    strokes = given[4 * pixels :].reshape(height, width) if len(given) > 4 * pixels else None
-    return Picture(np.ascontiguousarray(planes[..., :3]), planes[..., 3].copy(), strokes, box)
+    values = np.frombuffer(content, np.uint8)
+    rgba = values[: 4 * pixels].reshape(height, width, 4)
+    strokes = values[4 * pixels :].reshape(height, width) if len(values) > 4 * pixels else None
+    return Picture(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3].copy(), strokes, box)
 
 
 def find_object(picture: Picture) -> tuple[np.ndarray, bool]:
-    """The object's mask uint8 [H, W]: by the strokes, as given, or the largest part of what is found in box or picture;
-    whether there were other large parts.
+    """The object's mask uint8 [H, W], and whether other large regions were found.
+
+    The mask is the given one, with its corrections; without one it is the largest region found in the box or picture.
     """
     if picture.box is not None:
         return largest_region(cut_out(picture.colors, picture.box))
@@ -60,38 +61,40 @@ def find_object(picture: Picture) -> tuple[np.ndarray, bool]:
     return largest_region(find_mask(picture.colors)) if picture.mask.min() == 255 else (picture.mask, False)
 
 
-def make_meshes(models: Mapping[str, Model], picture: Picture, tell: Tell) -> None:
-    """Tell the mask, the progress, and in the end the meshes of all models, or an error as a sentence."""
+def make_meshes(models: Mapping[str, Model], picture: Picture, send: Send) -> None:
+    """Send the mask, the progress, and in the end the meshes of all models, or an error as a sentence."""
     try:
         mask, more = find_object(picture)
-        tell({"mask": _base64(np.packbits(mask > 127).tobytes()), "more": more})
+        send({"mask": _base64(np.packbits(mask > 127).tobytes()), "more": more})
         try:
             check_mask(mask, cropped=True)
         except ValueError:
             raise ValueError("No object was found. Draw a box around it, or paint it with Add.") from None
-        tell({"meshes": [_mesh(label, model, picture.colors, mask, tell) for label, model in models.items()]})
+        send({"meshes": [_mesh(label, model, picture.colors, mask, send) for label, model in models.items()]})
     except ValueError as error:
-        tell({"error": str(error)})
+        send({"error": str(error)})
 
 
-def _mesh(label: str, model: Model, colors: np.ndarray, mask: np.ndarray, tell: Tell) -> dict[str, Any]:
-    made = reconstruct_picture(model, colors, mask, progress=lambda text, part: tell({"progress": text, "part": part}))
-    if not len(made.surface.faces):
+def _mesh(label: str, model: Model, colors: np.ndarray, mask: np.ndarray, send: Send) -> dict[str, Any]:
+    result = reconstruct_picture(
+        model, colors, mask, progress=lambda text, part: send({"progress": text, "part": part})
+    )
+    if not len(result.surface.faces):
         raise ValueError(f"The model {label} makes an empty shape of this picture. Try another picture.")
-    angle = np.radians(made.azimuth_deg)
+    angle = np.radians(result.azimuth_deg)
     x, _, z = np.array([np.sin(angle), 0.0, -np.cos(angle)]) @ mesh_to_object()
-    glb = mesh_bytes(made.surface, "glb", "object")
+    glb = mesh_bytes(result.surface, "glb", "object")
     return {
         "label": label,
         "glb": _base64(glb),
         "yaw": float(np.arctan2(x, z)),
-        "kind": made.kind,
-        "warning": made.warning,
+        "kind": result.kind,
+        "warning": result.warning,
     }
 
 
 def example(category: str) -> bytes:
-    """A PNG of a generated object, cut out, in natural colours, seen half from the front."""
+    """An example picture as PNG: a generated object in natural colours on transparency, seen obliquely."""
     rng = np.random.default_rng(EXAMPLES[category])
     mesh = make_shape(category, rng)
     vertices = np.float32(mesh.vertices @ mesh_to_object("y", "z").T)

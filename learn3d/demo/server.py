@@ -1,4 +1,4 @@
-"""The server of the page: its files, and one address that turns pixels into meshes. It keeps nothing of a visitor."""
+"""The server of the page: static files, and an address that turns pixels into meshes. It stores no visitor's data."""
 
 from __future__ import annotations
 
@@ -25,67 +25,67 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from learn3d.demo.gate import Gate
-from learn3d.demo.picture import EXAMPLES, SIDE, Picture, Tell, example, make_meshes, unpack
+from learn3d.demo.picture import EXAMPLES, SIDE, Picture, Send, example, make_meshes, unpack
 from learn3d.reconstruction import Model, load_model
 from learn3d.terminal import plain, say
 
-MOST_BYTES = 5 * SIDE**2  # of a request
-VISITORS = 200  # requests at once, so 260 MB in all; a browser that comes later tries again
-PATIENCE = 30  # seconds in which a picture must have arrived
+MOST_BYTES = 5 * SIDE**2  # largest body of a request
+VISITORS = 200  # simultaneous requests, 260 MB in all; the browser of a later one tries again
+PATIENCE = 30  # seconds in which a picture must arrive
 _TICK = 0.05  # seconds
 
 
 class _Closed(Exception):
-    """The page ends, and nobody waits for the rest of a job."""
+    """Ends a job when the server stops."""
 
 
-class Desk:
-    """Does one job at a time, in the order of arrival."""
+class JobQueue:
+    """Runs one job at a time, in the order of arrival, in a thread."""
 
     def __init__(self) -> None:
-        self.closed: Callable[[], bool] = lambda: False
-        self._thread, self._line = ThreadPoolExecutor(1), deque()
+        self.closed: Callable[[], bool] = lambda: False  # whether the server stops
+        self._thread, self._queue = ThreadPoolExecutor(1), deque()
 
-    async def messages(self, job: Callable[[Tell], None]) -> AsyncIterator[bytes]:
-        """Wait for the job's turn, do it, and give what it tells, one JSON object a line; first its place in the line.
+    async def run(self, job: Callable[[Send], None]) -> AsyncIterator[bytes]:
+        """Run a job and yield the messages that it sends, each a line of JSON. First come its places in the queue.
 
-        A visitor who leaves gives up the place.
+        The place becomes free if the iteration is cancelled: the visitor has left.
         """
-        ticket, told, place = object(), deque(), 0
+        ticket, messages, place = object(), deque(), 0
 
-        def tell(message: dict) -> None:
+        def send(message: dict) -> None:
             if self.closed():
                 raise _Closed
-            told.append(message)
+            messages.append(message)
 
-        def work_on() -> None:
+        def run_job() -> None:
             with contextlib.suppress(_Closed):
-                job(tell)
+                job(send)
 
-        self._line.append(ticket)
+        self._queue.append(ticket)
         try:
-            while (ahead := self._line.index(ticket)) and not self.closed():
+            while (ahead := self._queue.index(ticket)) and not self.closed():
                 if ahead != place:
-                    yield _line({"place": ahead})
+                    yield _json_line({"place": ahead})
                 place = ahead
                 await asyncio.sleep(_TICK)
-            work = asyncio.get_running_loop().run_in_executor(self._thread, work_on)
-            while not (self.closed() or (work.done() and not told)):
-                while told:
-                    yield _line(told.popleft())
+            work = asyncio.get_running_loop().run_in_executor(self._thread, run_job)
+            while not (self.closed() or (work.done() and not messages)):
+                while messages:
+                    yield _json_line(messages.popleft())
                 await asyncio.wait([work], timeout=_TICK)
             if not self.closed():
                 await work  # raises the job's error
         finally:
-            self._line.remove(ticket)
+            self._queue.remove(ticket)
 
 
-def _line(message: dict) -> bytes:
+def _json_line(message: dict) -> bytes:
     return json.dumps(message).encode() + b"\n"
 
 
-def application(models: dict[str, Model], host: str, desk: Desk) -> Starlette:
-    """The page for these models, by the names under which they are shown, behind the gate of `host`."""
+def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlette:
+    """The page for these models, by their displayed names, served under the name `host`."""
     pictures = {category: example(category) for category in EXAMPLES}
     kinds = [kind.strip() for model in models.values() for kind in model.config.category.split(",")]
 
@@ -104,8 +104,7 @@ def application(models: dict[str, Model], host: str, desk: Desk) -> Starlette:
             raise HTTPException(400, f"this is no picture as the page sends it: {error}") from None
         except (asyncio.TimeoutError, ClientDisconnect):
             raise HTTPException(408, "the picture did not arrive in time") from None
-        job = partial(make_meshes, models, picture)
-        return StreamingResponse(desk.messages(job), media_type="application/x-ndjson")
+        return StreamingResponse(jobs.run(partial(make_meshes, models, picture)), media_type="application/x-ndjson")
 
     routes = [
         Route("/about", about),
@@ -117,10 +116,9 @@ def application(models: dict[str, Model], host: str, desk: Desk) -> Starlette:
 
 
 async def _receive(request: Request) -> Picture:
-    """The picture of a request: /mesh?width=W&height=H and perhaps &box=x,y,width,height, its bytes in the body."""
-    given = request.query_params
-    width, height = int(given["width"]), int(given["height"])
-    box = tuple(map(int, given["box"].split(","))) if "box" in given else None
+    """The picture in a request to /mesh?width=W&height=H (and &box=x,y,width,height), with its bytes in the body."""
+    query = request.query_params
+    box = tuple(map(int, query["box"].split(","))) if "box" in query else None
     if box is not None and len(box) != 4:
         raise ValueError("a box has four numbers")
     content = bytearray()
@@ -128,28 +126,29 @@ async def _receive(request: Request) -> Picture:
         content += chunk
         if len(content) > MOST_BYTES:
             raise HTTPException(413, f"a picture has at most {MOST_BYTES} bytes")
-    return unpack(bytes(content), width, height, box)
+    return unpack(bytes(content), int(query["width"]), int(query["height"]), box)
 
 
 class _PlainFormatter(logging.Formatter):
-    """A visitor's words in an error give the terminal no commands."""
+    """Escapes control characters: an error may contain a visitor's text."""
 
     def format(self, record: logging.LogRecord) -> str:
         return plain(super().format(record))
 
 
-def labels(runs: Sequence[Path]) -> list[str]:
-    """A name for each run: that of its folder or file; numbered if several have the same."""
+def name_models(runs: Sequence[Path]) -> list[str]:
+    """The displayed names of runs: those of their folders or files, numbered if they are equal."""
     names = [Path(run).resolve().name for run in runs]
     return [f"{name} {i + 1}" if names.count(name) > 1 else name for i, name in enumerate(names)]
 
 
 def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
-    """Load the models of `runs` (none: the package's small one) and serve the page until a signal asks for the end.
+    """Load the models of `runs` (if empty, the small model of the package) and serve the page until a signal comes.
 
-    Raises ValueError and OSError for models that cannot be loaded and an address that is taken.
+    Raises ValueError or OSError if a model cannot be loaded or the address is in use.
     """
-    models = dict(zip(labels(runs), map(load_model, runs), strict=True)) if runs else {"small model": load_model(None)}
+    models = {name: load_model(run) for name, run in zip(name_models(runs), runs, strict=True)}
+    models = models or {"small model": load_model(None)}
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         listening = socket.create_server((host, port), family=family, backlog=VISITORS)
@@ -158,18 +157,12 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
     errors = logging.StreamHandler()
     errors.setFormatter(_PlainFormatter("%(message)s"))
     logging.getLogger("uvicorn").addHandler(errors)
-    desk = Desk()
-    bounds = {"limit_concurrency": VISITORS, "timeout_graceful_shutdown": 5, "h11_max_incomplete_event_size": 2**14}
-    quiet = {
-        "log_config": None,
-        "log_level": "error",
-        "access_log": False,
-        "server_header": False,
-        "proxy_headers": False,
-    }
-    app = application(models, host, desk)
-    server = uvicorn.Server(uvicorn.Config(app, http="h11", ws="none", lifespan="off", **bounds, **quiet))
-    desk.closed = lambda: server.should_exit
+    jobs = JobQueue()
+    limits = {"limit_concurrency": VISITORS, "timeout_graceful_shutdown": 5, "h11_max_incomplete_event_size": 2**14}
+    off = dict.fromkeys(("access_log", "server_header", "proxy_headers"), False)
+    options = {"http": "h11", "ws": "none", "lifespan": "off", "log_config": None, "log_level": "error"}
+    server = uvicorn.Server(uvicorn.Config(application(models, host, jobs), **limits, **options, **off))
+    jobs.closed = lambda: server.should_exit
     name = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     url = f"http://{name}:{listening.getsockname()[1]}/"
     say(f"the page is at {url} (Ctrl-C ends it)")

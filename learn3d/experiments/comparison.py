@@ -1,7 +1,7 @@
-"""A table from stored results: the paper's figures beside ours, with confidence intervals, as Markdown.
+"""The report of a table from stored results: the paper's figures beside ours, with confidence intervals.
 
-The paper's figures are of other meshes, so no difference to them is taken. Intervals are those of the bootstrap over
-test objects.
+No difference to the paper's figures is taken, because they are of other meshes. Intervals over test objects are by
+bootstrap, intervals over seeds by Student's t.
 """
 
 from __future__ import annotations
@@ -14,41 +14,41 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from learn3d.experiments.estimated_poses import pose_rows
 from learn3d.experiments.measurement import MEASURES, Result, figures
 from learn3d.experiments.plan import PlannedRun, Request, command_line, select_rows
 from learn3d.experiments.tables import CATEGORIES, MEAN, TABLES, Row
+from learn3d.files import limits
+from learn3d.files.reading import parse_json, read_bytes
 
 RESAMPLES = 2000
 
 
 def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray], *, seed: int = 0) -> np.ndarray:
-    """Means of 2,000 resampled test sets, float64 [2000].
+    """Means of 2,000 resampled test sets, float64 [2000]; NaN if no image of a set has a value.
 
-    sums[c], counts[c] float [N_c]: sum of a measure over the images of each object of category c, and their number. The
-    images of an object are not independent of each other, so objects are drawn, with replacement, within each category;
-    the mean over the images of each category is taken, then that over categories. The draws depend on the seed and the
-    numbers of objects alone: two results of the same objects have the same ones and can be subtracted, which makes the
-    bootstrap of their difference a paired one. (scipy.stats.bootstrap knows neither strata nor weights.)
+    sums[c], counts[c] float [N_c]: sum of a measure over the images of each object of category c, and their number.
+    Objects are drawn with replacement within each category, because the images of an object depend on each other. The
+    result is the mean over the images of a category, then over categories. The draws depend only on the seed and the
+    numbers of objects. So results on the same objects can be subtracted: the bootstrap of their difference is paired.
+    (scipy.stats.bootstrap has neither strata nor weights.)
     """
     rng = np.random.default_rng(seed)
-    total = np.zeros(RESAMPLES)
-    for part, number in zip(sums, counts, strict=True):
-        for start in range(0, RESAMPLES, 250):
-            drawn = rng.integers(len(part), size=(250, len(part)))
-            with np.errstate(invalid="ignore", divide="ignore"):
-                total[start : start + 250] += part[drawn].sum(1) / number[drawn].sum(1)
-    return total / len(sums)
+    means = []
+    for of_objects, images in zip(sums, counts, strict=True):
+        drawn = rng.integers(len(images), size=(RESAMPLES, len(images)))
+        with np.errstate(invalid="ignore"):
+            means.append(of_objects[drawn].sum(1) / images[drawn].sum(1))
+    return np.mean(means, axis=0)
 
 
 def percentile_interval(resampled: np.ndarray) -> tuple[float, float] | None:
-    """The middle 95 % of resampled values; None if none is defined."""
+    """The ends of the middle 95 % of resampled values; None if all are NaN."""
     known = resampled[np.isfinite(resampled)]
     return tuple(np.quantile(known, [0.025, 0.975]).tolist()) if len(known) else None
 
 
 Cells = list[list[str]]
-Side = list[dict[int, Result]]  # the results of one method by seed, for each category of a column
+Side = list[dict[int, Result]]  # results of one method for each category of a column, by seed
 
 LABELS = {"voxel_iou": "kato18", "voxel_iou_kato19": "kato19", "mmd": "mmd"}
 NOTES = (
@@ -61,13 +61,12 @@ NOTES = (
 def make_report(
     request: Request, runs: Sequence[PlannedRun], results: Mapping[Path, Result]
 ) -> tuple[dict[str, Cells], str]:
-    """The tables "main", "differences", "runs" and, if there are any, "poses", and the report as Markdown.
+    """The tables "main", "differences", "runs" and, if poses were estimated, "poses"; and the report as Markdown.
 
-    results: by folder.
-
-    Commands have DATA and OUTPUT in place of folders, so that no path gets in.
+    results: by folder. Commands have DATA and OUTPUT in place of folders, so that the report has no path of a machine.
     """
-    table, done = TABLES[request.table], [run for run in runs if run.folder in results]
+    table = TABLES[request.table]
+    done = [run for run in runs if run.folder in results]
     measured: dict[tuple[str | None, str], dict[int, Result]] = {}
     for run in done:
         by_seed = measured.setdefault((run.variant, run.config.category), {})
@@ -78,16 +77,16 @@ def make_report(
     measures = ["mmd"] if table.measure == "mmd" else ["voxel_iou", "voxel_iou_kato19"]
     main, differences = [["method", "", *columns]], [["method", *columns]]
     for label, row in select_rows(request).items():
-        ours, theirs = (
+        sides, baselines = (
             [[measured.get((variant, name), {}) for name in names] for names in columns.values()]
             for variant in (row.variant, baseline)
         )
         if row.figures:
             main.append([label, f"paper ({row.about})", *(_format_printed(row, c, categories) for c in columns)])
         if row.variant:
-            main += [[label, f"here ({LABELS[m]})", *(_compare(m, side) for side in ours)] for m in measures]
+            main += [[label, f"here ({LABELS[m]})", *(_compare(m, side) for side in sides)] for m in measures]
         if row.variant and row.variant != baseline:
-            differences.append([label, *map(functools.partial(_compare, table.measure), ours, theirs)])
+            differences.append([label, *map(functools.partial(_compare, table.measure), sides, baselines)])
     headers = [header for header, _ in MEASURES.values()]
     trained = [["run", "networks", "iterations", "batch", "images", *headers, "minutes", "commit"]]
     for run in done:
@@ -110,7 +109,7 @@ def make_report(
     parts = [f"## {table.title}", _markdown(main), NOTES, *([f"Missing: {', '.join(missing)}."] if missing else [])]
     parts += [f"Differences to {table.baseline}, paired by seed and by object:", _markdown(differences)]
     tables = {"main": main, "differences": differences, "runs": trained}
-    if poses := pose_rows(runs, results):
+    if poses := _pose_rows(runs, results):
         tables["poses"] = poses
         parts += ["Estimated azimuths of all images, and voxel IoU (kato18) of the trainings:", _markdown(poses)]
     parts += ["What was run:", _markdown(trained), "\n".join(["```sh", *dict.fromkeys(commands), "```"])]
@@ -118,7 +117,7 @@ def make_report(
 
 
 def _format_printed(row: Row, column: str, categories: Sequence[str]) -> str:
-    """The paper's figure for a column. Its mean is taken over the same categories as ours, if it has them."""
+    """The paper's figure for a column. Its mean is over the same categories as ours, else in parentheses."""
     printed = row.printed
     if column == MEAN and set(categories) != (set(printed) - {MEAN} or set(CATEGORIES)):
         if all(name in printed for name in categories):
@@ -128,7 +127,7 @@ def _format_printed(row: Row, column: str, categories: Sequence[str]) -> str:
 
 
 def _compare(measure: str, *sides: Side) -> str:
-    """The mean of one side, or the difference of two, with its intervals; "-" if a result is missing."""
+    """The mean of one method, or the difference of two, with its intervals; "-" if a result is missing."""
     values = [[[getattr(r, measure) for r in by_seed.values()] for by_seed in side] for side in sides]
     if not all(v and None not in v for side in values for v in side):
         return "-"
@@ -143,7 +142,7 @@ def _compare(measure: str, *sides: Side) -> str:
         return text + (f" (x {means[0] / means[1]:.2f})" if len(means) == 2 else "")
     for of_category in zip(*sides, strict=True):
         if len({tuple(o.name for o in r.objects) for by_seed in of_category for r in by_seed.values()}) > 1:
-            return text  # measured on different objects: they cannot be drawn together
+            return text  # on different objects: they cannot be resampled together
     if interval := percentile_interval(_subtract([_resample(measure, side) for side in sides])):
         text += f" [{interval[0]:{form}}, {interval[1]:{form}}]"
     return text
@@ -154,7 +153,7 @@ def _subtract(values: list) -> np.ndarray:
 
 
 def _resample(measure: str, side: Side) -> np.ndarray:
-    """Mean IoUs over resampled objects [2000]; the IoUs of an object are those of all seeds together."""
+    """Mean IoUs over resampled objects [2000]. The IoUs of an object are those of all seeds."""
     sums, counts = [], []
     for by_seed in side:
         images = np.array([[o.images for o in result.objects] for result in by_seed.values()], float)
@@ -164,8 +163,36 @@ def _resample(measure: str, side: Side) -> np.ndarray:
     return resampled_means(sums, counts)
 
 
+_POSES_HEADER = ["category", "seed", "Acc@30", "median error, degrees", "flips", "objects flipped"]
+_POSES_HEADER += ["mean confidence", "IoU, known poses", "IoU, estimated poses", "ratio"]
+
+
+def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> Cells:
+    """Errors of the estimated poses of each run, and its IoU beside that of the run on known poses; [] without any."""
+    known = {(r.config.category, r.config.seed): r.folder for r in runs if r.config.poses is None}
+    rows, by_category = [], {}
+    for run in (run for run in runs if run.config.poses is not None):
+        folders = known.get((run.config.category, run.config.seed)), run.folder
+        if not all(folder in results for folder in folders):
+            continue
+        errors_file = run.config.poses.with_suffix(".json")
+        errors = parse_json(read_bytes(errors_file, limits.JSON_BYTES, "the errors of a table of poses as JSON"))
+        ious = [results[folder].voxel_iou for folder in folders]
+        names = ("accuracy", "median_deg", "flips", "objects_flipped", "confidence")
+        values = [*(errors[name] for name in names), *ious, ious[1] / ious[0]]
+        rows.append([run.config.category, str(run.config.seed), *_format_poses(values)])
+        by_category.setdefault(run.config.category, []).append(values)
+    several = {category: values for category, values in by_category.items() if len(values) > 1}
+    rows += [[category, "mean", *_format_poses(np.mean(values, axis=0))] for category, values in several.items()]
+    return [_POSES_HEADER, *rows] if rows else []
+
+
+def _format_poses(values: Sequence[float]) -> list[str]:
+    return [f"{value:.1f}" if place == 1 else f"{value:.3f}" for place, value in enumerate(values)]
+
+
 def _markdown(table: Cells) -> str:
-    """The table without HTML: names in results may be a stranger's."""
+    """The table as Markdown, with HTML escaped, because names in results come from untrusted files."""
     cells = [[html.escape(" ".join(c.splitlines()), quote=False).replace("|", "\\|") for c in row] for row in table]
     lines = ["| " + " | ".join(row) + " |" for row in cells]
     return "\n".join([lines[0], "|" + "---|" * len(cells[0]), *lines[1:]])

@@ -1,4 +1,4 @@
-"""One table from beginning to end: plan its runs, train and test the missing ones, write the report."""
+"""`learn3d experiment`: plan the runs of a table, train and test the missing ones, write the report."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from pathlib import Path
 
 import torch
 
-from learn3d.config import differences, load_config
+from learn3d.config import TrainConfig, differences, load_config
 from learn3d.device import resolve_precision
 from learn3d.experiments.comparison import make_report
-from learn3d.experiments.estimated_poses import estimate_poses
 from learn3d.experiments.measurement import Result, measure
 from learn3d.experiments.plan import PlannedRun, Request, plan_runs
 from learn3d.experiments.tables import TABLES, VARIANTS
 from learn3d.files import limits, writing
 from learn3d.files.reading import read_bytes
+from learn3d.poses.estimate import PoseOptions
+from learn3d.poses.views import CameraOptions, compare, estimate_views, load_views
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.runs.tasks import Task, run_tasks
@@ -24,19 +25,36 @@ from learn3d.terminal import INTERRUPTED, align, note, say
 from learn3d.training import train
 
 LOG_FILE, RESULT_FILE = "log.txt", "test.json"  # files in a run's folder
+_CANDIDATES = 4  # estimated poses of each image
+
+
+def estimate_poses(config: TrainConfig) -> None:
+    """Write the table of estimated poses that a run needs, unless it exists, and a JSON file with its errors.
+
+    The estimate has the run's seed. It is turned into the frame of the data by the angle that fits the validation
+    images best.
+    """
+    if config.poses.is_file():
+        return
+    datasets = load_views(config.layout, config.data, config.category, config.views_per_object)
+    views = estimate_views(datasets, CameraOptions(), PoseOptions(seed=config.seed), _CANDIDATES)
+    comparison = compare(views)
+    note(comparison.text())
+    config.poses.parent.mkdir(parents=True, exist_ok=True)
+    confidence = {"confidence": float(views.table.confidence.mean())}
+    writing.write_json(config.poses.with_suffix(".json"), dataclasses.asdict(comparison) | confidence)
+    views.table.turned(comparison.offset_deg).write(config.poses)
 
 
 def train_and_test(run: PlannedRun) -> bool:
-    """Train, measure and write test.json; False if a signal stopped the training. Raises as `train` and `measure` do.
-    A table of poses that the run needs is made first.
+    """Estimate poses if the run needs them, train, measure and write test.json; False if a signal stopped the training.
 
-    An existing run goes on. If it only needs measuring, `train` checks that it is complete and of the same options and
-    data.
+    An existing run continues; `train` checks that it has the same options and data. Raises as `train` and `measure` do.
     """
     if run.config.poses is not None:
         estimate_poses(run.config)
     resume = run_folder.is_run(run.folder)
-    if not train(run.config, resume=resume, overwrite=not resume).finished:  # its log lies in the folder already
+    if not train(run.config, resume=resume, overwrite=not resume).finished:  # the folder exists: log.txt is in it
         return False
     file = checkpoint.find(run.folder, VARIANTS[run.variant].checkpoint)
     result = measure(file, data=run.config.data, device=run.config.device)
@@ -46,11 +64,11 @@ def train_and_test(run: PlannedRun) -> bool:
 
 
 def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = train_and_test) -> int:
-    """Carry out a table's missing runs and write its report; the exit status: 0, 1 if a run failed, 130 if stopped.
+    """Train and test the missing runs of a table and write its report.
 
-    work: trains and tests a run; returns False if it was stopped. The report is written in any case, from the results
-    so far. Raises ValueError for a method or option that does not exist, for runs with other options in the output
-    folder, and for damaged files.
+    Returns the exit status: 0, 1 if a run failed, 130 if a signal stopped it. The report of the results so far is
+    written in any case. work: trains and tests a run, and returns False if a signal stopped it. Raises ValueError for
+    an unknown method or option, for runs with other options in the output folder, and for damaged files.
     """
     threads = request.threads or max(1, torch.get_num_threads() // request.jobs)
     runs, failed = plan_runs(dataclasses.replace(request, threads=threads)), {}
@@ -84,7 +102,7 @@ def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = tra
 
 
 def read_result(path: Path) -> Result:
-    """Read a test.json; ValueError naming it if it is damaged or holds something else."""
+    """Read a test.json. Raises ValueError naming the file if it is damaged or no result."""
     try:
         return Result.model_validate_json(read_bytes(path, limits.JSON_BYTES, "the measurement of a run as JSON"))
     except ValueError as error:
@@ -93,7 +111,7 @@ def read_result(path: Path) -> Result:
 
 
 def read_results(runs: Sequence[PlannedRun]) -> dict[Path, Result]:
-    """The stored results of these runs by folder, if they are of this length of training and data."""
+    """The stored results of these runs, by folder. Those of other data or another number of iterations are left out."""
     results = {}
     for run in runs:
         if (path := run.folder / RESULT_FILE).is_file():
@@ -104,14 +122,13 @@ def read_results(runs: Sequence[PlannedRun]) -> dict[Path, Result]:
 
 
 def find_conflict(run: PlannedRun) -> str:
-    """The options in which the run in the folder differs from the planned one, as a sentence; "" if it can go on."""
+    """A sentence with the options in which the run in the folder differs from the planned one; "" if there are none."""
     if not (run.folder / run_folder.CONFIG).is_file():
         return ""
-    asked, saved = (  # a run saves the precision that "auto" stands for
-        dataclasses.replace(config, precision=resolve_precision(config.precision, config.device))
-        for config in (run.config, load_config(run.folder / run_folder.CONFIG))
+    precision = resolve_precision(run.config.precision, run.config.device)  # a run saves what "auto" stands for
+    changed = differences(
+        dataclasses.replace(run.config, precision=precision), load_config(run.folder / run_folder.CONFIG)
     )
-    changed = differences(asked, saved)
     return f"{run.folder} has a run with other options: " + "; ".join(changed) if changed else ""
 
 
@@ -122,9 +139,8 @@ def describe_tables() -> str:
         lines.append(f"{name}: {table.title}")
         lines.append(f"  layout {table.layout}, {len(table.categories)} categories, seeds {table.seeds}")
         for label, row in table.rows.items():
-            variant = VARIANTS.get(row.variant)
-            changes = "".join(f", {option}={value}" for option, value in variant.changes.items()) if variant else ""
-            lines.append(
-                f"  {label}: {row.variant}, preset {variant.preset}{changes}" if variant else f"  {label}: quoted"
-            )
+            about = ["quoted"]
+            if variant := VARIANTS.get(row.variant):
+                about = [row.variant, f"preset {variant.preset}", *(f"{n}={v}" for n, v in variant.changes.items())]
+            lines.append(f"  {label}: {', '.join(about)}")
     return "\n".join(lines)

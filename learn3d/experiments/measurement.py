@@ -1,4 +1,4 @@
-"""Trained networks measured on a split, for `learn3d evaluate` and for experiments."""
+"""Measures trained networks on a split, for `learn3d evaluate` and for experiments."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from learn3d.runs import checkpoint
 from learn3d.settings import MOST, Step
 from learn3d.terminal import align
 
-#: Header of each measure in tables, and its definition. A measure is a mean over images, then over classes.
+#: For each measure its header in tables and its definition. Measures are means over images, then over categories.
 MEASURES = {
     "voxel_iou": (
         "voxel IoU",
@@ -52,25 +52,25 @@ class ObjectMeans(NamedTuple):
     """Mean IoUs of the images of one object."""
 
     name: str
-    images: Amount  # that have an IoU
+    images: Amount  # number of images that have an IoU
     voxel_iou: Number
     voxel_iou_kato19: Number
 
 
 class Result(BaseModel, strict=True):
-    """The networks of one checkpoint, measured on one category and split. A measure without a value is None."""
+    """Measures of one checkpoint on one category and split; None if a measure has no value."""
 
     checkpoint: str  # file
     method: str  # label of the preset
     preset: str
     category: str
     data: str
-    command: str  # repeats the training
+    command: str  # command that repeats the training
     iterations: Step  # length of the whole training
     step: Amount  # step after which these networks were saved
     seed: Amount
     seconds: Number  # duration of the training
-    versions: dict[str, str | None]  # that trained it
+    versions: dict[str, str | None]  # packages and commit of the training
     images: Amount
     hollow: Number  # share of meshes that reach beyond the voxel grid
     voxel_iou: Number
@@ -150,10 +150,10 @@ def evaluate_runs(
     which: Literal["last", "best"] = "last",
     **options: Any,
 ) -> list[Result]:
-    """Measure run folders or checkpoint files (`which` of a folder), a run on several categories on each by itself.
+    """Measure run folders (their checkpoint `which`) or checkpoint files, on each of their categories by itself.
 
-    The options are those of `measure`. Raises ValueError or OSError before anything is measured if a checkpoint or a
-    data folder is missing.
+    options: those of `measure`. Raises ValueError or OSError before anything is measured if a checkpoint or a data
+    folder is missing.
     """
     if not paths:
         raise ValueError("give at least one run folder or checkpoint to evaluate")
@@ -168,18 +168,17 @@ def evaluate_runs(
 
 
 def describe_measures() -> str:
-    """One line for each column of figures of `format_table`."""
+    """One line for each measure: its header and definition."""
     width = max(len(header) for header, _ in MEASURES.values())
     return "\n".join(f"  {header:{width}}  {definition}" for header, definition in MEASURES.values())
 
 
 def format_table(results: Sequence[Result]) -> str:
-    """A text table: a line per result, then a mean over classes per method."""
+    """The results as a text table: a line per result, then the mean over categories of each method."""
     rows = [("class", "method", "seed", "iterations", "images", *(header for header, _ in MEASURES.values()))]
     for r in results:
-        rows.append(
-            (r.category, f"{r.method} ({r.preset})", str(r.seed), str(r.step), str(r.images), *figures(vars(r)))
-        )
+        about = (r.category, f"{r.method} ({r.preset})", str(r.seed), str(r.step), str(r.images))
+        rows.append((*about, *figures(vars(r))))
     for m in class_means(results):
         classes = f"{m['classes']} classes" if m["classes"] > 1 else "1 class"
         rows.append(("mean", f"{m['method']} ({m['preset']})", "", "", classes, *figures(m)))
@@ -187,12 +186,12 @@ def format_table(results: Sequence[Result]) -> str:
 
 
 def figures(values: dict[str, Any]) -> list[str]:
-    """The cells of a line of a table: all measures, with four digits."""
+    """All measures with four digits, as cells of a table."""
     return ["-" if values[name] is None else f"{values[name]:.4f}" for name in MEASURES]
 
 
 def class_means(results: Iterable[Result]) -> list[dict[str, Any]]:
-    """Mean over classes of each method's measures; results of the same class (seeds) are averaged first."""
+    """Each method's measures, as means over seeds, then over categories."""
     by_method: dict[tuple[str, str], dict[str, list[Result]]] = {}
     for r in results:
         by_method.setdefault((r.method, r.preset), {}).setdefault(r.category, []).append(r)
@@ -204,6 +203,6 @@ def class_means(results: Iterable[Result]) -> list[dict[str, Any]]:
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    """Plain mean, or None if a value is missing."""
+    """The mean; None if a value is missing."""
     values = list(values)
     return None if None in values else sum(values) / len(values)

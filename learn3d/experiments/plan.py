@@ -1,4 +1,4 @@
-"""The training runs that a table needs: their names, folders and options."""
+"""Plans the training runs of a table: their names, folders and options."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from learn3d.settings import Rare, split_names
 from learn3d.terminal import unknown_name
 
 _FIRST = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")  # options of every command line
-_FIXED = (*_FIRST, "layout", "device", "threads", "poses")  # the request or the table decides these, --set cannot
+_FIXED = (*_FIRST, "layout", "device", "threads", "poses")  # options that --set cannot change
 
 
 @dataclass(frozen=True)
 class Request:
-    """The table that is asked for, and the choices of the user."""
+    """The table that the user asks for, with options."""
 
     table: str
     """Name of the table, see --list."""
@@ -48,8 +48,8 @@ class Request:
     threads: Rare[int | None] = None
     """CPU threads of each run (default: cores, or OMP_NUM_THREADS, divided by --jobs)."""
     set: tuple[str, ...] = ()
-    """Settings and training options to change, as NAME=VALUE in all methods that have them, or as METHOD:NAME=VALUE in
-    one (default: none)."""
+    """Settings and training options to change: NAME=VALUE for all methods that have them, METHOD:NAME=VALUE for one
+    (default: none)."""
     jobs: int = 1
     """Runs at a time, each in a process of its own with its share of the cores."""
     report_only: bool = False
@@ -69,7 +69,7 @@ class Request:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A training run and its test. The folder identifies it: every table that needs the run finds it there."""
+    """A training run and its test. Tables that need the same run share its folder."""
 
     variant: str
     config: TrainConfig
@@ -86,9 +86,9 @@ class PlannedRun:
 
 
 def select_rows(request: Request) -> dict[str, Row]:
-    """The rows of the table whose label or variant is among the methods of the request (all for none), by label.
+    """The rows of the table that the request asks for by label or variant, by label; all if it names no methods.
 
-    Quoted rows are always among them. Raises ValueError naming a method that the table does not have.
+    Quoted rows are always included. Raises ValueError for a method that the table does not have.
     """
     rows = TABLES[request.table].rows
     names = {label.lower(): row.variant for label, row in rows.items()} | {r.variant: r.variant for r in rows.values()}
@@ -150,7 +150,7 @@ def _configure(
 
 
 def _parse_changes(variants: Sequence[str], texts: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """The changes "name=value" and "variant:name=value" by variant; without a variant, of all that have that name."""
+    """The changes NAME=VALUE and VARIANT:NAME=VALUE, by variant."""
     known = {name: _flatten(TrainConfig(Path(), "-", Path(), VARIANTS[name].preset)) for name in variants}
     changes: dict[str, dict[str, Any]] = {variant: {} for variant in variants}
     for text in texts:
@@ -179,7 +179,7 @@ def _parse_value(text: str, is_list: bool = False) -> Any:
 
 
 def command_line(config: TrainConfig, **placeholders: str) -> str:
-    """The command that repeats a run, quoted for a POSIX shell; `placeholders` replace the values of these options."""
+    """The command that repeats a run, quoted for a POSIX shell. placeholders: words in place of options' values."""
     values, usual = _flatten(config), _flatten(TrainConfig(config.data, config.category, config.output, config.preset))
     names = [n for n in values if n not in (*_FIRST, "device", "threads") and values[n] != usual[n]]
     words = ["learn3d", "train"]
@@ -196,6 +196,6 @@ def command_line(config: TrainConfig, **placeholders: str) -> str:
 
 
 def _flatten(config: TrainConfig) -> dict[str, Any]:
-    """Options by name, the method's settings among them."""
+    """All options by name, the method's settings included."""
     values = {field.name: getattr(config, field.name) for field in fields(config)}
     return values | dataclasses.asdict(values.pop("settings"))

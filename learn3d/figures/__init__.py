@@ -1,1 +1,1 @@
-"""The paper's figures from saved checkpoints, and the picture grid that a run draws while it trains."""
+"""The paper's figures of trained runs, and the picture grid that a run draws while it trains."""

@@ -16,10 +16,10 @@ from learn3d.methods.surfaces import grid_surface
 from learn3d.pictures.sheets import TILE, magnify, natural_colors, tile
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
 
-TURNS_DEG = (0, 60, 120, 180, 240, 300)
+TURNS_DEG = (0, 60, 120, 180, 240, 300)  # views of a shape, counted from the input's view
 TILE_SIZE = 128  # pixels of a picture in a comparison
-AZIMUTHS_DEG = (-135.0, -45.0)  # viewpoints of an interpolation, oblique for whichever axis the object faces
-STEPS = 4  # shapes of an interpolation from one image up to the next
+AZIMUTHS_DEG = (-135.0, -45.0)  # views of an interpolation: oblique, along whichever axis the objects face
+STEPS = 4  # steps of an interpolation from one image to the next
 _AROUND = [f"+{turn}°" for turn in TURNS_DEG[1:]]
 
 
@@ -28,7 +28,7 @@ def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.nd
     """Inputs and results of a method in training: uint8 [H,W,3].
 
     A row per image: the input, the target silhouette, the rendered silhouette and the shaded shape at the input's view,
-    and the shape from five new views around it.
+    and the shape from five more views around it.
     """
     batch = dataset.batch(indices)
     training = method.training
@@ -57,11 +57,11 @@ def comparison_grid(
     truth: bool = False,
     title: str = "input",
 ) -> np.ndarray:
-    """The same images through several methods, each a (label, method): uint8 [H,W,3].
+    """Reconstructions of the same images by several methods, given as (label, method): uint8 [H,W,3].
 
     A group of rows per image: the input, and a row per method with its shape from the input's view and from five more
-    around the object. `title` stands above the inputs. All pictures are magnified alike, as far as the shapes allow.
-    With `truth` the objects' voxels come first; raises ValueError if they are not known.
+    around the object. `title` is above the inputs. All pictures are magnified by the same factor, as far as the shapes
+    allow. With `truth` the first row of a group has the true voxels; raises ValueError if there are none.
     """
     batch = dataset.batch(samples)
     shown = [(label, method.decode(method.encode(batch.images)).surfaces()) for label, method in methods]
@@ -76,8 +76,8 @@ def comparison_grid(
     inputs = magnify(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom)
     rows = []
     for i, pose in enumerate(poses):
-        nearer = orbit(pose, TURNS_DEG, zoom=zoom)
-        pictures = [draw_surface(shapes[i], nearer, image_size=TILE_SIZE) for _, shapes in shown]
+        zoomed = orbit(pose, TURNS_DEG, zoom=zoom)
+        pictures = [draw_surface(shapes[i], zoomed, image_size=TILE_SIZE) for _, shapes in shown]
         rows += [[inputs[i] if k == 0 else None, *row] for k, row in enumerate(pictures)]
     labels = [label for label, _ in shown] * len(samples)
     rules = range(len(shown), len(rows), len(shown))
@@ -86,18 +86,18 @@ def comparison_grid(
 
 @torch.no_grad()
 def interpolate(method: Method, dataset: ViewDataset, samples: Tensor, *, title: str = "input") -> np.ndarray:
-    """Shapes on the way from that of each image `samples`, int64 [n], to that of the next: uint8 [H,W,3].
+    """Shapes between the reconstructions of images, samples int64 [n]: uint8 [H,W,3].
 
-    The images, each over its own reconstruction, and below them a row per viewpoint with (n - 1) * STEPS + 1 shapes, in
-    equal steps through the space of codes; `title` stands before the images. Raises ValueError for fewer than two.
+    The first row has the images, each above its reconstruction, and `title` before them. Below it are a row per view of
+    (n - 1) * STEPS + 1 shapes, whose codes are interpolated linearly. Raises ValueError for fewer than two images.
     """
     if len(samples) < 2:
         raise ValueError(f"an interpolation takes at least two images, got {len(samples)}")
     batch, pose = dataset.batch(samples), dataset.poses[samples[:1]]
     codes = method.encode(batch.images)
-    share = torch.arange(STEPS, dtype=codes.dtype, device=codes.device)[:, None] / STEPS
-    way = torch.lerp(codes[:-1, None], codes[1:, None], share).flatten(0, 1)
-    shapes = method.decode(torch.cat([way, codes[-1:]])).surfaces()
+    weights = torch.arange(STEPS, dtype=codes.dtype, device=codes.device)[:, None] / STEPS
+    between = torch.lerp(codes[:-1, None], codes[1:, None], weights).flatten(0, 1)
+    shapes = method.decode(torch.cat([between, codes[-1:]])).surfaces()
     turns = [azimuth - float(azimuths_deg(pose)[0]) for azimuth in AZIMUTHS_DEG]
     cameras = orbit(pose, turns)
     zoom = common_zoom([(surface, cameras) for surface in shapes], batch.masks)

@@ -1,4 +1,4 @@
-"""The paper's figures, each from opened runs into files: the functions that `learn3d figures` calls."""
+"""The paper's figures of opened runs as files: a function for each figure of `learn3d figures`."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ from learn3d.pictures.sheets import save_png, stack
 def save_grid(
     runs: Sequence[Run], output: Path, *, images: int = 6, indices: Sequence[int] = (), truth: bool = False
 ) -> list[Path]:
-    """Reconstructions of test images, the runs of a category below each other, as a PNG.
+    """Save reconstructions of images as a PNG: a block per category, with a row per image and run.
 
-    images: how many of each category, chosen by `choose_samples`. indices: samples to show instead, of every category.
-    truth: show the true voxels, too.
+    images, indices: the samples of each category, see `choose_samples`. truth: show the true voxels as well.
     """
     blocks, datasets = [], {id(run.dataset): run.dataset for run in runs}
     for dataset in datasets.values():
@@ -31,43 +30,37 @@ def save_grid(
         methods = [(run.label, run.method) for run in runs if run.dataset is dataset]
         title = dataset.category if len(datasets) > 1 else "input"
         blocks.append(comparison_grid(methods, dataset, samples, truth=truth, title=title))
-    return _save_sheets(blocks, output)
+    return _save_stack(blocks, output)
 
 
 def save_tsne(runs: Sequence[Run], output: Path) -> list[Path]:
-    """Shape codes of test images in the plane, coloured by the view, a map per run, as PNG and SVG."""
+    """Save shape codes in the plane, coloured by the view, as PNG and SVG: a map per run."""
     return tsne.save_figure(tsne.draw_tsne(runs), output)
 
 
 def save_interpolation(
     runs: Sequence[Run], output: Path, *, images: int = 3, indices: Sequence[int] = ()
 ) -> list[Path]:
-    """Shapes between those of some test images, a strip per run, as a PNG.
+    """Save shapes between the reconstructions of some images as a PNG: a strip per run.
 
-    images: how many, chosen by `choose_samples`. indices: samples to use instead.
+    images, indices: the samples, see `choose_samples`.
     """
-    strips = [
-        interpolate(
-            run.method,
-            run.dataset,
-            choose_samples(run.dataset, images, indices),
-            title=run.label if len(runs) > 1 else "input",
-        )
-        for run in runs
-    ]
-    return _save_sheets(strips, output)
+    strips = []
+    for run in runs:
+        samples, title = choose_samples(run.dataset, images, indices), run.label if len(runs) > 1 else "input"
+        strips.append(interpolate(run.method, run.dataset, samples, title=title))
+    return _save_stack(strips, output)
 
 
-def _save_sheets(sheets: Sequence[np.ndarray], output: Path) -> list[Path]:
-    """Write pictures below each other as a PNG."""
+def _save_stack(pictures: Sequence[np.ndarray], output: Path) -> list[Path]:
     output.parent.mkdir(parents=True, exist_ok=True)
     path = output.with_suffix(".png")
-    save_png(path, stack(sheets, gap=10))
+    save_png(path, stack(pictures, gap=10))
     return [path]
 
 
 def choose_samples(dataset: ViewDataset, count: int, indices: Sequence[int] = ()) -> Tensor:
-    """The samples `indices`, int64, or else `count` of them, of different objects and views as far as possible.
+    """The samples `indices`, int64; without them `count` samples, of different objects and views if possible.
 
     Raises ValueError if the data set has fewer.
     """

@@ -1,4 +1,4 @@
-"""Saved checkpoints, opened for figures and pages: method, data and a name for each."""
+"""Opens runs for figures and pages: the trained method, a data set and a label of each."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from learn3d.runs.checkpoint import Metadata
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A trained method with the data that figures show it on. Runs on the same data share one `dataset`."""
+    """A trained method and the data on which figures show it. Runs on the same data share one `dataset`."""
 
     label: str
     method: Method  # in evaluation mode
@@ -34,20 +34,19 @@ def open_runs(
     category: str | None = None,
     split: str = "test",
     which: Literal["last", "best"] = "last",
-    device: str = "cpu",
     report_progress: Callable[[str], None] = lambda text: None,
 ) -> list[Run]:
-    """Open run folders or checkpoint files, with one split of the data.
+    """Open run folders (their checkpoint `which`) or checkpoint files, each with a split of its data.
 
-    `data` and `category` default to those each run was trained with, `labels` to `name_runs`. Raises ValueError without
-    runs, for a wrong number of labels, and if a checkpoint or data set cannot be read.
+    `data` and `category` default to those of the training, `labels` to `name_runs`. Raises ValueError without runs, for
+    a wrong number of labels, and if a checkpoint or data set cannot be read.
     """
     if not paths:
         raise ValueError("give at least one run folder or checkpoint to draw")
     loaded, datasets = [], {}
     for path in paths:
         report_progress(f"opening {path}")
-        method, config, metadata = checkpoint.load_method(path, which, device=device)
+        method, config, metadata = checkpoint.load_method(path, which)
         config = dataclasses.replace(config, data=data or config.data, category=category or config.category)
         key = (config.layout, config.data.resolve(), config.category, method.image_size, config.view_bins)
         if key not in datasets:
@@ -58,9 +57,9 @@ def open_runs(
 
 
 def name_runs(configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Sequence[str] = ()) -> list[str]:
-    """Names of runs in a figure: the labels, else those of the presets, with the category if there are several.
+    """The names of runs in a figure: `labels`, else those of the presets, with the category if there are several.
 
-    Runs that would have the same name are called after their folders. Raises ValueError for a wrong number of labels.
+    Runs of the same preset and category get the names of their folders. Raises ValueError for a wrong number of labels.
     """
     if labels:
         if len(labels) != len(paths):

@@ -1,4 +1,4 @@
-"""The paper's maps of shape codes, coloured by the view, drawn by matplotlib. No window opens."""
+"""The paper's t-SNE maps of shape codes, coloured by the view."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
+import matplotlib as mpl
 import numpy as np
 import skimage.color
 import torch
@@ -22,14 +22,14 @@ from learn3d.figures.runs import Run
 from learn3d.files import writing
 from learn3d.pictures.surfaces import azimuths_deg
 
-MOST_CODES = 2000  # images whose codes are laid out
-FEWEST_CODES = 10  # below, neither an embedding nor a share says anything
-_styled = matplotlib.rc_context(  # a decorator, which leaves the settings of others alone
+MOST_CODES = 2000  # images in a map
+FEWEST_CODES = 10  # a map of fewer images means nothing
+_styled = mpl.rc_context(  # a decorator: matplotlib's settings change in the decorated functions alone
     {
         "font.size": 9,
         "axes.titlesize": 9.5,
-        "text.parse_math": False,  # names are names, whatever dollars are in them
-        "svg.hashsalt": "learn3d",  # the same drawing gives the same file
+        "text.parse_math": False,  # a label may have dollar signs
+        "svg.hashsalt": "learn3d",  # the same figure gives the same file
         "svg.fonttype": "none",
     }
 )
@@ -38,10 +38,10 @@ _styled = matplotlib.rc_context(  # a decorator, which leaves the settings of ot
 @_styled
 @torch.no_grad()
 def draw_tsne(runs: Sequence[Run]) -> Figure:
-    """The shape codes of up to 2,000 images by t-SNE, a map for each run, coloured by the azimuths of the cameras.
+    """The shape codes of up to 2,000 images by t-SNE: a map for each run, coloured by the azimuths of the cameras.
 
-    A map says the share of the view that is in its codes, and a wheel which colour is which azimuth. Raises ValueError
-    for data of fewer than 10 images or without poses.
+    Above each map is how often the view is predicted from a code; a colour wheel is the legend. Raises ValueError for
+    data of fewer than 10 images or without poses.
     """
     side, columns = 3.2, min(4, len(runs))
     rows = -(-len(runs) // columns)
@@ -54,22 +54,22 @@ def draw_tsne(runs: Sequence[Run]) -> Figure:
         batches = [run.method.encode(dataset.batch(part).images).float().cpu() for part in samples.split(256)]
         codes, rows = torch.cat(batches).numpy(), samples.numpy()
         points, color = embed(codes), wheel(azimuths_deg(dataset.poses)[samples].numpy() / 360 % 1.0)
-        order = np.random.default_rng(0).permutation(len(points))  # else the last views would cover the others
+        order = np.random.default_rng(0).permutation(len(points))  # so that no view covers all others
         size = float(np.clip(7000 / len(points), 4, 16))
         axes = figure.add_subplot(grid[index // columns, index % columns])
         axes.scatter(*points[order].T, c=color[order], s=size, linewidths=0, rasterized=len(points) > 3000)
         axes.set(xticks=[], yticks=[])
         axes.set_title(run.label, fontsize=11, pad=18)
         accuracy = view_accuracy(codes, dataset.view_ids[rows], dataset.object_ids[rows])
-        told = "view told from the code: {:.0%} (chance {:.0%})".format(*accuracy) if accuracy else ""
-        axes.text(0.5, 1.02, told.replace("%", " %"), transform=axes.transAxes, ha="center", va="bottom", fontsize=8)
+        caption = "view told from the code: {:.0%} (chance {:.0%})".format(*accuracy) if accuracy else ""
+        axes.text(0.5, 1.02, caption.replace("%", " %"), transform=axes.transAxes, ha="center", va="bottom", fontsize=8)
         axes.margins(0.06)
         axes.spines[:].set_color("#bbbbbb")
     axes = figure.add_subplot(grid[:, -1], projection="polar")
     edges = np.linspace(0, 2 * np.pi, 361)
     middles = (edges[1:] + edges[:-1]) / 2
     axes.pcolormesh(edges, [0.58, 1.0], middles[None], cmap=wheel, vmin=0, vmax=2 * np.pi, rasterized=True)
-    axes.set_theta_zero_location("S")  # as seen from above: camera 0 stands below, azimuth 90 to the right
+    axes.set_theta_zero_location("S")  # seen from above: the camera of azimuth 0 is below, that of 90 to the right
     axes.set(ylim=(0, 1), yticks=[])
     axes.set_thetagrids([0, 90, 180, 270], ["0°", "90°", "180°", "270°"], fontsize=8)
     axes.tick_params(pad=-1)
@@ -80,7 +80,7 @@ def draw_tsne(runs: Sequence[Run]) -> Figure:
 
 
 def embed(codes: np.ndarray) -> np.ndarray:
-    """Codes float [M, C] in the plane by t-SNE, float32 [M, 2]: the same points for the same codes."""
+    """Embed codes float [M, C] in the plane by t-SNE, float32 [M, 2]. The same codes give the same points."""
     if len(codes) < FEWEST_CODES:
         raise ValueError(f"an embedding needs codes [M, C] of at least {FEWEST_CODES} images, got {list(codes.shape)}")
     tsne = TSNE(n_components=2, perplexity=min(30.0, (len(codes) - 1) / 3), init="pca", random_state=0)
@@ -88,11 +88,11 @@ def embed(codes: np.ndarray) -> np.ndarray:
 
 
 def view_accuracy(codes: np.ndarray, view_ids: np.ndarray, object_ids: np.ndarray) -> tuple[float, float] | None:
-    """How well the view class is read from a code: (share predicted right by 5 nearest neighbours, share by chance).
+    """Accuracies of predicting the view class from codes float [M, C]: by 5 nearest neighbours, and by chance.
 
-    Codes float [M, C]. Neighbours are sought among the images of other objects (5-fold cross-validation over objects):
-    other views of the same object lie nearest in a code without pose, and would count as wrong answers. Chance is the
-    most frequent view of the other objects. None with a single object or view.
+    5-fold cross-validation over objects: neighbours are images of other objects. In a code without pose the nearest
+    neighbours are other views of the same object, which would count as errors. Chance always predicts the most frequent
+    view. None if there is a single object or view.
     """
     objects = len(np.unique(object_ids))
     if objects < 2 or len(np.unique(view_ids)) < 2:
@@ -105,10 +105,10 @@ def view_accuracy(codes: np.ndarray, view_ids: np.ndarray, object_ids: np.ndarra
 
 
 def cyclic_colors(count: int = 256) -> np.ndarray:
-    """Colours of a full turn, float [count, 3] in [0, 1]: no jump at its end, opposite directions clearly different.
+    """A cyclic colour map, float [count, 3] in [0, 1], that is safe for every kind of colour vision.
 
-    A circle in CIE Lab through lightness and the blue-yellow axis, which every kind of colour vision sees, with some
-    red-green in between: dark violet, blue, light green, brown. None is too light for a white page.
+    A circle in CIE Lab through lightness and the blue-yellow axis: dark violet, blue, light green, brown. Opposite
+    directions differ clearly, and no colour is too light for a white page.
     """
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
     lab = np.stack([54 - 28 * np.cos(angle), 24 * np.cos(angle) - 16 * np.sin(angle), -50 * np.sin(angle)], axis=1)

@@ -1,10 +1,10 @@
 "use strict";
 const page = JSON.parse(document.getElementById("data").textContent);
-const MOST_MESHES = 4;  // browsers keep a few WebGL scenes alive
+const MOST_MESHES = 4;  // browsers limit the number of WebGL scenes
 const config = { displayModeBar: false, responsive: true, scrollZoom: false, showTips: false };
 const find = id => document.getElementById(id);
 const color = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-const plain = text => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");  // plotly takes text for HTML
+const plain = text => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");  // plotly reads text as HTML
 const iou = value => value === null ? "–" : value.toFixed(3);
 
 function element(parent, tag, values = {}) {
@@ -45,7 +45,7 @@ function drawViews() {
     angularaxis: { ...lines, rotation: 270, dtick: 45 }, radialaxis: { ...lines, range: [0, Math.min(1, 1.05 * top)], angle: 290, nticks: 5 } } })), config);
 }
 
-// Shapes: a scene for each mesh, filled again for another image. All have one camera.
+// Shapes: a scene for each mesh, used again for the next image. All scenes share one camera.
 
 let item = 0, camera = null, active = null, panes = [];
 
@@ -131,7 +131,7 @@ function show(number) {
   drawPanes();
 }
 
-// Choosing: images, objects of the table, runs where there are more than scenes.
+// Choosing images, objects of the table, and runs if there are more runs than scenes.
 
 find("items").addEventListener("change", event => show(Number(event.target.value)));
 find("objects").tBodies[0].addEventListener("click", event => {

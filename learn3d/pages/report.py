@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -32,16 +32,16 @@ from learn3d.pictures.surfaces import Surface, azimuths_deg, eyes
 from learn3d.presets import PRESETS
 from learn3d.terminal import plain
 
-UNIT = 1e-4  # unit of the stored int16 coordinates: they reach to 3.3, objects to 1
-#: Turns row vectors of the object frame into the page's axes: z is up (in mesh files y is).
+UNIT = 1e-4  # length of 1 in the stored int16 coordinates, which reach 3.3; objects reach 1
+#: Maps row vectors of the object frame to the page's axes, with z up (y is up in mesh files).
 _TO_PAGE = mesh_to_object() @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 @torch.no_grad()
 def pack_shapes(runs: Sequence[Run], samples: Sequence[int]) -> list[dict[str, Any]]:
-    """For each of the images the picture and the meshes: one of each run, then the true shape if it is known.
+    """For each image the picture and its meshes: one of each run, then the true shape if it is known.
 
-    "reach" is the largest radius, "eye" the direction of the camera, an oblique one if it is not known.
+    "reach" is the largest radius of the meshes, "eye" the direction of the camera (an oblique one if it is unknown).
     """
     dataset = max((run.dataset for run in runs), key=lambda dataset: dataset.image_size)
     batch = dataset.batch(torch.tensor(samples))
@@ -49,7 +49,8 @@ def pack_shapes(runs: Sequence[Run], samples: Sequence[int]) -> list[dict[str, A
     shapes = [run.method.decode(run.method.encode(own)).surfaces() for run, own in zip(runs, images, strict=True)]
     if batch.voxels is not None:
         grids = dataset.convention.to_object(batch.voxels).float()
-        shapes.append([_smoothed(grid_surface(grid, box=dataset.convention.cube_side)) for grid in grids])
+        surfaces = [grid_surface(grid, box=dataset.convention.cube_side) for grid in grids]
+        shapes.append([Surface(*smooth(s.vertices, s.faces, levels=0)) if len(s.faces) else s for s in surfaces])
     pictures = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
     oblique = LookAtPoses(torch.full((len(samples),), -30.0), 20.0, 1.0, 15.0)
     cameras = eyes(batch.poses or oblique).numpy() @ _TO_PAGE
@@ -72,27 +73,22 @@ def pack_shapes(runs: Sequence[Run], samples: Sequence[int]) -> list[dict[str, A
     return items
 
 
-def _smoothed(surface: Surface) -> Surface:
-    """Without the steps of its voxels."""
-    return Surface(*smooth(surface.vertices, surface.faces, levels=0)) if len(surface.faces) else surface
-
-
 def _mesh(surface: Surface) -> dict[str, Any]:
     points = np.rint(surface.vertices.double().numpy() @ _TO_PAGE / UNIT).clip(-32767, 32767)
-    corners = surface.faces.numpy()[:, [0, 2, 1]]  # turned over: the object frame is left-handed
+    corners = surface.faces.numpy()[:, [0, 2, 1]]  # reversed, because the object frame is left-handed
     packed = {axis: _base64(points[:, n], "i2") for n, axis in enumerate("xyz")}
     kind = "u2" if len(points) <= 2**16 else "u4"
     return packed | {axis: _base64(corners[:, n], kind) for n, axis in enumerate("ijk")} | {"empty": len(corners) == 0}
 
 
 def _base64(values: np.ndarray, dtype: str) -> dict[str, str]:
-    """An array in plotly's form."""
+    """An array in plotly's encoding."""
     return {"dtype": dtype, "bdata": base64.b64encode(values.astype(f"<{dtype}").tobytes()).decode()}
 
 
-#: Okabe and Ito's colours, told apart with any kind of colour vision, darker ones first: yellow is too faint for lines.
-COLORS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-#: Titles of panels. Other numbers have the name under which they are logged.
+#: Okabe and Ito's colours, safe for every kind of colour vision, darker ones first, without the faint yellow.
+COLORS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+#: Titles of curves. Other curves have the name under which they are logged.
 TITLES = {
     "projection": "projection loss (1 - IoU)",
     "smoothness": "smoothness loss",
@@ -106,20 +102,20 @@ TITLES = {
     "silhouette_iou": "silhouette IoU",
     "mmd": "MMD between views",
 }
-_FIRST = ("voxel_iou", "mmd", "projection", "total")  # panels in this order, then as they come
+_FIRST = ("voxel_iou", "mmd", "projection", "total")  # the first curves; the others follow in the order of the log
 _NOT_CURVES = {"hollow", "seconds"}
 
 SECTOR_DEG = 15
-Key = tuple[str, str]  # split ("train", "val" ...) and name of a number
-Curve = dict[int, float]  # value at each step, in the order of the steps
-Log = dict[Key, Curve]  # all that a run has logged
+POINTS = 500  # the most points of a curve: every n-th is drawn of a longer one
+MOST_SHOWN = 100  # images with shapes; each takes some 60 kB
+#: All curves of a run: by split ("train", "val") and name, the value at each step, in the order of the steps.
+Log = dict[tuple[str, str], dict[int, float]]
 
 
 def read_metrics(folder: Path) -> Log:
-    """All curves of a run folder's metrics.jsonl, by split and name.
+    """The curves in a run folder's metrics.jsonl. An incomplete last line is ignored: the run may be writing it.
 
-    A last line cut short is left out: the run may be writing it. Raises FileNotFoundError without such a file and
-    ValueError for one above 256 MiB and, naming it, for a line that is not a record of a run.
+    Raises FileNotFoundError without such a file, and ValueError for one above 256 MiB or a line that is no record.
     """
     file = Path(folder) / "metrics.jsonl"
     lines = read_text(file, limits.METRICS_BYTES, "the metrics of a run", errors="replace").splitlines()
@@ -145,34 +141,19 @@ def read_metrics(folder: Path) -> Log:
     return {key: dict(sorted(curve.items())) for key, curve in curves.items()}
 
 
-def panels(runs: Iterable[Log]) -> list[Key]:
-    """The numbers of all runs in the order in which they are shown: validation first, then losses."""
-    keys = dict.fromkeys(key for run in runs for key in run)
-    return sorted(keys, key=lambda key: (key[0] == "train", _FIRST.index(key[1]) if key[1] in _FIRST else len(_FIRST)))
-
-
-def title_of(key: Key) -> str:
-    """The title of a panel."""
-    return f"{TITLES.get(key[1], key[1])}, {key[0]}"
-
-
 def mean_by_azimuth(azimuths_deg: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(Azimuths float64 [D] of the sectors of 15 degrees that have images, mean of their values without NaN).
+    """Azimuths float64 [D] of the sectors that have images, and the mean of their values, NaN if none is known.
 
-    The sectors are centred at 0, 15, 30 ...; azimuths_deg and values are float [M]. A mean of nothing is NaN.
+    Sectors have 15 degrees and are centred at 0, 15, 30 ... azimuths_deg, values: float [M].
     """
     sectors, ids = np.unique(np.round(azimuths_deg / SECTOR_DEG) % (360 / SECTOR_DEG), return_inverse=True)
     return SECTOR_DEG * sectors, np.array([mean(values[ids == number]) for number in range(len(sectors))])
 
 
 def mean(values: np.ndarray) -> float:
-    """Mean without NaN; NaN if nothing is left."""
+    """The mean of the values that are not NaN; NaN if all are."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else float("nan")
-
-
-POINTS = 500  # the most that are drawn of a curve: every n-th of a longer one
-MOST_SHOWN = 100  # images with shapes; each takes some 60 kB
 
 
 def write_report(
@@ -184,24 +165,23 @@ def write_report(
     category: str | None = None,
     split: str = "test",
     which: Literal["last", "best"] = "last",
-    device: str = "cpu",
     objects: int = 12,
     indices: Sequence[int] = (),
     report_progress: Callable[[str], None] = lambda text: None,
 ) -> int:
-    """Measure runs on a split as `learn3d evaluate` does and write the page; returns its size in bytes.
+    """Measure runs on a split as `learn3d evaluate` does, and write the page; returns its size in bytes.
 
-    `data` and `category` default to those that the runs were trained with, `labels` to the names of their presets.
-    Shapes are shown of so many `objects`, from the best to the worst, each from a view that is typical of its IoU; or
-    of the images `indices` (object * views + view). Raises ValueError or OSError, before anything is measured, if a
-    checkpoint or its data is not there, and for runs that are not of one class and the same images.
+    `data` and `category` default to those of the training, `labels` to the names of the presets. objects: number of
+    objects whose shapes are shown, from the best to the worst, each in an image of typical IoU. indices: images to show
+    instead (object * views + view). Raises ValueError or OSError, before anything is measured, if a checkpoint or its
+    data is missing, and ValueError for runs on several categories or on different images.
     """
     if not 1 <= (count := len(indices) or objects) <= MOST_SHOWN:
         raise ValueError(f"shapes can be shown of 1 to {MOST_SHOWN} images, and {count} are asked for")
-    where = {"data": data, "category": category, "split": split, "which": which, "device": device}
-    runs = open_runs(paths, labels=labels, report_progress=report_progress, **where)
+    source = {"data": data, "category": category, "split": split, "which": which}
+    runs = open_runs(paths, labels=labels, report_progress=report_progress, **source)
     _check_same_images(runs, data)
-    runs[0].dataset.batch(torch.tensor(indices, dtype=torch.int64))  # says which indices there are
+    runs[0].dataset.batch(torch.tensor(indices, dtype=torch.int64))  # raises for wrong indices
     logs = [read_metrics(path) if (Path(path) / "metrics.jsonl").is_file() else {} for path in paths]
     results = []
     for run in runs:
@@ -213,7 +193,7 @@ def write_report(
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["plain"] = plain
     template = environment.from_string(folder.joinpath("report.html").read_text("utf-8"))
-    page["data"] = plain(Path(data or runs[0].metadata.config.data).name)
+    page["data"] = plain((data or runs[0].metadata.config.data).name)
     content = template.render(page, style=style, script=script, plotly=Markup(get_plotlyjs())).encode()
     writing.write_bytes(output, content)
     return len(content)
@@ -237,38 +217,40 @@ def _check_same_images(runs: Sequence[Run], data: Path | None) -> None:
 def _fill(
     runs: Sequence[Run], results: Sequence[Evaluation], logs: Sequence[Log], objects: int, indices: Sequence[int]
 ) -> dict[str, Any]:
-    """All that the template is filled with; "browser" is for its script."""
+    """The values of the template; "browser" is for the script of the page."""
     dataset = runs[0].dataset
     ids, names, truth = dataset.object_ids, dataset.object_names, dataset.voxels is not None
-    ious = np.full((len(runs), len(ids)), np.nan)  # run by image
-    for row, result in zip(ious, results, strict=True):
-        row[:] = result.values[result.main_metric].numpy()
+    ious = np.stack([result.values[result.main_metric].numpy() for result in results])  # run by image
     sums = np.stack([np.bincount(ids, np.nan_to_num(row), len(names)) for row in ious])
     counts = np.stack([np.bincount(ids, ~np.isnan(row), len(names)) for row in ious])
     means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)  # run by object
     over_runs = np.array([mean(column) for column in means.T])
     ranked = np.unique(ids)  # the best object first
     ranked = ranked[np.argsort(-np.nan_to_num(over_runs[ranked], nan=-1.0), kind="stable")]
+
+    def typical_sample(number: int) -> int:
+        samples = np.flatnonzero(ids == number)
+        distances = [abs(mean(ious[:, sample]) - over_runs[number]) for sample in samples]
+        return samples[np.nan_to_num(distances, nan=9.0).argmin()]
+
     if not indices:
-        for number in ranked[np.unique(np.linspace(0, len(ranked) - 1, min(objects, len(ranked))).round().astype(int))]:
-            samples = np.flatnonzero(ids == number)
-            off = [abs(mean(ious[:, sample]) - over_runs[number]) for sample in samples]
-            indices = [*indices, samples[np.nan_to_num(off, nan=9.0).argmin()]]
+        places = np.unique(np.linspace(0, len(ranked) - 1, min(objects, len(ranked))).round().astype(int))
+        indices = [typical_sample(number) for number in ranked[places]]
     rank = {number: place for place, number in enumerate(ranked)}
     shown = sorted(map(int, dict.fromkeys(indices)), key=lambda sample: rank[ids[sample]])
     items = pack_shapes(runs, shown)
     for item, sample in zip(items, shown, strict=True):
         item |= {"ious": _numbers(ious[:, sample]), "means": _numbers(means[:, ids[sample]])}
-    place = {ids[sample]: number for number, sample in reversed(list(enumerate(shown)))}
+    first_item = {ids[sample]: number for number, sample in reversed(list(enumerate(shown)))}  # of an object
     views = []
     if dataset.poses is not None:
         by_view = [mean_by_azimuth(azimuths_deg(dataset.poses).numpy(), row) for row in ious]
         views = [{"azimuths": azimuths.tolist(), "ious": _numbers(values)} for azimuths, values in by_view]
-    looks = [{"name": plain(run.label), "color": COLORS[k % (len(COLORS) - 1)]} for k, run in enumerate(runs)]
+    legend = [{"name": plain(run.label), "color": COLORS[k % len(COLORS)]} for k, run in enumerate(runs)]
     resampled = [resampled_means([total], [number]) for total, number in zip(sums, counts, strict=True)]
     rows = []
-    for run, result, look, samples in zip(runs, results, looks, resampled, strict=True):
-        row = look | {"about": run.metadata, "method": PRESETS[run.metadata.config.preset].label, "mmd": result.mmd}
+    for run, result, entry, samples in zip(runs, results, legend, resampled, strict=True):
+        row = entry | {"about": run.metadata, "method": PRESETS[run.metadata.config.preset].label, "mmd": result.mmd}
         row |= {"iou": result.means.get(result.main_metric), "interval": percentile_interval(samples)}
         row["command"] = command_line(run.metadata.config, data="DATA", output="OUTPUT", pretrained="WEIGHTS")
         if rows and None not in (row["iou"], rows[0]["iou"]):
@@ -281,33 +263,39 @@ def _fill(
         "category": plain(dataset.category),
         "images": len(dataset),
         "objects": [
-            {"name": plain(names[number]), "ious": _numbers(means[:, number]), "item": place.get(number)}
+            {"name": plain(names[number]), "ious": _numbers(means[:, number]), "item": first_item.get(number)}
             for number in ranked
         ],
         "kind": kind,
         "meaning": MEASURES["voxel_iou" if truth else "silhouette_iou"][1],
         "mmd": MEASURES["mmd"][1],
         "truth": truth,
-        "browser": {"runs": looks, "items": items, "kind": kind, "views": views, "curves": _curves(logs), "unit": UNIT},
+        "browser": {
+            "runs": legend,
+            "items": items,
+            "kind": kind,
+            "views": views,
+            "curves": _curves(logs),
+            "unit": UNIT,
+        },
     }
 
 
 def _curves(logs: Sequence[Log]) -> list[dict[str, Any]]:
-    """The logged numbers as panels, validation first, with a line of each run."""
-    found = []
-    for key in panels(logs):
-        steps, values, positive = [], [], True
-        for log in logs:
-            points = list(log.get(key, {}).items())
-            points = points[:: len(points) // POINTS + 1]
-            steps.append([step for step, _ in points] or None)
-            values.append(_numbers([value for _, value in points]))
-            positive &= all(value > 0 for _, value in points)
-        found.append({"title": plain(title_of(key)), "steps": steps, "values": values})
-        found[-1]["log"] = key[0] == "train" and positive
-    return found
+    """A plot for each number in the logs, with a line per run: those of the validation first, then the losses."""
+    keys = dict.fromkeys(key for log in logs for key in log)
+    plots = []
+    for split, name in sorted(keys, key=lambda key: (key[0] == "train", [*_FIRST, key[1]].index(key[1]))):
+        lines = [list(log.get((split, name), {}).items()) for log in logs]
+        lines = [line[:: len(line) // POINTS + 1] for line in lines]
+        plot = {"title": plain(f"{TITLES.get(name, name)}, {split}")}
+        plot["steps"] = [[step for step, _ in line] or None for line in lines]
+        plot["values"] = [_numbers([value for _, value in line]) for line in lines]
+        plot["log"] = split == "train" and all(value > 0 for line in lines for _, value in line)
+        plots.append(plot)
+    return plots
 
 
 def _numbers(values: Sequence[float]) -> list[float | None]:
-    """To five significant digits; None for a number that JSON does not have."""
+    """The values to five significant digits; None for NaN and infinity, which JSON lacks."""
     return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]

@@ -1,1 +1,1 @@
-"""Drawing, for every other room: meshes as pictures, pictures in rows and columns, and the files they go into."""
+"""Drawing for all other rooms: meshes as pictures, pictures in rows and columns, image files."""

@@ -1,4 +1,4 @@
-"""Pictures in rows and columns with titles, the files that they are written into, and the sheet of a data set."""
+"""Pictures in rows and columns with titles, image files, and the contact sheet of a data set."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from learn3d.files import writing
 
-TILE = 96
-MARGIN = 4
-HEADER = 18
+TILE = 96  # pixels: side of a picture
+MARGIN = 4  # pixels between pictures
+HEADER = 18  # pixels: height of the column titles
 _TEXT = (60, 60, 60)
 _RULE = (205, 205, 205)
 
@@ -29,8 +29,8 @@ def tile(
 ) -> np.ndarray:
     """Arrange pictures uint8 [h,w,3] on a white sheet, each scaled to the same square; uint8 [H,W,3].
 
-    None leaves a place free. Titles stand above the columns and to the left of the rows; a thin line stands above each
-    row whose number is in `rules`.
+    None leaves a place free. Titles are above the columns and to the left of the rows. rules: numbers of the rows that
+    have a thin line above them.
     """
     font = ImageFont.load_default(12)
     top = HEADER + MARGIN if titles else MARGIN
@@ -57,37 +57,37 @@ def tile(
 
 
 def natural_colors(images: np.ndarray, *, inverted: bool = True) -> np.ndarray:
-    """Stored images uint8 [..., 4, H, W] -> uint8 [..., H, W, 3] as a person wants to see them.
+    """The colours uint8 [..., H, W, 3] of stored images uint8 [..., 4, H, W].
 
-    inverted: colours stored as 255 - colour over black, see `ViewDataset.inverted`.
+    inverted: colours are stored as 255 - colour over black, see `ViewDataset.inverted`.
     """
     colors = np.moveaxis(images[..., :3, :, :], -3, -1)
     return 255 - colors if inverted else colors
 
 
 def stack(blocks: Sequence[np.ndarray], *, gap: int = 0) -> np.ndarray:
-    """Pictures uint8 [h,w,3] below each other, flush left."""
-    width, last = max(block.shape[1] for block in blocks), len(blocks) - 1
-    padding = [((0, gap if i < last else 0), (0, width - block.shape[1]), (0, 0)) for i, block in enumerate(blocks)]
-    return np.concatenate([np.pad(b, p, constant_values=255) for b, p in zip(blocks, padding, strict=True)])
+    """Pictures uint8 [h,w,3] below each other, flush left, with `gap` white rows between them."""
+    width = max(block.shape[1] for block in blocks)
+    padded = [np.pad(b, ((0, gap), (0, width - b.shape[1]), (0, 0)), constant_values=255) for b in blocks]
+    return np.concatenate(padded)[: -gap or None]
 
 
 def magnify(pictures: np.ndarray, zoom: float) -> np.ndarray:
-    """The central part of pictures uint8 [N,h,w,3], a share 1 / zoom of each side; they become smaller by it."""
+    """The central part of pictures uint8 [N,h,w,3]: a share 1 / zoom of each side, in fewer pixels."""
     height, width = pictures.shape[1:3]
     top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
     return pictures[:, top : height - top, left : width - left]
 
 
 def save_png(path: Path, rgb: np.ndarray) -> None:
-    """Write a picture uint8 [H,W,3], or [H,W,4] with its opacity."""
+    """Write a picture uint8 [H,W,3], or [H,W,4] with opacity."""
     buffer = io.BytesIO()
     Image.fromarray(rgb).save(buffer, format="PNG", optimize=True)
     writing.write_bytes(path, buffer.getvalue())
 
 
 def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0) -> None:
-    """Write an endless animation from frames uint8 [N,H,W,3]."""
+    """Write an animation that repeats for ever, frames uint8 [N,H,W,3]."""
     buffer = io.BytesIO()
     first, *rest = [Image.fromarray(f).convert("P", palette=Image.Palette.ADAPTIVE, colors=64) for f in frames]
     times = {"duration": round(1000 / frames_per_second), "loop": 0}
@@ -95,10 +95,8 @@ def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0)
     writing.write_bytes(path, buffer.getvalue())
 
 
-CELL = 64
-VIEWS = 8
-ROWS = 6
-
+#: The contact sheet of a data set: side of its pictures in pixels, views of an object, objects of a split, and legend.
+CELL, VIEWS, ROWS = 64, 8, 6
 LEGEND = (
     "rows: up to 6 objects of each split; columns: up to 8 views, the mask of view 0 (black: the object), the voxels "
     "seen from the front (the darker, the thicker)"
@@ -106,30 +104,30 @@ LEGEND = (
 
 
 def make_row(rgb: np.ndarray, alpha: np.ndarray, voxels: np.ndarray) -> list[np.ndarray]:
-    """The pictures of an object, uint8 [64, 64, 3]: up to 8 views, the mask of view 0, the voxels from the front.
+    """An object's row of the contact sheet: up to 8 views, the mask of view 0, the voxels, each uint8 [64, 64, 3].
 
     rgb uint8 [n, S, S, 3] over white, alpha uint8 [n, S, S], voxels bool [32, 32, 32] with axes (x, y, z), z = away.
     """
     thickness = voxels.sum(axis=2).T[::-1]
     ink = np.where(thickness > 0, 60 + 195 * thickness / max(1, thickness.max()), 15)  # the grid's own square is grey
-    pictures = [*map(Image.fromarray, rgb[_shown(len(rgb))]), Image.fromarray(255 - alpha[0])]
+    pictures = [*map(Image.fromarray, rgb[_shown_views(len(rgb))]), Image.fromarray(255 - alpha[0])]
     pictures.append(Image.fromarray(255 - ink.astype(np.uint8)))
     return [np.asarray(p.resize((CELL, CELL), Image.Resampling.BOX).convert("RGB")) for p in pictures]
 
 
 def draw_sheet(splits: Mapping[str, Sequence[list[np.ndarray]]], views: int) -> np.ndarray:
-    """At most 6 rows of every split, named on the left, below the names of the columns (see `LEGEND`): uint8 [H, W, 3].
+    """The contact sheet of a data set with `views` views of each object (see `LEGEND`): uint8 [H, W, 3].
 
-    splits: rows that `make_row` made of objects with so many views, by split.
+    splits: for each split rows by `make_row`, of which at most 6 are drawn.
     """
     rows, names = [], []
     for split, of_split in splits.items():
         chosen = np.unique(np.linspace(0, len(of_split) - 1, ROWS).astype(int)) if of_split else ()
         rows += [of_split[i] for i in chosen]
         names += [split, *[""] * (len(chosen) - 1)][: len(chosen)]
-    titles = [*(f"view {view}" for view in _shown(views)), "mask of 0", "voxels"]
+    titles = [*(f"view {view}" for view in _shown_views(views)), "mask of 0", "voxels"]
     return tile(rows, titles, tile_size=CELL, row_titles=names, rules=[r for r, name in enumerate(names) if name])
 
 
-def _shown(views: int) -> range:
+def _shown_views(views: int) -> range:
     return range(0, views, -(-views // VIEWS))

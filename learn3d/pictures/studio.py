@@ -1,4 +1,4 @@
-"""Pictures of meshes for data sets and figures: nmr's lights, set up as in a studio, on white paper."""
+"""Pictures of meshes for data sets and figures: studio lights, white background."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import torch.nn.functional as F
 import nmr
 
 KEY_LIGHT = (0.45, 0.8, -0.4)  # towards the light, object frame (x right, y up, -z towards the camera of view 0)
-BACK_LIGHT = 0.35  # share of the diffuse light that comes from the opposite side: shadow sides keep their relief
+BACK_LIGHT = 0.35  # strength of the light from the opposite side, relative to the key light
 
 
 def studio_lights(light: Sequence[float] = KEY_LIGHT, ambient: float = 0.5, smooth: bool = False) -> nmr.Lights:
-    """A key light from `light` (any length but 0), a weaker one from behind, and a share `ambient` from everywhere.
+    """A key light from the direction `light` (of any length but 0), a weaker one from behind, and ambient light.
 
-    A surface that faces the key light has the light 1. smooth: no facets are seen.
+    ambient: its share in 0 .. 1; a surface that faces the key light has the brightness 1. smooth: interpolate normals.
     """
     key, direction = 1.0 - ambient, torch.as_tensor(light, dtype=torch.float64)
     direction = direction / direction.norm()
@@ -35,7 +35,7 @@ def photograph(
     lights: nmr.Lights | None = None,
     supersample: int = 2,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One mesh in B views on white, both sides of its faces lit alike; not differentiable.
+    """One mesh in B views on white. Both sides of its faces are lit in the same way. Not differentiable.
 
     vertices float [V, 3] in the object frame, faces integer [F, 3], face_colors float [F, 3] or [3] in [0, 1], a camera
     of nmr with B poses. supersample: subpixels per pixel and axis, an even number; 2 covers exactly the pixels that

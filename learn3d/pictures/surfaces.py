@@ -1,4 +1,4 @@
-"""Pictures of shapes: cameras around them, and how they are drawn."""
+"""Pictures of reconstructed shapes, and the cameras around them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from learn3d.pictures.studio import photograph, studio_lights
 
 CLAY = (0.62, 0.68, 0.78)
 _LIGHT = (-0.5, -0.45, -0.75)  # towards the light: left of, above and behind the camera, in its axes (y is down)
-_FAR = 5.0  # distance of orthographic cameras: outside of any object, or its faces would seem turned away
+_FAR = 5.0  # distance of orthographic cameras, outside of any object: faces behind a camera would be lit from behind
 
 Cameras = Sequence[nmr.LookAt | nmr.Orthographic]  # each of one view
 
@@ -26,15 +26,14 @@ class Surface(NamedTuple):
     """One shape as triangles, on the CPU."""
 
     vertices: Tensor  # float32 [V, 3], object frame
-    faces: Tensor  # int64 [F, 3]; F = 0 is an empty shape, for which nothing is drawn
+    faces: Tensor  # int64 [F, 3]; F = 0 is an empty shape
     colors: Tensor | None = None  # float32 [V, 3] in [0, 1], R, G, B of each vertex; None: clay
 
 
 def orbit(poses: Poses, turns_deg: Sequence[float], *, zoom: float = 1.0) -> Cameras:
-    """The camera of a single pose, carried around the object's vertical axis by these angles: one camera each.
+    """The camera of a single pose, turned about the object's vertical axis by each of these angles.
 
-    It keeps its elevation, distance, field of view and roll; 0 is the pose itself, a positive turn adds to the azimuth.
-    `zoom` magnifies the picture about its centre.
+    A turn adds to the azimuth; elevation, distance, field of view and roll stay. `zoom` magnifies about the centre.
     """
     if isinstance(poses, LookAtPoses):
         elevation, distance, half_fov = (
@@ -70,9 +69,9 @@ def azimuths_deg(poses: Poses | None) -> Tensor:
 
 
 def common_zoom(shapes: Iterable[tuple[Surface, Cameras]], masks: Tensor) -> float:
-    """The largest magnification, at least 1, at which shapes and photographed objects stay inside their pictures.
+    """The largest magnification, at least 1, at which shapes and masks stay inside their pictures.
 
-    masks: float [B, S, S] of the input images; one that touches its border allows no magnification.
+    masks: float [B, S, S] of the input images. A mask that touches the border allows no magnification.
     """
     inside = torch.nonzero(masks > 0.5)[:, 1:]
     farthest = [0.05, *((2 * inside + 1) / masks.shape[-1] - 1).abs().flatten().tolist()]  # 1 is the border
@@ -83,30 +82,27 @@ def common_zoom(shapes: Iterable[tuple[Surface, Cameras]], masks: Tensor) -> flo
 
 
 def draw_surface(surface: Surface, cameras: Cameras, *, image_size: int) -> np.ndarray:
-    """One shape on white, in its colours or as plain clay, as each of N cameras sees it: uint8 [N,S,S,3].
+    """One shape on white, in its colours or as clay, from each of N cameras: uint8 [N,S,S,3].
 
-    The light goes with the camera (from above its left shoulder), so that no side of the shape lies in the dark.
+    The light moves with the camera (from above, left of it), so that no side of the shape is dark.
     """
     if len(surface.faces) == 0:
         return np.full((len(cameras), image_size, image_size, 3), 255, np.uint8)
-    colored = surface.colors is not None  # by a picture, whose light is in the colours
+    colored = surface.colors is not None  # colours of a photograph have its light: shade them less
     colors = surface.colors.detach()[surface.faces].mean(dim=1).numpy() if colored else CLAY
     pictures = []
-    for camera in cameras:  # one at a time: the fine images take memory
-        light = torch.tensor(_LIGHT, dtype=torch.float64) @ camera.projection().matrix[0, :, :3]
-        fine = {
-            "image_size": image_size,
-            "supersample": 4,
-            "lights": studio_lights(light, 0.85 if colored else 0.4, smooth=colored),
-        }
-        pictures.append(photograph(surface.vertices, surface.faces, colors, camera, **fine)[0])
+    for camera in cameras:  # one at a time, to save memory
+        direction = torch.tensor(_LIGHT, dtype=torch.float64) @ camera.projection().matrix[0, :, :3]
+        options = {"lights": studio_lights(direction, 0.85 if colored else 0.4, smooth=colored), "supersample": 4}
+        rgb, _ = photograph(surface.vertices, surface.faces, colors, camera, image_size=image_size, **options)
+        pictures.append(rgb)
     return np.concatenate(pictures)
 
 
 def draw_around(
     surface: Surface, azimuths_deg: Sequence[float], *, elevation_deg: float = 20.0, image_size: int
 ) -> np.ndarray:
-    """One shape from several azimuths, by a camera that just holds it at each of them: uint8 [N,S,S,3]."""
+    """One shape from N azimuths, with the field of view that just contains it at all of them: uint8 [N,S,S,3]."""
     radius = float(surface.vertices.norm(dim=1).max()) if len(surface.vertices) else 0.0
     half_fov = max(1.0, math.degrees(math.asin(min(1.03 * radius / DISTANCE, 0.9))))
     pose = LookAtPoses(torch.zeros(1), elevation_deg, DISTANCE, half_fov)

@@ -1,4 +1,4 @@
-// The page: takes pictures, shows their outlines and lets a hand correct them, and shows the meshes that the server makes.
+// The page: takes pictures, shows their outlines for correction, and shows the meshes that the server makes.
 "use strict";
 
 const $ = (id) => document.getElementById(id);
@@ -10,8 +10,8 @@ const HINTS = {
   add: "Paint over the missing part.",
   remove: "Paint over the part that does not belong to it.",
 };
-const OBJECT = 1, BACKGROUND = 2, OPEN = 3; // as learn3d.fitting.cutting has them
-const BRUSH = 12, REACH = 34; // pixels of the picture: of a stroke, and within which the outline may move with it
+const OBJECT = 1, BACKGROUND = 2, OPEN = 3; // the values of learn3d.fitting.cutting
+const BRUSH = 12, REACH = 34; // radii in pixels: of a stroke, and of the region around it in which the outline may move
 let side = 512, name = "picture", colors = null, given = null, mask = null, tool = null, drag = null, current = null;
 
 // Taking pictures
@@ -30,7 +30,7 @@ async function take(source, title) {
     context.imageSmoothingQuality = "high";
     context.drawImage(image, 0, 0, width, height);
     const alpha = context.getImageData(0, 0, width, height).data.filter((_, i) => i % 4 === 3);
-    context.globalCompositeOperation = "destination-over"; // transparent pictures lie on white
+    context.globalCompositeOperation = "destination-over"; // white below transparent pictures
     context.fillStyle = "#fff";
     context.fillRect(0, 0, width, height);
     colors = context.getImageData(0, 0, width, height);
@@ -67,7 +67,7 @@ addEventListener("dragover", (event) => { event.preventDefault(); $("over").hidd
 addEventListener("dragleave", (event) => { if (!event.relatedTarget) $("over").hidden = true; });
 addEventListener("drop", (event) => { event.preventDefault(); $("over").hidden = true; takeFirst(event.dataTransfer.files); });
 
-// The picture, its outline, and the hand that corrects it
+// The picture, its outline, and its correction
 
 function show() {
   const context = picture.getContext("2d"), { width, height } = colors;
@@ -89,7 +89,7 @@ function show() {
   }
 }
 
-/** White inside of the mask's border, dark outside, so that it is seen on any picture. */
+/** The outline: white inside of the mask's border, dark outside, so that any picture shows it. */
 function outline(width, height) {
   const image = new ImageData(width, height), thick = 2;
   const near = (x, y, value) => {
@@ -118,7 +118,7 @@ function boxOf(points) {
   return [Math.min(x, u), Math.min(y, v), Math.abs(x - u), Math.abs(y - v)].map(Math.round);
 }
 
-/** For each pixel what a stroke says of it, as the server wants it. */
+/** The label of each pixel after a stroke, see learn3d.fitting.cutting. */
 function strokesOf(points, value) {
   const { width, height } = colors, strokes = new Uint8Array(width * height);
   const stamp = (x, y, radius, what) => {
@@ -205,7 +205,7 @@ async function send(alpha, strokes = null, box = null) {
       if (done) break;
       const lines = (rest + value).split("\n");
       rest = lines.pop();
-      for (const line of lines) ended = hear(JSON.parse(line), pixels) || ended;
+      for (const line of lines) ended = handle(JSON.parse(line), pixels) || ended;
     }
     if (!ended) throw new Error("the answer broke off");
   } catch (error) {
@@ -213,8 +213,8 @@ async function send(alpha, strokes = null, box = null) {
   }
 }
 
-/** One message of the server; whether it is the last. */
-function hear(message, pixels) {
+/** Handle one message of the server; returns whether it is the last. */
+function handle(message, pixels) {
   if (message.place) say(message.place === 1 ? "You are next …" : `${message.place} are before you …`);
   if (message.mask) {
     const bits = bytes(message.mask);
@@ -256,7 +256,7 @@ function present(meshes) {
   offer("Cut-out (PNG)", `${name}.png`, cutout);
 }
 
-/** The picture with the mask as transparency, which this page and `learn3d reconstruct` read. */
+/** The picture with the mask as transparency, as this page and `learn3d reconstruct` read it. */
 function cutout() {
   const { width, height } = colors, canvas = Object.assign(document.createElement("canvas"), { width, height });
   const image = new ImageData(colors.data.map((value, i) => (i % 4 === 3 ? mask[i >> 2] : value)), width, height);
@@ -275,7 +275,7 @@ function offer(label, file, make) {
   $("downloads").append(button);
 }
 
-// The beginning
+// Start
 
 fetch("about").then((answer) => answer.json()).then((about) => {
   side = about.side;

@@ -1,7 +1,7 @@
-// A mesh in colour that turns, drawn by the processor on a plain canvas: it needs no WebGL and looks alike everywhere.
+// A turning mesh in colour, drawn by the CPU on a canvas: it needs no WebGL and looks the same everywhere.
 "use strict";
 
-/** Positions, normals and colours (as a screen has them, 0 .. 255) and corners of the only mesh of a GLB file. */
+/** Positions, normals, colours (sRGB, 0 .. 255) and corners of the only mesh of a GLB file. */
 function readGlb(buffer) {
   const head = new DataView(buffer), size = head.getUint32(12, true);
   const tree = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 20, size)));
@@ -35,16 +35,16 @@ function toObj(mesh) {
   return lines.join("\n") + "\n";
 }
 
-/** Shows one mesh on a canvas; it turns by itself until a hand turns it, and again a while after. */
+/** Shows one mesh on a canvas. It turns by itself, but not for some seconds after the user has turned it. */
 class Viewer {
   static SPEED = 0.5; // radians a second
-  static REST = 4000; // milliseconds after a hand's last move
+  static REST = 4000; // milliseconds after the user's last move
   static LIGHT = [-0.44, 0.62, 0.65]; // right, up, towards the eye
 
   constructor(canvas, mesh, yaw) {
     Object.assign(this, { canvas, mesh, yaw, pitch: 0.3, zoom: 1, quality: 2 });
     this.still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-    this.waitUntil = performance.now() + 1200; // at first from the side that the picture shows
+    this.waitUntil = performance.now() + 1200; // at first the mesh is seen from the picture's camera
     this.fine = document.createElement("canvas");
     this.measure();
     canvas.tabIndex = 0;
@@ -119,11 +119,11 @@ class Viewer {
     this.drawShadow(context, width, height);
     context.imageSmoothingQuality = "high";
     context.drawImage(fine, 0, 0, width, height);
-    const took = performance.now() - start; // a slow device draws fewer pixels
+    const took = performance.now() - start; // draw fewer pixels on slow devices
     if (took > 45) this.quality = Math.max(0.6, this.quality * 0.8);
   }
 
-  /** Where the camera stands: [right, up, towards the eye], distance, pixels per unit at distance 1. */
+  /** The camera: its axes [right, up, towards the eye], its distance, pixels per unit at distance 1. */
   camera(width, height) {
     const cy = Math.cos(this.yaw), sy = Math.sin(this.yaw), cp = Math.cos(this.pitch), sp = Math.sin(this.pitch);
     const distance = 4.2 * this.reach;
@@ -147,7 +147,7 @@ class Viewer {
     }
   }
 
-  /** Triangles with colours between those of their corners, the nearest in front. */
+  /** Draw the triangles with interpolated colours and a depth buffer. */
   fill(width, height) {
     const { corners } = this.mesh, { seen, lit, pixels, near } = this;
     for (let f = 0; f < corners.length; f += 3) {
@@ -175,7 +175,7 @@ class Viewer {
     }
   }
 
-  /** A soft shadow on the ground: a small picture of all points as they lie on it, drawn large. */
+  /** A soft shadow on the ground: a small picture of the points' projections, enlarged. */
   drawShadow(context, width, height) {
     if (this.pitch < 0.05) return; // seen from below the ground
     const { points } = this.mesh, { axes, distance, focus } = this.camera(width, height), [right, up, eye] = axes;
@@ -196,7 +196,7 @@ class Viewer {
     Object.assign(small, { width: w, height: h });
     small.getContext("2d").putImageData(image, 0, 0);
     context.imageSmoothingQuality = "high";
-    context.filter = `blur(${cell}px)`; // browsers without filters show it a little coarser
+    context.filter = `blur(${cell}px)`; // coarser in browsers without filters
     context.drawImage(small, 0, 0, w * cell, h * cell);
     context.filter = "none";
   }

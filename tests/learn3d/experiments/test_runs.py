@@ -19,7 +19,7 @@ import stub_work
 from learn3d.commands.train import Train
 from learn3d.config import config_to_dict
 from learn3d.device import resolve_precision
-from learn3d.experiments import estimated_poses, experiment
+from learn3d.experiments import experiment
 from learn3d.experiments.experiment import find_conflict, read_results, run_experiment, train_and_test
 from learn3d.experiments.plan import Request, command_line, plan_runs
 from learn3d.experiments.tables import BINS, TABLES, VARIANTS
@@ -203,14 +203,14 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, read_report) 
 def test_poses_are_estimated_for_the_runs_that_need_them(tmp_path, tiny_folder, monkeypatch) -> None:
     """Once; a report without training has their errors, and the IoUs of both runs."""
     quick = functools.partial(PoseOptions, steps=1, restarts=1, prototypes=2)
-    monkeypatch.setattr(estimated_poses, "PoseOptions", quick)
+    monkeypatch.setattr(experiment, "PoseOptions", quick)
     given = Request("poses", tiny_folder, tmp_path / "out", "airplane", (), 1, 8, seeds=1, set=SMALL, threads=1)
     runs = plan_runs(given)
     assert all(map(train_and_test, runs))
     table, poses = tmp_path / "out/poses/airplane-seed0.npz", [run.config.poses for run in runs]
     assert poses == [None, table]
-    monkeypatch.setattr(estimated_poses, "PoseOptions", None)
-    estimated_poses.estimate_poses(runs[1].config)
+    monkeypatch.setattr(experiment, "PoseOptions", None)
+    experiment.estimate_poses(runs[1].config)
     assert run_experiment(dataclasses.replace(given, report_only=True)) == 0
     _, row = json.loads((tmp_path / "out/poses.json").read_text())["poses"]
     known, estimated = (json.loads((run.folder / "test.json").read_text())["voxel_iou"] for run in runs)

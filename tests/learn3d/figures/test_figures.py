@@ -152,7 +152,8 @@ def test_metrics_become_curves(tmp_path) -> None:
     read = report.read_metrics(write_metrics(tmp_path / "run", records(0.25), tail='{"step": 200, "spl'))
     assert set(read) == {("train", "projection"), ("train", "total"), ("val", "voxel_iou")}
     assert read["train", "projection"] == pytest.approx({50: 1.25, 100: 0.75, 150: 1 / 3 + 0.25})
-    assert report.panels([read]) == [("val", "voxel_iou"), ("train", "projection"), ("train", "total")]
+    titles = [plot["title"] for plot in report._curves([read])]
+    assert titles == ["voxel IoU, val", "projection loss (1 - IoU), train", "total loss (weighted), train"]
 
 
 NO_RECORD = "line 1 is no record with a step and a split"
