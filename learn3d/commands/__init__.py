@@ -19,14 +19,14 @@ COMMANDS = {
     "evaluate": ("models:Evaluate", "train", "measure trained models on a test set"),
     "reconstruct": ("models:Reconstruct", "train", "turn images into meshes with a trained model"),
     "export": ("models:Export", "train", "write a trained model into one small file"),
-    "demo": ("pages:Demo", "demo", "open a page that turns pictures into meshes"),
+    "demo": ("models:Demo", "demo", "open a page that turns pictures into meshes"),
     "make-dataset": ("data:MakeDataset", "train", "render a data set from meshes"),
     "convert-dataset": ("data:ConvertDataset", "train", "convert a data set into shards, for data larger than memory"),
     "check-dataset": ("data:CheckDataset", "train", "list everything that is wrong with a data set"),
-    "estimate-poses": ("poses:EstimatePoses", "train", "find the poses of images from their masks"),
+    "estimate-poses": ("data:EstimatePoses", "train", "find the poses of images from their masks"),
     "experiment": ("train:Experiment", "train", "make a table of the paper: train, measure, report"),
-    "figures": ("pages:Figures", "figures", "draw the paper's figures from trained models"),
-    "report": ("pages:Report", "report", "write a page about trained models, with shapes to turn"),
+    "figures": ("models:Figures", "figures", "draw the paper's figures from trained models"),
+    "report": ("models:Report", "report", "write a page about trained models, with shapes to turn"),
     "fetch-debian-models": ("data:FetchDebianModels", "train", "get meshes out of Debian packages"),
 }
 HELP = """usage: learn3d COMMAND [OPTIONS]

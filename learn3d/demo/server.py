@@ -44,14 +44,14 @@ class JobQueue:
 
     def __init__(self) -> None:
         self.closed: Callable[[], bool] = lambda: False  # whether the server stops
-        self._thread, self._queue = ThreadPoolExecutor(1), deque()
+        self._thread = ThreadPoolExecutor(1)
 
     async def run(self, job: Callable[[Send], None]) -> AsyncIterator[bytes]:
-        """Run a job and yield the messages that it sends, each a line of JSON. First come its places in the queue.
+        """Run a job and yield the messages that it sends, each a line of JSON.
 
-        The place becomes free if the iteration is cancelled: the visitor has left.
+        A waiting job is dropped if the iteration ends early, because the visitor has left.
         """
-        ticket, messages, place = object(), deque(), 0
+        messages = deque()
 
         def send(message: dict) -> None:
             if self.closed():
@@ -62,14 +62,8 @@ class JobQueue:
             with contextlib.suppress(_Closed):
                 job(send)
 
-        self._queue.append(ticket)
+        work = asyncio.get_running_loop().run_in_executor(self._thread, run_job)
         try:
-            while (ahead := self._queue.index(ticket)) and not self.closed():
-                if ahead != place:
-                    yield _json_line({"place": ahead})
-                place = ahead
-                await asyncio.sleep(_TICK)
-            work = asyncio.get_running_loop().run_in_executor(self._thread, run_job)
             while not (self.closed() or (work.done() and not messages)):
                 while messages:
                     yield _json_line(messages.popleft())
@@ -77,7 +71,7 @@ class JobQueue:
             if not self.closed():
                 await work  # raises the job's error
         finally:
-            self._queue.remove(ticket)
+            work.cancel()
 
 
 def _json_line(message: dict) -> bytes:

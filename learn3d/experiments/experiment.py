@@ -125,10 +125,11 @@ def find_conflict(run: PlannedRun) -> str:
     """A sentence with the options in which the run in the folder differs from the planned one; "" if there are none."""
     if not (run.folder / run_folder.CONFIG).is_file():
         return ""
-    precision = resolve_precision(run.config.precision, run.config.device)  # a run saves what "auto" stands for
-    changed = differences(
-        dataclasses.replace(run.config, precision=precision), load_config(run.folder / run_folder.CONFIG)
+    asked, saved = (  # a run saves the precision that "auto" stands for
+        dataclasses.replace(config, precision=resolve_precision(config.precision, config.device))
+        for config in (run.config, load_config(run.folder / run_folder.CONFIG))
     )
+    changed = differences(asked, saved)
     return f"{run.folder} has a run with other options: " + "; ".join(changed) if changed else ""
 
 

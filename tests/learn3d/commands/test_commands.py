@@ -10,7 +10,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from learn3d import commands
@@ -216,15 +215,6 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, command
 
     monkeypatch.setattr("learn3d.commands.models.write_json", refuse)
     assert command(*words)[:2] == (1, out), "the table is not lost"
-
-
-def test_reconstruct_lists_its_files(finished_run, tiny_folder, tmp_path, command, monkeypatch) -> None:
-    monkeypatch.setattr("learn3d.reconstruction.turntable", lambda *_, **__: np.zeros((2, 32, 32, 3), np.uint8))
-    words = ["--run", finished_run, "--output", tmp_path, "--data", tiny_folder, "--indices", 0, 7]
-    status, out, _ = command("reconstruct", *words)
-    listed = [Path(path) for path in out.split()]
-    assert (status, len(listed)) == (0, 6) and {path.suffix for path in listed} == {".glb", ".gif", ".png"}
-    assert all(path.stat().st_size > 100 for path in listed)
 
 
 def test_interrupting_the_command_saves_and_says_so(tiny_folder, run_folder) -> None:

@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from learn3d.commands.poses import EstimatePoses
+from learn3d.commands.data import EstimatePoses
 from learn3d.config import TrainConfig
 from learn3d.data.checking import check_folder
 from learn3d.data.layouts import load_dataset
