@@ -12,7 +12,7 @@ from PIL import Image
 import nmr
 from learn3d.data.conventions import view_poses
 from learn3d.data.poses import LookAtPoses, RotationPoses
-from learn3d.methods import Grids, Meshes
+from learn3d.methods import Grids
 from learn3d.pictures.sheets import (
     HEADER,
     MARGIN,
@@ -127,8 +127,7 @@ def test_the_light_goes_with_the_camera() -> None:
 def test_shapes_are_drawn_in_their_colours() -> None:
     vertices, faces = nmr.icosphere(3)
     red = torch.tensor([1.0, 0.0, 0.0]).expand_as(vertices)
-    (surface,) = Meshes(vertices[None], faces, red[None]).surfaces()
-    middle = draw_surface(surface, [FRONT], image_size=32)[0, 16, 16]
+    middle = draw_surface(Surface(vertices, faces, red), [FRONT], image_size=32)[0, 16, 16]
     assert middle[0] > 120 and middle[1:].max() < 10
 
 
