@@ -44,14 +44,14 @@ class JobQueue:
 
     def __init__(self) -> None:
         self.closed: Callable[[], bool] = lambda: False  # whether the server stops
-        self._thread = ThreadPoolExecutor(1)
+        self._thread, self._line = ThreadPoolExecutor(1), deque()
 
     async def run(self, job: Callable[[Send], None]) -> AsyncIterator[bytes]:
-        """Run a job and yield the messages that it sends, each a line of JSON.
+        """Run a job and yield the messages that it sends, each a line of JSON; before them {"place": jobs ahead of it}.
 
         A waiting job is dropped if the iteration ends early, because the visitor has left.
         """
-        messages = deque()
+        messages, ticket, place = deque(), object(), 0
 
         def send(message: dict) -> None:
             if self.closed():
@@ -62,15 +62,21 @@ class JobQueue:
             with contextlib.suppress(_Closed):
                 job(send)
 
+        self._line.append(ticket)
         work = asyncio.get_running_loop().run_in_executor(self._thread, run_job)
         try:
             while not (self.closed() or (work.done() and not messages)):
+                ahead = self._line.index(ticket)
+                if ahead and ahead != place:
+                    yield _json_line({"place": ahead})
+                place = ahead
                 while messages:
                     yield _json_line(messages.popleft())
                 await asyncio.wait([work], timeout=_TICK)
             if not self.closed():
                 await work  # raises the job's error
         finally:
+            self._line.remove(ticket)
             work.cancel()
 
 

@@ -72,7 +72,7 @@ class PoseInvariantSettings(MeshSettings):
 
 
 def area_weight(settings: PoseInvariantSettings, info: DatasetInfo) -> float:
-    """The weight of the area of the surface, for the objects of the data if the settings say "auto"."""
+    """`lambda_area` of the settings, or for "auto" the weight that suits the masks of the data."""
     if settings.lambda_area != "auto":
         return settings.lambda_area
     return COMPACT_AREA_WEIGHT if is_compact(info) else 0.0
@@ -117,7 +117,8 @@ class PoseInvariant(MeshMethod):
             load_pretrained(self.encoder, self.settings.pretrained)
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Train encoder and generator on projection + lambda_1 smoothness + lambda_4 prior in every step.
+        """Train encoder and generator in every step on projection + lambda_1 smoothness + lambda_area area + lambda_4
+        prior.
 
         Odd steps add lambda_2 classification on detached codes, which trains the discriminator alone. Even steps add
         lambda_3 confusion, which trains the encoder through the discriminator; the discriminator itself does not learn.

@@ -218,7 +218,7 @@ class VPL(MeshMethod):
         if self.settings.discriminator == "dcgan":
             with self.autocast():
                 return network(silhouettes, upload(batch.view_ids[seen_at], self.device)).float()
-        # without autocast, under which spectral normalisation mixes dtypes
+        # autocast is off: with it, spectral normalisation mixes dtypes
         conditions = [upload(batch.poses[seen_at].features(), self.device)]
         if self.settings.class_conditional:
             conditions.append(upload(batch.class_ids, self.device))

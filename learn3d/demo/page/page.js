@@ -215,6 +215,7 @@ async function send(alpha, strokes = null, box = null) {
 
 /** Handle one message of the server; returns whether it is the last. */
 function handle(message, pixels) {
+  if (message.place) say(message.place === 1 ? "You are next …" : `${message.place} are before you …`);
   if (message.mask) {
     const bits = bytes(message.mask);
     mask = Uint8ClampedArray.from({ length: pixels }, (_, i) => (bits[i >> 3] >> (7 - (i & 7))) & 1 ? 255 : 0);

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import socket
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 import nmr
@@ -70,7 +72,10 @@ def test_a_picture_gets_its_mesh_step_by_step_or_a_sentence(finished_run) -> Non
     models = {"my run": load_model(finished_run)}
     pictures.make_meshes(models, pictures.Picture(colors.copy(), alpha[..., 0]), sent.append)
     assert "mask" in sent[0] and not sent[0]["more"] and [each["part"] for each in sent[1:-1]] == [0.0, 0.3, 0.7, 1.0]
-    assert [mesh["label"] for mesh in sent[-1]["meshes"]] == ["my run"]
+    (result,) = sent[-1]["meshes"]
+    glb = base64.b64decode(result["glb"])
+    assert result["label"] == "my run" and b"COLOR_0" in glb
+    assert len(trimesh.load(io.BytesIO(glb), "glb", force="mesh").faces) > 100
     for mask in (np.zeros_like(alpha[..., 0]), np.full_like(alpha[..., 0], 254)):
         pictures.make_meshes(models, pictures.Picture(colors, mask), sent.append)
         assert sent[-1] == {"error": "No object was found. Draw a box around it, or paint it with Add."}

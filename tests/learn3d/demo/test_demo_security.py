@@ -141,13 +141,15 @@ def test_a_picture_must_arrive_in_time_and_visitors_may_leave(client, server, bo
     assert (process.folder / "errors.txt").read_text() == ""
 
 
-def test_thirty_visitors_at_once_all_get_their_mesh(server, box) -> None:
+def test_thirty_visitors_at_once_all_get_their_mesh_and_see_their_place(server, box) -> None:
     def visit(_: int) -> list[dict]:
         return messages(httpx.post(server[1] + ADDRESS, content=box, timeout=300))
 
     with ThreadPoolExecutor(30) as visitors:
         said = list(visitors.map(visit, range(30)))
     assert all("meshes" in each[-1] for each in said)
+    places = [[message["place"] for message in each if "place" in message] for each in said]
+    assert max(map(len, places)) > 5 and all(each == sorted(each, reverse=True) for each in places)
 
 
 def test_words_of_a_visitor_reach_the_terminal_written_out(monkeypatch, capsys) -> None:

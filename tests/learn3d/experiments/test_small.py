@@ -10,6 +10,7 @@ import contextlib
 import io
 import json
 import math
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ from learn3d import commands
 from learn3d.experiments import experiment
 from learn3d.experiments.tables import TABLES, VARIANTS
 from learn3d.make_data.render import DatasetConfig, make_dataset
+from learn3d.runs.checkpoint import load_metadata
 
 pytestmark = pytest.mark.slow
 
@@ -82,7 +84,8 @@ def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> 
         if row.variant is None:
             assert len(cells) == 1, "a quoted row is not measured"
             continue
-        results = [json.loads(p.read_text()) for p in folder.glob(f"out/runs/airplane/{row.variant}-seed?/test.json")]
+        files = sorted(folder.glob(f"out/runs/airplane/{row.variant}-seed?/test.json"))
+        results = [json.loads(file.read_text()) for file in files]
         assert len(results) == (PASCAL_SEEDS if name == "pascal" else 1)
         for result in results:
             for measure in ("voxel_iou", "voxel_iou_kato19", "f_score", "mmd", "mmd_paper", "chamfer_l1"):
@@ -93,3 +96,14 @@ def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> 
         cell, mean_cell = cells["here (mmd)" if name == "mmd" else "here (kato18)"]
         assert cell == mean_cell and cell.startswith(f"{mean:.3f}"), label
         assert ("±" in cell) == (name == "pascal")
+        if name != "mmd":
+            low, high = map(float, re.search(r"\[(.*), (.*)\]", cell).groups())
+            assert low - 1e-3 <= mean <= high + 1e-3
+        in_list = {line[1]: line[2:] for line in lines if line[0] == f"airplane/{row.variant}-seed0"}
+        assert f"{results[0]['chamfer_l1']:.4f}" in in_list[f"step {results[0]['step']}"]
+
+
+def test_settings_of_rows_reach_their_runs(folder: Path) -> None:
+    wanted = {"60x60": 6, "30x30": 24, "20x20": 54, "20x15": 72, "15x20": 72, "15x15": 96, "10x10": 216}
+    files = {widths: folder / f"out/runs/airplane/bins-{widths}-seed0/best.safetensors" for widths in wanted}
+    assert {widths: load_metadata(file).info.num_views for widths, file in files.items()} == wanted

@@ -102,6 +102,22 @@ def test_killed_at_any_place(server, killed_config, uninterrupted, wanted: int) 
         check_same(config.output, reference)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["last", "best"])
+def test_killed_in_the_middle_of_each_checkpoint(server, killed_config, uninterrupted, name: str) -> None:
+    """Half of a file under its temporary name, whatever is saved; it is removed when the run goes on."""
+    reference, _, things = uninterrupted
+    for place in range(things // 4, things):
+        config = dataclasses.replace(killed_config, output=reference.with_name(f"half-{name}-{place}"))
+        server(config, kill_at=place, half=True)
+        if (config.output / f".{name}.safetensors.partial").exists():
+            check_whole(config.output)
+            assert server(config, resume=True)["status"] == 0
+            check_same(config.output, reference)
+            return
+    raise AssertionError(f"no kill left half of {name}")
+
+
 def test_signals_at_any_time(server, killed_config, uninterrupted) -> None:
     reference, seconds, _ = uninterrupted
     rng = random.Random(SEED)
