@@ -4,7 +4,8 @@
    its IoU with them. It starts anew several times; the start with the smallest silhouette loss is kept.
 2. Prototypes grow from it in the same way (EM over prototype and pose), which tells kinds of objects apart.
 3. Silhouettes hardly tell front from back, so a prototype may be turned by 180 degrees against the others. Nearly equal
-   masks of different prototypes vote for or against a turn: an Ising problem with a spin for each prototype.
+   masks of different prototypes vote for or against a turn, and so do upper outlines, which show what stands up at one
+   end only: an airplane's fin, a chair's back. It is an Ising problem with a spin for each prototype.
 4. The posteriors over poses are smoothed over the nearest masks and the nearest mirror images. Then the prototypes are
    trained again with the smoothed posteriors as a prior. Steps 3 and 4 are repeated.
 
@@ -39,6 +40,7 @@ _TEMPERATURE = 0.02  # of 1 - IoU
 _NEIGHBOURS, _VOTERS = 8, 5  # nearest masks that smooth, and that vote on turns
 _NEIGHBOUR_SCALE = 0.1  # distance at which the weight of a neighbour has fallen to 1 / e
 _FAR = 9.0  # distance of masks that must not be neighbours
+_OUTLINES = 0.5  # weight of the votes of upper outlines, those of nearly equal masks having 1
 
 
 @checked
@@ -335,21 +337,18 @@ def _normalized(posterior: Tensor) -> Tensor:
 
 
 def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> Tensor:
-    """Which prototypes must be turned by 180 degrees for nearly equal masks to have nearly equal azimuths: bool [M]."""
+    """Which prototypes must be turned by 180 degrees for similar masks to have nearly equal azimuths: bool [M]."""
     posterior = torch.softmax(-values.flatten(1) / _TEMPERATURE, 1).reshape(values.shape)
     count, azimuths = values.shape[1:3]
     prototype = posterior.sum((2, 3)).argmax(1)
     azimuth = posterior[torch.arange(len(values)), prototype].sum(2).argmax(1)
-    votes = torch.zeros(count, count, dtype=torch.float64)
-    near = azimuths / 12
-    neighbours = Neighbours.of(data, data, (prototype,), _VOTERS)
-    for mirrored, (rows, weights) in enumerate(zip(neighbours.rows, neighbours.weights, strict=True)):
-        own = (-azimuth) % azimuths if mirrored else azimuth
-        apart = (azimuth[rows] - own[:, None]) % azimuths
-        apart = torch.minimum(apart, azimuths - apart)
-        sign = (apart <= near).double() - (apart >= azimuths / 2 - near).double()
-        votes.index_put_((prototype[:, None].expand_as(rows), prototype[rows]), sign * weights, accumulate=True)
-    coupling = (votes + votes.T).fill_diagonal_(0).numpy()
+    coupling = np.zeros((count, count))
+    for weight, votes in (
+        (1.0, _mask_votes(data, prototype, azimuth, count, azimuths)),
+        (_OUTLINES, _outline_votes(data, prototype, azimuth, count, azimuths)),
+    ):
+        votes = (votes + votes.T).fill_diagonal_(0)
+        coupling += weight * (votes / votes.abs().sum().clamp_min(1e-12)).numpy()
     draw = np.random.default_rng(int(torch.randint(2**31, (), generator=rng)))
     best, best_score = np.ones(count), -np.inf
     for _ in range(200):
@@ -363,3 +362,48 @@ def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> Tensor:
         if (score := spins @ coupling @ spins) > best_score:
             best, best_score = spins, score
     return torch.from_numpy(best * best[0] < 0)
+
+
+def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:
+    """For each pair of prototypes, the nearest masks with nearly equal azimuths minus those with opposite ones: float64
+    [M, M]. prototype, azimuth: int64 [N].
+    """
+    votes = torch.zeros(count, count, dtype=torch.float64)
+    near = azimuths / 12
+    neighbours = Neighbours.of(data, data, (prototype,), _VOTERS)
+    for mirrored, (rows, weights) in enumerate(zip(neighbours.rows, neighbours.weights, strict=True)):
+        own = (-azimuth) % azimuths if mirrored else azimuth
+        apart = (azimuth[rows] - own[:, None]) % azimuths
+        apart = torch.minimum(apart, azimuths - apart)
+        sign = (apart <= near).double() - (apart >= azimuths / 2 - near).double()
+        votes.index_put_((prototype[:, None].expand_as(rows), prototype[rows]), sign * weights, accumulate=True)
+    return votes
+
+
+def _outline_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:
+    """For each mask and prototype, how much farther the nearest upper outline of the opposite azimuth is than that of
+    the same azimuth, summed over the masks of each prototype: float64 [M, M]. prototype, azimuth: int64 [N].
+    """
+    outlines = _upper_outlines(data.masks)
+    votes = torch.zeros(count, count, dtype=torch.float64)
+    for part in torch.arange(len(data)).split(512):
+        nearest = torch.full((len(part), count * azimuths), float("inf"))
+        same_object = data.objects[part][:, None] == data.objects
+        for others, seen_from in ((outlines, azimuth), (outlines.flip(1), (-azimuth) % azimuths)):
+            values = torch.cdist(outlines[part], others).masked_fill(same_object, float("inf"))
+            cells = (prototype * azimuths + seen_from).expand_as(values)
+            nearest.scatter_reduce_(1, cells, values, "amin")
+        nearest = nearest.view(len(part), count, azimuths)
+        rows = torch.arange(len(part))
+        gain = nearest[rows, :, (azimuth[part] + azimuths // 2) % azimuths] - nearest[rows, :, azimuth[part]]
+        votes.index_add_(0, prototype[part], gain.nan_to_num(0.0, posinf=0.0, neginf=0.0).double())
+    return votes
+
+
+def _upper_outlines(masks: Tensor) -> Tensor:
+    """The height of the outline above the centre of mass in each column, 0 in empty ones: float32 [N, SIZE]."""
+    shown = masks.reshape(-1, SIZE, SIZE) > 0.5
+    rows = torch.arange(SIZE, dtype=torch.float32)[:, None]
+    centre = (shown * rows).sum((1, 2)) / shown.sum((1, 2)).clamp_min(1)
+    top = shown.float().argmax(1).float()
+    return torch.where(shown.any(1), centre[:, None] - top, 0.0)

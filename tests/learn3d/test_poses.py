@@ -20,7 +20,7 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import kato
 from learn3d.data.sampling import batches
 from learn3d.files.reading import DamagedFile
-from learn3d.poses.estimate import PoseOptions
+from learn3d.poses.estimate import SIZE, Masks, PoseOptions, _outline_votes
 from learn3d.poses.sheet import draw_sheet
 from learn3d.poses.views import CameraOptions, EstimatedViews, compare, estimate_views
 from learn3d.training import train
@@ -81,6 +81,20 @@ def test_a_range_of_elevations_and_unknown_cameras() -> None:
         CameraOptions("30:x").elevations()
     with pytest.raises(ValueError, match="--compare needs true poses"):
         compare(views)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_upper_outlines_tell_front_from_back(turned: bool) -> None:
+    """Two kinds of objects with a fin at the back, one seen from its right and one from its left side each."""
+    masks = torch.zeros(4, SIZE, SIZE)
+    for mask, height in zip(masks, (4, 4, 8, 8), strict=True):
+        mask[16 : 16 + height, 4:28], mask[8:16, 23:27] = 1, 1
+    masks[1::2] = masks[1::2].flip(2)
+    prototype, azimuth = torch.tensor([0, 0, 1, 1]), torch.tensor([1, 3, 1, 3])
+    seen = torch.where(prototype == 1, (azimuth + 2) % 4, azimuth) if turned else azimuth
+    data = Masks(masks.flatten(1), torch.ones(4, 1, dtype=torch.bool), torch.arange(4))
+    votes = _outline_votes(data, prototype, seen, 2, 4)
+    assert (votes[0, 1] < 0 and votes[1, 0] < 0) if turned else (votes[0, 1] > 0 and votes[1, 0] > 0)
 
 
 def test_poses_that_cannot_be_told_are_doubted() -> None:
