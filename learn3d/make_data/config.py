@@ -34,7 +34,7 @@ class DatasetConfig:
     source: FilePath | None = None
     """Folder of meshes, searched with all folders in it, or a mesh pack .npz (default: --procedural is given)."""
     procedural: Amount = 0
-    """Make this many shapes with the procedural generator instead of reading meshes."""
+    """Make this many shapes with the procedural generator, instead of meshes or beside them."""
     test: Weight | None = None
     """Part of the meshes for the test split: a share below 1 (then at least 4 meshes), or their number (default: 0.2;
     pascal3d has no test split)."""
@@ -42,7 +42,8 @@ class DatasetConfig:
     """Part of the meshes for the validation split, 0 for none (default: 0.1, for pascal3d 0.2; r2n2 has no validation
     split)."""
     augment: Amount = 0
-    """Copies of each mesh to train on, besides itself, with every axis scaled by a random 0.75 .. 1.25."""
+    """Copies of each mesh to train on, besides itself, with every axis scaled by a random 0.75 .. 1.25; of the shapes
+    of --procedural only without --source."""
     up: Axis = "y"
     """Axis of the mesh files that points up."""
     front: Axis | None = None
@@ -58,10 +59,10 @@ class DatasetConfig:
     """Shards that are made at a time, each in a process of its own."""
 
     def __post_init__(self) -> None:
-        if (self.source is None) == (self.procedural == 0):
-            raise ValueError(
-                "give either --source (a folder of meshes or a mesh pack .npz) or --procedural (a number of shapes)"
-            )
+        if self.source is None and self.procedural == 0:
+            raise ValueError("give --source (a folder of meshes or a mesh pack .npz), --procedural (a number), or both")
+        if self.source and self.procedural and (self.up, self.facing) != ("y", "z"):
+            raise ValueError("meshes beside shapes of --procedural must stand like these: up y, front z")
         if WRITERS[self.layout].only_shards and not self.shards:
             raise ValueError(f"the layout {self.layout} is made as shards: add --shards")
         if self.shards and self.layout not in ("kato", "around"):
@@ -92,10 +93,6 @@ class DatasetConfig:
     def facing(self) -> str:
         """The axis that faces the camera of view 0."""
         return self.front or ("z" if self.procedural else "y" if self.up.endswith("x") else "x")
-
-    def copies(self, split: str) -> int:
-        """Objects that are made of each mesh of a split."""
-        return 1 + self.augment if split == "train" else 1
 
     def plain(self) -> dict[str, Any]:
         """The settings that the files depend on, as plain values."""

@@ -37,6 +37,7 @@ class Item:
     split: str
     file: str
     read: meshes.Source
+    copies: int  # objects that are made of it
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def render_meshes(
         mesh, objects = {"name": item.file, "split": item.split}, []
         try:
             raw = meshes.checked(item.read())
-            objects = [_render(config, writer, raw, item, copy) for copy in range(config.copies(item.split))]
+            objects = [_render(config, writer, raw, item, copy) for copy in range(item.copies)]
             mesh["objects"] = [made.name for made in objects]
         except ValueError as error:  # it cannot be read, rendered or seen: the others go on
             mesh["reason"] = str(error)
@@ -172,13 +173,19 @@ def _render(config: DatasetConfig, writer: Writer, mesh: meshes.RawMesh, item: I
 
 def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
     """The meshes of the splits train, val and test."""
-    if config.procedural:
-        sources = meshes.procedural_sources(config.category, config.procedural, config.seed)
-    else:
-        sources = meshes.list_sources(config.source)
+    shapes = meshes.procedural_sources(config.category, config.procedural, config.seed) if config.procedural else {}
+    sources = meshes.list_sources(config.source) if config.source else shapes
+    augmented = len(sources)
+    sources = sources | shapes
     numbers = split_objects(len(sources), config.test, config.val, config.seed)
     named = list(zip(meshes.object_names(sources), sources.items(), strict=True))
-    return {s: [Item(i, named[i][0], s, *named[i][1]) for i in numbers[s].tolist()] for s in SPLITS}
+
+    def item(number: int, split: str) -> Item:
+        name, (file, read) = named[number]
+        copies = config.augment if split == "train" and number < augmented else 0
+        return Item(number, name, split, file, read, 1 + copies)
+
+    return {split: [item(number, split) for number in numbers[split].tolist()] for split in SPLITS}
 
 
 def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, np.ndarray]:

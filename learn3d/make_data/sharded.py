@@ -7,7 +7,7 @@ A shard depends on the settings and its meshes alone. So it does not matter whic
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -43,10 +43,9 @@ def make_shards(config: DatasetConfig) -> int:
     threads = max(1, torch.get_num_threads() // config.jobs)
     tasks = {}
     for split, items in splits.items():
-        step = max(1, OBJECTS_PER_SHARD // config.copies(split))  # meshes of a shard
-        for number, start in enumerate(range(0, len(items), step)):
+        for number, part in enumerate(_parts(items)):
             path = shard_path(folder / split, number)
-            given = (config, path, number, items[start : start + step], threads)
+            given = (config, path, number, part, threads)
             tasks[path] = Task(f"{split} {number}", make_shard, given, folder / f"{split}-{number:05d}.log")
     missing = [task for path, task in tasks.items() if not path.is_file()]
     note(f"{config.category}: {len(tasks)} shards, {len(missing)} to be made; logs: {folder / '*.log'}")
@@ -75,6 +74,18 @@ def make_shard(config: DatasetConfig, path: Path, number: int, items: Sequence[I
         write_shard(path.parent, number, writer.dataset(objects, config.category, items[0].split))
     print(f"{path.parent.name} {number}: {len(objects)} objects", flush=True)
     return True
+
+
+def _parts(items: Sequence[Item]) -> Iterator[list[Item]]:
+    """The meshes of each shard: as many as make `OBJECTS_PER_SHARD` objects at most, and at least one."""
+    part: list[Item] = []
+    for item in items:
+        if part and sum(each.copies for each in part) + item.copies > OBJECTS_PER_SHARD:
+            yield part
+            part = []
+        part.append(item)
+    if part:
+        yield part
 
 
 def _prepare(config: DatasetConfig, folder: Path, splits: dict[str, list[Item]]) -> None:

@@ -141,7 +141,7 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
         ("train --output {run} --resume --overwrite", "give one of them"),
         ("train --data x --category chair --output {tmp}/run --batch-size 0", "batch_size must be at least 1, got 0"),
         ("train --data {data} --category lamp --output {tmp}/run", "is missing (lamp, train)"),
-        ("make-dataset --output {tmp}/x --category chair", "give either --source"),
+        ("make-dataset --output {tmp}/x --category chair", "give --source (a folder"),
         ("check-dataset {tmp}/no", "there is no folder"),
         ("evaluate", "give at least one run"),
         ("evaluate {run} {tmp}/nope", "there is no checkpoint {tmp}/nope"),

@@ -104,6 +104,12 @@ def test_only_training_objects_get_scaled_copies(tmp_path, folder):
         assert max(spans) >= 31
 
 
+def test_meshes_and_shapes_may_be_mixed_and_only_meshes_get_copies(tmp_path, folder):
+    names = make(tmp_path / "data", folder, procedural=5, front="z", test=0, augment=2).objects["train"]
+    assert sorted(name for name in names if name.startswith("chair_")) == [f"chair_{i:05d}" for i in range(5)]
+    assert len(names) == 5 + 3 * 6
+
+
 def test_split_is_test_then_val_then_train_of_one_permutation():
     order = np.random.default_rng(0).permutation(116)
     for test, val, sizes in ((0.2, 0.0, [23, 0, 93]), (7, 0.1, [7, 12, 97]), (0.01, 0, [4, 0, 112])):
@@ -124,7 +130,7 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
         ({"source": "nowhere"}, "folder of meshes or a mesh pack"),
         ({"source": "nothing"}, "there is no mesh"),
         ({"source": "bad"}, r"no mesh to train on .* a.obj: no faces"),
-        ({"procedural": 3}, "either --source"),
+        ({"procedural": 3, "front": "x"}, "must stand like these: up y, front z"),
         ({"source": None, "procedural": 3, "category": "unicorn"}, "procedural generator makes"),
         ({"up": "z", "front": "-z"}, "two different axes"),
         ({"out": "bad/a.obj"}, "a.obj"),
