@@ -9,45 +9,43 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.cluster.vq import kmeans2
-from torch import Tensor
+from torch import Tensor, nn
 
 from learn3d.data.dataset import ViewDataset
 from learn3d.methods import MeshMethod
 
-CENTRES = 120  # clusters of the codes of all training images, and of those of other objects
+CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
 MOST = 0.82  # distance above which a picture is unknown if no other objects were learnt
-OTHER = 0.54  # `KnownCodes.resemblance` above which a picture is unknown
-KNOWN_CODES = "known_codes", "other_codes", "code_weights"  # names of the tensors of `KnownCodes` in a checkpoint
+OTHER = 1.0  # `KnownCodes.resemblance` above which a picture is unknown
+KNOWN_CODES = "known_codes", "hidden_layer", "output_layer"  # names of the tensors of `KnownCodes` in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
-_SHARPNESS, _RIDGE = 4.0, 0.5  # of the radial basis functions, and of their ridge regression
+_HIDDEN, _MEMBERS, _DROPOUT, _STEPS = 64, 2, 0.3, 300  # of the classifiers, whose logits are averaged
+_SCALE = 10.0  # length of the codes that they see
 
 
 class KnownCodes(NamedTuple):
-    """Cluster centres (k-means) of normalised codes."""
+    """Cluster centres (k-means) of normalised codes, and a network that knows codes of other objects."""
 
     kinds: Tensor  # float [N, K, C]: centres of the training images of N categories
-    others: Tensor | None = None  # float [M, C]: centres of pictures of other objects
-    weights: Tensor | None = None  # float [N K + M]: weights of all centres in `resemblance`
+    hidden: Tensor | None = None  # float [H, C + 1]: weights of its hidden units, the bias last; None: not learnt
+    output: Tensor | None = None  # float [H + 1]: weights of its logit, the bias last
 
     def nearest_kind(self, code: Tensor) -> int:
         """The category whose codes are nearest to a code [C]."""
         return int(torch.stack([_distance(code, centres) for centres in self.kinds]).argmin())
 
     def resemblance(self, code: Tensor) -> float:
-        """Score of a code [C]: near 1 for other objects, near -1 for objects as in the training images."""
-        centres = torch.cat([self.kinds.flatten(0, 1), self.others]).float()
-        return float(_radial(F.normalize(code[None], dim=1), centres)[0] @ self.weights.float())
+        """Logit of the probability that a code [C] is that of another object."""
+        hidden, output = self.hidden.float(), self.output.float()
+        units = F.relu(hidden[:, :-1] @ (_SCALE * F.normalize(code, dim=0)) + hidden[:, -1])
+        return float(output[:-1] @ units + output[-1])
 
     def is_strange(self, code: Tensor) -> bool:
         """Whether a code [C] is like those of other objects or, if none were learnt, far from the training images'."""
-        if self.others is not None:
+        if self.hidden is not None:
             return self.resemblance(code) > OTHER
         return float(_distance(code, self.kinds.flatten(0, 1))) > MOST
-
-
-def _radial(points: Tensor, centres: Tensor) -> Tensor:
-    return torch.exp(-_SHARPNESS * torch.cdist(points, centres).square())
 
 
 def _distance(code: Tensor, centres: Tensor) -> Tensor:
@@ -62,21 +60,34 @@ def known_codes(method: MeshMethod, dataset: ViewDataset, others: Tensor | None 
     classes, codes = torch.cat([b.class_ids for b in batches]), _directions(method, (b.images for b in batches))
     count = min(CENTRES // dataset.num_classes, int(classes.bincount(minlength=dataset.num_classes).min()))
     kinds = torch.stack([_centres(codes[classes == kind], count) for kind in range(dataset.num_classes)])
-    return KnownCodes(kinds) if others is None else learn_others(kinds, _directions(method, others.split(128)))
+    if others is None:
+        return KnownCodes(kinds)
+    return KnownCodes(kinds, *learn_others(codes, _directions(method, others.split(128))))
 
 
-def learn_others(kinds: Tensor, others: Tensor) -> KnownCodes:
-    """Known codes of N categories [N, K, C] and of other objects [M, C], separated by ridge regression.
+def learn_others(known: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
+    """`KnownCodes.hidden` and `.output` that tell normalised codes of training images [N, C] from others [M, C].
 
-    The basis functions are radial around all centres; both classes have the same total weight.
+    They are small networks with dropout, trained on all codes at once; both classes have the same total weight.
     """
-    known, centres = kinds.flatten(0, 1), _centres(others, CENTRES)
-    samples, middles = torch.cat([known, others]), torch.cat([known, centres])
-    wanted = torch.cat([-torch.ones(len(known)), torch.ones(len(others))])
-    share = torch.where(wanted < 0, len(samples) / 2 / len(known), len(samples) / 2 / len(others))
-    values = _radial(samples, middles)
-    system = values.T @ (share[:, None] * values) + _RIDGE * _radial(middles, middles) + 1e-4 * torch.eye(len(middles))
-    return KnownCodes(kinds, centres, torch.linalg.solve(system, values.T @ (share * wanted)))
+    codes = _SCALE * torch.cat([known, others])
+    wanted = torch.cat([torch.zeros(len(known)), torch.ones(len(others))])
+    share = torch.where(wanted > 0, 0.5 / len(others), 0.5 / len(known))
+    hidden, output, bias = [], [], []
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        for _ in range(_MEMBERS):
+            first, last = nn.Linear(codes.shape[1], _HIDDEN), nn.Linear(_HIDDEN, 1)
+            network = nn.Sequential(first, nn.ReLU(), nn.Dropout(_DROPOUT), last)
+            optimizer = torch.optim.AdamW(network.parameters(), 1e-2, weight_decay=0.1)
+            for _ in range(_STEPS):
+                optimizer.zero_grad()
+                F.binary_cross_entropy_with_logits(network(codes)[:, 0], wanted, share, reduction="sum").backward()
+                optimizer.step()
+            hidden.append(torch.cat([first.weight, first.bias[:, None]], 1).detach())
+            output.append(last.weight[0].detach() / _MEMBERS)
+            bias.append(last.bias.detach() / _MEMBERS)
+    return torch.cat(hidden), torch.cat([*output, torch.stack(bias).sum(0)])
 
 
 @torch.no_grad()

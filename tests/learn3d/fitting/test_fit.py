@@ -166,7 +166,8 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
     first, second, other = torch.nn.functional.normalize(
         torch.eye(3, 16)[:, None] + 0.05 * torch.randn(3, 40, 16), dim=2
     )
-    known = learn_others(torch.stack([first[:20], second[:20]]), other[:20])
+    known = torch.cat([first[:20], second[:20]])
+    known = KnownCodes(known[None], *learn_others(known, other[:20]))
     assert all(known.is_strange(7 * code) for code in other[20:])
     assert not any(known.is_strange(7 * code) for code in (*first[20:], *second[20:]))
     model = load_model(finished_run)
@@ -176,7 +177,7 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
     Image.fromarray(np.concatenate([255 - image[:3], image[3:]]).transpose(1, 2, 0)).save(tmp_path / "other.png")
     export(finished_run, tmp_path / "small.safetensors", others=cut_out_pictures(model, tmp_path))
     known = load_model(tmp_path / "small.safetensors").known_codes
-    assert len(known.others) == 1 and len(known.weights) == known.kinds[..., 0].numel() + 1
+    assert len(known.output) == len(known.hidden) + 1 == 2 * 64 + 1
 
 
 def test_a_picture_is_taken_for_the_nearest_kind(finished_run, tiny_folder) -> None:
@@ -185,7 +186,7 @@ def test_a_picture_is_taken_for_the_nearest_kind(finished_run, tiny_folder) -> N
     kinds = np.arange(dataset.num_objects)  # each object one kind
     dataset = dataclasses.replace(dataset, class_ids=kinds, class_names=tuple("abc"))
     known = known_codes(method, dataset)
-    assert len(known.kinds) == 3 and known.others is None
+    assert len(known.kinds) == 3 and known.hidden is None
     batch = dataset.batch(torch.arange(len(dataset)))
     found = [known.nearest_kind(code) for code in method.encode(batch.images)]
     assert np.mean(np.equal(found, batch.class_ids.numpy())) > 0.9
