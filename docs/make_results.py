@@ -15,16 +15,24 @@ from pathlib import Path
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "results.md"
-BLOCK = re.compile(r"(<!-- results: ([\w-]+) (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- results: ([\w-]+) (\w+) -->\n)(?:\|.*\n)*")
 
 
 def rows(name: str, part: str) -> list[list[str]]:
     """The header and the rows of a table. The second voxelizer stays in the file.
 
     part: a table of the file, or one made of "main" and "differences": "both" puts the difference under each method,
-    "side" puts paper, here and difference of a single category side by side.
+    "side" puts paper, here and difference of a single category side by side, "seeds" adds the mean difference over
+    seeds as a last column.
     """
     tables = json.loads((DOCS / "results" / f"{name}.json").read_text())
+    if part == "seeds":
+        header, *main = tables["main"]
+        (title, *_, spread), *rest = tables["differences"]
+        means = {(row[0], title.split()[0]): row[-1] for row in rest}
+        lines = [[*row, means.pop(tuple(row[:2]), "")] for row in main]
+        last = [[name, title, *[""] * (len(header) - 2), mean] for (name, _), mean in means.items()]
+        return [[*header, f"{title}: {spread}"], *lines, *last]
     if part not in ("both", "side"):
         return [row for row in tables[part] if row[1] != "here (kato19)"]
     header, *main = [row for row in tables["main"] if row[1] != "here (kato19)"]
@@ -54,7 +62,7 @@ def table(name: str, part: str) -> str:
 
 def filled(page: str) -> str:
     """The page with every table made anew."""
-    return BLOCK.sub(lambda block: block[1] + table(block[2], block[3]) + block[4], page)
+    return BLOCK.sub(lambda block: block[1] + table(block[2], block[3]), page)
 
 
 if __name__ == "__main__":
