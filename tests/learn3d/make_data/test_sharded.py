@@ -71,7 +71,7 @@ def test_a_second_call_makes_nothing_and_other_settings_are_refused(config, here
     assert sharded.make_shards(config) == 0
     assert "4 shards, 0 to be made" in capsys.readouterr().err
     assert contents(config.output) == before
-    with pytest.raises(ValueError, match="were made with another seed; ask for the same"):
+    with pytest.raises(ValueError, match="were made with another seed; repeat those settings"):
         sharded.make_shards(dataclasses.replace(config, seed=1))
     photograph = config.output / "03001627" / "photograph.png"
     photograph.write_bytes(b"mine")
