@@ -54,7 +54,7 @@ def read_with_alpha(path: Path, size: int) -> View:
     color, alpha = split_alpha(image)
     if alpha is None:
         raise DamagedFile(path, f"has the channels {image.mode}; expected RGBA, whose alpha is the mask")
-    return *shrink(color, alpha, size), int(alpha.max())
+    return *shrink(_planes(color, alpha), size), int(alpha.max())
 
 
 def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
@@ -71,7 +71,7 @@ def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
         mask = np.where(grey < 250, 255, 0).astype(np.uint8)
     elif mask is None:
         raise MissingFile(depth_path, f"is missing, and {path.name} has no alpha channel; expected the depth image")
-    return *shrink(color, mask, size), int(mask.max())
+    return *shrink(_planes(color, mask), size), int(mask.max())
 
 
 def read_with_mask(path: Path, mask_path: Path, size: int) -> View:
@@ -111,26 +111,31 @@ def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
     return np.asarray(white), np.asarray(alpha)
 
 
-def shrink(color: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """An image uint8 [4, size, size] and a mask uint8 [64, 64] of colours uint8 [S, S, 3] and a mask uint8 [S, S].
-
-    Each pixel becomes the mean over its area of the original; fractions of original pixels count as such.
-    """
+def _planes(color: np.ndarray, mask: np.ndarray) -> np.ndarray:
     planes = np.empty((4, *mask.shape), np.float32)
     planes[:3], planes[3] = color.transpose(2, 0, 1), mask
+    return planes
+
+
+def shrink(planes: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """An image uint8 [4, size, size] and its mask uint8 [64, 64] of colours and mask float32 [4, H, W], 0 .. 255.
+
+    The planes are padded with 0 to a square. Each pixel is the mean over its area, fractions of pixels included.
+    """
     image = _shrink(planes, size)
-    return image, image[3] if size == MASK_SIZE else _shrink(planes[3], MASK_SIZE)
+    return image, image[3] if size == MASK_SIZE else _shrink(planes[3:], MASK_SIZE)[0]
 
 
 def _shrink(planes: np.ndarray, size: int) -> np.ndarray:
-    if planes.shape[-1] == size:
+    if planes.shape[1:] == (size, size):
         return planes.astype(np.uint8)
-    weights = area_weights(planes.shape[-1], size)
-    return np.rint(weights @ planes @ weights.T).astype(np.uint8)
+    side = max(planes.shape[1:])
+    rows, columns = (_area_weights(side, size)[:, (side - n) // 2 :][:, :n] for n in planes.shape[1:])
+    return np.rint(rows @ planes @ columns.T).astype(np.uint8)
 
 
 @functools.cache
-def area_weights(source: int, size: int) -> np.ndarray:
+def _area_weights(source: int, size: int) -> np.ndarray:
     """Share of each of `source` pixels in each of `size` larger ones, float32 [size, source]; rows sum to 1."""
     edges = np.arange(size + 1) * (source / size)
     pixels = np.arange(source)

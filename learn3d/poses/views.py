@@ -14,7 +14,7 @@ from torch import Tensor
 
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.layouts import Layout, load_dataset
-from learn3d.data.pose_table import PoseTable, fingerprints, masks_of
+from learn3d.data.pose_table import PoseTable, fingerprints
 from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.files.reading import MissingFile
 from learn3d.poses.estimate import MIN_IMAGES, NEAR_DEG, SIZE, Candidates, Estimate, Masks, PoseOptions, estimate
@@ -144,7 +144,7 @@ def _masks(dataset: ViewDataset, factor: Tensor) -> Tensor:
     """Masks float32 [M, SIZE^2] in 0 .. 1, each magnified by its factor; read in parts, as images may exceed memory."""
     reduced = []
     for rows in torch.arange(len(dataset)).split(1024):
-        masks = _magnify(torch.from_numpy(masks_of(dataset, rows.numpy())).float() / 255, factor[rows])
+        masks = _magnify(torch.from_numpy(dataset.read_masks(rows.numpy())).float() / 255, factor[rows])
         reduced.append(F.avg_pool2d(masks[:, None], MASK_SIZE // SIZE).flatten(1))
     return torch.cat(reduced)
 

@@ -128,13 +128,13 @@ def test_a_table_is_read_as_written_and_matched_by_image(tmp_path: Path, tiny_se
     random_table(dataset).write(tmp_path / "poses.npz")
     table = PoseTable.read(tmp_path / "poses.npz")
     rows = np.random.default_rng(1).permutation(len(dataset))[:7]
-    part = table.applied(dataset.select(rows), "poses.npz")
+    part = table.apply(dataset.select(rows), "poses.npz")
     assert np.array_equal(part.poses.azimuth_deg, table.azimuth_deg[rows, 0])
     assert np.array_equal(part.candidates.weights, table.weights[rows])
     with pytest.raises(
         ValueError, match=r"poses.npz has no pose for 72 of 72 test images of airplane .* of object 0000"
     ):
-        table.applied(tiny_set, "poses.npz")
+        table.apply(tiny_set, "poses.npz")
 
 
 @pytest.mark.parametrize(

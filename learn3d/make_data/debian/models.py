@@ -60,10 +60,10 @@ class Report:
 
 
 def fetch_debian_models(config: FetchConfig, progress: bool = True) -> Report:
-    """Write the meshes into the output folder, which gets its name when it is complete.
+    """Write the meshes into the output folder. The folder appears when it is complete.
 
-    The report lists unreadable models and duplicates. Raises ValueError if the output exists, or if a package is missing
-    or damaged.
+    The report lists unreadable models and duplicates. Raises ValueError if the output exists, or if a package is
+    missing or damaged.
     """
     output, report = config.output.resolve(), Report()
     if output.exists():

@@ -119,7 +119,7 @@ def test_classes_are_drawn_uniformly_whatever_their_size() -> None:
     both = concatenate([continuous(40, 4), continuous(1, 2, "jar", seed=1)])
     drawn = both.batch(sample_indices(both, "classes", 400, seed=0, step=1)).class_ids
     assert 150 < int((drawn == 1).sum()) < 250
-    with pytest.raises(ValueError, match="sampling must be views, pairs or classes, got 'all'"):
+    with pytest.raises(ValueError, match="sampling must be views, pairs, groups, classes, got 'all'"):
         sample_indices(both, "all", 4, seed=0, step=1)
 
 

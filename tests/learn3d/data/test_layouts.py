@@ -56,8 +56,8 @@ def test_one_category_or_several(folders, layout, views, classes) -> None:
 def test_a_folder_that_is_not_there_or_of_another_layout_is_named(folders, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     for folder, message in (
-        ("data", rf"data: there is no such folder \(here that is {tmp_path / 'data'}\); say where the data set is"),
-        (tmp_path / "nowhere", "nowhere: there is no such folder; say"),
+        ("data", rf"data: there is no such folder \({tmp_path / 'data'}\); give the folder of the data set"),
+        (tmp_path / "nowhere", "nowhere: there is no such folder; give"),
         (folders / "kar", "kar: this is a data set of the layout 'kar', not 'dvr'; .*--layout"),
     ):
         with pytest.raises(FileNotFoundError, match=message):

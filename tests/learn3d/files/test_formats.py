@@ -62,8 +62,9 @@ def test_damaged_exif_data_do_not_cost_the_photograph(tmp_path):
 def test_shrinking_takes_the_mean_over_each_pixels_area():
     rng = np.random.default_rng(0)
     color, mask = rng.integers(0, 256, (128, 128, 3), np.uint8), rng.integers(0, 256, (128, 128), np.uint8)
-    image, small = shrink(color, mask, 64)
-    blocks = np.dstack([color, mask]).reshape(64, 2, 64, 2, 4).mean((1, 3)).transpose(2, 0, 1)
+    pixels = np.dstack([color, mask])
+    image, small = shrink(pixels.transpose(2, 0, 1).astype(np.float32), 64)
+    blocks = pixels.reshape(64, 2, 64, 2, 4).mean((1, 3)).transpose(2, 0, 1)
     assert image.dtype == np.uint8 and np.abs(image - blocks).max() <= 0.51
     np.testing.assert_array_equal(small, image[3])
 
@@ -71,7 +72,7 @@ def test_shrinking_takes_the_mean_over_each_pixels_area():
 def test_shrinking_by_three_and_a_half_keeps_the_covered_area():
     mask = np.zeros((224, 224), np.uint8)
     mask[10:101, 50:171] = 255
-    image, small = shrink(np.dstack([mask] * 3), mask, 224)
+    image, small = shrink(np.float32([mask] * 4), 224)
     np.testing.assert_array_equal(image[3], mask)
     assert small.sum() * 3.5**2 == pytest.approx(mask.sum(), rel=1e-3)
     assert small[:, 10].max() == 0 and small[20, 20] == 255
