@@ -54,7 +54,7 @@ def load(
         images, masks = ([root / name / part / f"{k:04d}.png" for k in range(NUM_VIEWS)] for part in ("image", "mask"))
         return ObjectFiles(
             root / name,
-            Call(npz.read_those_there, root / name / "cameras.npz", (_MATRICES, 16 * 8), _CAMERAS),
+            Call(npz.read_existing, root / name / "cameras.npz", (_MATRICES, 16 * 8), _CAMERAS),
             Call(npz.read, root / name / "pointcloud.npz", ("points", limits.OBJECT_BYTES), _CLOUD),
             [Call(renderings.read_with_mask, i, (m, IMAGE_SIZE)) for i, m in zip(images, masks, strict=True)],
         )

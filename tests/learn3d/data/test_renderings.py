@@ -226,7 +226,7 @@ FAULTS = {
     ("dvr", "the camera of view 5 is not Kato's"): change_matrix(5, lambda m: m + 0.3 * ASIDE),
     ("dvr", "the camera of view 6 is not Kato's"): change_matrix(6, turned(1, 0.1)),
     ("dvr", "the camera of view 9 is not Kato's"): change_matrix(9, turned(2, 0.1)),
-    ("dvr", "or is rolled or mirrored"): change_cameras(reverse_views),
+    ("dvr", "neither rolled nor mirrored"): change_cameras(reverse_views),
     ("dvr", "pointcloud.npz: is missing"): lambda f: (views(f) / "pointcloud.npz").unlink(),
     ("dvr", "pointcloud.npz: has the shape [5, 4]"): save_points(points=np.zeros((5, 4))),
     ("dvr", "pointcloud.npz: has coordinates up to nan"): save_points(points=np.full((5, 3), np.nan)),

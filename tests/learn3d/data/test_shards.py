@@ -194,7 +194,7 @@ def test_a_shard_that_changed_after_a_kill_is_noticed(stored, tiny_config, tmp_p
 def test_pipes_and_devices_are_refused_at_once(stored, make) -> None:
     (path := shard_file(stored)).unlink()
     make(path)
-    expect(stored, path, "it is no plain file")
+    expect(stored, path, "it is not a regular file")
 
 
 def test_a_set_that_claims_a_million_shards_is_refused_at_once(stored) -> None:

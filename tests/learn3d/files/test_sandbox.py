@@ -46,7 +46,7 @@ def test_what_goes_wrong_is_one_sentence_and_the_next_file_is_read(path: Path, f
 
 
 def test_worker_that_does_not_answer_is_ended(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learn3d.files.sandbox._PATIENCE", 0.5)
+    monkeypatch.setattr("learn3d.files.sandbox._TIMEOUT", 0.5)
     with pytest.raises(DamagedFile, match="stopped"):
         read(strange.sleep, path, 60.0)
 
