@@ -61,11 +61,6 @@ class EstimatedViews:
     table: PoseTable  # for all rows
 
     @property
-    def is_sure(self) -> bool:
-        """Whether the mean confidence is high enough to train on the poses."""
-        return float(self.result.confidence.mean()) >= MIN_CONFIDENCE
-
-    @property
     def warnings(self) -> list[str]:
         """Reasons to distrust the poses."""
         warnings = []
@@ -74,7 +69,7 @@ class EstimatedViews:
         training = int((self.shown < len(self.datasets[0])).sum())
         if training < MIN_IMAGES:
             warnings.append(f"{training} training images are too few to estimate poses; the minimum is {MIN_IMAGES}")
-        elif not self.is_sure:
+        elif float(self.result.confidence.mean()) < MIN_CONFIDENCE:
             warnings.append(
                 "these masks do not determine the poses: nearly equal masks of different objects got different "
                 "azimuths, so objects may look alike from several sides. Check the sheet before training on this table"

@@ -208,7 +208,7 @@ def test_flip_image_leaves_mask_and_pose(folder: Path) -> None:
     assert changed.poses is batch.poses
 
 
-def test_crop_is_refused_where_it_cannot_be(folder: Path) -> None:
+def test_impossible_crops_are_refused(folder: Path) -> None:
     batch = pascal3d.load(folder, "aeroplane", "train").batch(torch.arange(2))
     with pytest.raises(ValueError, match=r"crop must be the first augmentation, got flip, crop"):
         augment(batch, ["flip", "crop"], 0, 1)

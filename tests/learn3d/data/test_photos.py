@@ -218,7 +218,7 @@ def test_photographs_without_poses_learn_from_an_estimate(chairs: Path, tmp_path
     refused(chairs, "images: is empty; expected photographs")
 
 
-def test_tables_that_are_none_are_named(chairs: Path, tmp_path: Path) -> None:
+def test_other_files_than_tables_are_named(chairs: Path, tmp_path: Path) -> None:
     header = ",".join(COLUMNS)
     for content, message in [
         (b"", "has the columns ; expected a table of photographs with the columns file, azimuth_deg"),

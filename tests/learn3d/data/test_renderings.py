@@ -253,7 +253,7 @@ def test_faults_of_an_object_are_named_by_load_and_by_the_check(copy, layout, me
 
 
 @pytest.mark.parametrize("pose", [(1e30, 5, 2), (1, 5, 0), (1, np.nan, 2)])
-def test_poses_that_cannot_be_are_refused(pose) -> None:
+def test_impossible_poses_are_refused(pose) -> None:
     with pytest.raises(DamagedFile, match=r"row 1 has azimuth .*; expected a table"):
         check_poses(Path("view.txt"), np.array([(0.0, 0.0, 2.0), pose]), "a table")
 

@@ -1,4 +1,4 @@
-"""Damaged data sets: a sentence with the name of the file, whatever is changed in it."""
+"""Damaged data sets: they are read, or an error names the damaged file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images, meshes and voxel grids: what is read, and what is refused."""
+"""Images, meshes and voxel grids: valid files are read, others are refused."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_decoders_of_other_formats_are_never_tried(tmp_path, kind):
             open_image(tmp_path / "a.png", formats, 100)
 
 
-def test_damaged_exif_data_do_not_cost_the_photograph(tmp_path):
+def test_a_photograph_with_damaged_exif_data_is_read(tmp_path):
     Image.fromarray(np.full((9, 6), 255, np.uint8)).save(tmp_path / "m.png")
     exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\xff\xff\xff\x7f\xff\xff\xff\xff"
     Image.fromarray(np.full((9, 6, 3), 7, np.uint8)).save(tmp_path / "a.jpg", exif=exif)
@@ -159,7 +159,7 @@ def test_buffers_from_elsewhere_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["obj", "off"])
-def test_a_letter_that_is_not_utf8_costs_nothing(tmp_path, kind):
+def test_comments_in_latin1_are_accepted(tmp_path, kind):
     content = trimesh.creation.box().export(file_type=kind).encode()
     (tmp_path / f"a.{kind}").write_bytes(content.replace(b"\n", b"\n# " + "größe".encode("latin-1") + b"\n", 1))
     assert len(read_mesh(tmp_path / f"a.{kind}").faces) == 12
@@ -190,7 +190,7 @@ def test_the_array_is_found_among_others(tmp_path, compressed, dtype):
             matlab(tmp_path, content, name, size)
 
 
-def test_matlab_files_that_are_none(tmp_path):
+def test_other_files_than_matlab_are_refused(tmp_path):
     for content in (b"MATLAB", saved(Volume=CELLS)[:-5], b"", bytes(limits.VOLUME_BYTES + 1)):
         with pytest.raises(ValueError, match=r"a\.mat: "):
             matlab(tmp_path, content)
@@ -201,7 +201,7 @@ def binvox(path: Path, content: bytes, size: int = 8) -> geometry.Binvox:
     return sandbox.read(geometry.read_binvox, path, size)
 
 
-def test_reads_the_axes_of_the_mesh_and_where_the_grid_lies(tmp_path):
+def test_binvox_grids_have_the_axes_of_the_mesh(tmp_path):
     content = binvox_bytes(CELLS, scale=0.7, translate=-0.3)
     grid = binvox(tmp_path / "model.binvox", content)
     np.testing.assert_array_equal(grid.voxels, CELLS)

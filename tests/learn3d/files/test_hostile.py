@@ -1,4 +1,4 @@
-"""Files that were made to do harm, through the functions that the commands read with: one sentence, soon, in bounds."""
+"""Hostile files, read with the functions of the commands: errors of one sentence, within limits of memory and time."""
 
 from __future__ import annotations
 

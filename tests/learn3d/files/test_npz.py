@@ -1,4 +1,4 @@
-"""Arrays out of npz files: those that numpy writes are read, files that promise more than they hold are not."""
+"""Arrays of npz files: those from numpy are read, damaged and hostile files are refused."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from learn3d.files.renderings import PHOTOGRAPHS, open_image
 from learn3d.files.weights import read_state_dict
 
 
-def test_only_plain_files_of_a_stated_size_are_read(tmp_path):
+def test_only_regular_files_below_a_limit_are_read(tmp_path):
     path = tmp_path / "a.txt"
     path.write_bytes("ä\r\nb\rc\n".encode())
     assert check_file(path, 8, "a text") == 8 and read_text(path, 8, "a text") == "ä\nb\nc\n"
@@ -112,7 +112,7 @@ def test_sync_comes_before_the_new_name(tmp_path, monkeypatch) -> None:
     assert calls == ["fsync", "replace", "fsync"], "the content, the name, the folder that holds the name"
 
 
-def test_what_is_no_plain_file_is_not_replaced(tmp_path) -> None:
+def test_only_regular_files_are_replaced(tmp_path) -> None:
     """Never with a path in /dev: should the check be broken, the test would break the machine."""
     fifo, folder, link, output = (tmp_path / name for name in ("fifo", "folder", "link", "output"))
     os.mkfifo(fifo)

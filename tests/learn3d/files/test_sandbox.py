@@ -1,4 +1,4 @@
-"""Reading in worker processes: whatever happens there is a sentence here, and the next file is read all the same."""
+"""Reading in worker processes: a failure becomes an error of one sentence, and the next file is read."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def test_up_and_front_turn_the_mesh(tmp_path):
     assert np.abs(images.astype(int) - same).mean() < 0.1 < images.std()
 
 
-def test_our_own_mistakes_are_not_taken_for_bad_meshes_and_leave_nothing_behind(tmp_path, folder, monkeypatch):
+def test_bugs_are_raised_and_leave_no_files(tmp_path, folder, monkeypatch):
     for error in (IndexError, KeyboardInterrupt):
 
         def fail(*_, error=error, **__):

@@ -1,4 +1,4 @@
-"""Shards made by many processes: the same objects as in one, whatever was killed, and whatever could not be read."""
+"""Shards made by several processes: the same objects as from one process, also after kills and with bad meshes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes out of Debian packages."""
+"""Meshes from Debian packages."""
 
 from __future__ import annotations
 
