@@ -89,10 +89,10 @@ class LayoutProperties:
 def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:
     """Matrix float64 [3, 3] from right-handed mesh coordinates to the object frame: object = matrix @ mesh.
 
-    `up` is the mesh axis that points up, `front` the one that faces the camera of view 0 ("x", "-x", "y" ...). For a
-    viewer in front of the mesh up x front is on the right, so the rows are [up x front, up, -front] and the determinant
-    is -1. The default, (x, y, z) -> (-z, y, -x), is that of Kato's renderings of ShapeNet. Raises ValueError for
-    other or parallel axes.
+    `up` is the mesh axis that points up, `front` the one that faces the camera of view 0 ("x", "-x", "y" ...). A viewer
+    in front of the mesh has up x front on the right. So the rows are [up x front, up, -front], and the determinant is
+    -1. The default, (x, y, z) -> (-z, y, -x), is that of Kato's renderings of ShapeNet. Raises ValueError for other or
+    parallel axes.
     """
     axes = {s + a: np.float64(-1 if s else 1) * row for s in ("", "-") for a, row in zip("xyz", np.eye(3), strict=True)}
     if up not in axes or front not in axes:

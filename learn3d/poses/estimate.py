@@ -382,8 +382,8 @@ def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azi
 def _outline_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:
     """Votes float64 [M, M] of upper outlines. prototype, azimuth: int64 [N].
 
-    The vote of a mask on a prototype is the distance to its nearest outline at the opposite azimuth minus the distance
-    to its nearest outline at the same azimuth.
+    A mask votes with the distance to the prototype's nearest outline at the opposite azimuth, minus that at the same
+    azimuth.
     """
     outlines = _upper_outlines(data.masks)
     votes = torch.zeros(count, count, dtype=torch.float64)

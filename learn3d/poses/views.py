@@ -203,8 +203,8 @@ class Comparison:
 def compare(views: EstimatedViews) -> Comparison:
     """Compare the most probable azimuths with the true ones.
 
-    The frame is turned by the whole number of degrees with the smallest mean error of the validation images, or of all
-    images if there is no validation split. Raises ValueError if the data set has no poses.
+    The frame is turned by the whole number of degrees with the smallest mean error. It is that of the validation
+    images, or of all images if there is no validation split. Raises ValueError if the data set has no poses.
     """
     if any(dataset.poses is None for dataset in views.datasets):
         raise ValueError("--compare needs true poses, but this data set has none")

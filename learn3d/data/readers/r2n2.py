@@ -8,7 +8,7 @@
 - Split as published: ids sorted, the first 80 % for training, the rest for test. There is no validation split.
 
 Cameras. The distance is 1.75 times the ratio, in units of the mesh. The camera is Blender's default, a 35 mm lens on a
-32 mm sensor: half the field of view is atan(16 / 35), 24.567 degrees. (The 25 in the table did not change it.) In the
+32 mm sensor: half the field of view is atan(16 / 35), 24.567 degrees. The 25 in the table has no effect on it. In the
 mesh's frame (y up) the eye is at d (cos e cos a, sin e, cos e sin a). So in the object frame, (-z, y, -x) of the mesh,
 the azimuth of `nmr.points_from_angles` is -a.
 

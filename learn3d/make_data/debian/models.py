@@ -1,8 +1,8 @@
 """Real meshes from Debian packages: chairs, tables, cabinets, sofas, lamps (Sweet Home 3D) and airplanes (FlightGear).
 
-`fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply, welded, y up, facing +z, box centred at the origin, longest side
-1, with OUTPUT/index.csv (the source and licence of each mesh) and OUTPUT/licences (the packages' copyright files). The
-same packages give the same bytes.
+`fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply: welded, y up, front +z, box centred at the origin, longest side
+1. OUTPUT/index.csv has the source and licence of each mesh, OUTPUT/licences the packages' copyright files. The same
+packages give the same bytes.
 """
 
 from __future__ import annotations

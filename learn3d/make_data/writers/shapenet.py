@@ -27,8 +27,8 @@ class KarWriter(Writer):
     """A folder of renderings and a voxel grid for each object, and `splits.json` for all categories.
 
     `depth_{i}.png` has 0 .. 240 over 1.8 units around the object's centre (nearer is darker), and 255 for background.
-    `camera_{i}.mat` has K [3, 3] in pixels, extrinsic [3, 4] from ShapeNet's coordinates (right-handed, y up, front x)
-    to a camera with x right, y down, z away, and its rotation as quat (w, x, y, z). The published code reads neither
+    `camera_{i}.mat` has K [3, 3] in pixels, extrinsic [3, 4], and its rotation as quat (w, x, y, z). extrinsic takes
+    ShapeNet's coordinates (right-handed, y up, front x) to x right, y down, z away. The published code reads neither
     extrinsic nor quat.
     """
 
