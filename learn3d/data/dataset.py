@@ -271,7 +271,7 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
     def joined(name: str) -> Array | Crops | None:
         parts = [getattr(d, name) for d in datasets]
         if len({type(part) for part in parts}) > 1:
-            raise ValueError(f"not all of them have {name}, or some have it in shards; convert all of them or none")
+            raise ValueError(f"not all of them have {name}, or only some have it as shards; convert all or none")
         if parts[0] is None:
             return None
         join = {DiskArray: DiskArray.join, Crops: join_crops}.get(type(parts[0]), np.concatenate)

@@ -170,7 +170,7 @@ def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], findings: Find
     """Compare the objects' sizes in the photographs with those from distances and fields of view."""
     scales = [2 * f.share * p.distance * math.tan(math.radians(p.fov_deg) / 2) for p, f in pairs]
     middle = float(np.median(scales)) if scales else 1.0
-    message = f"the objects are {middle:.2g} times as large in the photographs as by the table; distance must be in "
+    message = f"the objects are {middle:.2g} times as large in the photographs as in the table; distance must be in "
     message += "lengths of the object's longest side, fov_deg the full angle across the longer side"
     if not 1 / _SCALE_OFF < middle < _SCALE_OFF:
         findings.take(DamagedFile(table, message))
@@ -178,7 +178,7 @@ def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], findings: Find
         findings.warn(table, message)
     for (photo, _), scale in zip(pairs, scales, strict=True):
         if not 1 / _SCALE_OFF < scale / middle < _SCALE_OFF:
-            message = f"compared with the others, its object is {scale / middle:.2g} times as large as by the table"
+            message = f"compared with the others, its object is {scale / middle:.2g} times as large as in the table"
             findings.warn(photo.file, f"{message}; is the distance in line {photo.line} right?")
 
 
@@ -238,7 +238,7 @@ def _photo(table: Path, line: int, row: dict[str, Any], masks: dict[str, Path], 
     """Check one row of the table."""
     try:
         if None in row or None in row.values():  # csv.DictReader marks too long and too short rows with None
-            raise ValueError("its number of values is not that of the columns")
+            raise ValueError("it has more or fewer values than there are columns")
         values = {name: value.strip() for name, value in row.items()}
         name = Path(values["file"].removeprefix("images/"))
         if not name.name or name.is_absolute() or ".." in name.parts or "\0" in str(name):

@@ -38,7 +38,7 @@ def get_package(name: str, folder: Path) -> Path:
         if result.returncode != 0:
             raise ValueError(
                 f"apt-get could not download {name} ({result.stderr.strip()}); run `apt-get update` as root, enable "
-                "the component non-free for a package -nonfree, or put the .deb file into the folder --packages-dir"
+                "the component non-free if the package is in it, or put the .deb file into the folder --packages-dir"
             )
     return max(folder.glob(f"{name}_*.deb"))
 
