@@ -23,7 +23,7 @@ from learn3d.make_data.debian.models import FetchConfig, fetch_debian_models
 from learn3d.pictures.sheets import save_png
 from learn3d.poses.estimate import PoseOptions
 from learn3d.poses.sheet import LEGEND, draw_sheet
-from learn3d.poses.views import SURE, CameraOptions, compare, estimate_views, load_views
+from learn3d.poses.views import MIN_CONFIDENCE, CameraOptions, compare, estimate_views, load_views
 from learn3d.settings import Count, split_names
 from learn3d.terminal import is_watched, note, say
 
@@ -188,7 +188,7 @@ class EstimatePoses(Command):
         with tqdm(total=self.options.all_steps, desc="poses", unit="step", disable=not is_watched()) as bar:
             views = estimate_views(datasets, self.cameras, self.options, self.candidates, bar.update)
         table = views.table
-        doubtful = float((table.confidence < SURE).mean())
+        doubtful = float((table.confidence < MIN_CONFIDENCE).mean())
         say(f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below .5: {doubtful:.0%}")
         if self.compare:
             comparison = compare(views)

@@ -1,1 +1,1 @@
-"""Data sets: one class and one batch type, readers that hide each layout's oddities, the maker of data sets."""
+"""Data sets: one class and one batch type for all layouts, and a reader for each layout."""

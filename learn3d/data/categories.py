@@ -1,4 +1,4 @@
-"""The 13 categories of ShapeNet that the data sets share, and what their files are called."""
+"""The 13 ShapeNet categories of Kato's data set, and the prefixes of their file names."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SYNSETS = {
     "telephone": "04401088",
     "vessel": "04530566",
 }
-_OTHER_NAMES = {"aeroplane": "airplane"}  # what Pascal3D+ says
+_OTHER_NAMES = {"aeroplane": "airplane"}  # in Pascal3D+
 
 
 def synset_of(category: str) -> str:

@@ -1,7 +1,7 @@
-"""Everything that is wrong with a folder of data, found at once: the report of `learn3d check-dataset`.
+"""Finds all faults of a data set at once: the report of `learn3d check-dataset`.
 
-It is the walk of the readers' `load`, with findings that go on: an error is something that `load` would raise, a
-warning an oddity that it would read.
+It calls the readers' `load` with findings that are not strict. Errors are faults that `load` would raise, warnings
+those that it would accept.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from learn3d.files.reading import Findings, Problem
 
 @dataclass(frozen=True)
 class SplitReport:
-    """One category and split."""
+    """Faults of one category and split."""
 
     category: str
     split: str
-    objects: int  # that the files list
+    objects: int  # number of objects that the files list
     problems: tuple[Problem, ...]
 
     def count(self, severity: str) -> int:
@@ -34,7 +34,7 @@ class SplitReport:
 
 @dataclass(frozen=True)
 class Report:
-    """A whole folder."""
+    """Faults of a folder."""
 
     layout: str
     folder: str
@@ -60,10 +60,10 @@ def check_folder(
     *,
     progress: bool = False,
 ) -> Report:
-    """Examine every file of the categories and splits of a folder; by default of all that are there.
+    """Examine all files of the categories and splits of a folder (default: all that it has).
 
-    A category or split that was asked for and is not there is an error of the report. Raises ValueError for an unknown
-    layout, FileNotFoundError for a folder that does not exist, or in which nothing of the layout is found.
+    A missing category or split is an error of the report. Raises ValueError for an unknown layout, FileNotFoundError if
+    the folder does not exist or has nothing of the layout.
     """
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}; got {layout!r}")
@@ -73,14 +73,14 @@ def check_folder(
     found, others = shards.contents(folder), {}
     try:
         others = READERS[layout].contents(folder)
-    except (ValueError, OSError):  # there are only shards, or reading a category will tell
+    except (ValueError, OSError):  # the folder has only shards, or `_check_split` finds the fault
         if not categories and not found:
             raise
     for category, there in others.items():
         found[category] = tuple(split for split in SPLITS if split in (*there, *found.get(category, ())))
     if not found and not categories:
         others = layouts_in(folder, layout)
-        hint = f"it is a data set of the layout {others[0]!r}: add --layout {others[0]}" if others else "see"
+        hint = f"it is a data set of the layout {others[0]!r}: add --layout {others[0]}" if others else "see its files"
         raise FileNotFoundError(f"{folder} holds nothing of the layout {layout!r}; {hint} (docs/data-sets.md)")
     reports = []
     for category in categories or found:
@@ -96,7 +96,7 @@ def _check_split(layout: str, folder: Path, category: str, split: str, progress:
     findings = Findings()
     try:
         load(folder, category, split, findings=findings, **options)
-    except (ValueError, OSError) as error:  # which ends the walk
+    except (ValueError, OSError) as error:
         path, message = getattr(error, "path", folder), getattr(error, "message", str(error))
         findings.problems.append(Problem(str(path), message))
     return SplitReport(category, split, findings.objects, tuple(dict.fromkeys(findings.problems)))

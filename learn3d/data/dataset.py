@@ -1,4 +1,4 @@
-"""A data set: a flat list of views of objects, whatever layout it was read from."""
+"""A data set of any layout: a flat list of views of objects."""
 
 from __future__ import annotations
 
@@ -28,45 +28,44 @@ Array = np.ndarray | DiskArray
 
 @checked
 class DatasetInfo:
-    """Facts about the data that a method needs before it builds its networks. They are saved in every checkpoint."""
+    """Properties of the data that methods need to build their networks. Every checkpoint has them."""
 
     num_views: Annotated[int, Field(ge=0, le=100_000)]  # K view classes
-    num_classes: Annotated[int, Field(ge=1, le=10_000)] = 1  # categories in the set
-    pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # of a camera: eye position 3, rotation 9, unknown 0
+    num_classes: Annotated[int, Field(ge=1, le=10_000)] = 1  # number of categories
+    pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # length of `features` of a pose; 0 if poses are unknown
     inverted: bool = False  # colours are stored as 255 - colour
-    mirror_plane_deg: float | None = None  # result of `data.mirror_plane`; None: no plane, or it was not asked for
-    cube_side: float | None = None  # side of the cube, centred at the origin, that holds all objects; None: unknown
-    solidity: float | None = None  # result of `ViewDataset.solidity`; None: not computed
+    mirror_plane_deg: float | None = None  # result of `data.mirror_plane`; None if none was found or looked for
+    cube_side: float | None = None  # side of the cube, centred at the origin, that holds all objects; None if unknown
+    solidity: float | None = None  # result of `ViewDataset.solidity`; None if not computed
 
 
 @dataclass(frozen=True, eq=False)
 class ViewDataset:
-    """One split of one category, or of several: M views (samples) of N objects. Every reader returns one.
+    """One split of one category or of several: M views (samples) of N objects.
 
-    Images, masks, voxels and points are in memory, or on disk if they were read from shards (`data.shards`).
-
-    Raises ValueError if the parts do not fit each other.
+    Images, masks, depth, voxels and points are in memory, or on disk if they were read from shards (`data.shards`).
+    Raises ValueError if fields have different numbers of views or objects, or wrong shapes.
     """
 
-    category: str  # as the user called it; several names are joined by commas
+    category: str  # name from the user; several names are joined by commas
     split: str
     images: Array  # uint8 [M, 4, S, S]: R, G, B and the mask
     poses: Poses | None  # M camera poses; None if they are unknown
     view_ids: np.ndarray  # int64 (int32 if on disk) [M] in 0 .. K-1: view classes
     view_names: tuple[str, ...]  # K names of the view classes
-    object_ids: np.ndarray  # likewise, in 0 .. N-1
-    object_names: tuple[str, ...]  # N names, as in the files
-    voxels: Array | None  # bool [N, 32, 32, 32] in the data set's own axes; None if there is no ground truth
-    convention: VoxelConvention  # how predictions are brought into those axes
-    masks: Array | None = None  # uint8 [M, 64, 64] silhouettes to be matched; None: the images' fourth channel
+    object_ids: np.ndarray  # int64 (int32 if on disk) [M] in 0 .. N-1: the object in each view
+    object_names: tuple[str, ...]  # N names from the files
+    voxels: Array | None  # bool [N, 32, 32, 32] ground truth in the data set's own axes; None if unknown
+    convention: VoxelConvention  # axes of the voxels
+    masks: Array | None = None  # uint8 [M, 64, 64] ground truth silhouettes; None: the images' fourth channel
     depth: Array | None = None  # uint8 [M, 64, 64], see `depth_levels`; None if unknown
-    class_ids: np.ndarray | None = None  # int64 [N]: category of each object, None for a single category
+    class_ids: np.ndarray | None = None  # int64 [N]: category of each object; None for a single category
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
-    points: Array | None = None  # float32 [N, P, 3]: points on the true surfaces in the object frame, if known
-    inverted: bool = True  # colours stored as 255 - colour over black (Kato's form), or as they are
-    crops: Crops | None = None  # M: sources of the augmentation "crop"; None if unknown
-    sides: np.ndarray | None = None  # float32 [M]: `object_sides`, if they are known already
-    candidates: PoseCandidates | None = None  # M: poses to draw from in training; None: `poses` alone
+    points: Array | None = None  # float32 [N, P, 3]: points on the true surfaces in the object frame; None if unknown
+    inverted: bool = True  # True if colours are stored as 255 - colour, so that a white background is 0 (Kato's form)
+    crops: Crops | None = None  # M original images for the augmentation "crop"; None if unknown
+    sides: np.ndarray | None = None  # float32 [M]: `object_sides`; None if not computed
+    candidates: PoseCandidates | None = None  # M sets of poses for training to draw from; None: `poses` alone
 
     def __post_init__(self) -> None:
         m, n = len(self.images), self.num_objects
@@ -113,16 +112,16 @@ class ViewDataset:
         return self.images.shape[2]
 
     def info(self, mirror_plane_deg: float | None = None, solidity: float | None = None) -> DatasetInfo:
-        """The facts that a method needs, with the mirror plane and the solidity of the objects, if they are known."""
+        """The properties that methods need; None for an unknown mirror plane or solidity."""
         features = 0 if self.poses is None else self.poses.num_features
         cube_side = None if self.voxels is None else self.convention.cube_side
-        facts = self.num_views, self.num_classes, features, self.inverted, mirror_plane_deg, cube_side
-        return DatasetInfo(*facts, solidity)
+        known = self.num_views, self.num_classes, features, self.inverted, mirror_plane_deg, cube_side
+        return DatasetInfo(*known, solidity)
 
     def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:
-        """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU.
+        """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU. ValueError for other indices.
 
-        voxels: training needs none, and they are twice as large as the images.
+        voxels: False for training, which needs none; they are twice as large as the images.
         """
         indices = torch.as_tensor(indices, dtype=torch.int64)
         samples = indices.numpy()
@@ -147,17 +146,17 @@ class ViewDataset:
         )
 
     def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
-        """Occupancy bool [B, 32, 32, 32] of predictions in the data set's voxel axes; see `VoxelConvention`."""
+        """Occupancy bool [B, 32, 32, 32] of meshes in the data set's voxel axes, see `VoxelConvention.voxelize`."""
         return self.convention.voxelize(vertices, faces, definition)
 
     def prepare(self, indices: Tensor) -> None:
-        """Begin to read what `batch` will be asked for next, if it is on disk."""
+        """Start to read the samples of the next `batch` in the background, if they are on disk."""
         for array in (self.images, self.masks, self.depth):
             if isinstance(array, DiskArray):
                 array.prepare(indices.numpy())
 
     def digest(self, *, voxels: bool = True) -> int:
-        """CRC-32 of images, masks, poses and classes, and of the voxels if wanted; of arrays on disk, of checksums."""
+        """CRC-32 of images, masks, poses and classes, and of voxels if wanted. Arrays on disk count by checksums."""
         fields = () if self.poses is None else dataclasses.fields(self.poses)
         poses = [np.asarray(getattr(self.poses, field.name)) for field in fields]
         parts = [self.images, self.masks, self.depth, *poses, self.view_ids, self.object_ids, self.class_ids]
@@ -171,28 +170,30 @@ class ViewDataset:
         return crc
 
     def check_masks(self) -> str:
-        """A warning if some images show nothing, else "". Raises ValueError if all of them do."""
+        """A warning if some masks are empty, else "". Raises ValueError if all masks are empty."""
         empty = int((self.object_sides() == 0).sum())
         if empty == len(self):
             found = f"all {empty} {self.split} images of {self.category} have an empty mask"
-            raise ValueError(f"{found}, so that there is nothing to learn; look at the data (learn3d check-dataset)")
+            raise ValueError(f"{found}; run learn3d check-dataset on the data")
         return f"{empty} of {len(self)} {self.split} images have an empty mask" if empty else ""
 
     def object_share(self) -> float:
-        """Mean of `object_sides`, by which photographs are framed like the images that the networks know."""
+        """Mean of `object_sides`: the scale at which `reconstruct` frames photographs."""
         return float(self.object_sides().mean(dtype=np.float64))
 
     def solidity(self) -> float:
-        """Mean of the masks' areas over those of their convex hulls, for at most 256 images; 0 if all are empty."""
+        """Mean ratio of a mask's area to that of its convex hull, for at most 256 images; 0 if all masks are empty."""
         from skimage.morphology import convex_hull_image  # takes half a second to import
 
-        stored = self.images if self.masks is None else self.masks
-        some = np.linspace(0, len(self) - 1, min(len(self), 256)).astype(int)
-        masks = stored[some].reshape(len(some), -1, *stored.shape[-2:])[:, -1] > 127
+        masks = self.read_masks(np.linspace(0, len(self) - 1, min(len(self), 256)).astype(int)) > 127
         return float(np.mean([mask.sum() / convex_hull_image(mask).sum() for mask in masks if mask.any()] or 0.0))
 
+    def read_masks(self, samples: np.ndarray) -> np.ndarray:
+        """The ground truth silhouettes of the samples `samples`, int64 [B]: uint8 [B, 64, 64]."""
+        return self.images[samples][:, 3] if self.masks is None else self.masks[samples]
+
     def object_sides(self) -> np.ndarray:
-        """The larger side of each mask's bounding box, as a share of the picture's side: floats [M], 0 if empty."""
+        """The larger side of each mask's bounding box over the side of the image: float [M], 0 for an empty mask."""
         if self.sides is not None:
             return self.sides
         masks = self.images[:, 3] > 127
@@ -205,19 +206,19 @@ class ViewDataset:
         return np.maximum(*sides)
 
     def with_bins(self, bins: AngleBins) -> ViewDataset:
-        """The same views with view classes from cells of azimuth and elevation."""
+        """The same views with cells of azimuth and elevation as view classes. Raises ValueError without such poses."""
         if not isinstance(self.poses, LookAtPoses):
             got = "no poses" if self.poses is None else "rotations"
             raise ValueError(f"cells of azimuth and elevation need look-at cameras; this data set has {got}")
         return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), view_names=tuple(bins.names()))
 
     def with_few_views(self, count: int) -> ViewDataset:
-        """`count` views of every object, or all if it has fewer, drawn at random for each, the same ones in every run.
+        """`count` random views of each object, or all of an object with fewer; the same ones in every run.
 
-        Raises ValueError if no object has so many.
+        Raises ValueError if no object has `count` views.
         """
         order = np.random.default_rng(0).permutation(len(self))
-        order = order[np.argsort(self.object_ids[order], kind="stable")]  # by object, the views of each shuffled
+        order = order[np.argsort(self.object_ids[order], kind="stable")]  # sorted by object, shuffled within it
         _, starts, sizes = np.unique(self.object_ids[order], return_index=True, return_counts=True)
         if not 1 <= count <= sizes.max(initial=0):
             raise ValueError(f"views_per_object must lie in 1 .. {sizes.max(initial=0)}, got {count}")
@@ -225,32 +226,31 @@ class ViewDataset:
         return self.select(np.sort(order[number < count]))
 
     def select(self, samples: np.ndarray) -> ViewDataset:
-        """Only the samples `samples`, int64; all objects stay. Arrays on disk stay there."""
+        """The samples `samples`, int64 [B], and all objects. Arrays on disk are not read."""
         names = ("images", "masks", "depth", "view_ids", "object_ids", "sides", "crops", "poses")
         parts = {name: part for name in names if (part := getattr(self, name)) is not None}
-        return dataclasses.replace(
-            self, **{n: p.select(samples) if isinstance(p, DiskArray) else p[samples] for n, p in parts.items()}
-        )
+        chosen = {n: p.select(samples) if isinstance(p, DiskArray) else p[samples] for n, p in parts.items()}
+        return dataclasses.replace(self, **chosen)
 
 
-DEPTH_REACH = 0.9  # a box of side 1 lies within 0.87 of its centre, at which the cameras look
+DEPTH_REACH = 0.9  # the corners of a cube of side 1 are 0.87 from its centre, at which the cameras look
 
 
 def depth_levels(depth: Tensor, poses: LookAtPoses) -> Tensor:
-    """Depth maps float [M, S, S] as bytes: 1 .. 255 over `DEPTH_REACH` before and behind the centre, 0: no surface."""
+    """Quantise depth maps float [M, S, S]: 1 .. 255 within `DEPTH_REACH` of the centre's depth, 0 for no surface."""
     nearer = (depth - poses.distance[:, None, None]) / DEPTH_REACH
     level = (1 + 127 * (nearer + 1)).round().clamp(1, 255)
     return torch.where(nearer.abs() <= 1, level, 0).to(torch.uint8)
 
 
 def depth_of_levels(levels: Tensor, poses: LookAtPoses) -> Tensor:
-    """The inverse: float32 [M, S, S] in units of the object frame, 0 where there is no surface."""
+    """The inverse of `depth_levels`: float32 [M, S, S] in units of the object frame, 0 for no surface."""
     depth = ((levels.float() - 1) / 127 - 1) * DEPTH_REACH + poses.distance[:, None, None]
     return torch.where(levels > 0, depth, 0.0)
 
 
 def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
-    """Several categories of one layout and split as one set with class ids; their view classes must be the same."""
+    """Join categories of one layout and split to a set with class ids. ValueError if their view classes differ."""
     if len(datasets) == 1:
         return datasets[0]
     return dataclasses.replace(
@@ -262,7 +262,7 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
 
 
 def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
-    """The views and objects of several sets, one after the other, as one. Raises ValueError if the sets differ."""
+    """Concatenate the views and objects of several sets. Raises ValueError if their kinds of images or poses differ."""
     first = datasets[0]
     for other in datasets[1:]:
         if other.view_names != first.view_names or other.images.shape[1:] != first.images.shape[1:]:
@@ -271,19 +271,17 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
     def joined(name: str) -> Array | Crops | None:
         parts = [getattr(d, name) for d in datasets]
         if len({type(part) for part in parts}) > 1:
-            raise ValueError(f"not all of them have {name}, or have it in shards: convert all, or none")
+            raise ValueError(f"not all of them have {name}, or only some have it as shards; convert all or none")
         if parts[0] is None:
             return None
         join = {DiskArray: DiskArray.join, Crops: join_crops}.get(type(parts[0]), np.concatenate)
         return join(parts)
 
     starts = np.cumsum([0] + [d.num_objects for d in datasets])[:-1].tolist()
+    names = ("images", "masks", "depth", "view_ids", "voxels", "points", "sides", "crops")
     return dataclasses.replace(
         first,
-        **{
-            name: joined(name)
-            for name in ("images", "masks", "depth", "view_ids", "voxels", "points", "sides", "crops")
-        },
+        **{name: joined(name) for name in names},
         poses=join_poses([d.poses for d in datasets]),
         object_ids=np.concatenate([d.object_ids + start for d, start in zip(datasets, starts, strict=True)]),
         object_names=tuple(name for d in datasets for name in d.object_names),

@@ -1,4 +1,4 @@
-"""Data sets by the name of their layout: `READERS` has them all."""
+"""Loads data sets by the name of their layout."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LAYOUTS: dict[str, LayoutProperties] = {name: reader.PROPERTIES for name, reader
 
 
 def check_options(layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str | None = None) -> None:
-    """Raise a ValueError for an unknown layout and for an option of `load_dataset` that does not go with it."""
+    """Raise ValueError for an unknown layout, or for an option of `load_dataset` that it does not support."""
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
     if "image_size" not in LAYOUTS[layout].options and image_size != IMAGE_SIZE:
@@ -29,18 +29,18 @@ def check_options(layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str |
         AngleBins.parse(view_bins)
         if not LAYOUTS[layout].angles:
             raise ValueError(
-                f"view_bins {view_bins!r}: cells of azimuth and elevation need cameras that look at the object, those "
-                f"of the layout {layout!r} are rotations; choose a preset that is made for it"
+                f"view_bins {view_bins!r}: cells of azimuth and elevation need look-at cameras, but the poses of the "
+                f"layout {layout!r} are rotations; choose a preset for this layout"
             )
 
 
 def require_folder(folder: Path | str) -> None:
-    """Raise FileNotFoundError if the folder of a data set is not there, with the place that a relative path means."""
+    """Raise FileNotFoundError if the folder of a data set does not exist; the message has its absolute path."""
     folder = Path(folder)
     if not folder.is_dir():
-        where = "" if folder.is_absolute() else f" (here that is {folder.absolute()})"
-        said = "say where the data set is with --data, or make it (learn3d make-dataset)"
-        raise MissingFile(folder, f"there is no such folder{where}; {said}")
+        absolute = "" if folder.is_absolute() else f" ({folder.absolute()})"
+        advice = "give the folder of the data set with --data, or make it (learn3d make-dataset)"
+        raise MissingFile(folder, f"there is no such folder{absolute}; {advice}")
 
 
 def load_dataset(
@@ -55,19 +55,19 @@ def load_dataset(
     poses: Path | None = None,
     progress: bool = False,
 ) -> ViewDataset:
-    """Read one split ("train", "val" or "test") of one category, or of several joined by commas, of a folder.
+    """Read one split ("train", "val" or "test") of one category, or of several joined by commas.
 
-    Categories that the folder has in shards (`data.shards`) are read from these, and their images stay on disk.
+    Categories that the folder has as shards (`data.shards`) are read from these, and their images stay on disk.
 
-    image_size: side of the network's images in pixels, for layouts that keep larger ones; Kato's renderings are 64x64.
-    view_bins: view classes from cells of azimuth and elevation, see `AngleBins.parse`; None: the layout's own.
-    views_per_object: use only so many views of every object (kar: the first; else drawn at random, the same in every
-    run); None: as in the layout's published protocol.
-    poses: a table of estimated poses (`PoseTable`) that replaces those of the data set.
-    progress: show a bar if many files are read.
+    image_size: side of the network's images in pixels; only layouts with larger files have other sizes than 64.
+    view_bins: cells of azimuth and elevation as view classes, see `AngleBins.parse`; None: the layout's own classes.
+    views_per_object: number of views of each object (kar: the first ones; else random, the same ones in every run);
+    None: as in the layout's published protocol.
+    poses: file of a `PoseTable`, which replaces the poses of the data set.
+    progress: show a progress bar if the layout has many files.
 
-    Raises ValueError for an unknown layout, an option that the layout does not have, and damaged files (named);
-    FileNotFoundError for missing ones.
+    Raises ValueError for an unknown layout, an unsupported option or a damaged file, FileNotFoundError for a missing
+    one. Messages name the file.
     """
     check_options(layout, image_size=image_size, view_bins=view_bins)
     require_folder(folder)
@@ -91,19 +91,19 @@ def load_dataset(
             hint += f"with a preset for it, or with --layout {others[0]}"
             raise MissingFile(Path(folder), hint) from None
         check = f"learn3d check-dataset {shlex.quote(str(folder))} --layout {layout}"
-        message = f"{error.message}. All that is wrong with the data set is listed by: {check}"
+        message = f"{error.message}. To list all faults of the data set, run: {check}"
         raise type(error)(error.path, message) from error
     if views_per_object is not None and (any(stored) or "views_per_object" not in options):
         dataset = dataset.with_few_views(views_per_object)
     if poses is not None:
-        dataset = PoseTable.read(poses).applied(dataset, str(poses))
+        dataset = PoseTable.read(poses).apply(dataset, str(poses))
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
 
 
 def layouts_in(folder: Path, asked: str) -> list[str]:
-    """The layouts of which the folder holds something, if it holds nothing of the one that was asked for."""
+    """The layouts of a folder's data sets; [] if `asked` is one of them."""
     found = []
     for layout, reader in READERS.items():
-        with contextlib.suppress(ValueError, OSError):  # the file that lists them is damaged, or another layout's
+        with contextlib.suppress(ValueError, OSError):  # a list of objects is damaged, or of another layout
             found += [layout] * bool(reader.contents(folder))
     return [] if asked in found else found

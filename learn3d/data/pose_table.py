@@ -1,7 +1,7 @@
-"""Tables of estimated poses: an npz file beside a data set, which takes the place of the poses that it has.
+"""Tables of estimated poses: npz files that replace the poses of a data set.
 
-Every row belongs to one image. It is found by a fingerprint, a hash of the object's name and the mask, so that a table
-fits any part of the data that it was made from, in any order, and no other data.
+Each row belongs to one image. Its fingerprint is a hash of the object's name and of the mask. So a table fits any part
+of its data, in any order, and no other data.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from learn3d.files.sandbox import read
 from learn3d.files.writing import replacing
 
 _WANTED = "a table that learn3d estimate-poses wrote"
-_DTYPES = {"fingerprint": np.dtype(np.uint64)}  # the others are float32
-_MOST_CANDIDATES = 64
+_DTYPES = {"fingerprint": np.dtype(np.uint64)}  # the other arrays are float32
+_MAX_CANDIDATES = 64
 
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """C candidates for each of N images, the best first."""
+    """C candidate poses for each of N images, the most probable first. Raises ValueError for impossible values."""
 
     fingerprint: np.ndarray  # uint64 [N]
     azimuth_deg: np.ndarray  # float32 [N, C]
     elevation_deg: np.ndarray  # float32 [N, C]
-    weights: np.ndarray  # float32 [N, C]; their sum is 1
+    weights: np.ndarray  # float32 [N, C]: probabilities; each row sums to 1
     distance: np.ndarray  # float32 [N]
     half_fov_deg: np.ndarray  # float32 [N]
     confidence: np.ndarray  # float32 [N]: probability that the best azimuth is right to 30 degrees
 
     def __post_init__(self) -> None:
         count, shape = len(self.fingerprint), self.azimuth_deg.shape
-        if not count or len(shape) != 2 or not 1 <= shape[1] <= _MOST_CANDIDATES:
-            raise ValueError(f"azimuth_deg must be [N, C] with N >= 1 and C in 1 .. {_MOST_CANDIDATES}, got {shape}")
+        if not count or len(shape) != 2 or not 1 <= shape[1] <= _MAX_CANDIDATES:
+            raise ValueError(f"azimuth_deg must be [N, C] with N >= 1 and C in 1 .. {_MAX_CANDIDATES}, got {shape}")
         for field in dataclasses.fields(self):
             values = getattr(self, field.name)
             dtype = _DTYPES.get(field.name, np.dtype(np.float32))
@@ -61,7 +61,7 @@ class PoseTable:
             raise ValueError("the weights of the candidates of an image must add up to 1")
 
     def poses(self, rows: np.ndarray, best: bool = False) -> LookAtPoses:
-        """The poses of these rows, candidate by candidate, or the best ones alone."""
+        """The B * C candidate poses of the rows `rows`, int64 [B], or only the B best ones."""
         last = 1 if best else self.azimuth_deg.shape[1]
         angles = (values[rows, :last].reshape(-1) for values in (self.azimuth_deg, self.elevation_deg))
         return LookAtPoses(*angles, *(values[rows].repeat(last) for values in (self.distance, self.half_fov_deg)))
@@ -78,7 +78,7 @@ class PoseTable:
 
     @classmethod
     def read(cls, path: Path | str) -> PoseTable:
-        """Read a table that somebody else may have made. Raises DamagedFile and MissingFile."""
+        """Read an untrusted table. Raises DamagedFile and MissingFile."""
         names = [field.name for field in dataclasses.fields(cls)]
         arrays = read(npz.read_table, Path(path), names, wanted=_WANTED)
         try:
@@ -86,8 +86,8 @@ class PoseTable:
         except ValueError as error:
             raise DamagedFile(Path(path), f"{error}; expected {_WANTED}") from None
 
-    def applied(self, dataset: ViewDataset, source: str) -> ViewDataset:
-        """The data set with the poses of this table, and view classes of them. `source` names the table in messages.
+    def apply(self, dataset: ViewDataset, source: str) -> ViewDataset:
+        """The data set with the poses of this table and view classes from them. `source` names the table in messages.
 
         Raises ValueError if an image is not in the table.
         """
@@ -99,7 +99,7 @@ class PoseTable:
             raise ValueError(
                 f"{source} has no pose for {len(missing)} of {len(dataset)} {dataset.split} images of "
                 f"{dataset.category} (the first is of object {first}): it was made from other data; run learn3d "
-                "estimate-poses on these"
+                "estimate-poses on this data set"
             )
         poses, training = self.poses(rows, best=True), self.poses(np.arange(len(order)), best=True)
         view_ids, view_names = view_classes(poses, training)
@@ -110,16 +110,11 @@ class PoseTable:
 
 
 def fingerprints(dataset: ViewDataset) -> np.ndarray:
-    """A hash of the object's name and the mask of every image: uint64 [M]."""
+    """A hash of the object's name and of the mask, for each image: uint64 [M]."""
     found = np.empty(len(dataset), np.uint64)
     for rows in np.array_split(np.arange(len(dataset)), len(dataset) // 1024 + 1):
-        for row, mask in zip(rows, masks_of(dataset, rows), strict=True):
+        for row, mask in zip(rows, dataset.read_masks(rows), strict=True):
             name = dataset.object_names[dataset.object_ids[row]].encode()
             digest = hashlib.blake2b(name + b"\0" + mask.tobytes(), digest_size=8).digest()
             found[row] = int.from_bytes(digest, "little")
     return found
-
-
-def masks_of(dataset: ViewDataset, rows: np.ndarray) -> np.ndarray:
-    """The masks to be matched of some images: uint8 [B, 64, 64]."""
-    return dataset.images[rows][:, 3] if dataset.masks is None else dataset.masks[rows]

@@ -1,4 +1,4 @@
-"""Camera tables: the pose of every sample of a data set, ready to become cameras or features for a discriminator."""
+"""Camera poses of the samples of a data set: look-at poses and rotations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from learn3d.files import limits
 
 
 def wrap_deg(angle_deg: Tensor) -> Tensor:
-    """Angles in degrees, brought into -180 (included) .. 180 (excluded)."""
+    """Angles in degrees, wrapped to [-180, 180)."""
     return torch.remainder(angle_deg + 180.0, 360.0) - 180.0
 
 
@@ -50,7 +50,7 @@ class LookAtPoses:
         return LookAtPoses(*(value[indices] if isinstance(value, Tensor) else value for value in self._values()))
 
     def in_range(self) -> Tensor:
-        """Which poses are finite and within `files.limits`: bool [M]."""
+        """Which poses are finite and within the bounds of `files.limits`: bool [M]."""
         (near, far), (narrow, wide) = limits.DISTANCE, limits.FOV_DEG
         azimuth, elevation, distance, half_fov = map(torch.as_tensor, self._values())
         sound = (azimuth.abs() <= limits.ANGLE_DEG) & (elevation.abs() < 90)
@@ -63,11 +63,11 @@ class LookAtPoses:
         )
 
     def features(self) -> Tensor:
-        """The description of each view for a discriminator: the eye's position, float32 [M, 3]."""
+        """The input of a discriminator: the eye's position of each view, float32 [M, 3]."""
         return nmr.cameras.points_from_angles(self.distance, self.elevation_deg, self.azimuth_deg).to(torch.float32)
 
     def mirrored(self, chosen: Tensor) -> LookAtPoses:
-        """The same poses, those with `chosen` (bool [M]) in a mirror: image flipped left-right, azimuth negated."""
+        """The poses of the images, those with `chosen` (bool [M]) flipped left-right: their azimuths are negated."""
         return replace(self, azimuth_deg=torch.where(chosen, -self.azimuth_deg, self.azimuth_deg))
 
     def _values(self) -> tuple[Tensor | float, ...]:
@@ -76,9 +76,9 @@ class LookAtPoses:
 
 @dataclass(frozen=True, eq=False)
 class RotationPoses:
-    """M orthographic cameras given by a rotation each (Pascal3D+): v' = R v, and x', y' in [-1, 1] span the image.
+    """M orthographic cameras, each given by a rotation (Pascal3D+): v' = R v, and x', y' in [-1, 1] span the image.
 
-    The depth is moved in front of the camera (z' + `depth_offset`), which changes no pixel of a silhouette.
+    Objects are moved in front of the camera (z' + `depth_offset`), which changes no pixel of a silhouette.
     """
 
     rotation: Tensor  # float32 [M, 3, 3]
@@ -98,7 +98,7 @@ class RotationPoses:
         return RotationPoses(self.rotation[indices], self.depth_offset)
 
     def in_range(self) -> Tensor:
-        """Which rotations, with or without a reflection, are finite and not flat: bool [M]."""
+        """Which matrices are finite and invertible: bool [M]. Rotations may include a reflection."""
         return torch.linalg.det(self.rotation.nan_to_num()).ne(0) & self.rotation.isfinite().all(2).all(1)
 
     def cameras(self) -> nmr.cameras.Projection:
@@ -108,13 +108,13 @@ class RotationPoses:
         return nmr.cameras.Projection(torch.cat([self.rotation, offset], dim=2), intrinsics, perspective=False)
 
     def features(self) -> Tensor:
-        """The description of each view for a discriminator: the nine entries of the rotation, float32 [M, 9]."""
+        """The input of a discriminator: the nine entries of each rotation, float32 [M, 9]."""
         return self.rotation.reshape(len(self), 9)
 
     def mirrored(self, chosen: Tensor) -> RotationPoses:
-        """The same poses, those with `chosen` (bool [M]) for the image flipped left-right of an object with x' -> -x'.
+        """The poses of the images, those with `chosen` (bool [M]) flipped left-right (x' -> -x').
 
-        For an object that is symmetric about z = 0 the flipped image is seen under D R D', D = diag(-1, 1, 1),
+        For an object that is symmetric about z = 0, the pose of the flipped image is D R D' with D = diag(-1, 1, 1) and
         D' = diag(1, 1, -1).
         """
         image, body = torch.tensor([-1.0, 1.0, 1.0]), torch.tensor([1.0, 1.0, -1.0])
@@ -126,7 +126,7 @@ Poses = LookAtPoses | RotationPoses
 
 
 def join_poses(poses: Sequence[Poses | None]) -> Poses | None:
-    """The poses of several sets, one after the other. Raises ValueError for cameras of different kinds."""
+    """Concatenate the poses of several sets; None if they are unknown. Raises ValueError for different kinds."""
     kind = type(poses[0])
     if any(type(p) is not kind for p in poses):
         raise ValueError("the categories have cameras of different kinds")

@@ -1,6 +1,6 @@
-"""The batches of a training, sampled and randomly changed: functions of (data set, seed, step) alone.
+"""Samples and augments the batches of a training.
 
-So resuming needs no memory of them.
+They depend on (data set, seed, step) alone, so a resumed training needs no saved state of them.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from learn3d.data.batch import Batch
 from learn3d.data.dataset import ViewDataset
 
 Sampling = Literal["views", "pairs", "groups", "classes"]
-GROUP_SIZE = 5  # views of an object in sampling "groups"
-#: Views of one object that stand in a batch, [a_1 .. a_n, b_1 .. b_n, ...]; 1 if views are drawn on their own.
+GROUP_SIZE = 5  # views per object of sampling "groups"
+#: Views of each object in a batch, ordered [a_1 .. a_n, b_1 .. b_n, ...]; 1 if views are drawn independently.
 VIEWS_OF_OBJECT: dict[Sampling, int] = {"views": 1, "pairs": 2, "groups": GROUP_SIZE, "classes": 1}
 
 
 class BatchOptions(Protocol):
-    """The options of a run that its batches depend on; a `TrainConfig` has them."""
+    """The options of a `TrainConfig` that its batches depend on."""
 
     sampling: Sampling
     batch_size: int
@@ -36,7 +36,7 @@ class BatchOptions(Protocol):
 def batches(dataset: ViewDataset, options: BatchOptions, start: int = 1) -> Iterator[Batch]:
     """The batches of the training steps `start` .. `options.iterations`, sampled and augmented, without voxels.
 
-    While a step uses a batch, a thread reads the next one from the disk, if the data set is there.
+    If the data set is on disk, a thread reads the next batch during a step.
     """
     indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, start)
     for step in range(start, options.iterations + 1):
@@ -50,12 +50,12 @@ def batches(dataset: ViewDataset, options: BatchOptions, start: int = 1) -> Iter
 
 
 def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, seed: int, step: int) -> Tensor:
-    """Samples of step `step` (from 1), int64 [batch_size].
+    """Samples of step `step` (from 1): int64 [batch_size], or the largest multiple of the group size below it.
 
-    "views": every view on its own, epochs of shuffled samples. "pairs": two different views of each of batch_size / 2
-    objects drawn at random, [a_1 .. a_n, b_1 .. b_n] (Kato et al. 2018). "groups": likewise GROUP_SIZE views of each,
-    different ones if the object has so many. "classes": categories drawn uniformly, then a
-    view of each (Kato and Harada 2019).
+    "views": epochs of shuffled views. "pairs": two different views of each of batch_size / 2 random objects,
+    [a_1 .. a_n, b_1 .. b_n] (Kato et al. 2018). "groups": GROUP_SIZE views of each of batch_size / GROUP_SIZE random
+    objects; views repeat if the object has fewer. "classes": a random view of each of batch_size random categories
+    (Kato and Harada 2019). Raises ValueError if "pairs" or "groups" finds no object with two views.
     """
     if sampling == "views":
         return shuffled_epochs(len(dataset), batch_size, seed, step)
@@ -78,11 +78,11 @@ def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, se
         members = _views_by_class(dataset)
         drawn = rng.integers(dataset.num_classes, size=batch_size)
         return torch.from_numpy(np.array([members[c][rng.integers(len(members[c]))] for c in drawn]))
-    raise ValueError(f"sampling must be views, pairs or classes, got {sampling!r}")
+    raise ValueError(f"sampling must be {', '.join(get_args(Sampling))}, got {sampling!r}")
 
 
 def shuffled_epochs(num_samples: int, batch_size: int, seed: int, step: int) -> Tensor:
-    """The next ones of an endless row of shuffled epochs."""
+    """Samples of step `step` (from 1) from a sequence of shuffled epochs, int64 [batch_size]."""
     positions = range((step - 1) * batch_size, step * batch_size)
     pieces = []
     for epoch in range(positions.start // num_samples, (positions.stop - 1) // num_samples + 1):
@@ -100,7 +100,7 @@ def _epoch_order(num_samples: int, seed: int, epoch: int) -> Tensor:
 
 @functools.lru_cache(maxsize=2)
 def _views_by_object(dataset: ViewDataset) -> tuple[np.ndarray, np.ndarray]:
-    """(starts [N+1], samples ordered by object [M])."""
+    """Samples int64 [M] sorted by object, after the position int64 [N+1] at which each object starts."""
     order = np.argsort(dataset.object_ids, kind="stable")
     return np.searchsorted(dataset.object_ids[order], np.arange(dataset.num_objects + 1)), order
 
@@ -116,21 +116,21 @@ def _views_by_class(dataset: ViewDataset) -> list[np.ndarray]:
 
 Augmentation = Literal["flip", "flip-image", "channels", "colors", "crop"]
 
-COLOR_GAIN = 0.3  # "colors" multiplies each colour by 1 - this .. 1 + this
-WITHOUT_COLOR = 0.3  # share of the images that it leaves without colours
+COLOR_GAIN = 0.3  # "colors" multiplies each colour by a factor in 1 - COLOR_GAIN .. 1 + COLOR_GAIN
+WITHOUT_COLOR = 0.3  # share of the images that "colors" makes black or white
 
 
 def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *, inverted: bool = True) -> Batch:
-    """The batch with the named changes, each drawn for every sample on its own, in the order of the names.
+    """The batch with the named augmentations, in this order, each drawn independently for every sample.
 
-    "flip": image, mask and pose (if known) mirrored left-right with probability 1/2 (Kato and Harada 2019).
-    "flip-image": the colours alone (published code of both papers on Pascal3D+, whose meshes are symmetric).
-    "channels": a random permutation of the three colours.
-    "colors": a random permutation, each colour times a random factor of 0.7 .. 1.3, and 30 % of the images without
-    colours (0). It changes 255 - colour, so that a white background stays white; `inverted` says that images are stored
-    so. It is not for encoders that ignore the mask.
-    "crop": the colours cut anew from the original image, each side of the padded box moved by up to 15 % of the box,
-    uniformly (Pascal3D+, both papers). It must come first.
+    "flip": image, mask, depth and pose (if known) mirrored left-right with probability 1/2 (Kato and Harada 2019).
+    "flip-image": only the colours mirrored (published code of both papers on Pascal3D+, whose meshes are symmetric).
+    "channels": a random permutation of the three colour channels.
+    "colors": a random permutation, each channel times a random factor in 0.7 .. 1.3, and in 30 % of the images times 0.
+    It changes 255 - colour, so that a white background stays white; `inverted`: images are stored as 255 - colour. Not
+    for encoders that ignore the mask.
+    "crop": the colours cropped anew from the original image, each side of the padded box moved by up to 15 % of the
+    box (Pascal3D+, both papers). It must come first.
 
     Raises ValueError for an unknown name, and for "crop" if it is not first or there are no original images.
     """
@@ -144,8 +144,8 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *
             if position > 0:
                 raise ValueError(f"crop must be the first augmentation, got {', '.join(names)}")
             if batch.crops is None:
-                where = "only the layout pascal3d has, and not in shards"
-                raise ValueError(f"the augmentation crop needs the original images, which {where}; leave it out")
+                wanted = "needs the original images, which only the layout pascal3d without shards has"
+                raise ValueError(f"the augmentation crop {wanted}; leave it out")
             colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))))
         elif name in ("channels", "colors"):
             order = torch.from_numpy(np.argsort(rng.random((count, 3)), axis=1))

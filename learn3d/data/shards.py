@@ -1,21 +1,20 @@
-"""Data sets of any size, kept in shards: files of which training reads only the rows of each batch.
+"""Data sets of any size, stored as shards: files from which training reads the rows of one batch at a time.
 
-`FOLDER/CATEGORY/SPLIT/` holds, for a split of N objects and M views,
+The folder `FOLDER/CATEGORY/SPLIT/` of a split has the files
 
-    00000.safetensors, 00001 ...    some objects with their views, in the format of the library safetensors
-    set.json                        facts about all shards, written last: it declares the split complete
+    00000.safetensors, 00001 ...    shards: some objects with their views, in the safetensors format
+    set.json                        facts about all shards, written last: with it the split is complete
 
 A shard of n objects and m views has the tensors
 
-    images                          uint8 [m, 4, S, S], as `ViewDataset.images`; likewise `masks`, `depth`, if there
-                                    are any
-    voxels                          bool [n, 32, 32, 32]; likewise `points` float32 [n, P, 3]; each if there are any
+    images                          uint8 [m, 4, S, S], see `ViewDataset`; also `masks` and `depth` if known
+    voxels                          bool [n, 32, 32, 32] if known; also `points` float32 [n, P, 3]
     images.checksums ...            uint32: CRC-32 of each row of these arrays
     object_ids, view_ids, sides     int32 [m] in 0 .. n-1, int32 [m], float32 [m]: tables of the views
-    azimuth_deg ... or rotation     float32 [m, ...]: the poses; those fields that are the same for all are in set.json
+    azimuth_deg ... or rotation     float32 [m, ...]: the poses; fields with one value for all views are in set.json
 
-and the names of its objects and a CRC-32 of the names and tables as metadata. Its bytes depend on its content alone.
-The layout (`kato`, `kar` ...) says how axes and colours are meant, as it does without shards.
+Its metadata are the names of the objects, and a CRC-32 of names and tables. The bytes of a shard depend on its content
+alone. Axes and colours are those of the layout (`kato`, `kar` ...).
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from torch import Tensor
 
 from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS, ViewDataset, join_datasets
-from learn3d.data.disk_array import MOST_BYTES, WANTED, DiskArray
+from learn3d.data.disk_array import MAX_BYTES, WANTED, DiskArray
 from learn3d.data.poses import LookAtPoses, Poses, RotationPoses
 from learn3d.data.readers import READERS
 from learn3d.files import limits
@@ -45,17 +44,11 @@ from learn3d.files.writing import replacing, write_json
 from learn3d.settings import checked
 
 SET_FILE = "set.json"
-SHARD_BYTES = 2**28  # of images in a shard, about
+SHARD_BYTES = 2**28  # approximate size of the images in a shard
 _FILES = 5 * "[0-9]" + "*.safetensors"
-_REPORTS = 5 * "[0-9]" + "*.report.json"  # lists of meshes, which `make_data.sharded` writes
-_ARRAYS = (
-    "images",
-    "masks",
-    "depth",
-    "voxels",
-    "points",
-)  # the first three have a row for each view, the others for each object
-_DTYPES = {  # of tensors, by name; all others are float32
+_REPORTS = 5 * "[0-9]" + "*.report.json"  # lists of meshes from `make_data.sharded`
+_ARRAYS = ("images", "masks", "depth", "voxels", "points")
+_DTYPES = {  # name of a tensor -> names of its dtype in safetensors and NumPy; all others are float32
     **dict.fromkeys(("images", "masks", "depth"), ("U8", np.uint8)),
     **dict.fromkeys(("object_ids", "view_ids"), ("I32", np.int32)),
     "voxels": ("BOOL", np.bool_),
@@ -63,21 +56,21 @@ _DTYPES = {  # of tensors, by name; all others are float32
 }
 _POSES = {kind.__name__: kind for kind in (LookAtPoses, RotationPoses)}
 _MAKE_AGAIN = "make or copy it again"
-_ROWS_AT_ONCE = 256  # that are read to be checked
+_ROWS_AT_ONCE = 256  # rows that `_read_rows` reads at a time
 
 Text = Annotated[str, Field(max_length=1000)]
 
 
 @checked
 class SetFile:
-    """`set.json`: the facts that hold for all shards."""
+    """`set.json`: facts about all shards of a split."""
 
     layout: Literal[tuple(READERS)]
     shards: Annotated[int, Field(ge=1)]
     image_size: Annotated[int, Field(ge=1, le=4096)]
     view_names: Annotated[list[Text], Field(max_length=limits.VIEW_CLASSES)]
-    poses: Literal[(None, *_POSES)]  # kind of the poses; None if they are unknown
-    constants: dict[Text, Annotated[float, Field(allow_inf_nan=False)]]  # fields of the poses that all views share
+    poses: Literal[(None, *_POSES)]  # class of the poses; None if they are unknown
+    constants: dict[Text, Annotated[float, Field(allow_inf_nan=False)]]  # fields of the poses with one value for all
 
 
 def split_folder(folder: Path | str, category: str, split: str) -> Path:
@@ -86,7 +79,7 @@ def split_folder(folder: Path | str, category: str, split: str) -> Path:
 
 
 def holds(folder: Path | str, category: str, split: str) -> bool:
-    """Whether the folder has this split in shards; False for a name that no category can have."""
+    """Whether the folder has this split as complete shards; False for an invalid category."""
     try:
         return (split_folder(folder, category, split) / SET_FILE).is_file()
     except (ValueError, OSError):
@@ -94,12 +87,12 @@ def holds(folder: Path | str, category: str, split: str) -> bool:
 
 
 def shard_path(folder: Path, number: int) -> Path:
-    """Shard `number` in the folder of its split. The file is there only when it is complete."""
+    """Path of shard `number` in the folder of its split. The file exists only if it is complete."""
     return folder / f"{number:05d}.safetensors"
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
-    """The categories of a folder that are kept in shards, and the splits of each."""
+    """The categories of a folder that are stored as shards, and the splits of each."""
     found = {}
     for path in sorted(Path(folder).glob(f"*/*/{SET_FILE}")):
         found.setdefault(path.parents[1].name, set()).add(path.parent.name)
@@ -107,7 +100,7 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 
 def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
-    """Write shard `number` of a split's folder: a part of a data set, whose arrays are in memory."""
+    """Write `part` of a data set, with its arrays in memory, as shard `number` in the folder of its split."""
     tensors = {name: getattr(part, name).astype(np.int32) for name in ("object_ids", "view_ids")}
     tensors["sides"] = part.object_sides().astype(np.float32)
     tensors |= {name: v.numpy() for name, v in _fields(part.poses).items() if isinstance(v, Tensor)}
@@ -121,7 +114,7 @@ def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
 
 
 def finish_set(folder: Path, layout: str, shards: int, part: ViewDataset) -> None:
-    """Declare a split of so many shards complete. `part`: any part of the data set."""
+    """Mark a split of `shards` shards as complete. `part`: any part of the data set."""
     facts = SetFile(
         layout=layout,
         shards=shards,
@@ -134,9 +127,9 @@ def finish_set(folder: Path, layout: str, shards: int, part: ViewDataset) -> Non
 
 
 def write_set(folder: Path, layout: str, dataset: ViewDataset) -> int:
-    """Write a whole split as shards of about `SHARD_BYTES` each; returns how many.
+    """Write a whole split as shards of about `SHARD_BYTES` each. Returns their number.
 
-    The crops of Pascal3D+ (`ViewDataset.crops`) are not kept.
+    `ViewDataset.crops` is not written.
     """
     count = dataset.num_objects
     step = max(1, SHARD_BYTES * count // max(1, dataset.images.nbytes))
@@ -151,7 +144,7 @@ def write_set(folder: Path, layout: str, dataset: ViewDataset) -> int:
 
 
 def remove(folder: Path) -> None:
-    """Remove the shards of a split's folder with their reports, and nothing else that may be there."""
+    """Remove the shards in the folder of a split, with their reports; other files stay."""
     for path in itertools.chain(*(folder.glob(pattern) for pattern in (SET_FILE, _FILES, _REPORTS))):
         path.unlink()
 
@@ -165,10 +158,10 @@ def load(
     image_size: int | None = None,
     findings: Findings = STRICT,
 ) -> ViewDataset | None:
-    """The split, with its arrays on disk: only names and tables are read, about 60 bytes for each view.
+    """Read names and tables of a split, about 60 bytes for each view; the arrays stay on disk.
 
-    Raises MissingFile and DamagedFile for shards that are missing, damaged, or of another layout or image size. If the
-    findings are not strict, all arrays are read, too, and the result is None.
+    Raises MissingFile and DamagedFile if shards are missing, damaged, or of another layout or image size. If the
+    findings are not strict, it checks all arrays, too, and returns None.
     """
     where = split_folder(folder, category, split)
     content = read_bytes(where / SET_FILE, limits.JSON_BYTES, "the description of shards as JSON")
@@ -177,16 +170,14 @@ def load(
     except (ValueError, TypeError) as error:
         raise DamagedFile(where / SET_FILE, f"is no description of shards ({error}); {_MAKE_AGAIN}") from None
     if facts.layout != layout or image_size not in (None, facts.image_size):
-        found, wanted = (
-            f"images of {facts.image_size} pixels in the layout {facts.layout!r}",
-            image_size or facts.image_size,
-        )
+        found = f"images of {facts.image_size} pixels in the layout {facts.layout!r}"
+        wanted = f"{image_size or facts.image_size} pixels in {layout!r}"
         hint = "give another --layout, or convert it with another --image-size"
-        raise DamagedFile(where, f"has {found}, but {layout!r} is wanted with {wanted}; {hint}")
+        raise DamagedFile(where, f"has {found}, expected {wanted}; {hint}")
     paths = sorted(where.glob(_FILES))
     if len(paths) != facts.shards:
         missing = next(path for n in itertools.count() if (path := shard_path(where, n)) not in paths)
-        findings.take(DamagedFile(missing, f"one of {facts.shards} shards, of which {len(paths)} are there"))
+        findings.take(DamagedFile(missing, f"the split needs {facts.shards} shards, but has {len(paths)}"))
     read = (findings.attempt(_read_shard, path, facts, category, split) for path in paths)
     parts = [part for part in read if part is not None]
     try:
@@ -204,8 +195,8 @@ def load(
 
 
 def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDataset:
-    """The names and tables of a shard, if it agrees with the facts; its arrays stay on disk."""
-    with open_file(path, MOST_BYTES, WANTED) as file:
+    """Read names and tables of a shard, and check them against the facts; its arrays stay on disk."""
+    with open_file(path, MAX_BYTES, WANTED) as file:
         try:
             names, tables, arrays = _read_tables(path, file)
             poses = None
@@ -247,14 +238,14 @@ def _read_tables(path: Path, file: BinaryIO) -> tuple[list[str], dict[str, np.nd
         if info["dtype"] != code or not all(type(n) is int and n >= 0 for n in (*shape, *info["data_offsets"])):
             raise ValueError(f"{name} is {info}; expected {code}")
         if stop > end or stop - begin != count * np.dtype(dtype).itemsize:
-            raise ValueError(f"{name} is not as long as it should be; the file has {end} bytes")
+            raise ValueError(f"{name} has another length than its shape; the file has {end} bytes")
         if name in _ARRAYS:
             positions[name] = begin, tuple(shape), np.dtype(dtype)
         else:
             file.seek(begin)
             tables[name] = np.fromfile(file, dtype, count).reshape(shape)
     if _crc(metadata["objects"], tables) != metadata["crc"]:
-        raise ValueError("its content is not as it was written: another CRC-32")
+        raise ValueError("its content has changed since it was written: another CRC-32")
     arrays = {}
     for name, (begin, (count, *row_shape), dtype) in positions.items():
         checksums = tables.pop(f"{name}.checksums")
@@ -275,7 +266,7 @@ def _read_rows(array: DiskArray) -> None:
 
 
 def _crc(objects: list[str] | tuple[str, ...], tables: dict[str, np.ndarray]) -> int:
-    """CRC-32 of the names of objects, and of tables in the order of their names."""
+    """CRC-32 of the names of objects and of the tables, sorted by name."""
     crc = zlib.crc32("\n".join(objects).encode())
     for name in sorted(tables):
         crc = zlib.crc32(np.ascontiguousarray(tables[name]), crc)

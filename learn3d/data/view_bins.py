@@ -1,4 +1,4 @@
-"""From continuous viewpoints to the K view classes that the discriminator tells apart."""
+"""Maps continuous viewpoints to the K view classes of a discriminator."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from learn3d.settings import Positive, checked
 class AngleBins:
     """Cells of equal width in azimuth and elevation, K = azimuth cells x elevation cells (paper, table of bins).
 
-    Cell = floor((azimuth + 180) / w) * n_el + floor((elevation - low) / h), as in the published code; angles on or
-    beyond the upper end count as the last cell.
+    Cell = floor((azimuth + 180) / w) * n_el + floor((elevation - low) / h), as in the published code. Angles beyond the
+    range are clamped to the first or last cell.
     """
 
     azimuth_width_deg: Annotated[float, Field(gt=0, le=360)]
@@ -39,7 +39,7 @@ class AngleBins:
 
     @classmethod
     def parse(cls, text: str) -> AngleBins:
-        """From "15x20" (azimuth x elevation widths in degrees), or "15x20:-20:40" with the range of elevations."""
+        """From "15x20" (azimuth x elevation widths in degrees), or "15x20:-20:40" with a range of elevations."""
         number = r"(-?\d+(?:\.\d+)?)"
         if not (match := re.fullmatch(f"{number}x{number}(?::{number}:{number})?", text)):
             wanted = "AZIMUTHxELEVATION in degrees, such as 15x20 or 15x20:-20:40"
@@ -64,13 +64,12 @@ class AngleBins:
         azimuth = poses.azimuth_deg.double()
         turn = torch.where(azimuth == 180, azimuth, wrap_deg(azimuth)) + 180  # the upper end belongs to the last cell
         a = (turn / self.azimuth_width_deg).floor().long().clamp(0, azimuths - 1)
-        e = (
-            torch.as_tensor(poses.elevation_deg, dtype=torch.float32).double() - self.elevation_low_deg
-        ) / self.elevation_width_deg
-        return a * elevations + e.floor().long().clamp(0, elevations - 1)
+        elevation = torch.as_tensor(poses.elevation_deg, dtype=torch.float32).double()
+        e = ((elevation - self.elevation_low_deg) / self.elevation_width_deg).floor().long().clamp(0, elevations - 1)
+        return a * elevations + e
 
     def names(self) -> list[str]:
-        """What to call each class, by the middle of its cell."""
+        """The K names of the classes: the middles of their cells."""
         azimuths, elevations = self.shape
         middle_a = [-180 + (k + 0.5) * self.azimuth_width_deg for k in range(azimuths)]
         middle_e = [self.elevation_low_deg + (k + 0.5) * self.elevation_width_deg for k in range(elevations)]
@@ -80,10 +79,10 @@ class AngleBins:
 def training_classes(
     cells: np.ndarray, directions: np.ndarray, training_cells: np.ndarray, training_directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Class int64 [M] in 0 .. K-1 of each view, and the K cells int64 [K] that have training views.
+    """Class int64 [M] in 0 .. K-1 of each view, and the cells int64 [K] of the classes: those with training views.
 
-    A view in another cell gets the class of the training view with the nearest direction. cells int64 [M] and
-    directions float [M, D] of the views, whose product is largest for the nearest; likewise of the T training views.
+    A view in another cell gets the class of the training view with the nearest direction, that is the largest dot
+    product. cells: int64 [M]. directions: float [M, D]. training_cells: int64 [T]. training_directions: float [T, D].
     """
     kept = np.unique(training_cells)
     unseen = ~np.isin(cells, kept)

@@ -1,4 +1,4 @@
-"""Untrusted meshes and voxel grids: functions for the sandbox."""
+"""Reads untrusted meshes and voxel grids in the sandbox."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from learn3d.files import limits, sandbox
 from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile, open_file, read_bytes
 
 EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # trimesh reads these without further packages
-_MEMORY_PER_BYTE = 30  # trimesh takes some 20 times the size of a text file
-_BYTES_PER_SECOND = 1e6  # trimesh reads twice as many
+_MEMORY_PER_BYTE = 30  # trimesh takes about 20 times the size of a text file
+_BYTES_PER_SECOND = 1e6  # trimesh is about twice as fast
 
 
 @dataclass(frozen=True, eq=False)
 class RawMesh:
-    """Triangles as read: any scale and place, right-handed, either winding."""
+    """The triangles of a file: right-handed coordinates of any scale and position, either winding."""
 
     vertices: np.ndarray  # float64 [V, 3]
     faces: np.ndarray  # int64 [F, 3]
 
 
 def read_mesh(path: Path) -> RawMesh:
-    """All triangles of a mesh file, scenes concatenated with their transforms.
+    """Read all triangles of a mesh file; the meshes of a scene are transformed and concatenated.
 
-    Buffers that it refers to must lie in its own folder or below. Raises ValueError with the reason if it cannot be
-    read, holds no triangle, or has over 256 MiB.
+    Other files that it refers to must be in its folder or below. Raises ValueError with the reason if it cannot be
+    read, has no triangle, or has over 256 MiB.
     """
     try:
         return sandbox.read(_read, path, wanted="a mesh file")
@@ -39,7 +39,6 @@ def read_mesh(path: Path) -> RawMesh:
 
 
 def _read(path: Path) -> RawMesh:
-    """The mesh, in the sandbox."""
     import trimesh
 
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -57,7 +56,7 @@ def _read(path: Path) -> RawMesh:
 
 
 class _FilesBelow:
-    """A resolver for trimesh: files in a folder or below."""
+    """A resolver for trimesh that reads files in a folder or below it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.resolve()
@@ -72,7 +71,7 @@ class _FilesBelow:
 
 
 def _content(path: Path) -> bytes:
-    """A file; an OBJ or OFF file in UTF-8: comments and names may be in Latin-1."""
+    """The content of a file; of an OBJ or OFF file as valid UTF-8, since comments may be in Latin-1."""
     content = read_bytes(path, limits.MESH_FILE_BYTES, "a mesh file, or a file that a mesh refers to")
     sandbox.allow(_MEMORY_PER_BYTE * len(content), len(content) / _BYTES_PER_SECOND)
     is_text = path.suffix.lower() in (".obj", ".off")
@@ -80,27 +79,26 @@ def _content(path: Path) -> bytes:
 
 
 def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
-    """The array `name` of numbers [size, size, size] of a MATLAB file (version 5 to 7) as bool: True if not 0."""
-    import scipy.io  # here, as it takes longer to import than all else in a worker
+    """Which numbers of the array `name` [size, size, size] of a MATLAB file (version 5 to 7) are not 0: bool."""
+    import scipy.io  # imported here, as its import takes longer than a worker's start
 
     wanted = f"a MATLAB file (version 5 to 7) with the array {name!r} of numbers [{size}, {size}, {size}]"
     with open_file(path, limits.VOLUME_BYTES, wanted) as file:
         array = np.asarray(scipy.io.loadmat(file, variable_names=[name]).get(name))
     if array.dtype.kind not in "biuf" or array.shape != (size,) * 3:
-        raise DamagedFile(path, f"has {array.dtype} {list(array.shape)} there; expected {wanted}")
+        raise DamagedFile(path, f"has {array.dtype} {list(array.shape)} as {name!r}; expected {wanted}")
     return array != 0
 
 
 class Binvox(NamedTuple):
-    """One grid: cell (i, j, k) has its centre at translate + scale * ((i, j, k) + 0.5) / size of the mesh's x, y, z."""
+    """A voxel grid."""
 
     voxels: np.ndarray  # bool [D, D, D], axes x, y, z of the mesh
-    translate: np.ndarray  # float64 [3], corner of the grid
-    scale: float  # side of the grid
+    scale: float  # side of the grid in the mesh's units
 
 
 def read_binvox(path: Path, size: int) -> Binvox:
-    """A grid of size^3 cells: a text header, then runs of (value, count) bytes with y fastest, then z, then x."""
+    """Read a grid of size^3 cells: a text header, then runs of (value, count) bytes; y runs fastest, then z, then x."""
     wanted = f"a binvox file of {size}x{size}x{size} cells: the lines dim, translate, scale, data, then pairs of bytes"
     head, _, runs = read_bytes(path, limits.VOLUME_BYTES, wanted).partition(b"\ndata\n")
     header = {words[0]: words[1:] for line in head.split(b"\n") if (words := line.split())}
@@ -117,4 +115,4 @@ def read_binvox(path: Path, size: int) -> Binvox:
     if (total := int(pairs[:, 1].sum(dtype=np.int64))) != size**3:
         raise DamagedFile(path, f"its runs fill {total} cells; expected {size**3}. {FETCH_AGAIN}")
     grid = np.repeat(pairs[:, 0] != 0, pairs[:, 1]).reshape(size, size, size)  # axes x, z, y
-    return Binvox(np.ascontiguousarray(grid.transpose(0, 2, 1)), translate, float(scale))
+    return Binvox(np.ascontiguousarray(grid.transpose(0, 2, 1)), float(scale))

@@ -1,9 +1,9 @@
-"""Opening and reading untrusted files, and the faults that are found in them.
+"""Opens and reads untrusted files, and collects their faults.
 
-Every refusal is a `DamagedFile` (a ValueError) or `MissingFile` (a FileNotFoundError) that names the file.
+A fault is a `DamagedFile` (a ValueError) or `MissingFile` (a FileNotFoundError), whose message names the file.
 
-A reader parses an object in steps, each through `Findings.attempt`. With strict findings the first step that fails
-raises; otherwise it is noted and the next one follows. So loading a data set and checking it are the same walk.
+A reader calls `Findings.attempt` for each step. With strict findings the first fault is raised. Otherwise all faults
+are recorded, so the same code loads and checks a data set.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ R = TypeVar("R")
 FETCH_AGAIN = "Perhaps the download or copy was cut short: fetch it again"
 
 
-class _NamesFile(Exception):
+class _FileError(Exception):
     def __init__(self, path: Path, message: str) -> None:
         super().__init__(f"{path}: {message}")
         self.path, self.message = path, message
 
     def __reduce__(self) -> tuple[type, tuple[Path, str]]:
-        return type(self), (self.path, self.message)  # so that it can be pickled
+        return type(self), (self.path, self.message)  # for pickle, which passes only the text by default
 
 
-class DamagedFile(_NamesFile, ValueError):
-    """A file that is there, but not as it should be."""
+class DamagedFile(_FileError, ValueError):
+    """A file or folder with wrong content."""
 
 
-class MissingFile(_NamesFile, FileNotFoundError):
-    """A file or folder that should be there."""
+class MissingFile(_FileError, FileNotFoundError):
+    """A missing file or folder."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One fault of a file: an error stops `load`, a warning does not."""
+    """One fault of a file. `load` raises errors and ignores warnings."""
 
     path: str
     message: str  # the fault, and what was expected
@@ -50,21 +50,21 @@ class Problem:
 
 @dataclass
 class Findings:
-    """Faults that were found while something was read."""
+    """Collects the faults of a data set."""
 
-    strict: bool = False  # raise the first error, drop warnings
+    strict: bool = False  # True: raise the first error, ignore warnings
     problems: list[Problem] = field(default_factory=list)
     objects: int = 0  # number of objects that the files list
 
     def attempt(self, function: Callable[..., R], *arguments: Any) -> R | None:
-        """The result of function(*arguments), or None with a note of why there is none."""
+        """The result of function(*arguments). If it raises a fault, the fault is recorded, and the result is None."""
         try:
             return function(*arguments)
         except (DamagedFile, MissingFile) as error:
             return self.take(error)
 
     def take(self, result: Any) -> Any:
-        """A result of `sandbox.read_all`; None with a note if it is a fault of its file."""
+        """A result of `sandbox.read_all`. If it is a fault, the fault is recorded, and the result is None."""
         if not isinstance(result, (DamagedFile, MissingFile)):
             return result
         if self.strict:
@@ -73,7 +73,7 @@ class Findings:
         return None
 
     def warn(self, path: Path, message: str) -> None:
-        """Note something that is odd, but can be read."""
+        """Record a warning."""
         if not self.strict:
             self.problems.append(Problem(str(path), message, "warning"))
 
@@ -81,10 +81,10 @@ class Findings:
 STRICT = Findings(strict=True)
 
 
-def open_file(path: Path | str, most: int, wanted: str) -> BinaryIO:
-    """A plain file of at most `most` bytes, opened. A pipe is not waited for, and a device not read.
+def open_file(path: Path | str, max_bytes: int, wanted: str) -> BinaryIO:
+    """Open an untrusted file for reading. wanted: description of the file, for messages.
 
-    Every untrusted file is opened here. wanted: description of the file, for messages. Raises MissingFile, DamagedFile.
+    Raises MissingFile, and DamagedFile for files above `max_bytes` bytes and, at once, for pipes and devices.
     """
     path = Path(path)
     try:
@@ -94,42 +94,42 @@ def open_file(path: Path | str, most: int, wanted: str) -> BinaryIO:
     except (OSError, ValueError) as error:
         raise DamagedFile(path, f"cannot be read ({error}); expected {wanted}") from error
     status = os.fstat(file.fileno())
-    if stat.S_ISREG(status.st_mode) and status.st_size <= most:
+    if stat.S_ISREG(status.st_mode) and status.st_size <= max_bytes:
         return file
     file.close()
-    fault = f"has {status.st_size} bytes, and at most {most} are read"
+    fault = f"has {status.st_size} bytes; the limit is {max_bytes}"
     if not stat.S_ISREG(status.st_mode):
-        fault = "cannot be read: it is no plain file"
+        fault = "cannot be read: it is not a regular file"
     raise DamagedFile(path, f"{fault}; expected {wanted}")
 
 
-def check_file(path: Path | str, most: int, wanted: str) -> int:
-    """The size in bytes of a file that `open_file` opens."""
-    with open_file(path, most, wanted) as file:
+def check_file(path: Path | str, max_bytes: int, wanted: str) -> int:
+    """The size of a file in bytes. Raises as `open_file`."""
+    with open_file(path, max_bytes, wanted) as file:
         return os.fstat(file.fileno()).st_size
 
 
-def read_bytes(path: Path | str, most: int, wanted: str) -> bytes:
-    """A whole file of at most `most` bytes."""
-    with open_file(path, most, wanted) as file:
+def read_bytes(path: Path | str, max_bytes: int, wanted: str) -> bytes:
+    """The content of a file. Raises as `open_file`."""
+    with open_file(path, max_bytes, wanted) as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
-def read_text(path: Path | str, most: int, wanted: str, *, encoding: str = "utf-8", errors: str = "strict") -> str:
-    """A whole text file of at most `most` bytes, its line ends as \\n."""
+def read_text(path: Path | str, max_bytes: int, wanted: str, *, encoding: str = "utf-8", errors: str = "strict") -> str:
+    """The content of a text file, with line ends \\n. Raises as `open_file`, and DamagedFile for another encoding."""
     try:
-        text = read_bytes(path, most, wanted).decode(encoding, errors)
+        text = read_bytes(path, max_bytes, wanted).decode(encoding, errors)
     except UnicodeDecodeError as error:
         raise DamagedFile(Path(path), f"cannot be read as text ({error}); expected {wanted}. {FETCH_AGAIN}") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
-    """The value of a JSON text. Raises ValueError, also for NaN and infinities unless `finite` is False."""
+    """The value of a JSON text. Raises ValueError if it is invalid, or has NaN or infinities and `finite` is True."""
 
     def number(word: str) -> float:
         if not math.isfinite(value := float(word)):
-            raise ValueError(f"{word[:30]} is no number of JSON that a float holds")
+            raise ValueError(f"{word[:30]} is not a finite number")
         return value
 
     try:

@@ -1,4 +1,4 @@
-"""Untrusted image files, decoded by Pillow in the sandbox, and the renderings of data sets made of them."""
+"""Decodes untrusted images with Pillow in the sandbox, and reads the renderings of data sets."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from PIL import Image, UnidentifiedImageError
 from learn3d.files import limits, sandbox
 from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile, open_file, read_text
 
-# TIFF is no format here: its tables may name millions of strips, each an object before the first pixel.
+# TIFF is not supported: a small file can list millions of strips, for which Pillow makes objects before it decodes.
 RENDERINGS = ("PNG", "JPEG")
 PHOTOGRAPHS = ("PNG", "JPEG", "WEBP", "BMP")
-_MEMORY_PER_PIXEL = 16  # bytes; two copies of four channels, and one to work with
+_MEMORY_PER_PIXEL = 16  # bytes; three copies of four channels, and some room
 _PIXELS_PER_SECOND = 2e7
 
 
-def open_image(path: Path, formats: Sequence[str], most_side: int) -> Image.Image:
-    """A decoded image in its own mode, of one of the formats (Pillow's names) and at most `most_side` pixels a side.
+def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image:
+    """Decode an image, in the sandbox. formats: Pillow's names of the allowed formats.
 
-    For functions that run in the sandbox. Raises MissingFile, and DamagedFile for a file of another kind or above 256
-    MiB, and for more than 64 million pixels.
+    Raises MissingFile, and DamagedFile for another format, a file above 256 MiB, a side above `max_side` pixels, and
+    more than 64 million pixels.
     """
     with open_file(path, limits.IMAGE_FILE_BYTES, "an image") as file:
         try:
             image = Image.open(file, formats=formats)
             pixels = image.width * image.height
-            if max(image.size) <= most_side and pixels <= limits.IMAGE_PIXELS:
+            if max(image.size) <= max_side and pixels <= limits.IMAGE_PIXELS:
                 sandbox.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
                 image.load()
                 return image
-            fault = f"is {image.width}x{image.height} pixels; at most {most_side} a side and {limits.IMAGE_PIXELS} in "
+            fault = f"is {image.width}x{image.height} pixels; at most {max_side} a side and {limits.IMAGE_PIXELS} in "
             fault += "all are read: make it smaller"
         except UnidentifiedImageError:
-            fault = f"cannot be decoded as an image of the kind {', '.join(formats)}. Convert it if it is of another"
+            fault = f"cannot be decoded as an image in the format {', '.join(formats)}; convert it from other formats"
         except MemoryError:
             raise
-        except Exception as error:  # Pillow's decoders raise whatever a damaged file leads them to
+        except Exception as error:  # Pillow raises various errors for damaged files
             fault = f"cannot be decoded as an image ({sandbox.reason(error)}). {FETCH_AGAIN}"
     raise DamagedFile(path, fault)
 
@@ -49,16 +49,16 @@ View = tuple[np.ndarray, np.ndarray, int]
 
 
 def read_with_alpha(path: Path, size: int) -> View:
-    """A rendering whose mask is its alpha channel, colours over white."""
+    """A square rendering, reduced to `size`: colours over white, and its alpha channel as the mask."""
     image = _read_square(path, size)
     color, alpha = split_alpha(image)
     if alpha is None:
         raise DamagedFile(path, f"has the channels {image.mode}; expected RGBA, whose alpha is the mask")
-    return *shrink(color, alpha, size), int(alpha.max())
+    return *shrink(_planes(color, alpha), size), int(alpha.max())
 
 
 def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
-    """A rendering whose mask is where its depth is below 250 in 8 bits; without a depth file, its alpha channel."""
+    """A square rendering, reduced to `size`. Mask: depth below 250 in 8 bits, or alpha if there is no depth file."""
     image = _read_square(path, size)
     color, mask = split_alpha(image)
     if depth_path.exists():
@@ -66,16 +66,16 @@ def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
         if depth.size != image.size:
             sizes = [f"{i.width}x{i.height} pixels" for i in (depth, image)]
             raise DamagedFile(depth_path, f"is {sizes[0]}, but {path.name} is {sizes[1]}")
-        is_deep = depth.mode.startswith("I")  # 16 bits, of which the high byte counts
-        grey = np.asarray(depth) >> 8 if is_deep else np.asarray(depth.convert("L"))
+        is_16_bit = depth.mode.startswith("I")  # then the high byte counts
+        grey = np.asarray(depth) >> 8 if is_16_bit else np.asarray(depth.convert("L"))
         mask = np.where(grey < 250, 255, 0).astype(np.uint8)
     elif mask is None:
         raise MissingFile(depth_path, f"is missing, and {path.name} has no alpha channel; expected the depth image")
-    return *shrink(color, mask, size), int(mask.max())
+    return *shrink(_planes(color, mask), size), int(mask.max())
 
 
 def read_with_mask(path: Path, mask_path: Path, size: int) -> View:
-    """A rendering and its mask, both of exactly this size; colours inverted over black, as Kato stores them."""
+    """A rendering and its mask, both size x size; colours are inverted, as in Kato's files."""
     color, mask = (_read_exactly(each, size) for each in (path, mask_path))
     return np.dstack([255 - color, mask[..., 0]]).transpose(2, 0, 1), mask[..., 0], int(mask.max())
 
@@ -111,26 +111,31 @@ def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
     return np.asarray(white), np.asarray(alpha)
 
 
-def shrink(color: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """An image uint8 [4, size, size] and a mask uint8 [64, 64] of colours uint8 [S, S, 3] and a mask uint8 [S, S].
-
-    Each pixel becomes the mean over its area of the original; fractions of original pixels count as such.
-    """
+def _planes(color: np.ndarray, mask: np.ndarray) -> np.ndarray:
     planes = np.empty((4, *mask.shape), np.float32)
     planes[:3], planes[3] = color.transpose(2, 0, 1), mask
+    return planes
+
+
+def shrink(planes: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """An image uint8 [4, size, size] and its mask uint8 [64, 64] of colours and mask float32 [4, H, W], 0 .. 255.
+
+    The planes are padded with 0 to a square. Each pixel is the mean over its area, fractions of pixels included.
+    """
     image = _shrink(planes, size)
-    return image, image[3] if size == MASK_SIZE else _shrink(planes[3], MASK_SIZE)
+    return image, image[3] if size == MASK_SIZE else _shrink(planes[3:], MASK_SIZE)[0]
 
 
 def _shrink(planes: np.ndarray, size: int) -> np.ndarray:
-    if planes.shape[-1] == size:
+    if planes.shape[1:] == (size, size):
         return planes.astype(np.uint8)
-    weights = area_weights(planes.shape[-1], size)
-    return np.rint(weights @ planes @ weights.T).astype(np.uint8)
+    side = max(planes.shape[1:])
+    rows, columns = (_area_weights(side, size)[:, (side - n) // 2 :][:, :n] for n in planes.shape[1:])
+    return np.rint(rows @ planes @ columns.T).astype(np.uint8)
 
 
 @functools.cache
-def area_weights(source: int, size: int) -> np.ndarray:
+def _area_weights(source: int, size: int) -> np.ndarray:
     """Share of each of `source` pixels in each of `size` larger ones, float32 [size, source]; rows sum to 1."""
     edges = np.arange(size + 1) * (source / size)
     pixels = np.arange(source)
@@ -139,7 +144,7 @@ def area_weights(source: int, size: int) -> np.ndarray:
 
 
 def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
-    """The first `rows` rows of a table of numbers in a text file, float64 [rows, columns], all finite."""
+    """The first rows and columns of a table of numbers in a text file: float64 [rows, columns], all finite."""
     text = read_text(path, limits.TABLE_BYTES, wanted)
     lines = [line.split() for line in text.splitlines() if line.strip()]
     if len(lines) < rows:

@@ -1,10 +1,9 @@
-"""One sandbox for untrusted files: worker processes that may crash, hang or fill their memory without harm to us.
+"""A sandbox for untrusted files: worker processes that may crash, hang or run out of memory.
 
-`read` and `read_all` run functions in workers, which have limits of memory (on Linux), processor time and time. Workers
-start when first needed, one for each core, and read many files each. Whatever goes wrong with a file, an exception, a
-crash, too much memory or too much time, becomes a `DamagedFile` or `MissingFile`: one sentence that names the file.
-A worker that dies is replaced. This module imports neither torch nor scipy, so that a worker starts in a tenth of a
-second. It needs a POSIX system.
+`read` and `read_all` run functions in workers, with limits of memory (on Linux), processor time and elapsed time. They
+start on demand, one for each core, and read many files each. An exception, a crash, and too much memory or time become
+a `DamagedFile` or `MissingFile`, whose message names the file. A dead worker is replaced. This module imports neither
+torch nor scipy, so that a worker starts in a tenth of a second. It needs a POSIX system.
 """
 
 from __future__ import annotations
@@ -32,32 +31,32 @@ import numpy as np
 
 from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile
 
-MEMORY = 256 * 2**20  # bytes that a call may add to its worker; arrays made by `empty` do not count
+MEMORY = 256 * 2**20  # bytes that a call may allocate; large arrays made by `empty` do not count
 SECONDS = 5.0  # processor time of a call
-_PATIENCE = 600.0  # seconds that a worker may be silent, as disks can be slow
-_GROWTH = 256 * 2**20  # bytes that a worker may keep after a call; beyond, it is replaced
-_LARGE = 2**20  # bytes above which `empty` takes shared memory
+_TIMEOUT = 600.0  # seconds from the start of a group of calls to its results; disks can be slow
+_GROWTH = 256 * 2**20  # a worker that keeps more bytes after its calls is replaced
+_LARGE = 2**20  # size in bytes from which `empty` uses shared memory
 _LINUX = sys.platform == "linux"
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
 class Call:
-    """One file to read: function(path, *arguments), by a function of a module that does not import torch."""
+    """One file to read: function(path, *arguments). The module of the function should not import torch."""
 
     function: Callable[..., Any]
     path: Path
     arguments: tuple[Any, ...] = ()
     wanted: str = "a sound file"  # description of the file, for messages
-    memory: int = MEMORY  # bytes beside its result
-    seconds: float = SECONDS  # processor time
+    memory: int = MEMORY  # limit in bytes, without the result
+    seconds: float = SECONDS  # limit of processor time
 
 
 def read(function: Callable[..., Any], path: Path | str, *arguments: Any, **options: Any) -> Any:
-    """function(path, *arguments), computed in a worker; `options` are the other fields of `Call`.
+    """function(path, *arguments), computed in a worker. options: other fields of `Call`.
 
-    The function returns arrays and plain values. One that finds that its file deserves more than the usual limits calls
-    `allow`. Raises DamagedFile and MissingFile.
+    The function returns arrays and plain values. It can raise its limits with `allow`. Raises DamagedFile and
+    MissingFile.
     """
     ((result,),) = read_all([[Call(function, Path(path), arguments, **options)]])
     if isinstance(result, Exception):
@@ -66,10 +65,10 @@ def read(function: Callable[..., Any], path: Path | str, *arguments: Any, **opti
 
 
 def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
-    """The results of each group of calls, in order, read on all cores.
+    """The results of each group of calls, in order, computed on all cores.
 
-    One worker reads a group (the files of one object, say). A DamagedFile or MissingFile takes the place of the result
-    of a bad file. Only a few groups are read ahead of the one that is asked for.
+    A worker takes a whole group, for example the files of one object. The result for a bad file is a DamagedFile or
+    MissingFile. Two groups per core are read ahead, at most.
     """
     groups, tasks, most = iter(groups), deque(), cores()
     try:
@@ -87,14 +86,14 @@ def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
                         task.receive()
             else:
                 return
-    finally:  # after an interruption some still read
+    finally:  # after an interruption some workers are still busy
         for task in tasks:
             if task.results is None:
                 task.worker.end()
 
 
 def cores() -> int:
-    """The number of workers: the cores that this process may use."""
+    """The number of cores that this process may use, which is the number of workers."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -102,14 +101,14 @@ class _Task:
     """A group of calls in a worker."""
 
     def __init__(self, calls: list[Call]) -> None:
-        self.calls, self.deadline = calls, time.monotonic() + _PATIENCE
+        self.calls, self.deadline = calls, time.monotonic() + _TIMEOUT
         self.results: list[Any] | None = None
         self.worker = _idle_worker()
-        with contextlib.suppress(OSError):  # it died just now, which `receive` finds
+        with contextlib.suppress(OSError):  # if the worker has died, `receive` finds out
             self.worker.connection.send((os.getcwd(), calls))
 
     def receive(self) -> None:
-        """Take the results of the worker; if it has died or is late, a sentence about the file at fault."""
+        """Receive the results of the worker; if it has died or is late, find the file at fault."""
         try:
             if not self.worker.connection.poll():
                 raise TimeoutError
@@ -121,11 +120,11 @@ class _Task:
             self.results = [self._fault(status)] if single else [next(read_all([[call]]))[0] for call in self.calls]
 
     def _fault(self, status: int) -> DamagedFile:
-        call, fault = self.calls[0], f"the process that read it crashed (status {status})"
+        call, fault = self.calls[0], f"reading it crashed its process (status {status})"
         if status == -signal.SIGXCPU:
             fault = f"reading it takes more than {call.seconds:g} seconds of processor time"
         elif time.monotonic() > self.deadline:
-            fault = f"reading it was stopped after {_PATIENCE:g} seconds"
+            fault = f"reading it was stopped after {_TIMEOUT:g} seconds"
         return DamagedFile(call.path, f"{fault}; expected {call.wanted}. {FETCH_AGAIN}")
 
 
@@ -136,14 +135,14 @@ class _Worker:
         self.connection, theirs = Pipe()
         paths, end = [str(Path(__file__).parents[2]), *sys.path], theirs.fileno()
         code = f"import sys; sys.path[:] = {paths!r}; from learn3d.files import sandbox; sandbox._serve({end})"
-        silent = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)  # libraries print what nobody needs
-        with theirs:  # -S -E: without the start-up files of site-packages
+        silent = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)  # libraries print warnings
+        with theirs:  # -S -E: skip the start-up files of site-packages
             command = [sys.executable, "-S", "-E", "-c", code]
             self.process = subprocess.Popen(command, pass_fds=[end], env={**os.environ, **_ONE_THREAD}, **silent)
         _workers.add(self)
 
     def receive(self) -> tuple[list[Any], bool]:
-        """The results of its calls, and whether the process has grown too large to be kept."""
+        """The results of its calls, and whether the process has grown by more than `_GROWTH`."""
         data, sizes, grown = self.connection.recv()
         buffers = []
         for size in sizes:
@@ -152,7 +151,7 @@ class _Worker:
         return pickle.loads(data, buffers=buffers), grown
 
     def end(self) -> int:
-        """Kill the process, which has nothing to save. Returns its exit status."""
+        """Kill the process. Returns its exit status."""
         _workers.discard(self)
         self.process.kill()
         self.connection.close()
@@ -168,26 +167,26 @@ def _idle_worker() -> _Worker:
     return _Worker()
 
 
-_workers: set[_Worker] = set()  # all that are alive
+_workers: set[_Worker] = set()  # all living workers
 _idle: list[_Worker] = []
 atexit.register(lambda: [worker.end() for worker in list(_workers)])
 os.register_at_fork(after_in_child=lambda: (_workers.clear(), _idle.clear()))  # they belong to the original
 
 
-# The rest runs in a worker.
+# The rest runs in workers.
 
-_limits: tuple[float, float] | None = None  # bytes of private memory and seconds of processor time; None: no worker
-_shared: dict[int, int] = {}  # open files of shared memory, by the address of the array in each
+_limits: tuple[float, float] | None = None  # bytes of private memory, seconds of processor time; None if no worker
+_shared: dict[int, int] = {}  # address of an array in shared memory -> its file descriptor
 
 
 def allow(memory: int = 0, seconds: float = 0.0) -> None:
-    """Let the call that runs now take more, once its file's header has shown a size that we can hold."""
+    """Raise the limits of the running call by bytes and seconds, for a file whose header shows an acceptable size."""
     if _limits is not None:
         _limit(_limits[0] + memory, _limits[1] + seconds)
 
 
 def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An array to be filled; on Linux a large one is memory that the parent shares, so that it is not copied."""
+    """An uninitialised array. On Linux a large one is in shared memory, so that the parent gets it without a copy."""
     dtype = np.dtype(dtype)
     size = math.prod(shape) * dtype.itemsize
     if _limits is None or size < _LARGE or not _LINUX:
@@ -200,8 +199,8 @@ def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def _serve(end: int) -> None:
-    """Answer requests, current folders and lists of calls, until the connection is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interruption ends
+    """Run the requests, each a current folder and a list of calls, until the connection is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent kills workers after an interruption
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     start = _memory()
     with contextlib.suppress(EOFError, OSError), Connection(end) as connection:
@@ -239,21 +238,21 @@ def _attempt(call: Call) -> Any:
     except MemoryError:
         _limit(math.inf, math.inf)
         return DamagedFile(call.path, f"reading it would take too much memory; expected {call.wanted}")
-    except Exception as error:  # the libraries raise whatever a damaged file leads them to
+    except Exception as error:  # libraries raise various errors for damaged files
         return DamagedFile(call.path, f"cannot be read ({reason(error)}); expected {call.wanted}. {FETCH_AGAIN}")
 
 
 def reason(error: Exception) -> str:
-    """The first line of an error's text, with its kind if that says more than "ValueError"."""
+    """The first line of an error's text, with its class unless that is ValueError."""
     text = (str(error).strip().splitlines() or [""])[0][:300]
     return text if text and type(error) is ValueError else f"{type(error).__name__}: {text}"
 
 
 def _limit(memory: float, seconds: float) -> None:
-    """Bound the private memory of this process, in bytes, and its processor time; math.inf for no bound."""
+    """Limit the private memory of this process in bytes, and its processor time; math.inf for no limit."""
     global _limits
     _limits = memory, seconds
-    # Elsewhere than on Linux RLIMIT_DATA does not count what malloc takes in large pieces.
+    # Only Linux counts malloc's large blocks in RLIMIT_DATA.
     for kind, value in {resource.RLIMIT_CPU: seconds, **({resource.RLIMIT_DATA: memory} if _LINUX else {})}.items():
         hard = resource.getrlimit(kind)[1]
         most = math.inf if hard == resource.RLIM_INFINITY else hard
@@ -261,7 +260,7 @@ def _limit(memory: float, seconds: float) -> None:
 
 
 def _memory() -> int:
-    """Bytes of private memory of this process; 0 if the system does not tell."""
+    """Bytes of private memory of this process; 0 on other systems than Linux."""
     if not _LINUX:
         return 0
     with open("/proc/self/statm", "rb", buffering=0) as file:

@@ -1,4 +1,4 @@
-"""Untrusted pretrained weights: a function for the sandbox."""
+"""Reads untrusted pretrained weights in the sandbox."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from learn3d.files import limits, sandbox
 from learn3d.files.reading import DamagedFile, check_file
 
-MEMORY = 2**30  # bytes that importing torch may add, beside four times the file's size
-SECONDS = 30.0
+MEMORY = 2**30  # bytes for importing torch; `read_state_dict` adds four times the file's size
+SECONDS = 30.0  # processor time
 
 
 def read_state_dict(path: Path) -> dict[str, np.ndarray]:
-    """The tensors of a state dict (.safetensors or from torch.save), floating-point ones as float32 or float64.
+    """Read the tensors of a state dict (.safetensors or from torch.save); half precision becomes float32.
 
-    Nothing in the file is executed (weights_only). Raises DamagedFile if it is no state dict of plain numbers.
+    No code in the file is executed (weights_only). Raises DamagedFile if it is not a state dict.
     """
     import torch
     from safetensors.torch import load_file

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Writes files and folders atomically: they appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from learn3d.terminal import stop_on_signal
 
 @contextlib.contextmanager
 def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
-    """Gives a temporary path in the folder of `path`; the file written there takes the name `path` at the end.
+    """Yield a temporary path in the folder of `path`; at the end the file there is renamed to `path`.
 
-    After an exception nothing is left of it; a killed process leaves the temporary file (`remove_partials`). With
-    `sync` not even a power cut leaves half a file. Raises OSError if `path` is a folder, a pipe or a device.
+    After an exception the temporary file is removed; a killed process leaves it (`remove_partials`). sync: the file is
+    complete even after a power failure. Raises OSError if `path` is a folder, a pipe or a device.
     """
     path = Path(path)
     if not _may_replace(path):
-        raise OSError(f"{path} is no plain file and is not replaced; give another name")
+        raise OSError(f"{path} is not a regular file and is not replaced; give another name")
     temporary = path.with_name(f".{path.name}.partial")
-    temporary.unlink(missing_ok=True)  # a killed process may have left it as a second name of a file
+    temporary.unlink(missing_ok=True)  # a killed process may have left a hard link, which must not be overwritten
     try:
         yield temporary
         if sync:
@@ -34,7 +34,7 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
         if sync:
             _sync(path.parent)
     except OSError as error:
-        if error.errno is not None and error.filename is None:  # a full disk does not name the file
+        if error.errno is not None and error.filename is None:  # the error for a full disk has no file name
             error.filename = str(path)
         raise
     finally:
@@ -42,7 +42,7 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
 
 
 def _may_replace(path: Path) -> bool:
-    # /dev/stdout is a link into /proc; it must stay one even if the output goes to a plain file.
+    # /dev/stdout is a link into /proc; it must stay one even if the output is redirected to a regular file.
     into_proc = path.is_symlink() and path.readlink().is_relative_to("/proc")
     return not into_proc and (path.is_file() or not path.exists())
 
@@ -56,16 +56,16 @@ def _sync(path: Path) -> None:
 
 
 def check_target(path: Path, option: str, *, folder: bool = False) -> None:
-    """Raise OSError if `path` cannot be written. For the beginning of long work; nothing is left of the attempt.
+    """Raise OSError if `path` cannot be written. To be called before long computations; it leaves no files.
 
-    With `folder` it is a folder for files, which need not be there yet. `option` is the command's name of the path.
+    folder: `path` is a folder, which need not exist. option: the command's option for the path, for the message.
     """
     path = Path(path)
-    there = next(p for p in (path, *path.parents) if p.exists()) if folder else path.parent
+    existing = next(p for p in (path, *path.parents) if p.exists()) if folder else path.parent
     try:
         if not folder and not _may_replace(path):
-            raise OSError("it is no plain file, and is not replaced")
-        with tempfile.TemporaryFile(dir=there):
+            raise OSError("it is not a regular file, and is not replaced")
+        with tempfile.TemporaryFile(dir=existing):
             pass
     except OSError as error:
         raise OSError(f"cannot write {path}: {error.strerror or error}; give another {option}") from error
@@ -79,10 +79,7 @@ def remove_partials(*folders: Path) -> None:
 
 
 def give_second_name(path: Path, name: Path) -> None:
-    """Let a file be found under another name as well, in place of a file of that name.
-
-    It is a hard link, or a copy if the file system has none.
-    """
+    """Make `name` a hard link to `path`, or a copy if the file system has no hard links. Replaces a file `name`."""
     with replacing(name, sync=True) as temporary:
         try:
             os.link(path, temporary)
@@ -91,23 +88,22 @@ def give_second_name(path: Path, name: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes, *, sync: bool = False) -> None:
-    """Write a whole file."""
+    """Write a file atomically, see `replacing`."""
     with replacing(path, sync=sync) as temporary:
         temporary.write_bytes(content)
 
 
 def write_json(path: Path, value: Any, *, sync: bool = False) -> None:
-    """Write a value as indented JSON with a line break at the end."""
+    """Write a value as indented JSON atomically, see `replacing`."""
     write_bytes(path, (json.dumps(value, indent=2) + "\n").encode(), sync=sync)
 
 
 @contextlib.contextmanager
 def publishing(folder: Path, paths: Sequence[str]) -> Iterator[Path]:
-    """Give a temporary folder in `folder`; its files and folders `paths` replace those of `folder` in the end.
+    """Yield a temporary folder in `folder`; at the end its files and folders `paths` replace those of `folder`.
 
-    What is missing there is removed here; all other files stay. After an exception nothing changes. It is all on one
-    file system, so nothing is copied, and an interruption waits until all is in place: files of two data sets do not go
-    together.
+    If one of `paths` is missing in it, it is removed from `folder`; all other files stay. After an exception nothing
+    changes. Signals wait until all files are moved, so that files of two data sets are never mixed.
     """
     with tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=folder) as temporary:
         new, old = Path(temporary) / "new", Path(temporary) / "old"

@@ -1,7 +1,4 @@
-"""Sources of meshes: a folder of files, a mesh pack (npz) or the procedural generator.
-
-Reading a mesh raises ValueError if its file is damaged, and `checked` if it cannot be used, each with the reason.
-"""
+"""Sources of meshes: a folder of files, a mesh pack (npz) or the procedural generator."""
 
 from __future__ import annotations
 
@@ -16,8 +13,8 @@ from learn3d.files import npz, sandbox
 from learn3d.files.geometry import EXTENSIONS, RawMesh, read_mesh
 from learn3d.make_data.shapes import CATEGORIES, make_shape
 
-MOST_FACES = 1_000_000
-Source = Callable[[], RawMesh]  # reads a mesh when its turn comes; it can be pickled
+MAX_FACES = 1_000_000
+Source = Callable[[], RawMesh]  # reads one mesh, or raises ValueError if its file is damaged; can be pickled
 _PACK = "an npz file with v0, f0, v1, f1, ... and no pickled objects"
 
 
@@ -58,8 +55,8 @@ def _procedural(category: str, seed: int, number: int) -> RawMesh:
 
 
 def object_names(files: Iterable[str]) -> list[str]:
-    """A name for each mesh that can be part of a file name, all different: letters, digits and underscores."""
-    names: dict[str, str] = {}  # by their lower case: some file systems know no other
+    """A unique name for each mesh, valid in file names: letters, digits and underscores."""
+    names: dict[str, str] = {}  # keys in lower case, as some file systems ignore case
     for file in files:
         plain = re.sub(r"\W+", "_", str(Path(file).with_suffix(""))).strip("_")[-80:] or "mesh"
         name, number = plain, 1
@@ -70,17 +67,17 @@ def object_names(files: Iterable[str]) -> list[str]:
     return list(names.values())
 
 
-def checked(mesh: RawMesh) -> RawMesh:
-    """The mesh with the vertices that no face uses dropped; ValueError with the reason if it cannot be rendered."""
+def check(mesh: RawMesh) -> RawMesh:
+    """The mesh without unused vertices, as float64 and int64. Raises ValueError if it cannot be rendered."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     numbers = vertices.dtype.kind in "fiu" and faces.dtype.kind in "iu"
     if not numbers or vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         shapes = f"{vertices.dtype} {list(vertices.shape)}, {faces.dtype} {list(faces.shape)}"
         raise ValueError(f"not a triangle mesh: wanted vertices float [V, 3] and faces int [F, 3], got {shapes}")
-    if not 0 < len(faces) <= MOST_FACES:
-        raise ValueError(f"too large: {len(faces)} faces, the limit is {MOST_FACES}" if len(faces) else "no faces")
+    if not 0 < len(faces) <= MAX_FACES:
+        raise ValueError(f"too large: {len(faces)} faces, the limit is {MAX_FACES}" if len(faces) else "no faces")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"faces refer to vertices {faces.min()} .. {faces.max()}, there are {len(vertices)}")
+        raise ValueError(f"faces refer to vertices {faces.min()} .. {faces.max()}, but there are {len(vertices)}")
     used, faces = np.unique(faces, return_inverse=True)
     vertices = vertices[used].astype(np.float64)
     extent = np.ptp(vertices, axis=0).max()
@@ -90,6 +87,6 @@ def checked(mesh: RawMesh) -> RawMesh:
 
 
 def fit_to_box(vertices: np.ndarray) -> np.ndarray:
-    """Vertices [V, 3] with their bounding box centred at the origin and its longest side 1."""
+    """Vertices [V, 3], moved and scaled so that their bounding box is centred at 0 and its longest side is 1."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     return (vertices - (low + high) / 2) / (high - low).max()

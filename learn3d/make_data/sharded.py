@@ -1,7 +1,6 @@
-"""Data sets of any size: meshes -> shards (`learn3d.data.shards`), each made by a process of its own.
+"""Makes a data set as shards (`learn3d.data.shards`), each in its own process.
 
-A shard depends on the settings and its meshes alone. So it does not matter which process makes it, and the shards
- that a killed call has made are kept by the next one.
+A shard depends on the settings and its meshes alone, so a later call keeps the shards of a killed one.
 """
 
 from __future__ import annotations
@@ -29,14 +28,12 @@ LIST = ".report.json"  # suffix of the list of a shard's meshes
 
 
 def make_shards(config: DatasetConfig) -> int:
-    """Make the data set that `config` describes as shards in `output/CATEGORY/SPLIT`; returns the exit status.
+    """Make the data set that `config` describes as shards in `output/SYNSET/SPLIT`.
 
-    Shards that are there already are kept. A mesh that cannot be used is left out, and listed in the report (the same
-    files as those of `make_dataset`); a shard whose process dies is reported, and the next call tries it again. Returns
-    1 then, 130 if a signal stopped it.
+    Existing shards are kept. Unusable meshes are skipped and listed in the report, which has the same files as that of
+    `make_dataset`. Returns the exit status: 0, 1 if a shard failed (the next call tries it again), 130 after a signal.
 
-    Raises ValueError (no usable mesh, settings that do not fit, shards of other settings in the folder), OSError (the
-    folder cannot be written).
+    Raises ValueError (no usable mesh, shards of other settings in the folder), OSError (folder not writable).
     """
     folder, splits = config.output / synset_of(config.category), split_items(config)
     _prepare(config, folder, splits)
@@ -60,7 +57,7 @@ def make_shards(config: DatasetConfig) -> int:
 
 
 def make_shard(config: DatasetConfig, path: Path, number: int, items: Sequence[Item], threads: int) -> bool:
-    """Make one shard and the list of its meshes; returns False if a signal stopped it."""
+    """Make one shard and the list of its meshes. Returns False if a signal stopped it."""
     torch.set_num_threads(threads)
     writer, made, objects = WRITERS[config.layout](path.parent, config.category), [], []
     with stop_on_signal() as stop:
@@ -89,7 +86,7 @@ def _parts(items: Sequence[Item]) -> Iterator[list[Item]]:
 
 
 def _prepare(config: DatasetConfig, folder: Path, splits: dict[str, list[Item]]) -> None:
-    """Make the category's folder, and write the settings of its shards or compare them with those there."""
+    """Make the category's folder, and write its settings. Raises ValueError if it has shards of other settings."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "settings.json"
     if config.overwrite:
@@ -98,12 +95,12 @@ def _prepare(config: DatasetConfig, folder: Path, splits: dict[str, list[Item]])
         path.unlink(missing_ok=True)
     names = sorted((item.number, item.name) for items in splits.values() for item in items)
     crc = zlib.crc32("\n".join(name for _, name in names).encode())
-    settings = config.plain() | {"list of meshes": f"{len(names)}, CRC-32 {crc:08x}"}
+    settings = config.to_dict() | {"list of meshes": f"{len(names)}, CRC-32 {crc:08x}"}
     before = parse_json(read_bytes(path, 2**20, "the settings of shards")) if path.is_file() else settings
     if different := sorted(k for k in {*settings, *before} if settings.get(k) != before.get(k)):
         raise ValueError(
-            f"{folder} has shards that were made with another {', '.join(different)}; ask for the same, give another "
-            "folder, or --overwrite to replace them"
+            f"{folder} has shards that were made with another {', '.join(different)}; repeat those settings, give "
+            "another folder, or --overwrite to replace them"
         )
     write_json(path, settings)
 
@@ -111,7 +108,7 @@ def _prepare(config: DatasetConfig, folder: Path, splits: dict[str, list[Item]])
 def _finish(
     config: DatasetConfig, folder: Path, splits: dict[str, list[Item]], shards: Sequence[Path]
 ) -> DatasetReport:
-    """Declare the splits complete, and write the report."""
+    """Mark the splits as complete, and write the report."""
     lists = [parse_json(read_bytes(path.with_suffix(LIST), 2**28, "the list of a shard's meshes")) for path in shards]
     report = DatasetReport(config, [mesh for found in lists for mesh in found])
     rows, writer = {}, WRITERS[config.layout](folder, config.category)

@@ -1,1 +1,1 @@
-"""Camera poses that nobody measured: estimated from masks, kept in a table, drawn on a sheet."""
+"""Estimates camera poses from masks, and draws a sheet to check them by eye."""

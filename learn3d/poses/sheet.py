@@ -1,4 +1,4 @@
-"""A picture that tells at once whether poses were found: prototypes, and images sorted by azimuth."""
+"""Draws a contact sheet of estimated poses: prototypes, and images sorted by azimuth."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from learn3d.pictures.sheets import natural_colors, tile
 from learn3d.pictures.surfaces import Surface, draw_surface, orbit
 from learn3d.poses.views import EstimatedViews
 
-COLUMNS = 12  # azimuths
-PROTOTYPES, ROWS = 6, 8
-TILE = 64
-LEGEND = "columns: azimuths; first rows: prototypes, rendered there; other rows: images whose estimate is there"
+COLUMNS = 12  # azimuths, at most
+PROTOTYPES, ROWS = 6, 8  # rows of prototypes, and of images, at most
+TILE = 64  # side of a picture in pixels
+LEGEND = "columns: azimuths; first rows: renderings of the prototypes; other rows: images with that estimated azimuth"
 
 
 def draw_sheet(views: EstimatedViews) -> np.ndarray:
-    """Uint8 [H, W, 3]: the most frequent prototypes at 12 azimuths, and below each azimuth images estimated there."""
+    """Uint8 [H, W, 3]: the most frequent prototypes, and below each azimuth images with about that estimate."""
     candidates, result = views.candidates, views.result
     count = min(COLUMNS, len(candidates.azimuth_deg))
     azimuths = candidates.azimuth_deg[torch.linspace(0, len(candidates.azimuth_deg), count + 1)[:-1].long()]
@@ -35,10 +35,8 @@ def draw_sheet(views: EstimatedViews) -> np.ndarray:
         pictures = []
         for row in views.shown[chosen].tolist():
             part = int(np.searchsorted(starts, row, side="right")) - 1
-            dataset = views.datasets[part]
-            pictures.append(
-                natural_colors(dataset.images[np.array([row - starts[part]])], inverted=dataset.inverted)[0]
-            )
+            dataset, index = views.datasets[part], np.array([row - starts[part]])
+            pictures.append(natural_colors(dataset.images[index], inverted=dataset.inverted)[0])
         columns.append(pictures + [None] * (ROWS - len(pictures)))
     names = [f"prototype, {float(result.weights[m]):.0%}" for m in order] + ["images", *[""] * (ROWS - 1)]
     titles = [f"{azimuth:g}°" for azimuth in azimuths.tolist()]

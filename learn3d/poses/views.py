@@ -1,4 +1,4 @@
-"""From data sets to poses: the views of all splits, their estimate, the table, and a comparison with true poses."""
+"""Estimates the poses of all images of a data set, and compares them with true poses."""
 
 from __future__ import annotations
 
@@ -14,31 +14,30 @@ from torch import Tensor
 
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.layouts import Layout, load_dataset
-from learn3d.data.pose_table import PoseTable, fingerprints, masks_of
+from learn3d.data.pose_table import PoseTable, fingerprints
 from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.files.reading import MissingFile
-from learn3d.poses.estimate import FEWEST, NEAR_DEG, SIZE, Candidates, Estimate, Masks, PoseOptions, estimate
+from learn3d.poses.estimate import MIN_IMAGES, NEAR_DEG, SIZE, Candidates, Estimate, Masks, PoseOptions, estimate
 
-ELEVATION_STEP_DEG = 15.0  # between candidates, at most
+MAX_ELEVATION_STEP_DEG = 15.0  # between neighbouring candidates
 DEFAULT_ELEVATION_DEG, DEFAULT_FOV_DEG = 30.0, 30.0
-SURE = 0.5  # confidence below which an image counts as doubtful
+MIN_CONFIDENCE = 0.5  # an image with less counts as doubtful
 
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """The cameras, as far as they are known."""
+    """Known values of the cameras."""
 
     elevation: str | None = None
-    """Height angle of all cameras in degrees, or its range, LOW:HIGH (default: the data set's own, or 30 if it has
-    none)."""
+    """Elevation of all cameras in degrees, or a range LOW:HIGH (default: from the data set, or 30 if it has none)."""
     distance: float | None = None
-    """Distance of all cameras in lengths of the object (default: the data set's own, or such that the largest mask is
-    one length)."""
+    """Distance of all cameras, in units of the object's longest side (default: from the data set, or estimated from the
+    largest mask)."""
     fov_deg: float | None = None
-    """Full field of view of all cameras in degrees (default: the data set's own, or 30 if it has none)."""
+    """Full field of view of all cameras in degrees (default: from the data set, or 30 if it has none)."""
 
     def elevations(self) -> tuple[float, float] | None:
-        """The lowest and the highest one; None: not given."""
+        """The lowest and the highest elevation; None if no elevation is given. Raises ValueError for bad text."""
         if self.elevation is None:
             return None
         try:
@@ -53,23 +52,33 @@ class CameraOptions:
 
 @dataclass(frozen=True, eq=False)
 class EstimatedViews:
-    """The images of all splits, one after the other, and their poses."""
+    """The images of all splits, concatenated, and their poses."""
 
     datasets: tuple[ViewDataset, ...]
-    shown: Tensor  # int64: rows that show something
+    shown: Tensor  # int64: rows of the images whose masks are not empty
     candidates: Candidates
-    result: Estimate  # of these rows
-    table: PoseTable  # of all rows
-    warnings: tuple[str, ...]
+    result: Estimate  # for the rows `shown`
+    table: PoseTable  # for all rows
 
     @property
-    def is_sure(self) -> bool:
-        """Whether the poses can be told at all."""
-        return float(self.result.confidence.mean()) >= SURE
+    def warnings(self) -> list[str]:
+        """Reasons to distrust the poses."""
+        warnings = []
+        if empty := len(self.table.confidence) - len(self.shown):
+            warnings.append(f"{empty} images have an empty mask; their poses are unknown")
+        training = int((self.shown < len(self.datasets[0])).sum())
+        if training < MIN_IMAGES:
+            warnings.append(f"{training} training images are too few to estimate poses; the minimum is {MIN_IMAGES}")
+        elif float(self.result.confidence.mean()) < MIN_CONFIDENCE:
+            warnings.append(
+                "these masks do not determine the poses: nearly equal masks of different objects got different "
+                "azimuths, so objects may look alike from several sides. Check the sheet before training on this table"
+            )
+        return warnings
 
 
 def load_views(layout: Layout, data: Path, category: str, views_per_object: int | None = None) -> list[ViewDataset]:
-    """The training split of a data set, and the others that are there."""
+    """Read the training split of a data set, and those of the other splits that exist."""
     datasets = [load_dataset(layout, data, category, "train", views_per_object=views_per_object)]
     for split in ("val", "test"):
         with contextlib.suppress(MissingFile):
@@ -84,10 +93,10 @@ def estimate_views(
     kept: int,
     tick: Callable[[], object] = lambda: None,
 ) -> EstimatedViews:
-    """Poses of all images of the splits, training first; shapes are fitted to the training images.
+    """Estimate the poses of all images. Shapes are fitted to the images of the first data set, the training split.
 
-    kept: number of candidates of each image in the table. Raises ValueError if all masks are empty, or cameras are
-    rotations.
+    kept: number of candidates of each image in the table. tick: called after each of `options.all_steps` steps. Raises
+    ValueError if all training masks are empty, or if the data set's poses are rotations.
     """
     elevation, distance, half_fov = _cameras(datasets, cameras)
     size = distance * torch.tan(half_fov.deg2rad())
@@ -97,9 +106,9 @@ def estimate_views(
     shown = torch.nonzero(masks.sum(1) > 0.25)[:, 0]
     training = shown[shown < len(datasets[0])]
     if not len(training):
-        raise ValueError("all training masks are empty, so that no pose can be told; look at the data")
+        raise ValueError("all training masks are empty; run learn3d check-dataset on the data")
     span = cameras.elevations() or (float(elevation.min()), float(elevation.max()))
-    grid = torch.linspace(*span, 1 + int(np.ceil((span[1] - span[0]) / ELEVATION_STEP_DEG)))
+    grid = torch.linspace(*span, 1 + int(np.ceil((span[1] - span[0]) / MAX_ELEVATION_STEP_DEG)))
     azimuths = torch.arange(options.azimuths) * (360 / options.azimuths)
     candidates = Candidates(azimuths, grid, float(distance.median()), float(half_fov.median()))
     allowed = torch.ones(len(masks), len(grid), dtype=torch.bool)
@@ -123,35 +132,20 @@ def estimate_views(
         *(part.numpy().astype(np.float32) for part in (wrap_deg(azimuths[chosen // len(grid)]), heights)),
         *(part.numpy() for part in (weights / weights.sum(1, keepdim=True), distance, half_fov, confidence)),
     )
-    views = EstimatedViews(tuple(datasets), shown, candidates, result, table, ())
-    return EstimatedViews(tuple(datasets), shown, candidates, result, table, tuple(_warnings(views, len(training))))
-
-
-def _warnings(views: EstimatedViews, training: int) -> list[str]:
-    warnings = []
-    if empty := len(views.table.confidence) - len(views.shown):
-        warnings.append(f"{empty} images have an empty mask; their poses are unknown")
-    if training < FEWEST:
-        warnings.append(f"{training} training images are too few to tell poses; {FEWEST} are the least")
-    elif not views.is_sure:
-        warnings.append(
-            "poses cannot be told from these masks: nearly equal masks of different objects got different azimuths, as "
-            "if objects looked alike from several sides. Look at the sheet before training on this table"
-        )
-    return warnings
+    return EstimatedViews(tuple(datasets), shown, candidates, result, table)
 
 
 def _masks(dataset: ViewDataset, factor: Tensor) -> Tensor:
-    """Float32 [M, SIZE^2] in 0 .. 1, magnified by a factor each; read in parts, as the images may not fit in memory."""
+    """Masks float32 [M, SIZE^2] in 0 .. 1, each magnified by its factor; read in parts, as images may exceed memory."""
     reduced = []
     for rows in torch.arange(len(dataset)).split(1024):
-        masks = _scaled(torch.from_numpy(masks_of(dataset, rows.numpy())).float() / 255, factor[rows])
+        masks = _magnify(torch.from_numpy(dataset.read_masks(rows.numpy())).float() / 255, factor[rows])
         reduced.append(F.avg_pool2d(masks[:, None], MASK_SIZE // SIZE).flatten(1))
     return torch.cat(reduced)
 
 
 def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions) -> tuple[Tensor, Tensor, Tensor]:
-    """Elevation, distance and half field of view of every image: given, or the data's own, or a guess."""
+    """Elevation, distance and half field of view of every image: the given ones, the data set's, or defaults."""
     given = cameras.elevations() or (DEFAULT_ELEVATION_DEG,) * 2
     half_fov = torch.full((sum(map(len, datasets)),), (cameras.fov_deg or DEFAULT_FOV_DEG) / 2)
     share = max(float(dataset.object_sides().max()) for dataset in datasets)
@@ -159,9 +153,7 @@ def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions) -> tuple[T
     distance, elevation = torch.full_like(half_fov, guess), torch.full_like(half_fov, sum(given) / 2)
     if any(dataset.poses is not None for dataset in datasets):
         if not all(isinstance(dataset.poses, LookAtPoses) for dataset in datasets):
-            raise ValueError(
-                "poses are estimated for cameras that look at the object; those of this layout are rotations"
-            )
+            raise ValueError("poses can only be estimated for look-at cameras; the poses of this layout are rotations")
         own = [_column(datasets, name) for name in ("elevation_deg", "distance", "half_fov_deg")]
         elevation = own[0] if cameras.elevation is None else elevation
         distance, half_fov = own[1], half_fov if cameras.fov_deg else own[2]
@@ -171,13 +163,13 @@ def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions) -> tuple[T
 
 
 def _column(datasets: Sequence[ViewDataset], name: str) -> Tensor:
-    """One value of the poses of all images, float32."""
+    """One field of the poses of all images, float32 [N]."""
     columns = [torch.as_tensor(getattr(d.poses, name), dtype=torch.float32).expand(len(d)) for d in datasets]
     return torch.cat(columns)
 
 
-def _scaled(masks: Tensor, factor: Tensor) -> Tensor:
-    """Each mask magnified about its centre, as another distance or field of view shows it, about."""
+def _magnify(masks: Tensor, factor: Tensor) -> Tensor:
+    """Magnify each mask about the image centre: an approximate change of the distance or of the field of view."""
     if bool((factor - 1).abs().max() < 1e-3):
         return masks
     theta = torch.zeros(len(masks), 2, 3)
@@ -188,14 +180,14 @@ def _scaled(masks: Tensor, factor: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Estimated azimuths against true ones, after one rotation of the frame by `offset_deg`."""
+    """Errors of the estimated azimuths, after the whole frame was turned by `offset_deg`."""
 
     offset_deg: float
-    accuracy: float  # Acc@30
+    accuracy: float  # Acc@30: share of errors of at most 30 degrees
     median_deg: float
     mean_deg: float
     flips: float  # share of errors of at least 150 degrees
-    objects_flipped: float  # share of the objects whose images are mostly flips
+    objects_flipped: float  # share of the objects with flips in most of their images
     calibration: tuple[tuple[float, float, int], ...]  # mean confidence, accuracy and number of images, by confidence
 
     def text(self) -> str:
@@ -205,15 +197,17 @@ class Comparison:
             f"median error {self.median_deg:.1f}, mean {self.mean_deg:.1f} degrees, flips {self.flips:.3f}, objects "
             f"flipped as a whole {self.objects_flipped:.3f}"
         ]
-        return "\n".join(lines + [f"confidence {c:.2f}: right {a:.2f} ({n} images)" for c, a, n in self.calibration])
+        return "\n".join(lines + [f"confidence {c:.2f}: Acc@30 {a:.2f} ({n} images)" for c, a, n in self.calibration])
 
 
 def compare(views: EstimatedViews) -> Comparison:
-    """The errors of the best azimuths. The frame is turned by the whole number of degrees with the smallest mean error
-    of the validation images, or of all if there are none. Raises ValueError without true poses.
+    """Compare the most probable azimuths with the true ones.
+
+    The frame is turned by the whole number of degrees with the smallest mean error. It is that of the validation
+    images, or of all images if there is no validation split. Raises ValueError if the data set has no poses.
     """
     if any(dataset.poses is None for dataset in views.datasets):
-        raise ValueError("--compare needs true poses, which these data do not have")
+        raise ValueError("--compare needs true poses, but this data set has none")
     true, found = _column(views.datasets, "azimuth_deg"), torch.from_numpy(views.table.azimuth_deg[:, 0])
     splits = np.concatenate([[dataset.split] * len(dataset) for dataset in views.datasets])
     chosen = torch.from_numpy(splits == "val") if "val" in splits else torch.ones(len(true), dtype=torch.bool)
@@ -221,10 +215,8 @@ def compare(views: EstimatedViews) -> Comparison:
     means = torch.stack([wrap_deg(found[chosen] + o - true[chosen]).abs().mean() for o in offsets])
     offset = float(offsets[means.argmin()])
     errors = wrap_deg(found + offset - true).abs()[views.shown]
-    flips, objects = (
-        (errors >= 150).double(),
-        torch.cat([torch.from_numpy(d.object_ids) + 10**6 * i for i, d in enumerate(views.datasets)]),
-    )
+    flips = (errors >= 150).double()
+    objects = torch.cat([torch.from_numpy(d.object_ids) + 10**6 * i for i, d in enumerate(views.datasets)])
     _, which = objects[views.shown].unique(return_inverse=True)
     by_object = torch.bincount(which, flips) / torch.bincount(which)
     right, confidence = (errors <= NEAR_DEG).double(), views.result.confidence.double()

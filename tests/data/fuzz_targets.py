@@ -230,7 +230,7 @@ def mesh_target(tmp: Path) -> Target:
     def read(folder: Path) -> None:
         for read_one in meshes.list_sources(folder).values():
             with contextlib.suppress(ValueError):
-                checked = meshes.checked(read_one())
+                checked = meshes.check(read_one())
                 assert np.isfinite(checked.vertices).all() and checked.faces.max() < len(checked.vertices)
 
     return Target(folder, damaged | {"model.gltf": m.damage_json}, read)
@@ -243,7 +243,7 @@ def pack_target(tmp: Path) -> Target:
     def read(folder: Path) -> None:
         for read_one in meshes.list_sources(folder / "pack.npz").values():
             with contextlib.suppress(ValueError):
-                meshes.checked(read_one())
+                meshes.check(read_one())
 
     return Target(tmp, {"pack.npz": NPZ}, read)
 

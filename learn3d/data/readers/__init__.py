@@ -2,10 +2,10 @@
 
 from learn3d.data.readers import around, dvr, kar, kato, pascal3d, photos, r2n2
 
-#: By the name of the layout. Each module has its `PROPERTIES` and two functions. `load(folder, category, split, *,
-#: findings, ...)` reads and checks a category (name or synset id) and split, with the keywords of `PROPERTIES.options`.
-#: It raises MissingFile or DamagedFile for the first fault; if the findings are not strict, it notes all faults and
-#: returns None. `contents(folder)` says which categories there are, with their splits.
+#: Layout -> module with `PROPERTIES` and two functions. `load(folder, category, split, *, findings, ...)` reads a split
+#: of a category (name or synset id), with the keywords `PROPERTIES.options`. It raises MissingFile or DamagedFile for
+#: the first fault; if the findings are not strict, it records all faults and returns None. `contents(folder)` returns
+#: the categories of a folder and the splits of each.
 READERS = {
     "kato": kato,
     "dvr": dvr,

@@ -1,8 +1,8 @@
-"""Generated objects seen from all around: our own layout, in shards only (`learn3d.data.shards`).
+"""Generated objects seen from all sides: our own layout, as shards only (`learn3d.data.shards`).
 
-Images are 64x64, with colours stored as 255 - colour. Cameras stand at any azimuth, at heights of -10 to 60 degrees, at
-a distance from which the whole object is seen, and have fields of view of 14 to 40 degrees. Every view has a depth map.
-Voxel axes are Kato's; the view classes are 24 cells of azimuth.
+Images are 64x64, with colours stored as 255 - colour. Cameras have any azimuth, elevations in -10 .. 60 degrees, fields
+of view in 14 .. 40 degrees, and see the whole object. Every view has a depth map. Voxel axes are Kato's; the view
+classes are 24 cells of azimuth.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ BINS = AngleBins.parse("15x70:-10:60")
 
 
 def load(folder: Path | str, category: str, split: str, *, findings: Findings = STRICT) -> ViewDataset | None:
-    """Refuse: a split that is not in shards is missing."""
+    """Raise MissingFile, as only shards exist."""
     raise MissingFile(
         Path(folder), f"has no shards of {category}, {split}; make them: learn3d make-dataset --layout around --shards"
     )
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
-    """No categories but those in shards."""
+    """No categories, as only shards exist."""
     return {}

@@ -6,12 +6,12 @@
 - `{synset}/{id}/pointcloud.npz`: `points` [P, 3] on the surface in the world of the cameras.
 - `{synset}/softras_{train,val,test}.lst`: one id per line.
 
-The data set has the content of Kato's npz files, and Kato's cameras to the last bit. The file's cameras only have to
-agree with them. A fit of the 24 eyes finds the rotation (and reflection) from the file's world to the object frame, and
-brings the points there, too. A file whose views have another order, direction or distance is refused.
+The data set has the content of Kato's npz files, and exactly Kato's cameras. A fit of the 24 camera positions finds the
+rotation (and reflection) from the file's world to the object frame, which is also applied to the points. A file with
+another order, direction or distance of its views is refused.
 
-There are no voxels: measure by the points (Chamfer distance, F-score). Kato's own voxels file is not taken from beside
-it, because nothing says that its objects stand in the order of the lists.
+There are no voxels: measure with the points (Chamfer distance, F-score). Kato's voxels are not used, because their
+objects may have another order than the lists.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile, re
 from learn3d.files.sandbox import Call
 
 PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("progress",))
-POINTS = 10_000  # kept of each object's point cloud, which holds 100,000 in random order
-_EYE_TOLERANCE = 0.01  # units of the object frame
-_LEAST_COSINE = 0.9995
+POINTS = 10_000  # points that are kept of each object's 100,000, which are in random order
+_EYE_TOLERANCE = 0.01  # largest error of a camera position, in units of the object frame
+_MIN_COSINE = 0.9995  # of the angle between an image axis or a viewing direction and Kato's
 _MATRICES = [f"world_mat_{k}" for k in range(NUM_VIEWS)]
 _CAMERAS = "an npz file with world_mat_0 .. world_mat_23, 4x4, from the world to Kato's 24 cameras"
 _CLOUD = "an npz file with the array 'points' [P, 3]: finite, within the unit cube"
@@ -54,7 +54,7 @@ def load(
         images, masks = ([root / name / part / f"{k:04d}.png" for k in range(NUM_VIEWS)] for part in ("image", "mask"))
         return ObjectFiles(
             root / name,
-            Call(npz.read_those_there, root / name / "cameras.npz", (_MATRICES, 16 * 8), _CAMERAS),
+            Call(npz.read_existing, root / name / "cameras.npz", (_MATRICES, 16 * 8), _CAMERAS),
             Call(npz.read, root / name / "pointcloud.npz", ("points", limits.OBJECT_BYTES), _CLOUD),
             [Call(renderings.read_with_mask, i, (m, IMAGE_SIZE)) for i, m in zip(images, masks, strict=True)],
         )
@@ -90,7 +90,7 @@ def _build(files: ObjectFiles, cameras: dict[str, np.ndarray], points: np.ndarra
 
 
 def _fit_world(path: Path, cameras: dict[str, np.ndarray]) -> np.ndarray:
-    """Orthogonal [3, 3] that takes the world of the cameras to the object frame; DamagedFile if they are not Kato's."""
+    """Orthogonal matrix [3, 3] from the cameras' world to the object frame. DamagedFile if they are not Kato's."""
     matrices = [cameras.get(name, np.zeros(0)) for name in _MATRICES]
     if wrong := [name for name, matrix in zip(_MATRICES, matrices, strict=True) if matrix.shape != (4, 4)]:
         raise DamagedFile(path, f"has no {wrong[0]} of 4x4 numbers; expected {_CAMERAS}")
@@ -108,11 +108,11 @@ def _fit_world(path: Path, cameras: dict[str, np.ndarray]) -> np.ndarray:
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     cosines = [(rotations[:, row] @ to_object.T * axis).sum(1) for row, axis in ((0, right), (2, forward))]
     off = np.linalg.norm(eyes @ to_object.T - true_eyes, axis=1)
-    fault = np.maximum(off / _EYE_TOLERANCE, (1 - np.minimum(*cosines)) / (1 - _LEAST_COSINE))
+    fault = np.maximum(off / _EYE_TOLERANCE, (1 - np.minimum(*cosines)) / (1 - _MIN_COSINE))
     if fault.max() > 1:
         raise DamagedFile(
             path,
-            f"the camera of view {fault.argmax()} stands or looks elsewhere than Kato's (distance 2.732, elevation "
-            "30, azimuth -15 degrees per view), or is rolled or mirrored: another set of views is not read",
+            f"the camera of view {fault.argmax()} is not Kato's (distance 2.732, elevation 30, azimuth -15 degrees per "
+            "view, neither rolled nor mirrored); other views are not read",
         )
     return to_object

@@ -1,23 +1,23 @@
-"""The renderings of Kar et al. 2017 (LSM): objects of ShapeNet from 20 viewpoints drawn at random.
+"""The renderings of Kar et al. 2017 (LSM): objects of ShapeNet from 20 random viewpoints.
 
-- `splits.json` of the LSM code, laid beside the data: {synset: {"name": .., "train": [id, ..], "val": .., "test": ..}}.
+- `splits.json` of the LSM code, beside the data: {synset: {"name": .., "train": [id, ..], "val": .., "test": ..}}.
 - `renders/{synset}/{id}/render_0.png` .. `render_19.png`, 224x224, and `depth_0.png` .., white as background.
-- `renders/{synset}/{id}/view.txt`: a row per render: azimuth (-180 .. 180 degrees), elevation (-20 .. 40), a column
-  that is not used, distance of the camera.
+- `renders/{synset}/{id}/view.txt`: a row per render: azimuth (-180 .. 180 degrees), elevation (-20 .. 40), an unused
+  column, distance of the camera.
 - `voxels/modelVoxels32/{synset}/{id}.mat`: the array 'Volume' [32, 32, 32].
 
 Deviations from the published code of Peng et al. 2020 are marked (*):
 
 - Cameras are `nmr.points_from_angles(distance, elevation, azimuth)` with a HALF field of view of 14.9314 degrees
   (atan(16 / 60): a 60 mm lens on a 32 mm sensor), the published renderer's viewing_angle.
-- The mask is depth < 250 in 8 bits (the high byte of 16-bit files, as OpenCV converts them); without a depth file, the
-  alpha channel of the render (*).
-- Colours stay as they are, over white; their order is R, G, B, not OpenCV's (*).
-- 224 -> 64 pixels by the mean over each pixel's area, for colours and mask alike, so that the mask has soft borders.
-  skimage.transform.resize(anti_aliasing=True), which the published code calls, is a little softer (*).
-- Training uses render 0 of each object alone (single view), validation and test use all 20, or as many as view.txt of
-  the first object has rows; `views_per_object`.
-- Three objects whose renders are broken are left out, as by Kato and Harada 2019 (*).
+- The mask is depth < 250 in 8 bits (the high byte of 16-bit files, as OpenCV converts them). If there is no depth file,
+  it is the alpha channel of the render (*).
+- Colours are not inverted, over white; their order is R, G, B, not OpenCV's (*).
+- Colours and mask are reduced from 224 to 64 pixels by the mean over each pixel's area, so the mask has soft borders.
+  skimage.transform.resize(anti_aliasing=True) of the published code is a little softer (*).
+- Training uses render 0 of each object alone (single view). Validation and test use as many renders as view.txt of the
+  first object has rows, 20 at most. `views_per_object` changes both.
+- Three objects with broken renders are skipped, as by Kato and Harada 2019 (*).
 """
 
 from __future__ import annotations
@@ -62,9 +62,8 @@ def load(
 ) -> ViewDataset | None:
     """Read a split. View classes are cells of azimuth and elevation, see `VIEW_BINS`.
 
-    image_size: side of the images in pixels, 64 or up to 224. The masks to be matched have 64 pixels in any case.
-    views_per_object: use the first 1 .. 20 renders of each object; None: 1 for training, all for the other splits and
-    if the findings are not strict.
+    image_size: side of the images in pixels, up to 224; masks always have 64. views_per_object: use the first 1 .. 20
+    renders of each object; None: 1 for training, all for the other splits and if the findings are not strict.
     """
     if views_per_object is not None and not 1 <= views_per_object <= NUM_RENDERS:
         raise ValueError(f"views_per_object must lie in 1 .. {NUM_RENDERS}, got {views_per_object}")
@@ -94,7 +93,7 @@ def load(
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
-    """The categories (synset ids) that are listed and whose renders are there, and the splits of each."""
+    """The listed categories (synset ids) with renders, and the splits of each."""
     return {
         synset: tuple(split for split in SPLITS if entry.get(split))
         for synset, entry in sorted(read_splits(Path(folder)).items())
@@ -103,7 +102,7 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 
 def read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
-    """splits.json of a folder."""
+    """Read splits.json of a folder: synset -> split -> ids. Raises MissingFile and DamagedFile."""
     path = folder / "splits.json"
     content = read_bytes(path, limits.JSON_BYTES, _LISTS)
     try:
@@ -118,7 +117,7 @@ def read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
 
 
 def _rows(path: Path) -> int:
-    """Number of rows of a table, 20 at most."""
+    """Number of rows of a table, or 20 if it has more."""
     lines = read_bytes(path, limits.TABLE_BYTES, _TABLE).splitlines()
     return min(NUM_RENDERS, sum(bool(line.strip()) for line in lines))
 

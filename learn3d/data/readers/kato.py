@@ -1,6 +1,4 @@
-"""Kato's data protocol: 24 views per object, 64x64, kept in two npz files per category and split.
-
-The oddities that this module hides (Kato et al. 2018):
+"""Kato's layout (Kato et al. 2018): 24 views of each object, 64x64, in two npz files per category and split.
 
 - Files are `{synset}_{split}_images.npz`, uint8 [N, 24, 4, 64, 64], and `{synset}_{split}_voxels.npz`, bool
   [N, 32, 32, 32]; each holds the single array 'arr_0'.
@@ -30,7 +28,7 @@ from learn3d.data.conventions import (
 from learn3d.data.dataset import SPLITS, ViewDataset
 from learn3d.files import npz
 from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile
-from learn3d.files.sandbox import Call, read_all
+from learn3d.files.sandbox import read
 
 PROPERTIES = LayoutProperties(voxels=True, convention=KATO, inverted=True)
 
@@ -51,7 +49,7 @@ def load(folder: Path | str, category: str, split: str, *, findings: Findings = 
     """Read a split. Sample `object * 24 + view` is one view of one object; the view classes are the 24 views."""
     paths = split_paths(folder, category, split)
     images = findings.attempt(_read, paths[0], "images", category, split, None)
-    # Grids are mostly zeros, and no expansion would be suspect: they are as many as the images.
+    # Grids are mostly zeros, so their compression ratio is no sign of a zip bomb: the number of images bounds them.
     voxels = findings.attempt(_read, paths[1], "voxels", category, split, None if images is None else len(images))
     if images is None or voxels is None:
         return None
@@ -62,13 +60,13 @@ def load(folder: Path | str, category: str, split: str, *, findings: Findings = 
             findings.warn(paths[1], f"the grid of object {index} is empty")
     if len(images) != len(voxels) or not len(images):
         counts = f"{len(images)} objects and {paths[1].name} {len(voxels)}"
-        raise DamagedFile(paths[0], f"holds {counts}; expected as many, and at least one: fetch or make both again")
+        raise DamagedFile(paths[0], f"holds {counts}; expected equal numbers above 0: fetch or make both again")
     findings.objects = len(images)
     return from_arrays(images, voxels, category, split)
 
 
 def from_arrays(images: np.ndarray, voxels: np.ndarray | None, category: str, split: str) -> ViewDataset:
-    """The data set of images uint8 [N, 24, 4, 64, 64] and voxels bool [N, 32, 32, 32], as the files hold them."""
+    """The data set of images uint8 [N, 24, 4, 64, 64] and voxels bool [N, 32, 32, 32], in the files' conventions."""
     count = len(images)
     view_ids = np.tile(np.arange(NUM_VIEWS), count)
     return ViewDataset(
@@ -97,7 +95,7 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 
 def _read(path: Path, kind: str, category: str, split: str, count: int | None) -> np.ndarray:
-    """The array of one file, of `count` objects at most if that is known."""
+    """The array of one file. count: largest number of objects; None if unknown."""
     if not path.is_file():
         names = {synset: name for name, synset in SYNSETS.items()}
         there = [f"{names.get(prefix, prefix)} {s}" for prefix, splits in contents(path.parent).items() for s in splits]
@@ -108,9 +106,8 @@ def _read(path: Path, kind: str, category: str, split: str, count: int | None) -
         )
     dtype, shape = _ARRAYS[kind]
     wanted = f"an npz file with {dtype} [N, {', '.join(map(str, shape))}] under the key '{_KEY}' and no pickled objects"
-    most = None if count is None else count * math.prod(shape) * dtype.itemsize
-    ((array,),) = read_all([[Call(npz.read, path, (_KEY, most), wanted)]])
-    array = STRICT.take(array)
+    max_bytes = None if count is None else count * math.prod(shape) * dtype.itemsize
+    array = read(npz.read, path, _KEY, max_bytes, wanted=wanted)
     if (array.dtype, array.shape[1:]) != (dtype, shape) or not array.shape:
         raise DamagedFile(path, f"the {kind} file must be {wanted}, got {array.dtype} {list(array.shape)}")
     return array

@@ -1,18 +1,15 @@
 """Pascal3D+ as packed by Kato and Harada 2019 (view prior learning, VPL): real photographs with approximate 3D models.
 
-The oddities that this module hides:
-
 - Files are `{aeroplane,car,chair}_{train,val,imagenet}.npz`; training uses train and imagenet. There is no test split:
-  both papers report on val, and so "test" is val here.
-- `images` is an object array of uint8 [H, W, 3], pickled by Python 2: see `files.npz`. The network sees the object's
-  box, padded by 15 % a side, clipped to the image and stretched to a square; in training each side moves by up to 15 %
-  more or less (the augmentation "crop").
-- `images_ref` uint8 [N, 224, 224, 4] is the crop whose fourth channel is the silhouette to be matched; it never moves.
-  The published code of Peng et al. 2020 takes every 3.5th pixel of it to get 64x64.
+  both papers report on val, so "test" is val here.
+- `images` is an object array of uint8 [H, W, 3], pickled by Python 2, see `files.npz`. The input of the network is the
+  object's box, padded by 15 % a side, clipped to the image and stretched to a square. In training each side moves by up
+  to 15 % more or less (the augmentation "crop").
+- The fourth channel of `images_ref` uint8 [N, 224, 224, 4] is the ground truth silhouette of the crop without that
+  augmentation. The published code of Peng et al. 2020 takes every 3.5th pixel of it to get 64x64.
 - Cameras are orthographic: v' = R v. VPL's rasterizer turns images upside down AND left-right in the end, so x' points
   LEFT in the image. Here, as everywhere, x' points right: the stored rotation is mirrored once, in `poses`.
-- VPL moves depths by 1 + 1e-5 and draws from 0.1 on, so that z' < -0.9 is cut off; `RotationPoses` draws all that VPL
-  draws, and what lies in front of that, too.
+- VPL adds 1 + 1e-5 to depths and draws from depth 0.1 on, which cuts off z' < -0.9. `RotationPoses` cuts nothing off.
 - Objects lie in [-1, 1], upright and mirror-symmetric about z = 0. Voxels are 32^3 over the same box.
 """
 
@@ -47,13 +44,13 @@ _CELLS = 360 // CELL_DEG
 _OTHER_NAMES = {"airplane": "aeroplane", "02691156": "aeroplane", "02958343": "car", "03001627": "chair"}
 _X_RIGHT = np.diag([-1.0, 1.0, 1.0])
 _WANTED = "an npz file of Pascal3D+ as packed by the authors of view prior learning"
-_SHAPES = {  # of one item of the arrays beside `images`
+_SHAPES = {  # other arrays -> shape of an item
     "images_ref": (IMAGE_SIZE, IMAGE_SIZE, 4),
     "bounding_boxes": (4,),
     "rotation_matrices": (3, 3),
     "voxels": (VOXEL_SIZE,) * 3,
 }
-_ROTATION_BYTES = 200_000 * 72  # of a file at most; Pascal3D+ has 5,000 photographs
+_ROTATION_BYTES = 200_000 * 72  # largest size of a file's rotations; Pascal3D+ has 5,000 photographs
 
 
 class _File(NamedTuple):
@@ -71,9 +68,9 @@ def load(
 ) -> ViewDataset | None:
     """Read a split ("test" is val); each photograph is an object of its own.
 
-    image_size: side of the network's images, 224 in both papers. View classes are the 45-degree cells of the rotation
-    (`rotation_cells`) that occur in training; a photograph in another cell gets the class of the training photograph
-    with the nearest rotation. Only the MMD depends on it.
+    image_size: side of the network's images in pixels, 224 in both papers. View classes are the 45-degree cells of the
+    rotation (`rotation_cells`) with training photographs. Another photograph gets the class of the training photograph
+    with the nearest rotation; only the MMD depends on it.
     """
     paths = _paths(folder, category, split)
     sizes = {key: 8 * int(np.prod(shape)) for key, shape in _SHAPES.items()}
@@ -112,10 +109,10 @@ def poses(rotations: np.ndarray) -> RotationPoses:
 
 
 def rotation_cells(rotations: np.ndarray) -> np.ndarray:
-    """45-degree cells of the Euler angles about y, then z, then x (scipy's 'yzx'), int64 [M] in 0 .. 511.
+    """45-degree cells of the Euler angles about y, then z, then x (scipy's 'yzx'): int64 [M] in 0 .. 511.
 
-    Angles are rounded to a thousandth of a degree first: many are 0, at which two cells meet, and the noise of float32
-    would choose between them in the published code.
+    Angles are first rounded to a thousandth of a degree. Many are 0, the border of two cells, and in the published code
+    rounding errors of float32 choose the cell.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Gimbal lock")
@@ -125,7 +122,7 @@ def rotation_cells(rotations: np.ndarray) -> np.ndarray:
 
 
 def view_classes(rotations: np.ndarray, training: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Class int64 [M] in 0 .. K-1 of each rotation and the K names: the cells that `training` [T, 3, 3] occupies."""
+    """Class int64 [M] in 0 .. K-1 of each rotation [M, 3, 3], and the K names. Classes are cells of `training`."""
     # The trace of A^T B grows as the angle between the rotations A and B falls.
     flat, training_flat = rotations.reshape(-1, 9), training.reshape(-1, 9)
     ids, kept = training_classes(rotation_cells(rotations), flat, rotation_cells(training), training_flat)
@@ -143,7 +140,7 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 
 def class_name(category: str) -> str:
-    """The name of a category in Pascal3D+, of that name, one of Kato's or a synset id; ValueError for others."""
+    """The name of a category in Pascal3D+, from this name, Kato's name or the synset id; ValueError for others."""
     name = _OTHER_NAMES.get(category, category)
     if name not in CATEGORIES:
         raise ValueError(f"Pascal3D+ has the categories {', '.join(CATEGORIES)}; got {category!r}")
@@ -157,9 +154,9 @@ def _paths(folder: Path | str, category: str, split: str) -> list[Path]:
 
 
 def _parse(path: Path, found: Any, findings: Findings) -> _File:
-    """A file of the arrays read from it, checked."""
+    """Check the arrays of a file."""
     images, *arrays = STRICT.take(found)
-    if isinstance(images, tuple):  # all images one after the other, and their shapes
+    if isinstance(images, tuple):  # concatenated images and their shapes, see `npz.read_ragged`
         flat, shapes = images
         parts = np.split(flat, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]) if shapes else []
         images = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
@@ -196,7 +193,7 @@ def _check_rotations(path: Path, rotations: np.ndarray, findings: Findings) -> N
 
 
 def _training_rotations(path: Path) -> np.ndarray:
-    """The rotations of a file alone, float64 [N, 3, 3]."""
+    """Read only the rotations of a file: float64 [N, 3, 3]."""
     rotations = read(npz.read, path, "rotation_matrices", _ROTATION_BYTES, wanted=_WANTED)
     if rotations.ndim != 3 or rotations.shape[1:] != (3, 3):
         raise DamagedFile(path, f"rotation_matrices must be [N, 3, 3], got {list(rotations.shape)}")
@@ -205,6 +202,6 @@ def _training_rotations(path: Path) -> np.ndarray:
 
 
 def _nearest(masks: np.ndarray, size: int) -> np.ndarray:
-    """Masks uint8 [M, S, S] at another size, pixel by pixel, as torch.nn.functional.interpolate does by default."""
+    """Resize masks uint8 [M, S, S] by nearest neighbour, as torch.nn.functional.interpolate does by default."""
     rows = np.arange(size) * masks.shape[1] // size
     return masks[:, rows[:, None], rows]

@@ -1,11 +1,11 @@
 """Your own photographs: a folder with images, masks and a table of camera poses.
 
-    mug/poses.csv      one row per photograph: file, azimuth_deg, elevation_deg, distance, fov_deg, and perhaps
+    mug/poses.csv      one row per photograph: file, azimuth_deg, elevation_deg, distance, fov_deg, and optionally
                        object, split
     mug/images/*.jpg   the photographs; PNG files with transparency need no mask
-    mug/masks/*.png    white where the object is, named like its photograph
+    mug/masks/*.png    masks with a white object, named like the photographs
 
-`docs/your-own-category.md` says how angles and distances are counted, with a drawing.
+`docs/your-own-category.md` defines angles and distances with a drawing.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from learn3d.settings import checked
 PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("image_size", "progress"))
 AZIMUTH_WIDTHS_DEG = (15, 20, 30, 45, 60, 90)
 ELEVATION_WIDTH_DEG = 20
-PHOTOS_PER_CLASS = 8  # on average, at least: fewer tell a discriminator nothing
-_SCALE_ODD = 1.7  # factor of the objects' size that is worth a warning: half an angle for a whole one makes 2
-_SCALE_OFF = 5.0  # factor that shows that distances are in another unit
+PHOTOS_PER_CLASS = 8  # smallest mean number of photographs per view class
+_SCALE_ODD = 1.7  # factor between sizes in images and table that gives a warning; half angles for whole ones give 2
+_SCALE_OFF = 5.0  # factor that is an error: distances are in another unit
 TABLE = "poses.csv"
 NUMBERS = ("azimuth_deg", "elevation_deg", "distance", "fov_deg")
 OPTIONAL = ("object", "split")
 _WANTED = f"a table of photographs with the columns file, {', '.join(NUMBERS)}, and perhaps {', '.join(OPTIONAL)}"
-VAL_SHARE, TEST_SHARE = 0.1, 0.2  # of the objects, if the table does not say which split they are in
+VAL_SHARE, TEST_SHARE = 0.1, 0.2  # shares of the objects if the table has no splits
 
 
 @checked
@@ -73,11 +73,11 @@ def load(
 ) -> ViewDataset | None:
     """Read a split of the photographs in `folder/category`.
 
-    Images have Kato's form (`framing`), so that methods and presets made for renderings take them. View classes are
-    the cells of azimuth and elevation (`choose_bins`) that training photographs occupy; another photograph gets the
-    class of the training photograph with the nearest direction.
+    image_size: side of the images in pixels. They have Kato's form (`framing.frame`), for which methods and presets are
+    made. View classes are the cells of azimuth and elevation (`choose_bins`) with training photographs. Another
+    photograph gets the class of the training photograph with the nearest direction.
     """
-    synset_of(category)  # refuses a category that is no plain name: it would lead to other folders
+    synset_of(category)  # raises ValueError for a path, which would lead to other folders
     table = Path(folder) / category / TABLE
     photos = read_table(table, findings)
     splits = split_objects(table, photos)
@@ -93,7 +93,7 @@ def load(
         if isinstance(result, Exception):
             result = type(result)(result.path, f"{result.message} ({TABLE}, line {photo.line})")
         elif result.touches_border:
-            findings.warn(photo.file, "its object touches the border; what lies outside counts as empty")
+            findings.warn(photo.file, "its object touches the border; parts outside the image count as empty")
         framed.append(findings.take(result))
     if chosen[0].distance is not None:
         _check_scales(table, [pair for pair in zip(chosen, framed, strict=True) if pair[1] is not None], findings)
@@ -126,17 +126,17 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     for table in sorted({path.parent / TABLE for name in (TABLE, "images") for path in Path(folder).glob(f"*/{name}")}):
         try:
             splits = set(split_objects(table, read_table(table, Findings())).values())
-        except (ValueError, OSError):  # reading a split will tell
+        except (ValueError, OSError):  # `load` raises the same fault
             splits = set()
         found[table.parent.name] = tuple(name for name in SPLITS if name in splits) or ("train",)
     return found
 
 
 def choose_bins(poses: LookAtPoses) -> AngleBins:
-    """Cells for photographs with these cameras.
+    """Cells of azimuth and elevation for photographs with these poses.
 
-    Elevations are cut in steps of about 20 degrees, azimuths in the smallest step from 15 degrees up with which an
-    occupied cell has 8 photographs on average.
+    The elevation width is about 20 degrees. The azimuth width is the smallest of AZIMUTH_WIDTHS_DEG for which occupied
+    cells have PHOTOS_PER_CLASS photographs or more on average.
     """
     elevations = torch.as_tensor(poses.elevation_deg)
     low = math.floor(float(elevations.min()))
@@ -150,7 +150,7 @@ def choose_bins(poses: LookAtPoses) -> AngleBins:
 
 
 def view_classes(poses: LookAtPoses, training: LookAtPoses) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Class int64 [M] in 0 .. K-1 of each pose and the K names: the cells that `training` occupies."""
+    """Class int64 [M] in 0 .. K-1 of each of M poses, and the K names. Classes are the cells of `training`."""
     bins = choose_bins(training)
     cells, training_cells = (bins.ids(p).numpy() for p in (poses, training))
     eyes, training_eyes = (
@@ -167,25 +167,25 @@ def _poses(photos: list[Photo]) -> LookAtPoses:
 
 
 def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], findings: Findings) -> None:
-    """Compare the objects' sizes in the photographs with those that distances and fields of view say."""
+    """Compare the objects' sizes in the photographs with those from distances and fields of view."""
     scales = [2 * f.share * p.distance * math.tan(math.radians(p.fov_deg) / 2) for p, f in pairs]
     middle = float(np.median(scales)) if scales else 1.0
-    said = f"the objects are {middle:.2g} times as large in the photographs as the table says; distance must be in "
-    said += "lengths of the object's longest side, fov_deg the full angle across the longer side"
+    message = f"the objects are {middle:.2g} times as large in the photographs as in the table; distance must be in "
+    message += "lengths of the object's longest side, fov_deg the full angle across the longer side"
     if not 1 / _SCALE_OFF < middle < _SCALE_OFF:
-        findings.take(DamagedFile(table, said))
+        findings.take(DamagedFile(table, message))
     elif not 1 / _SCALE_ODD < middle < _SCALE_ODD:
-        findings.warn(table, said)
+        findings.warn(table, message)
     for (photo, _), scale in zip(pairs, scales, strict=True):
         if not 1 / _SCALE_OFF < scale / middle < _SCALE_OFF:
-            said = f"beside the others its object is {scale / middle:.2g} times as large as line {photo.line} says"
-            findings.warn(photo.file, f"{said}; is the distance right?")
+            message = f"compared with the others, its object is {scale / middle:.2g} times as large as in the table"
+            findings.warn(photo.file, f"{message}; is the distance in line {photo.line} right?")
 
 
 def read_table(table: Path, findings: Findings) -> list[Photo]:
-    """The rows of a table that are sound; what is wrong with the others goes to the findings.
+    """The valid rows of a table; faults of the others go to the findings. Without a table, all images without poses.
 
-    Raises MissingFile, and DamagedFile for what is no such table.
+    Raises MissingFile, and DamagedFile if the file is not a table of photographs.
     """
     if not table.exists() and (table.parent / "images").is_dir():
         names = sorted(path.name for path in (table.parent / "images").iterdir() if not path.name.startswith("."))
@@ -207,14 +207,14 @@ def read_table(table: Path, findings: Findings) -> list[Photo]:
             if photo := findings.attempt(_photo, table, reader.line_num, row, masks, photos):
                 photos[photo.file] = photo
     except csv.Error as error:
-        raise DamagedFile(table, f"line {reader.line_num} is no line of a table: {error}") from None
+        raise DamagedFile(table, f"line {reader.line_num} cannot be read as CSV: {error}") from None
     return list(photos.values())
 
 
 def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
-    """The split of every object: the table's, or, ordered by a hash of the names, 20 % test, 10 % val, the rest train.
+    """The split of each object. Without splits in the table, a hash of the names selects 20 % test and 10 % val.
 
-    Raises DamagedFile if an object is in two splits or in none, or there are too few to split.
+    Raises DamagedFile if an object is in two splits or in none, or if there are too few objects to split.
     """
     given: dict[str, set[str | None]] = {}
     for photo in photos:
@@ -235,17 +235,17 @@ def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
 
 
 def _photo(table: Path, line: int, row: dict[str, Any], masks: dict[str, Path], others: Container[Path]) -> Photo:
-    """One row, checked."""
+    """Check one row of the table."""
     try:
-        if None in row or None in row.values():  # csv.DictReader's marks of a row of another length
-            raise ValueError("it has another number of values than there are columns")
+        if None in row or None in row.values():  # csv.DictReader marks too long and too short rows with None
+            raise ValueError("it has more or fewer values than there are columns")
         values = {name: value.strip() for name, value in row.items()}
         name = Path(values["file"].removeprefix("images/"))
         if not name.name or name.is_absolute() or ".." in name.parts or "\0" in str(name):
             raise ValueError(f"it must name a file in images/, got {values['file']!r:.80}")
         file = table.parent / "images" / name
         if file in others:
-            raise ValueError(f"{file.name} is in another line already")
+            raise ValueError(f"{file.name} is in two lines")
         return Photo(
             line=line,
             file=file,

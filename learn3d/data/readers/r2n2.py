@@ -1,21 +1,21 @@
-"""The renderings of 3D-R2N2 (Choy et al. 2016): objects of ShapeNet from 24 viewpoints drawn at random.
+"""The renderings of 3D-R2N2 (Choy et al. 2016): objects of ShapeNet from 24 random viewpoints.
 
-- `ShapeNetRendering/{synset}/{id}/rendering/00.png` .. `23.png`, RGBA, 137x137. The published network crops 127x127 of
-  it at random; here the whole image is taken, so that one field of view holds for all. Colours stay, over white.
+- `ShapeNetRendering/{synset}/{id}/rendering/00.png` .. `23.png`, RGBA, 137x137. The published network uses random crops
+  of 127x127; here whole images are used, so that all have one field of view. Colours are not inverted, over white.
 - `.../rendering/rendering_metadata.txt`: a row per image: azimuth (0 .. 360 degrees), elevation (25 .. 30), yaw (0),
   ratio of the distance (0.65 .. 0.95), field of view (25).
 - `ShapeNetVox32/{synset}/{id}/model.binvox`: 32^3 cells.
 - Split as published: ids sorted, the first 80 % for training, the rest for test. There is no validation split.
 
-Cameras. The distance is 1.75 times the ratio, in units of the mesh. The camera is Blender's default one, a 35 mm lens
-on a 32 mm sensor: half of the field of view is atan(16 / 35), 24.567 degrees. (The table's 25 was handed to the
-rendering code only.) In the mesh's frame (y up) the eye is at d (cos e cos a, sin e, cos e sin a), so that in the
-object frame, (-z, y, -x) of the mesh, the azimuth of `nmr.points_from_angles` is -a.
+Cameras. The distance is 1.75 times the ratio, in units of the mesh. The camera is Blender's default, a 35 mm lens on a
+32 mm sensor: half the field of view is atan(16 / 35), 24.567 degrees. The 25 in the table has no effect on it. In the
+mesh's frame (y up) the eye is at d (cos e cos a, sin e, cos e sin a). So in the object frame, (-z, y, -x) of the mesh,
+the azimuth of `nmr.points_from_angles` is -a.
 
-Voxels. binvox keeps the axes (x, y, z) of the mesh. The header says which cube of the mesh's frame the grid spans; the
-object frame of each object is scaled by that cube's side, which makes it 1 (distances are divided by it). The headers
-of the published archive are believed to read 1 throughout, whatever the size of the mesh that was rendered. If so,
-predictions and voxels differ in size: compare no figure of IoU on this data set with one on another.
+Voxels. Grids have the axes (x, y, z) of the mesh. The binvox header has the side of the grid's cube. Each object frame
+is scaled so that this side is 1; distances are divided by it. The headers of the published archive are believed to have
+the side 1 for meshes of any size. If so, predictions and voxels differ in size: do not compare IoUs on this data set
+with those on another.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from learn3d.files import geometry, renderings
 from learn3d.files.reading import STRICT, DamagedFile, Findings
 from learn3d.files.sandbox import Call
 
-#: binvox's grids: axes (-z, y, -x) of the object frame, backwards. They span the cube that binvox fits to the object.
+#: binvox grids have the axes (-z, y, -x) of the object frame, and span the cube in the header.
 R2N2 = VoxelConvention("r2n2", swap=(1, 3), flip=(1, 3), kato18_scale=INNER)
 PROPERTIES = LayoutProperties(
     voxels=True, convention=R2N2, inverted=False, validation=False, options=("image_size", "progress")
 )
 NUM_RENDERS = 24
-DISTANCE = 1.75  # of the ratio 1
+DISTANCE = 1.75  # distance of the camera at ratio 1
 HALF_FOV_DEG = math.degrees(math.atan(16 / 35))
-VIEW_BINS = "15x5:25:30"  # K = 24: elevations differ by five degrees only
+VIEW_BINS = "15x5:25:30"  # K = 24: all elevations share one cell
 SPLITS = ("train", "test")
 _TABLE = "a row per image: azimuth, elevation, yaw, ratio of the distance, field of view"
 
@@ -57,7 +57,7 @@ def load(
 ) -> ViewDataset | None:
     """Read a split, "train" or "test". View classes are cells of azimuth and elevation, see `VIEW_BINS`.
 
-    image_size: side of the images in pixels, up to 137. The masks to be matched have 64 pixels in any case.
+    image_size: side of the images in pixels, up to 137; masks always have 64.
     """
     if split not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}; got {split!r}")

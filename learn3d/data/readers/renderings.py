@@ -1,4 +1,4 @@
-"""What the readers of renderings share: objects of several files each, read at once and joined to arrays."""
+"""Shared functions of the readers kar, r2n2 and dvr: read the files of many objects, and join them to arrays."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from learn3d.files.sandbox import Call, read_all
 class ObjectFiles(NamedTuple):
     """The files of one object, as calls of the sandbox."""
 
-    folder: Path  # that must be there
+    folder: Path  # it must exist
     cameras: Call
     shape: Call  # voxels or points
-    views: list[Call]  # each results in an image uint8 [4, S, S], a mask uint8 [64, 64] and the mask's largest value
+    views: list[Call]  # each returns an image uint8 [4, S, S], a mask uint8 [64, 64] and the mask's largest value
 
 
 class Objects(NamedTuple):
@@ -35,8 +35,8 @@ class Objects(NamedTuple):
 
     images: np.ndarray  # uint8 [N * V, 4, S, S]
     masks: np.ndarray | None  # uint8 [N * V, 64, 64]; None: the images' fourth channel
-    poses: list[np.ndarray]  # N of the first results of `build`
-    shapes: list[np.ndarray]  # N of the second results
+    poses: list[np.ndarray]  # N first results of `build`
+    shapes: list[np.ndarray]  # N second results of `build`
 
 
 def read_objects(
@@ -47,10 +47,10 @@ def read_objects(
     findings: Findings,
     progress: str = "",
 ) -> Objects | None:
-    """Read the objects of these names, all with equally many views; None if the findings are not strict.
+    """Read the objects `names`, all with the same number of views. Returns None if the findings are not strict.
 
-    `build` makes poses and shape of an object from the results of its calls, or raises a DamagedFile. progress: title
-    of a progress bar; "" for none.
+    build: returns the poses and the shape of an object from the results of its calls `cameras` and `shape`, or raises
+    DamagedFile. progress: title of a progress bar; "" for none.
     """
     findings.objects, asked = len(names), deque()
 
@@ -98,9 +98,9 @@ def join_objects(
     view_bins: str,
     convention: VoxelConvention,
 ) -> ViewDataset | None:
-    """The data set of objects with voxels, seen by one kind of camera from sides of their own; None if objects is None.
+    """The data set of objects with voxels and look-at poses; None if objects is None. Colours are not inverted.
 
-    view_bins: view classes as `AngleBins.parse` takes them. Colours are as they are, not inverted.
+    view_bins: cells of the view classes, see `AngleBins.parse`.
     """
     if objects is None:
         return None
@@ -123,7 +123,7 @@ def join_objects(
 
 
 def check_poses(path: Path, poses: np.ndarray, wanted: str) -> np.ndarray:
-    """Poses float64 [V, 3] (azimuth, elevation, distance) as they are. Raises DamagedFile if one cannot be."""
+    """Return poses float64 [V, 3] (azimuth, elevation, distance). Raises DamagedFile if one is out of range."""
     sound = LookAtPoses(*torch.from_numpy(poses.T), 15.0).in_range().numpy()
     if not sound.all():
         k = int(sound.argmin())
@@ -134,7 +134,7 @@ def check_poses(path: Path, poses: np.ndarray, wanted: str) -> np.ndarray:
 
 
 def category_folder(folder: Path, category: str) -> Path:
-    """The folder of a category (name or synset id) below `folder`; a MissingFile says which there are."""
+    """The folder of a category (name or synset id) in `folder`. Raises MissingFile with the existing ones."""
     path = folder / synset_of(category)
     if not path.is_dir():
         found = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
@@ -143,9 +143,9 @@ def category_folder(folder: Path, category: str) -> Path:
 
 
 def check_lists(path: Path, lists: dict[str, list[str]], split: str, findings: Findings) -> list[str]:
-    """The ids of objects that a split lists; `lists` has those of all splits, `path` is the file that says so.
+    """The ids of the objects of a split. lists: split -> ids. path: file of the lists, for messages.
 
-    Raises DamagedFile if there is none, or one that is no plain name of a folder.
+    Raises DamagedFile if there are no ids, or if one is not a plain name of a folder.
     """
     ids = lists.get(split, [])
     if not ids:

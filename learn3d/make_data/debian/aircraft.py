@@ -16,22 +16,22 @@ AIRCRAFT_PACKAGE = "flightgear-data-ai"
 FOLDER = "usr/share/games/flightgear/AI/Aircraft/"
 
 NOT_AIRPLANES = re.compile(r"balloon|ferry|ship|heli|vehicle|truck|bluebird|shuttle|flash2a", re.IGNORECASE)
-# Files that hold a part of an aircraft: by their folder or their stem.
+# Names of folders and stems of files that hold a part of an aircraft.
 PART_FOLDERS = re.compile(r"^(lights?|refuel\w*)$", re.IGNORECASE)
 PART_STEMS = re.compile(
     r"light(?!ning)|flare|^flash$|beacon|strobe|toggle|^nav[lr]?$|navback|taxi$|wheel|tank|probe|refuel|exhaust|banner|pilot|"
     r"engine|gear|ssme|oms",
     re.IGNORECASE,
 )
-# Objects inside a file that stand for motion, light or smoke, or for the pilot: left out by name.
+# Names of objects in a file that draw motion, light or smoke, or the pilot; they are skipped.
 EFFECTS = re.compile(
     r"prop.*dis[ck]|prplr-disk|disque.?helice|giro.?helice|(?<!ou)blur|prop.*(fast|slow)|(fast|slow)prop|"
     r"halo|glow|flare|^flash\d*$|recog$|flame|burner|cond?ens|chute$|light-?cone|banner|noshadow|"
     r"^pilot($|[-_])|helmet",
     re.IGNORECASE,
 )
-DISC_DIAMETER = 0.09  # of the longest side: a flat disc across the flight direction that wide is a propeller disc
-DETACHED = 2e-3  # of the longest side: a lone quadrilateral that far from every other vertex is drawn light or vapour
+MIN_DISC = 0.09  # diameter of a propeller disc over the longest side of the airplane
+DETACHED = 2e-3  # distance, over the longest side, at which a quadrilateral is not joined to other parts
 
 
 def is_airplane_file(path: str) -> bool:
@@ -42,12 +42,12 @@ def is_airplane_file(path: str) -> bool:
     return not any(PART_FOLDERS.match(name) for name in folders) and not PART_STEMS.search(stem)
 
 
-def without_effects(parts: list[Part]) -> list[Part]:
-    """The parts less propeller discs and lone quadrilaterals, which draw motion, light or vapour by their texture.
+def remove_effects(parts: list[Part]) -> list[Part]:
+    """The parts without propeller discs and detached quadrilaterals: textures on them draw motion, light or vapour.
 
-    A disc (or the square it is drawn on) is a part whose depth along the flight direction x is under 3 % of its
-    diameter, of round or square outline, and wider than DISC_DIAMETER of the whole. A lone quadrilateral is a part of
-    one or two triangles that no other part comes near (DETACHED), except its own other side at the same place.
+    A disc, or the square with its texture, is a part with a round or square outline that is wider than MIN_DISC. Its
+    depth along the flight direction x is below 3 % of its diameter. A detached quadrilateral is a part of one or two
+    triangles farther than DETACHED from all others, except from its own reverse side.
     """
     corners = [part.vertices[np.unique(part.faces)] for part in parts]
     size = np.ptp(np.concatenate(corners), axis=0).max()
@@ -57,7 +57,7 @@ def without_effects(parts: list[Part]) -> list[Part]:
         triangles = parts[index].vertices[parts[index].faces]
         area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
         flat = x < 0.03 * max(y, z) and min(y, z) > 0.8 * max(y, z) and area.sum() / 2 > 0.55 * y * z
-        return flat and max(y, z) > DISC_DIAMETER * size
+        return flat and max(y, z) > MIN_DISC * size
 
     def is_alone(index: int) -> bool:
         middle = corners[index].mean(axis=0)
@@ -71,7 +71,7 @@ def without_effects(parts: list[Part]) -> list[Part]:
 def aircraft_models(files: Mapping[str, bytes]) -> Iterator[Candidate]:
     """The airplanes among the files of the package, by path."""
     texts = {p.removeprefix(FOLDER): text.decode("latin-1") for p, text in files.items() if p.startswith(FOLDER)}
-    authors: dict[tuple[str, str], str] = {}  # of a folder and the name of a model in it
+    authors: dict[tuple[str, str], str] = {}  # (folder, name of a model file in it) -> author
     for path, text in texts.items():
         if path.endswith(".xml") and (author := re.search(r"<author>([^<]+)</author>", text)):
             name = " ".join(author[1].split())
@@ -92,7 +92,7 @@ def aircraft_models(files: Mapping[str, bytes]) -> Iterator[Candidate]:
 
 
 def _read_aircraft(text: str) -> Part:
-    parts = without_effects(read_ac3d(text, skip=EFFECTS.search))
+    parts = remove_effects(read_ac3d(text, skip=EFFECTS.search))
     vertices, faces = trimesh.util.append_faces(*zip(*parts, strict=True))
-    # FlightGear's frame (nose -x, y up, left wing +z) to the frame of the furniture: front +z, y up, left +x
+    # from FlightGear's frame (nose -x, y up, left wing +z) to front +z, y up, left +x
     return Part(np.stack([vertices[:, 2], vertices[:, 1], -vertices[:, 0]], axis=1), faces)

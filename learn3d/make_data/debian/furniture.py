@@ -19,8 +19,7 @@ from learn3d.make_data.debian.packages import Candidate, Part, read_obj
 
 FURNITURE_PACKAGES = ("sweethome3d-furniture", "sweethome3d-furniture-nonfree")  # the second is optional
 
-# The first rule whose words occur in the English name of the catalogue gives the category; None leaves the piece out.
-# Each pattern is searched in "name" as written in the catalogue, lower case.
+# The first pattern found in an entry's English name, in lower case, gives its category; None skips the entry.
 FURNITURE_RULES: tuple[tuple[str, str | None], ...] = (
     (r"\b(switch|racket|bat|fan|freezer|wheelchair|ottoman|swinging|opened|skylight|tablet|flashlight)\b", None),
     (r"\b(knife|towel|clothes|hat|cd|wine|speech) .*\b(stand|rack|unit)\b|washbasin|changing table|extension", None),
@@ -34,21 +33,21 @@ FURNITURE_RULES: tuple[tuple[str, str | None], ...] = (
     (r"\b(cabinet|cupboard|wardrobe|bookcase|dresser|sideboard|locker|commode|chest|closet)\b", "cabinet"),
     (r"\b(drawers?|shelves|bookshelves|shelving|shelf|rack)\b", "cabinet"),
 )
-# Models that do not look like their names: two beds' bedside ends, a bathroom with its basin, two boards on a wall.
-MISFITS = ("comodinoSinistro", "comodinoSinistroCiliegio", "bathroomFurniture", "shelving")
-FURNITURE_SECTIONS_LEFT_OUT = ("Characters", "Doors and windows", "Staircases", "Vehicles")
+# Models with misleading names: two bedside ends of beds, a bathroom with its basin, two boards on a wall.
+SKIPPED_MODELS = ("comodinoSinistro", "comodinoSinistroCiliegio", "bathroomFurniture", "shelving")
+SKIPPED_SECTIONS = ("Characters", "Doors and windows", "Staircases", "Vehicles")
 
 
 def furniture_category(name: str, section: str = "") -> str | None:
-    """Category of a catalogue entry from its English name and the section it is listed in; None if it has none."""
-    if section in FURNITURE_SECTIONS_LEFT_OUT:
+    """Category of a catalogue entry from its English name and its section; None if the entry is skipped."""
+    if section in SKIPPED_SECTIONS:
         return None
     return next((category for pattern, category in FURNITURE_RULES if re.search(pattern, name.lower())), None)
 
 
 def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
     """The general properties and the entries (`key#N`, in the order of N) of a Sweet Home 3D furniture catalogue."""
-    entries: defaultdict[int, dict[str, str]] = defaultdict(dict)  # the general ones under 0
+    entries: defaultdict[int, dict[str, str]] = defaultdict(dict)  # N -> entry; general properties under 0
     for key, number, value in re.findall(r"^\s*(\w+)(?:#(\d+))?\s*=[^\S\n]*(.*)$", text, re.MULTILINE):
         value = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value).strip()
         entries[int(number or 0)][key] = value
@@ -81,7 +80,7 @@ def furniture_models(files: Mapping[str, bytes]) -> Iterator[Candidate]:
         for entry in entries:
             model = PurePosixPath(entry.get("model", "").removeprefix("/"))
             category = furniture_category(entry.get("name", ""), entry.get("category", ""))
-            if category is not None and model.stem not in MISFITS:
+            if category is not None and model.stem not in SKIPPED_MODELS:
                 yield Candidate(
                     category=category,
                     title=entry["name"],
@@ -97,6 +96,6 @@ def _read_furniture(archive: zipfile.ZipFile, model: str, entry: Mapping[str, st
     if not model.lower().endswith(".obj"):
         raise ValueError("only OBJ models are read")
     if model not in archive.namelist():
-        raise ValueError("its catalogue does not hold it")
+        raise ValueError("the model is missing in its catalogue")
     vertices, faces = read_obj(archive.read(model).decode("latin-1"))
     return Part(place_furniture(vertices, entry), faces)

@@ -1,8 +1,8 @@
 """Real meshes from Debian packages: chairs, tables, cabinets, sofas, lamps (Sweet Home 3D) and airplanes (FlightGear).
 
-`fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply, welded, y up, facing +z, box centred at the origin, longest side
-1, with OUTPUT/index.csv (the source and licence of each mesh) and OUTPUT/licences (the packages' copyright files). The
-same packages give the same bytes.
+`fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply: welded, y up, front +z, box centred at the origin, longest side
+1. OUTPUT/index.csv has the source and licence of each mesh, OUTPUT/licences the packages' copyright files. The same
+packages give the same bytes.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from learn3d.files.writing import publishing
 from learn3d.make_data.debian.aircraft import AIRCRAFT_PACKAGE, aircraft_models
 from learn3d.make_data.debian.furniture import FURNITURE_PACKAGES, furniture_models
 from learn3d.make_data.debian.packages import Candidate, get_package, read_package
-from learn3d.make_data.meshes import RawMesh, checked, fit_to_box
+from learn3d.make_data.meshes import RawMesh, check, fit_to_box
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 PACKAGES = {name: furniture_models for name in FURNITURE_PACKAGES} | {AIRCRAFT_PACKAGE: aircraft_models}
-GRID = 24  # cells per side when surfaces are compared
-SAMPLES = 2_000_000  # points of surfaces in memory at a time
-DUPLICATE_IOU = 0.85  # two surfaces that overlap more are one model
+GRID = 24  # cells per side of the grids that are compared to find duplicates
+MAX_SAMPLES = 2_000_000  # surface points in memory at a time
+DUPLICATE_IOU = 0.85  # two models whose surface grids have a larger IoU are duplicates
 INDEX = ("category", "file", "title", "author", "licence", "package", "version", "source")
 INDEX += ("vertices", "faces", "watertight")  # columns of index.csv; watertight: each edge belongs to exactly two faces
 
@@ -39,35 +39,35 @@ class FetchConfig:
     """Options of `fetch_debian_models`."""
 
     output: settings.FilePath
-    """Folder to write; it must not be there yet."""
+    """Folder to write; it must not exist."""
     packages_dir: settings.FilePath | None = None
-    """Folder that keeps the .deb files; those that it lacks are downloaded (default: none is kept)."""
+    """Folder for the .deb files; missing ones are downloaded into it (default: a temporary folder)."""
 
 
 @dataclass
 class Report:
     """The outcome of `fetch_debian_models`."""
 
-    models: list[dict] = field(default_factory=list)  # rows of index.csv, a mesh each
-    dropped: dict[str, str] = field(default_factory=dict)  # the reason why a model was left out, by its source
-    notes: list[str] = field(default_factory=list)  # optional packages that were not there
+    models: list[dict] = field(default_factory=list)  # rows of index.csv, one for each mesh
+    dropped: dict[str, str] = field(default_factory=dict)  # source of each skipped model -> reason
+    notes: list[str] = field(default_factory=list)  # missing optional packages
 
     def summary(self) -> str:
-        """A few lines for a person: counts per category, reasons of those left out, notes."""
+        """Lines for the terminal: meshes per category, skipped models per reason, notes."""
         lines = [f"{name:9s}{n:5d} meshes" for name, n in Counter(row["category"] for row in self.models).items()]
         reasons = Counter(reason.split(" of ")[0] for reason in self.dropped.values())
-        return "\n".join([*lines, *(f"{n} left out: {reason}" for reason, n in reasons.most_common()), *self.notes])
+        return "\n".join([*lines, *(f"{n} skipped: {reason}" for reason, n in reasons.most_common()), *self.notes])
 
 
 def fetch_debian_models(config: FetchConfig, progress: bool = True) -> Report:
-    """Write the meshes into the output folder, which appears at once or not at all.
+    """Write the meshes into the output folder. The folder appears when it is complete.
 
-    Raises ValueError (a sentence that says what to do) for an output that is there already, and for a package that is
-    missing or damaged. A model that cannot be read is reported, not raised.
+    The report lists unreadable models and duplicates. Raises ValueError if the output exists, or if a package is
+    missing or damaged.
     """
     output, report = config.output.resolve(), Report()
     if output.exists():
-        raise ValueError(f"{config.output} is there already; remove it, or give another folder")
+        raise ValueError(f"{config.output} already exists; remove it, or give another folder")
     output.parent.mkdir(parents=True, exist_ok=True)
     with publishing(output.parent, [output.name]) as scratch:
         folder, kept = scratch / output.name, {category: {} for category in CATEGORIES}
@@ -78,7 +78,7 @@ def fetch_debian_models(config: FetchConfig, progress: bool = True) -> Report:
             except ValueError as missing:
                 if not name.endswith("-nonfree"):
                     raise
-                report.notes.append(f"done without {name}: {missing}")
+                report.notes.append(f"without the optional package {name}: {missing}")
                 continue
             files = read_package(package, (".sh3f", ".ac", ".xml", notice := f"/doc/{name}/copyright"))
             for path in [path for path in files if path.endswith(notice)]:
@@ -97,9 +97,10 @@ def fetch_debian_models(config: FetchConfig, progress: bool = True) -> Report:
 
 
 def _write_model(model: Candidate, folder: Path, kept: dict[str, list[np.ndarray]]) -> dict:
-    """Write a mesh, and return its row of index.csv. kept: surfaces in proportion and stretched to cubes, by name.
+    """Write a mesh, add its grids to `kept`, and return its row of index.csv.
 
-    Raises ValueError if it cannot be read, or is nearly one of those kept.
+    kept: name -> [surface grid, surface grid stretched to a cube] of the category's meshes. Raises ValueError if the
+    model cannot be read or is a near-duplicate of a kept one.
     """
     mesh = clean_mesh(*model.read())
     surface = [surface_grid(mesh.vertices, mesh.faces, GRID, per_axis=cube) for cube in (False, True)]
@@ -121,12 +122,12 @@ def _write_model(model: Candidate, folder: Path, kept: dict[str, list[np.ndarray
 
 
 def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
-    """The welded mesh with its box centred at the origin and its longest side 1.
+    """The welded mesh, its bounding box centred at the origin, its longest side 1.
 
-    Vertices closer than about 1e-5 of the longest side become one; faces without area, repeated faces (in whatever
-    winding) and unused vertices go. Raises ValueError if nothing solid is left or a coordinate is not finite.
+    Merges vertices closer than about 1e-5 of the longest side. Removes faces without area, repeated faces (of either
+    winding) and unused vertices. Raises ValueError if the mesh is flat or empty, or a coordinate is not finite.
     """
-    raw = checked(RawMesh(vertices, faces))
+    raw = check(RawMesh(vertices, faces))
     mesh = trimesh.Trimesh(fit_to_box(raw.vertices), raw.faces, process=False)
     mesh.merge_vertices(digits_vertex=5)
     mesh.update_faces((mesh.area_faces > 1e-12) & mesh.unique_faces())
@@ -140,9 +141,9 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
 
 
 def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: bool = False) -> np.ndarray:
-    """Cells bool [size, size, size] that the surface passes through, by samples at most a third of a cell apart.
+    """Grid bool [size, size, size] of the cells with a surface sample; samples are at most a third of a cell apart.
 
-    The box is centred in the grid and its longest side fills it; with `per_axis` each side fills it.
+    The bounding box is centred in the grid. Its longest side, or with `per_axis` each side, fills the grid.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     scale = high - low if per_axis else (high - low).max()
@@ -155,7 +156,7 @@ def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: b
         i, j = i[i + j <= count], j[i + j <= count]
         weights = np.stack([i, j, count - i - j], axis=1) / count
         chosen = corners[steps == count]
-        for part in np.array_split(chosen, 1 + len(chosen) * len(weights) // SAMPLES):
+        for part in np.array_split(chosen, 1 + len(chosen) * len(weights) // MAX_SAMPLES):
             cells = np.clip(np.floor((weights @ part).reshape(-1, 3)).astype(np.int64), 0, size - 1)
             grid[tuple(cells.T)] = True
     return grid

@@ -1,8 +1,7 @@
-"""Files out of Debian packages, without installing them, and readers of their two mesh formats: OBJ and AC3D.
+"""Reads files from Debian packages without installing them, and meshes in their formats OBJ and AC3D.
 
-Of the meshes only the geometry is read: positions and polygons, the latter cut into triangles. trimesh reads OBJ, too,
-but makes a fan of every polygon, which covers the gaps of concave ones (the backs of some chairs). It does not know
-AC3D.
+trimesh does not read AC3D. From OBJ it makes a fan of each polygon, which fills the gaps of concave polygons such as
+the backs of some chairs. These readers return positions and triangles only.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ import numpy as np
 
 
 class Candidate(NamedTuple):
-    """A model as its package has it."""
+    """A model in a package."""
 
     category: str
-    title: str  # the maker's name for it
+    title: str
     author: str
     licence: str
     source: str  # path inside the package
@@ -30,7 +29,7 @@ class Candidate(NamedTuple):
 
 
 def get_package(name: str, folder: Path) -> Path:
-    """The .deb file of a package in `folder`; if there is none, apt-get downloads it there, without being root.
+    """The .deb file of a package in `folder`. If it is missing, apt-get downloads it, which needs no root rights.
 
     Raises ValueError if apt-get fails, OSError if it is not installed.
     """
@@ -39,13 +38,13 @@ def get_package(name: str, folder: Path) -> Path:
         if result.returncode != 0:
             raise ValueError(
                 f"apt-get could not download {name} ({result.stderr.strip()}); run `apt-get update` as root, enable "
-                "the component non-free for packages of that name, or put the .deb file into the folder --packages-dir"
+                "the component non-free if the package is in it, or put the .deb file into the folder --packages-dir"
             )
     return max(folder.glob(f"{name}_*.deb"))
 
 
 def read_package(package: Path, suffixes: tuple[str, ...]) -> dict[str, bytes]:
-    """The plain files of a .deb file whose paths end in one of `suffixes`, by path without a leading /.
+    """The regular files of a .deb file whose paths (relative to /) end in one of `suffixes`: path -> content.
 
     Raises ValueError for a damaged file, OSError if dpkg-deb is not installed.
     """
@@ -53,8 +52,8 @@ def read_package(package: Path, suffixes: tuple[str, ...]) -> dict[str, bytes]:
         if subprocess.run(["dpkg-deb", "--extract", package, folder], capture_output=True).returncode != 0:
             raise ValueError(f"{package} cannot be read as a Debian package; download it again")
         found = [path for path in Path(folder).rglob("*") if path.as_posix().endswith(suffixes)]
-        plain = [path for path in found if path.is_file() and not path.is_symlink()]
-        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in plain}
+        regular = [path for path in found if path.is_file() and not path.is_symlink()]
+        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in regular}
 
 
 class Part(NamedTuple):
@@ -81,13 +80,13 @@ def read_obj(text: str) -> Part:
 def read_ac3d(text: str, skip: Callable[[str], object]) -> list[Part]:
     """Objects of an AC3D text with at least one polygon, placed by the `loc` and `rot` of their ancestors.
 
-    An object whose name `skip` accepts is left out with its children; so are lines (surface types 1 and 2).
-    Convention of FlightGear's models: nose towards -x, y up, left wing towards +z.
-    Raises ValueError if the text is not AC3D or ends too early.
+    Skips lines (surface types 1 and 2), and objects with a name that `skip` accepts, with their children. Frame of
+    FlightGear's models: nose towards -x, y up, left wing towards +z. Raises ValueError if the text is not AC3D or
+    incomplete.
     """
-    lines = (line for line in map(str.strip, text.splitlines()) if line)  # some exporters scatter blank ones
+    lines = (line for line in map(str.strip, text.splitlines()) if line)  # some exporters add blank lines
     if not next(lines, "").startswith("AC3D"):
-        raise ValueError("an AC3D file starts with AC3D")
+        raise ValueError("not an AC3D file: it does not start with AC3D")
     try:
         return list(_read_objects(lines, 1, np.eye(3), np.zeros(3), skip))
     except (RuntimeError, IndexError) as error:  # a generator turns StopIteration into a RuntimeError
@@ -97,7 +96,7 @@ def read_ac3d(text: str, skip: Callable[[str], object]) -> list[Part]:
 def _read_objects(
     lines: Iterator[str], count: int, rotation: np.ndarray, translation: np.ndarray, skip: Callable[[str], object]
 ) -> Iterator[Part]:
-    """The next `count` objects with their children; rotation [3, 3] (of row vectors) is that of their parent."""
+    """The next `count` objects with their children. The parent's frame is v @ rotation [3, 3] + translation [3]."""
     for _ in range(count):
         if not any(line.startswith("OBJECT") for line in lines):
             return
@@ -108,7 +107,7 @@ def _read_objects(
             if key == "name":
                 name = value.strip('"')
             elif key == "data":
-                next(lines)  # free text, which may look like anything
+                next(lines)  # free text, which may look like a key
             elif key == "loc":
                 shift = np.array(value.split(), dtype=np.float64)
             elif key == "rot":
@@ -138,14 +137,14 @@ def triangulate(polygons: Sequence[Sequence[int]], vertices: np.ndarray) -> np.n
     by_size: dict[int, list[Sequence[int]]] = {}
     for polygon in polygons:
         if min(polygon) < 0 or max(polygon) >= len(vertices):
-            raise ValueError(f"a polygon {polygon} names a vertex that is not there")
+            raise ValueError(f"polygon {polygon} refers to a missing vertex; there are {len(vertices)}")
         by_size.setdefault(len(polygon), []).append(polygon)
     triangles = [np.empty((0, 3), dtype=np.int64)]
     for size in sorted(by_size):
         corners = np.array(by_size[size], dtype=np.int64)  # [P, size]
         points = vertices[corners]
         points = points - points[:, :1]
-        normals = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)  # Newell's: the area's, of any polygon
+        normals = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)  # Newell's method: right for concave ones
         fan = np.stack([np.zeros(size - 2, dtype=np.int64), np.arange(1, size - 1), np.arange(2, size)], axis=1)
         areas = np.cross(points[:, 1:-1], points[:, 2:])
         folded = ((areas * normals[:, None]).sum(axis=2) < 0).any(axis=1)
@@ -155,13 +154,13 @@ def triangulate(polygons: Sequence[Sequence[int]], vertices: np.ndarray) -> np.n
 
 
 def _cut_ears(points: np.ndarray, normal: np.ndarray) -> list[tuple[int, int, int]]:
-    """Triangles of one polygon [N, 3], cut in the coordinate plane that sees most of it; all N corners are used."""
+    """N - 2 triangles of a polygon [N, 3], by ear clipping in the coordinate plane of its largest projection."""
     axis = int(np.abs(normal).argmax())
     u, v = (axis + 1) % 3, (axis + 2) % 3
     flat = points[:, [u, v] if normal[axis] >= 0 else [v, u]]  # counter-clockwise
 
     def left_of(a: int, b: int, others: int | list[int]) -> np.ndarray:
-        """Twice the area of the triangle from a to b to each of the others: above 0 on the left."""
+        """Twice the signed area of the triangles from a to b to each of the others: positive on the left."""
         (x, y), to = flat[b] - flat[a], flat[others] - flat[a]
         return x * to[..., 1] - y * to[..., 0]
 
@@ -176,5 +175,5 @@ def _cut_ears(points: np.ndarray, normal: np.ndarray) -> list[tuple[int, int, in
                 del corners[at]
                 break
         else:
-            break  # nothing can be cut off (the polygon crosses itself): the rest becomes a fan
+            break  # the polygon crosses itself and has no ear: the rest becomes a fan
     return triangles + [(corners[0], *pair) for pair in pairwise(corners[1:])]

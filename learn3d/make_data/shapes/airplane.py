@@ -107,7 +107,7 @@ def _two_engines(draw: Draw, radius: float) -> Part:
 
 
 def _one_engine(draw: Draw, radius: float) -> Part:
-    """A nozzle at the rear, and an intake on both sides, at the chin, or in the nose (not visible)."""
+    """A nozzle at the rear, and intakes at the sides or at the chin, or in the nose, where none is drawn."""
     intake = {
         "side": box((0.8 * radius, 1.2 * radius, 0.34), (0.95 * radius, 0.1 * radius, 0.03), 0.02).both_sides(),
         "chin": box((1.2 * radius, 0.9 * radius, 0.3), (0, -0.9 * radius, 0.06), 0.02),
@@ -160,10 +160,8 @@ def light_plane(draw: Draw) -> Part:
     tall = 1.2 * radius
     size = draw.measures(half=(0.5, 0.72), root=(0.14, 0.2), tip=(0.09, 0.14), sweep_deg=(0, 4))
     dihedral, z = draw(0, 3) if high else draw(3, 8), draw(0.16, 0.24)
-    y, shape = (
-        tall * draw(1.05, 1.2) if high else -0.7 * tall,
-        draw.pick(("straight", "straight", "elliptic", "kinked")),
-    )
+    y = tall * draw(1.05, 1.2) if high else -0.7 * tall
+    shape = draw.pick(("straight", "straight", "elliptic", "kinked"))
     plan = Planform(**size, dihedral_deg=dihedral, z=z, y=y, shape=shape)
     plane = fuselage(radius, **form) + plan.wing()
     if high:

@@ -9,7 +9,7 @@ import numpy as np
 from .draw import Draw
 from .parts import Part, bar, ellipse, ellipsoid, loft, rectangle, revolve, tube, wing
 
-# Shares of the half span at which a wing of each shape needs a section, beside its middle and its tip.
+# Shares of the half span at which a wing of each shape has a section, in addition to its middle and its tip.
 _STATIONS = {
     "straight": [],
     "elliptic": np.sin(np.linspace(0, np.pi / 2, 8)).round(4).tolist(),
@@ -29,7 +29,7 @@ class Planform:
     dihedral_deg: float  # rise of the wing towards the tip
     z: float  # position of the leading edge in the middle
     y: float  # height of the wing in the middle
-    kink: float = 0.0  # share of the half span at which the trailing edge bends (0: straight trailing edge)
+    kink: float = 0.0  # share of the half span at which the trailing edge bends; 0 for a straight one
     shape: str = "straight"  # "straight", "elliptic", "kinked" (constant chord, then tapered) or "gull"
     thickness: float = 0.12  # thickness over chord
 
@@ -39,7 +39,7 @@ class Planform:
         slope = np.tan(np.radians(self.sweep_deg))
         y, z = self.y + x * np.tan(np.radians(self.dihedral_deg)), self.z - x * slope
         chord = self.root + share * (self.tip - self.root)
-        if self.kink > 0.0:  # straight trailing edge up to the kink, tapered behind it
+        if self.kink > 0.0:  # unswept trailing edge up to the kink, swept beyond it
             inner = self.root - self.kink * self.half * slope
             middle = max(inner, 0.5 * (self.root + self.tip) * 0.8, 1.2 * self.tip)
             chord = np.interp(share, [0, self.kink, 1], [self.root, middle, self.tip])
@@ -90,9 +90,9 @@ def fuselage(
 ) -> Part:
     """A fuselage along z from +length/2 (nose) to -length/2, `tall` times as high as wide.
 
-    The nose takes the share `nose` of the length, and the tail all behind the share `tail_start`. nose_power is the
-    bluntness of the nose (1 = cone, 2 = ellipse). upsweep lifts the end of the tail and droop lowers the tip of the
-    nose, both in radii. tail_radius is the radius at the end, in radii. exponent shapes the section as in `ellipse`.
+    The nose ends at the share `nose` of the length, and the tail begins at the share `tail_start`. nose_power is the
+    bluntness of the nose: 1 for a cone, 2 for an ellipse. upsweep lifts the end of the tail and droop lowers the tip of
+    the nose, both in radii. tail_radius is the radius at the end, in radii. exponent is that of `ellipse`.
     """
     ahead = np.array([0.0, 0.02, 0.07, 0.16, 0.3, 0.5, 0.75, 1.0])
     behind = np.array([0.15, 0.35, 0.6, 0.85, 1.0])
@@ -111,7 +111,7 @@ def fin(height: float, root: float, tip: float, sweep_deg: float, z: float, thic
 
 
 def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
-    """Fin and stabiliser: "conventional", "cross" (half-way up the fin), "T", "V" or "twin" (fins at the ends)."""
+    """Fin and stabiliser of a kind: "conventional", "cross" (stabiliser half-way up the fin), "T", "V" or "twin"."""
     height = draw(0.14, 0.21)
     sweep = draw(28, 45) if swept else draw(5, 20)
     root, tip = draw(0.13, 0.19), draw(0.06, 0.1)
@@ -193,9 +193,9 @@ def canopy(width: float, height: float, length: float, y: float, z: float) -> Pa
 
 
 def gear(belly: float, drop: float, main_x: float, main_z: float, other_z: float) -> Part:
-    """A main gear at +-main_x and a nose wheel (tail wheel if behind it), `drop` below the axis of the fuselage.
+    """A main gear at x = +-main_x, and a nose wheel or, if other_z < main_z, a tail wheel.
 
-    belly is the radius of the fuselage there.
+    drop: depth of the wheels below the axis of the fuselage. belly: radius of the fuselage at the gear.
     """
     main, top = _wheel(0.026), -0.5 * belly
     part = bar((0.4 * main_x, top, main_z), (main_x, -drop, main_z), 0.016).both_sides()

@@ -1,4 +1,4 @@
-"""Procedural cars, in metres: a body lofted from bumper to bumper, wheels, mirrors, a roof box or a spoiler."""
+"""Procedural cars, in metres: a body lofted from front to rear, wheels, mirrors, perhaps a roof box or a spoiler."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ TYRE = 0.22  # width of the wheels
 
 @dataclass(frozen=True)
 class Body:
-    """The measures of a car body: in metres, or as shares of the length (0 = front bumper) and of the height."""
+    """Measures of a car body, in metres or as shares of its length (0 = front bumper) or height."""
 
     length: float
     width: float
     height: float
     wheel: float  # radius of the wheels, metres
     clearance: float  # height of the floor over the ground, metres
-    bonnet: float  # length of the bonnet, a share
-    screen: float  # length of the windscreen behind it, a share
-    roof: float  # end of the roof, a share
-    window: float  # end of the rear window and start of the boot or bed, a share
-    belt: float  # height of the shoulder line under the windows, a share
+    bonnet: float  # length of the bonnet, share of the length
+    screen: float  # length of the windscreen, share of the length
+    roof: float  # end of the roof, share of the length
+    window: float  # end of the rear window and start of the boot or bed, share of the length
+    belt: float  # height of the shoulder line under the windows, share of the height
     lean: float  # inward lean of the side windows per height
-    has_bed: bool = False  # an open box behind the cabin
+    has_bed: bool = False  # True for an open box behind the cabin
 
     @property
     def shoulder(self) -> float:
@@ -41,7 +41,7 @@ class Body:
         return self.wheel + 0.48, self.length - self.wheel - 0.44
 
 
-# The least and the largest measures of each kind, in the order of the fields of Body.
+# The smallest and the largest measures of each kind, in the order of the fields of Body.
 _MEASURES = {
     #               length width height wheel clear. bonnet screen roof window belt  lean
     "sedan":     (( 4.2,  1.70,  1.38,  0.30,  0.14,  0.25,  0.14, 0.66,  0.80, 0.56, 0.20),

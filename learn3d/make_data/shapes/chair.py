@@ -11,11 +11,11 @@ from .parts import Part, bar, between, ellipse, post, rectangle, rounded_path, s
 from .sofa import upholstered
 from .supports import legs, support
 
-# Weights of the supports of each family of chairs.
+# Weights of the supports of dining, lounge and bar chairs.
 _DINING = {"legs": 6, "loops": 1, "cantilever": 1, "cross": 0.8, "panels": 0.6, "disc": 0.7, "star": 0.4, "rocker": 0.5}
 _LOUNGE = {"legs": 2.5, "loops": 2, "cantilever": 1, "rocker": 1, "star": 0.6, "panels": 0.7, "cross": 0.7}
 _BAR = {"legs": 3, "disc": 1.5, "loops": 1, "panels": 0.3}
-# Weights of the backs of wooden ones; a back is upright in the plane z = 0 from y = 0.
+# Weights of the backs of chairs without padding.
 _BACKS = {"ladder": 2, "slats": 2, "spindles": 1, "splat": 1.2, "cross": 0.8, "open": 1.0, "lattice": 0.7, "band": 1.0}
 _BACKS |= {"panel": 1.2, "hoop": 1.2, "solid": 2.0}
 
@@ -66,7 +66,7 @@ def jointed_chair(draw: Draw, family: str) -> Part:
 def _arm(
     draw: Draw, depth: float, height: float, thickness: float, edge: float, stile_x: float, lean_deg: float, bow: float
 ) -> Part:
-    """An arm from the stile of a back that leans and bows forward by `bow`, at the edge of the seat, to its front."""
+    """The arm at x > 0, from the back to the front. The back leans by lean_deg and bows forward by `bow`."""
     rise = draw(0.17, 0.26)
     y = height + rise
     rear = -depth / 2 + 0.03 + bow - np.tan(np.radians(lean_deg)) * rise
@@ -94,7 +94,7 @@ def _arm(
 
 
 def _back(draw: Draw, family: str, half: float, height: float, curve: float) -> tuple[Part, float]:
-    """A back of the given height between stiles at x = -half and half, and the distance of its front from z = 0."""
+    """A back in the plane z = 0, from y = 0 to `height`, between stiles at x = +-half; and the z of its front."""
     top = height + 0.02
     if draw.maybe({"office": 0.8, "lounge": 0.5}.get(family, 0.12)):
         thickness = draw(0.05, 0.11)
@@ -158,7 +158,7 @@ def _framed_back(draw: Draw, half: float, height: float, curve: float, kind: str
 
 
 def _bow(x: np.ndarray, half: float, curve: float) -> np.ndarray:
-    """z of a back that is bent towards the sitter: `curve` at the stiles (x = half), zero in the middle."""
+    """z of a back that is bent forward: `curve` at the stiles (|x| = half), 0 in the middle."""
     return curve * (np.abs(x) / half) ** 2
 
 
@@ -181,7 +181,7 @@ def _plate(draw: Draw, half: float, top: float, curve: float, thickness: float) 
 
 
 def _padded_back(draw: Draw, half: float, top: float, curve: float, thickness: float, detached: bool) -> Part:
-    """An upholstered back; most `detached` ones float above the seat on a spine."""
+    """An upholstered back. A `detached` one is mostly held above the seat by a spine."""
     if not detached or draw.maybe(0.3):
         if draw.maybe(0.5):
             return _plate(draw, 1.05 * half, top, curve, thickness)
@@ -221,7 +221,7 @@ def shell_chair(draw: Draw) -> Part:
     ease = ease**2 * (3 - 2 * ease)
     span = 0.5 * width * (1 - draw(-0.1, 0.35) * ease) * (1 - np.clip((t - 0.75) / 0.25, 0, 1) ** 3 * draw(0.1, 0.6))
     span = span * (1 - 0.25 * np.clip(1 - t / 0.15, 0, 1) ** 2)
-    # The rims are lifted off the seat and pulled forward off the back; `wings` makes arms of them about the hip.
+    # The rims of the seat are lifted and those of the back pulled forward; at the hip `wings` turns them into arms.
     hip = np.exp(-(((t - 0.5) / 0.25) ** 2))
     lift = (curl * np.abs(v) ** 2.5 + wings * hip * np.abs(v) ** 3) * (1 - 0.7 * ease)
     pull = (curl + wings * hip) * np.abs(v) ** 2.5 * ease

@@ -1,4 +1,4 @@
-"""Random decisions in words, so that the recipes of the shapes read as sentences."""
+"""Random numbers and choices for the recipes of shapes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ T = TypeVar("T")
 
 
 class Draw:
-    """A source of random measures and choices: `width = draw(0.4, 0.5)`, `if draw.maybe(0.3)`."""
+    """Random numbers and choices from a generator: `width = draw(0.4, 0.5)`, `if draw.maybe(0.3)`."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
 
     def __call__(self, least: float, greatest: float) -> float:
-        """A random number between the two."""
+        """A random number in [least, greatest)."""
         return self._rng.uniform(least, greatest)
 
     def measures(self, **ranges: tuple[float, float]) -> dict[str, float]:
@@ -32,7 +32,7 @@ class Draw:
         return bool(self._rng.random() < probability)
 
     def pick(self, options: dict[T, float] | tuple[T, ...]) -> T:
-        """One of the options: with equal chances, or with the weights that a dict gives them."""
+        """One of the options, with equal probability or, for a dict, in proportion to its values."""
         keys = tuple(options)
         weights = np.cumsum(list(options.values()) if isinstance(options, dict) else np.ones(len(keys)))
         return keys[min(int(np.searchsorted(weights, self._rng.random() * weights[-1], side="right")), len(keys) - 1)]

@@ -69,7 +69,7 @@ def floor_lamp(draw: Draw) -> Part:
 
 
 def arc_lamp(draw: Draw) -> Part:
-    """A floor lamp whose pole bends over to the front and lets a shade hang down."""
+    """A floor lamp with a pole that bends over to the front, and a shade that hangs from it."""
     height, reach = draw(1.4, 1.9), draw(0.5, 1.2)
     rise = draw(0.3, 0.7) * height
     angle = np.linspace(0, np.pi * draw(0.7, 0.95), 14)

@@ -1,8 +1,7 @@
 """Closed parts of procedural shapes: boxes, slabs, posts, tubes, revolved profiles, sheets, wings.
 
-All of them are lofts. A loft is watertight whatever its rings are, so a shape made of lofts is a union of closed
-components. Axes: x right, y up, z forward. Outlines are closed curves [N, 2], counter-clockwise, star-shaped about
-their mean.
+All parts are lofts. A loft is watertight for any rings, so a shape made of lofts is a union of closed components. Axes:
+x right, y up, z forward. Outlines are closed curves [N, 2], counter-clockwise, star-shaped about their mean.
 """
 
 from __future__ import annotations
@@ -17,37 +16,37 @@ import trimesh
 
 Point = Sequence[float] | np.ndarray  # (x, y, z); in a profile (radius, y)
 
-# Bars thinner than THIN (of the longest side of the whole shape) get a ring at least every STEP: a voxeliser that casts
-# rays on a 32^3 grid can miss a bar between two grid lines, but it also marks the cell of every vertex.
-THIN, STEP = 0.06, 0.031
+# Thin bars get extra rings: a voxeliser that casts rays on a 32^3 grid misses bars between two grid lines, but it also
+# marks the cell of every vertex. Both lengths are in units of the longest side of the shape.
+THIN, STEP = 0.06, 0.031  # diameter below which a bar is thin, and the largest distance of its rings
 
 
 class Loft(NamedTuple):
     """A closed surface: a stack of rings of equal size, joined in order and closed at the ends."""
 
     rings: np.ndarray  # [R, N, 3] float64; neighbours in R and in N are joined
-    ends: str  # the end rings are closed by a "fan" about their mean or a "strip" (i to N-1-i), or joined to a "ring"
+    ends: str  # "fan": about the mean of an end ring; "strip": from point i to N-1-i; "ring": last ring joins the first
 
 
 @dataclass(frozen=True)
 class Part:
-    """Closed surfaces that are moved, turned and mirrored together; `a + b` joins two parts."""
+    """A set of closed surfaces; `a + b` joins two parts."""
 
     lofts: tuple[Loft, ...] = ()
 
     def __add__(self, other: Part) -> Part:
         return Part(self.lofts + other.lofts)
 
-    def _mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> Part:
+    def _map(self, function: Callable[[np.ndarray], np.ndarray]) -> Part:
         return Part(tuple(Loft(function(rings), ends) for rings, ends in self.lofts))
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Part:
         """The part shifted by (x, y, z)."""
-        return self._mapped(lambda rings: rings + np.array([x, y, z]))
+        return self._map(lambda rings: rings + np.array([x, y, z]))
 
     def scaled(self, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> Part:
         """The part scaled about the origin; a negative factor mirrors it."""
-        return self._mapped(lambda rings: rings * np.array([x, y, z]))
+        return self._map(lambda rings: rings * np.array([x, y, z]))
 
     def rotated(self, axis: str, angle_deg: float, about: Point = (0.0, 0.0, 0.0)) -> Part:
         """The part turned right-handedly about the x, y or z axis through the point `about`."""
@@ -55,7 +54,7 @@ class Part:
         cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
         matrix = np.eye(3)
         matrix[[i, i, j, j], [i, j, i, j]] = cosine, -sine, sine, cosine
-        return self._mapped(lambda rings: (rings - np.asarray(about)) @ matrix.T + np.asarray(about))
+        return self._map(lambda rings: (rings - np.asarray(about)) @ matrix.T + np.asarray(about))
 
     def both_sides(self) -> Part:
         """The part and its mirror image in the plane x = 0."""
@@ -77,7 +76,7 @@ def join(parts: Iterable[Part]) -> Part:
 
 
 def loft(rings: np.ndarray | Sequence[np.ndarray], ends: str = "fan") -> Part:
-    """The part made of one stack of rings [R, N, 3]."""
+    """The part with one surface, of the rings [R, N, 3]."""
     return Part((Loft(np.asarray(rings), ends),))
 
 
@@ -113,7 +112,7 @@ def inset(outline: np.ndarray, distance: float) -> np.ndarray:
 
 
 def _prism(outline: np.ndarray, rims: Sequence[tuple[float, float]], axes: tuple[int, int, int]) -> Part:
-    """Copies of an outline in the first two axes, each inset by a distance, at a level along the third axis."""
+    """A loft along axes[2]: for each (distance, level) of `rims`, the outline, inset by the distance, at that level."""
     rings = np.empty((len(rims), len(outline), 3))
     for ring, (distance, level) in zip(rings, rims, strict=True):
         ring[:, axes[:2]] = inset(outline, distance)
@@ -139,13 +138,13 @@ def box(size: Point, center: Point = (0.0, 0.0, 0.0), radius: float | None = Non
 
 
 def between(lower: Point, upper: Point, radius: float | None = None) -> Part:
-    """The rounded box with the given lower and upper corner."""
+    """The rounded box between two opposite corners."""
     lower, upper = np.minimum(lower, upper), np.maximum(lower, upper)
     return box(upper - lower, (lower + upper) / 2, radius)
 
 
 def post(foot: Point, head: Point, outline: np.ndarray, profile: Sequence[tuple[float, float]]) -> Part:
-    """A (slanted) post with horizontal sections; profile = [(height 0 at the foot .. 1, scale of the outline)]."""
+    """A post, perhaps slanted, with horizontal sections. profile: [(height from 0 at the foot to 1, outline scale)]."""
     foot, head = np.asarray(foot, dtype=float), np.asarray(head, dtype=float)
     section = np.stack([outline[:, 0], np.zeros(len(outline)), outline[:, 1]], 1)
     return loft(np.stack([foot + t * (head - foot) + scale * section for t, scale in profile]))
@@ -193,9 +192,9 @@ def tube(
     closed: bool = False,
     side: Point = (0.0, 0.0, 1.0),
 ) -> Part:
-    """A tube along a path [P, 3] whose section (a circle, or [N, 2] times radius) keeps its thickness in the bends.
+    """A tube along a path [P, 3], with mitred bends. section: outline [N, 2] (default: a circle); radius scales it.
 
-    The first axis of the section points along `side` as far as the path allows; radius is a number or [P].
+    The first axis of the section points towards `side` as far as the path allows. radius is a number or [P].
     """
     path = np.asarray(path, dtype=float)
     section = ellipse(2.0, 2.0, 8) if section is None else section
@@ -246,9 +245,8 @@ def sheet(surface: np.ndarray, thickness: float) -> Part:
 def wing(sections: list[Sequence[float]], points: int = 7, upright: bool = False, whole: bool = False) -> Part:
     """A wing through airfoil sections (span, rise, leading edge z, chord, thickness / chord), nose towards +z.
 
-    The span runs along x and the rise along y; `upright` exchanges the two (a fin). `whole` mirrors the sections of
-    the right half, the first of which is in the middle. The airfoil is the symmetric four-digit NACA thickness, closed
-    by a blunt trailing edge.
+    The span is along x and the rise along y; `upright` swaps them, for a fin. `whole` adds the mirrored sections; the
+    first section is then in the middle. The airfoil is a symmetric four-digit NACA profile with a blunt trailing edge.
     """
     if whole:
         sections = [(-x, *rest) for x, *rest in sections[:0:-1]] + sections
@@ -265,7 +263,7 @@ def wing(sections: list[Sequence[float]], points: int = 7, upright: bool = False
 
 @lru_cache(maxsize=1024)
 def _loft_faces(rings: int, size: int, ends: str) -> np.ndarray:
-    """The faces of a loft of `rings` rings of `size` points; a fan's two centre points follow the ring points."""
+    """Faces int64 [F, 3] of a loft of `rings` rings of `size` points each, then the two centre points of a fan."""
     r = np.arange(rings if ends == "ring" else rings - 1)[:, None] * size
     n = np.arange(size)[None]
     after = (n + 1) % size
@@ -283,8 +281,8 @@ def _loft_faces(rings: int, size: int, ends: str) -> np.ndarray:
     return np.concatenate(faces)
 
 
-def _refined(rings: np.ndarray, ends: str) -> np.ndarray:
-    """The rings of a thin bar with interpolated ones in between, at most STEP apart; other rings as they are."""
+def _refine(rings: np.ndarray, ends: str) -> np.ndarray:
+    """Interpolate rings of a thin bar so that they are at most STEP apart; other rings are returned unchanged."""
     if np.linalg.norm(np.ptp(rings, axis=1), axis=1).max() > THIN:
         return rings
     closed = ends == "ring"
@@ -300,12 +298,12 @@ def _refined(rings: np.ndarray, ends: str) -> np.ndarray:
 
 
 def assemble(part: Part) -> trimesh.Trimesh:
-    """The part as a mesh of closed, outward oriented components; box centred at the origin, longest side 1."""
+    """The mesh of a part: closed components, oriented outwards; box centred at the origin, longest side 1."""
     lower = np.min([rings.min((0, 1)) for rings, _ in part.lofts], 0)
     upper = np.max([rings.max((0, 1)) for rings, _ in part.lofts], 0)
     vertices, faces, offset = [], [], 0
     for rings, ends in part.lofts:
-        rings = _refined((rings - (lower + upper) / 2) / (upper - lower).max(), ends)
+        rings = _refine((rings - (lower + upper) / 2) / (upper - lower).max(), ends)
         triangles = _loft_faces(len(rings), rings.shape[1], ends)
         points = rings.reshape(-1, 3)
         if ends == "fan":

@@ -18,7 +18,7 @@ def _cushions(lower: tuple[float, float, float], upper: tuple[float, float, floa
 
 
 def upholstered(draw: Draw, seats: int) -> Part:
-    """An armchair (one seat, perhaps with wings) or a sofa: a block, cushions, a leaned back, and arms or none."""
+    """An armchair (one seat, perhaps with wings) or a sofa: a block, cushions, a leaning back, perhaps arms."""
     half, depth = seats * draw(0.27, 0.36), draw(0.75, 1.0)
     foot, seat, high = draw(0.05, 0.16), draw(0.36, 0.46), draw(0.66, 0.95 if seats > 1 else 1.1)
     back, lean, soft = draw(0.14, 0.24), draw(0, 12), draw(0.02, 0.06)
@@ -105,7 +105,7 @@ def settee(draw: Draw) -> Part:
 
 
 def curved_sofa(draw: Draw) -> Part:
-    """A sofa on an arc, or a tub sofa, whose back runs around into the arms."""
+    """A sofa on an arc, or a tub sofa: the back continues into the arms."""
     half, depth, seat = draw(0.7, 1.25), draw(0.75, 0.95), draw(0.36, 0.44)
     foot, high, thick = draw(0.04, 0.14), draw(0.66, 0.85), draw(0.1, 0.2)
     turn = np.radians(draw(75, 92))

@@ -1,6 +1,6 @@
-"""What carries a seat or a table top, in metres: legs, pedestals, loops of tube, crossed bars, panels, rockers.
+"""Supports of seats and table tops, in metres: legs, pedestals, loops of tube, crossed bars, panels, rockers.
 
-Each function makes a support from the floor (y = 0) to `height`, reaching about x = +-half_x and z = +-half_z.
+A support reaches from the floor (y = 0) to `height`, and to about x = +-half_x and z = +-half_z.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from .parts import Part, bar, between, ellipse, ellipsoid, join, post, rectangle
 
 
 def leg_profile(draw: Draw) -> tuple[list[tuple[float, float]], bool]:
-    """The scale of a leg over its height (0 = floor), and whether the leg is turned (round)."""
+    """The profile [(height, scale)] of a leg, 0 = floor, 1 = top, and whether the leg is turned (round)."""
     kind = draw.pick({"straight": 2, "tapered": 3, "turned": 1.5, "baluster": 1, "stepped": 0.7})
     if kind == "straight":
         profile = [(0, 1), (1, 1)]
@@ -34,9 +34,9 @@ def leg_profile(draw: Draw) -> tuple[list[tuple[float, float]], bool]:
 def legs(
     draw: Draw, half_x: float, half_z: float, height: float, size: float | None = None, plain: bool = False
 ) -> Part:
-    """Four legs, straight or splayed, perhaps with stretchers and an apron; sometimes bent-wire (hairpin) legs.
+    """Four legs, straight or splayed, perhaps with stretchers and an apron; or bent-wire (hairpin) legs.
 
-    `plain` ones are tapered and without an apron.
+    plain: tapered legs without an apron.
     """
     size = draw(0.028, 0.055) if size is None else size
     splay = draw(0.02, 0.16) * height if draw.maybe(0.55) else 0.0
@@ -134,7 +134,7 @@ def disc(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     part = revolve(profile, 20)
     if kind in ("disc", "dome"):
         part += slab(ellipse(1.2 * half_x, 1.2 * half_z, 16), 0.025).moved(y=height - 0.02)
-    if height > 0.55 and draw.maybe(0.6):  # a ring to put the feet on
+    if height > 0.55 and draw.maybe(0.6):  # a foot ring
         angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
         x, y, z = 0.75 * reach * np.cos(angle), np.full(20, 0.35 * height), 0.75 * reach * np.sin(angle)
         part += tube(np.stack([x, y, z], 1), 0.012, closed=True)
@@ -159,7 +159,7 @@ def loops(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
 
 
 def cantilever(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
-    """One bent tube: under the seat to the front, down to the floor, back and across; nothing under the rear edge."""
+    """One bent tube: under the seat to the front, down to the floor, to the rear and across. It has no rear legs."""
     size = draw(0.022, 0.034)
     low, high, reach = size / 2, height - 0.3 * size, half_z * draw(0.9, 1.15)
     front = half_z + draw(-0.05, 0.08)
@@ -170,7 +170,7 @@ def cantilever(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
 
 
 def cross(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
-    """Legs that cross like scissors and the bars between them: at the sides (folding chair), or at front and rear."""
+    """Legs that cross like scissors, at the sides (folding chair) or at front and rear, joined by bars."""
     size, deep = draw(0.022, 0.035), draw(1.2, 1.8)
     at_sides = draw.maybe(0.6)
     x, z = (half_x, half_z) if at_sides else (half_z, half_x)
@@ -186,7 +186,7 @@ def cross(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
 
 
 def panels(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
-    """A board on each side, and one between them: upright, or a shelf."""
+    """A board on each side, and an upright board or a shelf between them."""
     t = draw(0.018, 0.05)
     part = between((half_x - t, 0, -half_z), (half_x, height + 0.005, half_z)).both_sides()
     if draw.maybe(0.6):

@@ -1,4 +1,4 @@
-"""Writers of data sets: all with the interface of `learn3d.make_data.writers.writer`."""
+"""Writers of data sets, one for each layout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Makes the views of generated objects from all around, with colours and lights as in daily life."""
+"""Makes views of objects from all sides, with everyday colours and lights."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HALF_FOVS_DEG = (7.0, 20.0)
 
 
 class AroundWriter(Writer):
-    """Shards alone: see `learn3d.data.readers.around`."""
+    """Makes shards only, see `learn3d.data.readers.around`."""
 
     default_views = 12
     only_shards = True
@@ -34,14 +34,14 @@ class AroundWriter(Writer):
         return ()
 
     def write(self, item: RenderedObject) -> None:
-        raise NotImplementedError("shards are written from `dataset`")
+        raise NotImplementedError("this layout exists as shards only, which `dataset` makes")
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
         azimuth, elevation = uniform(rng, (-180.0, 180.0), count), uniform(rng, ELEVATIONS_DEG, count)
         half_fov = uniform(rng, HALF_FOVS_DEG, count)
         return LookAtPoses(azimuth, elevation, distances(rng, vertices, half_fov), half_fov)
 
-    def dress(
+    def paint(
         self, vertices: np.ndarray, faces: np.ndarray, color: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, nmr.Lights]:
         return natural_look(vertices, faces, rng)
@@ -73,8 +73,9 @@ class AroundWriter(Writer):
 
 
 def natural_look(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, nmr.Lights]:
-    """Colours [F, 3] and lights for a mesh [V, 3], [F, 3]: parts of the same kind (as many faces each) have one colour
-    out of three; the light comes from any side.
+    """Random colours [F, 3] and lights for a mesh [V, 3], [F, 3].
+
+    Connected parts with the same number of faces get the same colour out of three. The light comes from any side.
     """
     joined = coo_array((np.ones(len(faces) * 2), (faces[:, :2].ravel(), faces[:, 1:].ravel())), 2 * [len(vertices)])
     part = connected_components(joined, directed=False)[1][faces[:, 0]]
@@ -86,7 +87,7 @@ def natural_look(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generat
 
 
 def _material(rng: np.random.Generator) -> tuple[float, float, float]:
-    """A colour: of wood, of paint or cloth, or a grey from black to white."""
+    """A random colour of wood, of paint or cloth, or a grey."""
     kind = rng.choice(3, p=(0.25, 0.4, 0.35))
     if kind == 0:
         return colorsys.hsv_to_rgb(rng.uniform(0.05, 0.11), rng.uniform(0.3, 0.75), rng.uniform(0.2, 0.85))

@@ -1,4 +1,4 @@
-"""Writes Kato's renderings, in his own files and in those of DVR's mirror of them."""
+"""Writes renderings in Kato's files, and in those of DVR's copy of them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class KatoWriter(Writer):
 
     @staticmethod
     def images(item: RenderedObject) -> np.ndarray:
-        """Images of an object, uint8 [24, 4, 64, 64]: 255 - composite over white, and alpha."""
+        """Images of an object, uint8 [24, 4, 64, 64]: inverted colours (255 - composite over white) and alpha."""
         return np.concatenate([255 - item.rgb, item.alpha[..., None]], axis=-1).transpose(0, 3, 1, 2)
 
     @classmethod
@@ -62,9 +62,10 @@ class KatoWriter(Writer):
 class DvrWriter(Writer):
     """A folder for each object, and the lists `softras_{split}.lst`.
 
-    World coordinates are ShapeNet's: right-handed, y up, x towards the camera of view 0, longest side 1; the points
-    lie in them. `world_mat_k` [4, 4] takes them to camera axes (x right, y down, z away), so its rotation has
-    determinant 1, and `camera_mat_k` to [-1, 1] across the image (y down): diag(f, f, 1, 1), f = 1 / tan 15 deg.
+    World coordinates are ShapeNet's: right-handed, y up, x towards the camera of view 0, longest side 1. The points of
+    `pointcloud.npz` are world coordinates. `world_mat_k` [4, 4], whose rotation has determinant 1, takes them to camera
+    axes (x right, y down, z away). `camera_mat_k` = diag(f, f, 1, 1), f = 1 / tan 15 deg, takes these to [-1, 1] across
+    the image.
     """
 
     fixed_views = True

@@ -1,4 +1,4 @@
-"""Writes renderings on backgrounds like photographs: Pascal3D+ as packed by Kato and Harada 2019, and photo folders."""
+"""Writes renderings on photo-like backgrounds: Pascal3D+ as packed by Kato and Harada 2019, and photo folders."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.data.readers.pascal3d import PASCAL3D, class_name
 from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer, distances, uniform, write_png
 
-FILES = ("train", "imagenet", "val")  # images to train on go to the first two in turn
-HEIGHTS, WIDTHS = (160, 300), (200, 400)  # of the photographs, in pixels
-SHARES = (0.5, 0.9)  # of the photograph's shorter side that the cube takes
+FILES = ("train", "imagenet", "val")  # training images go to the first two alternately
+HEIGHTS, WIDTHS = (160, 300), (200, 400)  # ranges for photographs, in pixels
+SHARES = (0.5, 0.9)  # range of the side of the rendering over the shorter side of the photograph
 
 
 class Pascal3dWriter(Writer):
     """`{class}_{train,imagenet,val}.npz`, with renderings on out-of-focus backgrounds as photographs.
 
-    All rotations are proper (determinant 1), so the object frame is right-handed. It has x to the front, y up and z to
-    the left as seen from the front, so that objects are symmetric about z = 0, as the symmetric generator wants it.
-    Half the diagonal of an object's bounding box is 1: then no rotation takes it out of [-1, 1].
+    All rotations are proper (determinant 1), so the object frame is right-handed: x to the front, y up, z to the left
+    as seen from the front. Objects are symmetric about z = 0, as the symmetric generator requires. Half the diagonal of
+    the bounding box is 1, so that a rotated object stays in [-1, 1].
     """
 
     image_size = 224
@@ -45,7 +45,7 @@ class Pascal3dWriter(Writer):
         return tuple(f"{class_name(category)}_{name}.npz" for name in FILES)
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> RotationPoses:
-        """Any azimuth, elevations in -10 .. 40, tilted by up to 15 degrees, as photographers hold a camera."""
+        """Any azimuth, elevations in -10 .. 40, tilts up to 15 degrees: the poses of hand-held cameras."""
         ranges = ((-180.0, 180.0), (-10.0, 40.0), (-15.0, 15.0))
         azimuth_deg, elevation_deg, tilt_deg = (uniform(rng, limits, count) for limits in ranges)
         look = nmr.LookAt.from_angles(1.0, torch.from_numpy(elevation_deg), torch.from_numpy(azimuth_deg))
@@ -63,7 +63,7 @@ class Pascal3dWriter(Writer):
 
     def finish(self, output: Path, objects: dict[str, list[str]]) -> None:
         if len(self._rows) < 2:
-            raise ValueError("the layout pascal3d needs at least two pictures to train on: more meshes, or more views")
+            raise ValueError("the layout pascal3d needs two pictures or more for training; give more meshes or views")
         for path, rows in zip(
             self.paths(self.category), (self._rows[::2], self._rows[1::2], self._val_rows), strict=True
         ):
@@ -75,13 +75,13 @@ class Pascal3dWriter(Writer):
 
 
 def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Put a rendering [224, 224, 4] somewhere on a photograph: its entries of images, images_ref, bounding_boxes."""
+    """Paste a rendering [224, 224, 4] into a photograph. Returns its images, images_ref and bounding_boxes entries."""
     height, width = int(rng.integers(*HEIGHTS)), int(rng.integers(*WIDTHS))
     side = int(rng.uniform(*SHARES) * min(height, width))
     small = Image.fromarray(rgba).resize((side, side), Image.Resampling.BICUBIC)
     rows, columns = (np.flatnonzero((np.asarray(small)[..., 3] > 127).any(axis=axis)) for axis in (1, 0))
     if not len(rows):
-        rows = columns = np.array([0, side - 1])  # too thin for the small image
+        rows = columns = np.array([0, side - 1])  # the object vanished when the image was reduced
     size = np.array([columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1])
     corner = rng.integers(0, np.array([width, height]) - size + 1)  # the whole object is in the photograph
     left, top = corner[0] - columns[0], corner[1] - rows[0]
@@ -108,7 +108,7 @@ class PhotosWriter(Writer):
         return (category,)
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        """Any azimuth, elevations in -10 .. 50, another lens for each image; the whole object is seen."""
+        """Any azimuth, elevations in -10 .. 50, a random lens for each image; images hold the whole object."""
         azimuth_deg, elevation_deg = uniform(rng, (-180.0, 180.0), count), uniform(rng, (-10.0, 50.0), count)
         half_fov_deg = uniform(rng, (12.0, 25.0), count)  # lenses of 84 .. 38 mm on a square of 36 mm
         return LookAtPoses(azimuth_deg, elevation_deg, distances(rng, vertices, half_fov_deg), half_fov_deg)
@@ -136,7 +136,7 @@ def over(item: RenderedObject, backgrounds: np.ndarray) -> np.ndarray:
 
 
 def photo_background(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw an out-of-focus background: colours that change slowly, blotches and noise. uint8 [H, W, 3]."""
+    """Draw an out-of-focus background, uint8 [H, W, 3]: smooth colours, blotches and noise."""
 
     def enlarge(small: np.ndarray) -> np.ndarray:
         channels = [Image.fromarray(channel.astype(np.float32)) for channel in np.moveaxis(small, 2, 0)]

@@ -1,4 +1,4 @@
-"""Writes the renderings of ShapeNet of Kar et al. 2017 and of 3D-R2N2, with a folder for each object."""
+"""Writes renderings in the layouts of Kar et al. 2017 and of 3D-R2N2, with a folder for each object."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ KAR_HALF_FOV_DEG = 14.9314  # 60 mm lens, 32 mm sensor
 
 
 class KarWriter(Writer):
-    """A folder of renderings and a grid for each object, and `splits.json`, which all categories share.
+    """A folder of renderings and a voxel grid for each object, and `splits.json` for all categories.
 
-    Depth in `depth_{i}.png` is 0 .. 240 over 1.8 units around the object's centre (nearer is darker), 255 elsewhere.
-    `camera_{i}.mat` has K [3, 3] in pixels, extrinsic [3, 4] and its rotation as quat (w, x, y, z). The published code
-    reads neither extrinsic nor quat; here they take ShapeNet's coordinates (right-handed, y up, front x) to a camera
-    with x right, y down, z away.
+    `depth_{i}.png` has 0 .. 240 over 1.8 units around the object's centre (nearer is darker), and 255 for background.
+    `camera_{i}.mat` has K [3, 3] in pixels, extrinsic [3, 4], and its rotation as quat (w, x, y, z). extrinsic takes
+    ShapeNet's coordinates (right-handed, y up, front x) to x right, y down, z away. The published code reads neither
+    extrinsic nor quat.
     """
 
     image_size = 224
@@ -42,9 +42,9 @@ class KarWriter(Writer):
         return f"renders/{synset_of(category)}", f"voxels/modelVoxels32/{synset_of(category)}"
 
     def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        """Azimuths in -180 .. 180, elevations in -20 .. 40; the whole object is seen.
+        """Azimuths in -180 .. 180, elevations in -20 .. 40; images hold the whole object.
 
-        The distances of Kar's own files are not published; these fill the image about as much as theirs do.
+        The distances of Kar's own files are not published; here objects fill about as much of the image.
         """
         azimuth_deg, elevation_deg = uniform(rng, (-180.0, 180.0), count), uniform(rng, (-20.0, 40.0), count)
         distance = distances(rng, vertices, np.full(count, KAR_HALF_FOV_DEG))
@@ -85,10 +85,10 @@ def _write_mat(path: Path, **arrays: np.ndarray) -> None:
 
 
 class R2n2Writer(Writer):
-    """A folder of renderings and a grid for each object, in ShapeNet's coordinates: the diagonal of the box is 1.
+    """A folder of renderings and a voxel grid for each object, in ShapeNet's coordinates (bounding box diagonal 1).
 
-    The grid is the cube around the object whose side is the longest side of the bounding box. Readers sort the ids and
-    take the first 80 % to train on, so ids begin with a number that sorts the objects to train on first.
+    The side of the grid is the longest side of the bounding box. Readers sort the ids and train on the first 80 %, so
+    an id begins with a number, and the training objects have the lowest ones.
     """
 
     image_size = 137
@@ -128,13 +128,13 @@ class R2n2Writer(Writer):
     def split(self, meshes: list[dict]) -> list[dict]:
         used = [mesh for mesh in meshes if "objects" in mesh]
         if (first := len(used) * 8 // 10) == 0:
-            raise ValueError("the layout r2n2 needs at least two objects, one to train on and one for test")
+            raise ValueError("the layout r2n2 needs two objects or more, for training and test; give more meshes")
         used = [mesh | {"split": "train" if k < first else "test"} for k, mesh in enumerate(used)]
         return used + [mesh for mesh in meshes if "objects" not in mesh]
 
 
 def binvox_bytes(voxels: np.ndarray, side: float) -> bytes:
-    """Encode a grid bool [D, D, D] with axes x, y, z over a cube around 0 as binvox: y runs fastest, then z, then x."""
+    """Encode a grid bool [D, D, D] (axes x, y, z) of a cube centred at 0 as binvox: y runs fastest, then z, then x."""
     size, corner = " ".join(map(str, voxels.shape)), " ".join([f"{-side / 2:.9g}"] * 3)
     header = f"#binvox 1\ndim {size}\ntranslate {corner}\nscale {side:.9g}\ndata\n"
     runs = bytearray()

@@ -1,4 +1,4 @@
-"""The data set in memory: what goes into a batch, several categories, parts that do not fit; sampling; view classes."""
+"""The data set in memory: batches, several categories, parts that do not fit; sampling; view classes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def continuous(objects: int = 3, views: int = 4, category: str = "cup", seed: in
     )
 
 
-def test_batch_has_what_belongs_to_each_sample() -> None:
+def test_a_batch_has_the_fields_of_its_samples() -> None:
     data = continuous()
     batch = data.batch(torch.tensor([7, 0, 7]))
     assert len(batch) == 3
@@ -56,7 +56,7 @@ def test_batch_has_what_belongs_to_each_sample() -> None:
         data.batch(torch.tensor([12]))
 
 
-def test_masks_of_their_own_go_before_the_fourth_channel() -> None:
+def test_separate_masks_replace_the_fourth_channel() -> None:
     data = continuous(1, 2)
     large = dataclasses.replace(
         data, images=np.zeros((2, 4, 224, 224), np.uint8), masks=np.full((2, 64, 64), 51, np.uint8)
@@ -119,7 +119,7 @@ def test_classes_are_drawn_uniformly_whatever_their_size() -> None:
     both = concatenate([continuous(40, 4), continuous(1, 2, "jar", seed=1)])
     drawn = both.batch(sample_indices(both, "classes", 400, seed=0, step=1)).class_ids
     assert 150 < int((drawn == 1).sum()) < 250
-    with pytest.raises(ValueError, match="sampling must be views, pairs or classes, got 'all'"):
+    with pytest.raises(ValueError, match="sampling must be views, pairs, groups, classes, got 'all'"):
         sample_indices(both, "all", 4, seed=0, step=1)
 
 

@@ -1,4 +1,4 @@
-"""Kato's files: what is read back, which camera saw what, and what a bad file is told."""
+"""Kato's files: their content, their cameras, and the errors for damaged ones."""
 
 from __future__ import annotations
 

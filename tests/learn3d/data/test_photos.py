@@ -179,7 +179,7 @@ def test_a_direction_without_training_photos_gets_the_nearest_class() -> None:
         ("file", "", "it must name a file in images/, got ''"),
         ("file", "../secret.png", "it must name a file in images/, got '../secret.png'"),
         ("file", "/etc/passwd", "it must name a file in images/, got '/etc/passwd'"),
-        ("file", "chair000_0.jpg", "chair000_0.jpg is in another line already"),
+        ("file", "chair000_0.jpg", "chair000_0.jpg is in two lines"),
         ("fov_deg", "x" * 100_000, "fov_deg must be a number, got 'x{100,300}"),
     ],
     ids=range(10),
@@ -218,7 +218,7 @@ def test_photographs_without_poses_learn_from_an_estimate(chairs: Path, tmp_path
     refused(chairs, "images: is empty; expected photographs")
 
 
-def test_tables_that_are_none_are_named(chairs: Path, tmp_path: Path) -> None:
+def test_other_files_than_tables_are_named(chairs: Path, tmp_path: Path) -> None:
     header = ",".join(COLUMNS)
     for content, message in [
         (b"", "has the columns ; expected a table of photographs with the columns file, azimuth_deg"),
@@ -226,8 +226,8 @@ def test_tables_that_are_none_are_named(chairs: Path, tmp_path: Path) -> None:
         (b"file,azimuth_deg,elevation_deg,distance\n", "has the columns file, .*, distance; expected"),
         (f"{header},half_fov_deg\n".encode(), "has the columns .*, half_fov_deg; expected"),
         (f"{header},{'x' * 100_000}\n".encode(), "has the columns .{0,200}; expected"),
-        (f"{header}\na.jpg,1,2,3,40,5,6\n".encode(), "line 2: it has another number of values than there are columns"),
-        (f"{header}\na.jpg,1,2\n".encode(), "line 2: it has another number of values than there are columns"),
+        (f"{header}\na.jpg,1,2,3,40,5,6\n".encode(), "line 2: it has more or fewer values than there are columns"),
+        (f"{header}\na.jpg,1,2\n".encode(), "line 2: it has more or fewer values than there are columns"),
         (header.encode() + b"\nst\xfchle.jpg,1,2,3,4\n", "cannot be read as text"),
     ]:
         (chairs / "poses.csv").write_bytes(content)
@@ -266,7 +266,7 @@ def test_damaged_photos_are_named_with_their_row(chairs: Path) -> None:
     [
         (slice(None), "distance", 12, "error", r"poses.csv: the objects are \d+ times as large .*distance must be in"),
         (slice(None), "fov_deg", 0.5, "warning", r"poses.csv: the objects are 0.\d+ times as large .*the full angle"),
-        (slice(4, 5), "distance", 10, "warning", r"chair001_1.jpg: .* times as large as line 6 says; is the distance"),
+        (slice(4, 5), "distance", 10, "warning", r"chair001_1.jpg: .* is the distance in line 6 right\?"),
     ],
     ids=["centimetres", "half an angle", "a point forgotten"],
 )
@@ -290,5 +290,5 @@ def test_objects_that_are_cut_off_are_warned_of(chairs: Path) -> None:
     mask = np.array(Image.open(path))
     mask[100:110, :150] = 255
     Image.fromarray(mask).save(path)
-    message = "its object touches the border; what lies outside counts as empty"
+    message = "its object touches the border; parts outside the image count as empty"
     assert check(chairs, "warning") == [("chair002_0.jpg", message)]

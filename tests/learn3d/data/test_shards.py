@@ -1,10 +1,9 @@
-"""Data sets in shards: the same batches and the same training as in memory, and what happens to damaged ones."""
+"""Data sets in shards: the same batches and the same training as in memory; damaged shards are refused."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import subprocess
 import sys
 import time
@@ -103,10 +102,10 @@ def test_shards_that_are_missing_or_too_many_are_refused(stored, tiny_folder, co
     path = shard_file(stored, 1)
     path.rename(other := shard_file(stored, 7))
     other.rename(other.with_name("mine.safetensors"))
-    expect(stored, path, "one of 3 shards, of which 2 are there")
+    expect(stored, path, "the split needs 3 shards, but has 2")
     shard_file(stored, 1).write_bytes(shard_file(stored).read_bytes())
     other.write_bytes(b"of an earlier, larger set")
-    with pytest.raises(ValueError, match="one of 3 shards, of which 4 are there"):
+    with pytest.raises(ValueError, match="the split needs 3 shards, but has 4"):
         load_dataset("kato", stored, "airplane", "train")
     (mine := other.with_name("photograph.png")).write_bytes(b"mine")
     (stored / "02691156" / "train" / shards.SET_FILE).unlink()  # as an unfinished conversion leaves it
@@ -148,7 +147,7 @@ def rewrite(stored: Path, **changes) -> Path:
         ({"view_ids": np.zeros(24, np.float32)}, "view_ids is {'dtype': 'F32'"),
     ],
 )
-def test_tables_that_cannot_be_are_refused(stored, changes, message) -> None:
+def test_impossible_tables_are_refused(stored, changes, message) -> None:
     expect(stored, rewrite(stored, **changes), message)
 
 
@@ -190,18 +189,11 @@ def test_a_shard_that_changed_after_a_kill_is_noticed(stored, tiny_config, tmp_p
         train(config, resume=True)
 
 
-@pytest.mark.parametrize("make", [os.mkfifo, lambda path: os.symlink("/dev/zero", path)])
-def test_pipes_and_devices_are_refused_at_once(stored, make) -> None:
-    (path := shard_file(stored)).unlink()
-    make(path)
-    expect(stored, path, "it is no plain file")
-
-
 def test_a_set_that_claims_a_million_shards_is_refused_at_once(stored) -> None:
     path = stored / "02691156" / "train" / "set.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "shards": 10**6}))
     began = time.process_time()
-    expect(stored, shard_file(stored, 3), "one of 1000000 shards, of which 3 are there")
+    expect(stored, shard_file(stored, 3), "the split needs 1000000 shards, but has 3")
     assert time.process_time() - began < 2
 
 
@@ -216,9 +208,9 @@ def test_a_file_that_is_cut_short_later_is_an_error(stored) -> None:
 
 
 def test_another_layout_or_set_file(stored) -> None:
-    with pytest.raises(ValueError, match="has images of 64 pixels in the layout 'kato', but 'kar' is wanted"):
+    with pytest.raises(ValueError, match="has images of 64 pixels in the layout 'kato', expected 64 pixels in 'kar'"):
         shards.load(stored, "airplane", "train", layout="kar")
-    with pytest.raises(ValueError, match=r"but 'kato' is wanted with 224; .* another --image-size"):
+    with pytest.raises(ValueError, match=r"expected 224 pixels in 'kato'; .* another --image-size"):
         shards.load(stored, "airplane", "train", layout="kato", image_size=224)
     assert all(split.count("error") == 1 for split in check_folder("kar", stored).splits)
     assert check_folder("kato", stored).count("error") == 0
@@ -228,14 +220,14 @@ def test_another_layout_or_set_file(stored) -> None:
         load_dataset("kato", stored, "airplane", "train")
 
 
-def test_what_is_read_ahead_is_what_was_asked_for(stored) -> None:
+def test_rows_read_ahead_are_the_requested_ones(stored) -> None:
     dataset = load_dataset("kato", stored, "airplane", "train")
     first, second = torch.tensor([3, 1]), torch.tensor([2, 2])
     images = [dataset.batch(indices).images for indices in (first, second)]
     dataset.prepare(first)
     assert torch.equal(dataset.batch(second).images, images[1]), "another batch than was expected"
     assert torch.equal(dataset.batch(first).images, images[0])
-    with pytest.raises(TypeError, match="by their numbers"):
+    with pytest.raises(TypeError, match="must be an integer array"):
         dataset.images[:, 3]
 
 

@@ -171,7 +171,7 @@ NO_RECORD = "line 1 is no record with a step and a split"
         ('{"step": 1, "split": "train", "\\u001b[2J": 1.0}', "line 1 has a metric with an invalid name: 'train "),
         (json.dumps({"step": 1, "split": "t", "a" * 61: 1.0}), "line 1 has a metric with an invalid name: 't a"),
         (json.dumps({"step": 1, "split": "t"} | {f"n{k}": 1.0 for k in range(101)}), r"holds 10\d different numbers"),
-        ("\n" * 100_000, r"metrics\.jsonl: has \d+ bytes, and at most 90000 are read"),
+        ("\n" * 100_000, r"metrics\.jsonl: has \d+ bytes; the limit is 90000"),
     ],
 )
 def test_hostile_logs_are_refused(tmp_path, monkeypatch, line, message) -> None:

@@ -1,4 +1,4 @@
-"""Damaged data sets: a sentence with the name of the file, whatever is changed in it."""
+"""Damaged data sets: they are read, or an error names the damaged file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_damaged_file_ends_training_with_its_name_and_what_to_do(tmp_path: Pat
         train(config)
     named, text = Path(str(error.value).split(": ", 1)[0]), str(error.value)
     assert named.is_file() and named.match(pattern)
-    assert text.endswith(f"is listed by: learn3d check-dataset '{folder}' --layout {layout}")
+    assert text.endswith(f"faults of the data set, run: learn3d check-dataset '{folder}' --layout {layout}")
     assert text.count("cut short") == text.count("fetch it again") == 1
     assert not {path.name for path in (tmp_path / "run").glob("*")} - {".lock"}
     report = check_folder(layout, folder, ["chair"])

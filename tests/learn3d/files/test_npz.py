@@ -1,4 +1,4 @@
-"""Arrays out of npz files: those that numpy writes are read, files that promise more than they hold are not."""
+"""Arrays of npz files: those from numpy are read, damaged and hostile files are refused."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def write(path: Path, member: bytes, method: int = zipfile.ZIP_DEFLATED) -> Path
     return path
 
 
-def read(path: Path, most: int | None = None) -> np.ndarray:
-    return sandbox.read(npz.read, path, "a", most)
+def read(path: Path, max_bytes: int | None = None) -> np.ndarray:
+    return sandbox.read(npz.read, path, "a", max_bytes)
 
 
-def refused(path: Path, said: str = "", most: int | None = None) -> None:
+def refused(path: Path, said: str = "", max_bytes: int | None = None) -> None:
     with pytest.raises(ValueError, match=rf"a\.npz: cannot be read .*{said}"):
-        read(path, most)
+        read(path, max_bytes)
 
 
 def ragged(path: Path, member: bytes) -> list[np.ndarray]:
@@ -63,7 +63,7 @@ def test_names_and_arrays_with_items(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, a=np.arange(6), images=object_array(*IMAGES), plain=np.zeros((2, 5)), boxes=np.ones((2, 4)))
     assert sandbox.read(npz.keys, path) == ["a", "images", "plain", "boxes"]
-    assert list(sandbox.read(npz.read_those_there, path, ["plain", "c"], 100)) == ["plain"]
+    assert list(sandbox.read(npz.read_existing, path, ["plain", "c"], 100)) == ["plain"]
     found = sandbox.read(npz.read_with_items, path, "images", {"boxes": 32})
     assert found[0][1] == [(3, 2, 3), (20, 7, 3)] and found[1].shape == (2, 4)
     assert sandbox.read(npz.read_ragged, path, "plain").shape == (2, 5)
@@ -91,7 +91,7 @@ def test_zip_bombs_are_refused(tmp_path):
     path = write(tmp_path / "a.npz", npy(bytes(100_000_000), header=UINT8 % 100_000_000))
     assert path.stat().st_size < 200_000
     refused(path, r"would unpack to \d+ bytes, 10\d\d times its size")
-    refused(path, "at most 1000", most=1000)
+    refused(path, "the limit is 1000", max_bytes=1000)
     assert read(path, 100_000_000).nbytes == 100_000_000  # if it is known that there are so many
 
 

@@ -15,11 +15,11 @@ from learn3d.files.renderings import PHOTOGRAPHS, open_image
 from learn3d.files.weights import read_state_dict
 
 
-def test_only_plain_files_of_a_stated_size_are_read(tmp_path):
+def test_only_regular_files_below_a_limit_are_read(tmp_path):
     path = tmp_path / "a.txt"
     path.write_bytes("ä\r\nb\rc\n".encode())
     assert check_file(path, 8, "a text") == 8 and read_text(path, 8, "a text") == "ä\nb\nc\n"
-    with pytest.raises(ValueError, match=r"a\.txt: has 8 bytes, and at most 6 are read; expected a text"):
+    with pytest.raises(ValueError, match=r"a\.txt: has 8 bytes; the limit is 6; expected a text"):
         read_bytes(path, 6, "a text")
     with pytest.raises(FileNotFoundError, match=r"b\.txt: is missing; expected a text"):
         read_bytes(tmp_path / "b.txt", 8, "a text")
@@ -47,7 +47,7 @@ def test_pipes_are_not_waited_for_and_devices_not_read(tmp_path: Path, kind: str
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "zeros").symlink_to("/dev/zero")
     for name in ("pipe", "zeros"):
-        with pytest.raises(ValueError, match="cannot be read: it is no plain file; expected"):
+        with pytest.raises(ValueError, match="cannot be read: it is not a regular file; expected"):
             READERS[kind](tmp_path / name)
 
 
@@ -58,9 +58,9 @@ def test_json():
     cases = {
         "[" * 1_000_000: "nested too deeply",
         '{"a":' * 100_000: "nested too deeply",
-        "[NaN]": "NaN is no number of JSON",
-        "[-Infinity]": "-Infinity is no number of JSON",
-        "1e999": "1e999 is no number of JSON",
+        "[NaN]": "NaN is not a finite number",
+        "[-Infinity]": "-Infinity is not a finite number",
+        "1e999": "1e999 is not a finite number",
         "9" * 5000: "digits",
         "{": "Expecting",
     }
@@ -112,7 +112,7 @@ def test_sync_comes_before_the_new_name(tmp_path, monkeypatch) -> None:
     assert calls == ["fsync", "replace", "fsync"], "the content, the name, the folder that holds the name"
 
 
-def test_what_is_no_plain_file_is_not_replaced(tmp_path) -> None:
+def test_only_regular_files_are_replaced(tmp_path) -> None:
     """Never with a path in /dev: should the check be broken, the test would break the machine."""
     fifo, folder, link, output = (tmp_path / name for name in ("fifo", "folder", "link", "output"))
     os.mkfifo(fifo)
@@ -122,9 +122,9 @@ def test_what_is_no_plain_file_is_not_replaced(tmp_path) -> None:
         output.symlink_to(f"/proc/self/fd/{file.fileno()}")  # as /dev/stdout is one
         before = {path.name: path.lstat().st_ino for path in tmp_path.iterdir()}
         for path in (fifo, folder, link, output):
-            with pytest.raises(OSError, match="is no plain file and is not replaced"):
+            with pytest.raises(OSError, match="is not a regular file and is not replaced"):
                 writing.write_json(path, {})
-            with pytest.raises(OSError, match="it is no plain file"):
+            with pytest.raises(OSError, match="it is not a regular file"):
                 writing.check_target(path, "--json")
     assert {path.name: path.lstat().st_ino for path in tmp_path.iterdir()} == before
 
@@ -138,7 +138,7 @@ def test_a_target_is_checked_before_the_work(tmp_path, monkeypatch) -> None:
     (tmp_path / "file").touch()
     for name, folder, why in (
         ("a/t.json", False, "No such file or directory"),
-        (".", False, "no plain file"),
+        (".", False, "not a regular file"),
         ("file/t.json", False, "Not a directory"),
         ("file", True, "Not a directory"),
         ("file/a/b", True, "Not a directory"),

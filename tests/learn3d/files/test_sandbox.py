@@ -1,4 +1,4 @@
-"""Reading in worker processes: whatever happens there is a sentence here, and the next file is read all the same."""
+"""Reading in worker processes: a failure becomes an error of one sentence, and the next file is read."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_what_goes_wrong_is_one_sentence_and_the_next_file_is_read(path: Path, f
 
 
 def test_worker_that_does_not_answer_is_ended(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learn3d.files.sandbox._PATIENCE", 0.5)
+    monkeypatch.setattr("learn3d.files.sandbox._TIMEOUT", 0.5)
     with pytest.raises(DamagedFile, match="stopped"):
         read(strange.sleep, path, 60.0)
 

@@ -79,7 +79,7 @@ def test_up_and_front_turn_the_mesh(tmp_path):
     assert np.abs(images.astype(int) - same).mean() < 0.1 < images.std()
 
 
-def test_our_own_mistakes_are_not_taken_for_bad_meshes_and_leave_nothing_behind(tmp_path, folder, monkeypatch):
+def test_bugs_are_raised_and_leave_no_files(tmp_path, folder, monkeypatch):
     for error in (IndexError, KeyboardInterrupt):
 
         def fail(*_, error=error, **__):
@@ -129,7 +129,7 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
     [
         ({"source": "nowhere"}, "folder of meshes or a mesh pack"),
         ({"source": "nothing"}, "there is no mesh"),
-        ({"source": "bad"}, r"no mesh to train on .* a.obj: no faces"),
+        ({"source": "bad"}, r"no mesh can be used for training; .* a.obj: no faces"),
         ({"procedural": 3, "front": "x"}, "must stand like these: up y, front z"),
         ({"source": None, "procedural": 3, "category": "unicorn"}, "procedural generator makes"),
         ({"up": "z", "front": "-z"}, "two different axes"),
@@ -138,8 +138,8 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
         ({"layout": "r2n2", "val": 1, "test": None}, "no val split"),
         ({"layout": "r2n2", "augment": 2, "test": None}, "first 80 %"),
         ({"layout": "r2n2", "test": 0.5}, "first 80 %"),
-        ({"procedural": 1, "source": None, "layout": "pascal3d", "views": 1, "test": None}, "two pictures"),
-        ({"procedural": 1, "source": None, "layout": "r2n2", "views": 1, "test": None}, "two objects"),
+        ({"procedural": 1, "source": None, "layout": "pascal3d", "views": 1, "test": None}, "two pictures or more"),
+        ({"procedural": 1, "source": None, "layout": "r2n2", "views": 1, "test": None}, "two objects or more"),
         ({"layout": "kar", "shards": True}, "make the data set without --shards, and convert it"),
         ({"jobs": 2}, "add --shards"),
     ],
@@ -284,14 +284,14 @@ TRIANGLE, FACE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1,
         (TRIANGLE, FACE + 1, r"refer to vertices 1 \.\. 3"),
         (TRIANGLE, FACE - 1, "refer to vertices -1"),
         (np.where(TRIANGLE > 0, np.inf, TRIANGLE), FACE, "extent"),
-        (TRIANGLE, np.broadcast_to(FACE, (meshes.MOST_FACES + 1, 3)), "1000001 faces, the limit is 1000000"),
+        (TRIANGLE, np.broadcast_to(FACE, (meshes.MAX_FACES + 1, 3)), "1000001 faces, the limit is 1000000"),
     ],
 )
 def test_arrays_that_are_refused(vertices: np.ndarray, faces: np.ndarray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        meshes.checked(meshes.RawMesh(vertices, faces))
+        meshes.check(meshes.RawMesh(vertices, faces))
 
 
 def test_vertices_that_no_face_uses_are_dropped_unchecked() -> None:
     stray = np.vstack([TRIANGLE, [[np.nan] * 3], [[50.0] * 3]])
-    np.testing.assert_array_equal(meshes.checked(meshes.RawMesh(stray, FACE)).vertices, TRIANGLE)
+    np.testing.assert_array_equal(meshes.check(meshes.RawMesh(stray, FACE)).vertices, TRIANGLE)

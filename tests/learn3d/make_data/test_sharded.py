@@ -1,4 +1,4 @@
-"""Shards made by many processes: the same objects as in one, whatever was killed, and whatever could not be read."""
+"""Shards made by several processes: the same objects as from one process, also after kills and with bad meshes."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_second_call_makes_nothing_and_other_settings_are_refused(config, here
     assert sharded.make_shards(config) == 0
     assert "4 shards, 0 to be made" in capsys.readouterr().err
     assert contents(config.output) == before
-    with pytest.raises(ValueError, match="were made with another seed; ask for the same"):
+    with pytest.raises(ValueError, match="were made with another seed; repeat those settings"):
         sharded.make_shards(dataclasses.replace(config, seed=1))
     photograph = config.output / "03001627" / "photograph.png"
     photograph.write_bytes(b"mine")

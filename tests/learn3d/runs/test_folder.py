@@ -141,7 +141,7 @@ def test_a_link_is_replaced_and_a_pipe_refused(tmp_path) -> None:
     assert other.read_text() == "mine" and not path.is_symlink() and path.stat().st_size
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(OSError, match=r"metrics.jsonl is no plain file"):
+    with pytest.raises(OSError, match=r"metrics.jsonl is not a regular file"):
         RunLog(path.parent, start=0, total=10)
 
 

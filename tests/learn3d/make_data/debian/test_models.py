@@ -1,4 +1,4 @@
-"""Meshes out of Debian packages."""
+"""Meshes from Debian packages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import trimesh
 from small_packages import AIRCRAFT, AIRPLANE, CHAIR, TABLE, ac_object, ac_text, box, catalogue, deb, entry, fetch
 
 from learn3d.make_data.debian import packages
-from learn3d.make_data.debian.aircraft import is_airplane_file, without_effects
+from learn3d.make_data.debian.aircraft import is_airplane_file, remove_effects
 from learn3d.make_data.debian.furniture import furniture_category, place_furniture, read_catalogue
 from learn3d.make_data.debian.models import clean_mesh, surface_grid
 from learn3d.make_data.debian.packages import Part, read_ac3d, read_obj, triangulate
@@ -65,7 +65,7 @@ def test_recipe_writes_meshes_index_and_licences(debs: Path, tmp_path: Path) -> 
     assert reasons.pop("copy.obj") == "near-duplicate of chair/test-chair (surface IoU 1.000)"
     assert reasons.pop("tall.obj").startswith("stretched near-duplicate of chair/test-chair")
     assert reasons.keys() == {"broken.obj", "lost.obj", "odd.dae"}
-    assert "chair        1 meshes\n" in report.summary() and "\n1 left out: near-duplicate" in report.summary()
+    assert "chair        1 meshes\n" in report.summary() and "\n1 skipped: near-duplicate" in report.summary()
     assert (tmp_path / "out/licences/sweethome3d-furniture.copyright").read_bytes() == b"Free-Art"
     for row in rows:
         mesh = trimesh.load(tmp_path / "out" / row["file"], process=False)
@@ -88,7 +88,7 @@ def test_airplane_faces_front_without_its_disc(debs: Path, tmp_path: Path) -> No
 
 def test_requests_that_are_refused_leave_nothing_behind(debs: Path, tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
-    with pytest.raises(ValueError, match="is there already"):
+    with pytest.raises(ValueError, match="already exists"):
         fetch(tmp_path / "there", debs)
     file = next(debs.glob("flightgear*"))
     for content in (b"", b"!<arch>\n", file.read_bytes()[:-200]):
@@ -200,7 +200,7 @@ def test_effects_are_found_by_shape() -> None:
     vapour, twin = Part(square, faces), Part(square, faces[:, ::-1])
     panel = Part(square - [4, 0, 0], faces)  # touches the body's edge
     panel.vertices[0] = [5, 0, 5]
-    kept = without_effects([body, disc, fan, blade, wing, vapour, twin, panel])
+    kept = remove_effects([body, disc, fan, blade, wing, vapour, twin, panel])
     assert [id(one) for one in kept] == [id(one) for one in (body, fan, blade, wing, panel)]
 
 
@@ -246,5 +246,5 @@ def test_obj_text() -> None:
     np.testing.assert_array_equal(vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     np.testing.assert_array_equal(faces, [[0, 1, 2]])
     for text in ("v 0 0\nv 1 2 3", "v 0 0 0\nf 1 2 4", "v 0 0 0\nf 1 1 -9", "f 1 2 x"):
-        with pytest.raises(ValueError, match=r"inhomogeneous|names a vertex that is not there|invalid literal"):
+        with pytest.raises(ValueError, match=r"inhomogeneous|refers to a missing vertex|invalid literal"):
             read_obj(text)
