@@ -9,8 +9,7 @@ from pydantic import Field
 
 from learn3d.data import conventions
 from learn3d.data.categories import synset_of
-from learn3d.data.layouts import Layout
-from learn3d.make_data.writers import WRITERS
+from learn3d.make_data.writers import WRITERS, WrittenLayout
 from learn3d.settings import Count, FilePath, Rare, Weight, checked
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -26,7 +25,7 @@ class DatasetConfig:
     """Folder for the files. It may hold other categories, too."""
     category: str
     """Name of the category. File names have a synset id instead of each of Kato's 13 names."""
-    layout: Layout = "kato"
+    layout: WrittenLayout = "kato"
     """Published data set whose file layout and viewpoints are used, see docs/data-sets.md."""
     views: Count | None = None
     """Views of each object (default: 20 for kar, 24 for r2n2, 8 for pascal3d, 12 for photos and around; kato and dvr

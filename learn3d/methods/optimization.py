@@ -40,7 +40,11 @@ class TrainingSchedule:
             return 1 - done
         if self.lr_schedule == "cosine":
             return (1 + math.cos(math.pi * done)) / 2
-        return 0.1 if self.lr_schedule == "step" and 20 * step > 19 * self.iterations else 1.0
+        if self.lr_schedule == "step":
+            return 0.1 if 20 * step > 19 * self.iterations else 1.0
+        if self.lr_schedule == "constant":
+            return 1.0
+        raise ValueError(f"the schedule {self.lr_schedule!r} has no line in TrainingSchedule.lr_factor")
 
 
 CONSTANT_LR = TrainingSchedule()  # constant learning rates, no EMA

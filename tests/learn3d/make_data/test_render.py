@@ -16,7 +16,6 @@ import nmr
 from learn3d.commands import main
 from learn3d.data.conventions import mesh_to_object, view_poses
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.layouts import LAYOUTS
 from learn3d.data.readers import kato
 from learn3d.make_data import meshes, render
 from learn3d.make_data.render import split_objects
@@ -166,7 +165,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if not WRITERS[name].only_shards])
+@pytest.mark.parametrize("layout", [name for name, writer in WRITERS.items() if not writer.only_shards])
 def test_same_seed_same_bytes_whatever_the_order_of_the_folder(tmp_path, layout, monkeypatch):
     (tmp_path / "meshes").mkdir()
     folder = write_meshes(tmp_path / "meshes")

@@ -85,6 +85,8 @@ def test_schedules() -> None:
     assert factors(warmup_steps=2, lr_schedule="linear") == [0.5, 1, 1, 0.5]
     published = TrainingSchedule(200_000, "step")
     assert [published.lr_factor(step) for step in (1, 190_000, 190_001, 200_000)] == [1, 1, 0.1, 0.1]
+    with pytest.raises(ValueError, match="the schedule 'cubic' has no line"):
+        factors(lr_schedule="cubic")
     with pytest.raises(ValueError, match="warmup_steps"):
         TrainingSchedule(10, warmup_steps=10)
 
