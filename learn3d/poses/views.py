@@ -6,34 +6,38 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import Tensor
 
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.layouts import Layout, load_dataset
 from learn3d.data.pose_table import PoseTable, fingerprints
 from learn3d.data.poses import LookAtPoses, wrap_deg
+from learn3d.files import limits
 from learn3d.files.reading import MissingFile
 from learn3d.poses.estimate import MIN_IMAGES, NEAR_DEG, SIZE, Candidates, Estimate, Masks, PoseOptions, estimate
+from learn3d.settings import checked
 
 MAX_ELEVATION_STEP_DEG = 15.0  # between neighbouring candidates
 DEFAULT_ELEVATION_DEG, DEFAULT_FOV_DEG = 30.0, 30.0
 MIN_CONFIDENCE = 0.5  # an image with less counts as doubtful
 
 
-@dataclass(frozen=True)
+@checked
 class CameraOptions:
     """Known values of the cameras."""
 
     elevation: str | None = None
     """Elevation of all cameras in degrees, or a range LOW:HIGH (default: from the data set, or 30 if it has none)."""
-    distance: float | None = None
+    distance: Annotated[float, Field(gt=0.5, lt=limits.DISTANCE[1])] | None = None
     """Distance of all cameras, in units of the object's longest side (default: from the data set, or estimated from the
     largest mask)."""
-    fov_deg: float | None = None
+    fov_deg: Annotated[float, Field(gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None = None
     """Full field of view of all cameras in degrees (default: from the data set, or 30 if it has none)."""
 
     def elevations(self) -> tuple[float, float] | None:
