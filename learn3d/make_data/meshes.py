@@ -28,7 +28,7 @@ def list_sources(source: Path) -> dict[str, Source]:
         files = {p.relative_to(source).as_posix(): p for p in source.rglob("*") if p.suffix.lower() in EXTENSIONS}
         found = {name: functools.partial(read_mesh, files[name]) for name in sorted(files)}
     elif source.suffix == ".npz":
-        count = sum(key.startswith("v") for key in sandbox.read(npz.keys, source, wanted=_PACK))
+        count = sum(bool(re.fullmatch(r"v\d+", key)) for key in sandbox.read(npz.keys, source, wanted=_PACK))
         found = {f"{i:0{len(str(count - 1))}d}": functools.partial(_packed, source, i) for i in range(count)}
     else:
         kind = ValueError if source.exists() else FileNotFoundError

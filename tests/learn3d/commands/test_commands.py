@@ -136,7 +136,7 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
         ("train --data {tmp} --category airplane --output {tmp}/run", "02691156_train_images.npz"),
         ("train --output {tmp} --resume", "folder of a training run"),
         ("train --out {tmp} --resume", "--resume needs --output: the folder of the run"),
-        ("train --data {tmp}/no --category chair --output {tmp}/run", "data set is with --data"),
+        ("train --data {tmp}/no --category chair --output {tmp}/run", "data set with --data"),
         ("train --output {run} --resume --preset vanilla", "with the preset peng2020-kato, got peng2020-kato-vanilla"),
         ("train --output {run} --resume --overwrite", "give one of them"),
         ("train --data x --category chair --output {tmp}/run --batch-size 0", "batch_size must be at least 1, got 0"),
@@ -157,7 +157,7 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
             "reconstruct --run {run} --data {data} --output {tmp}/file/x",
             "cannot write {tmp}/file/x: Not a directory; give another",
         ),
-        ("reconstruct --run {run} --data {tmp}/nope --output {tmp}/x", "is with --data"),
+        ("reconstruct --run {run} --data {tmp}/nope --output {tmp}/x", "data set with --data"),
     ],
 )
 def test_mistakes_are_one_clear_line_before_a_model_is_loaded(
