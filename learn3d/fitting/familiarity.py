@@ -17,7 +17,7 @@ from learn3d.methods import MeshMethod
 CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
 MOST = 0.82  # distance above which a picture is unknown if no other objects were learnt
-OTHER = 1.0  # `KnownCodes.resemblance` above which a picture is unknown
+OTHER = 2.0  # `KnownCodes.resemblance` above which a picture is unknown
 KNOWN_CODES = "known_codes", "hidden_layer", "output_layer"  # names of the tensors of `KnownCodes` in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
 _HIDDEN, _MEMBERS, _DROPOUT, _STEPS = 64, 2, 0.3, 300  # of the classifiers, whose logits are averaged

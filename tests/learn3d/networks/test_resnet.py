@@ -176,7 +176,7 @@ def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
     with open(path, "wb") as file:
         file.truncate(limits.WEIGHTS_BYTES + 1)
-    with pytest.raises(ValueError, match=r"w\.pth: has \d+ bytes, and at most"):
+    with pytest.raises(ValueError, match=r"w\.pth: has \d+ bytes; the limit is"):
         load_pretrained(encoder, path)
 
 
