@@ -13,6 +13,8 @@ from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import batches
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.methods import create_method
+from learn3d.methods.method import MeshMethod
+from learn3d.poses.updates import update_poses, update_steps
 from learn3d.runs import folder as run_folder
 from learn3d.runs.log import RunLog, check_log
 from learn3d.runs.state import Run, describe_images
@@ -47,10 +49,12 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
         method = create_method(config.settings, info, **options)
         method.check_batch(next(batches(train_set, config)))  # before `begin` removes an older run
-        run = Run(config, method, info, describe_images(train_set))
+        run = Run(config, method, info, describe_images(train_set), train_set.candidates)
         progress, notes = run.begin(train_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:
             return Summary.of(config, progress, started)
+        estimated = train_set.candidates is not None and isinstance(method, MeshMethod)
+        updates = update_steps(config.iterations, config.pose_updates if estimated else 0)
         before, start = progress.seconds, progress.step + 1
         threads.resume(progress.threads)
 
@@ -75,6 +79,9 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
                 last, stopped_by = step == config.iterations, stop.name
                 if last or step % config.log_every == 0:
                     log.metrics(step, "train", recent)
+                if step in updates:
+                    changed = update_poses(method, train_set)
+                    log.say(f"step {step}: poses weighted anew, {changed:.0%} of the images have another one")
                 if last or step % config.validate_every == 0:
                     progress = validate(run, val_set, progress, log)
                 if last or step % config.pictures_every == 0:

@@ -16,6 +16,7 @@ from learn3d.data.categories import synset_of
 from learn3d.data.checking import check_folder
 from learn3d.data.conventions import IMAGE_SIZE
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
+from learn3d.data.pose_table import MAX_CANDIDATES
 from learn3d.data.readers import READERS
 from learn3d.files.writing import check_target, write_json
 from learn3d.make_data.config import DatasetConfig
@@ -174,15 +175,15 @@ class EstimatePoses(Command):
     options: PoseOptions
     cameras: CameraOptions
     candidates: Annotated[int, tyro.conf.arg(metavar="INT")] = 4
-    """Number of poses of each image in the table, with probabilities; each training step draws one."""
+    """Number of poses of each image with a probability above 0; each training step draws one."""
     compare: bool = False
     """Compare with the known azimuths, and turn the table into their frame, so that voxel IoU can be measured."""
     views_per_object: Count | None = None
     """Number of training images of each object (default: the layout's protocol, one for kar, else all)."""
 
     def run(self) -> None:
-        if not 1 <= self.candidates <= 64:
-            raise ValueError(f"candidates must lie in 1 .. 64, got {self.candidates}")
+        if not 1 <= self.candidates <= MAX_CANDIDATES:
+            raise ValueError(f"candidates must lie in 1 .. {MAX_CANDIDATES}, got {self.candidates}")
         check_target(self.output, "--output")
         datasets = load_views(self.layout, self.data, self.category, self.views_per_object)
         with tqdm(total=self.options.all_steps, desc="poses", unit="step", disable=not is_watched()) as bar:

@@ -25,7 +25,7 @@ from learn3d.files.writing import replacing
 
 _WANTED = "a table that learn3d estimate-poses wrote"
 _DTYPES = {"fingerprint": np.dtype(np.uint64)}  # the other arrays are float32
-_MAX_CANDIDATES = 64
+MAX_CANDIDATES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +42,8 @@ class PoseTable:
 
     def __post_init__(self) -> None:
         count, shape = len(self.fingerprint), self.azimuth_deg.shape
-        if not count or len(shape) != 2 or not 1 <= shape[1] <= _MAX_CANDIDATES:
-            raise ValueError(f"azimuth_deg must be [N, C] with N >= 1 and C in 1 .. {_MAX_CANDIDATES}, got {shape}")
+        if not count or len(shape) != 2 or not 1 <= shape[1] <= MAX_CANDIDATES:
+            raise ValueError(f"azimuth_deg must be [N, C] with N >= 1 and C in 1 .. {MAX_CANDIDATES}, got {shape}")
         for field in dataclasses.fields(self):
             values = getattr(self, field.name)
             dtype = _DTYPES.get(field.name, np.dtype(np.float32))

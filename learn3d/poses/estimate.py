@@ -4,9 +4,10 @@
    IoU. Of several random initialisations, the one with the smallest silhouette loss is kept.
 2. Prototypes, shapes for the different kinds of objects, start as the mean shape and are fitted in the same way: EM
    over prototype and pose.
-3. Silhouettes hardly tell front from back, so a prototype may be turned by 180 degrees against the others. Nearly equal
-   masks of different prototypes vote for or against a turn. So do upper outlines, which show parts at one end only: an
-   airplane's fin, a chair's back. The votes are the couplings of an Ising model with one spin per prototype.
+3. Silhouettes hardly tell front from back, nor the long side of a table from its short side. So a prototype may be
+   turned by 90 or 180 degrees against the others. Nearly equal masks of different prototypes vote for turns. So do
+   upper outlines, which show parts at one end only: an airplane's fin, a chair's back. The votes are the couplings of
+   a Potts model whose states are the four turns of each prototype.
 4. The posteriors over poses are smoothed over the nearest masks and the nearest mirrored masks. Then steps 2 to 4 are
    repeated with the smoothed posteriors as a prior.
 
@@ -15,6 +16,7 @@ Objects are assumed to be symmetric about x = 0: the view from azimuth -a is the
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -33,10 +35,11 @@ SIZE = 32  # side of the compared masks and renderings, in pixels
 MAX_FITTED = 6000  # images that shapes are fitted to and that can be neighbours
 MIN_IMAGES = 100  # with fewer images, no pose is trusted
 NEAR_DEG = 30.0  # largest error of an azimuth that counts as right
+TURNS = 4  # states of a prototype's turn, in steps of 90 degrees
 STAGES = 3  # repetitions of the steps 2 to 4
 MAX_CONFIDENCE = 0.88  # if the nearest masks all agree; below 1, as they also agree if all are turned by 180 degrees
 _BATCH = 256
-_TEMPERATURE = 0.02  # of a softmax over 1 - IoU
+TEMPERATURE = 0.02  # of a softmax over 1 - IoU
 _NEIGHBOURS, _VOTERS = 8, 5  # nearest masks for smoothing, and for votes on turns
 _NEIGHBOUR_SCALE = 0.1  # distance at which the weight of a neighbour has fallen to 1 / e
 _FAR = 9.0  # distance of masks that must not be neighbours
@@ -45,8 +48,8 @@ _OUTLINE_WEIGHT = 0.5  # weight of the votes of upper outlines; that of nearly e
 
 @checked
 class PoseOptions:
-    azimuths: Annotated[int, Field(ge=4, le=360, multiple_of=2)] = 24
-    """Number of candidate azimuths, equally spaced."""
+    azimuths: Annotated[int, Field(ge=4, le=360, multiple_of=4)] = 24
+    """Number of candidate azimuths, equally spaced; a multiple of 4."""
     prototypes: Annotated[int, Field(ge=1, le=64)] = 24
     """Number of fitted shapes, each for one kind of object."""
     restarts: Annotated[int, Field(ge=1, le=100)] = 4
@@ -132,20 +135,20 @@ def estimate(
         torch.manual_seed(options.seed)
         shapes = _mean_shape(subset, candidates, options, rng, tick)
     shapes.codes = 0.3 * torch.randn(options.prototypes, CODE_SIZE, generator=rng)
-    shapes.turned = torch.zeros(options.prototypes, dtype=torch.bool)
+    shapes.turns = torch.zeros(options.prototypes, dtype=torch.int64)
     neighbours, log_prior = Neighbours.of(subset, subset), None
     for stage in range(STAGES):
         start = 0.03 if stage else 0.05
         _train(shapes, subset, options, rng, start=start, smooth=3e-4, log_prior=log_prior, tick=tick)
-        shapes.turned = shapes.turned ^ _turns(shapes.all_distances(subset), subset, rng)
-        own = _posteriors(-shapes.all_distances(subset) / _TEMPERATURE, options.prior)
+        shapes.turns = (shapes.turns + _turns(shapes.all_distances(subset), subset, rng)) % TURNS
+        own = _posteriors(-shapes.all_distances(subset) / TEMPERATURE, options.prior)
         smooth = neighbours.smooth(own.sum(1), options.prior)
         log_prior = (smooth + 1e-3).log()
     posterior, confidence = torch.empty(len(data), *smooth.shape[1:]), torch.empty(len(data))
     for rows in torch.arange(len(data)).split(2048):
         part = data[rows]
         near = Neighbours.of(part, subset)
-        alone = _posteriors(-shapes.all_distances(part) / _TEMPERATURE, "free").sum(1)
+        alone = _posteriors(-shapes.all_distances(part) / TEMPERATURE, "free").sum(1)
         posterior[rows] = _normalize(alone**0.3 * (near.message(smooth) + 1e-3))
         best = posterior[rows].sum(2).argmax(1)
         confidence[rows] = MAX_CONFIDENCE * near_mass(near.message(own.sum(1)).sum(2), best)
@@ -183,7 +186,7 @@ class Shapes:
         scale = torch.exp(torch.empty(3).uniform_(np.log(0.3), 0.0, generator=rng))
         self.base = 0.5 * self.network.place(self.network.sphere) * (scale - 1)
         self.codes = torch.zeros(1, CODE_SIZE)
-        self.turned = torch.zeros(1, dtype=torch.bool)  # True if azimuth 0 of a shape is at its back
+        self.turns = torch.zeros(1, dtype=torch.int64)  # quarter turns of a shape: its own azimuth 0 is at 90 of them
 
     def vertices(self) -> Tensor:
         """Vertices float32 [M, V, 3], before any turn."""
@@ -196,13 +199,16 @@ class Shapes:
         repeated = vertices.repeat_interleave(len(cameras.eye) // count, 0)
         rendered = nmr.render_silhouette(repeated, self.network.faces, cameras, image_size=SIZE).flatten(1)
         values = distances(masks, rendered).reshape(len(masks), count, azimuths, -1)
-        return torch.where(self.turned[:, None, None], values.roll(azimuths // 2, 2), values)
+        own = (torch.arange(azimuths) - self.turns[:, None] * (azimuths // TURNS)) % azimuths
+        return values.gather(2, own[None, :, :, None].expand_as(values))
 
     @torch.no_grad()
     def align(self) -> tuple[Tensor, Tensor]:
         """Vertices [M, V, 3], all turned with azimuth 0 to the front, and faces [F, 3]."""
-        turn = torch.where(self.turned[:, None], torch.tensor([-1.0, 1.0, -1.0]), torch.ones(3))
-        return self.vertices() * turn[:, None], self.network.faces
+        angle = self.turns * (2 * math.pi / TURNS)
+        cos, sin = angle.cos().round()[:, None], angle.sin().round()[:, None]
+        x, y, z = self.vertices().unbind(2)
+        return torch.stack([cos * x - sin * z, y, sin * x + cos * z], 2), self.network.faces
 
     @torch.no_grad()
     def all_distances(self, data: Masks) -> Tensor:
@@ -231,7 +237,7 @@ def _train(
 ) -> None:
     """EM: the posteriors over shapes and poses follow from the IoU, then a gradient step fits the shapes to the masks.
 
-    The temperature falls from `start` to `_TEMPERATURE`. smooth: weight of the smoothness loss. log_prior: [N, A, E].
+    The temperature falls from `start` to `TEMPERATURE`. smooth: weight of the smoothness loss. log_prior: [N, A, E].
     """
     shapes.codes.requires_grad_()
     groups = [{"params": shapes.network.parameters()}]
@@ -240,7 +246,7 @@ def _train(
     optimizer = torch.optim.Adam(groups, 4e-4)
     for step, (rows, elevations) in enumerate(data.batches(rng, options.steps)):
         done = step / options.steps
-        temperature = start ** (1 - done) * _TEMPERATURE**done
+        temperature = start ** (1 - done) * TEMPERATURE**done
         vertices = shapes.vertices()
         values = shapes.distances(data.masks[rows], vertices, elevations)
         logits = -values.detach() / temperature
@@ -277,7 +283,7 @@ def _mean_shape(
         shapes = Shapes(candidates, rng)
         _train(shapes, data, options, rng, start=0.1, smooth=5e-4, tick=tick)
         values = shapes.all_distances(data)
-        posterior = _posteriors(-values / _TEMPERATURE, options.prior)
+        posterior = _posteriors(-values / TEMPERATURE, options.prior)
         loss = float((posterior * values.nan_to_num(posinf=0.0)).sum((1, 2, 3)).mean())
         found.append((loss, shapes))
     return min(found, key=lambda pair: pair[0])[1]
@@ -335,69 +341,79 @@ def _normalize(posterior: Tensor) -> Tensor:
 
 
 def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> Tensor:
-    """Which prototypes to turn by 180 degrees so that similar masks have nearly equal azimuths: bool [M]."""
-    posterior = torch.softmax(-values.flatten(1) / _TEMPERATURE, 1).reshape(values.shape)
+    """Quarter turns of the prototypes after which similar masks have nearly equal azimuths: int64 [M]."""
+    posterior = torch.softmax(-values.flatten(1) / TEMPERATURE, 1).reshape(values.shape)
     count, azimuths = values.shape[1:3]
     prototype = posterior.sum((2, 3)).argmax(1)
     azimuth = posterior[torch.arange(len(values)), prototype].sum(2).argmax(1)
-    coupling = np.zeros((count, count))
+    coupling = np.zeros((TURNS, TURNS, count, count))
     for weight, votes in (
         (1.0, _mask_votes(data, prototype, azimuth, count, azimuths)),
         (_OUTLINE_WEIGHT, _outline_votes(data, prototype, azimuth, count, azimuths)),
     ):
-        votes = (votes + votes.T).fill_diagonal_(0)
+        votes = votes + votes.permute(1, 0, 3, 2)
+        votes = (votes - votes.mean((0, 1))) * (1 - torch.eye(count))
         coupling += weight * (votes / votes.abs().sum().clamp_min(1e-12)).numpy()
     draw = np.random.default_rng(int(torch.randint(2**31, (), generator=rng)))
-    best, best_score = np.ones(count), -np.inf  # coordinate ascent from random spins
-    for _ in range(200):
-        spins = draw.choice([-1.0, 1.0], count)
+    best, best_score, every = np.zeros(count, np.int64), -np.inf, np.arange(count)
+    for _ in range(200):  # coordinate ascent from random turns
+        turns = draw.integers(TURNS, size=count)
         for _ in range(50):
-            before = spins.copy()
+            before = turns.copy()
             for i in draw.permutation(count):
-                spins[i] = 1.0 if coupling[i] @ spins >= 0 else -1.0
-            if (spins == before).all():
+                turns[i] = coupling[:, turns, i, every].sum(1).argmax()
+            if (turns == before).all():
                 break
-        if (score := spins @ coupling @ spins) > best_score:
-            best, best_score = spins, score
-    return torch.from_numpy(best * best[0] < 0)
+        if (score := coupling[turns[:, None], turns, every[:, None], every].sum()) > best_score:
+            best, best_score = turns, score
+    return torch.from_numpy((best - best[0]) % TURNS)
 
 
 def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:
-    """Votes float64 [M, M] of nearest masks of different prototypes: 1 for nearly equal azimuths, -1 for opposite ones.
+    """Votes float64 [TURNS, TURNS, M, M] of nearest masks of different prototypes: their weight if these turns of the
+    two prototypes make the azimuths nearly equal.
 
     prototype, azimuth: int64 [N].
     """
-    votes = torch.zeros(count, count, dtype=torch.float64)
-    near = azimuths / 12
-    neighbours = Neighbours.of(data, data, prototype, _VOTERS)
+    votes = torch.zeros(TURNS, TURNS, count, count, dtype=torch.float64)
+    neighbours, quarter = Neighbours.of(data, data, prototype, _VOTERS), azimuths // TURNS
     for mirrored, (rows, weights) in enumerate(zip(neighbours.rows, neighbours.weights, strict=True)):
-        own = (-azimuth) % azimuths if mirrored else azimuth
-        error = (azimuth[rows] - own[:, None]) % azimuths
-        error = torch.minimum(error, azimuths - error)
-        sign = (error <= near).double() - (error >= azimuths / 2 - near).double()
-        votes.index_put_((prototype[:, None].expand_as(rows), prototype[rows]), sign * weights, accumulate=True)
+        pairs = (prototype[:, None].expand_as(rows), prototype[rows])
+        for own, other in itertools.product(range(TURNS), repeat=2):
+            turned = (azimuth + own * quarter) * (-1 if mirrored else 1)
+            error = (azimuth[rows] + other * quarter - turned[:, None]) % azimuths
+            near = torch.minimum(error, azimuths - error) <= azimuths / 12
+            votes[own, other].index_put_(pairs, near.double() * weights, accumulate=True)
     return votes
 
 
 def _outline_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:
-    """Votes float64 [M, M] of upper outlines. prototype, azimuth: int64 [N].
+    """Votes float64 [TURNS, TURNS, M, M] of upper outlines. prototype, azimuth: int64 [N].
 
-    A mask votes with the distance to the prototype's nearest outline at the opposite azimuth, minus that at the same
-    azimuth.
+    A mask votes against two turns with its distance to the other prototype's nearest outline at the same azimuth.
     """
     outlines = _upper_outlines(data.masks)
-    votes = torch.zeros(count, count, dtype=torch.float64)
+    votes = torch.zeros(TURNS, TURNS, count, count, dtype=torch.float64)
     for part in torch.arange(len(data)).split(512):
-        nearest = torch.full((len(part), count * azimuths), float("inf"))
         same_object = data.objects[part][:, None] == data.objects
+        nearest = []
         for others, seen_from in ((outlines, azimuth), (outlines.flip(1), (-azimuth) % azimuths)):
             values = torch.cdist(outlines[part], others).masked_fill(same_object, float("inf"))
             cells = (prototype * azimuths + seen_from).expand_as(values)
-            nearest.scatter_reduce_(1, cells, values, "amin")
-        nearest = nearest.view(len(part), count, azimuths)
+            least = torch.full((len(part), count * azimuths), float("inf")).scatter_reduce_(1, cells, values, "amin")
+            nearest.append(least.view(len(part), count, azimuths))
+        known = torch.minimum(*nearest)
+        mean = known.nan_to_num(posinf=0.0).sum(2) / known.isfinite().sum(2).clamp_min(1)  # if no mask has an azimuth
         rows = torch.arange(len(part))
-        gain = nearest[rows, :, (azimuth[part] + azimuths // 2) % azimuths] - nearest[rows, :, azimuth[part]]
-        votes.index_add_(0, prototype[part], gain.nan_to_num(0.0, posinf=0.0, neginf=0.0).double())
+        for own, other in itertools.product(range(TURNS), repeat=2):
+            turned, turn = azimuth[part] + own * (azimuths // TURNS), other * (azimuths // TURNS)
+            plain, mirrored = (
+                values[rows, :, place % azimuths]
+                for values, place in zip(nearest, (turned - turn, turned + turn), strict=True)
+            )
+            distance = torch.minimum(plain, mirrored)
+            distance = torch.where(distance.isinf(), mean, distance).double()
+            votes[own, other].index_add_(0, prototype[part], -distance)
     return votes
 
 

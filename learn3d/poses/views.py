@@ -16,7 +16,7 @@ from torch import Tensor
 
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.layouts import Layout, load_dataset
-from learn3d.data.pose_table import PoseTable, fingerprints
+from learn3d.data.pose_table import MAX_CANDIDATES, PoseTable, fingerprints
 from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.files import limits
 from learn3d.files.reading import MissingFile
@@ -99,8 +99,9 @@ def estimate_views(
 ) -> EstimatedViews:
     """Estimate the poses of all images. Shapes are fitted to the images of the first data set, the training split.
 
-    kept: number of candidates of each image in the table. tick: called after each of `options.all_steps` steps. Raises
-    ValueError if all training masks are empty, or if the data set's poses are rotations.
+    kept: number of candidates of each image with a probability above 0; the table holds up to MAX_CANDIDATES, which a
+    training can weight anew. tick: called after each of `options.all_steps` steps. Raises ValueError if all training
+    masks are empty, or if the data set's poses are rotations.
     """
     elevation, distance, half_fov = _cameras(datasets, cameras)
     size = distance * torch.tan(half_fov.deg2rad())
@@ -127,7 +128,8 @@ def estimate_views(
     posterior = torch.full((len(masks), len(azimuths) * len(grid)), 1 / (len(azimuths) * len(grid)))
     posterior[shown] = result.posterior.flatten(1)
     confidence = torch.zeros(len(masks)).index_copy(0, shown, result.confidence)
-    weights, chosen = posterior.topk(min(kept, posterior.shape[1]), 1)
+    weights, chosen = posterior.topk(min(MAX_CANDIDATES, posterior.shape[1]), 1)
+    weights[:, kept:] = 0
     heights = grid[chosen % len(grid)]
     if cameras.elevation is None:
         heights = elevation[:, None].expand_as(heights)
@@ -188,6 +190,7 @@ class Comparison:
 
     offset_deg: float
     accuracy: float  # Acc@30: share of errors of at most 30 degrees
+    half_turn_accuracy: float  # the same, if half a turn does not count: many tables look the same from behind
     median_deg: float
     mean_deg: float
     flips: float  # share of errors of at least 150 degrees
@@ -198,8 +201,9 @@ class Comparison:
         """Lines for the terminal."""
         lines = [
             f"against the data's azimuths (frame turned by {self.offset_deg:g} degrees): Acc@30 {self.accuracy:.3f}, "
-            f"median error {self.median_deg:.1f}, mean {self.mean_deg:.1f} degrees, flips {self.flips:.3f}, objects "
-            f"flipped as a whole {self.objects_flipped:.3f}"
+            f"up to half a turn {self.half_turn_accuracy:.3f}, median error {self.median_deg:.1f}, "
+            f"mean {self.mean_deg:.1f} degrees, flips {self.flips:.3f}, "
+            f"objects flipped as a whole {self.objects_flipped:.3f}"
         ]
         return "\n".join(lines + [f"confidence {c:.2f}: Acc@30 {a:.2f} ({n} images)" for c, a, n in self.calibration])
 
@@ -207,8 +211,9 @@ class Comparison:
 def compare(views: EstimatedViews) -> Comparison:
     """Compare the most probable azimuths with the true ones.
 
-    The frame is turned by the whole number of degrees with the smallest mean error. It is that of the validation
-    images, or of all images if there is no validation split. Raises ValueError if the data set has no poses.
+    The frame is turned by the whole number of degrees with the smallest sum of two mean errors of the validation images
+    (of all images, if there is no validation split): that of the azimuths, and that up to half a turn, which alone
+    decides for objects that look the same from front and back. Raises ValueError if the data set has no poses.
     """
     if any(dataset.poses is None for dataset in views.datasets):
         raise ValueError("--compare needs true poses, but this data set has none")
@@ -216,8 +221,8 @@ def compare(views: EstimatedViews) -> Comparison:
     splits = np.concatenate([[dataset.split] * len(dataset) for dataset in views.datasets])
     chosen = torch.from_numpy(splits == "val") if "val" in splits else torch.ones(len(true), dtype=torch.bool)
     offsets = torch.arange(360.0)
-    means = torch.stack([wrap_deg(found[chosen] + o - true[chosen]).abs().mean() for o in offsets])
-    offset = float(offsets[means.argmin()])
+    turned = (wrap_deg(found[chosen] + o - true[chosen]).abs() for o in offsets)
+    offset = float(offsets[torch.stack([(e + _up_to_half_turn(e)).mean() for e in turned]).argmin()])
     errors = wrap_deg(found + offset - true).abs()[views.shown]
     flips = (errors >= 150).double()
     objects = torch.cat([torch.from_numpy(d.object_ids) + 10**6 * i for i, d in enumerate(views.datasets)])
@@ -226,5 +231,10 @@ def compare(views: EstimatedViews) -> Comparison:
     right, confidence = (errors <= NEAR_DEG).double(), views.result.confidence.double()
     bins = [torch.nonzero((10 * confidence).floor().clamp(max=9) == k)[:, 0] for k in range(10)]
     calibration = tuple((float(confidence[b].mean()), float(right[b].mean()), len(b)) for b in bins if len(b))
-    numbers = (right.mean(), errors.median(), errors.mean(), flips.mean(), (by_object > 0.5).double().mean())
-    return Comparison(offset, *map(float, numbers), calibration)
+    up_to_half_turn = (_up_to_half_turn(errors) <= NEAR_DEG).double()
+    numbers = (right.mean(), up_to_half_turn.mean(), errors.median(), errors.mean(), flips.mean())
+    return Comparison(offset, *map(float, (*numbers, (by_object > 0.5).double().mean())), calibration)
+
+
+def _up_to_half_turn(errors: Tensor) -> Tensor:
+    return torch.minimum(errors, 180 - errors)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from learn3d.config import TrainConfig, check_resume, config_to_dict, load_config
+from learn3d.data.batch import PoseCandidates
 from learn3d.data.dataset import ViewDataset
 from learn3d.files import writing
 from learn3d.methods import DatasetInfo, Method
@@ -32,6 +33,7 @@ class Run:
     method: Method
     info: DatasetInfo
     data: str  # `describe_images` of the training images
+    candidates: PoseCandidates | None = None  # estimated poses of the training images, whose weights change
     versions: dict[str, str | None] = field(default_factory=versions)
 
     def begin(self, train_set: ViewDataset, *, resume: bool, overwrite: bool) -> tuple[Progress, tuple[str, ...]]:
@@ -74,6 +76,8 @@ class Run:
                 checkpoint.restore_networks(self.method, tensors, path, "ema")
         for name, optimizer in self.method.optimizers.items():
             checkpoint.restore_optimizer(name, optimizer, tensors, path)
+        if self.candidates is not None:
+            self.candidates.weights[:] = tensors["poses.weights"]
         if "random.cpu" not in tensors:
             raise ValueError(f"{path} holds no state of the random numbers; is it the last checkpoint of a run?")
         torch.set_rng_state(tensors["random.cpu"])
@@ -93,6 +97,8 @@ class Run:
         tensors = checkpoint.network_tensors(self.method)
         if self.method.ema is not None:
             tensors |= {f"ema.{name}": tensor for name, tensor in self.method.ema.tensors.items()}
+        if self.candidates is not None:
+            tensors["poses.weights"] = torch.from_numpy(self.candidates.weights)
         tensors["random.cpu"] = torch.get_rng_state()
         if self.config.device == "cuda":
             tensors["random.cuda"] = torch.cuda.get_rng_state()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import torch
 
 import nmr
 from learn3d.config import TrainConfig
-from learn3d.data.batch import PoseCandidates
+from learn3d.data.batch import Batch, PoseCandidates
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
 from learn3d.data.pose_table import PoseTable, fingerprints
@@ -20,24 +22,34 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import kato
 from learn3d.data.sampling import batches
 from learn3d.files.reading import DamagedFile
-from learn3d.poses.estimate import SIZE, Masks, PoseOptions, _outline_votes
+from learn3d.methods.plus import Plus
+from learn3d.methods.surfaces import Meshes
+from learn3d.poses.estimate import SIZE, Masks, PoseOptions, _outline_votes, _turns
 from learn3d.poses.sheet import draw_sheet
+from learn3d.poses.updates import update_poses, update_steps
 from learn3d.poses.views import CameraOptions, EstimatedViews, compare, estimate_views
+from learn3d.runs import checkpoint
 from learn3d.training import train
 
 QUICK = PoseOptions(steps=25, restarts=1, prototypes=3)
 
 
-def darts(objects: int) -> ViewDataset:
-    """Objects with a thick front and a thin back, in Kato's 24 views."""
+def dart_shapes(count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Vertices and faces of objects with a thick front and a thin back."""
     sphere, faces = nmr.icosphere(2)
-    rng, images = np.random.default_rng(0), np.zeros((objects, 24, 4, 64, 64), np.uint8)
-    poses = kato.from_arrays(images[:1], None, "dart", "train").poses
-    for image in images:
-        width = torch.from_numpy(rng.uniform(0.9, 1.1, 3)) * torch.tensor([0.3, 0.1, 0.5])
-        taper = torch.stack([1 - 0.9 * sphere[:, 2], 1 - 0.9 * sphere[:, 2], torch.ones(len(sphere))], 1)
-        vertices = (sphere * taper * width).float().expand(24, -1, -1)
-        image[:, 3] = (255 * nmr.render_silhouette(vertices, faces, poses.cameras(), image_size=64)).byte().numpy()
+    width = torch.from_numpy(np.random.default_rng(0).uniform(0.9, 1.1, (count, 1, 3))) * torch.tensor([0.3, 0.1, 0.5])
+    taper = torch.stack([1 - 0.9 * sphere[:, 2], 1 - 0.9 * sphere[:, 2], torch.ones(len(sphere))], 1)
+    return (sphere * taper * width).float(), faces
+
+
+def darts(objects: int) -> ViewDataset:
+    """`dart_shapes` in Kato's 24 views."""
+    shapes, faces = dart_shapes(objects)
+    images = np.zeros((objects, 24, 4, 64, 64), np.uint8)
+    cameras = kato.from_arrays(images[:1], None, "dart", "train").poses.cameras()
+    for image, vertices in zip(images, shapes, strict=True):
+        drawn = nmr.render_silhouette(vertices.expand(24, -1, -1), faces, cameras, image_size=64)
+        image[:, 3] = (255 * drawn).byte().numpy()
     return kato.from_arrays(images, None, "dart", "train")
 
 
@@ -53,7 +65,7 @@ def found() -> EstimatedViews:
 def test_azimuths_of_distinct_shapes_are_found(found: EstimatedViews) -> None:
     result = compare(found)
     assert result.accuracy > 0.9 and result.flips < 0.1 and not found.warnings
-    assert found.table.weights.shape == (192, 2)
+    assert found.table.weights.shape == (192, 24) and (found.table.weights[:, 2:] == 0).all()
     assert draw_sheet(found).ndim == 3
 
 
@@ -83,18 +95,31 @@ def test_a_range_of_elevations_and_unknown_cameras() -> None:
         compare(views)
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_upper_outlines_tell_front_from_back(turned: bool) -> None:
+@pytest.mark.parametrize("turns", [0, 2])
+def test_upper_outlines_tell_front_from_back(turns: int) -> None:
     """Two kinds of objects with a fin at the back, one seen from its right and one from its left side each."""
     masks = torch.zeros(4, SIZE, SIZE)
     for mask, height in zip(masks, (4, 4, 8, 8), strict=True):
         mask[16 : 16 + height, 4:28], mask[8:16, 23:27] = 1, 1
     masks[1::2] = masks[1::2].flip(2)
     prototype, azimuth = torch.tensor([0, 0, 1, 1]), torch.tensor([1, 3, 1, 3])
-    seen = torch.where(prototype == 1, (azimuth + 2) % 4, azimuth) if turned else azimuth
+    seen = torch.where(prototype == 1, (azimuth - turns) % 4, azimuth)
     data = Masks(masks.flatten(1), torch.ones(4, 1, dtype=torch.bool), torch.arange(4))
-    votes = _outline_votes(data, prototype, seen, 2, 4)
-    assert (votes[0, 1] < 0 and votes[1, 0] < 0) if turned else (votes[0, 1] > 0 and votes[1, 0] > 0)
+    votes = _outline_votes(data, prototype, seen, 2, 4)[0, :, 0, 1]  # the first prototype stays as it is
+    assert votes.argmax() == turns and votes[turns] > votes[2 - turns]
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_prototypes_are_turned_into_one_frame(turns: int) -> None:
+    """Two prototypes for objects of one kind; azimuths of the second are counted from another side."""
+    dataset = darts(6)
+    masks = torch.from_numpy(dataset.read_masks(np.arange(144))).float() / 255
+    masks = torch.nn.functional.avg_pool2d(masks[:, None], 64 // SIZE).flatten(1)
+    data = Masks(masks, torch.ones(144, 1, dtype=torch.bool), torch.from_numpy(dataset.object_ids).long())
+    azimuth, prototype = (dataset.poses.azimuth_deg / 15).round().long() % 24, data.objects % 2
+    values = torch.ones(144, 2, 24, 1)
+    values[torch.arange(144), prototype, (azimuth - 6 * turns * prototype) % 24] = 0.0
+    assert _turns(values, data, torch.Generator().manual_seed(0)).tolist() == [0, turns]
 
 
 def test_ambiguous_poses_get_low_confidence() -> None:
@@ -177,13 +202,82 @@ def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset) -> None:
     assert all((b.poses.azimuth_deg % 2).sum() < 8 for b in batches(dataset, options))
 
 
-@pytest.mark.parametrize("preset", ["plus-kato", "peng2020-kato", "peng2020-kato-vanilla", "peng2020-kato-vpl"])
-def test_methods_learn_from_a_table(
-    preset: str, tmp_path: Path, run_folder: Path, tiny_folder: Path, tiny_config: Callable[..., TrainConfig]
-) -> None:
-    sets = [load_dataset("kato", tiny_folder, "airplane", split) for split in ("train", "val")]
-    tables = [random_table(dataset) for dataset in sets]
-    columns = (np.concatenate([getattr(table, name) for table in tables]) for name in vars(tables[0]))
+class Prophet:
+    """A method that knows the shape of each image."""
+
+    training, device = False, "cpu"
+
+    def __init__(self, vertices: torch.Tensor, faces: torch.Tensor) -> None:
+        self.vertices, self.faces, self.done = vertices, faces, 0
+
+    def ema_weights(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def set_training(self, training: bool) -> None: ...
+
+    def encode(self, images: torch.Tensor) -> torch.Tensor:
+        return images
+
+    def decode(self, codes: torch.Tensor) -> Meshes:
+        self.done += len(codes)
+        return Meshes(self.vertices[self.done - len(codes) : self.done], self.faces)
+
+
+def test_poses_are_found_again_from_the_models_shapes() -> None:
+    vertices, faces = dart_shapes(6)
+    dataset = darts(6)
+    poses = LookAtPoses(torch.arange(24.0).repeat(144) * 15, 30.0, 2.732, 15.0)
+    weights = np.full((144, 24), 1 / 24, np.float32)
+    dataset = dataclasses.replace(dataset, candidates=PoseCandidates(poses, np.zeros(24 * 144, int), weights))
+    changed = update_poses(Prophet(vertices.repeat_interleave(24, 0), faces), dataset)
+    found = torch.from_numpy(weights.argmax(1)) * 15.0
+    assert ((found - dataset.poses.azimuth_deg + 180) % 360 - 180).abs().max() == 0
+    assert np.allclose(weights.sum(1), 1) and changed == pytest.approx(1 - 1 / 24)
+
+
+def test_poses_are_weighted_in_halves_of_a_run() -> None:
+    assert update_steps(1600, 3) == (200, 400, 800)
+    assert update_steps(2, 3) == (1,) and update_steps(100, 0) == ()
+
+
+@pytest.fixture
+def table(tmp_path: Path, tiny_folder: Path) -> Path:
+    """A random table for the splits of the tiny data set."""
+    tables = [random_table(load_dataset("kato", tiny_folder, "airplane", split)) for split in ("train", "val")]
+    columns = (np.concatenate([getattr(part, name) for part in tables]) for name in vars(tables[0]))
     PoseTable(*columns).write(tmp_path / "poses.npz")
-    config = tiny_config(run_folder, preset=preset, iterations=2, poses=tmp_path / "poses.npz")
-    assert train(config).finished
+    return tmp_path / "poses.npz"
+
+
+def test_weights_of_poses_survive_a_stop(
+    table: Path, tmp_path: Path, tiny_config: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Weighted anew after the steps 1 and 3, stopped after step 4."""
+    options = {"preset": "plus-kato", "poses": table, "iterations": 6, "pose_updates": 2}
+    assert train(tiny_config(tmp_path / "whole", **options)).finished
+    step_of = Plus.take_step
+
+    def stop(method: Plus, batch: Batch, step: int) -> dict[str, float]:
+        if step == 4:
+            signal.raise_signal(signal.SIGINT)
+        return step_of(method, batch, step)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Plus, "take_step", stop)
+        assert not train(tiny_config(tmp_path / "stopped", **options)).finished
+    assert train(tiny_config(tmp_path / "stopped", **options), resume=True).finished
+    whole, stopped = (checkpoint.load(tmp_path / name / "last.safetensors")[0] for name in ("whole", "stopped"))
+    assert whole.keys() == stopped.keys()
+    assert all(torch.equal(whole[name], stopped[name]) for name in whole)
+    assert not np.array_equal(
+        whole["poses.weights"][:, 0], PoseTable.read(table).weights[: len(whole["poses.weights"]), 0]
+    )
+
+
+@pytest.mark.parametrize(
+    "preset", ["plus-kato", "peng2020-kato", "peng2020-kato-vanilla", "peng2020-kato-vpl", "prgan"]
+)
+def test_methods_learn_from_a_table(
+    preset: str, table: Path, run_folder: Path, tiny_config: Callable[..., TrainConfig]
+) -> None:
+    assert train(tiny_config(run_folder, preset=preset, iterations=2, poses=table)).finished

@@ -1,0 +1,49 @@
+"""Weights the candidate poses of training images anew during training, by the model's own shapes.
+
+The shape that the model predicts from an image is rendered at all candidate poses of the image; the IoU with the mask
+gives the weights. All images share the networks, so a shape whose pose was wrong is drawn into the frame of the others.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+
+import nmr
+from learn3d.data.dataset import MASK_SIZE, ViewDataset
+from learn3d.methods.method import MeshMethod
+from learn3d.poses.estimate import SIZE, TEMPERATURE
+
+_IMAGES = 128  # at a time
+
+
+def update_steps(iterations: int, count: int) -> tuple[int, ...]:
+    """The steps of a run after which poses are weighted anew: 1/2, 1/4, ... of its length."""
+    return tuple(iterations >> k for k in range(count, 0, -1) if iterations >> k)
+
+
+@torch.no_grad()
+def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
+    """Weight the candidates of all images of `dataset` anew; returns the share of images with another best pose.
+
+    The weights are softmax(IoU / TEMPERATURE) over the candidates, with masks and renderings of SIZE pixels.
+    """
+    candidates = dataset.candidates
+    count, changed, was_training = candidates.weights.shape[1], 0, method.training
+    method.set_training(False)
+    with method.ema_weights():
+        for rows in torch.arange(len(dataset)).split(_IMAGES):
+            batch = dataset.batch(rows, voxels=False)
+            shapes = method.decode(method.encode(batch.images))
+            poses = candidates.poses[(rows[:, None] * count + torch.arange(count)).flatten()]
+            vertices = shapes.vertices.repeat_interleave(count, 0)
+            drawn = nmr.render_silhouette(vertices, shapes.faces, poses.cameras(), image_size=SIZE).cpu()
+            masks = F.avg_pool2d(batch.masks[:, None], MASK_SIZE // SIZE).expand(-1, count, -1, -1)
+            drawn = drawn.view(masks.shape)
+            common = (drawn * masks).sum((2, 3))
+            iou = common / ((drawn + masks).sum((2, 3)) - common).clamp_min(1e-6)
+            weights = (iou / TEMPERATURE).softmax(1).numpy()
+            changed += int((weights.argmax(1) != candidates.weights[rows].argmax(1)).sum())
+            candidates.weights[rows] = weights
+    method.set_training(was_training)
+    return changed / len(dataset)
