@@ -6,8 +6,8 @@
    over prototype and pose.
 3. Silhouettes hardly tell front from back, nor the long side of a table from its short side. So a prototype may be
    turned by 90 or 180 degrees against the others. Nearly equal masks of different prototypes vote for turns. So do
-   upper outlines, which show parts at one end only: an airplane's fin, a chair's back. The votes are the couplings of
-   a Potts model whose states are the four turns of each prototype.
+   peaks of the upper outlines, which are at one end only: an airplane's fin, a chair's back. The votes are the
+   couplings of a Potts model whose states are the four turns of each prototype.
 4. The posteriors over poses are smoothed over the nearest masks and the nearest mirrored masks. Then steps 2 to 4 are
    repeated with the smoothed posteriors as a prior.
 
@@ -24,6 +24,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
@@ -43,7 +44,8 @@ TEMPERATURE = 0.02  # of a softmax over 1 - IoU
 _NEIGHBOURS, _VOTERS = 8, 5  # nearest masks for smoothing, and for votes on turns
 _NEIGHBOUR_SCALE = 0.1  # distance at which the weight of a neighbour has fallen to 1 / e
 _FAR = 9.0  # distance of masks that must not be neighbours
-_OUTLINE_WEIGHT = 0.5  # weight of the votes of upper outlines; that of nearly equal masks is 1
+_PEAK_WIDTH = 5  # peaks of upper outlines are narrower, in pixels
+_PEAK_WEIGHT = 0.002  # weight of their votes; that of nearly equal masks is 1
 
 
 @checked
@@ -346,14 +348,9 @@ def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> Tensor:
     count, azimuths = values.shape[1:3]
     prototype = posterior.sum((2, 3)).argmax(1)
     azimuth = posterior[torch.arange(len(values)), prototype].sum(2).argmax(1)
-    coupling = np.zeros((TURNS, TURNS, count, count))
-    for weight, votes in (
-        (1.0, _mask_votes(data, prototype, azimuth, count, azimuths)),
-        (_OUTLINE_WEIGHT, _outline_votes(data, prototype, azimuth, count, azimuths)),
-    ):
-        votes = votes + votes.permute(1, 0, 3, 2)
-        votes = (votes - votes.mean((0, 1))) * (1 - torch.eye(count))
-        coupling += weight * (votes / votes.abs().sum().clamp_min(1e-12)).numpy()
+    votes = _mask_votes(data, prototype, azimuth, count, azimuths)
+    votes += _PEAK_WEIGHT * _peak_votes(data, prototype, azimuth, count, azimuths)
+    coupling = ((votes + votes.permute(1, 0, 3, 2)) * (1 - torch.eye(count))).numpy()
     draw = np.random.default_rng(int(torch.randint(2**31, (), generator=rng)))
     best, best_score, every = np.zeros(count, np.int64), -np.inf, np.arange(count)
     for _ in range(200):  # coordinate ascent from random turns
@@ -387,40 +384,37 @@ def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azi
     return votes
 
 
-def _outline_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:
-    """Votes float64 [TURNS, TURNS, M, M] of upper outlines. prototype, azimuth: int64 [N].
+def _peak_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:
+    """Votes float64 [TURNS, TURNS, M, M] of the peaks of upper outlines: an airplane's fin, a chair's back.
 
-    A mask votes against two turns with its distance to the other prototype's nearest outline at the same azimuth.
+    The vote of two turned prototypes is the inner product of their mean peaks at all azimuths, each azimuth weighted by
+    the roots of its numbers of masks. prototype, azimuth: int64 [N].
     """
-    outlines = _upper_outlines(data.masks)
-    votes = torch.zeros(TURNS, TURNS, count, count, dtype=torch.float64)
-    for part in torch.arange(len(data)).split(512):
-        same_object = data.objects[part][:, None] == data.objects
-        nearest = []
-        for others, seen_from in ((outlines, azimuth), (outlines.flip(1), (-azimuth) % azimuths)):
-            values = torch.cdist(outlines[part], others).masked_fill(same_object, float("inf"))
-            cells = (prototype * azimuths + seen_from).expand_as(values)
-            least = torch.full((len(part), count * azimuths), float("inf")).scatter_reduce_(1, cells, values, "amin")
-            nearest.append(least.view(len(part), count, azimuths))
-        known = torch.minimum(*nearest)
-        mean = known.nan_to_num(posinf=0.0).sum(2) / known.isfinite().sum(2).clamp_min(1)  # if no mask has an azimuth
-        rows = torch.arange(len(part))
-        for own, other in itertools.product(range(TURNS), repeat=2):
-            turned, turn = azimuth[part] + own * (azimuths // TURNS), other * (azimuths // TURNS)
-            plain, mirrored = (
-                values[rows, :, place % azimuths]
-                for values, place in zip(nearest, (turned - turn, turned + turn), strict=True)
-            )
-            distance = torch.minimum(plain, mirrored)
-            distance = torch.where(distance.isinf(), mean, distance).double()
-            votes[own, other].index_add_(0, prototype[part], -distance)
-    return votes
+    cells, peaks = prototype * azimuths + azimuth, _peaks(data.masks)
+    total = torch.zeros(count * azimuths, SIZE).index_add_(0, cells, peaks).view(count, azimuths, SIZE)
+    number = torch.bincount(cells, minlength=count * azimuths).view(count, azimuths)
+    turned, places = [], torch.arange(azimuths)
+    for turn in range(TURNS):
+        plain, mirrored = ((p - turn * (azimuths // TURNS)) % azimuths for p in (places, -places))
+        masks = (number[:, plain] + number[:, mirrored])[..., None]
+        mean = (total[:, plain] + total[:, mirrored].flip(2)) / masks.clamp_min(1)
+        mean = (mean - (mean * masks).sum(1, keepdim=True) / masks.sum(1, keepdim=True).clamp_min(1)) * masks.sqrt()
+        turned.append(mean.flatten(1))
+    stacked = torch.stack(turned).double()
+    return torch.einsum("smk,tnk->stmn", stacked, stacked)
 
 
-def _upper_outlines(masks: Tensor) -> Tensor:
-    """Height of the topmost pixel of each column above the centre of mass, 0 in empty columns: float32 [N, SIZE]."""
+def _peaks(masks: Tensor) -> Tensor:
+    """What stands out of the upper outline of each mask and is narrower than PEAK_WIDTH pixels: float32 [N, SIZE].
+
+    The outline is the height of the topmost pixel of each column above the centre of mass, 0 in empty columns; the
+    peaks are its difference to its morphological opening.
+    """
     shown = masks.reshape(-1, SIZE, SIZE) > 0.5
     rows = torch.arange(SIZE, dtype=torch.float32)[:, None]
     centre = (shown * rows).sum((1, 2)) / shown.sum((1, 2)).clamp_min(1)
     top = shown.float().argmax(1).float()
-    return torch.where(shown.any(1), centre[:, None] - top, 0.0)
+    outline = torch.where(shown.any(1), centre[:, None] - top, 0.0)[:, None]
+    side = _PEAK_WIDTH // 2
+    eroded = -F.max_pool1d(F.pad(-outline, (side, side)), _PEAK_WIDTH, 1)
+    return (outline - F.max_pool1d(F.pad(eroded, (side, side), value=-SIZE), _PEAK_WIDTH, 1))[:, 0]
