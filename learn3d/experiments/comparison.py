@@ -163,8 +163,16 @@ def _resample(measure: str, side: Side) -> np.ndarray:
     return resampled_means(sums, counts)
 
 
-_POSES_HEADER = ["category", "seed", "Acc@30", "up to half a turn", "median error, degrees", "flips", "objects flipped"]
-_POSES_HEADER += ["mean confidence", "IoU, known poses", "IoU, estimated poses", "ratio"]
+_POSE_ERRORS = {  # fields of the JSON file beside a table of poses, and the columns
+    "accuracy": "Acc@30",
+    "updated_accuracy": "after training",
+    "half_turn_accuracy": "up to half a turn",
+    "median_deg": "median error, degrees",
+    "flips": "flips",
+    "objects_flipped": "objects flipped",
+    "confidence": "mean confidence",
+}
+_POSES_HEADER = ["category", "seed", *_POSE_ERRORS.values(), "IoU, known poses", "IoU, estimated poses", "ratio"]
 
 
 def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> Cells:
@@ -178,8 +186,7 @@ def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> Ce
         errors_file = run.config.poses.with_suffix(".json")
         errors = parse_json(read_bytes(errors_file, limits.JSON_BYTES, "the errors of a table of poses as JSON"))
         ious = [results[folder].voxel_iou for folder in folders]
-        names = ("accuracy", "half_turn_accuracy", "median_deg", "flips", "objects_flipped", "confidence")
-        values = [*(errors[name] for name in names), *ious, ious[1] / ious[0]]
+        values = [*(errors[name] for name in _POSE_ERRORS), *ious, ious[1] / ious[0]]
         rows.append([run.config.category, str(run.config.seed), *_format_poses(values)])
         by_category.setdefault(run.config.category, []).append(values)
     several = {category: values for category, values in by_category.items() if len(values) > 1}
@@ -188,7 +195,7 @@ def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> Ce
 
 
 def _format_poses(values: Sequence[float]) -> list[str]:
-    return [f"{value:.1f}" if place == 2 else f"{value:.3f}" for place, value in enumerate(values)]
+    return [f"{value:.1f}" if place == 3 else f"{value:.3f}" for place, value in enumerate(values)]
 
 
 def _markdown(table: Cells) -> str:

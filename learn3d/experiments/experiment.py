@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 
 from learn3d.config import TrainConfig, differences, load_config
+from learn3d.data.layouts import load_dataset
+from learn3d.data.poses import wrap_deg
 from learn3d.device import resolve_precision
 from learn3d.experiments.comparison import make_report
 from learn3d.experiments.measurement import Result, measure
 from learn3d.experiments.plan import PlannedRun, Request, plan_runs
 from learn3d.experiments.tables import TABLES, VARIANTS
 from learn3d.files import limits, writing
-from learn3d.files.reading import read_bytes
-from learn3d.poses.estimate import PoseOptions
+from learn3d.files.reading import parse_json, read_bytes
+from learn3d.poses.estimate import NEAR_DEG, PoseOptions
 from learn3d.poses.views import CameraOptions, compare, estimate_views, load_views
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
@@ -46,6 +49,19 @@ def estimate_poses(config: TrainConfig) -> None:
     views.table.turned(comparison.offset_deg).write(config.poses)
 
 
+def _measure_updated_poses(config: TrainConfig) -> None:
+    """Add the share of azimuths that were right to 30 degrees at the end of the training to the JSON file of errors."""
+    weights = checkpoint.load(checkpoint.find(config.output, "last"))[0]["poses.weights"]
+    load = functools.partial(load_dataset, config.layout, config.data, config.category, "train")
+    known, estimated = (load(views_per_object=config.views_per_object, poses=poses) for poses in (None, config.poses))
+    azimuths = estimated.candidates.poses.azimuth_deg.view(weights.shape)
+    best = azimuths.gather(1, weights.argmax(1, keepdim=True))[:, 0]
+    right = wrap_deg(best - torch.as_tensor(known.poses.azimuth_deg)).abs() <= NEAR_DEG
+    path = config.poses.with_suffix(".json")
+    errors = parse_json(read_bytes(path, limits.JSON_BYTES, "the errors of a table of poses as JSON"))
+    writing.write_json(path, errors | {"updated_accuracy": float(right.double().mean())})
+
+
 def train_and_test(run: PlannedRun) -> bool:
     """Estimate poses if the run needs them, train, measure and write test.json; False if a signal stopped the training.
 
@@ -57,6 +73,8 @@ def train_and_test(run: PlannedRun) -> bool:
     if not train(run.config, resume=resume, overwrite=not resume).finished:  # the folder exists: log.txt is in it
         return False
     file = checkpoint.find(run.folder, VARIANTS[run.variant].checkpoint)
+    if run.config.poses is not None:
+        _measure_updated_poses(run.config)
     result = measure(file, data=run.config.data, device=run.config.device)
     writing.write_json(run.folder / RESULT_FILE, result.model_dump())
     print(f"tested: voxel IoU {result.voxel_iou:.4f} (kato18)", flush=True)

@@ -215,7 +215,8 @@ def test_poses_are_estimated_for_the_runs_that_need_them(tmp_path, tiny_folder, 
     _, row = json.loads((tmp_path / "out/poses.json").read_text())["poses"]
     known, estimated = (json.loads((run.folder / "test.json").read_text())["voxel_iou"] for run in runs)
     assert row[-3:] == [f"{value:.3f}" for value in (known, estimated, estimated / known)]
-    assert row[2] == f"{json.loads(table.with_suffix('.json').read_text())['accuracy']:.3f}"
+    errors = json.loads(table.with_suffix(".json").read_text())
+    assert row[2:4] == [f"{errors[name]:.3f}" for name in ("accuracy", "updated_accuracy")]
     assert "--poses OUTPUT/poses/CATEGORY-seedSEED.npz" in (tmp_path / "out/poses.md").read_text()
 
 
