@@ -120,6 +120,9 @@ class Estimate:
     prototypes: Tensor  # float32 [M, V, 3], y up, z towards azimuth 0
     faces: Tensor  # int64 [F, 3]
     weights: Tensor  # float32 [M]: mean posterior of each prototype
+    front_votes: (
+        float  # share of the nearly equal masks of different prototypes that got the same, not the opposite side
+    )
 
 
 def estimate(
@@ -142,7 +145,8 @@ def estimate(
     for stage in range(STAGES):
         start = 0.03 if stage else 0.05
         _train(shapes, subset, options, rng, start=start, smooth=3e-4, log_prior=log_prior, tick=tick)
-        shapes.turns = (shapes.turns + _turns(shapes.all_distances(subset), subset, rng)) % TURNS
+        turns, front_votes = _turns(shapes.all_distances(subset), subset, rng)
+        shapes.turns = (shapes.turns + turns) % TURNS
         own = _posteriors(-shapes.all_distances(subset) / TEMPERATURE, options.prior)
         smooth = neighbours.smooth(own.sum(1), options.prior)
         log_prior = (smooth + 1e-3).log()
@@ -156,7 +160,7 @@ def estimate(
         confidence[rows] = MAX_CONFIDENCE * near_mass(near.message(own.sum(1)).sum(2), best)
     if len(subset) < MIN_IMAGES or _views_coincide(posterior.sum(2).argmax(1), data.objects, options.azimuths):
         confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
-    return Estimate(posterior, confidence, *shapes.align(), own.sum((2, 3)).mean(0))
+    return Estimate(posterior, confidence, *shapes.align(), own.sum((2, 3)).mean(0), front_votes)
 
 
 def near_mass(mass: Tensor, azimuth: Tensor) -> Tensor:
@@ -342,14 +346,14 @@ def _normalize(posterior: Tensor) -> Tensor:
     return posterior / posterior.sum((1, 2), keepdim=True)
 
 
-def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> Tensor:
-    """Quarter turns of the prototypes after which similar masks have nearly equal azimuths: int64 [M]."""
+def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, float]:
+    """Quarter turns of the prototypes after which similar masks have nearly equal azimuths: int64 [M]; front_votes."""
     posterior = torch.softmax(-values.flatten(1) / TEMPERATURE, 1).reshape(values.shape)
     count, azimuths = values.shape[1:3]
     prototype = posterior.sum((2, 3)).argmax(1)
     azimuth = posterior[torch.arange(len(values)), prototype].sum(2).argmax(1)
-    votes = _mask_votes(data, prototype, azimuth, count, azimuths)
-    votes += _PEAK_WEIGHT * _peak_votes(data, prototype, azimuth, count, azimuths)
+    of_masks = _mask_votes(data, prototype, azimuth, count, azimuths)
+    votes = of_masks + _PEAK_WEIGHT * _peak_votes(data, prototype, azimuth, count, azimuths)
     coupling = ((votes + votes.permute(1, 0, 3, 2)) * (1 - torch.eye(count))).numpy()
     draw = np.random.default_rng(int(torch.randint(2**31, (), generator=rng)))
     best, best_score, every = np.zeros(count, np.int64), -np.inf, np.arange(count)
@@ -363,7 +367,10 @@ def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> Tensor:
                 break
         if (score := coupling[turns[:, None], turns, every[:, None], every].sum()) > best_score:
             best, best_score = turns, score
-    return torch.from_numpy((best - best[0]) % TURNS)
+    same, opposite = (
+        float(of_masks[best[:, None], turned, every[:, None], every].sum()) for turned in (best, (best + 2) % TURNS)
+    )
+    return torch.from_numpy((best - best[0]) % TURNS), 1 - opposite / max(same + opposite, 1e-9)
 
 
 def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:

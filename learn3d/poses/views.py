@@ -26,6 +26,7 @@ from learn3d.settings import checked
 MAX_ELEVATION_STEP_DEG = 15.0  # between neighbouring candidates
 DEFAULT_ELEVATION_DEG, DEFAULT_FOV_DEG = 30.0, 30.0
 MIN_CONFIDENCE = 0.5  # an image with less counts as doubtful
+_MIN_FRONT_VOTES = 0.8  # `Estimate.front_votes` of objects whose front and back differ
 
 
 @checked
@@ -78,6 +79,8 @@ class EstimatedViews:
                 "these masks do not determine the poses: nearly equal masks of different objects got different "
                 "azimuths, so objects may look alike from several sides. Check the sheet before training on this table"
             )
+        elif self.result.front_votes < _MIN_FRONT_VOTES:
+            warnings.append("many masks look the same from front and back: azimuths may be wrong by 180 degrees")
         return warnings
 
 

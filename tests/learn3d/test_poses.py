@@ -117,9 +117,13 @@ def test_prototypes_are_turned_into_one_frame(turns: int) -> None:
     masks = torch.nn.functional.avg_pool2d(masks[:, None], 64 // SIZE).flatten(1)
     data = Masks(masks, torch.ones(144, 1, dtype=torch.bool), torch.from_numpy(dataset.object_ids).long())
     azimuth, prototype = (dataset.poses.azimuth_deg / 15).round().long() % 24, data.objects % 2
-    values = torch.ones(144, 2, 24, 1)
-    values[torch.arange(144), prototype, (azimuth - 6 * turns * prototype) % 24] = 0.0
-    assert _turns(values, data, torch.Generator().manual_seed(0)).tolist() == [0, turns]
+    flipped = 12 * (torch.arange(144) % 3 == 0)
+    for wrong in (0, flipped):
+        values = torch.ones(144, 2, 24, 1)
+        values[torch.arange(144), prototype, (azimuth + wrong - 6 * turns * prototype) % 24] = 0.0
+        found, front_votes = _turns(values, data, torch.Generator().manual_seed(0))
+        assert found.tolist() == [0, turns] and (front_votes > 0.9) == (wrong is not flipped)
+    assert front_votes < 0.8
 
 
 def test_ambiguous_poses_get_low_confidence() -> None:
