@@ -102,11 +102,15 @@ def measure(
     device: str = "cpu",
     report_progress: Callable[[str], None] = lambda text: None,
 ) -> Result:
-    """Measure a checkpoint on all images of a split; `data` and `category` default to those of the training."""
+    """Measure a checkpoint on all images of a split; `data` and `category` default to those of the training.
+
+    With estimated poses, if the model learnt from some and the data are those of the training (`data` is None).
+    """
     method, config, metadata = checkpoint.load_method(file, device=device, precision=precision)
-    label, category, data = PRESETS[config.preset].label, category or config.category, data or config.data
+    label, category = PRESETS[config.preset].label, category or config.category
     report_progress(f"{file}: {label} ({config.preset}) on {category}, {split}")
-    dataset = checkpoint.load_data(config, split, data=data, category=category, layout=layout)
+    other = None if category == config.category else category
+    dataset = checkpoint.load_data(config, split, data=data, category=other, layout=layout)
     evaluation = evaluate(method, dataset, detailed=True)
     means = dict.fromkeys((*MEASURES, "hollow")) | evaluation.means
     if means["hollow"]:
@@ -118,7 +122,7 @@ def measure(
         method=label,
         preset=config.preset,
         category=category,
-        data=str(data.resolve()),
+        data=str((data or config.data).resolve()),
         command=command_line(config),
         iterations=config.iterations,
         step=metadata.progress.step,

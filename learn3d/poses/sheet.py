@@ -30,7 +30,7 @@ def draw_sheet(views: EstimatedViews) -> np.ndarray:
     found = torch.from_numpy(views.table.azimuth_deg[:, 0])[views.shown]
     columns = []
     for azimuth in azimuths:
-        near = torch.nonzero((torch.remainder(found - azimuth + 180, 360) - 180).abs() < 180 / count)[:, 0]
+        near = torch.nonzero(torch.remainder(found - azimuth + 180 / count, 360) < 360 / count)[:, 0]
         chosen = near[torch.linspace(0, len(near) - 1, min(ROWS, len(near))).long()]
         pictures = []
         for row in views.shown[chosen].tolist():

@@ -214,15 +214,14 @@ class Comparison:
 def compare(views: EstimatedViews) -> Comparison:
     """Compare the most probable azimuths with the true ones.
 
-    The frame is turned by the whole number of degrees with the smallest sum of two mean errors of the validation images
-    (of all images, if there is no validation split): that of the azimuths, and that up to half a turn, which alone
-    decides for objects that look the same from front and back. Raises ValueError if the data set has no poses.
+    The frame is turned by the whole number of degrees with the smallest sum of two mean errors, over all images but
+    those of the test split: that of the azimuths, and that up to half a turn, which alone decides for objects that look
+    the same from front and back. Raises ValueError if the data set has no poses.
     """
     if any(dataset.poses is None for dataset in views.datasets):
         raise ValueError("--compare needs true poses, but this data set has none")
     true, found = _column(views.datasets, "azimuth_deg"), torch.from_numpy(views.table.azimuth_deg[:, 0])
-    splits = np.concatenate([[dataset.split] * len(dataset) for dataset in views.datasets])
-    chosen = torch.from_numpy(splits == "val") if "val" in splits else torch.ones(len(true), dtype=torch.bool)
+    chosen = torch.cat([torch.full((len(dataset),), dataset.split != "test") for dataset in views.datasets])
     offsets = torch.arange(360.0)
     turned = (wrap_deg(found[chosen] + o - true[chosen]).abs() for o in offsets)
     offset = float(offsets[torch.stack([(e + _up_to_half_turn(e)).mean() for e in turned]).argmin()])

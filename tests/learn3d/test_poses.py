@@ -21,6 +21,8 @@ from learn3d.data.pose_table import PoseTable, fingerprints
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import kato
 from learn3d.data.sampling import batches
+from learn3d.evaluation import Evaluation, evaluate
+from learn3d.experiments import measurement
 from learn3d.files.reading import DamagedFile
 from learn3d.methods.plus import Plus
 from learn3d.methods.surfaces import Meshes
@@ -276,6 +278,22 @@ def test_weights_of_poses_survive_a_stop(
     assert not np.array_equal(
         whole["poses.weights"][:, 0], PoseTable.read(table).weights[: len(whole["poses.weights"]), 0]
     )
+
+
+def test_a_run_is_measured_with_its_poses_on_its_own_data(
+    table: Path, run_folder: Path, tiny_folder: Path, tiny_config: Callable[..., TrainConfig], monkeypatch
+) -> None:
+    train(tiny_config(run_folder, preset="plus-kato", iterations=1, poses=table))
+    measured = []
+
+    def look(method: Plus, dataset: ViewDataset, **options: object) -> Evaluation:
+        measured.append(dataset.candidates is not None)
+        return evaluate(method, dataset, **options)
+
+    monkeypatch.setattr(measurement, "evaluate", look)
+    for data in (None, tiny_folder):
+        measurement.measure(run_folder / "last.safetensors", data=data, category="airplane", split="val")
+    assert measured == [True, False]
 
 
 @pytest.mark.parametrize("preset", ["plus-kato", "peng2020-kato", "peng2020-kato-vanilla", "peng2020-kato-vpl"])
