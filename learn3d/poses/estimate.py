@@ -120,9 +120,7 @@ class Estimate:
     prototypes: Tensor  # float32 [M, V, 3], y up, z towards azimuth 0
     faces: Tensor  # int64 [F, 3]
     weights: Tensor  # float32 [M]: mean posterior of each prototype
-    front_votes: (
-        float  # share of the nearly equal masks of different prototypes that got the same, not the opposite side
-    )
+    front_votes: float  # of the nearly equal masks with the same or opposite azimuths, the share with the same
 
 
 def estimate(

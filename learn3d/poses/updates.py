@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
 import nmr
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
@@ -15,6 +16,7 @@ from learn3d.methods.method import MeshMethod
 from learn3d.poses.estimate import SIZE, TEMPERATURE
 
 _IMAGES = 128  # at a time
+_ROUNDS = 20  # of scaling to the wanted marginal
 
 
 def update_steps(iterations: int, count: int) -> tuple[int, ...]:
@@ -26,10 +28,11 @@ def update_steps(iterations: int, count: int) -> tuple[int, ...]:
 def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
     """Weight the candidates of all images of `dataset` anew; returns the share of images with another best pose.
 
-    The weights are softmax(IoU / TEMPERATURE) over the candidates, with masks and renderings of SIZE pixels.
+    The weights are softmax(IoU / TEMPERATURE + b) over the candidates, with masks and renderings of SIZE pixels. b is a
+    number for each azimuth, such that all azimuths together stay as probable as they were.
     """
-    candidates = dataset.candidates
-    count, changed, was_training = candidates.weights.shape[1], 0, method.training
+    candidates, was_training = dataset.candidates, method.training
+    count, logits = candidates.weights.shape[1], []
     method.set_training(False)
     with method.ema_weights():
         for rows in torch.arange(len(dataset)).split(_IMAGES):
@@ -41,9 +44,22 @@ def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
             masks = F.avg_pool2d(batch.masks[:, None], MASK_SIZE // SIZE).expand(-1, count, -1, -1)
             drawn = drawn.view(masks.shape)
             common = (drawn * masks).sum((2, 3))
-            iou = common / ((drawn + masks).sum((2, 3)) - common).clamp_min(1e-6)
-            weights = (iou / TEMPERATURE).softmax(1).numpy()
-            changed += int((weights.argmax(1) != candidates.weights[rows].argmax(1)).sum())
-            candidates.weights[rows] = weights
+            logits.append(common / ((drawn + masks).sum((2, 3)) - common).clamp_min(1e-6) / TEMPERATURE)
     method.set_training(was_training)
-    return changed / len(dataset)
+    before = torch.from_numpy(candidates.weights)
+    weights = _with_marginal(torch.cat(logits), candidates.poses.azimuth_deg.view(before.shape), before)
+    changed = float((weights.argmax(1) != before.argmax(1)).double().mean())
+    candidates.weights[:] = weights.numpy()
+    return changed
+
+
+def _with_marginal(logits: Tensor, azimuth_deg: Tensor, before: Tensor) -> Tensor:
+    """Softmax of logits [M, C], shifted by a number for each azimuth so that its mean weight is that of `before`."""
+    _, azimuth = (azimuth_deg % 360).round(decimals=1).unique(return_inverse=True)
+    azimuth = azimuth.flatten()
+    wanted = torch.bincount(azimuth, before.flatten())
+    weights, shift = logits.softmax(1), torch.zeros(len(wanted), dtype=torch.float64)
+    for _ in range(_ROUNDS):
+        shift += (wanted.clamp_min(1e-6) / torch.bincount(azimuth, weights.flatten()).clamp_min(1e-6)).log()
+        weights = (logits + shift[azimuth].float().view(logits.shape)).softmax(1)
+    return weights
