@@ -53,8 +53,8 @@ class TrainConfig:
     poses: MayDiffer[FilePath | None] = None
     """Table of poses from learn3d estimate-poses, instead of the poses of the data set (default: none)."""
     pose_updates: Rare[Annotated[int, Field(ge=0, le=16)]] = 3
-    """Number of times in a run that --poses are weighted anew by the model's own shapes: after 1/2, 1/4, ... of all
-    steps. 0: never."""
+    """Number of times a run reweights the candidates of --poses by the IoU of its own shapes: after 1/2, 1/4, ... of
+    all steps. 0: never."""
     sampling: Rare[Sampling | None] = None
     """How batches are drawn. views: single images. pairs: two views of each object. groups: five views of each object.
     classes: single images, every category equally often."""

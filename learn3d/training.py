@@ -81,7 +81,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
                     log.metrics(step, "train", recent)
                 if step in updates:
                     changed = update_poses(method, train_set)
-                    log.say(f"step {step}: poses weighted anew, {changed:.0%} of the images have another one")
+                    log.say(f"step {step}: poses reweighted; the best pose of {changed:.0%} of the images changed")
                 if last or step % config.validate_every == 0:
                     progress = validate(run, val_set, progress, log)
                 if last or step % config.pictures_every == 0:

@@ -6,7 +6,7 @@
    over prototype and pose.
 3. Silhouettes hardly tell front from back, nor the long side of a table from its short side. So a prototype may be
    turned by 90 or 180 degrees against the others. Nearly equal masks of different prototypes vote for turns. So do
-   peaks of the upper outlines, which are at one end only: an airplane's fin, a chair's back. The votes are the
+   peaks of the upper outline: an airplane's fin or a chair's back is at one end of the object. The votes are the
    couplings of a Potts model whose states are the four turns of each prototype.
 4. The posteriors over poses are smoothed over the nearest masks and the nearest mirrored masks. Then steps 2 to 4 are
    repeated with the smoothed posteriors as a prior.
@@ -101,11 +101,11 @@ class Masks:
 
     def batches(self, rng: torch.Generator, steps: int) -> Iterator[tuple[Tensor, slice]]:
         """Rows of each batch and the elevations to render. If elevations are known, a batch has a single one."""
-        known = bool((self.allowed.sum(1) == 1).all())
+        one_each = bool((self.allowed.sum(1) == 1).all())
         counts = self.allowed.sum(0).double()
         for _ in range(steps):
             rows, elevations = torch.arange(len(self)), slice(None)
-            if known:
+            if one_each:
                 e = int(torch.multinomial(counts, 1, generator=rng))
                 rows, elevations = torch.nonzero(self.allowed[:, e])[:, 0], slice(e, e + 1)
             yield rows[torch.randint(len(rows), (_BATCH,), generator=rng)], elevations
@@ -120,7 +120,7 @@ class Estimate:
     prototypes: Tensor  # float32 [M, V, 3], y up, z towards azimuth 0
     faces: Tensor  # int64 [F, 3]
     weights: Tensor  # float32 [M]: mean posterior of each prototype
-    front_votes: float  # of the nearly equal masks with the same or opposite azimuths, the share with the same
+    front_votes: float  # share of equal among equal and opposite azimuths of similar masks
 
 
 def estimate(
@@ -142,18 +142,18 @@ def estimate(
     neighbours, log_prior = Neighbours.of(subset, subset), None
     for stage in range(STAGES):
         start = 0.03 if stage else 0.05
-        _train(shapes, subset, options, rng, start=start, smooth=3e-4, log_prior=log_prior, tick=tick)
+        _train(shapes, subset, options, rng, start=start, smoothness_weight=3e-4, log_prior=log_prior, tick=tick)
         turns, front_votes = _turns(shapes.all_distances(subset), subset, rng)
         shapes.turns = (shapes.turns + turns) % TURNS
         own = _posteriors(-shapes.all_distances(subset) / TEMPERATURE, options.prior)
-        smooth = neighbours.smooth(own.sum(1), options.prior)
-        log_prior = (smooth + 1e-3).log()
-    posterior, confidence = torch.empty(len(data), *smooth.shape[1:]), torch.empty(len(data))
+        smoothed = neighbours.smooth(own.sum(1), options.prior)
+        log_prior = (smoothed + 1e-3).log()
+    posterior, confidence = torch.empty(len(data), *smoothed.shape[1:]), torch.empty(len(data))
     for rows in torch.arange(len(data)).split(2048):
         part = data[rows]
         near = Neighbours.of(part, subset)
         alone = _posteriors(-shapes.all_distances(part) / TEMPERATURE, "free").sum(1)
-        posterior[rows] = _normalize(alone**0.3 * (near.message(smooth) + 1e-3))
+        posterior[rows] = _normalize(alone**0.3 * (near.message(smoothed) + 1e-3))
         best = posterior[rows].sum(2).argmax(1)
         confidence[rows] = MAX_CONFIDENCE * near_mass(near.message(own.sum(1)).sum(2), best)
     if len(subset) < MIN_IMAGES or _views_coincide(posterior.sum(2).argmax(1), data.objects, options.azimuths):
@@ -190,7 +190,7 @@ class Shapes:
         scale = torch.exp(torch.empty(3).uniform_(np.log(0.3), 0.0, generator=rng))
         self.base = 0.5 * self.network.place(self.network.sphere) * (scale - 1)
         self.codes = torch.zeros(1, CODE_SIZE)
-        self.turns = torch.zeros(1, dtype=torch.int64)  # quarter turns of a shape: its own azimuth 0 is at 90 of them
+        self.turns = torch.zeros(1, dtype=torch.int64)  # azimuth 0 of shape m is the common azimuth 90 * turns[m]
 
     def vertices(self) -> Tensor:
         """Vertices float32 [M, V, 3], before any turn."""
@@ -203,8 +203,8 @@ class Shapes:
         repeated = vertices.repeat_interleave(len(cameras.eye) // count, 0)
         rendered = nmr.render_silhouette(repeated, self.network.faces, cameras, image_size=SIZE).flatten(1)
         values = distances(masks, rendered).reshape(len(masks), count, azimuths, -1)
-        own = (torch.arange(azimuths) - self.turns[:, None] * (azimuths // TURNS)) % azimuths
-        return values.gather(2, own[None, :, :, None].expand_as(values))
+        shifted = (torch.arange(azimuths) - self.turns[:, None] * (azimuths // TURNS)) % azimuths
+        return values.gather(2, shifted[None, :, :, None].expand_as(values))
 
     @torch.no_grad()
     def align(self) -> tuple[Tensor, Tensor]:
@@ -235,13 +235,13 @@ def _train(
     rng: torch.Generator,
     *,
     start: float,
-    smooth: float,
+    smoothness_weight: float,
     log_prior: Tensor | None = None,
     tick: Callable[[], object] = lambda: None,
 ) -> None:
     """EM: the posteriors over shapes and poses follow from the IoU, then a gradient step fits the shapes to the masks.
 
-    The temperature falls from `start` to `TEMPERATURE`. smooth: weight of the smoothness loss. log_prior: [N, A, E].
+    The temperature falls from `start` to `TEMPERATURE`. log_prior: [N, A, E].
     """
     shapes.codes.requires_grad_()
     groups = [{"params": shapes.network.parameters()}]
@@ -258,7 +258,7 @@ def _train(
             logits = logits + log_prior[rows][:, None, :, elevations]
         posterior = _posteriors(logits, options.prior)
         loss = (posterior * values).sum((1, 2, 3)).mean()
-        total = loss + smooth * nmr.losses.smoothness_loss(vertices, shapes.network.edges)
+        total = loss + smoothness_weight * nmr.losses.smoothness_loss(vertices, shapes.network.edges)
         optimizer.zero_grad()
         total.backward()
         optimizer.step()
@@ -285,7 +285,7 @@ def _mean_shape(
     found = []
     for _ in range(options.restarts):
         shapes = Shapes(candidates, rng)
-        _train(shapes, data, options, rng, start=0.1, smooth=5e-4, tick=tick)
+        _train(shapes, data, options, rng, start=0.1, smoothness_weight=5e-4, tick=tick)
         values = shapes.all_distances(data)
         posterior = _posteriors(-values / TEMPERATURE, options.prior)
         loss = float((posterior * values.nan_to_num(posinf=0.0)).sum((1, 2, 3)).mean())
@@ -410,10 +410,9 @@ def _peak_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azi
 
 
 def _peaks(masks: Tensor) -> Tensor:
-    """What stands out of the upper outline of each mask and is narrower than PEAK_WIDTH pixels: float32 [N, SIZE].
+    """White top-hat of each mask's upper outline, its parts narrower than _PEAK_WIDTH pixels: float32 [N, SIZE].
 
-    The outline is the height of the topmost pixel of each column above the centre of mass, 0 in empty columns; the
-    peaks are its difference to its morphological opening.
+    The outline is the height of the topmost pixel of each column above the centre of mass, 0 in empty columns.
     """
     shown = masks.reshape(-1, SIZE, SIZE) > 0.5
     rows = torch.arange(SIZE, dtype=torch.float32)[:, None]

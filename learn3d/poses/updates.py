@@ -1,4 +1,4 @@
-"""Weights the candidate poses of training images anew during training, by the model's own shapes.
+"""Reweights the candidate poses of training images during training, by the model's own shapes.
 
 The shape that the model predicts from an image is rendered at all candidate poses of the image; the IoU with the mask
 gives the weights. All images share the networks, so a shape whose pose was wrong is drawn into the frame of the others.
@@ -20,13 +20,13 @@ _ROUNDS = 20  # of scaling to the wanted marginal
 
 
 def update_steps(iterations: int, count: int) -> tuple[int, ...]:
-    """The steps of a run after which poses are weighted anew: 1/2, 1/4, ... of its length."""
+    """The steps of a run after which poses are reweighted: 1/2, 1/4, ... of its length."""
     return tuple(iterations >> k for k in range(count, 0, -1) if iterations >> k)
 
 
 @torch.no_grad()
 def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
-    """Weight the candidates of all images of `dataset` anew; returns the share of images with another best pose.
+    """Reweight the candidates of all images of `dataset`; returns the share of images whose best pose changed.
 
     The weights are softmax(IoU / TEMPERATURE + b) over the candidates, with masks and renderings of SIZE pixels. b is a
     number for each azimuth, such that all azimuths together stay as probable as they were.

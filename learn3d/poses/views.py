@@ -103,7 +103,7 @@ def estimate_views(
     """Estimate the poses of all images. Shapes are fitted to the images of the first data set, the training split.
 
     kept: number of candidates of each image with a probability above 0; the table holds up to MAX_CANDIDATES, which a
-    training can weight anew. tick: called after each of `options.all_steps` steps. Raises ValueError if all training
+    training can reweight. tick: called after each of `options.all_steps` steps. Raises ValueError if all training
     masks are empty, or if the data set's poses are rotations.
     """
     elevation, distance, half_fov = _cameras(datasets, cameras)
