@@ -258,7 +258,7 @@ def table(tmp_path: Path, tiny_folder: Path) -> Path:
 def test_weights_of_poses_survive_a_stop(
     table: Path, tmp_path: Path, tiny_config: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Weighted anew after the steps 1 and 3, stopped after step 4."""
+    """Reweighted after the steps 1 and 3, stopped after step 4."""
     options = {"preset": "plus-kato", "poses": table, "iterations": 6, "pose_updates": 2}
     assert train(tiny_config(tmp_path / "whole", **options)).finished
     step_of = Plus.take_step
