@@ -374,7 +374,8 @@ def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, f
     same, opposite = (
         float(of_masks[best[:, None], turned, every[:, None], every].sum()) for turned in (best, (best + 2) % TURNS)
     )
-    return torch.from_numpy((best - best[0]) % TURNS), 1 - opposite / max(same + opposite, 1e-9)
+    best = (best + 2 * (best[0] >= 2)) % TURNS  # half a turn of all prototypes changes no vote
+    return torch.from_numpy(best), 1 - opposite / max(same + opposite, 1e-9)
 
 
 def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:

@@ -124,7 +124,9 @@ def test_prototypes_are_turned_into_one_frame(turns: int) -> None:
         values = torch.ones(144, 2, 24, 1)
         values[torch.arange(144), prototype, (azimuth + wrong - 6 * turns * prototype) % 24] = 0.0
         found, front_votes = _turns(values, data, torch.Generator().manual_seed(0))
-        assert found.tolist() == [0, turns] and (front_votes > 0.9) == (wrong is not flipped)
+        assert (
+            found[0] % 2 == 0 and (found[1] - found[0]) % 4 == turns and (front_votes > 0.9) == (wrong is not flipped)
+        )
     assert front_votes < 0.8
 
 
