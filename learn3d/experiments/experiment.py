@@ -39,6 +39,8 @@ def estimate_poses(config: TrainConfig) -> None:
     """
     if config.poses.is_file():
         return
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
     datasets = load_views(config.layout, config.data, config.category, config.views_per_object)
     views = estimate_views(datasets, CameraOptions(), PoseOptions(seed=config.seed), _CANDIDATES)
     comparison = compare(views)
