@@ -210,7 +210,11 @@ class ViewDataset:
         if not isinstance(self.poses, LookAtPoses):
             got = "no poses" if self.poses is None else "rotations"
             raise ValueError(f"cells of azimuth and elevation need look-at cameras; this data set has {got}")
-        return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), view_names=tuple(bins.names()))
+        candidates = self.candidates
+        if candidates is not None:
+            candidates = dataclasses.replace(candidates, view_ids=bins.ids(candidates.poses).numpy())
+        parts = {"view_names": tuple(bins.names()), "candidates": candidates}
+        return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), **parts)
 
     def with_few_views(self, count: int) -> ViewDataset:
         """`count` random views of each object, or all of an object with fewer; the same ones in every run.

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import nmr
+from learn3d.data.batch import PoseCandidates
 from learn3d.data.conventions import KATO
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.poses import LookAtPoses, RotationPoses
@@ -166,6 +167,10 @@ def test_rebinning_changes_the_classes_alone() -> None:
     binned = data.with_bins(AngleBins.parse("60x60"))
     assert binned.num_views == 6
     assert np.array_equal(binned.view_ids, AngleBins.parse("60x60").ids(data.poses).numpy())
+    candidates = PoseCandidates(data.poses.mirrored(torch.ones(12, dtype=bool)), data.view_ids, np.ones((12, 1)))
+    drawn = dataclasses.replace(data, candidates=candidates).with_bins(AngleBins.parse("60x60")).candidates
+    assert np.array_equal(drawn.view_ids, AngleBins.parse("60x60").ids(candidates.poses).numpy())
+    assert not np.array_equal(drawn.view_ids, binned.view_ids)
     turned = dataclasses.replace(data, poses=RotationPoses(torch.eye(3).expand(12, 3, 3)))
     with pytest.raises(ValueError, match="need look-at cameras"):
         turned.with_bins(AngleBins.parse("60x60"))
