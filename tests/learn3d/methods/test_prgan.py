@@ -162,4 +162,4 @@ def test_voxels_lie_where_the_data_sets_voxels_do() -> None:
 )
 def test_other_cameras_are_refused(poses: LookAtPoses | RotationPoses, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        small_prgan().take_step(make_batch(poses=poses), 1)
+        small_prgan().check_batch(make_batch(poses=poses))
