@@ -168,7 +168,8 @@ def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
     """A line for each option of `config` that differs from the run `saved` and must not."""
     old, new = (_flat(c) for c in (saved, config))
     schedule = f"the schedule {config.lr_schedule}" if config.lr_schedule != "constant" else ""
-    varies = schedule or config.settings.varies_over_run
+    updates = "pose_updates" if config.poses is not None and config.pose_updates > 0 else ""
+    varies = schedule or config.settings.varies_over_run or updates
     allowed = _MAY_DIFFER_NAMES - ({"iterations"} if varies else set())
     return [
         f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"

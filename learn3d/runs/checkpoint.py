@@ -203,6 +203,7 @@ def load_data(
 ) -> ViewDataset:
     """A split of a run's data, or of another folder, category or layout, in the form that its networks take.
 
+    The run's own data have the poses and, in the training split, the views of its training.
     Raises ValueError if the layout inverts colours and the training layout does not, or the other way round.
     """
     layout = layout or config.layout
@@ -212,7 +213,7 @@ def load_data(
     if layout == config.layout:
         form["view_bins"] = config.view_bins
     if data is None and category is None and layout == config.layout:
-        form["poses"] = config.poses
+        form |= {"poses": config.poses, "views_per_object": config.views_per_object if split == "train" else None}
     return load_dataset(layout, data or config.data, category or config.category, split, **form)
 
 
