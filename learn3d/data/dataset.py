@@ -31,9 +31,9 @@ class DatasetInfo:
     """Properties of the data that methods need to build their networks. Every checkpoint has them."""
 
     num_views: Annotated[int, Field(ge=0, le=100_000)]  # K view classes
+    inverted: bool  # colours are stored as 255 - colour
     num_classes: Annotated[int, Field(ge=1, le=10_000)] = 1  # number of categories
     pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # length of `features` of a pose; 0 if poses are unknown
-    inverted: bool = False  # colours are stored as 255 - colour
     mirror_plane_deg: float | None = None  # result of `data.mirror_plane`; None if none was found or looked for
     cube_side: float | None = None  # side of the cube, centred at the origin, that holds all objects; None if unknown
     solidity: float | None = None  # result of `ViewDataset.solidity`; None if not computed
@@ -57,12 +57,12 @@ class ViewDataset:
     object_names: tuple[str, ...]  # N names from the files
     voxels: Array | None  # bool [N, 32, 32, 32] ground truth in the data set's own axes; None if unknown
     convention: VoxelConvention  # axes of the voxels
+    inverted: bool  # True if colours are stored as 255 - colour, so that a white background is 0 (Kato's form)
     masks: Array | None = None  # uint8 [M, 64, 64] ground truth silhouettes; None: the images' fourth channel
     depth: Array | None = None  # uint8 [M, 64, 64], see `depth_levels`; None if unknown
     class_ids: np.ndarray | None = None  # int64 [N]: category of each object; None for a single category
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
     points: Array | None = None  # float32 [N, P, 3]: points on the true surfaces in the object frame; None if unknown
-    inverted: bool = True  # True if colours are stored as 255 - colour, so that a white background is 0 (Kato's form)
     crops: Crops | None = None  # M original images for the augmentation "crop"; None if unknown
     sides: np.ndarray | None = None  # float32 [M]: `object_sides`; None if not computed
     candidates: PoseCandidates | None = None  # M sets of poses for training to draw from; None: `poses` alone
@@ -115,7 +115,7 @@ class ViewDataset:
         """The properties that methods need; None for an unknown mirror plane or solidity."""
         features = 0 if self.poses is None else self.poses.num_features
         cube_side = None if self.voxels is None else self.convention.cube_side
-        known = self.num_views, self.num_classes, features, self.inverted, mirror_plane_deg, cube_side
+        known = self.num_views, self.inverted, self.num_classes, features, mirror_plane_deg, cube_side
         return DatasetInfo(*known, solidity)
 
     def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:

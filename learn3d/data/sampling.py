@@ -120,7 +120,7 @@ COLOR_GAIN = 0.3  # "colors" multiplies each colour by a factor in 1 - COLOR_GAI
 WITHOUT_COLOR = 0.3  # share of the images that "colors" makes black or white
 
 
-def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *, inverted: bool = True) -> Batch:
+def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *, inverted: bool) -> Batch:
     """The batch with the named augmentations, in this order, each drawn independently for every sample.
 
     "flip": image, mask, depth and pose (if known) mirrored left-right with probability 1/2 (Kato and Harada 2019).

@@ -33,7 +33,7 @@ def changed(network: torch.nn.Module, before: list[torch.Tensor]) -> bool:
 
 def make_step(config: TrainConfig, data: ViewDataset):
     """Networks by name, and a function that takes one step with them."""
-    method = create_method(config.settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
+    method = create_method(config.settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0)
     batch = data.batch(torch.tensor([0, 25, 50, 7]))
     return method.networks, lambda iteration: method.take_step(batch, iteration)
 
@@ -233,7 +233,7 @@ def test_empty_masks_are_said_and_nothing_but_empty_ones_refused(
 @pytest.mark.parametrize(("plane", "fixed"), [(37.5, True), (None, False)])
 def test_symmetry_auto_is_the_plane_that_the_data_have(preset: str, plane: float | None, fixed: bool) -> None:
     settings = dataclasses.replace(PRESETS[preset].settings, symmetry="auto", generator="sphere-small")
-    shape = DatasetInfo(24, mirror_plane_deg=plane)
+    shape = DatasetInfo(24, inverted=False, mirror_plane_deg=plane)
     generator = create_method(settings, shape, device="cpu", precision="fp32", seed=0).networks["generator"]
     assert (generator.mirror is not None) == fixed
 

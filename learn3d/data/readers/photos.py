@@ -117,6 +117,7 @@ def load(
         object_names=tuple(names.tolist()),
         voxels=None,
         convention=KATO,
+        inverted=PROPERTIES.inverted,
     )
 
 

@@ -36,6 +36,7 @@ def continuous(objects: int = 3, views: int = 4, category: str = "cup", seed: in
         object_names=tuple(f"{category}{i}" for i in range(objects)),
         voxels=rng.random((objects, 32, 32, 32)) < 0.5,
         convention=KATO,
+        inverted=True,
     )
 
 
@@ -217,7 +218,7 @@ def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
     assert concatenate([unknown, unknown]).poses is None
     assert unknown.select(np.array([0, 1])).poses is None
     indices = torch.tensor([1, 30])
-    batch, known = (augment(dataset.batch(indices), ("flip",), 0, 1) for dataset in (unknown, tiny_set))
+    batch, known = (augment(dataset.batch(indices), ("flip",), 0, 1, inverted=True) for dataset in (unknown, tiny_set))
     assert batch.poses is None
     assert torch.equal(batch.images, known.images)
     with pytest.raises(ValueError, match="no poses"):
@@ -229,7 +230,7 @@ def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
 @pytest.mark.parametrize("preset", ["peng2020-kato", "kato2018-kato", "peng2020-kato-vpl", "gadelha2017-kato"])
 def test_methods_that_need_poses_say_so(preset: str) -> None:
     with pytest.raises(ValueError, match="has no poses"):
-        create_method(PRESETS[preset].settings, DatasetInfo(1, pose_features=0), device="cpu", precision="fp32", seed=0)
+        create_method(PRESETS[preset].settings, DatasetInfo(1, inverted=False, pose_features=0), device="cpu", precision="fp32", seed=0)
 
 
 def test_few_views_of_every_object(tiny_set) -> None:
@@ -251,10 +252,10 @@ def test_few_views_of_every_object(tiny_set) -> None:
 
 def test_colours_are_permuted_scaled_or_left_out(tiny_set) -> None:
     batch = tiny_set.batch(torch.arange(72))
-    changed = augment(batch, ("colors",), 0, 1)
+    changed = augment(batch, ("colors",), 0, 1, inverted=True)
     assert torch.equal(changed.images[:, 3], batch.images[:, 3])
     assert torch.equal(changed.masks, batch.masks)
-    assert torch.equal(augment(batch, ("colors",), 0, 1).images, changed.images)
+    assert torch.equal(augment(batch, ("colors",), 0, 1, inverted=True).images, changed.images)
     means, before = (b.images[:, :3].double().mean((2, 3)).sort(dim=1).values for b in (changed, batch))
     without = (means == 0).all(1)
     assert 8 < without.sum() < 36  # 30 % of 72
@@ -272,6 +273,6 @@ def test_batches_are_sampled_and_augmented_from_any_step_on(tiny_set) -> None:
     assert len(found) == 4
     for step, batch in enumerate(found, 3):
         samples = sample_indices(tiny_set, "views", 4, 5, step)
-        wanted = augment(tiny_set.batch(samples, voxels=False), ("flip", "channels"), 5, step)
+        wanted = augment(tiny_set.batch(samples, voxels=False), ("flip", "channels"), 5, step, inverted=True)
         assert batch.voxels is None and torch.equal(batch.images, wanted.images)
         assert torch.equal(batch.poses.azimuth_deg, wanted.poses.azimuth_deg)

@@ -23,7 +23,7 @@ SMALL = {"generator_channels": (4, 4, 2, 1), "discriminator_channels": (4, 4, 4,
 
 def small_prgan(**settings: object) -> PrGAN:
     torch.manual_seed(0)
-    return PrGAN(PrGANSettings(**SMALL | settings), DatasetInfo(VIEWS), "cpu", "fp32")
+    return PrGAN(PrGANSettings(**SMALL | settings), DatasetInfo(VIEWS, inverted=False), "cpu", "fp32")
 
 
 def make_batch(count: int = 3, poses: LookAtPoses | RotationPoses | None = None) -> Batch:

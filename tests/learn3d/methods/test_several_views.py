@@ -44,7 +44,7 @@ def make_batch(objects: list[int]) -> Batch:
 def method() -> MultiView:
     torch.manual_seed(0)
     return MultiView(
-        MultiViewSettings(encoder="conv-small"), DatasetInfo(24), "cpu", "fp32", TrainingSchedule(200, "step")
+        MultiViewSettings(encoder="conv-small"), DatasetInfo(24, inverted=False), "cpu", "fp32", TrainingSchedule(200, "step")
     )
 
 
@@ -186,7 +186,7 @@ def test_depth_is_that_of_the_renderer(dataset: ViewDataset) -> None:
 
 def test_flipped_batches_have_flipped_depth(dataset: ViewDataset) -> None:
     batch = dataset.batch(torch.arange(10))
-    changed = augment(batch, ["flip"], 0, 1)
+    changed = augment(batch, ["flip"], 0, 1, inverted=True)
     turned = (changed.masks != batch.masks).flatten(1).any(1)
     assert 0 < turned.sum() < 10
     assert torch.equal(changed.depth[turned], batch.depth[turned].flip(2))
