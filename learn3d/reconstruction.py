@@ -36,7 +36,6 @@ from learn3d.fitting.cutting import Box, cut_out
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.fitting.fit import SHARE, Progress, belief, fit
 from learn3d.methods import MeshMethod, Method
-from learn3d.methods.many_views import ManyViews
 from learn3d.methods.refinement import refine
 from learn3d.networks.encoders import centre
 from learn3d.pictures.sheets import natural_colors, save_gif, save_png, tile
@@ -244,7 +243,8 @@ def reconstruct_picture(
     """
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image = torch.from_numpy(stored)
-    probabilities = view_probabilities(model, image)
+    found = method.view_probabilities(image[None])
+    probabilities = None if found is None else found[0]
     if not refined or not isinstance(method, MeshMethod):
         (surface,) = reconstruct(method, stored[None])
         azimuth_deg = input_azimuth_deg(surface, stored[3], probabilities)
@@ -258,16 +258,6 @@ def reconstruct_picture(
         fitted.vertices, method.faces, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], method.generator.reflection
     )
     return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, *recognize(model, image))
-
-
-def view_probabilities(model: Model, image: Tensor) -> Tensor | None:
-    """Probability of each azimuth cell of `fitting.fit` for a stored image uint8 [4, S, S]; None if not learnt."""
-    method, config = model.method, model.config
-    other_cells = config.layout != "around" or config.view_bins is not None
-    if not isinstance(method, MeshMethod) or (isinstance(method, ManyViews) and other_cells):
-        return None
-    probabilities = method.view_probabilities(image[None])
-    return None if probabilities is None else probabilities[0]
 
 
 def recognize(model: Model, image: Tensor) -> tuple[str | None, str | None]:

@@ -54,6 +54,12 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 
 
+def test_images_may_be_flipped_if_their_view_classes_are_not_read():
+    settings = {"encoder": "conv-light", "lambda_view": 1.0}
+    config = config_from_dict(BASE | {"preset": "many-views-kato", "settings": settings, "augment": ["flip"]})
+    assert config.augment == ("flip",) and not config.settings.reads_view_ids
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_options_are_named_with_their_file(tmp_path, name):
     values, message = WRONG[name]

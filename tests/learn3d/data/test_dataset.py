@@ -230,7 +230,13 @@ def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
 @pytest.mark.parametrize("preset", ["peng2020-kato", "kato2018-kato", "peng2020-kato-vpl", "gadelha2017-kato"])
 def test_methods_that_need_poses_say_so(preset: str) -> None:
     with pytest.raises(ValueError, match="has no poses"):
-        create_method(PRESETS[preset].settings, DatasetInfo(1, inverted=False, pose_features=0), device="cpu", precision="fp32", seed=0)
+        create_method(
+            PRESETS[preset].settings,
+            DatasetInfo(1, inverted=False, pose_features=0),
+            device="cpu",
+            precision="fp32",
+            seed=0,
+        )
 
 
 def test_few_views_of_every_object(tiny_set) -> None:

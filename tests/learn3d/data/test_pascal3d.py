@@ -181,7 +181,9 @@ def test_rotation_cells_are_45_degrees_of_scipys_yzx_angles() -> None:
 def test_crop_jitter_is_a_function_of_seed_and_step(folder: Path, contents: dict[str, dict]) -> None:
     dataset = pascal3d.load(folder, "aeroplane", "train")
     batch = dataset.batch(torch.tensor([1, 4, 1, 0]))
-    one, same, other, seed = (augment(batch, ["crop"], s, k, inverted=True).images for s, k in ((0, 7), (0, 7), (0, 8), (1, 7)))
+    one, same, other, seed = (
+        augment(batch, ["crop"], s, k, inverted=True).images for s, k in ((0, 7), (0, 7), (0, 8), (1, 7))
+    )
     assert torch.equal(one, same)
     assert all((one != x).any() for x in (other, seed, batch.images))
     assert (one[0] != one[2]).any()  # the same photograph twice: cropped in two ways

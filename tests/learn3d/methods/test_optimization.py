@@ -123,7 +123,9 @@ def test_steps_follow_the_schedule_and_ignore_the_average(tiny_names, tiny_set) 
     ends = []
     for average in (0.0, 0.9):
         schedule = TrainingSchedule(4, "linear", ema_decay=average)
-        method = create_method(settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0, schedule=schedule)
+        method = create_method(
+            settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0, schedule=schedule
+        )
         for step in (1, 2, 3):
             method.take_step(tiny_set.batch(torch.arange(4)), step)
             assert [o.param_groups[0]["lr"] for o in method.optimizers.values()] == [1e-3 * (1 - (step - 1) / 4)] * 3

@@ -264,7 +264,9 @@ def test_the_background_goes_on_beyond_the_border_and_the_mask_does_not() -> Non
 
 
 def create(preset: str, seed: int = 0, device: str = "cpu") -> Method:
-    return create_method(PRESETS[preset].settings, DatasetInfo(24, inverted=False), device=device, precision="fp32", seed=seed)
+    return create_method(
+        PRESETS[preset].settings, DatasetInfo(24, inverted=False), device=device, precision="fp32", seed=seed
+    )
 
 
 def test_initial_weights_follow_the_seed_and_not_the_discriminator() -> None:
