@@ -16,7 +16,7 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import Definition
 from learn3d.data.dataset import ViewDataset
-from learn3d.losses import mmd_from_distances
+from learn3d.losses import mmd
 from learn3d.methods import Grids, Meshes, Method
 from learn3d.methods.surfaces import grid_surface
 from learn3d.pictures.surfaces import Surface
@@ -247,5 +247,5 @@ def mean_mmd(codes: Tensor, view_ids: Tensor, forms: Sequence[str] = ("mmd",)) -
         between = distances(i, j)
         for form, found in values.items():
             kind = "paper" if form == "mmd_paper" else "released"
-            found.append(float(mmd_from_distances(within[i], within[j], between, kind)))
+            found.append(float(mmd(within[i], within[j], between, kind)))
     return {form: sum(found) / len(found) for form, found in values.items()}

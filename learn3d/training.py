@@ -62,7 +62,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         with (
             run_folder.advice_on_errors(folder),
             stop_on_signal() as stop,
-            RunLog(folder, start=progress.step, total=config.iterations, config=config) as log,
+            RunLog(config, start=progress.step) as log,
         ):
             for warning in filter(None, (*notes, empty_masks)):
                 log.say(f"warning: {warning}")

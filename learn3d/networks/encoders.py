@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.device import upload
-from learn3d.networks.layers import initialize_he, linear_layers
+from learn3d.networks.layers import BATCH_NORM_EPS, initialize_he, linear_layers
 from learn3d.networks.resnet import ResNet18Encoder
 
 CODE_SIZE = 512
@@ -179,9 +179,6 @@ def network_input(images: Tensor, device: torch.device | str, size: int = 64) ->
     for channel in range(4):  # one pass converts and copies; torch's own change of layout is slower
         pixels[..., channel].copy_(images[:, channel])
     return pixels.div_(255).permute(0, 3, 1, 2)
-
-
-BATCH_NORM_EPS = 2e-5  # published code
 
 
 class PreactResNet18(nn.Module):
