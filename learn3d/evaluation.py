@@ -101,9 +101,7 @@ def evaluate(
     generator = torch.Generator().manual_seed(0)
     surfaces = _true_surfaces(dataset, generator) if detailed else None
     codes, values = [], []
-    was_training = method.training
-    method.set_training(False)
-    try:
+    with method.in_use():
         for chosen in samples.split(batch_size):
             batch = dataset.batch(chosen)
             code = method.encode(batch.images)
@@ -120,8 +118,6 @@ def evaluate(
             unknown = torch.full((len(chosen),), math.nan)
             values.append(torch.stack([measured.get(name, unknown).double() for name in MEASURED], dim=1))
             codes.append(code.float().cpu())
-    finally:
-        method.set_training(was_training)
     object_ids, view_ids = (torch.from_numpy(ids[samples.numpy()]) for ids in (dataset.object_ids, dataset.view_ids))
     figures = dict(zip(MEASURED, torch.cat(values).T, strict=True))
     means = {name: float(v.nanmean()) for name, v in figures.items() if not v.isnan().all()}

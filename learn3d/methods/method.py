@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import contextlib
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -236,6 +236,17 @@ class Method(abc.ABC):
     def ema_weights(self) -> contextlib.AbstractContextManager[None]:
         """Context in which the networks have their EMA weights, if the run keeps an EMA."""
         return contextlib.nullcontext() if self.ema is None else self.ema.in_place()
+
+    @contextlib.contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Context for evaluation during a training: `ema_weights`, and networks in evaluation mode. Do not nest it."""
+        was_training = self.training
+        self.set_training(False)
+        try:
+            with self.ema_weights():
+                yield
+        finally:
+            self.set_training(was_training)
 
     def autocast(self) -> torch.autocast:
         """Context in which the networks run at the method's precision."""
