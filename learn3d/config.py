@@ -149,7 +149,9 @@ def load_config(path: Path) -> TrainConfig:
     try:
         content = read_bytes(path, limits.CONFIG_BYTES, "the options of a run")
     except FileNotFoundError:
-        raise ValueError(f"no {path}: is this the folder of a training run? One begins without --resume") from None
+        raise ValueError(
+            f"{path} is missing: is this the folder of a run? To start a new run, leave out --resume."
+        ) from None
     try:
         values = parse_json(content)
     except ValueError as error:

@@ -85,8 +85,9 @@ def evaluate(
     """Measure the shape of every image of a split, and the mean MMD over all pairs of view classes.
 
     Shapes are voxelized in the data set's convention and compared with the object's voxels. If poses are known, the
-    silhouette of a mesh at the camera of another image of the object is compared with that image's mask. Without
-    voxels, an object's only image is compared with its own mask.
+    silhouette of a mesh at the camera of another image of the object is compared with that image's mask. An
+    object's only image is compared with its own mask. If voxels are known and no object has a second image, silhouettes
+    are left out. A method in training is measured with its EMA weights.
 
     max_images: use only that many images, always the same ones (see `spread_samples`).
     detailed: add the voxel IoU with kato19, the MMD as the paper prints it, and Chamfer-L1 and F-score between 2,000

@@ -82,7 +82,7 @@ class ViewDataset:
         wanted |= dict.fromkeys(("voxels", "points", "class_ids"), n)
         sizes = {name: len(getattr(self, name)) for name in wanted if getattr(self, name) is not None}
         if wrong := {name: size for name, size in sizes.items() if size != wanted[name]}:
-            raise ValueError(f"{m} images of {n} objects do not go with {wrong}")
+            raise ValueError(f"expected {m} images and {n} objects, got {wrong}")
         for name, end in (("view_ids", self.num_views), ("object_ids", n)):
             values = getattr(self, name)
             if m and not (values.min() >= 0 and values.max() < end):
@@ -275,7 +275,7 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
     def joined(name: str) -> Array | Crops | None:
         parts = [getattr(d, name) for d in datasets]
         if len({type(part) for part in parts}) > 1:
-            raise ValueError(f"not all of them have {name}, or only some have it as shards; convert all or none")
+            raise ValueError(f"some categories lack {name} or do not have it as shards; convert all categories or none")
         if parts[0] is None:
             return None
         join = {DiskArray: DiskArray.join, Crops: join_crops}.get(type(parts[0]), np.concatenate)

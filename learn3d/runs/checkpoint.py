@@ -29,7 +29,7 @@ from learn3d.device import resolve_precision
 from learn3d.files import writing
 from learn3d.files.reading import parse_json
 from learn3d.methods import DatasetInfo, Method, create_method
-from learn3d.settings import Count, Share, Weight, checked
+from learn3d.settings import Count, NonNegative, Share, checked
 
 
 @functools.cache
@@ -71,7 +71,7 @@ class Progress:
     step: AnyStep = 0  # last step taken
     best_iou: Annotated[float, Field(ge=-1, le=1)] = -1.0  # best validation IoU so far; -1 before the first validation
     best_step: AnyStep = 0  # step of best_iou
-    seconds: Weight = 0.0  # training time, over all resumptions
+    seconds: NonNegative = 0.0  # training time, over all resumptions
     object_share: Share = 0.0  # mean share of the side of the training images that objects take
     threads: Count | None = None  # CPU threads that the run has chosen; None: fixed, or not chosen yet
     losses: dict[str, float] = dataclasses.field(default_factory=dict)  # losses of the last step

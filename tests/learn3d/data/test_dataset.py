@@ -72,8 +72,8 @@ def test_separate_masks_replace_the_fourth_channel() -> None:
     [
         ({"images": np.zeros((12, 4, 64, 64))}, r"images must be uint8 \[M, 4, S, S\], got float64"),
         ({"images": np.zeros((12, 4, 32, 32), np.uint8)}, r"masks must be \[M, 64, 64\], got \[12, 32, 32\]"),
-        ({"view_ids": np.zeros(5, np.int64)}, r"12 images of 3 objects do not go with \{'view_ids': 5\}"),
-        ({"voxels": np.zeros((2, 32, 32, 32), bool)}, r"do not go with \{'voxels': 2\}"),
+        ({"view_ids": np.zeros(5, np.int64)}, r"expected 12 images and 3 objects, got \{'view_ids': 5\}"),
+        ({"voxels": np.zeros((2, 32, 32, 32), bool)}, r"12 images and 3 objects, got \{'voxels': 2\}"),
         ({"voxels": np.zeros((3, 16, 16, 16), bool)}, r"voxels must be \[N, 32, 32, 32\]"),
         ({"view_ids": np.full(12, 2)}, r"view_ids must lie in 0 .. 1, got 2 .. 2"),
         ({"object_ids": np.full(12, -1)}, r"object_ids must lie in 0 .. 2, got -1 .. -1"),
