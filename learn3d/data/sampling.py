@@ -1,6 +1,7 @@
 """Samples and augments the batches of a training.
 
-They depend on (data set, seed, step) alone, so a resumed training needs no saved state of them.
+They depend on the data set, the seed, the step and the weights of the candidate poses. Checkpoints save only these
+weights.
 """
 
 from __future__ import annotations
