@@ -149,9 +149,9 @@ def _compare_voxels(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, 
 def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
     """IoU of a batch's masks and the silhouettes at its cameras: sum of minima over sum of maxima (NaN: both empty)."""
     size = batch.masks.shape[-1]
-    seen = nmr.render_silhouette(shapes.vertices, shapes.faces, batch.cameras, image_size=size).flatten(1)
+    silhouettes = nmr.render_silhouette(shapes.vertices, shapes.faces, batch.cameras, image_size=size).flatten(1)
     masks = batch.masks.flatten(1)
-    return {"silhouette_iou": torch.minimum(seen, masks).sum(1) / torch.maximum(seen, masks).sum(1)}
+    return {"silhouette_iou": torch.minimum(silhouettes, masks).sum(1) / torch.maximum(silhouettes, masks).sum(1)}
 
 
 def _compare_surfaces(shapes: Meshes | Grids, truth: list[Tensor], generator: torch.Generator) -> dict[str, Tensor]:

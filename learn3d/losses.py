@@ -69,17 +69,17 @@ def silhouette_pyramid_loss(prediction: Tensor, target: Tensor) -> Tensor:
     return total
 
 
-def silhouette_energy_distance(drawn: Tensor, real: Tensor) -> Tensor:
-    """Energy distance between the distributions of rendered silhouettes p and real ones t (Szekely and Rizzo 2013).
+def silhouette_energy_distance(silhouettes: Tensor, masks: Tensor) -> Tensor:
+    """Energy distance between the distributions of silhouettes p and masks t (Szekely and Rizzo 2013).
 
     2 mean_ij d(p_i, t_j) - mean_(i != k) d(p_i, p_k); the third term is constant and left out. The distance
     d(a, b) = 1 - a.b / (a.a + b.b - a.b) is 1 - IoU for silhouettes of 0 and 1 (Tanimoto's similarity, a positive
     definite kernel: Ralaivola et al. 2005), and 0 for two empty ones.
 
-    drawn: float [N,D], N >= 2, differentiable; real: float [M,D], M >= 1.
+    silhouettes: float [N,D], N >= 2, differentiable; masks: float [M,D], M >= 1.
     """
-    across, within = _tanimoto_distances(drawn, real), _tanimoto_distances(drawn, drawn)
-    pairs = len(drawn) * (len(drawn) - 1)
+    across, within = _tanimoto_distances(silhouettes, masks), _tanimoto_distances(silhouettes, silhouettes)
+    pairs = len(silhouettes) * (len(silhouettes) - 1)
     return 2 * across.mean() - (within.sum() - within.diagonal().sum()) / pairs
 
 

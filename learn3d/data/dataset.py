@@ -64,7 +64,7 @@ class ViewDataset:
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
     points: Array | None = None  # float32 [N, P, 3]: points on the true surfaces in the object frame; None if unknown
     crops: Crops | None = None  # M original images for the augmentation "crop"; None if unknown
-    sides: np.ndarray | None = None  # float32 [M]: `object_sides`; None if not computed
+    stored_sizes: np.ndarray | None = None  # float32 [M]: `object_sizes`; None if not computed
     candidates: PoseCandidates | None = None  # M sets of poses for training to draw from; None: `poses` alone
 
     def __post_init__(self) -> None:
@@ -78,7 +78,9 @@ class ViewDataset:
             raise ValueError(f"depth must be [M, {MASK_SIZE}, {MASK_SIZE}], got {list(self.depth.shape)}")
         if self.voxels is not None and self.voxels.shape[1:] != (VOXEL_SIZE,) * 3:
             raise ValueError(f"voxels must be [N, {VOXEL_SIZE}, {VOXEL_SIZE}, {VOXEL_SIZE}]")
-        wanted = dict.fromkeys(("poses", "view_ids", "object_ids", "masks", "depth", "crops", "sides", "candidates"), m)
+        wanted = dict.fromkeys(
+            ("poses", "view_ids", "object_ids", "masks", "depth", "crops", "stored_sizes", "candidates"), m
+        )
         wanted |= dict.fromkeys(("voxels", "points", "class_ids"), n)
         sizes = {name: len(getattr(self, name)) for name in wanted if getattr(self, name) is not None}
         if wrong := {name: size for name, size in sizes.items() if size != wanted[name]}:
@@ -171,15 +173,15 @@ class ViewDataset:
 
     def check_masks(self) -> str:
         """A warning if some masks are empty, else "". Raises ValueError if all masks are empty."""
-        empty = int((self.object_sides() == 0).sum())
+        empty = int((self.object_sizes() == 0).sum())
         if empty == len(self):
             found = f"all {empty} {self.split} images of {self.category} have an empty mask"
             raise ValueError(f"{found}; run learn3d check-dataset on the data")
         return f"{empty} of {len(self)} {self.split} images have an empty mask" if empty else ""
 
-    def object_share(self) -> float:
-        """Mean of `object_sides`: the scale at which `reconstruct` frames photographs."""
-        return float(self.object_sides().mean(dtype=np.float64))
+    def mean_object_size(self) -> float:
+        """Mean of `object_sizes`: the scale at which `reconstruct` frames photographs."""
+        return float(self.object_sizes().mean(dtype=np.float64))
 
     def solidity(self) -> float:
         """Mean ratio of a mask's area to that of its convex hull, for at most 256 images; 0 if all masks are empty."""
@@ -192,10 +194,10 @@ class ViewDataset:
         """The ground truth silhouettes of the samples `samples`, int64 [B]: uint8 [B, 64, 64]."""
         return self.images[samples][:, 3] if self.masks is None else self.masks[samples]
 
-    def object_sides(self) -> np.ndarray:
+    def object_sizes(self) -> np.ndarray:
         """The larger side of each mask's bounding box over the side of the image: float [M], 0 for an empty mask."""
-        if self.sides is not None:
-            return self.sides
+        if self.stored_sizes is not None:
+            return self.stored_sizes
         masks = self.images[:, 3] > 127
         sides = []
         for axis in (1, 2):
@@ -231,7 +233,7 @@ class ViewDataset:
 
     def select(self, samples: np.ndarray) -> ViewDataset:
         """The samples `samples`, int64 [B], and all objects. Arrays on disk are not read."""
-        names = ("images", "masks", "depth", "view_ids", "object_ids", "sides", "crops", "poses")
+        names = ("images", "masks", "depth", "view_ids", "object_ids", "stored_sizes", "crops", "poses")
         parts = {name: part for name in names if (part := getattr(self, name)) is not None}
         chosen = {n: p.select(samples) if isinstance(p, DiskArray) else p[samples] for n, p in parts.items()}
         return dataclasses.replace(self, **chosen)
@@ -282,7 +284,7 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
         return join(parts)
 
     starts = np.cumsum([0] + [d.num_objects for d in datasets])[:-1].tolist()
-    names = ("images", "masks", "depth", "view_ids", "voxels", "points", "sides", "crops")
+    names = ("images", "masks", "depth", "view_ids", "voxels", "points", "stored_sizes", "crops")
     return dataclasses.replace(
         first,
         **{name: joined(name) for name in names},

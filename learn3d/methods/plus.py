@@ -138,9 +138,9 @@ class Plus(PoseInvariant):
         seen_by = int(torch.randint(len(batch), ()))
         if not self.mask_bank.full:
             return {}
-        drawn = _reduced(self.render(vertices, batch.poses[torch.full((len(vertices),), seen_by)]))
-        real = self.mask_bank.of_view(int(batch.view_ids[seen_by])).to(drawn.device)
-        return {"novel_view": silhouette_energy_distance(drawn, real)}
+        silhouettes = _reduced(self.render(vertices, batch.poses[torch.full((len(vertices),), seen_by)]))
+        masks = self.mask_bank.of_view(int(batch.view_ids[seen_by])).to(silhouettes.device)
+        return {"novel_view": silhouette_energy_distance(silhouettes, masks)}
 
 
 def _reduced(silhouettes: Tensor) -> Tensor:

@@ -72,7 +72,7 @@ class Progress:
     best_iou: Annotated[float, Field(ge=-1, le=1)] = -1.0  # best validation IoU so far; -1 before the first validation
     best_step: AnyStep = 0  # step of best_iou
     seconds: NonNegative = 0.0  # training time, over all resumptions
-    object_share: Share = 0.0  # mean share of the side of the training images that objects take
+    object_share: Share = 0.0  # `ViewDataset.mean_object_size` of the training images
     threads: Count | None = None  # CPU threads that the run has chosen; None: fixed, or not chosen yet
     losses: dict[str, float] = dataclasses.field(default_factory=dict)  # losses of the last step
 

@@ -46,7 +46,7 @@ class Run:
         if saved is not None:
             progress = self._restore(*saved)
         else:
-            progress = Progress(object_share=train_set.object_share())
+            progress = Progress(object_share=train_set.mean_object_size())
             self.method.start_from_pretrained()
         if progress.step > config.iterations:
             raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
